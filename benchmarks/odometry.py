@@ -1,17 +1,21 @@
 """Poses estimated from scans alone, against true ones, beside KISS-ICP. Writes a table of BENCHMARKS.md.
 
-    OMP_NUM_THREADS=1 python benchmarks/odometry.py --data FOLDER [--names hall intel] [--most 150] [--runs 3]
+    OMP_NUM_THREADS=1 python benchmarks/odometry.py --data FOLDER [--names hall] [--most 150] [--seeds 0 1]
 
 FOLDER holds hall/, courtyard/, street/ and laser2d/. `--most` limits the scans of each. Each run moves all
-points by noise of 1 mm, because a step that is nearly ambiguous may change with it. One thread.
+points by noise of 1 mm, because a step that is nearly ambiguous may change with it. The first run also scores
+the map of the scans with the given and with the estimated poses, as gmmtorch-occupancy does. Every run is a
+line of the file `--runs`, which may hold runs of other calls; the table has all of them. One thread.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import statistics
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -19,11 +23,15 @@ from tables import hardware, markdown, publish
 
 import gmmtorch as gt
 from gmmtorch.datasets import Dataset
+from gmmtorch.evaluation.held_out import Protocol, evaluate
+from gmmtorch.evaluation.methods import choose, methods
 from gmmtorch.evaluation.trajectories import absolute_trajectory_error, relative_pose_error
 from gmmtorch.localization.recorded_poses import METHODS, with_odometry
 
 NOISE = 1e-3  # metres of standard deviation that move every point of a run
 WRONG = 0.2  # metres of a step
+HELD_OUT = {"hall": 5, "courtyard": 5, "street": 5}  # every n-th scan; 10 of the others
+RESOLUTION = {2: 0.1, 3: 0.2}  # metres of a cell
 
 
 def opened(data: Path, name: str, most: int | None) -> Dataset:
@@ -56,56 +64,94 @@ class Jittered(Dataset):
         return self._source.times
 
 
-def row(scans: Dataset, method: str, runs: int) -> dict[str, object]:
-    rates, errors, median_steps, wrong, unnoticed, lost, closures = [], [], [], [], [], [], []
-    for seed in range(runs):
-        begin = time.process_time()
-        posed, trajectory = with_odometry(Jittered(scans, seed), method)
-        rates.append(len(posed) / (time.process_time() - begin))
-        true = torch.stack([posed.own_pose(index) for index in range(len(posed))])
-        steps = relative_pose_error(trajectory.poses, true).distances
-        errors.append(absolute_trajectory_error(trajectory.poses, true).rmse)
-        median_steps.append(1e3 * float(steps.median()))
-        found = trajectory.found
-        wrong.append(int((steps > WRONG).sum()))
-        unnoticed.append(int(((steps > WRONG) & found[1:] & found[:-1]).sum()))
-        lost.append(int((~found).sum()))
-        closures.append(trajectory.n_closures)
-        print(scans.name, method, seed, errors[-1], wrong[-1], unnoticed[-1], lost[-1], flush=True)
+def measured(scans: Dataset, method: str, seed: int, name: str) -> dict[str, object]:
+    """The figures of one run."""
+    begin = time.process_time()
+    posed, trajectory = with_odometry(Jittered(scans, seed), method)
+    seconds = time.process_time() - begin
+    true = torch.stack([posed.own_pose(index) for index in range(len(posed))])
+    steps, found = relative_pose_error(trajectory.poses, true).distances, trajectory.found
+    is_wrong, is_lost = steps > WRONG, ~(found[1:] & found[:-1])
+    figures = {
+        "data": name,
+        "method": method,
+        "seed": seed,
+        "n_scans": len(posed),
+        "ate": absolute_trajectory_error(trajectory.poses, true).rmse,
+        "step": float(steps.median()),
+        "n_wrong": int(is_wrong.sum()),
+        "n_noticed": int((is_wrong & is_lost).sum()),
+        "n_lost": int((~found).sum()),
+        "n_closures": trajectory.n_closures,
+        "seconds": seconds,
+    }
+    if method == "mixture" and seed == 0:
+        figures["auc"] = [map_score(each, name) for each in (scans, posed)]
+    return figures
+
+
+def map_score(scans: Dataset, name: str) -> float:
+    """AUC of the map of the scans that are not held out, without a budget of bytes."""
+    resolution = RESOLUTION[scans[0].dim]
+    factories = choose(("point",), methods(partial(gt.GaussianMap, cutoff=3.0, hit_length=1.0)))
+    protocol = Protocol(HELD_OUT.get(name, 10), (1.0,), "beams", (resolution,), max_beams=50_000)
+    return float(evaluate(name, list(scans), factories, protocol).rows[0]["auc"])
+
+
+def row(runs: list[dict]) -> dict[str, object]:
+    """The row of the table of one data set and method, of runs by seed."""
+    mixture = runs[0]["method"] == "mixture"
+    auc = next((run["auc"] for run in runs if "auc" in run), None)
     return {
-        "data": scans.name,
-        "scans": len(scans),
-        "odometry": method,
-        "ATE": f"{statistics.median(errors):.2f} m",
-        "worst ATE": f"{max(errors):.2f} m",
-        "median step error": f"{statistics.median(median_steps):.0f} mm",
-        f"steps off by over {WRONG} m": _each(wrong),
-        "of these, not called lost": _each(unnoticed),
-        "lost scans": _each(lost) if method == "mixture" else "",
-        "closures": _each(closures) if method == "mixture" else "",
-        "scans/s": f"{statistics.median(rates):.1f}",
+        "data": runs[0]["data"],
+        "scans": runs[0]["n_scans"],
+        "odometry": runs[0]["method"],
+        "ATE": ", ".join(f"{run['ate']:.2f}" for run in runs) + " m",
+        "median step error": f"{1e3 * statistics.median(run['step'] for run in runs):.0f} mm",
+        f"steps off by over {WRONG} m": _each(runs, "n_wrong"),
+        "of these, called lost": _each(runs, "n_noticed") if mixture else "",
+        "lost scans": _each(runs, "n_lost") if mixture else "",
+        "closures": _each(runs, "n_closures") if mixture else "",
+        "scans/s": f"{statistics.median(run['n_scans'] / run['seconds'] for run in runs):.1f}",
+        "AUC given → estimated poses": "" if auc is None else " → ".join(f"{score:.3f}" for score in auc),
     }
 
 
-def _each(counts: list[int]) -> str:
-    return ", ".join(map(str, counts))
+def _each(runs: list[dict], name: str) -> str:
+    return ", ".join(str(run[name]) for run in runs)
+
+
+def table(file: Path) -> str:
+    """All runs of a file; a later run replaces an earlier one of the same data, method and seed."""
+    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    kept = {(run["data"], run["method"], run["seed"]): run for run in lines}
+    rows = []
+    for name, method in dict.fromkeys((name, method) for name, method, _ in kept):
+        runs = [kept[key] for key in sorted(kept) if key[:2] == (name, method)]
+        rows.append(row(runs))
+    return markdown(list(rows[0]), [list(one.values()) for one in rows])
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--names", nargs="+", default=["hall", "intel", "freiburg-101", "aces"])
+    names = ["hall", "courtyard", "street", "intel", "freiburg-101", "aces"]
+    parser.add_argument("--names", nargs="*", default=names)
+    parser.add_argument("--methods", nargs="+", default=METHODS)
     parser.add_argument("--most", type=int)
-    parser.add_argument("--runs", type=int, default=3)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--runs", type=Path, default=Path("odometry_runs.jsonl"))
     options = parser.parse_args()
     torch.set_num_threads(1)
-    rows = [
-        row(opened(options.data, name, options.most), method, options.runs)
-        for name in options.names
-        for method in METHODS
-    ]
-    table = markdown(list(rows[0]), [list(one.values()) for one in rows])
-    publish("odometry", f"{table}\n\n{hardware()}")
+    for name in options.names:
+        scans = opened(options.data, name, options.most)
+        for method in options.methods:
+            for seed in options.seeds:
+                line = json.dumps(measured(scans, method, seed, name))
+                print(line, flush=True)
+                with options.runs.open("a") as file:
+                    file.write(line + "\n")
+    publish("odometry", f"{table(options.runs)}\n\n{hardware()}")
 
 
 if __name__ == "__main__":

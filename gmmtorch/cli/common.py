@@ -8,14 +8,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 
 if TYPE_CHECKING:
     from gmmtorch.datasets import Dataset
+    from gmmtorch.datasets.recordings.reposed import Reposed
     from gmmtorch.evaluation.events import Event, Row
     from gmmtorch.evaluation.protocol_options import FitOptions
+    from gmmtorch.localization.odometry import Trajectory
     from gmmtorch.scan import Scan
 
 logger = logging.getLogger("gmmtorch")
@@ -122,8 +124,21 @@ def use_runtime(runtime: DictConfig) -> str:
     return str(runtime.device)
 
 
+class OpenedDataset(NamedTuple):
+    """A data set; with `dataset.odometry`, also its trajectory, and the facts of it for results.json."""
+
+    dataset: Dataset
+    trajectory: Trajectory | None
+    odometry: Row | None
+
+
 def open_dataset(config: DictConfig) -> Dataset:
     """The data set that the options `dataset.*` describe."""
+    return open_with_trajectory(config).dataset
+
+
+def open_with_trajectory(config: DictConfig) -> OpenedDataset:
+    """The data set of the options `dataset.*`, with the trajectory that `dataset.odometry` gives."""
     from gmmtorch import datasets
     from gmmtorch.errors import DataError, check_choice
 
@@ -134,38 +149,60 @@ def open_dataset(config: DictConfig) -> Dataset:
         if not OmegaConf.is_missing(config, key) and config[key] is not None
     }
     method, name = options.pop("odometry", "none"), options.pop("name")
+    motion = options.pop("motion", "constant")
     check_choice("dataset.odometry", method, ("none", "auto", "kiss_icp", "mixture"))
     try:
         found = datasets.load(name, options.pop("path", None), **options)
         if method == "none" or (method == "auto" and found.pose(0) is not None):
-            return found
+            return OpenedDataset(found, None, None)
         has_truth = options.get("poses") != "standing"
     except DataError:
         if method == "none" or name not in _WITHOUT_POSES:
             raise
         found = datasets.load(name, config.path, **{**options, "poses": "standing"})
         has_truth = False
-    return _with_odometry(found, "mixture" if method == "auto" else method, has_truth)
+    return _with_odometry(found, "mixture" if method == "auto" else method, motion, has_truth)
 
 
-def _with_odometry(source: Dataset, method: str, has_truth: bool) -> Dataset:
+def _with_odometry(source: Dataset, method: str, motion: str, has_truth: bool) -> OpenedDataset:
     """The data set with estimated poses. Prints the errors against its own poses, if it has some."""
-    from gmmtorch.evaluation.trajectories import absolute_trajectory_error, relative_pose_error
     from gmmtorch.localization.recorded_poses import with_odometry
 
-    posed, trajectory = with_odometry(source, method)
-    lost = int((~trajectory.found).sum())
-    text = f"odometry  {len(posed)} poses estimated, {lost} scans lost, {trajectory.n_closures} loop closures"
-    if has_truth and len(posed) > 2:
-        import torch
-
-        true = torch.stack([posed.own_pose(index) for index in range(len(posed))])
-        estimate = torch.stack([posed.pose(index) for index in range(len(posed))])
-        # Laid over the first pose: positions on a line determine no other motion.
-        ate, rpe = absolute_trajectory_error(estimate, true, "first"), relative_pose_error(estimate, true)
-        text += f"; ATE {ate.rmse:.3f} m, RPE {rpe.rmse:.3f} m against the poses of the data set"
+    with naming({"odometry": "dataset.odometry", "motion": "dataset.motion"}):
+        posed, trajectory = with_odometry(source, method, motion=motion)
+    facts: Row = {
+        "method": method,
+        "n_lost": int((~trajectory.found).sum()),
+        "n_closures": trajectory.n_closures,
+        **_trajectory_scores(posed, trajectory, has_truth and motion == "constant"),
+    }
+    text = f"odometry  {len(posed)} poses estimated, {facts['n_lost']} scans lost, "
+    text += f"{trajectory.n_closures} loop closures"
+    if facts["ate"] is not None:
+        text += f"; ATE {facts['ate']:.3f} m, RPE {facts['rpe']:.3f} m against the poses of the data set"
     print(text)
-    return posed
+    return OpenedDataset(posed, trajectory, facts)
+
+
+def _trajectory_scores(posed: Reposed, trajectory: Trajectory, has_truth: bool) -> Row:
+    """ATE and RPE against the data set's own poses; None where they cannot be computed."""
+    import torch
+
+    from gmmtorch.errors import InvalidArgumentError
+    from gmmtorch.evaluation.trajectories import absolute_trajectory_error, relative_pose_error
+
+    names = [f"{kind}{part}" for kind in ("ate", "rpe") for part in ("", "_median", "_max", "_degrees")]
+    scores: Row = {"align": None, **dict.fromkeys(names)}
+    if not has_truth or len(posed) < 3:
+        return scores
+    true = torch.stack([posed.own_pose(index) for index in range(len(posed))])
+    scores |= relative_pose_error(trajectory.poses, true).scores("rpe")
+    try:
+        ate = absolute_trajectory_error(trajectory.poses, true, "rigid").scores("ate")
+        return scores | ate | {"align": "rigid"}
+    except InvalidArgumentError:  # positions on a line determine no rotation
+        ate = absolute_trajectory_error(trajectory.poses, true, "first").scores("ate")
+        return scores | ate | {"align": "first"}
 
 
 def all_scans(config: DictConfig, device: str, on_event: Event) -> tuple[str, list[Scan]]:

@@ -44,7 +44,7 @@ def run(config: DictConfig) -> None:
     if config.inputs:
         map_recordings.run(config)
         return
-    dataset = common.open_dataset(config.dataset)
+    dataset, poses, odometry = common.open_with_trajectory(config.dataset)
     target = maps.map_factory(config, resolution=config.resolution)()
     builder = MapBuilder(dataset, target, device)
     with ProgressBars(enabled=config.report.progress) as bars:
@@ -52,7 +52,9 @@ def run(config: DictConfig) -> None:
         _build(config, builder, folder / _CHECKPOINT, bars, view)
         target.save(folder / "map.safetensors")
         trajectory = map_outputs.write_trajectory(builder, folder)
-        row = map_outputs.result_row(dataset.name, builder, config)
+        row = map_outputs.result_row(dataset.name, builder, config, odometry)
+        if poses is not None:
+            map_outputs.write_pose_table(dataset, poses, folder)
         exported, errors = map_outputs.write_exports(config, target, folder, bars)
         common.write_results("map", config, [row], folder)
         map_outputs.draw(config, target, [trajectory], row, folder)

@@ -11,8 +11,10 @@ import torch
 from torch import Tensor
 
 from gmmtorch.localization.alignment import Alignment, AlignmentTarget, align, seen_normals
+from gmmtorch.localization.free_space import FreeSpace, View
 from gmmtorch.localization.location import Location, pose_covariance
 from gmmtorch.localization.motions import Motions, distinct, generators
+from gmmtorch.localization.pose_graph import logarithm
 from gmmtorch.localization.registration import register
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import WindowedRule
@@ -30,19 +32,25 @@ _TURNED = {
 }  # radians between the headings of neighbouring starts, for each metre between their places
 _NEAR = 0.5  # metres, and half as many radians, of the deviations of the first search in 2D
 _FARTHEST = 3.0  # metres of a search
-_IMPOSSIBLE = 4.0  # metres from every expected pose, which costs
-_NEVER = 1e4  # nats
+_NEVER = 1e4  # nats of a pose that is farther from the expected poses than the sensor moves
 _AT_ONCE = 256  # starts
-_SORTED = 1024  # best starts, of which
-_CLIMBED = 16  # different ones are climbed
+_SORTED = 400  # best starts, of which
+_CLIMBED = {2: 64, 3: 48}  # different ones are climbed
+_SPREAD = 0.75  # spacings between them
+_COARSE_POINTS = 400  # of the scan on all levels but the last one
 _RANKED = 200  # points of the scan that rank the starts
 # Points that share one error: with 10, the prediction outweighed the surfaces where a corridor begins.
 _CORRELATED = 3.0
 _LOOSEST = 0.3  # metres of standard deviation
+LOST = 1.0, math.radians(20)  # deviations (m, rad) of a pose that no scan confirms
 _APART = 0.3  # metres, and radians: poses are different
 _INSIDE = 5.0  # nats of a point on a surface, however many components it touches
-_USUAL = {2: 0.6, 3: 0.9}  # of the share that is expected to be explained: less, and the search is wider
-_ALIKE = 2.0  # nats by which another pose must be worse
+_UNKNOWN = 4.0  # nats of a point that the local map could not see: neither for nor against a pose
+_CONTRADICTED = 8.0  # nats that a point costs in free space, or an earlier point that the scan looks through
+_MOST_CONTRADICTED = 0.3  # sum of both shares
+_LEAST_SEEN = 0.5  # share of the points of which at least so many must lie on surfaces
+_USUAL = 0.85  # of the share that is expected to be explained: less, and the search is wider
+_ALIKE = 0.08  # nats of a point by which another pose must be worse: 1 % of those of a point on a surface
 
 
 class Keyframe(NamedTuple):
@@ -57,13 +65,24 @@ class Keyframe(NamedTuple):
 
 class Expectation(NamedTuple):
     """Where a scan is expected: poses (B, D+1, D+1), world ← sensor; the standard deviations of the first one
-    (m, rad); and the share of its points that is usually explained.
+    (m, rad); the share of its points that is usually explained; and the largest shift (m) and turn (rad) from
+    the nearest of the poses.
     """
 
     poses: Tensor
     distance: float
     angle: float
     explained: float
+    max_step: float = 4.0
+    max_turn: float = math.pi
+
+
+class _Found(NamedTuple):
+    """The result of one search, with its log-likelihood (nats) and the share of the points against it."""
+
+    location: Location
+    total: float
+    contradicted: float
 
 
 class LocalMap:
@@ -89,18 +108,22 @@ class LocalMap:
         normals = seen_normals(self._components)
         self._target = functools.partial(AlignmentTarget, centered, normals=normals)
         self._targets = [self._target(blur) for blur in _BLURS[self.dim]]
+        self._space = FreeSpace(
+            [frame.points for frame in keyframes], torch.stack([frame.pose for frame in keyframes])
+        )
 
     def locate(self, scan: Keyframe, expected: Expectation) -> Location:
         """The pose of a scan, whose own pose is not used; `found` if it is sure."""
-        best: tuple[Location, float] | None = None
+        best: _Found | None = None
         for starts, targets in self._searches(scan, expected):
             tried = self._climbed(scan, expected, starts, targets)
-            if best is None or (tried[0].found, tried[1]) > (best[0].found, best[1]):
+            if best is None or (tried.location.found, tried.total) > (best.location.found, best.total):
                 best = tried
-            if best[0].found and best[0].explained >= _USUAL[self.dim] * expected.explained:
+            supported = best.location.explained - best.contradicted
+            if best.location.found and supported >= _USUAL * expected.explained:
                 break
         assert best is not None
-        return best[0]
+        return best.location
 
     def _searches(
         self, scan: Keyframe, expected: Expectation
@@ -141,54 +164,78 @@ class LocalMap:
         score = torch.cat([target.sums(points, self._motions(part)).score for part in starts.split(_AT_ONCE)])
         total = score / _CORRELATED - self._unlikely(starts, expected)
         best = total.argsort(descending=True, stable=True)[:_SORTED]
-        different = distinct(self._motions(starts[best]), 1.5 * spacing, 1.5 * turn)
-        return torch.cat([expected.poses, starts[best[different]][:_CLIMBED]])
+        view = self._space.view(points, starts[best])
+        against = _CONTRADICTED * (view.in_free_space + view.looked_through) - _UNKNOWN * view.unknown
+        total = total[best] - against * len(points) / _CORRELATED
+        starts = starts[best[total.argsort(descending=True, stable=True)]]
+        starts = starts[distinct(self._motions(starts), _SPREAD * spacing, _SPREAD * turn)]
+        return torch.cat([expected.poses, starts[: _CLIMBED[self.dim]]])
 
     def _climbed(
         self, scan: Keyframe, expected: Expectation, starts: Tensor, targets: list[AlignmentTarget]
-    ) -> tuple[Location, float]:
+    ) -> _Found:
         motions, kept = self._motions(starts), len(starts)
         for target in targets:
-            found = align(scan.points[: self.n_points], target, motions, _STEPS)
-            kept = max(kept // 2, 3)
-            order = self._total(found, scan, expected).argsort(descending=True, stable=True)
+            points = scan.points[: self.n_points if target is targets[-1] else _COARSE_POINTS]
+            found = align(points, target, motions, _STEPS)
+            kept = max(kept // 3, 3)
+            total, view = self._total(found, points, expected)
+            order = total.argsort(descending=True, stable=True)
             order = order[distinct(found.motions.at(order), target.blur / 2, target.blur / 2)]
-            found = found.at(order[:kept])
+            order = order[:kept]
+            found, total, view = found.at(order), total[order], view.at(order)
             motions = found.motions
-        total = self._total(found, scan, expected)
-        return self._location(scan, found, total), float(total[0])
+        return self._judged(points, found, total, view, expected)
 
-    def _total(self, found: Alignment, scan: Keyframe, expected: Expectation) -> Tensor:
-        """Log-likelihood of the points, and of the motion (B,), nats."""
-        likelihood = (
-            (found.score + _INSIDE * found.explained) * len(scan.points[: self.n_points]) / _CORRELATED
+    def _total(self, found: Alignment, points: Tensor, expected: Expectation) -> tuple[Tensor, View]:
+        """Log-likelihood of the points and of the motion (B,), nats; how the points agree with free space."""
+        poses = self._poses(found.motions)
+        view = self._space.view(points, poses)
+        contradicted = view.in_free_space + view.looked_through
+        mean = (
+            found.score + _INSIDE * found.explained + _UNKNOWN * view.unknown - _CONTRADICTED * contradicted
         )
-        return likelihood - self._unlikely(self._poses(found.motions), expected)
+        return mean * len(points) / _CORRELATED - self._unlikely(poses, expected), view
 
     def _unlikely(self, poses: Tensor, expected: Expectation) -> Tensor:
         """Half the square deviation (B,) of poses from the nearest expected one, with a long tail."""
-        distance = torch.cdist(poses[:, :-1, -1], expected.poses[:, :-1, -1])
-        too_far = torch.where(distance.amin(1) > _IMPOSSIBLE, _NEVER, 0.0)
-        distance = distance / expected.distance
-        turned = torch.linalg.matrix_norm(poses[:, None, :-1, :-1] - expected.poses[:, :-1, :-1])
-        square = distance.square() + (turned / (math.sqrt(2) * expected.angle)).square()
-        return torch.log1p(square.amin(1) / 2) + too_far
+        shift = torch.cdist(poses[:, :-1, -1], expected.poses[:, :-1, -1])
+        chord = torch.linalg.matrix_norm(poses[:, None, :-1, :-1] - expected.poses[:, :-1, :-1])
+        turned = 2 * (chord / math.sqrt(8)).clamp_max(1).asin()
+        is_near = (shift <= expected.max_step) & (turned <= expected.max_turn)
+        square = (shift / expected.distance).square() + (turned / expected.angle).square()
+        return torch.log1p(square.amin(1) / 2) + torch.where(is_near.any(1), 0.0, _NEVER)
 
-    def _location(self, scan: Keyframe, found: Alignment, total: Tensor) -> Location:
-        covariance, loosest = pose_covariance(found.information[0], scan.points[: self.n_points])
-        share, doubts = float(found.explained[0]), []
-        if float(total[0]) < -_NEVER / 2:
-            doubts.append(f"the pose is more than {_IMPOSSIBLE:g} m from where it is expected")
-        if share < self.least_explained:
-            doubts.append(f"only {share:.0%} of the points lie on surfaces of the last scans")
-        if loosest > _LOOSEST:
-            doubts.append(f"the surfaces leave a direction open: a standard deviation of {loosest:.2g} m")
+    def _judged(
+        self, points: Tensor, found: Alignment, total: Tensor, view: View, expected: Expectation
+    ) -> _Found:
+        """The best pose; if others explain the scan nearly as well, the most expected one, with a doubt."""
         poses = self._poses(found.motions)
         shift = (poses[:, :-1, -1] - poses[0, :-1, -1]).norm(dim=1)
         turn = torch.linalg.matrix_norm(poses[:, :-1, :-1] - poses[0, :-1, :-1]) / math.sqrt(2)
-        if bool((((shift > _APART) | (turn > _APART)) & (total >= total[0] - _ALIKE)).any()):
+        rivals = ((shift > _APART) | (turn > _APART)) & (total >= total[0] - _ALIKE * len(points))
+        chosen = rivals | (torch.arange(len(total)) == 0)
+        best = int(torch.where(chosen, self._unlikely(poses, expected), torch.inf).argmin())
+        covariance, loosest = pose_covariance(found.information[best], points)
+        contradicted = float(view.in_free_space[best] + view.looked_through[best])
+        seen = 1 - float(view.unknown[best])
+        share, doubts = min(float(found.explained[best]) / max(seen, _LEAST_SEEN), 1.0), []
+        if float(total[best]) < -_NEVER / 2:
+            doubts.append("the pose is farther from where it is expected than max_step and max_turn allow")
+        if contradicted > _MOST_CONTRADICTED:
+            doubts.append(f"{contradicted:.0%} of the points contradict the free space of the last scans")
+        if share < self.least_explained:
+            doubts.append(f"only {share:.0%} of the points lie on surfaces of the last scans")
+        if doubts:
+            covariance = covariance + nowhere(self.dim)
+        if loosest > _LOOSEST:
+            doubts.append(f"the surfaces leave a direction open: a standard deviation of {loosest:.2g} m")
+        if bool(rivals.any()):
             doubts.append("another pose explains the scan as well")
-        return Location(poses[0], covariance, share, tuple(doubts))
+            covariance = covariance + _scatter(poses[best], poses[chosen])
+        return _Found(
+            Location(poses[best], covariance, share, tuple(doubts)), float(total[best]), contradicted
+        )
 
     def _motions(self, poses: Tensor) -> Motions:
         return Motions(poses[:, :-1, :-1], poses[:, :-1, -1] - self._center)
@@ -199,3 +246,19 @@ class LocalMap:
         poses[:, :-1, :-1] = left @ right
         poses[:, :-1, -1] = motions.translations + self._center
         return poses
+
+
+def nowhere(dim: int) -> Tensor:
+    """The covariance (F, F) of a pose that no scan confirms."""
+    deviations = torch.full((dim * (dim + 1) // 2,), LOST[1]).double()
+    deviations[:dim] = LOST[0]
+    return torch.diag(deviations.square())
+
+
+def _scatter(pose: Tensor, others: Tensor) -> Tensor:
+    """The second moment (F, F) of other poses (B, D+1, D+1) about a pose, where each may be the true one."""
+    off = others.clone()
+    off[:, :-1, :-1] = others[:, :-1, :-1] @ pose[:-1, :-1].T
+    off[:, :-1, -1] -= pose[:-1, -1]
+    steps = logarithm(off)
+    return steps.T @ steps / len(steps)

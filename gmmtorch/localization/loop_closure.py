@@ -25,10 +25,6 @@ _SYSTEMATIC = {  # deviations (m, rad) of errors that the points do not show, su
     2: torch.tensor([0.01, 0.01, 0.002]).double(),
     3: torch.tensor([0.01, 0.01, 0.01, 0.001, 0.001, 0.001]).double(),
 }
-_LOST = {  # deviations (m, rad) of a pose that no scan confirms
-    2: torch.tensor([1.0, 1.0, 0.35]).double(),
-    3: torch.tensor([1.0, 1.0, 1.0, 0.35, 0.35, 0.35]).double(),
-}
 _ANGLE = math.radians(10)  # of the heading of a closure
 
 
@@ -110,6 +106,5 @@ def information_of(location: Location) -> Tensor:
     turn[:dim, :dim] = location.pose[:dim, :dim]
     if dim == 3:
         turn[3:, 3:] = location.pose[:dim, :dim]
-    lost = torch.zeros_like(_SYSTEMATIC[dim]) if location.found else _LOST[dim]
-    covariance = location.covariance + torch.diag(lost.square()) + torch.diag(_SYSTEMATIC[dim].square())
+    covariance = location.covariance + torch.diag(_SYSTEMATIC[dim].square())
     return torch.linalg.inv(turn.T @ covariance @ turn)

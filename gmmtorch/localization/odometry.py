@@ -11,7 +11,7 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
 from gmmtorch.linalg import check_rigid
-from gmmtorch.localization.local_map import Expectation, Keyframe, LocalMap
+from gmmtorch.localization.local_map import LOST, Expectation, Keyframe, LocalMap, nowhere
 from gmmtorch.localization.location import Location
 from gmmtorch.localization.loop_closure import closed, information_of
 from gmmtorch.localization.pose_graph import Edges, optimised
@@ -28,19 +28,19 @@ _FIRST_STEP = 1.0, math.radians(30)  # standard deviations (m, rad) of the first
 _SURPRISE = 0.3, math.radians(10)  # least standard deviations of a motion from the predicted one
 _MEMORY = 0.7  # share of the past in the mean surprise
 _LONG_MEMORY = 0.9  # share of the past in the mean explained share
-_LOST = 1.0, math.radians(20)  # deviations (m, rad) of a motion that no scan confirms
 
 
 class Trajectory(NamedTuple):
     """Poses (N, D+1, D+1) of N scans, world ← sensor (the world is the frame of the first one); covariances
     (N, F, F) of a shift (m) and a turn (rad) in the frame of the sensor; whether each was found (N,); the
-    number of loop closures that were used.
+    number of loop closures that were used; and the reasons against each pose, empty if it was found.
     """
 
     poses: Tensor
     covariances: Tensor
     found: Tensor
     n_closures: int
+    doubts: tuple[str, ...]
 
 
 class Odometry:
@@ -64,6 +64,8 @@ class Odometry:
         n_points: of a scan that are used at most, drawn with a fixed seed.
         least_explained: share of the points that must lie on surfaces of the local map.
         rule: how a scan becomes a mixture.
+        max_step, max_turn: largest motion (m, rad) of the sensor between two scans. A pose that is farther
+            from the last one and from the predicted one is not found.
     """
 
     def __init__(
@@ -75,12 +77,17 @@ class Odometry:
         n_points: int = 1000,
         least_explained: float = 0.5,
         rule: WindowedRule = _RULE,
+        max_step: float = 4.0,
+        max_turn: float = math.pi,
     ) -> None:
         self.n_keyframes = check_whole("n_keyframes", n_keyframes, 1)
         self.n_points = check_whole("n_points", n_points, _FEWEST)
         check_number("distance", distance)
         check_number("angle", angle, math.pi)
         check_number("least_explained", least_explained, 1)
+        check_number("max_step", max_step)
+        check_number("max_turn", max_turn, math.pi)
+        self.max_step, self.max_turn = max_step, max_turn
         self.distance, self.angle, self.least_explained, self.rule = distance, angle, least_explained, rule
         self.keyframes: list[Keyframe] = []
         self._local: LocalMap | None = None
@@ -118,7 +125,7 @@ class Odometry:
         scan = self._scan(rows)
         ratio = self._clock(stamp)
         if not self._poses:
-            location = Location(torch.eye(dim + 1).double(), _nowhere(dim) * 0, 1.0, ())
+            location = Location(torch.eye(dim + 1).double(), nowhere(dim) * 0, 1.0, ())
         else:
             location = self._located(scan, measured, ratio)
         self._remember(scan, location)
@@ -135,7 +142,8 @@ class Odometry:
             edges = closed(poses, edges, places, self.least_explained, self.rule)
         best = optimised(poses, edges)
         used = edges.is_closure & (best.weights > 0.5)
-        return Trajectory(best.poses, best.covariances, found, int(used.sum()))
+        doubts = tuple("; ".join(location.doubts) for location in self._locations)
+        return Trajectory(best.poses, best.covariances, found, int(used.sum()), doubts)
 
     # -- one scan -------------------------------------------------------------------------------------
 
@@ -176,10 +184,11 @@ class Odometry:
             step = measured
         elif self._motion is not None:
             step = _scaled(self._motion, ratio)
-        expected = Expectation(torch.stack([last @ step, last]), *self._surprise, self._explained)
+        poses, bounds = torch.stack([last @ step, last]), (self.max_step, self.max_turn)
+        expected = Expectation(poses, *self._surprise, self._explained, *bounds)
         if not len(scan.mixture) or self._local is None:
             doubt = "the scan has too few points" if not len(scan.mixture) else "no scan before had points"
-            return Location(expected.poses[0], _nowhere(dim), 0.0, (doubt,))
+            return Location(expected.poses[0], nowhere(dim), 0.0, (doubt,))
         location = self._local.locate(scan, expected)
         self._note_surprise(location, expected)
         return location
@@ -191,7 +200,7 @@ class Odometry:
         if location.found:
             self._explained = _LONG_MEMORY * self._explained + (1 - _LONG_MEMORY) * location.explained
         else:
-            seen = max(seen[0], _LOST[0]), max(seen[1], _LOST[1])
+            seen = max(seen[0], LOST[0]), max(seen[1], LOST[1])
         self._surprise = (
             max(_SURPRISE[0], _mean(self._surprise[0], seen[0])),
             max(_SURPRISE[1], _mean(self._surprise[1], seen[1])),
@@ -203,7 +212,10 @@ class Odometry:
             # The surfaces are those of the keyframes, so the edge begins at the last one.
             since = torch.linalg.solve(self._poses[self._last_frame], location.pose)
             self._edges.append((self._last_frame, since, information_of(location)))
-            self._motion = torch.linalg.solve(self._poses[-1], location.pose) if location.found else None
+            if location.found:
+                self._motion = torch.linalg.solve(self._poses[-1], location.pose)
+            elif self._n_lost >= _GIVEN_UP:
+                self._motion = None  # a sensor that is covered for long may have stopped
         self._poses.append(location.pose)
         self._locations.append(location)
         self._n_lost = 0 if location.found else self._n_lost + 1
@@ -244,14 +256,6 @@ class Odometry:
 def _mean(before: float, now: float) -> float:
     """Of squares, weighted by `_MEMORY`."""
     return math.sqrt(_MEMORY * before**2 + (1 - _MEMORY) * now**2)
-
-
-def _nowhere(dim: int) -> Tensor:
-    """The covariance of a pose that no scan confirms."""
-    free = dim * (dim + 1) // 2
-    deviations = torch.full((free,), _LOST[1]).double()
-    deviations[:dim] = _LOST[0]
-    return torch.diag(deviations.square())
 
 
 def _scaled(motion: Tensor, ratio: float) -> Tensor:

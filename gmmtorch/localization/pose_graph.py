@@ -88,7 +88,7 @@ def optimised(poses: Tensor, edges: Edges, scale: float = 3.0) -> OptimisedPoses
 def residuals(poses: Tensor, edges: Edges) -> Tensor:
     """e_ij (E, F) of the edges: a shift (m) and a turn (rad)."""
     between = torch.linalg.solve(poses[edges.source], poses[edges.target])
-    return _logarithm(torch.linalg.solve(edges.motions, between))
+    return logarithm(torch.linalg.solve(edges.motions, between))
 
 
 def square_errors(poses: Tensor, edges: Edges) -> Tensor:
@@ -179,7 +179,7 @@ def _moved(poses: Tensor, steps: Tensor) -> Tensor:
     return moved
 
 
-def _logarithm(motions: Tensor) -> Tensor:
+def logarithm(motions: Tensor) -> Tensor:
     """A shift and a turn (E, F) of motions (E, D+1, D+1): the translation, and the rotation's vector."""
     dim = motions.shape[1] - 1
     rotation = motions[:, :dim, :dim]

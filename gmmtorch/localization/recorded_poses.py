@@ -10,11 +10,12 @@ from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset
 from gmmtorch.datasets.recordings.reposed import Reposed, with_poses
-from gmmtorch.errors import DataError, check_choice
+from gmmtorch.errors import DataError, InvalidArgumentError, check_choice
 from gmmtorch.localization.odometry import Odometry, Trajectory
 from gmmtorch.optional_packages import needs_extra
 
 METHODS = ("kiss_icp", "mixture")
+MOTIONS = ("constant", "dataset")
 
 
 class PosedRecording(NamedTuple):
@@ -25,7 +26,10 @@ class PosedRecording(NamedTuple):
 
 
 def with_odometry(
-    source: Dataset, method: str = "mixture", on_scan: Callable[[int, int], None] = lambda done, total: None
+    source: Dataset,
+    method: str = "mixture",
+    on_scan: Callable[[int, int], None] = lambda done, total: None,
+    motion: str = "constant",
 ) -> PosedRecording:
     """A data set whose poses are estimated from its scans. The frame of the first usable scan is the world.
 
@@ -34,17 +38,26 @@ def with_odometry(
         method: mixture, `Odometry`; or kiss_icp, the package of Vizzo et al. (2023), without closures of
             loops and without covariances (NaN).
         on_scan: called with the number of scans done and of all.
+        motion: prediction of each pose. constant: the motion continues; dataset: as between the poses of the
+            data set, such as those of wheels (mixture only).
 
-    Raises `InvalidArgumentError` for another method, `DataError` if no scan can be read.
+    Raises `InvalidArgumentError` for another method or motion, `DataError` if no scan can be read.
     """
     check_choice("odometry", method, METHODS)
+    check_choice("motion", motion, MOTIONS)
+    if motion == "dataset" and method != "mixture":
+        raise InvalidArgumentError(
+            f"motion=dataset does not go with odometry={method}; use odometry=mixture."
+        )
     odometry: Any = Odometry() if method == "mixture" else _KissIcp()
     known = torch.zeros(len(source), dtype=torch.bool)
     times = source.times
+    before: Tensor | None = None
     for index in range(len(source)):
         points = _sensor_points(source, index)
         if points is not None:
-            odometry.add(points, None if times is None else float(times[index]))
+            moved, before = _motion(source, index, before) if motion == "dataset" else (None, None)
+            odometry.add(points, None if times is None else float(times[index]), moved)
             known[index] = True
         on_scan(index + 1, len(source))
     if not known.any():
@@ -53,6 +66,14 @@ def with_odometry(
     poses = torch.eye(trajectory.poses.shape[1]).double().repeat(len(source), 1, 1)
     poses[known] = trajectory.poses
     return PosedRecording(with_poses(source, poses, known), trajectory)
+
+
+def _motion(source: Dataset, index: int, before: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
+    """The motion of the sensor since the pose `before`, by the poses of the data set; and the pose now."""
+    now = source.pose(index)
+    if now is None:
+        return None, before
+    return None if before is None else torch.linalg.solve(before.double(), now.double()), now
 
 
 def _sensor_points(source: Dataset, index: int) -> Tensor | None:
@@ -83,7 +104,7 @@ class _KissIcp:
         self._poses: list[Tensor] = []
         self._dim = 3
 
-    def add(self, points: Tensor, stamp: float | None = None) -> None:
+    def add(self, points: Tensor, stamp: float | None = None, motion: Tensor | None = None) -> None:
         self._dim = points.shape[1]
         rows = torch.nn.functional.pad(points, (0, 3 - self._dim))
         if len(rows):
@@ -99,4 +120,5 @@ class _KissIcp:
             poses[:, 1, 0], poses[:, 0, 1] = turn.sin(), -turn.sin()
         free = dim * (dim + 1) // 2
         unknown = torch.full((len(poses), free, free), torch.nan).double()
-        return Trajectory(poses, unknown, torch.ones(len(poses), dtype=torch.bool), 0)
+        found = torch.ones(len(poses), dtype=torch.bool)
+        return Trajectory(poses, unknown, found, 0, ("",) * len(poses))

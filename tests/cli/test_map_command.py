@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from command_runs import QUIET, Finished, refused, run_here, succeeded
 
+from gmmtorch.datasets import load
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.map_builder import MapBuilder
 
@@ -118,8 +119,49 @@ def test_scans_of_a_bag_that_cannot_be_used_are_counted_and_printed(monkeypatch,
     assert "a: no scan of 1 can be used: message without a valid point" in refused(empty)
 
 
-def test_odometry_maps_a_recording_without_poses(run):
-    done = run("dataset=synthetic_building_2d", "dataset.n_scans=3", "dataset.odometry=mixture")
-    assert (done.folder / "trajectory.tum").is_file()
+@pytest.fixture
+def recording(tmp_path: Path) -> tuple[Path, np.ndarray]:
+    """A folder of three scans without poses, and their true poses in the frame of the first one."""
+    source, folder = load("synthetic_building"), tmp_path / "recording"
+    (folder / "scans").mkdir(parents=True)
+    for index in range(3):
+        points = source[index].transformed(source.pose(index).inverse()).points.numpy()[::10]
+        header = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
+        header += f"WIDTH {len(points)}\nHEIGHT 1\nPOINTS {len(points)}\nDATA ascii\n"
+        rows = "\n".join(f"{x:.4f} {y:.4f} {z:.4f}" for x, y, z in points)
+        (folder / "scans" / f"{index}.pcd").write_text(header + rows + "\n")
+    return folder, np.stack([np.linalg.solve(source.pose(0), source.pose(i)) for i in range(3)])
+
+
+def test_odometry_auto_estimates_the_poses_of_a_recording_without_poses(monkeypatch, recording, tmp_path):
+    folder, true = recording
+    options = ["dataset=scan_folder", f"dataset.path={folder}", "dataset.odometry=auto", *QUIET]
+    done = succeeded(run_here(monkeypatch, "map", tmp_path / "run", *options))
     assert "3 poses estimated" in done.stdout
-    assert "ATE" in done.stdout
+    odometry = done.results()["rows"][0]["odometry"]
+    assert (odometry["method"], odometry["n_lost"], odometry["ate"]) == ("mixture", 0, None)
+    table = np.genfromtxt(
+        done.folder / "trajectory.csv", delimiter=",", names=True, dtype=None, encoding="utf8"
+    )
+    poses = np.loadtxt(done.folder / "trajectory.tum")
+    assert np.allclose(poses[:, 1:4], true[:, :3, 3], atol=0.05)
+    assert np.allclose(table["x"], poses[:, 1], atol=1e-6)
+    assert table["found"].tolist() == [1, 1, 1]
+    assert table["cov_x_x"][0] == 0
+    assert (table["cov_x_x"][1:] > 0).all()
+
+
+def test_odometry_auto_keeps_given_poses_and_mixture_is_scored_by_them(monkeypatch, recording, tmp_path):
+    folder, true = recording
+    np.savetxt(folder / "poses.txt", true[:, :3].reshape(3, 12))
+    options = ["dataset=scan_folder", f"dataset.path={folder}", *QUIET]
+    given = succeeded(run_here(monkeypatch, "map", tmp_path / "given", *options, "dataset.odometry=auto"))
+    assert "poses estimated" not in given.stdout
+    assert "trajectory.csv" not in given.files()
+    assert "odometry" not in given.results()["rows"][0]
+    done = succeeded(run_here(monkeypatch, "map", tmp_path / "run", *options, "dataset.odometry=mixture"))
+    odometry = done.results()["rows"][0]["odometry"]
+    assert odometry["align"] in ("rigid", "first")
+    assert 0 < odometry["ate"] < 0.05
+    assert 0 < odometry["rpe"] < 0.05
+    assert odometry["rpe_degrees"] < 1

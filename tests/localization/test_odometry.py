@@ -10,7 +10,8 @@ from gmmtorch.datasets import load
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.evaluation.trajectories import absolute_trajectory_error
 from gmmtorch.localization import Odometry, with_odometry
-from gmmtorch.localization.odometry import _scaled
+from gmmtorch.localization.local_map import Expectation, LocalMap
+from gmmtorch.localization.odometry import _RULE, _scaled
 
 N_2D, N_3D = 14, 6
 
@@ -66,6 +67,69 @@ def test_a_corridor_leaves_the_direction_along_it_open():
     assert float(spread[0]) > 5 * float(spread[1])
 
 
+def test_a_sensor_that_is_covered_for_ten_seconds_is_found_again():
+    scans, true = sensor_scans("synthetic_building_2d", 8)
+    odometry = Odometry()
+    stamp = 0.0
+    for number, points in enumerate(scans):
+        if number == 4:
+            for covered in range(10):
+                odometry.add(points[:0], stamp := stamp + (1.0 if covered != 5 else 1e6))  # the clock jumps
+        location = odometry.add(points, stamp := stamp + 1.0)
+        assert location.found
+    found = odometry.trajectory()
+    seen = [*range(4), *range(14, 18)]
+    assert found.found.nonzero().squeeze(1).tolist() == seen
+    errors = absolute_trajectory_error(found.poses[seen], true, align="first").distances
+    assert float(errors.max()) < 0.05
+    assert float(found.covariances[8, 0, 0]) > 1.0  # m²: no scan confirms the guess
+    assert "too few points" in found.doubts[8]
+    assert found.doubts[14] == ""
+
+
+def test_a_room_with_equal_sides_leaves_the_heading_in_doubt():
+    side = torch.linspace(-3, 3, 120).double()
+    wall = torch.full_like(side, 3.0)
+    room = torch.cat([torch.stack(w, 1) for w in ((side, wall), (side, -wall), (wall, side), (-wall, side))])
+    frame = Odometry()._scan(room)
+    local = LocalMap([frame], 0.5, _RULE)
+    between = torch.tensor(
+        [[math.cos(0.8), -math.sin(0.8), 0], [math.sin(0.8), math.cos(0.8), 0], [0, 0, 1]]
+    ).double()
+    location = local.locate(frame, Expectation(between[None], 0.3, 0.2, 0.95))
+    assert "another pose explains the scan as well" in location.doubts
+    heading = math.atan2(location.pose[1, 0], location.pose[0, 0])
+    assert heading == pytest.approx(math.pi / 2, abs=0.02)  # 45° lies between; 0.8 rad is nearer to this one
+
+
+def test_a_motion_beyond_the_bounds_is_not_found():
+    scans, _ = sensor_scans("synthetic_building_2d", 2)
+    free, bound = Odometry(), Odometry(max_step=0.05, max_turn=0.01)
+    for points in scans:
+        found, refused = free.add(points), bound.add(points)
+    assert found.found
+    assert not refused.found
+    assert "max_step" in "".join(refused.doubts)
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize(
+    ("log", "first", "last"),
+    [("intel", 0, 2), ("intel", 54, 60), ("hall", 20, 24)],
+    ids=["a wall grows behind the sensor", "a corridor", "a turn by 135 degrees"],
+)
+def test_steps_that_mislead_the_points_are_found_with_free_space(real_data, log, first, last):
+    planar = real_data / f"laser2d/{log}.log.gz"
+    scans = load("carmen", planar) if planar.is_file() else load("scan_folder", real_data / log)
+    true = torch.stack([scans.pose(i) for i in range(first, last + 1)])
+    odometry = Odometry()
+    for number, pose in enumerate(true, first):
+        location = odometry.add(scans[number].transformed(torch.linalg.inv(pose)).points)
+        assert location.found
+        errors = absolute_trajectory_error(location.pose[None], (true[:1].inverse() @ pose), align="none")
+        assert float(errors.distances[0]) < 0.2
+
+
 def test_one_scan_has_the_first_pose():
     odometry = Odometry()
     location = odometry.add(torch.rand(100, 3))
@@ -105,6 +169,12 @@ def test_bad_arguments_are_named():
         odometry.add(torch.rand(50, 2), motion=2 * torch.eye(3))
     with pytest.raises(InvalidArgumentError, match="odometry='icp'"):
         with_odometry(load("synthetic_building_2d", n_scans=2), "icp")
+    with pytest.raises(InvalidArgumentError, match="motion='wheels'"):
+        with_odometry(load("synthetic_building_2d", n_scans=2), motion="wheels")
+    with pytest.raises(InvalidArgumentError, match="use odometry=mixture"):
+        with_odometry(load("synthetic_building_2d", n_scans=2), "kiss_icp", motion="dataset")
+    with pytest.raises(InvalidArgumentError, match="max_turn"):
+        Odometry(max_turn=4.0)
 
 
 def test_a_recording_gets_the_estimated_poses_and_keeps_its_points():
@@ -115,6 +185,25 @@ def test_a_recording_gets_the_estimated_poses_and_keeps_its_points():
         moved = posed.pose(index) @ torch.linalg.inv(few.pose(index))
         assert torch.allclose(posed[index].points, few[index].transformed(moved).points, atol=1e-9)
         assert torch.equal(posed.own_pose(index), few.pose(index))
+
+
+def test_the_motion_of_the_data_set_predicts_the_poses(monkeypatch):
+    few = load("synthetic_building_2d", n_scans=3)
+    true = [few.pose(index) for index in range(3)]
+    motions: list[Tensor | None] = []
+    add = Odometry.add
+    monkeypatch.setattr(
+        Odometry,
+        "add",
+        lambda self, points, stamp, motion: (motions.append(motion), add(self, points, stamp, motion)),
+    )
+    with_odometry(few, motion="dataset")
+    assert motions[0] is None
+    for index in (1, 2):
+        assert torch.allclose(true[index - 1] @ motions[index], true[index])
+    motions.clear()
+    with_odometry(few)
+    assert motions == [None, None, None]
 
 
 def test_kiss_icp_gives_poses_of_the_same_scans():

@@ -18,6 +18,8 @@ class FileDataset:
     poses: trajectory file (TUM or KITTI) whose poses replace those of the data set.
     odometry: none, the poses of the data set; auto, mixture if it has none; mixture or kiss_icp, poses are
         estimated from the scans.
+    motion: prediction of odometry=mixture. constant: the motion continues; dataset: as between the poses of
+        the data set, such as those of wheels.
     """
 
     name: str = MISSING
@@ -27,6 +29,7 @@ class FileDataset:
     stride: int = 1
     poses: str | None = None
     odometry: str = "none"
+    motion: str = "constant"
 
 
 @dataclass

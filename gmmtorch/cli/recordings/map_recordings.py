@@ -174,7 +174,7 @@ def _mapped(config: DictConfig, path: Path) -> Mapped:
     begin = time.process_time()
     device = common.use_runtime(config.runtime)
     config.dataset.path = str(path)
-    dataset = common.open_dataset(config.dataset)
+    dataset, poses, odometry = common.open_with_trajectory(config.dataset)
     builder = MapBuilder(dataset, maps.map_factory(config, resolution=config.resolution)(), device)
     for _ in builder.insert_all():
         pass
@@ -182,8 +182,10 @@ def _mapped(config: DictConfig, path: Path) -> Mapped:
     files = tile_files(builder.map.components(), builder.map.settings, config.tile)
     with tempfile.TemporaryDirectory(prefix="gmmtorch-") as folder:
         map_outputs.write_trajectory(builder, Path(folder))
+        if poses is not None:
+            map_outputs.write_pose_table(dataset, poses, Path(folder))
         files |= {file.name: file.read_bytes() for file in Path(folder).iterdir()}
-    row = map_outputs.result_row(dataset.name, builder, config)
+    row = map_outputs.result_row(dataset.name, builder, config, odometry)
     row |= {"cpu_seconds": time.process_time() - begin, "worker": f"{platform.node()}:{os.getpid()}"}
     return Mapped(files, row, None)
 

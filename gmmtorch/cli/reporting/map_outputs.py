@@ -15,8 +15,10 @@ from gmmtorch.cli.options import map_schema
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from gmmtorch.datasets import Dataset
     from gmmtorch.evaluation.events import Event, Row
     from gmmtorch.live.moments import BuildMoments
+    from gmmtorch.localization.odometry import Trajectory
     from gmmtorch.mapping.components import Components
     from gmmtorch.mapping.gaussian_map import GaussianMap
     from gmmtorch.mapping.map_builder import MapBuilder
@@ -49,7 +51,7 @@ def check_exports(config: DictConfig) -> None:
             )
 
 
-TRAJECTORY = "trajectory.tum"
+TRAJECTORY, POSE_TABLE = "trajectory.tum", "trajectory.csv"
 RECORDINGS = "recordings"
 """Folder of a run with `inputs`: one folder for each recording."""
 
@@ -60,6 +62,32 @@ def write_trajectory(builder: MapBuilder, folder: Path) -> Tensor:
 
     write_tum(folder / TRAJECTORY, builder.times, builder.poses)
     return builder.poses[:, :-1, -1]
+
+
+def write_pose_table(dataset: Dataset, estimated: Trajectory, folder: Path) -> None:
+    """Write the estimated poses of all scans with their covariances, if the method gives some."""
+    import torch
+
+    from gmmtorch.export import trajectory_files
+    from gmmtorch.localization.scan_locations import scan_times
+
+    if bool(estimated.covariances.isnan().any()):
+        return
+    dim = estimated.poses.shape[1] - 1
+    turn = estimated.poses[:, :dim, :dim]
+    axes = torch.eye(estimated.covariances.shape[1]).to(turn).repeat(len(turn), 1, 1)
+    axes[:, :dim, :dim] = turn
+    if dim == 3:
+        axes[:, dim:, dim:] = turn
+    columns = {
+        "scan": range(len(turn)),
+        "found": estimated.found.int().tolist(),
+        "doubts": estimated.doubts,
+    }
+    spread = axes @ estimated.covariances @ axes.mT  # of the sensor's axes, in those of the world
+    trajectory_files.write_pose_table(
+        folder / POSE_TABLE, scan_times(dataset), estimated.poses, spread, columns
+    )
 
 
 def trajectories(folder: Path, dim: int) -> list[Tensor]:
@@ -111,8 +139,8 @@ def write_exports(
     return messages, errors
 
 
-def result_row(name: str, builder: MapBuilder, config: DictConfig) -> Row:
-    """The row of results.json of a recording."""
+def result_row(name: str, builder: MapBuilder, config: DictConfig, odometry: Row | None = None) -> Row:
+    """The row of results.json of a recording. odometry: facts of the estimated trajectory."""
     now, record, built = builder.progress(), builder.record, builder.map
     nbytes, seconds = built.nbytes, max(now.seconds, 1e-9)
     return {
@@ -131,6 +159,7 @@ def result_row(name: str, builder: MapBuilder, config: DictConfig) -> Row:
         "metres_per_second": now.metres / seconds,
         "memory_bytes": max(row["memory_bytes"] for row in record.history),
         "history": record.history,
+        **({} if odometry is None else {"odometry": odometry}),
     }
 
 
