@@ -15,7 +15,7 @@ from typing import Any
 
 from tables import ROOT
 
-_NUMBER = r"[-−+]?(?:\d[\d,]*(?:\.\d+)?|\.\d+)"
+_NUMBER = r"[-−+]?(?:\d+(?:,\d{3})*(?:\.\d+)?|\.\d+)"
 Interval = Callable[[float], tuple[float, float]]
 Reader = Callable[[Path], list[float]]  # of the folder of a run
 
@@ -96,8 +96,10 @@ def published(mark: str, label: Sequence[str], *columns: str) -> Reader:
 
     def read(out: Path) -> list[float]:
         rows = table_rows((out / f"{mark}.md").read_text(encoding="utf-8"))
-        (row,) = [row for row in rows if list(row.values())[: len(label)] == list(label)]
-        return [_number(found) for column in columns for found in re.findall(_NUMBER, row[column])]
+        chosen = [row for row in rows if list(row.values())[: len(label)] == list(label)]
+        if len(chosen) != 1:
+            raise ValueError(f"the run writes {len(chosen)} rows {', '.join(label)}, not one")
+        return [_number(found) for column in columns for found in re.findall(_NUMBER, chosen[0][column])]
 
     return read
 

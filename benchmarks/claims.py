@@ -397,7 +397,10 @@ def checked(claim: Claim, out: Path | None) -> list[str]:
         return [*start, shown, "", "no: the run failed"]
     if claim.read is None:
         return [*start, shown, "by the run itself", "yes"]
-    measured = claim.read(out)
+    try:
+        measured = claim.read(out)
+    except (ValueError, OSError) as error:  # the output lacks what the page has
+        return [*start, shown, "", f"no: {error}"]
     intervals = claim.intervals if isinstance(claim.intervals, Sequence) else [claim.intervals] * len(claimed)
     wrong = []
     for interval, said, found in zip(intervals, claimed, measured, strict=True):

@@ -40,6 +40,9 @@ def test_a_claim_holds_within_its_interval_only(claims, tmp_path):
     assert claims.checked(claim, tmp_path)[-1] == "yes"
     assert "0.7" in claims.checked(claim._replace(read=lambda out: [0.7]), tmp_path)[-1]
     assert claims.checked(claim, None)[-1].startswith("no")
+    assert claims.checked(claim._replace(read=claims.published("t", ["x"], "y")), tmp_path)[-1].startswith(
+        "no"
+    )
     assert claims.checked(claim._replace(text="no such # text"), tmp_path)[-1].startswith("no")
     with pytest.raises(ValueError, match="not once"):
         claims.numbers("| intel | # m |", claims.section("README.md"))  # twice in the table
