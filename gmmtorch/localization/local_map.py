@@ -50,7 +50,7 @@ _CONTRADICTED = 8.0  # nats that a point costs in free space, or an earlier poin
 _MOST_CONTRADICTED = 0.3  # sum of both shares
 _LEAST_SEEN = 0.5  # share of the points of which at least so many must lie on surfaces
 _USUAL = 0.85  # of the share that is expected to be explained: less, and the search is wider
-_ALIKE = 0.08  # nats of a point by which another pose must be worse: 1 % of those of a point on a surface
+_ALIKE = 2.0  # nats by which another pose must be worse
 
 
 class Keyframe(NamedTuple):
@@ -213,7 +213,7 @@ class LocalMap:
         poses = self._poses(found.motions)
         shift = (poses[:, :-1, -1] - poses[0, :-1, -1]).norm(dim=1)
         turn = torch.linalg.matrix_norm(poses[:, :-1, :-1] - poses[0, :-1, :-1]) / math.sqrt(2)
-        rivals = ((shift > _APART) | (turn > _APART)) & (total >= total[0] - _ALIKE * len(points))
+        rivals = ((shift > _APART) | (turn > _APART)) & (total >= total[0] - _ALIKE)
         chosen = rivals | (torch.arange(len(total)) == 0)
         best = int(torch.where(chosen, self._unlikely(poses, expected), torch.inf).argmin())
         covariance, loosest = pose_covariance(found.information[best], points)

@@ -137,6 +137,8 @@ class SyntheticDataset:
     seed: seed of the simulation.
     n_scans: number of scans; null: the whole tour.
     odometry: none, the simulated poses; mixture or kiss_icp, poses are estimated from the scans.
+    motion: prediction of odometry=mixture. constant: the motion continues; dataset: as between the simulated
+        poses.
     """
 
     name: str = MISSING
@@ -146,6 +148,7 @@ class SyntheticDataset:
     seed: int = 0
     n_scans: int | None = None
     odometry: str = "none"
+    motion: str = "constant"
 
 
 @dataclass
