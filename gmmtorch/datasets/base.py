@@ -90,10 +90,6 @@ class Dataset(Sequence[Scan]):
         name: of the data set.
         ranges: how readings are interpreted.
         stride: every n-th scan of the source is read.
-        times: (N,) times of the scans in seconds, float64; None if the source has no usable times.
-        skipped: reason → number of scans of the source that are left out for it, returned without points
-            because their data is unusable, or not deskewed. Empty if nothing is wrong. Damage inside a
-            scan is counted when that scan is read, so the counts are final after the last scan.
     """
 
     def __init__(self, name: str, ranges: Ranges, stride: int = 1) -> None:
@@ -144,7 +140,12 @@ class Dataset(Sequence[Scan]):
 
     @property
     def skipped(self) -> dict[str, int]:
-        """Number of scans that are left out, by the reason."""
+        """Reason → number of scans that are left out for it, returned without points because their
+        data is unusable, or not deskewed.
+
+        Empty if nothing is wrong. Damage inside a scan is counted when that scan is read, so the counts are
+        final after the last scan.
+        """
         return {reason: len(scans) for reason, scans in self._skipped.items()}
 
     def can_continue(self, n_read: int) -> bool:
