@@ -34,6 +34,8 @@ PARTS = (
     ("courtyard", "halves"),
     ("hall", "halves"),
     ("hall", "every second scan"),
+    ("aces", "halves"),
+    ("intel", "halves"),
 )
 FLAT, DEEP = ("intel", "aces", "freiburg-101"), ("hall", "courtyard", "street")
 PLACES = 40  # scans of a foreign log that are searched for

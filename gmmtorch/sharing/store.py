@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.files import joined_tensors, pack_tensors, split_tensors, unpack_tensors
 from gmmtorch.sharing.messages.envelope import MAX_BYTES
-from gmmtorch.sharing.replica.record_keys import RECORD_KINDS, Intervals, keys_in, keys_of_author
+from gmmtorch.sharing.replica.record_keys import RECORD_KINDS, WORLD, Intervals, keys_in, keys_of_author
 from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.sharing.store_file import explained, open_file, transaction
 
@@ -118,17 +118,18 @@ class Store:
     # -- records ------------------------------------------------------------------------------------
 
     def restore(self, replica: Replica) -> Restored:
-        """Load the stored records into a replica without records; from now on the store keeps this replica.
+        """Load the stored records into a new replica; from now on the store keeps this replica.
 
         Damaged rows are skipped and logged: teammates have what was sent. Raises `InvalidArgumentError` if
         the replica has records, or an incarnation that was used before.
         """
-        if replica.held:
+        before = replica.held  # one record, if the replica has a frame of its own
+        if before.size > (replica.placement.root != WORLD):
             raise InvalidArgumentError("replica has records already; restore its store first.")
         batches = [row for (row,) in self._rows("SELECT data FROM batch ORDER BY number")]
         datagrams = [row for (row,) in self._rows("SELECT datagram FROM record ORDER BY number")]
         n_refused = replica.load(batches, datagrams)
-        if replica.held & keys_of_author(replica.robot, replica.incarnation):
+        if (replica.held - before) & keys_of_author(replica.robot, replica.incarnation):
             raise InvalidArgumentError(
                 f"incarnation={replica.incarnation} of robot {replica.robot} has records in {self.path} "
                 f"already. Make Replica({replica.robot}) without incarnation: it draws a new one."
@@ -141,7 +142,7 @@ class Store:
                 n_refused,
                 len(batches) + len(datagrams),
             )
-        self._replica, self._kept = replica, replica.held.up_to(_MOST_NAMES)
+        self._replica, self._kept = replica, (replica.held - before).up_to(_MOST_NAMES)
         self._log_bytes = sum(map(len, datagrams))
         return Restored(len(batches) + len(datagrams) - n_refused, n_refused)
 
