@@ -152,7 +152,7 @@ def test_what_a_view_cannot_do_is_said_before_the_mission(watched, in_room, monk
 
 @pytest.mark.slow
 def test_a_team_is_shown_by_a_listener_in_its_network(watched, in_room):
-    done = succeeded(in_room("team", "settle=3", "network.announce=0.5", "duration=6"))
+    done = succeeded(in_room("team", "settle=3", "network.announce=0.5", "duration=3"))
     summary, *rows = done.results()["rows"]
     assert summary["same_map"] is True
     assert watched.sizes[-1] == rows[0]["n_components"]
