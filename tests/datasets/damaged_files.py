@@ -7,6 +7,7 @@ prints one line of JSON for each reading that ended in anything but finite point
 
 from __future__ import annotations
 
+import gzip
 import json
 import random
 import resource
@@ -18,10 +19,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
+import scan_files
 import test_point_chunks
-import test_readers
 import test_scan_graph
 import torch
+from PIL import Image
 
 from gmmtorch.datasets import load
 from gmmtorch.datasets.point_files.mesh_files import read_triangles
@@ -32,15 +34,13 @@ MEMORY_BYTES = 1 << 30
 CPU_SECONDS = 20
 HEADER_BYTES = 400
 
-IDENTITY = test_readers.kitti(np.eye(3), [0.0, 0.0, 0.0])
+IDENTITY = scan_files.kitti(np.eye(3), [0.0, 0.0, 0.0])
 POINTS = [(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)]
 
 
 def carmen(folder: Path, name: str = "a.log") -> None:
-    test = test_readers.flaser([1.0, 2.0, 3.0], (1.0, 2.0, 0.5)) * 4
-    (folder / name).write_bytes(
-        test_readers.gzip.compress(test.encode()) if name.endswith("z") else test.encode()
-    )
+    test = scan_files.flaser([1.0, 2.0, 3.0], (1.0, 2.0, 0.5)) * 4
+    (folder / name).write_bytes(gzip.compress(test.encode()) if name.endswith("z") else test.encode())
 
 
 def octomap(folder: Path) -> None:
@@ -53,16 +53,16 @@ def octomap_graph(folder: Path) -> None:
 
 
 def frames(folder: Path) -> None:
-    test_readers.depth_folder(folder, [(np.full((6, 8), 1500, np.uint16), np.eye(4))])
+    scan_files.depth_folder(folder, [(np.full((6, 8), 1500, np.uint16), np.eye(4))])
 
 
 def scans(folder: Path, form: str) -> None:
     content = {
-        "binary.pcd": test_readers.pcd(POINTS),
-        "ascii.pcd": test_readers.pcd(POINTS, binary=False),
-        "ascii.ply": test_readers.ply(POINTS),
+        "binary.pcd": scan_files.pcd(POINTS),
+        "ascii.pcd": scan_files.pcd(POINTS, binary=False),
+        "ascii.ply": scan_files.ply(POINTS),
     }
-    test_readers.scan_folder(folder, {form: content[form]}, IDENTITY)
+    scan_files.scan_folder(folder, {form: content[form]}, IDENTITY)
 
 
 def compressed(folder: Path) -> None:
@@ -124,7 +124,7 @@ def kitti_sequence(folder: Path) -> None:
 
 
 def tum_sequence(folder: Path) -> None:
-    test_readers.Image.fromarray(np.full((4, 5), 5000, np.uint16)).save(folder / "0.png")
+    Image.fromarray(np.full((4, 5), 5000, np.uint16)).save(folder / "0.png")
     (folder / "depth.txt").write_text("1.5 0.png\n")
     (folder / "groundtruth.txt").write_text("1.4 0 0 0 0 0 0 1\n1.6 1 0 0 0 0 0 1\n")
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from test_readers import TURN_LEFT, depth_folder, flaser, kitti, needs_open3d, pcd, scan_folder
+from scan_files import TURN_LEFT, depth_folder, flaser, kitti, needs_open3d, pcd, scan_folder
 
 from gmmtorch.datasets import load
 

@@ -10,21 +10,10 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scan_files import TURN_LEFT, depth_folder
 
 from gmmtorch.datasets import load
 from gmmtorch.errors import DataError, InvalidArgumentError
-
-TURN_LEFT = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-
-
-def depth_folder(path: Path, frames: list[tuple[np.ndarray, np.ndarray]]) -> Path:
-    height, width = frames[0][0].shape[:2]
-    center = (width - 1) / 2, (height - 1) / 2
-    (path / "camera-intrinsics.txt").write_text(f"100 0 {center[0]}\n0 200 {center[1]}\n0 0 1\n")
-    for number, (depth, pose) in enumerate(frames):
-        Image.fromarray(depth).save(path / f"frame-{number:06d}.depth.png")
-        np.savetxt(path / f"frame-{number:06d}.pose.txt", pose)
-    return path
 
 
 def test_depth_frames_back_project_and_transform_pixels(tmp_path):

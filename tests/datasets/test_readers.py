@@ -3,72 +3,19 @@
 from __future__ import annotations
 
 import gzip
-import importlib.util
 import math
-import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from scan_files import TURN_LEFT, flaser, kitti, needs_open3d, pcd, ply, scan_folder
 
 from gmmtorch.datasets import load
 from gmmtorch.datasets.carmen import beam_angles
 from gmmtorch.datasets.point_files.cloud_files import read_cloud
 from gmmtorch.errors import DataError
 
-TURN_LEFT = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 NAN_POINT = (math.nan,) * 3
-
-
-def open3d_loads() -> bool:
-    if importlib.util.find_spec("open3d") is None:
-        return False
-    try:
-        import open3d  # noqa: F401
-    except (ImportError, OSError):
-        return False
-    return True
-
-
-needs_open3d = pytest.mark.skipif(not open3d_loads(), reason="Open3D does not load on this machine")
-
-
-def flaser(readings: list[float], pose: tuple[float, ...] = (0.0, 0.0, 0.0)) -> str:
-    words = ["FLASER", len(readings), *readings, *pose, 9, 9, 9, 0.0, "host", 0.0]
-    return " ".join(map(str, words)) + "\n"
-
-
-def pcd(
-    points: list, viewpoint: str = "0 0 0 1 0 0 0", binary: bool = True, announce: int | None = None
-) -> bytes:
-    n = len(points) if announce is None else announce
-    header = (
-        "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
-        f"WIDTH {n}\nHEIGHT 1\nVIEWPOINT {viewpoint}\nPOINTS {n}\nDATA {'binary' if binary else 'ascii'}\n"
-    )
-    if binary:
-        return header.encode() + b"".join(struct.pack("<3f", *p) for p in points)
-    return (header + "".join("{} {} {}\n".format(*p) for p in points)).encode()
-
-
-def ply(points: list) -> bytes:
-    header = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n" + "".join(
-        f"property float {axis}\n" for axis in "xyz"
-    )
-    return (header + "end_header\n" + "".join("{} {} {}\n".format(*p) for p in points)).encode()
-
-
-def kitti(rotation: np.ndarray, translation: list[float]) -> str:
-    return " ".join(str(v) for v in np.column_stack([rotation, translation]).ravel()) + "\n"
-
-
-def scan_folder(path: Path, clouds: dict[str, bytes], poses: str) -> Path:
-    (path / "scans").mkdir()
-    for name, content in clouds.items():
-        (path / "scans" / name).write_bytes(content)
-    (path / "poses.txt").write_text(poses)
-    return path
 
 
 # CARMEN logs

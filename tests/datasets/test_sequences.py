@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from test_readers import depth_folder, flaser, kitti
+from scan_files import depth_folder, flaser, kitti
 
 from gmmtorch.datasets import load
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
