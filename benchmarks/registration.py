@@ -27,8 +27,8 @@ from tables import hardware, markdown, publish
 from torch import Tensor
 
 from gmmtorch import WindowedRule, datasets
-from gmmtorch.localization.motions import generators
 from gmmtorch.localization.registration import register, yaw_starts
+from gmmtorch.localization.rigid_motions import generators
 from gmmtorch.mapping.codec import component_batch as codec
 from gmmtorch.mapping.learning.windowed import learn_window
 from gmmtorch.scan import Scan

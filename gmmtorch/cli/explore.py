@@ -114,7 +114,7 @@ def _shower(view: LiveView | None) -> Callable[[Mission], None]:
     """What shows a mission after each tick; without a view it does nothing."""
     if view is None:
         return lambda mission: None
-    from gmmtorch.live.moments import MissionMoments
+    from gmmtorch.live.live_moments import MissionMoments
 
     known: list[MissionMoments] = []
 

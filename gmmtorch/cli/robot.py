@@ -287,7 +287,7 @@ def _shower(page: LiveView | None, mission: Drivable, view: RobotView) -> Callab
         return lambda now, is_last: None
     from gmmtorch.exploration.mission.mission import Mission
     from gmmtorch.exploration.mission.replay import ReplayMission
-    from gmmtorch.live.moments import SENT, AgentMoments, ReplayMoments
+    from gmmtorch.live.live_moments import SENT, AgentMoments, ReplayMoments
 
     def sent() -> tuple[str, float]:
         return SENT, view.scalars()["wire_bytes_sent"] / 1e3

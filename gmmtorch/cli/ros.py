@@ -96,8 +96,8 @@ def _play(config: DictConfig, node: Node) -> None:
 
 def _map(config: DictConfig, node: Node, device: str) -> None:
     """Build a map of the sensor's topic, and write it at the end."""
+    from gmmtorch.live.live_moments import BuildMoments
     from gmmtorch.live.mapper.live_mapper import LiveMapper, warm_up
-    from gmmtorch.live.moments import BuildMoments
     from gmmtorch.report.progress import ProgressBars
 
     make_map = maps.map_factory(config, resolution=config.resolution)

@@ -19,8 +19,8 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels.mixtures.point_alignment import AlignmentSums, alignment_sums
-from gmmtorch.localization.motions import Motions, chosen_rows
 from gmmtorch.localization.overlap import deviations
+from gmmtorch.localization.rigid_motions import Motions, chosen_rows
 from gmmtorch.mapping.components import Components
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.reduction.moments import merge_components

@@ -13,9 +13,9 @@ from torch import Tensor
 from gmmtorch.localization.alignment import Alignment, AlignmentTarget, align, seen_normals
 from gmmtorch.localization.free_space import FreeSpace, View
 from gmmtorch.localization.location import Location, pose_covariance
-from gmmtorch.localization.motions import Motions, distinct, generators
 from gmmtorch.localization.pose_graph import logarithm
 from gmmtorch.localization.registration import register
+from gmmtorch.localization.rigid_motions import Motions, distinct, generators
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import WindowedRule
 from gmmtorch.mapping.learning.windowed import learn_window

@@ -5,7 +5,7 @@ The overlap of densities f and g is ∫ f g dx, for mixtures a sum over pairs of
     S(R, t) = Σ_ij π_i π_j N(R μ_i + t | μ_j, R Σ_i Rᵀ + Σ_j)
 
 (Jian & Vemuri 2011; distribution-to-distribution NDT, Stoyanov et al. 2012). A motion is perturbed by a
-shift v and a turn ω as `localization.motions` defines it. With d = R μ_i + t − μ_j, A = R Σ_i Rᵀ,
+shift v and a turn ω as `localization.rigid_motions` defines it. With d = R μ_i + t − μ_j, A = R Σ_i Rᵀ,
 C = A + Σ_j, W = C⁻¹, z = W d and lever l = R μ_i, of each pair
 
     ∂ log N/∂v = −z,   ∂ log N/∂ω_k = −zᵀ G_k (l − A z) − tr(G_k A W).
@@ -21,7 +21,7 @@ from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.mixtures.pair_overlap import overlap_sums
-from gmmtorch.localization.motions import Motions, generators
+from gmmtorch.localization.rigid_motions import Motions, generators
 from gmmtorch.mixture.em.exact import Parameters
 
 _CHUNK = 1 << 14  # pairs processed at a time, so that they stay in a core's cache

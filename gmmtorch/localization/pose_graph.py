@@ -21,7 +21,7 @@ from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.localization.motions import generators
+from gmmtorch.localization.rigid_motions import generators
 
 _SETTLED = 1e-7  # metres and radians: a smaller step ends the optimisation
 _MOST_STEPS = 100

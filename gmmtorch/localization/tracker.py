@@ -14,7 +14,7 @@ from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
 from gmmtorch.linalg import check_rigid
 from gmmtorch.localization.alignment import Alignment, AlignmentTarget, align, merged_below, seen_normals
 from gmmtorch.localization.location import UNSEEN, Location, pose_covariance
-from gmmtorch.localization.motions import Motions, around, best_distinct, differences, everywhere
+from gmmtorch.localization.rigid_motions import Motions, around, best_distinct, differences, everywhere
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.surfaces import Surfaces, surface_mixture

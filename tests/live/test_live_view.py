@@ -16,8 +16,8 @@ pytest.importorskip("viser")
 
 from viser_client import Client, wait_until
 
+from gmmtorch.live.live_moments import CurveRecord, camera_rotation
 from gmmtorch.live.live_view import LiveView, Moment, ViewedCells, ViewedRobot
-from gmmtorch.live.moments import CurveRecord, camera_rotation
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gmmtorch.localization import alignment
 from gmmtorch.localization.alignment import AlignmentTarget, align
-from gmmtorch.localization.motions import Motions, generators, turns
+from gmmtorch.localization.rigid_motions import Motions, generators, turns
 from gmmtorch.mixture.em.exact import Parameters
 
 

@@ -14,10 +14,10 @@ from mapping.map_cases import some_motion
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
-from gmmtorch.localization.motions import Motions, generators
 from gmmtorch.localization.overlap import Pairs, overlap
 from gmmtorch.localization.overlap_ascent import Ascent
 from gmmtorch.localization.registration import register, yaw_starts
+from gmmtorch.localization.rigid_motions import Motions, generators
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mixture.em.exact import Parameters

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 import gmmtorch as gt
-from gmmtorch.localization.motions import generators
 from gmmtorch.localization.registration import register
+from gmmtorch.localization.rigid_motions import generators
 from gmmtorch.mapping.codec import component_batch as codec
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import WindowedRule

@@ -23,7 +23,7 @@ from gmmtorch.sharing.messages.message_registry import (
     encode_views,
     quantized_poses,
 )
-from gmmtorch.sharing.messages.motions import pose_of
+from gmmtorch.sharing.messages.pose_fields import pose_of
 from gmmtorch.sharing.messages.record_messages import (
     CorrectionMessage,
     FrameMessage,

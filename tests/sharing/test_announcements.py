@@ -17,7 +17,7 @@ from gmmtorch.mapping.codec.bitstream import BitWriter
 from gmmtorch.mapping.codec.quantization import COUNT_ERROR
 from gmmtorch.sharing.messages.fields import write_intervals, write_keys
 from gmmtorch.sharing.messages.message_registry import MAX_BYTES, decode
-from gmmtorch.sharing.messages.motions import pose_of
+from gmmtorch.sharing.messages.pose_fields import pose_of
 from gmmtorch.sharing.messages.record_messages import (
     AnnouncementMessage,
     CorrectionMessage,

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from gmmtorch.datasets import Dataset
     from gmmtorch.evaluation.events import Event, Row
-    from gmmtorch.live.moments import BuildMoments
+    from gmmtorch.live.live_moments import BuildMoments
     from gmmtorch.localization.odometry import Trajectory
     from gmmtorch.mapping.components import Components
     from gmmtorch.mapping.gaussian_map import GaussianMap
@@ -107,7 +107,7 @@ def positions(trajectory: Path, dim: int) -> Tensor:
 
 def moments_of(builder: MapBuilder) -> BuildMoments:
     """What the live view shows of a map that is built."""
-    from gmmtorch.live.moments import BuildMoments
+    from gmmtorch.live.live_moments import BuildMoments
 
     return BuildMoments(builder, lambda: builder.progress().nbytes)
 

@@ -13,8 +13,8 @@ from gmmtorch.cli.from_options import links, maps, missions
 
 if TYPE_CHECKING:
     from gmmtorch.exploration.robot.agent import Agent
+    from gmmtorch.live.live_moments import AgentMoments, ReplayMoments
     from gmmtorch.live.live_view import LiveView
-    from gmmtorch.live.moments import AgentMoments, ReplayMoments
     from gmmtorch.sharing.transport.frames import FramedTransport
 
 
@@ -28,7 +28,7 @@ def listener(
     if view is None:
         return lambda is_last: None
     from gmmtorch.exploration.mission.driver import WallClock
-    from gmmtorch.live.moments import RECEIVED
+    from gmmtorch.live.live_moments import RECEIVED
 
     number = config.team.size
     own: Any = OmegaConf.merge(config, OmegaConf.from_dotlist(list(link)))
@@ -61,7 +61,7 @@ def _of_world(
     import torch
 
     from gmmtorch.exploration.mission.team_setup import make_agent, start_poses
-    from gmmtorch.live.moments import AgentMoments
+    from gmmtorch.live.live_moments import AgentMoments
 
     options = missions.team_options(config, config.seed, {})
     world = missions.open_world(missions.world_options(config), options)
@@ -81,7 +81,7 @@ def _of_log(
 ) -> tuple[Callable[[float], object], ReplayMoments]:
     """A listener that holds the team's map."""
     from gmmtorch.exploration.mission.replay import ReplayMission
-    from gmmtorch.live.moments import ReplayMoments
+    from gmmtorch.live.live_moments import ReplayMoments
     from gmmtorch.sharing.replica.replica import Replica
 
     make_map = maps.map_factory(missions.log_map_options(config))

@@ -17,8 +17,8 @@ from gmmtorch.exploration.robot.gmm_mapper import GmmMapper
 from gmmtorch.exploration.robot.radio import Radio
 from gmmtorch.files import write_npz
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.sharing.replica.frames import robot_of_frame
 from gmmtorch.sharing.replica.replica import Replica
+from gmmtorch.sharing.replica.robot_frames import robot_of_frame
 from gmmtorch.sharing.transport.frames import FramedTransport
 from gmmtorch.sharing.transport.simulated_network import Network
 

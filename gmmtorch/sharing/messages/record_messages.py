@@ -26,7 +26,7 @@ from gmmtorch.sharing.messages.fields import (
     write_keys,
     write_number,
 )
-from gmmtorch.sharing.messages.motions import is_motion, matrix_of, motion_dim, read_motion, write_motion
+from gmmtorch.sharing.messages.pose_fields import is_motion, matrix_of, motion_dim, read_motion, write_motion
 from gmmtorch.sharing.replica.record_keys import (
     END,
     LARGEST_INCARNATION,

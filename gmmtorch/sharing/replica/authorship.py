@@ -17,7 +17,7 @@ from gmmtorch.mapping.components import Components
 from gmmtorch.sharing.messages.component_messages import fitted
 from gmmtorch.sharing.messages.envelope import split
 from gmmtorch.sharing.messages.message_registry import decode
-from gmmtorch.sharing.messages.motions import pose_of
+from gmmtorch.sharing.messages.pose_fields import pose_of
 from gmmtorch.sharing.messages.record_messages import (
     RECORD_BYTES,
     CorrectionMessage,

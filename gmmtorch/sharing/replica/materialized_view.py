@@ -12,8 +12,8 @@ from torch import Tensor
 from gmmtorch.mapping.components import Components
 from gmmtorch.sharing.messages.record_messages import CorrectionMessage
 from gmmtorch.sharing.replica.component_table import ComponentTable, Counters
-from gmmtorch.sharing.replica.frames import moved
 from gmmtorch.sharing.replica.record_keys import Ints, keys_of, robot_of
+from gmmtorch.sharing.replica.robot_frames import moved
 
 
 def gains(components: Components, gain: Tensor) -> Components:

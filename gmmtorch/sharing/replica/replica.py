@@ -28,7 +28,6 @@ from gmmtorch.sharing.messages.record_messages import (
 )
 from gmmtorch.sharing.replica.anti_entropy import Backlog, packets
 from gmmtorch.sharing.replica.authorship import Author, Published
-from gmmtorch.sharing.replica.frames import Placement, robot_of_frame
 from gmmtorch.sharing.replica.materialized_view import Changes
 from gmmtorch.sharing.replica.record_keys import (
     LARGEST_INCARNATION,
@@ -46,6 +45,7 @@ from gmmtorch.sharing.replica.record_keys import (
     robot_of,
 )
 from gmmtorch.sharing.replica.records import MOST_COMPONENTS, Records, RefusedError
+from gmmtorch.sharing.replica.robot_frames import Placement, robot_of_frame
 
 
 class Replica:

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from gmmtorch.kernels import kernels
-from gmmtorch.localization.motions import Motions
 from gmmtorch.localization.overlap import overlap
 from gmmtorch.localization.overlap_ascent import Ascent
+from gmmtorch.localization.rigid_motions import Motions
 from gmmtorch.mixture.em.exact import Parameters
 
 

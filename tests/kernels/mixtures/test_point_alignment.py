@@ -7,7 +7,7 @@ import torch
 
 from gmmtorch.kernels import kernels
 from gmmtorch.localization.alignment import AlignmentTarget
-from gmmtorch.localization.motions import Motions
+from gmmtorch.localization.rigid_motions import Motions
 from gmmtorch.mixture.em.exact import Parameters
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gmmtorch.mapping.components import Components
-from gmmtorch.sharing.messages.motions import matrix_of
+from gmmtorch.sharing.messages.pose_fields import matrix_of
 from gmmtorch.sharing.messages.record_messages import FrameMessage
 from gmmtorch.sharing.replica.record_keys import NUMBER_BITS, SEQUENCE_BITS, WORLD, Ints, authors
 
