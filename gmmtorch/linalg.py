@@ -12,6 +12,7 @@ from gmmtorch.kernels.mixtures.distinct_keys import distinct_keys
 
 _MANY_KEYS = 1 << 12  # from here on a hash table is faster than sorting
 _ORTHONORMAL = 1e-5  # largest error of an entry of R Rᵀ
+_LAST_ROW = 1e-12  # largest error of an entry of the last row: that of an inverse
 _JITTERS = (1e-12, 1e-10, 1e-8, 1e-6)  # relative to the mean of the diagonal
 
 
@@ -91,7 +92,7 @@ def check_rigid(transform: Tensor, dim: int, name: str = "transform") -> tuple[T
     """Rotation (D, D) and translation (D,), float64, of a rigid motion given as a matrix (D+1, D+1).
 
     Raises `InvalidArgumentError` unless the matrix is finite, its rotation is orthonormal with
-    determinant +1, and its last row is 0 … 0 1.
+    determinant +1, and its last row is 0 … 0 1, up to the rounding of an inverse.
     """
     shape = (dim + 1, dim + 1)
     if tuple(transform.shape) != shape:
@@ -105,8 +106,7 @@ def check_rigid(transform: Tensor, dim: int, name: str = "transform") -> tuple[T
         np.isfinite(values).all()
         and float(np.abs(turn @ turn.T - np.eye(dim)).max()) <= _ORTHONORMAL
         and np.linalg.det(turn) > 0
-        and last[dim] == 1
-        and not last[:dim].any()
+        and float(np.abs(last - np.eye(dim + 1)[dim]).max()) <= _LAST_ROW
     )
     if not rigid:
         raise InvalidArgumentError(
