@@ -146,6 +146,7 @@ def test_a_missing_package_names_its_extra(package, extra, call, tmp_path, monke
 
         for cached in ("compiler_failure", "_warp"):  # what an earlier test has found
             monkeypatch.setattr(compiler, cached, getattr(compiler, cached).__wrapped__)
+        monkeypatch.setattr(compiler._PROBE, "_loaded", set())
     with pytest.raises(GmmTorchError, match=re.escape(f"pip install 'gmmtorch[{extra}]'")):
         call(tmp_path)
 

@@ -34,6 +34,7 @@ def test_keys_in_datagrams_equal_the_decoded_keys():
             made = random_components(dim, k=k, robot=1023)
             made.ids[:, 1] = torch.randperm(1 << 20)[:k] << 32
             datagrams += encode_components(made)
+    datagrams += Replica(6, own_frame=True).datagrams()
     assert {datagram[0] & 15 for datagram in datagrams} == RECORD_KINDS
     for datagram in datagrams:
         assert keys_in(datagram) == decoded_keys(datagram)
