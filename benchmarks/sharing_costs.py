@@ -38,13 +38,13 @@ from gmmtorch.sharing.messages.message_registry import (
     encode_views,
     quantized_poses,
 )
+from gmmtorch.sharing.messages.pose_fields import pose_of
 from gmmtorch.sharing.messages.record_messages import (
     CorrectionMessage,
     SupersessionMessage,
     counters_message,
     encode_announcements,
     encode_record,
-    pose_of,
 )
 from gmmtorch.sharing.replica.record_keys import Intervals, first_key
 from gmmtorch.sharing.replica.replica import Replica
