@@ -175,6 +175,7 @@ PEAK = (
     "hydra.run.dir=$OUT', shell=True, check=True); "
     "print('peak', resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss // 1024, 'MiB')\""
 )
+ODOMETRY = "python benchmarks/odometry.py --data $DATA --runs $OUT/runs.jsonl --methods mixture"
 SEEDS = "gmmtorch-explore hydra.run.dir=$OUT experiment=fig4_4_entropy 'study.seeds=[0,1,2,3,4]' "
 ALONE = "team.size=3 duration=1600 evaluation.every=10 'study.variants=[{team:gmm_shared}]' "
 
@@ -269,8 +270,8 @@ RUNS = {
         *of_table(RESULTS, "registration-hall", 1, ALIGNED),
         *of_table(RESULTS, "registration-courtyard", 1, ALIGNED),
     ]),
-    "odometry": Run("cd $OUT && python $OLDPWD/benchmarks/odometry.py --data $DATA --names hall courtyard && "
-                    "python $OLDPWD/benchmarks/odometry.py --data $DATA --names intel --most 150",
+    "odometry": Run(f"{ODOMETRY} --seeds 0 --names courtyard street && {ODOMETRY} --seeds 0 1 --names hall && "
+                    f"{ODOMETRY} --seeds 0 --names intel aces --most 150",
                     of_table(RESULTS, "odometry", 3, FLOWN)),
     "fig3_4": Run(OCCUPANCY + "experiment=fig3_4_auc_sparsity_2d " + INTEL, [
         Claim(FIGURES, "1 cm Monte Carlo has # […] with all beams, # […] with 70 % removed and # […] with",
@@ -399,6 +400,8 @@ def checked(claim: Claim, out: Path | None) -> list[str]:
         return [*start, shown, "by the run itself", "yes"]
     try:
         measured = claim.read(out)
+        if len(measured) != len(claimed):
+            raise ValueError(f"the run has {len(measured)} numbers, the page {len(claimed)}")
     except (ValueError, OSError) as error:  # the output lacks what the page has
         return [*start, shown, "", f"no: {error}"]
     intervals = claim.intervals if isinstance(claim.intervals, Sequence) else [claim.intervals] * len(claimed)

@@ -39,6 +39,7 @@ def test_a_claim_holds_within_its_interval_only(claims, tmp_path):
     )
     assert claims.checked(claim, tmp_path)[-1] == "yes"
     assert "0.7" in claims.checked(claim._replace(read=lambda out: [0.7]), tmp_path)[-1]
+    assert "2 numbers" in claims.checked(claim._replace(read=lambda out: [0.9, 0.9]), tmp_path)[-1]
     assert claims.checked(claim, None)[-1].startswith("no")
     assert claims.checked(claim._replace(read=claims.published("t", ["x"], "y")), tmp_path)[-1].startswith(
         "no"
