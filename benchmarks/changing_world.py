@@ -1,7 +1,10 @@
 """A simulated hall in which boxes move and people walk: what stays in the map that is no longer there, and
-what is lost that is. Writes its table into BENCHMARKS.md.
+what is lost that is. Writes its table and its picture into BENCHMARKS.md.
 
-    OMP_NUM_THREADS=1 python benchmarks/changing_world.py
+    OMP_NUM_THREADS=1 python benchmarks/changing_world.py --data FOLDER
+
+FOLDER holds recordings in which nothing moves for long, as for benchmarks/accuracy.py: the second table tells
+what forgetting costs them.
 
 A lidar (32 × 160 beams, 10 m, noise 1 cm) walks through the hall twice. Between the passes boxes move; during
 both, people walk. Cells are 0.1 m wide. A *ghost* is a cell in which a person or a box was seen, that is free
@@ -13,21 +16,29 @@ from __future__ import annotations
 
 import argparse
 import math
+import statistics
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from tables import hardware, markdown, publish
+from accuracy import sources
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from tables import ROOT, hardware, markdown, publish
 from torch import Tensor
 
 import gmmtorch as gt
 from gmmtorch import GaussianMap, IncrementalRule
 from gmmtorch.baselines import LogOdds, OccupancyGrid, OctoMapMap
 from gmmtorch.evaluation import metrics
+from gmmtorch.evaluation.held_out import Protocol, evaluate
+from gmmtorch.evaluation.methods import choose, methods
 from gmmtorch.kernels.rays.ray_traversal import traverse
+from gmmtorch.report.style import PALETTE, label_axes, legend_below, new_figure, save_figure
 from gmmtorch.simulation import World3D, building_3d, poses_3d, spinning_lidar
 from gmmtorch.simulation.worlds.floor_plan import Footprint, circle
 from gmmtorch.simulation.worlds.furniture import prism
@@ -53,6 +64,14 @@ WAYS = (
 SPEED, STATURE, GIRTH = 1.2, 1.75, 0.25  # of people: m/s, metres, metres
 NEAREST = 0.6  # metres between the lidar and a person, who otherwise is not there
 
+
+DRAWN = (
+    "incremental, off",
+    "incremental, contradiction",
+    "log-odds grid, no clamp",
+    "OctoMap (log-odds with clamping)",
+)
+SLICE = 0.85  # height of the drawn slice, metres
 
 LOW, SHAPE = torch.tensor([-10, -10, -10]), (310, 130, 60)  # cells of the hall
 
@@ -146,36 +165,100 @@ def maps() -> dict[str, Callable[[], Any]]:
     return made
 
 
-def row(name: str, made: Any, world: Recorded) -> list[object]:
+def measured(made: Any, world: Recorded) -> list[float]:
+    """Ghosts that stay, surfaces lost (shares of cells), AUC, kilobytes and CPU seconds of one map."""
     begin = time.process_time()
     for scan in world.scans:
         made.insert(scan)
     made.finish()
     seconds = time.process_time() - begin
     ghosts, surfaces = (torch.as_tensor(made.occupancy(c, CELL)) for c in (world.ghosts, world.surfaces))
-    auc = metrics.roc(surfaces, ghosts).auc
     stays, lost = float((ghosts > 0.5).double().mean()), float((surfaces <= 0.5).double().mean())
-    size = made.nbytes / 1e3
-    return [name, f"{stays:.1%}", f"{lost:.1%}", f"{auc:.4f}", f"{size:,.0f} kB", f"{seconds:.0f}"]
+    return [stays, lost, metrics.roc(surfaces, ghosts).auc, made.nbytes / 1e3, seconds]
+
+
+def row(name: str, by_seed: list[list[float]]) -> list[object]:
+    """Mean and range over the seeds, in the formats of the table's columns."""
+    formats = ("{:.1%}", "{:.1%}", "{:.4f}", "{:,.0f} kB", "{:.0f}")
+    cells: list[object] = [name]
+    for column, (form, values) in enumerate(zip(formats, zip(*by_seed, strict=True), strict=True)):
+        text, low, high = (
+            form.format(value) for value in (statistics.mean(values), min(values), max(values))
+        )
+        cells.append(f"{text} ({low} to {high})" if column < 3 and low != high else text)
+    return cells
+
+
+def draw(made: dict[str, Any], world: Recorded) -> None:
+    """Slices of some maps at the height of people's chests, with the ghosts that stay."""
+    x, y = (torch.arange(n) for n in SHAPE[:2])
+    level = int(SLICE / CELL) - int(LOW[2])
+    plane = torch.cartesian_prod(x, y)
+    points = (torch.cat([plane, torch.full((len(plane), 1), level)], 1) + LOW + 0.5) * CELL
+    low, high = (LOW[:2] * CELL).tolist(), ((LOW[:2] + torch.tensor(SHAPE[:2])) * CELL).tolist()
+    figure = new_figure(11.5, 7)
+    panels = figure.subplots(2, 2, sharex=True, sharey=True).flat
+    for axes, (name, map_) in zip(panels, made.items(), strict=True):
+        theta = torch.as_tensor(map_.occupancy(points, CELL)).view(SHAPE[:2])
+        axes.imshow(
+            theta.T, cmap="Greys", vmin=0, vmax=1, origin="lower", extent=(low[0], high[0], low[1], high[1])
+        )
+        stays = world.ghosts[torch.as_tensor(map_.occupancy(world.ghosts, CELL)) > 0.5]
+        axes.scatter(stays[:, 0], stays[:, 1], s=9, color=PALETTE[1], linewidths=0)
+        label_axes(axes, f"{name}: {len(stays):,} of {len(world.ghosts):,} ghosts stay")
+        axes.set(xlim=(-0.5, 15.5), ylim=(-0.5, 10.5), aspect="equal")
+    left = "left by a person or a box, still occupied"
+    shown = [
+        Line2D([], [], marker="o", linestyle="", color=PALETTE[1], label=left),
+        Patch(facecolor="black", label=f"occupied, {SLICE} m above the floor"),
+        Patch(facecolor="0.5", label="unknown"),
+        Patch(facecolor="white", edgecolor="0.5", label="free"),
+    ]
+    legend_below(figure, shown)
+    save_figure(figure, ROOT / "docs/images/changing_world.png", dpi=90)
+
+
+def static_rows(folder: Path) -> list[list[object]]:
+    """AUC on held-out beams of recordings, without forgetting and with it."""
+    rows: list[list[object]] = []
+    for name, (dataset, test_every, resolutions, max_bytes) in sources(folder).items():
+        rules = [IncrementalRule(max_bytes=max_bytes, forget=forget) for forget in ("off", "contradiction")]
+        protocol = Protocol(test_every, (1.0,), "beams", resolutions[:1], max_beams=20_000)
+        found = []
+        for rule in rules:
+            make = methods(partial(GaussianMap, rule, cutoff=3.0, hit_length=1.0))
+            found += evaluate(name, list(dataset), choose(["point"], make), protocol).rows
+        off, kept = found
+        budget = f"{max_bytes / 1e3:.0f} kB" if max_bytes else "none"
+        counts = [f"{value['auc']:.4f}, {value['n_components']:,}" for value in (off, kept)]
+        rows.append([name, f"{resolutions[0]:g}", budget, *counts, f"{kept['auc'] - off['auc']:+.4f}"])
+        print(*rows[-1], sep=" | ", flush=True)
+    return rows
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scans", type=int, default=100, help="of a pass")
-    parser.add_argument("--names", nargs="+", help="beginnings of the names of maps; all if not given")
+    parser.add_argument("--seeds", type=int, default=5, help="halls, walks and noises")
+    parser.add_argument("--data", type=Path, help="recordings for the second table; not written without")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    world = recorded(options.scans, seed=0)
-    print(len(world.ghosts), "ghosts", len(world.surfaces), "surfaces", flush=True)
-    rows = []
-    for name, factory in maps().items():
-        if not options.names or name.startswith(tuple(options.names)):
-            rows.append(row(name, factory(), world))
-            print(*rows[-1], sep=" | ", flush=True)
-    if options.names:
-        return
+    values: dict[str, list[list[float]]] = {name: [] for name in maps()}
+    for seed in range(options.seeds):
+        world = recorded(options.scans, seed)
+        print(f"seed {seed}: {len(world.ghosts)} ghosts, {len(world.surfaces)} surfaces", flush=True)
+        made = {name: factory() for name, factory in maps().items()}
+        for name, map_ in made.items():
+            values[name].append(measured(map_, world))
+            print(*row(name, values[name][-1:]), sep=" | ", flush=True)
+        if seed == 0:
+            draw({name: made[name] for name in DRAWN}, world)
+    rows = [row(name, by_seed) for name, by_seed in values.items()]
     header = ["map", "ghosts that stay", "surfaces lost", "AUC", "bytes", "CPU s"]
     publish("changing-world", f"{markdown(header, rows)}\n\n{hardware()}")
+    if options.data:
+        header = ["data", "cell (m)", "budget", "`off`: AUC, components", "`contradiction`", "difference"]
+        publish("changing-world-static", markdown(header, static_rows(options.data)))
 
 
 if __name__ == "__main__":

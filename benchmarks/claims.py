@@ -270,7 +270,8 @@ RUNS = {
         *of_table(RESULTS, "registration-hall", 1, ALIGNED),
         *of_table(RESULTS, "registration-courtyard", 1, ALIGNED),
     ]),
-    "odometry": Run(f"{ODOMETRY} --seeds 0 --names courtyard street && {ODOMETRY} --seeds 0 1 --names hall && "
+    "odometry": Run(f"{ODOMETRY} --seeds 0 --names courtyard street && "
+                    f"{ODOMETRY} --seeds 0 1 --names hall && "
                     f"{ODOMETRY} --seeds 0 --names intel aces --most 150",
                     of_table(RESULTS, "odometry", 3, FLOWN)),
     "fig3_4": Run(OCCUPANCY + "experiment=fig3_4_auc_sparsity_2d " + INTEL, [
