@@ -11,13 +11,14 @@ from torch import Tensor
 from gmmtorch.errors import check_number, check_whole
 from gmmtorch.localization.registration import register
 from gmmtorch.localization.tracker import Tracker
+from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.scan import Scan
 from gmmtorch.sharing.replica.replica import Replica
 
 _AGREE = 0.3, math.radians(3)  # metres and radians at the newer scan: two estimates of a frame agree
 _POINTS = 1000  # of a scan that are remembered, as many as a tracker uses
-_GROWN = 1.2  # times the components that a frame had: old scans are searched for in it again
+_GROWN = 1.2  # times the components that a frame had: it is searched, or both maps registered, again
 _COARSEST = 0.25  # metres: the registration of both maps begins near the estimate
 _FEWEST = 20  # components of surfaces in which a scan is searched for
 
@@ -42,11 +43,12 @@ class FrameJoiner:
     A scan of the robot is located in the teammates' map (`localization.Tracker`, without a first pose),
     which gives the transform between the frames. Two located scans in succession, taken at different
     places, must give the same transform: within 0.3 m and 3° at the newer one. The registration of the
-    robot's map with theirs then makes it more accurate, if it is reliable and agrees.
+    robot's map with theirs then makes it more accurate, if it is reliable and agrees. It is repeated each
+    time the maps have grown by a fifth, because the frames are known better where the maps overlap more.
 
         joiner = FrameJoiner(replica)                # replica = Replica(robot, own_frame=True)
         joiner.add(scan)                             # each scan that the robot maps, in its own frame
-        joiner.search()                              # now and then: True if a frame was joined
+        joiner.search()                              # now and then: True if the frame was placed
 
     Of several frames the one of the robot with the lowest id is joined; see `Replica.join`.
 
@@ -88,11 +90,14 @@ class FrameJoiner:
     def search(self) -> bool:
         """Search for one scan, the newest that was not searched for, in the first of `other_frames`.
 
-        Returns whether a frame was joined. The time is that of a `Tracker` without a first pose.
+        If there is none, the frame that was joined is estimated again when the maps have grown.
+
+        Returns whether a frame was joined or moved. The time is that of a `Tracker` without a first pose, or
+        of one registration.
         """
         frames = self._replica.other_frames
         if not frames:
-            return False
+            return self._estimate_again()
         self._choose(frames[0])
         if not self._waiting:
             return False
@@ -132,22 +137,40 @@ class FrameJoiner:
             return False
         if float((last.place.origin - now.place.origin).norm()) < self._spacing:
             return False
-        self._replica.join(frame, self._refined(frame, now))
-        self._last = None
+        own, _ = self._split()
+        self._replica.join(frame, _refined(own, self._replica.components(frame), now))
+        self._last, self._n_components = None, len(self._replica.components())
         return True
 
-    def _refined(self, frame: int, estimate: _Estimate) -> Tensor:
-        """The transform that lays the robot's own map over the frame's, if it is reliable and agrees."""
-        own, to_root = self._replica.components(), self._replica.placement.transform
-        own = own.selected((own.ids[:, 0] == self._replica.robot).nonzero().squeeze(1))
-        own = own if to_root is None else own.transformed(torch.linalg.inv(to_root), torch.ones(len(own)) > 0)
-        if bool(own.max_range.all()):
-            return estimate.transform
-        theirs = self._replica.components(frame)
-        found = register(own, theirs, estimate.transform, coarsest=_COARSEST)
-        if found.reliable and _agree(found.transform, estimate):
-            return found.transform
+    def _estimate_again(self) -> bool:
+        """Lay the robot's map over the others' of the frame that it joined, if the maps have grown."""
+        transform, n = self._replica.placement.transform, len(self._replica.components())
+        if self._frame is None or transform is None or n < _GROWN * self._n_components:
+            return False
+        self._n_components = n
+        own, theirs = self._split()
+        found = _refined(own, theirs, _Estimate(transform, self._places[-1]))
+        if torch.equal(found, transform):
+            return False
+        self._replica.join(self._replica.placement.root, found)
+        return True
+
+    def _split(self) -> tuple[Components, Components]:
+        """The robot's own components in its own frame, and those of others in the frame of all."""
+        placed, to_root = self._replica.components(), self._replica.placement.transform
+        is_own = placed.ids[:, 0] == self._replica.robot
+        own, theirs = (placed.selected(which.nonzero().squeeze(1)) for which in (is_own, ~is_own))
+        if to_root is not None:
+            own = own.transformed(torch.linalg.inv(to_root), torch.ones(len(own)) > 0)
+        return own, theirs
+
+
+def _refined(own: Components, theirs: Components, estimate: _Estimate) -> Tensor:
+    """The transform that lays a map over another one, if it is reliable and agrees; else the estimate's."""
+    if bool(own.max_range.all()) or bool(theirs.max_range.all()):
         return estimate.transform
+    found = register(own, theirs, estimate.transform, coarsest=_COARSEST)
+    return found.transform if found.reliable and _agree(found.transform, estimate) else estimate.transform
 
 
 def _shifted(pose: Tensor, shift: Tensor) -> Tensor:

@@ -66,6 +66,30 @@ def test_two_parts_of_a_building_are_laid_over_each_other(scans, first_part):
     assert len(watcher.components(0)) == len(one.components())
 
 
+def test_a_frame_is_estimated_again_when_the_maps_have_grown(scans, first_part):
+    truth = motion(30.0, -7.0, 2.0)  # robot 1's frame ← the building's
+    theirs = [scan.transformed(truth) for scan in scans[N_SCANS // 2 :]]
+    one = robot_with(1, theirs[:14])
+    joiner = FrameJoiner(one)
+    for scan in theirs[:14]:
+        joiner.add(scan)
+    for datagram in first_part:
+        one.receive(datagram)
+    assert any(joiner.search() for _ in range(20))
+    assert not joiner.search()  # nothing is new
+    one.join(0, torch.linalg.inv(truth @ motion(0.1, 0.0, math.radians(0.5))))
+    grown = gt.GaussianMap(robot=1, window=20)
+    for scan in theirs:
+        grown.insert(scan)
+    one.add(grown)
+    assert joiner.search()
+    ends = torch.cat([scan.points for scan in scans])
+    back = one.placement.transform @ truth
+    off = (ends @ back[:2, :2].T + back[:2, 2] - ends).norm(dim=1)
+    assert float(off.max()) < 0.05
+    assert not joiner.search()
+
+
 def test_a_map_of_another_building_is_not_joined(first_part):
     other = list(gt.datasets.load("synthetic_building_2d", n_scans=16, seed=5))
     one = robot_with(1, other)

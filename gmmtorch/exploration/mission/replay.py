@@ -135,7 +135,7 @@ class ReplayMission:
         begin = time.process_time()
         with self.watch("joining"):
             if self._joiner.search():
-                _log.info("Robot %d has joined the frame of a teammate.", self.replica.robot)
+                _log.info("Robot %d has placed its frame in a teammate's.", self.replica.robot)
         self._search_at = now + (time.process_time() - begin) / _SEARCHING
 
     def content(self) -> int:
