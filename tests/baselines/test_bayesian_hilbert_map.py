@@ -287,7 +287,7 @@ def test_damaged_files_of_a_full_covariance_are_refused(tmp_path):
 @pytest.mark.slow
 def test_bayesian_hilbert_map_reaches_the_published_auc_on_intel(real_data):
     """The published AUC at 0.1 m is 0.950."""
-    scans = list(load("carmen", path=real_data / "laser2d" / "intel.log.gz"))
+    scans = list(load("carmen", path=real_data / "laser2d" / "intel.log.gz", stride=2))
     train, test = queries.split_indices(len(scans), 10)
     tested = queries.hit_and_free(
         *queries.test_beams([scans[i] for i in test], 4000, 0), free="uniform", resolution=0.1, seed=0

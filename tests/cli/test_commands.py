@@ -352,7 +352,9 @@ def test_the_number_of_components_can_be_automatic(run):
 
 
 def test_every_method_has_a_row_and_a_figure(run):
-    done = succeeded(run("fit", "experiment=strategies", "report.figures=true"))
+    done = succeeded(
+        run("fit", "experiment=strategies", "max_points=150", "mixture.n_components=3", "report.figures=true")
+    )
     results = done.results()
     methods = results["config"]["method"]
     assert [row["method"] for row in results["rows"]] == methods

@@ -79,15 +79,6 @@ def test_two_processes_give_the_result_of_one_and_write_it_once(run, cloud, tmp_
     assert {path.name for path in tmp_path.iterdir()} == {"cloud.npy", "one", "two"}
 
 
-@pytest.mark.slow
-def test_two_processes_on_a_data_set_give_the_result_of_one(run, tmp_path):
-    options = TINY["fit"]
-    one = run(*options, name="one")  # not streamed
-    two = torchrun(tmp_path / "two", *options)
-    assert two.returncode == 0, two.stderr
-    assert_same(one, tmp_path / "two")
-
-
 def test_a_streamed_row_covers_the_whole_cloud(run, cloud):
     done = run(f"points={cloud}", "stream.sample_points=300")
     assert done.status == 0, done.stderr

@@ -181,7 +181,7 @@ def test_the_noise_model_improves_likelihood_on_real_scans(real_data: Path):
     path = real_data / "laser2d" / "intel.log.gz"
     if not path.is_file():
         pytest.skip(f"{path} is not there")
-    study = SensorModelStudy("laser_2d", n_components=(200,), n_points=8000, max_beams=5000, max_iter=30)
-    plain, _, noise, _ = run("intel", list(load("carmen", path, stride=2)), study)
+    study = SensorModelStudy("laser_2d", n_components=(200,), n_points=8000, max_beams=2000, max_iter=15)
+    plain, _, noise, _ = run("intel", list(load("carmen", path, stride=4)), study)
     assert noise["held_out_log_likelihood"] > plain["held_out_log_likelihood"]
     assert noise["thickness"] < plain["thickness"]

@@ -207,5 +207,5 @@ def test_jobs_of_a_sweep_have_folders_and_are_not_run_again_in_them(run, steps, 
             assert job.results()["seed"] == job.results()["rows"][0]["seed"] == number
         assert not (done.folder / "results.json").exists()
         assert steps == [0, 1, 0, 1]
-    succeeded(run("-m", "seed=0,1", f"hydra.sweep.dir={tmp_path / 'sweep'}", "report.figures=true"))
-    assert steps == [0, 1] * 4  # to draw the figures
+    succeeded(run("-m", "seed=0", f"hydra.sweep.dir={tmp_path / 'sweep'}", "report.figures=true"))
+    assert steps == [0, 1] * 3  # to draw the figures
