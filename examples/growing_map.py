@@ -13,7 +13,7 @@ import gmmtorch as gt
 from gmmtorch.mapping.map_builder import MapBuilder
 from gmmtorch.report.maps.growth_animation import GrowthFrame, save_growth
 
-N_FRAMES = 40
+N_FRAMES = 20
 
 torch.set_num_threads(1)
 scans = (
@@ -32,5 +32,5 @@ for now in builder.insert_all():
         print(f"\r{now.n_read} of {now.n_total} scans, {copy.n_components:,} components", end="")
 
 Path("outputs/examples").mkdir(parents=True, exist_ok=True)
-picture = save_growth("outputs/examples/growing_map.webp", frames, resolution=0.05)
+picture = save_growth("outputs/examples/growing_map.webp", frames, resolution=0.05, period=0.3)
 print(f"\n{picture}: {len(frames)} frames, {picture.stat().st_size:,} bytes")
