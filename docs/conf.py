@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from importlib.metadata import version as installed
 from typing import Any
@@ -33,6 +34,7 @@ nb_execution_raise_on_error = True
 nb_execution_timeout = 300
 nb_execution_in_temp = True  # tutorials write files
 nb_merge_streams = True
+os.environ["OPEN3D_DISABLE_WEB_VISUALIZER"] = "true"  # Open3D announces it in the output of a cell
 
 autodoc_member_order = "groupwise"
 autodoc_typehints = "signature"

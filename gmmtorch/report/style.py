@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal
 
@@ -54,9 +55,18 @@ _LOG_STEPS = ((1.0,), (1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0))
 _MIN_TICKS = 4
 
 
+class _ShownFigure(Figure):
+    """A figure that notebooks show as a picture, also before pyplot has made a figure."""
+
+    def _repr_png_(self) -> bytes:
+        content = BytesIO()
+        self.savefig(content, format="png")
+        return content.getvalue()
+
+
 def new_figure(width: float, height: float) -> Figure:
     """Returns an empty white figure of this size (inches) with an automatic layout and the Agg renderer."""
-    figure = Figure(
+    figure = _ShownFigure(
         figsize=(width, height), layout=ConstrainedLayoutEngine(h_pad=0.09, w_pad=0.06), facecolor="white"
     )
     FigureCanvasAgg(figure)

@@ -61,3 +61,7 @@ def test_grid_is_below_the_data():
     assert all(line.get_visible() for line in lines)
     assert axes.yaxis.get_zorder() < bar.get_zorder()
     assert not any(line.get_visible() for line in axes.get_xgridlines())
+
+
+def test_a_notebook_shows_a_figure_as_a_picture():
+    assert new_figure(2.0, 2.0)._repr_png_().startswith(b"\x89PNG")
