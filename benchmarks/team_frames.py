@@ -82,7 +82,7 @@ class Robot:
 
 
 def joined(scans: Dataset, split: str) -> tuple[Robot, Robot, str, float]:
-    """Both robots, the scan of robot 1 at which it joined, and the seconds of a search."""
+    """Both robots, the scan of robot 1 at which it first joined, and the seconds of a search."""
     n = len(scans)
     parts = [range(n // 2), range(n // 2, n)] if split == "halves" else [range(0, n, 2), range(1, n, 2)]
     one, two = (Robot(number, scans, part) for number, part in enumerate(parts))
@@ -92,13 +92,13 @@ def joined(scans: Dataset, split: str) -> tuple[Robot, Robot, str, float]:
             robot.read(EVERY)
             robot.send(other)
         begin = time.process_time()
-        if two.joiner.search():
+        if two.joiner.search() and when == "never":
             when = f"{two.n_read} of {len(two.part)}"
         seconds += time.process_time() - begin
     before, begin = -1, time.process_time()
     while two.joiner.n_searches > before:
         before = two.joiner.n_searches
-        if two.joiner.search():
+        if two.joiner.search() and when == "never":
             when = "afterwards"
     seconds += time.process_time() - begin
     two.send(one)
