@@ -82,6 +82,15 @@ def test_a_typo_names_the_nearest_option_or_choice(command, options, words, run)
     assert "+" not in line
 
 
+@pytest.mark.parametrize("launcher", ["joblib", "ray"])
+def test_a_launcher_that_is_not_installed_names_its_extra(launcher, monkeypatch):
+    monkeypatch.setattr(command_options, "find_spec", lambda name: None)
+    overrides = [f"hydra/launcher={launcher}", "seed=0,1"]
+    message = command_options.explained("occupancy", overrides, RuntimeError("not found"))
+    assert f"hydra-{launcher}-launcher" in message
+    assert "gmmtorch[sweep]" in message
+
+
 def test_a_folder_that_cannot_be_written_is_a_one_line_error(run, tmp_path):
     (tmp_path / "file").touch()
     line = refused(run("occupancy", f"hydra.run.dir={tmp_path / 'file' / 'run'}"))

@@ -11,6 +11,7 @@ import inspect
 import re
 from collections.abc import Collection, Iterator, Sequence
 from difflib import SequenceMatcher
+from importlib.util import find_spec
 from pathlib import Path
 from string import Template
 from typing import Any, NamedTuple
@@ -30,6 +31,8 @@ from gmmtorch.errors import InvalidArgumentError
 
 _NEAR = 0.6
 """Least similarity of a name to the name that is proposed for it."""
+_LAUNCHERS = ("joblib", "ray")
+"""Hydra's launchers of the extra [sweep]."""
 _GROUPS = "== Configuration groups =="
 _LINE = 110
 """Characters of the description of an option, at most, if its first sentence is shorter."""
@@ -207,6 +210,13 @@ def explained(command: str, overrides: Sequence[str], error: Exception) -> str:
             return (
                 f"{text} is not option=value; quote lists and special characters for the shell, as in "
                 "'method=[em]'."
+            )
+    for launcher in _LAUNCHERS:
+        chosen = f"hydra/launcher={launcher}"
+        if chosen in overrides and find_spec(f"hydra_plugins.hydra_{launcher}_launcher") is None:
+            return (
+                f"{chosen} needs the package hydra-{launcher}-launcher, which is not installed; install it: "
+                "pip install 'gmmtorch[sweep]'."
             )
     config = _tolerant(command, [choice for one in parsed for choice in _choices(one)])
     groups = groups_of(command)
