@@ -40,7 +40,8 @@ class OccupancyGrid(TensorFileMap):
 
     With counts, hits are beam ends in a cell and misses are beams that passed through it; θ follows from
     (3.9), as for a mixture. With log-odds, each beam adds its update to every cell on its way (Moravec &
-    Elfes 1985; Thrun et al. 2005, ch. 9). There is no clamp, because a clamp would only make cells equal.
+    Elfes 1985; Thrun et al. 2005, ch. 9). Log-odds are not clamped, because a clamp would
+    only make cells equal.
 
     Args:
         resolution: side of a cell (m).

@@ -82,7 +82,7 @@ def _play(config: DictConfig, node: Node) -> None:
     for topic in player.unknown:
         print(f"skipped   {topic.name}: {topic.type} is not a type of ROS 2 Jazzy")
     if not player.wait_for_subscriber(config.wait):
-        print(f"nobody subscribes to the recording after {config.wait:g} s; it is played all the same")
+        print(f"no node subscribes to the recording after {config.wait:g} s; it is played anyway")
     with ProgressBars(enabled=config.report.progress) as bars, app.stop_requests() as is_stopped:
         for _ in player.play():
             bars("playing", player.n_played, player.n_messages)

@@ -41,7 +41,7 @@ def chunked(n: int, size: int, compute: Callable[[slice], T]) -> Iterator[T]:
             if part.stop - begin == 1:
                 raise memory_error(error) from error
             size = (part.stop - begin) // 2
-            logger.info("%s The work goes on in chunks of %d rows.", _asked(error), size)
+            logger.info("%s The work continues in chunks of %d rows.", _asked(error), size)
         else:
             begin = part.stop
             yield found

@@ -54,9 +54,9 @@ class Odometry:
         poses = odometry.trajectory().poses
 
     A scan becomes a small mixture. It is registered with the mixtures of the last keyframes (in 2D, the best
-    of a lattice of starts), then its points climb to the pose that their surfaces explain best. Motions are
-    predicted to continue. `trajectory` finds the places that were seen twice and corrects all poses by a
-    pose graph (`localization.pose_graph`).
+    of a lattice of starts), then the pose that best explains its points is found from there. The
+    prediction continues the last motion. `trajectory` finds the places that were seen twice and corrects
+    all poses by a pose graph (`localization.pose_graph`).
 
     Args:
         n_keyframes: in the local map.
@@ -111,7 +111,7 @@ class Odometry:
                 left out.
             stamp: time (s). The predicted motion is scaled by the time since the last scan, if both are
                 known and the clock runs forward.
-            motion: (D+1, D+1) of the sensor since the last scan, last ← now, by wheels or an IMU. None: the
+            motion: (D+1, D+1) of the sensor since the last scan, last ← now, from wheels or an IMU. None: the
                 motion continues.
 
         Raises `InvalidArgumentError` for another shape or dimension, or for a motion that is not rigid.
@@ -132,7 +132,7 @@ class Odometry:
         return location
 
     def trajectory(self, loops: bool = True) -> Trajectory:
-        """The poses of all scans so far; with `loops`, corrected by closures."""
+        """The poses of all scans so far; with `loops`, corrected by loop closures."""
         if not self._poses:
             raise InvalidArgumentError("no scan was added, so there is no trajectory.")
         poses, edges = torch.stack(self._poses), self._all_edges()

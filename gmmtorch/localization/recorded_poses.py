@@ -35,11 +35,11 @@ def with_odometry(
 
     Args:
         source: its own poses move the points into the frame of the sensor, and are not used otherwise.
-        method: mixture, `Odometry`; or kiss_icp, the package of Vizzo et al. (2023), without closures of
-            loops and without covariances (NaN).
+        method: mixture, `Odometry`; or kiss_icp, the package of Vizzo et al. (2023), without loop
+            closures and without covariances (NaN).
         on_scan: called with the number of scans done and of all.
         motion: prediction of each pose. constant: the motion continues; dataset: as between the poses of the
-            data set, such as those of wheels (mixture only).
+            data set, such as those of wheel odometry (mixture only).
 
     Raises `InvalidArgumentError` for another method or motion, `DataError` if no scan can be read.
     """

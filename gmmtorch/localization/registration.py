@@ -76,15 +76,16 @@ def register(
         S(T) = Σ_ij π_i π_j N(R μ_i + t | μ_j, R Σ_i Rᵀ + Σ_j + s² I)
 
     Coarse to fine: s is halved from `coarsest` to `finest`. While s exceeds the components' size, those in
-    one cell of side s are merged first, so coarse levels are small. A level climbs log S by Newton's steps
-    on SE(3) or SE(2), with the absolute values of the curvatures; each is cut until the score rises. Pairs
-    beyond four deviations are left out. Of several peaks, the best one that the surfaces hold is the result.
+    one cell of side s are merged first, so coarse levels are small. A level maximises log S by Newton steps
+    on SE(3) or SE(2), with the absolute values of the curvatures; each is shortened until the score rises.
+    Pairs beyond four standard deviations are left out. Of several maxima, the result is the best one that the
+    surfaces constrain in all directions.
 
     Args:
         source, target: maps, components, or (means, covariances, weights). `max_range` components are left
             out.
-        initial: (D+1, D+1), or (B, D+1, D+1) for several starts, of which the best wins (see `yaw_starts`).
-            None: the identity.
+        initial: (D+1, D+1), or (B, D+1, D+1) for several starts, of which the best is the result: see
+            `yaw_starts`. None: the identity.
         coarsest: first s (m), if the initial pose is known to about that much, as in tracking: coarser levels
             are left out, and a single start is tried once. None: an eighth of the smaller mixture's radius
             (root mean square), and a single start is tried again two levels below.
@@ -92,7 +93,7 @@ def register(
         max_iterations: of a level.
         tolerance: metres, also of a turn at the mixture's radius, below which a step ends a level.
         weighting: π by "area", √(λ₁λ₂) of the largest eigenvalues (√λ₁ in 2D), or by "support", the points
-            of each. Points are densest near the sensor, so supports would put sensor on sensor.
+            of each. Points are densest near the sensor, so supports would place one sensor at the other.
 
     Raises:
         InvalidArgumentError: no component with a surface; 2D against 3D; an initial pose that is not

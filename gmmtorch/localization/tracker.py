@@ -49,7 +49,7 @@ _MOST_FREE = 1.5  # times the share that need not be explained: points in free s
 
 
 class Tracker:
-    """Localises the scans of a sensor, one after the other, in a map that stays as it is.
+    """Localises the scans of a sensor, one after the other, in a map that does not change.
 
     A scan is aligned with the surfaces of the map (`localization.alignment`), from the pose that the last
     motion predicts. If this fails, starts around the prediction are tried, then four times as far. After

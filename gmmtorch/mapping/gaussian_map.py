@@ -287,7 +287,7 @@ class GaussianMap(MapState):
         return len(self._file()) if self.dim is not None else 0
 
     def save(self, path: str | Path) -> None:
-        """Writes the map atomically. An unfinished window is written as it is learned now."""
+        """Writes the map atomically. The scans of an unfinished window are learned for the file."""
         write_bytes(path, self._file())
 
     @classmethod

@@ -48,7 +48,7 @@ class FrameJoiner:
 
         joiner = FrameJoiner(replica)                # replica = Replica(robot, own_frame=True)
         joiner.add(scan)                             # each scan that the robot maps, in its own frame
-        joiner.search()                              # now and then: True if the frame was placed
+        joiner.search()                              # repeatedly: True if the frame was placed
 
     Of several frames the one of the robot with the lowest id is joined; see `Replica.join`.
 

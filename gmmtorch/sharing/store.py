@@ -53,7 +53,7 @@ class Store:
     -9` at any instant and a loss of power. The file has a log of datagrams; when the log is long, a
     transaction replaces it by batches of all components and the datagrams of the other records.
 
-    If the disk is full or fails, a warning is logged once and the robot goes on. `keep` then returns False,
+    If the disk is full or fails, a warning is logged once and the robot continues. `keep` then returns False,
     and tries again before the 1st, 2nd, 4th, 8th, … call that follows. If the file cannot be written when
     it is opened, the store reads a copy of it and keeps nothing.
 
@@ -201,7 +201,7 @@ class Store:
     def save_progress(self, n_scans: int, state: dict[str, Any]) -> bool:
         """Keep the state of the robot's own map after so many scans; returns whether it is on the disk.
 
-        The newest two states stay, in case one is damaged later.
+        The newest two states are kept, in case one is damaged later.
         """
         tree, tensors = split_tensors(state)
         data = pack_tensors(tensors, "progress", 1, tree=tree)
@@ -281,7 +281,7 @@ class Store:
                 change()
         except sqlite3.Error as error:
             if not self._is_failing:
-                _log.warning("%s is no longer written, and the robot goes on: %s.", self.path, error)
+                _log.warning("%s is no longer written, and the robot continues: %s.", self.path, error)
             self._is_failing = True
             return False
         if self._is_failing:

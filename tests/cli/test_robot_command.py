@@ -178,7 +178,7 @@ def test_a_robot_continues_on_a_full_disk_and_names_missing_files(run, monkeypat
         done = run(*LOG, *shown, "log.rate=3")
     assert done.status == 1
     assert done.stdout.count("report.tensorboard is switched off") == 1
-    assert done.stdout.count("is no longer written, and the robot goes on") == 1
+    assert done.stdout.count("is no longer written, and the robot continues") == 1
     assert "\nrobot 0\n" in done.stdout  # the table
     assert "n_records" in done.stdout
     assert "scan 6/6" in done.stderr

@@ -135,7 +135,7 @@ class MissionRecorder:
             snapshot.tick * mission.tick_seconds,
             _team_view(mission)._replace(image=snapshot.content["image"]),
             [path[: snapshot.tick + 1] for path in paths],
-            caption=f"{100 * snapshot.bits / mission.score.union.observable_bits:.0f} % of the entropy gone",
+            caption=f"{100 * snapshot.bits / mission.score.union.observable_bits:.0f} % of entropy removed",
             **shown,
         )
 

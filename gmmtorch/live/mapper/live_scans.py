@@ -304,7 +304,7 @@ class LiveScans(Dataset):
 
     def _newest(self, index: int) -> LiveScan:
         if self.newest is None or index != len(self) - 1:
-            raise IndexError(f"scan {index} of a live topic is gone")
+            raise IndexError(f"scan {index} of a live topic is no longer stored")
         return self.newest
 
     def _read(self, index: int) -> Scan:

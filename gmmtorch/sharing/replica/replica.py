@@ -231,7 +231,7 @@ class Replica:
         return sent
 
     def announcements(self, max_bytes: int = MAX_BYTES) -> list[bytes]:
-        """Datagrams that say which records this robot holds. Others answer with those that are missing."""
+        """Datagrams that list the records of this robot. Others answer with those that it lacks."""
         check_size(max_bytes)
         self._backlog.announcing()
         return encode_announcements(self.robot, self.incarnation, self._records.held, max_bytes)
@@ -321,7 +321,7 @@ class Replica:
 
     @property
     def earlier_frames(self) -> list[int]:
-        """Frames of earlier starts of this robot. A robot that goes on in one of them joins it."""
+        """Frames of earlier starts of this robot. A robot that continues in one of them joins it."""
         frames = (record.frame for record in self._records.of(FrameMessage))
         return sorted({f for f in frames if robot_of_frame(f) == self.robot} - {self._own})
 
@@ -329,7 +329,7 @@ class Replica:
     def other_frames(self) -> list[int]:
         """Frames with components that this robot may join; first the one that all robots prefer.
 
-        Left out are authors whose first record is not here: it says whether they have a frame of their own.
+        Authors whose first record is missing are left out: it says whether they have a frame of their own.
         """
         records = self._records
         keys = records.table.keys()
@@ -342,7 +342,7 @@ class Replica:
     def changes(self) -> Changes:
         """What was added since the last call, by this robot or others.
 
-        All `added` and `gained` together are `components()`, unless `rebuilt` demands to read these again.
+        All `added` and `gained` together are `components()`, unless `rebuilt` is True: then read these again.
         The first call returns everything. The time is proportional to the changes.
         """
         return self._records.changes()
@@ -355,14 +355,14 @@ class Replica:
 
     @property
     def held(self) -> Intervals:
-        """Keys of all records that are here, or were superseded: those that are announced."""
+        """Keys of all records that this robot holds or that were superseded. Announcements list them."""
         return self._records.held
 
     @property
     def missing(self) -> Intervals:
-        """Keys of records that other robots have announced, and that are not here.
+        """Keys of records that other robots have announced and that this robot lacks.
 
-        Robots that have not announced for long are left out: see `anti_entropy.PATIENCE`.
+        Robots without a recent announcement are left out: see `anti_entropy.PATIENCE`.
         """
         return self._backlog.missing(self._records.held)
 

@@ -47,7 +47,7 @@ class TransformTree:
             self._parents.setdefault(child, Counter())[parent] += 1
 
     def _forget(self, times: array[int], numbers: array[float], stamp: int) -> None:
-        """Removes samples of a frame that are not kept, now and then."""
+        """Removes samples of a frame that are not kept, from time to time."""
         if self._keep is None or not times:
             return
         if stamp < times[-1] - self._keep:
