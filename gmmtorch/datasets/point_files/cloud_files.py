@@ -64,7 +64,7 @@ def read_cloud(path: Path) -> Tensor:
     check_length(path, header)
     try:
         with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-            cloud = open3d.t.io.read_point_cloud(path)
+            cloud = open3d.t.io.read_point_cloud(str(path))
             points = cloud.point.positions.numpy() if "positions" in cloud.point else np.empty((0, 3))
     except (RuntimeError, KeyError, MemoryError, UnicodeDecodeError) as error:
         raise DataError(f"{path} cannot be read as a point cloud: {error}") from error

@@ -263,7 +263,10 @@ def add_row_flux(
 
 def whitened_rows(matrix: Tensor, origin: Tensor, toward: Tensor, log_norm: Tensor) -> Tensor:
     """The rows `cones` of `add_row_flux`: matrix (D, D, C), origin and toward (D, C), log_norm (C,)."""
-    pad = (0, 0, 0, 3 - len(origin))
-    square = torch.nn.functional.pad(matrix.permute(2, 0, 1), (0, pad[3], 0, pad[3])).flatten(1)
-    vectors = [torch.nn.functional.pad(part, pad).T for part in (origin, toward)]
-    return torch.cat([square, *vectors, torch.exp(-log_norm)[:, None]], 1)
+    dim, n = origin.shape
+    rows = origin.new_zeros(n, 16)
+    rows[:, :9].unflatten(1, (3, 3))[:, :dim, :dim] = matrix.permute(2, 0, 1)
+    rows[:, 9 : 9 + dim] = origin.T
+    rows[:, 12 : 12 + dim] = toward.T
+    rows[:, 15] = torch.exp(-log_norm)
+    return rows
