@@ -22,6 +22,9 @@ from gmmtorch.scan import Scan
 
 _RULE = WindowedRule(window=1, noise=0.02, length=0.4, max_cells=5000)
 _STORED = 4000  # points of a keyframe
+_KEYFRAMES = 10  # in the local map,
+_MANY_KEYFRAMES = 80  # or of a sensor that looks in one direction
+_NARROW = 0.8  # length of the mean direction of its points; 0.64 for a half circle, 0.9 for a cone of 70°
 _GIVEN_UP = 3  # lost scans in a row, after which the next one begins a new local map
 _FEWEST = 10  # returns of a scan that can be located
 _FIRST_STEP = 1.0, math.radians(30)  # standard deviations (m, rad) of the first motions
@@ -59,7 +62,9 @@ class Odometry:
     all poses by a pose graph (`localization.pose_graph`).
 
     Args:
-        n_keyframes: in the local map.
+        n_keyframes: in the local map. None: 10, or 80 for a sensor with a narrow field of view, such as a
+            depth camera, by the directions of the first points. Such a sensor loses its way along a wall if
+            the local map ends at what it saw last.
         distance, angle: a scan becomes a keyframe after this motion (m, rad).
         n_points: of a scan that are used at most, drawn with a fixed seed.
         least_explained: share of the points that must lie on surfaces of the local map.
@@ -71,7 +76,7 @@ class Odometry:
     def __init__(
         self,
         *,
-        n_keyframes: int = 10,
+        n_keyframes: int | None = None,
         distance: float = 0.3,
         angle: float = math.radians(10),
         n_points: int = 1000,
@@ -80,7 +85,7 @@ class Odometry:
         max_step: float = 4.0,
         max_turn: float = math.pi,
     ) -> None:
-        self.n_keyframes = check_whole("n_keyframes", n_keyframes, 1)
+        self.n_keyframes = None if n_keyframes is None else check_whole("n_keyframes", n_keyframes, 1)
         self.n_points = check_whole("n_points", n_points, _FEWEST)
         check_number("distance", distance)
         check_number("angle", angle, math.pi)
@@ -224,6 +229,10 @@ class Odometry:
             self._last_frame = number
             self._frames.append(number)
             self.keyframes.append(scan._replace(pose=location.pose))
+            if self.n_keyframes is None:
+                directions = torch.nn.functional.normalize(scan.points, dim=1)
+                is_narrow = float(directions.mean(0).norm()) > _NARROW
+                self.n_keyframes = _MANY_KEYFRAMES if is_narrow else _KEYFRAMES
             recent = self.keyframes[-self.n_keyframes :]
             self._local = LocalMap(recent, self.least_explained, self.rule, self.n_points)
 

@@ -130,6 +130,33 @@ def test_steps_that_mislead_the_points_are_found_with_free_space(real_data, log,
         assert float(errors.distances[0]) < 0.2
 
 
+@pytest.mark.slow
+@pytest.mark.real_data
+def test_a_narrow_lidar_keeps_its_way_along_a_wall(real_data):
+    scans = load(
+        "scan_folder", real_data / "courtyard"
+    )  # a cone of 70°; with ten keyframes it is lost by 2 m
+    true = torch.stack([scans.pose(number) for number in range(64)])
+    odometry = Odometry()
+    for number, pose in enumerate(true):
+        odometry.add(scans[number].transformed(torch.linalg.inv(pose)).points)
+    found = odometry.trajectory(loops=False)
+    assert absolute_trajectory_error(found.poses, true).rmse < 0.15
+
+
+@pytest.mark.parametrize(("spread", "expected"), [(0.3, 80), (10.0, 10)])
+def test_a_narrow_field_of_view_keeps_more_keyframes(spread, expected):
+    points = torch.tensor([5.0, 0.0, 0.0]) + torch.tensor([0.5, 5 * spread, 5 * spread]) * torch.randn(
+        500, 3, generator=torch.Generator().manual_seed(0)
+    )
+    odometry = Odometry()
+    odometry.add(points)
+    assert odometry.n_keyframes == expected
+    given = Odometry(n_keyframes=7)
+    given.add(points)
+    assert given.n_keyframes == 7
+
+
 def test_one_scan_has_the_first_pose():
     odometry = Odometry()
     location = odometry.add(torch.rand(100, 3))
