@@ -186,8 +186,8 @@ def row(label: str, method: Method, clouds: list[list[Cloud]], n_draws: int) -> 
     return [
         label,
         *cells,
-        f"{middle[0]:.3f}",
-        f"{middle[1]:.2f}",
+        f"{middle[0]:.3f}" if good else "–",
+        f"{middle[1]:.2f}" if good else "–",
         f"{preparing:.2f}",
         f"{statistics.median(seconds):.2f}",
         f"{n_bytes:,.0f}",
