@@ -50,7 +50,7 @@ def run(config: DictConfig) -> None:
         check_options(config)
         folder = common.run_dir()
         with ExitStack() as stack:
-            transport = links.open_link(config, config.id)
+            transport = links.open_link(config, config.id, is_alone=config.team.size == 1)
             stack.callback(transport.close)
             transport.lose(config.network.loss, config.seed + config.id)
             make = _flying if config.source == "world" else _replaying

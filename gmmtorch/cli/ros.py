@@ -5,13 +5,14 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
 
 from gmmtorch.cli import app, common
-from gmmtorch.cli.from_options import maps
+from gmmtorch.cli.from_options import links, maps, missions
 from gmmtorch.cli.options.structured import build
 from gmmtorch.cli.reporting import map_outputs
 from gmmtorch.cli.view import open_live_view
@@ -23,9 +24,12 @@ if TYPE_CHECKING:
     from gmmtorch.live.mapper.live_scans import LiveScans
     from gmmtorch.live.mapper.map_publisher import MapPublisher
     from gmmtorch.live.ros import Node
+    from gmmtorch.mapping.gaussian_map import GaussianMap
+    from gmmtorch.sharing.shared_map import SharedMap
 
 logger = logging.getLogger("gmmtorch")
 _CHECKPOINT = "checkpoint.safetensors"
+_STARTS = ("known", "unknown")
 _TABLE = "topic n_scans n_dropped n_malformed latency_median latency_p99 n_components nbytes"
 
 
@@ -41,13 +45,13 @@ def run(config: DictConfig) -> None:
     device = common.set_up(config)
     check_number("wait", config.wait)
     check_number("period", config.period)
-    with _node(config) as node:
+    with _node(config) as node, ExitStack() as stack:
         if config.play:
             _play(config, node)
         elif config.localize:
             _localize(config, node, device)
         else:
-            _map(config, node, device)
+            _map(config, node, device, _shared_map(config, stack))
 
 
 def _node(config: DictConfig) -> Node:
@@ -94,8 +98,9 @@ def _play(config: DictConfig, node: Node) -> None:
 # -- mapping --------------------------------------------------------------------------------------
 
 
-def _map(config: DictConfig, node: Node, device: str) -> None:
+def _map(config: DictConfig, node: Node, device: str, shared: SharedMap | None) -> None:
     """Build a map of the sensor's topic, and write it at the end."""
+    from gmmtorch.exploration.mission.driver import WallClock, settle
     from gmmtorch.live.live_moments import BuildMoments
     from gmmtorch.live.mapper.live_mapper import LiveMapper, warm_up
     from gmmtorch.report.progress import ProgressBars
@@ -104,16 +109,24 @@ def _map(config: DictConfig, node: Node, device: str) -> None:
     warm_up(make_map(), device)
     target = make_map()
     scans = _scans(config, node)
-    mapper = LiveMapper(node, scans, target, _publisher(config, node), config.period, device)
+    mapper = LiveMapper(node, scans, target, _publisher(config, node), config.period, device, shared)
     folder = common.run_dir()
     view = open_live_view(config)
-    moments = BuildMoments(mapper.builder, lambda: mapper.nbytes)
+    moments = BuildMoments(mapper.builder, lambda: mapper.nbytes, shared)
     checkpoint = _Checkpoint(config, mapper, folder / _CHECKPOINT)
+
+    def team() -> str:
+        if shared is None:
+            return ""
+        n_conflicts = shared.replica.duplicates[shared.replica.robot]
+        if (conflict := shared.radio.duplicate_id(n_conflicts)) is not None:
+            node.warn("id", conflict)
+        return f", {shared.replica.n_components:,} of the team{shared.radio.warnings(n_conflicts)}"
 
     def after_scan() -> None:
         now = mapper.builder.progress()
         bars("mapping", now.n_read, None)
-        bars.note("mapping", f"{now.n_components:,} components, {scans.n_dropped:,} dropped")
+        bars.note("mapping", f"{now.n_components:,} components, {scans.n_dropped:,} dropped{team()}")
         checkpoint.save_when_due()
         if view is not None:
             moments.note()
@@ -123,8 +136,52 @@ def _map(config: DictConfig, node: Node, device: str) -> None:
     with ProgressBars(enabled=config.report.progress) as bars:
         _until_stopped(config, node, scans, mapper, after_scan)
         mapper.finish()
+        if shared is not None:
+            settle(shared, WallClock(), config.settle)
     _write(config, mapper, scans, folder)
     (folder / _CHECKPOINT).unlink(missing_ok=True)
+
+
+def _shared_map(config: DictConfig, stack: ExitStack) -> SharedMap | None:
+    """The robot's map in the map of its team, with a store in the run directory; None without transport.
+
+    The transport and the store are closed with the stack.
+    """
+    import torch
+
+    from gmmtorch.errors import check_choice, check_whole
+    from gmmtorch.exploration.mission.driver import check_pace
+    from gmmtorch.sharing.frame_joiner import FrameJoiner
+    from gmmtorch.sharing.replica.replica import Replica
+    from gmmtorch.sharing.shared_map import SharedMap
+    from gmmtorch.sharing.store import Store
+
+    check_choice("start", config.start, _STARTS)
+    check_pace(settle=config.settle)
+    robot = check_whole("id", config.id, 0)
+    if config.transport is None:
+        return None
+    transport = links.open_link(config, robot)
+    stack.callback(transport.close)
+    with common.naming({"share": "network.loss"}):
+        transport.lose(config.network.loss, config.seed + robot)
+    facts = {"source": "ros", "start": config.start, "frame": config.sensor.frame}
+    store = stack.enter_context(Store(common.run_dir() / f"robot_{robot}.sqlite", robot, facts))
+    transport.disown(store.begin_session(transport.session))
+    is_free = config.start == "unknown"
+    replica = Replica(robot, own_frame=is_free)
+    store.restore(replica)
+    if is_free and replica.earlier_frames:  # the fixed frame of TF is where it was before
+        replica.join(replica.earlier_frames[0], torch.eye(4))
+    with common.naming({argument: f"network.{option}" for option, argument in missions.OF_ROBOTS.items()}):
+        return SharedMap(
+            replica,
+            transport,
+            store=store,
+            announce_every=config.network.announce,
+            budget=config.network.budget,
+            joiner=FrameJoiner(replica) if is_free else None,
+        )
 
 
 def _localize(config: DictConfig, node: Node, device: str) -> None:
@@ -233,16 +290,25 @@ def _trouble(node: Node, scans: LiveScans) -> str:
 
 def _write(config: DictConfig, mapper: LiveMapper, scans: LiveScans, folder: Path) -> None:
     """Write the map, the trajectory and results.json, and print a table."""
-    builder = mapper.builder
+    from gmmtorch.exploration.mission.robot_view import sharing_row
+
+    builder, shared = mapper.builder, mapper.shared
     n_scans = len(builder.record.indices)
     row = {"topic": scans.name, **mapper.diagnostics.numbers(n_scans, 0)}
+    made: dict[str, GaussianMap] = {}
     if n_scans:
-        builder.map.save(folder / "map.safetensors")
+        made["map"] = builder.map
         map_outputs.write_trajectory(builder, folder)
         row |= {"n_components": builder.map.n_components, "nbytes": builder.map.nbytes}
+    if shared is not None:
+        row["team"] = sharing_row(shared)
+        if n_scans:
+            made["team_map"] = mapper.snapshot(builder.map.codec)
+    for name, one in made.items():
+        one.save(folder / f"{name}.safetensors")
     _write_results(config, row, scans, folder, _TABLE)
-    if n_scans:
-        print(f"map       {folder / 'map.safetensors'}")
+    for name in made:
+        print(f"{name:<9} {folder / name}.safetensors")
 
 
 def _write_results(config: DictConfig, row: Row, scans: LiveScans, folder: Path, columns: str) -> None:

@@ -19,6 +19,7 @@ from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.map_builder import MapBuilder
 from gmmtorch.sharing.messages.message_registry import PlanMessage
+from gmmtorch.sharing.shared_map import SharedMap
 
 ENTROPY, SENT, RECEIVED = "entropy left [%]", "sent [kB]", "received [kB]"
 SIZE, COMPONENTS = "map [kB]", "components"
@@ -68,11 +69,14 @@ class CurveRecord:
 class BuildMoments:
     """The moments of a map that a `MapBuilder` builds.
 
-    nbytes: the bytes of the map as they were measured last.
+    nbytes: the bytes of the map as they were measured last. shared: the robot's map in that of its team,
+    which is shown; None: it is not shared.
     """
 
-    def __init__(self, builder: MapBuilder, nbytes: Callable[[], int]) -> None:
-        self._builder, self._nbytes = builder, nbytes
+    def __init__(
+        self, builder: MapBuilder, nbytes: Callable[[], int], shared: SharedMap | None = None
+    ) -> None:
+        self._builder, self._nbytes, self._shared = builder, nbytes, shared
         self._record = CurveRecord()
 
     def note(self) -> None:
@@ -89,10 +93,16 @@ class BuildMoments:
     def __call__(self) -> Moment:
         """The map of all scans of finished windows; the others are learned if there are some."""
         built, poses = self._builder.map, self._builder.poses
+        if built.dim is None:
+            return Moment(GaussianMap(), (), *self._record.copy())
         options = {**asdict(built.query_options), "resolution": built.resolution, "method": built.method}
-        shown = GaussianMap() if built.dim is None else GaussianMap.of(built.components(), **options)
-        robots = [ViewedRobot(0, poses[:, :-1, -1], poses[-1, :-1, :-1])] if len(poses) else []
-        return Moment(shown, robots, *self._record.copy())
+        components, number = built.components(), 0
+        teammates: list[ViewedRobot] = []
+        if self._shared is not None:
+            components, number = self._shared.components(), self._shared.replica.robot
+            teammates = [robot for robot in seen_paths(components) if robot.number != number]
+        own = ViewedRobot(number, poses[:, :-1, -1], poses[-1, :-1, :-1])
+        return Moment(GaussianMap.of(components, **options), [own, *teammates], *self._record.copy())
 
 
 class MissionMoments:

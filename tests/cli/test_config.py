@@ -308,7 +308,8 @@ def test_robots_and_teams_have_the_options_of_an_exploration():
 @pytest.mark.parametrize("command", [name for name in CONFIGURED if name != "team"])
 def test_the_configuration_file_shows_every_option(command):
     """`--help` prints the composed configuration; the file explains each option."""
-    files = [f"{command}.yaml", *(["exploration_base.yaml"] if command in ("explore", "robot") else [])]
+    bases = {"explore": ["exploration"], "robot": ["exploration", "link"], "ros": ["link"]}
+    files = [f"{command}.yaml", *(f"{name}_base.yaml" for name in bases.get(command, []))]
     text = "".join((CONF / name).read_text(encoding="utf-8") for name in files)
     groups = {"dataset", "world", "team", "planner", "study"} | (
         {"map"} if command in ("occupancy", "map") else set()

@@ -20,6 +20,9 @@ from command_runs import CHECKOUT, environment, refused, run_here, run_script, s
 pytest.importorskip("rosbags", reason="needs the extra [ros]: rosbags")
 pytest.importorskip("cyclonedds", reason="needs the extra [ros]: cyclonedds")
 
+from exploration.replays import content
+
+from gmmtorch.cli.from_options import links
 from gmmtorch.datasets.base import Ranges
 from gmmtorch.datasets.recordings.ros.bag_reader import Topic
 from gmmtorch.datasets.recordings.ros.bag_topics import LASER as LASERS
@@ -30,6 +33,9 @@ from gmmtorch.live.mapper.live_scans import LiveOptions, LiveScans
 from gmmtorch.live.ros import Node
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.map_builder import MapBuilder
+from gmmtorch.sharing import Replica
+from gmmtorch.sharing.shared_map import SharedMap
+from gmmtorch.sharing.transport.udp import UdpTransport
 
 LASER = "sensor_msgs/msg/LaserScan"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
@@ -47,11 +53,16 @@ def test_a_missing_topic_is_an_error_that_lists_what_is_there(monkeypatch, tmp_p
         ("node.domain=500", "domain=500"),
         ("sensor.poses=gps", "sensor.poses='gps'"),
         ("play=nowhere.bag", "nowhere.bag"),
+        ("transport=tcp", "transport='tcp' is not one of udp, zenoh"),
+        ("start=lost", "start='lost'"),
+        ("id=-1", "id=-1"),
+        ("settle=-1", "settle=-1"),
+        ("network.budget=0 transport=udp link.listen=127.0.0.1:0", "network.budget=0"),
     ],
 )
 def test_wrong_options_are_errors_of_one_line(monkeypatch, tmp_path, ros_domain, option, words):
     options = [f"node.domain={ros_domain}"] if "domain" not in option else []
-    assert words in refused(run_here(monkeypatch, "ros", tmp_path, *options, option, "wait=0.2"))
+    assert words in refused(run_here(monkeypatch, "ros", tmp_path, *options, *option.split(), "wait=0.2"))
 
 
 @pytest.mark.slow
@@ -127,8 +138,8 @@ def mapped(sweeps: list[int]) -> GaussianMap:
 
 
 @pytest.mark.slow
-def test_a_killed_mapper_goes_on_after_its_last_checkpoint(tmp_path, ros_domain):
-    folder = tmp_path / "run"
+def test_a_killed_mapper_of_a_team_goes_on_after_its_last_checkpoint(tmp_path, ros_domain):
+    folder, (here, other) = tmp_path / "run", links.free_addresses(2)
     options = [
         f"hydra.run.dir={folder}",
         f"node.domain={ros_domain}",
@@ -137,6 +148,9 @@ def test_a_killed_mapper_goes_on_after_its_last_checkpoint(tmp_path, ros_domain)
         "sensor.max_latency=null",
         "checkpoint_seconds=0",
         "report.progress=false",
+        "transport=udp",
+        f"link.listen={here}",
+        f"link.peers=[{other}]",
     ]
 
     def mapper() -> subprocess.Popen[str]:
@@ -146,6 +160,10 @@ def test_a_killed_mapper_goes_on_after_its_last_checkpoint(tmp_path, ros_domain)
         time.sleep(1.0)
         return made
 
+    transport = UdpTransport.unicast(1, links.address("", other), [links.address("", here)])
+    teammate = SharedMap(Replica(1), transport)
+    seen = mapped([99]).components()
+    teammate.replica.publish(seen, whole=True)
     with Node("sensor", domain=ros_domain) as sensor:
         send = sensor.publisher("/scan", LASER)
         first = mapper()
@@ -169,13 +187,20 @@ def test_a_killed_mapper_goes_on_after_its_last_checkpoint(tmp_path, ros_domain)
 
         def is_mapped() -> bool:
             sensor.spin_once(0.1)
+            teammate.exchange(time.monotonic())
             return counts[-1] == n_before + len(later)
 
         until(is_mapped, "the mapping of the later scans")
         second.send_signal(signal.SIGINT)
-        assert second.communicate(timeout=50)
+        while second.poll() is None:
+            teammate.exchange(time.monotonic())
+            time.sleep(0.05)
+    transport.close()
     assert 0 < n_before <= index + 1
     (row,) = json.loads((folder / "results.json").read_text())["rows"]
     assert row["n_scans"] == n_before + len(later)
     found = GaussianMap.load(folder / "map.safetensors").components()
     assert torch.equal(found.means, mapped([*range(n_before), *later]).components().means)
+    team = GaussianMap.load(folder / "team_map.safetensors").components()
+    assert content(team) == content(teammate.replica.components()) == content(found, seen)
+    assert row["team"]["digest"] == teammate.replica.digest().hex()

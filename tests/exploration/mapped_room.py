@@ -10,13 +10,13 @@ import torch
 
 from gmmtorch.exploration.robot.gmm_mapper import FrameRule, GmmMapper
 from gmmtorch.exploration.robot.mapper import Memo
-from gmmtorch.exploration.robot.radio import ReceivedMessage
 from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule
 from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.sharing.broadcast import Broadcast
 from gmmtorch.sharing.messages.message_registry import decode
+from gmmtorch.sharing.radio import ReceivedMessage
 from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.simulation.sensors.depth_camera import DepthCamera, DepthFrame
 

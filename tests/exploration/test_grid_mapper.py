@@ -11,7 +11,6 @@ from torch import Tensor
 
 from gmmtorch.exploration.robot.grid_mapper import MOST_INTERVALS, GridMapper, _bounded
 from gmmtorch.exploration.robot.mapper import Memo
-from gmmtorch.exploration.robot.radio import ReceivedMessage
 from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule
 from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.occupancy.voxels.boxes import Box
@@ -19,6 +18,7 @@ from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.sharing.messages.message_registry import PointsMessage, decode, encode_points
 from gmmtorch.sharing.messages.point_messages import POINTS_PER_DATAGRAM
+from gmmtorch.sharing.radio import ReceivedMessage
 from gmmtorch.sharing.replica.record_keys import Intervals
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 

@@ -168,7 +168,7 @@ def test_damaged_datagrams_are_counted():
     network.send(1, [b"", b"nonsense", b"\x11" * 1200], 0.0, "noise")
     network.send(1, robot(1, [], network).replica.announcements(), 0.0, "announcements")
     run(mission)
-    assert (mission.radio.n_received, mission.radio.n_damaged) == (4, 3)
+    assert (mission.shared.radio.n_received, mission.shared.radio.n_damaged) == (4, 3)
 
 
 def test_jumping_clocks_do_not_change_the_map():

@@ -15,7 +15,7 @@ from sharing.schedules import components
 from zenoh_cases import KEY, Opening, endpoint, greet, heard, until, wait_until_connected, zenoh
 
 from gmmtorch.errors import GmmTorchError
-from gmmtorch.exploration.robot.radio import Radio
+from gmmtorch.sharing.radio import Radio
 from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.sharing.transport.security import Sealer
 from gmmtorch.sharing.transport.simulated_network import Network, Traffic, Transport

@@ -36,15 +36,18 @@ _UDP_NAMES = {
 """Options by the arguments that they become, for error messages."""
 
 
-def open_link(config: DictConfig, robot: int) -> FramedTransport:
-    """A robot's end of the network of `transport` and `link.*`."""
-    link = _opened(config, robot)
+def open_link(config: DictConfig, robot: int, is_alone: bool = False) -> FramedTransport:
+    """A robot's end of the network of `transport` and `link.*`.
+
+    is_alone: the robot has no team, so that no warning is due if it sends to no other robot.
+    """
+    link = _opened(config, robot, is_alone)
     # Other robots name this session if they meet two robots with this id.
     common.logger.info("Robot %d uses %s in session %s.", robot, config.transport, link.session.hex())
     return link
 
 
-def _opened(config: DictConfig, robot: int) -> FramedTransport:
+def _opened(config: DictConfig, robot: int, is_alone: bool) -> FramedTransport:
     from gmmtorch.errors import InvalidArgumentError
 
     if config.transport not in TRANSPORTS:
@@ -55,12 +58,11 @@ def _opened(config: DictConfig, robot: int) -> FramedTransport:
         with common.naming(_ZENOH_NAMES):
             return _zenoh(robot, link, key)
     with common.naming(_UDP_NAMES):
-        if link["group"] is None and not link["peers"] and config.team.size > 1:
+        if link["group"] is None and not link["peers"] and not is_alone:
             common.logger.warning(
-                "link.peers=[]: robot %d of team.size=%d sends to no other robot. List the addresses of the "
-                "others, or give all the same link.group.",
+                "link.peers=[]: robot %d sends to no other robot. List the addresses of the others, or give "
+                "all the same link.group.",
                 robot,
-                config.team.size,
             )
         return _udp(robot, link, key)
 

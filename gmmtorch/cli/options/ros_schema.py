@@ -7,6 +7,8 @@ from typing import Any
 
 from omegaconf import MISSING
 
+from gmmtorch.cli.options.exploration_schema import RobotNetwork
+from gmmtorch.cli.options.robot_schema import Link
 from gmmtorch.cli.options.runtime_schema import ExportReport, Runtime
 
 
@@ -67,6 +69,11 @@ class Ros:
     view_host: address of the view; 0.0.0.0: other machines can open it, too.
     view_port: port of the view; the next free one if it is in use.
     checkpoint_seconds: between two checkpoints; a kill loses the scans since the last one.
+    transport: network of a team with which the map is shared: udp or zenoh; null: none.
+    id: of this robot, unique in its team.
+    start: known, the fixed frame is that of the whole team; or unknown, the robot finds its place in a
+        teammate's map.
+    settle: seconds without news of teammates after the last scan, until the command ends.
     """
 
     map: Any = MISSING
@@ -86,6 +93,12 @@ class Ros:
     view_host: str = "127.0.0.1"
     view_port: int = 8080
     checkpoint_seconds: float = 30.0
+    transport: str | None = None
+    id: int = 0
+    start: str = "known"
+    settle: float = 2.0
+    link: Link = field(default_factory=Link)
+    network: RobotNetwork = field(default_factory=RobotNetwork)
     node: NodeOptions = field(default_factory=NodeOptions)
     sensor: SensorOptions = field(default_factory=SensorOptions)
     report: ExportReport = field(default_factory=ExportReport)

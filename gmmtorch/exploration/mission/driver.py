@@ -108,7 +108,18 @@ _LOOK = 0.2
 """Mission seconds between two checks for news while a team settles, at most."""
 
 
-class Drivable(Protocol):
+class Exchanging(Protocol):
+    """One or more robots that share a map. Times are seconds of one clock."""
+
+    def exchange(self, now: float) -> None:
+        """Listens, answers and announces, without other work."""
+
+    def content(self) -> Hashable:
+        """A value that changes whenever a robot adds records to its map."""
+        ...
+
+
+class Drivable(Exchanging, Protocol):
     """One or more robots with work to do. Times are seconds since the start of the mission."""
 
     @property
@@ -123,13 +134,6 @@ class Drivable(Protocol):
 
     def tick(self, now: float) -> None:
         """Does one step of work, listening included."""
-
-    def exchange(self, now: float) -> None:
-        """Listens, answers and announces, without other work."""
-
-    def content(self) -> Hashable:
-        """A value that changes whenever a robot adds records to its map."""
-        ...
 
 
 class Run(NamedTuple):
@@ -186,7 +190,7 @@ def drive(
 
 
 def settle(
-    mission: Drivable,
+    mission: Exchanging,
     clock: Clock,
     quiet: float,
     *,

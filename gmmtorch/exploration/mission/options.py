@@ -13,11 +13,11 @@ from gmmtorch.exploration.planning.coordination import Coordination
 from gmmtorch.exploration.planning.planners import PLANNERS
 from gmmtorch.exploration.planning.primitives import Dynamics
 from gmmtorch.exploration.robot.gmm_mapper import FrameRule
-from gmmtorch.exploration.robot.radio import AnnouncementSchedule, TokenBucket
 from gmmtorch.exploration.robot.robot_state import StoppingRule
 from gmmtorch.exploration.world.scoring import BeliefRule
 from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.sharing.messages.envelope import check_codec
+from gmmtorch.sharing.radio import AnnouncementSchedule, TokenBucket
 from gmmtorch.sharing.transport.link_conditions import LinkConditions, Partition
 from gmmtorch.simulation.sensors.depth_camera import DepthCamera
 

@@ -5,22 +5,20 @@ from __future__ import annotations
 import itertools
 import json
 import logging
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from typing import Any, Protocol
 
 from gmmtorch.errors import DataError, check_whole
 from gmmtorch.exploration.mission.driver import Stopwatch, check_pace
-from gmmtorch.exploration.robot.radio import Radio, RecordStore
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.scan import Scan
 from gmmtorch.sharing.frame_joiner import FrameJoiner
+from gmmtorch.sharing.radio import RecordStore
 from gmmtorch.sharing.replica.replica import Replica
+from gmmtorch.sharing.shared_map import SharedMap
 from gmmtorch.sharing.transport.simulated_network import Transport
 
 _log = logging.getLogger(__name__)
-_SEARCHING = 0.2
-"""Share of the processor's time in which a robot without a known start pose searches for its place."""
 
 
 class ReplayStore(RecordStore, Protocol):
@@ -64,7 +62,8 @@ class ReplayMission:
         joiner: of a replica with a frame of its own; it is given the scans, and joins a teammate's frame.
 
     Attributes:
-        map: the robot's own map. n_scans: of the log; None while unknown.
+        map: the robot's own map. shared: what it exchanges with its team.
+        n_scans: of the log; None while unknown.
         position: scans read so far. resumed_at: position at the start of this session.
         n_unread: scans that could not be read.
     """
@@ -85,15 +84,15 @@ class ReplayMission:
     ) -> None:
         check_pace(rate=rate)
         self.replica, self.map, self.tick_seconds = replica, make_map(), 1 / rate
+        self.shared = SharedMap(
+            replica, transport, store=store, announce_every=announce_every, budget=budget, joiner=joiner
+        )
         self.n_scans = len(scans) if isinstance(scans, Sized) else None
-        self.radio = Radio(replica.robot, transport, announce_every, budget)
-        self.radio.store = store
         self.watch = Stopwatch()
         self.n_unread = 0
         self.is_over = False
         """Whether the log is over and all of it is published."""
-        self._scans, self._store, self._joiner = scans, store, joiner
-        self._search_at = 0.0  # seconds
+        self._scans, self._store = scans, store
         self._keep_every = check_whole("keep_every", keep_every, 1)
         self._covered_at: int | None = None
         """Position from which the map has all that earlier sessions published; None: there were none."""
@@ -118,29 +117,14 @@ class ReplayMission:
 
     def exchange(self, now: float) -> None:
         """Listens, answers and announces at the time `now` (s)."""
-        replica, radio = self.replica, self.radio
         with self.watch("sharing"):
-            received = radio.receive(now)
-            radio.keep([item.datagram for item in received if replica.receive(item.datagram, item.message)])
-            datagrams = radio.within_budget(lambda budget: replica.datagrams(budget=budget), now)
-            if radio.announcements.due(now, (replica.version,), urgent=bool(replica.missing)):
-                datagrams += replica.announcements()
-            radio.send(datagrams, now)
-        self._search(now)
-
-    def _search(self, now: float) -> None:
-        """Searches for the robot's place in a teammate's map, if it is time."""
-        if self._joiner is None or now < self._search_at:
-            return
-        begin = time.process_time()
+            self.shared.exchange(now)
         with self.watch("joining"):
-            if self._joiner.search():
-                _log.info("Robot %d has placed its frame in a teammate's.", self.replica.robot)
-        self._search_at = now + (time.process_time() - begin) / _SEARCHING
+            self.shared.search(now)
 
     def content(self) -> int:
         """Changes whenever records are added to the team's map."""
-        return self.replica.version
+        return self.shared.content()
 
     # -- the log ----------------------------------------------------------------------------------
 
@@ -183,8 +167,7 @@ class ReplayMission:
                 self.n_scans = self.position
                 return False
             self.map.insert(scan)
-            if self._joiner is not None:
-                self._joiner.add(scan)
+            self.shared.add(scan)
         self.position += 1
         return self.position != self.n_scans
 

@@ -14,11 +14,12 @@ from gmmtorch.errors import GmmTorchError
 from gmmtorch.exploration.mission.mission import Mission
 from gmmtorch.exploration.mission.replay import ReplayMission
 from gmmtorch.exploration.robot.gmm_mapper import GmmMapper
-from gmmtorch.exploration.robot.radio import Radio
 from gmmtorch.files import write_npz
 from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.sharing.radio import Radio
 from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.sharing.replica.robot_frames import robot_of_frame
+from gmmtorch.sharing.shared_map import SharedMap
 from gmmtorch.sharing.transport.frames import FramedTransport
 from gmmtorch.sharing.transport.simulated_network import Network
 
@@ -140,7 +141,7 @@ class ReplayingRobotView:
         self.robot = self._replica.robot
 
     def check_id(self) -> None:
-        _check_id(self._mission.radio, self._replica.duplicates[self.robot])
+        _check_id(self._mission.shared.radio, self._replica.duplicates[self.robot])
 
     def status(self) -> str:
         n_scans, replica = self._mission.n_scans, self._replica
@@ -149,7 +150,7 @@ class ReplayingRobotView:
             f"scan {self._mission.position:,}/{total}, {replica.n_components:,} components, "
             f"{replica.missing.size:,} missing, "
             f"{self._transport.traffic(self.robot).bytes / 1e3:,.0f} kB sent"
-            f"{self._mission.radio.warnings(replica.duplicates[self.robot])}"
+            f"{self._mission.shared.radio.warnings(replica.duplicates[self.robot])}"
         )
 
     def scalars(self) -> dict[str, float]:
@@ -161,31 +162,20 @@ class ReplayingRobotView:
             "missing": float(replica.missing.size),
             "bytes_sent": float(books["bytes_sent"]),
             "datagrams_sent": float(books["datagrams"]),
-            "datagrams_heard": float(self._mission.radio.n_received),
+            "datagrams_heard": float(self._mission.shared.radio.n_received),
             "wire_bytes_sent": float(books["wire_bytes"]),
             "wire_bytes_received": float(books["wire_bytes_received"]),
             "refused": float(sum(books["refused"].values()) + sum(replica.refused.values())),
         }
 
     def row(self) -> dict[str, Any]:
-        mission, replica = self._mission, self._replica
+        mission = self._mission
         return {
-            "robot": self.robot,
-            "digest": replica.digest().hex(),
-            "incarnation": replica.incarnation,
-            "frame": _placement(replica),
             "scans": mission.position,
             "n_scans": mission.n_scans,
             "resumed_at": mission.resumed_at,
             "unread": mission.n_unread,
-            "n_components": replica.n_components,
-            "n_records": replica.held.size,
-            "missing": replica.missing.size,
-            **self._transport.books(self.robot),
-            **_reception(mission.radio),
-            "not_merged": dict(replica.refused),
-            "conflicts": {str(robot): n for robot, n in sorted(replica.duplicates.items()) if n},
-            "unkept": _n_unkept(mission.radio),
+            **sharing_row(mission.shared),
             "stage_seconds": mission.watch.seconds,
         }
 
@@ -193,6 +183,25 @@ class ReplayingRobotView:
         """The team's map as this robot holds it, and the robot's own map."""
         maps = {"map": self._replica.map(codec="quantized"), "own_map": self._mission.map}
         return {name: (f"{name}{made.suffix}", made.save) for name, made in maps.items() if made.n_components}
+
+
+def sharing_row(shared: SharedMap) -> dict[str, Any]:
+    """What a robot shared with its team, as a part of a row of results.json."""
+    replica = shared.replica
+    return {
+        "robot": replica.robot,
+        "digest": replica.digest().hex(),
+        "incarnation": replica.incarnation,
+        "frame": _placement(replica),
+        "n_components": replica.n_components,
+        "n_records": replica.held.size,
+        "missing": replica.missing.size,
+        **shared.radio.transport.books(replica.robot),
+        **_reception(shared.radio),
+        "not_merged": dict(replica.refused),
+        "conflicts": {str(robot): n for robot, n in sorted(replica.duplicates.items()) if n},
+        "unkept": _n_unkept(shared.radio),
+    }
 
 
 def _placement(replica: Replica) -> dict[str, Any]:

@@ -16,7 +16,6 @@ from gmmtorch.exploration.planning.planner_interface import Plan, PlanningTask, 
 from gmmtorch.exploration.planning.primitives import Primitives
 from gmmtorch.exploration.planning.recovery import retreat
 from gmmtorch.exploration.robot.mapper import FrameUpdate, LocalMap, Memo
-from gmmtorch.exploration.robot.radio import Radio, RecordStore
 from gmmtorch.exploration.robot.robot_state import Robot
 from gmmtorch.sharing.messages.message_registry import (
     MAX_BYTES,
@@ -24,6 +23,7 @@ from gmmtorch.sharing.messages.message_registry import (
     ViewsMessage,
     encode_plan,
 )
+from gmmtorch.sharing.radio import Radio, RecordStore
 from gmmtorch.sharing.transport.simulated_network import Transport
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld

@@ -19,7 +19,6 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.exploration.robot.mapper import FrameUpdate, Mapper, Memo, novel_beams
-from gmmtorch.exploration.robot.radio import ReceivedMessage
 from gmmtorch.exploration.world.scoring import BeliefMap
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.association import box_around, count_explained, explained_within, summed
@@ -34,6 +33,7 @@ from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.scan import Scan
 from gmmtorch.sharing.broadcast import Broadcast
+from gmmtorch.sharing.radio import ReceivedMessage
 from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from gmmtorch.exploration.robot.mapper import FrameUpdate, Mapper, Memo, novel_beams
-from gmmtorch.exploration.robot.radio import ReceivedMessage
 from gmmtorch.exploration.world.scoring import BeliefMap
 from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
@@ -19,6 +18,7 @@ from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.sharing.broadcast import SendOnce
 from gmmtorch.sharing.messages.message_registry import Message, PointsMessage, decode, encode_points
 from gmmtorch.sharing.messages.point_messages import MOST_PARTS
+from gmmtorch.sharing.radio import ReceivedMessage
 from gmmtorch.sharing.replica.record_keys import Intervals
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 

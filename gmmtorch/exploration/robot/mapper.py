@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import check_whole
-from gmmtorch.exploration.robot.radio import ReceivedMessage
 from gmmtorch.exploration.world.scoring import BeliefMap
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.novelty import beam_novelty
@@ -22,6 +21,7 @@ from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.sharing.messages.message_registry import Message, decode
+from gmmtorch.sharing.radio import ReceivedMessage
 from gmmtorch.sharing.replica.record_keys import Intervals
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 

@@ -16,6 +16,7 @@ from gmmtorch.live.ros import Node
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.map_builder import MapBuilder
 from gmmtorch.scan import Scan
+from gmmtorch.sharing.shared_map import SharedMap
 
 _MESSAGES = 500  # of a flood, before a scan is mapped
 _PATIENCE = 3.0  # s that a due publication waits for the end of a window
@@ -24,12 +25,16 @@ _PATIENCE = 3.0  # s that a due publication waits for the end of a window
 class LiveMapper:
     """Inserts the scans of a live topic into a map with a `MapBuilder`, and publishes the map.
 
+    With `shared`, teammates receive the components of complete windows, and their components are published
+    together with the robot's own.
+
     Args:
         node: receives the messages of `scans`.
         scans: the scans.
         target: the map.
         publisher: publishes the map; None: it is not published.
         period: seconds between two publications, at least.
+        shared: the robot's map in the map of its team; None: it is not shared.
     """
 
     def __init__(
@@ -40,12 +45,15 @@ class LiveMapper:
         publisher: MapPublisher | None = None,
         period: float = 1.0,
         device: str | torch.device = "cpu",
+        shared: SharedMap | None = None,
     ) -> None:
         self.builder = MapBuilder(scans, target, device)
+        self.shared = shared
         self.diagnostics = Diagnostics(node, scans)
         self._node, self._scans, self._publisher, self._period = node, scans, publisher, period
         self._unpublished: list[int] = []  # stamps of scans, ns
         self._published: list[int] = []
+        self._content = 0  # of the team's map, when it was published last
         self._thread = ThreadPoolExecutor(1, "publication")
         self._publication: Future[int] | None = None
         self._nbytes = 0
@@ -55,6 +63,9 @@ class LiveMapper:
         """Handles the messages that wait, and maps at most one scan; returns whether it did."""
         handle_messages(self._node, timeout if not self._scans.n_waiting else min(timeout, 0.01))
         did = self._scans.advance() and self._insert()
+        if self.shared is not None:
+            self.shared.exchange(time.monotonic())
+            self.shared.search(time.monotonic())
         self._publish_when_due()
         self._report()
         return did
@@ -66,6 +77,7 @@ class LiveMapper:
             self._insert()
         if self.builder.record.indices:
             self.builder.finish()
+            self._share()
         for _ in range(2):  # the one that goes on, and one with all scans
             self._end_publication()
             self._begin_publication()
@@ -78,32 +90,50 @@ class LiveMapper:
         """Bytes of the map that was published last; 0 before."""
         return self._nbytes
 
-    def snapshot(self) -> GaussianMap:
-        """A copy of the map that does not grow."""
+    def snapshot(self, codec: str = "float") -> GaussianMap:
+        """A copy of the map that does not grow; of the team's map, if it is shared."""
         built = self.builder.map
         options = {**asdict(built.query_options), "resolution": built.resolution, "method": built.method}
-        return GaussianMap.of(built.components(), **options)
+        components = built.components() if self.shared is None else self.shared.components()
+        return GaussianMap.of(components, codec=codec, **options)
 
     def _insert(self) -> bool:
         for _ in self.builder.insert_all():
             newest = self._scans.newest
             if newest is not None:
                 self._unpublished.append(newest.stamp)
+                if self.shared is not None:
+                    self.shared.add(newest.scan)
+        if self.builder.map.n_pending == 0:
+            self._share()
         return True
+
+    def _share(self) -> None:
+        """Makes the robot's records those of its map. After a restart this withdraws what the checkpoint
+        lacks."""
+        if self.shared is not None:
+            self.shared.replica.publish(self.builder.map.components(), whole=True)
 
     def _publish_when_due(self) -> None:
         if self._publication is not None and self._publication.done():
             self._end_publication()
         late = time.monotonic() - self._next_publication
         is_whole = self.builder.map.n_pending == 0  # else the unfinished window would be learned for it
-        if self._unpublished and self._publication is None and (late > _PATIENCE or (late >= 0 and is_whole)):
+        if self._has_news() and self._publication is None and (late > _PATIENCE or (late >= 0 and is_whole)):
             self._begin_publication()
+
+    def _has_news(self) -> bool:
+        """Whether the map has changed since it was published last."""
+        is_merged = self.shared is not None and self.shared.content() != self._content
+        return bool(self._unpublished) or (is_merged and bool(self.builder.record.indices))
 
     def _begin_publication(self) -> None:
         """Publishes a copy of the map in another thread, while scans are mapped."""
-        self._published, self._unpublished = self._unpublished, []
-        if self._publisher is not None and self._published:
-            arguments = self.snapshot(), self._scans.world_frame, self._published[-1]
+        if self._publisher is not None and self._has_news():
+            self._content = 0 if self.shared is None else self.shared.content()
+            stamp = self._unpublished[-1] if self._unpublished else self._node.now()
+            arguments = self.snapshot(), self._scans.world_frame, stamp
+            self._published, self._unpublished = self._unpublished, []
             self._publication = self._thread.submit(self._work, *arguments)
             self._begin = time.monotonic()
 
@@ -111,7 +141,7 @@ class LiveMapper:
         """Publishes a copy of the map, and returns its bytes."""
         assert self._publisher is not None
         self._publisher.publish(shown, frame, stamp)
-        return shown.nbytes
+        return GaussianMap.of(shown.components(), codec=self.builder.map.codec).nbytes
 
     def _end_publication(self) -> None:
         if self._publication is None:

@@ -30,6 +30,10 @@ class Transport(Protocol):
         """(sender, datagram) of all that arrived at a robot by `now` and was not delivered before."""
         ...
 
+    def books(self, robot: int) -> dict[str, Any]:
+        """What a robot sent and received, as fields of a results row."""
+        ...
+
 
 class Traffic(NamedTuple):
     """Datagrams and bytes that were sent. Each broadcast counts once, however many robots receive it."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,9 @@ from gmmtorch.live.ros import Node, Quality
 from gmmtorch.live.ros.quality import LATCHED
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.map_builder import MapBuilder
+from gmmtorch.sharing import Replica
+from gmmtorch.sharing.shared_map import SharedMap
+from gmmtorch.sharing.transport.simulated_network import Network
 
 LASER_TYPE, GRID = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/OccupancyGrid"
 
@@ -181,6 +185,37 @@ def test_a_killed_mapper_continues_after_its_checkpoint(node, tmp_path):
     found, expected = second.builder.map.components(), first.builder.map.components()
     assert torch.equal(found.means, expected.means)
     assert second.builder.times.tolist() == [0, 1, 2, 3]  # the stamps before are not in the checkpoint
+
+
+def test_a_mapper_publishes_the_map_of_its_team(node):
+    network = Network(2)
+    teammate = SharedMap(Replica(1), network)
+    user: Any = Recorder()
+    with node() as listener:
+        listener.publisher("/scan", LASER_TYPE)
+        sensor = find_sensor(listener, "/scan", 10.0)
+        scans = open_scans(listener, sensor, Ranges(), LiveOptions(poses="standing", max_latency=None))
+        publisher, target = MapPublisher(user, 0.2), GaussianMap(window=1)
+        shared = SharedMap(Replica(0), network)
+        mapper = LiveMapper(listener, scans, target, publisher, 0.0, shared=shared)
+        scans.receive(laser(0.0), 0)
+        assert mapper.step(0.0)
+        while not user.take("map"):
+            mapper.step(0.01)
+        alone = len(mapper.snapshot().components())
+        assert alone == len(target.components()) > 0
+        teammate.replica.publish(pillar(-30.0).components(), whole=True)
+        n_published = len(user.take("map"))
+        while len(user.take("map")) == n_published:  # no scan arrives
+            teammate.exchange(time.monotonic())
+            mapper.step(0.01)
+        mapper.finish()
+        shown, origin = mapper.snapshot(), user.take("map")[-1]["info"]["origin"]["position"]
+    teammate.exchange(time.monotonic())
+    assert set(shown.components().ids[:, 0].tolist()) == {0, 1}
+    assert len(shown.components()) == alone + len(pillar(-30.0).components())
+    assert origin["x"] < -30
+    assert teammate.replica.digest() == shared.replica.digest()
 
 
 def test_missing_wrong_and_several_topics_are_errors_that_list_the_topics(node):
