@@ -151,13 +151,16 @@ MIXTURES = {  # how the same components are written, and for how many of them it
 def measure_mixtures(task: Task) -> Rows:
     """A row for each way to write the same components."""
     frames, asked = material(task.dataset, task.folder, task.n_frames)
-    rule = surface_fit(IncrementalRule().fitted([frame.scan for frame in frames]), 3)
-    rule = replace(
-        rule,
-        length=rule.length / FINER,
-        cell=rule.cell / FINER,
+    fitted = IncrementalRule().fitted([frame.scan for frame in frames])
+    assert fitted.length is not None
+    assert fitted.cell is not None
+    finer = replace(
+        fitted,
+        length=fitted.length / FINER,
+        cell=fitted.cell / FINER,
         window_components=int(task.setting),
     )
+    rule = surface_fit(finer, 3)
     learned = [learn(frame.scan, rule, _IDS_APART * i) for i, frame in enumerate(frames)]
     rows = []
     for codec in (name for name, measured in MIXTURES.items() if task.setting in measured):

@@ -113,7 +113,7 @@ def _map(config: DictConfig, node: Node, device: str, shared: SharedMap | None) 
     folder = common.run_dir()
     view = open_live_view(config)
     moments = BuildMoments(mapper.builder, lambda: mapper.nbytes, shared)
-    checkpoint = _Checkpoint(config, mapper, folder / _CHECKPOINT)
+    checkpoint = _Checkpoint(config, mapper, scans, folder / _CHECKPOINT)
 
     def team() -> str:
         if shared is None:
@@ -188,10 +188,16 @@ def _localize(config: DictConfig, node: Node, device: str) -> None:
     """Localise the sensor in a map that stays as it is; write the trajectory at the end."""
     import torch
 
+    from gmmtorch.errors import InvalidArgumentError
     from gmmtorch.export.trajectory_files import write_tum
     from gmmtorch.live.mapper.live_localizer import MAP, LiveLocalizer
     from gmmtorch.report.progress import ProgressBars
 
+    if config.sensor.poses not in ("tf", "standing"):
+        raise InvalidArgumentError(
+            f"sensor.poses={config.sensor.poses} does not go with localize, which finds the poses itself. "
+            "Use sensor.poses=tf, whose motion predicts them, or standing."
+        )
     known = maps.open_map(Path(config.localize).expanduser(), config.runtime)
     scans = _scans(config, node)
     localizer = LiveLocalizer(node, scans, known, config.sensor.poses == "tf", device)
@@ -237,7 +243,7 @@ def _publisher(config: DictConfig, node: Node) -> MapPublisher:
 class _Checkpoint:
     """The file from which a killed run goes on."""
 
-    def __init__(self, config: DictConfig, mapper: LiveMapper, path: Path) -> None:
+    def __init__(self, config: DictConfig, mapper: LiveMapper, scans: LiveScans, path: Path) -> None:
         import gmmtorch
         from gmmtorch.errors import check_number
 
@@ -252,6 +258,7 @@ class _Checkpoint:
         }
         if path.exists():
             self._builder.load(path, self._facts)
+            scans.continue_in(self._builder.map)
             print(f"continues after scan {self._builder.record.n_read} of {path}", flush=True)
         self._saved = time.monotonic()
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from gmmtorch.datasets.recordings.trajectory import in_space
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.files import write_bytes
 from gmmtorch.scan import ArrayLike
@@ -29,7 +30,7 @@ def write_tum(path: str | Path, times: ArrayLike, poses: ArrayLike) -> Path:
 
     Raises `InvalidArgumentError` for other shapes, and for values that are not finite.
     """
-    matrices = _in_space(poses)
+    matrices = _checked(poses)
     stamp = torch.as_tensor(times).detach().cpu().double().numpy()
     if stamp.shape != (len(matrices),) or not np.isfinite(stamp).all():
         raise InvalidArgumentError(
@@ -52,7 +53,7 @@ def write_kitti(path: str | Path, poses: ArrayLike) -> Path:
 
     Raises `InvalidArgumentError` for other shapes, and for values that are not finite.
     """
-    lines = [_numbers(matrix[:3].ravel(), 17) + "\n" for matrix in _in_space(poses)]
+    lines = [_numbers(matrix[:3].ravel(), 17) + "\n" for matrix in _checked(poses)]
     return write_bytes(path, "".join(lines).encode())
 
 
@@ -75,7 +76,7 @@ def write_pose_table(
 
     Raises `InvalidArgumentError` for other shapes, and for values that are not finite.
     """
-    matrices, stamp = _in_space(poses), torch.as_tensor(times).detach().cpu().double().numpy()
+    matrices, stamp = _checked(poses), torch.as_tensor(times).detach().cpu().double().numpy()
     spread = torch.as_tensor(covariances).detach().cpu().double().numpy()
     free = _FREE.get(spread.shape[-1] if spread.ndim == 3 else 0, ())
     if spread.shape != (len(matrices), len(free), len(free)) or not np.isfinite(spread).all():
@@ -109,17 +110,14 @@ def _quaternions(matrices: np.ndarray) -> np.ndarray:
     return Rotation.from_matrix(matrices[:, :3, :3]).as_quat() if len(matrices) else np.zeros((0, 4))
 
 
-def _in_space(poses: ArrayLike) -> np.ndarray:
+def _checked(poses: ArrayLike) -> np.ndarray:
     """Poses (S, 4, 4), float64, of poses in 2D or 3D."""
     given = torch.as_tensor(poses).detach().cpu().double().numpy()
     if given.ndim != 3 or given.shape[1:] not in ((3, 3), (4, 4)):
         raise InvalidArgumentError(f"poses has shape {given.shape}; expected (S, 3, 3) or (S, 4, 4).")
     if not np.isfinite(given).all():
         raise InvalidArgumentError("poses holds NaN or infinite values; drop these poses.")
-    dim = given.shape[1] - 1
-    matrices = np.tile(np.eye(4), (len(given), 1, 1))
-    matrices[:, :dim, :dim], matrices[:, :dim, 3] = given[:, :dim, :dim], given[:, :dim, dim]
-    return matrices
+    return in_space(given)
 
 
 def _numbers(row: np.ndarray, digits: int) -> str:

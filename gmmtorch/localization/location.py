@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+
+from gmmtorch.localization.rigid_motions import generators
 
 UNSEEN = 10.0
 """Metres of standard deviation of a direction that no surface fixes."""
@@ -44,3 +46,20 @@ def pose_covariance(information: Tensor, rows: Tensor) -> tuple[Tensor, float]:
     variances = _CORRELATED / values.clamp_min(_CORRELATED / UNSEEN**2)
     inner = axes @ (variances[:, None] * axes.mT)
     return inner * scale[:, None] * scale, float(variances.max().sqrt())
+
+
+def composed(first: Location, then: Location) -> Location:
+    """A location `then`, whose map's frame is the sensor's frame of `first`, in the map of `first`.
+
+    The errors of both are independent.
+    """
+    dim = len(first.pose) - 1
+    rotation = first.pose[:dim, :dim]
+    turned = torch.eye(len(then.covariance), dtype=torch.float64)
+    turned[:dim, :dim] = rotation
+    if dim == 3:
+        turned[3:, 3:] = rotation
+    lever = torch.eye(len(turned), dtype=torch.float64)  # an error of the first turn shifts later poses
+    lever[:dim, dim:] = (generators(dim) @ (rotation @ then.pose[:dim, dim])).mT
+    covariance = turned @ then.covariance @ turned.mT + lever @ first.covariance @ lever.mT
+    return replace(then, pose=first.pose @ then.pose, covariance=covariance)

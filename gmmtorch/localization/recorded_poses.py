@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset
 from gmmtorch.datasets.recordings.reposed import Reposed, with_poses
+from gmmtorch.datasets.recordings.trajectory import in_plane
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice
+from gmmtorch.localization.location import Location
 from gmmtorch.localization.odometry import Odometry, Trajectory
 from gmmtorch.optional_packages import needs_extra
 
@@ -49,7 +51,7 @@ def with_odometry(
         raise InvalidArgumentError(
             f"motion=dataset does not go with odometry={method}; use odometry=mixture."
         )
-    odometry: Any = Odometry() if method == "mixture" else _KissIcp()
+    odometry = odometry_of(method)
     known = torch.zeros(len(source), dtype=torch.bool)
     times = source.times
     before: Tensor | None = None
@@ -90,35 +92,40 @@ def _sensor_points(source: Dataset, index: int) -> Tensor | None:
     return (scan.points.double() - pose[:-1, -1]) @ pose[:-1, :-1]
 
 
-class _KissIcp:
+def odometry_of(method: str) -> Odometry | KissIcp:
+    """Odometry by a method, mixture or kiss_icp, without a scan yet."""
+    check_choice("odometry", method, METHODS)
+    return Odometry() if method == "mixture" else KissIcp()
+
+
+class KissIcp:
     """KISS-ICP behind the methods of `Odometry`. Scans in 2D lie at z = 0."""
 
     def __init__(self) -> None:
-        with needs_extra("odometry=kiss_icp needs", "kiss-icp", "odometry"):
+        with needs_extra("Odometry by kiss_icp needs", "kiss-icp", "odometry"):
             from kiss_icp.config import KISSConfig
             from kiss_icp.kiss_icp import KissICP
         config = KISSConfig()
         config.data.deskew = False  # the readers have deskewed the points
         config.mapping.voxel_size = config.data.max_range / 100  # its own default
         self._icp = KissICP(config)
-        self._poses: list[Tensor] = []
-        self._dim = 3
+        self._locations: list[Location] = []
 
-    def add(self, points: Tensor, stamp: float | None = None, motion: Tensor | None = None) -> None:
-        self._dim = points.shape[1]
-        rows = torch.nn.functional.pad(points, (0, 3 - self._dim))
+    def add(self, points: Tensor, stamp: float | None = None, motion: Tensor | None = None) -> Location:
+        """The pose of the next scan in the frame of the first one, without a covariance (NaN)."""
+        dim = points.shape[1]
+        rows = torch.nn.functional.pad(points, (0, 3 - dim))
         if len(rows):
             self._icp.register_frame(rows.numpy(), rows.new_zeros(0).numpy())
-        self._poses.append(torch.from_numpy(self._icp.last_pose.copy()))
+        pose = self._icp.last_pose if dim == 3 else in_plane(self._icp.last_pose[None])[0]
+        free = dim * (dim + 1) // 2
+        unknown = torch.full((free, free), torch.nan, dtype=torch.float64)
+        self._locations.append(Location(torch.from_numpy(pose.copy()), unknown, 1.0, ()))
+        return self._locations[-1]
 
     def trajectory(self) -> Trajectory:
-        poses, dim = torch.stack(self._poses), self._dim
-        if dim == 2:
-            turn = torch.atan2(poses[:, 1, 0], poses[:, 0, 0])
-            poses = poses[:, [0, 1, 3]][:, :, [0, 1, 3]].clone()
-            poses[:, 0, 0], poses[:, 1, 1] = turn.cos(), turn.cos()
-            poses[:, 1, 0], poses[:, 0, 1] = turn.sin(), -turn.sin()
-        free = dim * (dim + 1) // 2
-        unknown = torch.full((len(poses), free, free), torch.nan).double()
+        """The poses of all scans so far."""
+        poses = torch.stack([location.pose for location in self._locations])
+        covariances = torch.stack([location.covariance for location in self._locations])
         found = torch.ones(len(poses), dtype=torch.bool)
-        return Trajectory(poses, unknown, found, 0, ("",) * len(poses))
+        return Trajectory(poses, covariances, found, 0, ("",) * len(poses))

@@ -189,3 +189,11 @@ def in_plane(matrices: np.ndarray) -> np.ndarray:
     found[:, 0, 0], found[:, 0, 1], found[:, 1, 0], found[:, 1, 1] = cos, -sin, sin, cos
     found[:, :2, 2] = matrices[:, :2, 3]
     return found
+
+
+def in_space(poses: np.ndarray) -> np.ndarray:
+    """Poses (N, 3, 3) of the plane as poses (N, 4, 4) at height 0; poses (N, 4, 4) as they are."""
+    dim = poses.shape[1] - 1
+    found = np.tile(np.eye(4), (len(poses), 1, 1))
+    found[:, :dim, :dim], found[:, :dim, 3] = poses[:, :dim, :dim], poses[:, :dim, dim]
+    return found

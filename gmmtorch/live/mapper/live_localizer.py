@@ -6,21 +6,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets.recordings.trajectory import NANOSECONDS
+from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, in_space
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.export.message_fields import odometry_fields, transform_fields
 from gmmtorch.live.mapper.diagnostics import Diagnostics
 from gmmtorch.live.mapper.live_mapper import handle_messages
 from gmmtorch.live.mapper.live_scans import LiveScan, LiveScans
+from gmmtorch.live.mapper.pose_publisher import PosePublisher
 from gmmtorch.live.ros import Node
-from gmmtorch.localization.location import Location
 from gmmtorch.localization.tracker import Tracker
 from gmmtorch.mapping.gaussian_map import GaussianMap
 
 MAP = "map"
 """Frame of the map."""
-_PLANAR = (0, 1, 5)
-"""Rows of x, y and the heading among those of a pose's covariance in ROS."""
 
 
 class LiveLocalizer:
@@ -57,8 +54,7 @@ class LiveLocalizer:
         self._tracker = Tracker(known.to(device))
         self._n_components, self._nbytes = known.n_components, known.nbytes
         self._last: Tensor | None = None
-        self._send_pose = node.publisher("pose", "nav_msgs/msg/Odometry")
-        self._send_transform = node.publisher("/tf", "tf2_msgs/msg/TFMessage")
+        self._poses = PosePublisher(node, MAP)
 
     def step(self, timeout: float = 0.1) -> bool:
         """Handles the messages that wait, and localises at most one scan; returns whether it did."""
@@ -92,31 +88,7 @@ class LiveLocalizer:
             return
         self.poses.append(location.pose.cpu())
         self.times.append(newest.stamp / NANOSECONDS)
-        self._publish(location, newest, placed)
+        child = self._scans.world_frame if self._has_motion else newest.frame
+        below = in_space(placed.cpu().numpy()[None])[0] if self._has_motion else np.eye(4)
+        self._poses.publish(location, newest, child, below)
         self.diagnostics.note_latency((self._node.now() - newest.stamp) / NANOSECONDS)
-
-    def _publish(self, location: Location, newest: LiveScan, placed: Tensor) -> None:
-        pose = location.pose.cpu()
-        fields = odometry_fields(MAP, newest.frame, in_space(pose))
-        fields["pose"]["covariance"] = _covariance(location.covariance.cpu())
-        self._send_pose(fields, newest.stamp)
-        world = self._scans.world_frame if self._has_motion else newest.frame
-        if world != MAP:  # TF of somebody else has a frame of this name
-            above = in_space(pose @ torch.linalg.inv(placed) if self._has_motion else pose)
-            self._send_transform(transform_fields({(MAP, world): above}), newest.stamp)
-
-
-def in_space(pose: Tensor) -> np.ndarray:
-    """A pose (D+1, D+1) as one of space (4, 4); one of the plane is at height 0."""
-    dim = len(pose) - 1
-    found = np.eye(4)
-    found[:dim, :dim], found[:dim, 3] = pose[:dim, :dim].numpy(), pose[:dim, dim].numpy()
-    return found
-
-
-def _covariance(of_pose: Tensor) -> np.ndarray:
-    """The covariance (36,) of x, y, z and turns about them, from that of the tracker, (3, 3) or (6, 6)."""
-    found = np.zeros((6, 6))
-    rows = list(_PLANAR) if len(of_pose) == len(_PLANAR) else list(range(6))
-    found[np.ix_(rows, rows)] = of_pose.numpy()
-    return found.ravel()

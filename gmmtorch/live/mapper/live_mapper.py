@@ -12,6 +12,7 @@ from gmmtorch.datasets.recordings.trajectory import NANOSECONDS
 from gmmtorch.live.mapper.diagnostics import Diagnostics
 from gmmtorch.live.mapper.live_scans import LiveScans
 from gmmtorch.live.mapper.map_publisher import MapPublisher
+from gmmtorch.live.mapper.pose_publisher import PosePublisher
 from gmmtorch.live.ros import Node
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.map_builder import MapBuilder
@@ -24,6 +25,8 @@ _PATIENCE = 3.0  # s that a due publication waits for the end of a window
 
 class LiveMapper:
     """Inserts the scans of a live topic into a map with a `MapBuilder`, and publishes the map.
+
+    Poses of odometry are published, too.
 
     With `shared`, teammates receive the components of complete windows, and their components are published
     together with the robot's own.
@@ -51,6 +54,7 @@ class LiveMapper:
         self.shared = shared
         self.diagnostics = Diagnostics(node, scans)
         self._node, self._scans, self._publisher, self._period = node, scans, publisher, period
+        self._poses = PosePublisher(node, scans.world_frame) if scans.has_odometry else None
         self._unpublished: list[int] = []  # stamps of scans, ns
         self._published: list[int] = []
         self._content = 0  # of the team's map, when it was published last
@@ -102,6 +106,8 @@ class LiveMapper:
             newest = self._scans.newest
             if newest is not None:
                 self._unpublished.append(newest.stamp)
+                if self._poses is not None and newest.location is not None:
+                    self._poses.publish_odometry(newest.location, newest)
                 if self.shared is not None:
                     self.shared.add(newest.scan)
         if self.builder.map.n_pending == 0:

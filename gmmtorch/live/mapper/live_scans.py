@@ -19,12 +19,16 @@ from gmmtorch.datasets.recordings.ros.pose_sources import PoseSource, Standing, 
 from gmmtorch.datasets.recordings.ros.scan_conversion import ScanConversion
 from gmmtorch.datasets.recordings.ros.sensor_messages import Reading
 from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree, frame_name, stamp_of
-from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, in_plane
+from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, in_plane, in_space
 from gmmtorch.errors import DataError, check_choice, check_number
+from gmmtorch.localization.location import Location, composed
+from gmmtorch.localization.recorded_poses import METHODS, odometry_of
+from gmmtorch.localization.tracker import Tracker
+from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.scan import FARTHEST, Scan
 
 DROPPED = "dropped, because mapping is slower than the sensor"
-_SETTLING = 0.5  # s without a new frame above the sensor's, after which the root of TF is the world
+SETTLING = 0.5  # s without a new frame above the sensor's, after which the root of TF is the world
 _PATIENCE = 10.0  # s that a scan waits for its pose if there is no limit of the latency
 _WAITING_BYTES = 1 << 28
 _BACKWARDS = 30 * NANOSECONDS  # a clock that is set back further starts again
@@ -35,8 +39,9 @@ _DELAYS = 1001  # first messages, whose median delay counts
 class LiveOptions:
     """How live messages become scans.
 
-    poses: tf, or standing for a sensor that does not move.
-    frame: the fixed frame of TF, such as odom; None: the root of the sensor's tree.
+    poses: tf; standing for a sensor that does not move; mixture or kiss_icp for odometry from the scans.
+    frame: the fixed frame of TF, such as odom; None: the root of the sensor's tree. Of odometry: the name of
+        its frame; None: odom.
     max_gap: longest time (s) between two poses that are interpolated.
     clock: header, stamps of the messages; or received, times of receipt.
     deskew: each point with a time gets the pose of its own time.
@@ -55,7 +60,7 @@ class LiveOptions:
     max_latency: float | None = 2.0
 
     def __post_init__(self) -> None:
-        check_choice("poses", self.poses, ("tf", "standing"))
+        check_choice("poses", self.poses, ("tf", "standing", *METHODS))
         check_choice("clock", self.clock, ("header", "received"))
         check_number("max_gap", self.max_gap)
         if self.max_latency is not None:
@@ -74,12 +79,15 @@ class _Waiting:
 
 
 class LiveScan(NamedTuple):
-    """The newest scan. matrix: (4, 4) fixed frame ← sensor. stamp: ns. frame: of the sensor."""
+    """The newest scan. matrix: (4, 4) fixed frame ← sensor. stamp: ns. frame: of the sensor. location: of
+    odometry.
+    """
 
     scan: Scan
     matrix: np.ndarray
     stamp: int
     frame: str
+    location: Location | None = None
 
 
 class LiveScans(Dataset):
@@ -106,6 +114,9 @@ class LiveScans(Dataset):
         self._delays: list[int] = []
         self._conversion: ScanConversion | None = None
         self._candidate: tuple[list[str], float] = ([], 0.0)
+        self._odometry = odometry_of(options.poses) if options.poses in METHODS else None
+        self._start: Location | None = None  # of odometry in the map of an earlier run
+        self._tracker: Tracker | None = None  # of the map of an earlier run
         self._is_flat: bool | None = None
         self._last_stamp: int | None = None
         self._n_posed = 0
@@ -214,7 +225,7 @@ class LiveScans(Dataset):
 
     def _settled(self, frame: str) -> PoseSource | None:
         """The source of poses once the fixed frame is clear."""
-        if self._options.poses == "standing":
+        if self._options.poses != "tf":
             return Standing()
         top = self._options.frame
         source = TfPoses(self._tree, top, self._options.max_gap, f"topic {self.name}")
@@ -228,13 +239,15 @@ class LiveScans(Dataset):
                 return None
             if chain != self._candidate[0]:
                 self._candidate = chain, time.monotonic()
-            if time.monotonic() - self._candidate[1] < _SETTLING:
+            if time.monotonic() - self._candidate[1] < SETTLING:
                 return None
         return source
 
     @property
     def world_frame(self) -> str:
         """The fixed frame of the map; "map" before it is known and for a standing sensor."""
+        if self._odometry is not None:
+            return self._options.frame or "odom"
         if self._conversion is None or not isinstance(self._conversion.source, TfPoses):
             return "map"
         return self._options.frame or self._candidate[0][-1]
@@ -285,9 +298,39 @@ class LiveScans(Dataset):
         scan = conversion.scan(found, item.stamp, item.frame, matrix, self._is_flat, self._delay, self._note)
         if scan.n_beams == 0:
             return False
-        self.newest = LiveScan(scan, matrix, item.stamp, item.frame)
+        location = None
+        if self._odometry is not None:
+            location = self._located(scan, item.stamp)
+            if not location.found:
+                self.trouble = "; ".join(location.doubts)
+                self._note("no pose was found by odometry")
+                return False
+            scan, matrix = scan.transformed(location.pose), in_space(location.pose.numpy()[None])[0]
+        self.newest = LiveScan(scan, matrix, item.stamp, item.frame, location)
         self._stamps.append(item.stamp / NANOSECONDS)
         return True
+
+    def _located(self, scan: Scan, stamp: int) -> Location:
+        """Where odometry finds a scan, which is in the frame of its sensor, in the fixed frame."""
+        assert self._odometry is not None
+        points = scan.points.double()
+        if self._tracker is not None:
+            first = self._tracker.locate(points)
+            if not first.found:
+                return first
+            self._start, self._tracker = first, None
+        location = self._odometry.add(points, stamp / NANOSECONDS)
+        return location if self._start is None else composed(self._start, location)
+
+    @property
+    def has_odometry(self) -> bool:
+        """Whether poses are estimated from the scans."""
+        return self._odometry is not None
+
+    def continue_in(self, known: GaussianMap) -> None:
+        """Odometry begins where the next scan is found in a map; scans that are not found are left out."""
+        if self._odometry is not None:
+            self._tracker = Tracker(known)
 
     # -- as a data set --------------------------------------------------------------------------------
 

@@ -76,7 +76,7 @@ def open_scans(
 ) -> LiveScans:
     """The scans of a sensor, with the subscriptions that they need."""
     scans = LiveScans(sensor, node.transforms, ranges, options)
-    if options.poses == "tf":
+    if options.poses != "standing":
         node.listen_to_transforms()
     if sensor.is_camera:
         info = camera_info or _camera_info(node, sensor.topic.name)

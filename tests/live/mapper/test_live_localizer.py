@@ -78,14 +78,15 @@ def node(ros_domain):
 
 
 def test_poses_and_the_transform_to_odometry_are_published(node, known, monkeypatch):
-    monkeypatch.setattr(live_scans, "_SETTLING", 0.0)
+    monkeypatch.setattr(live_scans, "SETTLING", 0.0)
     odom_in_map = pose(1.0, 0.5, 0.3)
     sensor = SensorTopic(Topic("/scan", "", 0), LASER)
     scans = LiveScans(sensor, node.transforms, Ranges(), LiveOptions(frame="odom", max_latency=None))
+    sent: dict[str, list[Any]] = {"pose": [], "/tf": [], "/diagnostics": []}
+    monkeypatch.setattr(
+        node, "publisher", lambda topic, _: lambda message, stamp: sent[topic].append(message)
+    )
     localizer = LiveLocalizer(node, scans, known)
-    sent: dict[str, list[Any]] = {"pose": [], "tf": []}
-    monkeypatch.setattr(localizer, "_send_pose", lambda message, stamp: sent["pose"].append(message))
-    monkeypatch.setattr(localizer, "_send_transform", lambda message, stamp: sent["tf"].append(message))
     from gmmtorch.export.message_fields import transform_fields
 
     for index, at in enumerate(PATH):
@@ -99,7 +100,7 @@ def test_poses_and_the_transform_to_odometry_are_published(node, known, monkeypa
     for at, found in zip(PATH, localizer.poses, strict=True):
         assert np.allclose(found[:2, 2], at[:2], atol=0.05)
         assert float(torch.atan2(found[1, 0], found[0, 0])) == pytest.approx(at[2], abs=0.03)
-    above = sent["tf"][-1]["transforms"][0]
+    above = sent["/tf"][-1]["transforms"][0]
     assert (above["header"]["frame_id"], above["child_frame_id"]) == ("map", "odom")
     assert above["transform"]["translation"]["x"] == pytest.approx(1.0, abs=0.08)
     assert 2 * np.arctan2(*(above["transform"]["rotation"][a] for a in "zw")) == pytest.approx(0.3, abs=0.05)

@@ -69,6 +69,11 @@ class TransformTree:
         """Whether a transform of the chain is not static."""
         return any(child in self._samples for child in chain[:-1])
 
+    def static_part(self, chain: list[str]) -> list[str]:
+        """The frames of a chain up to the first transform that moves."""
+        moving = (index for index, child in enumerate(chain[:-1]) if child in self._samples)
+        return chain[: next(moving, len(chain)) + 1]
+
     def chain(self, frame: str, top: str | None = None) -> list[str]:
         """Frames from `frame` up to `top`, or to the root of its tree.
 
