@@ -177,7 +177,10 @@ PEAK = (
 )
 ODOMETRY = "python benchmarks/odometry.py --data $DATA --runs $OUT/runs.jsonl --methods mixture"
 SEEDS = "gmmtorch-explore hydra.run.dir=$OUT experiment=fig4_4_entropy 'study.seeds=[0,1,2,3,4]' "
-ALONE = "team.size=3 duration=1600 evaluation.every=10 'study.variants=[{team:gmm_shared}]' "
+TEAMS = (
+    "team.size=3 duration=1600 evaluation.every=10 "
+    "'study.variants=[{team:gmm_shared},{team:grid_shared},{team:grid_isolated}]' "
+)
 
 LEARNED = {"times faster": times(2), "K": within(0), "held-out nats": within(0.02), "PSNR2 dB": within(0.5)}
 CLOUDS = (
@@ -311,7 +314,7 @@ RUNS = {
         Claim(FIGURES, "Ours sends # […] times fewer bytes than the thesis's E0, and # […] times fewer",
               joined(saving("gmm_thesis"), saving("grid_shared")), times(1.15)),
     ]),
-    "exploration": Run(SEEDS + ALONE + "'evaluation.codecs=[octree,draco]'", [
+    "exploration": Run(SEEDS + TEAMS + "'evaluation.codecs=[octree,draco]'", [
         Claim("README.md", "send [# times fewer bytes than raw points](",
               saving("bytes_raw_points"), times(1.1)),
         Claim("docs/exploration.md", "E0 sends # times fewer bytes than … from, and # times fewer than Draco",
