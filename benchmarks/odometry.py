@@ -26,7 +26,7 @@ from gmmtorch.datasets import Dataset
 from gmmtorch.evaluation.held_out import Protocol, evaluate
 from gmmtorch.evaluation.methods import choose, methods
 from gmmtorch.evaluation.trajectories import absolute_trajectory_error, relative_pose_error
-from gmmtorch.localization.recorded_poses import METHODS, with_odometry
+from gmmtorch.localization.odometry.recorded_poses import METHODS, with_odometry
 
 NOISE = 1e-3  # metres of standard deviation that move every point of a run
 WRONG = 0.2  # metres of a step

@@ -27,7 +27,7 @@ from tables import hardware, markdown, publish
 from torch import Tensor
 
 from gmmtorch import WindowedRule, datasets
-from gmmtorch.localization.registration import register, yaw_starts
+from gmmtorch.localization.registration.registration import register, yaw_starts
 from gmmtorch.localization.rigid_motions import generators
 from gmmtorch.mapping.codec import component_batch as codec
 from gmmtorch.mapping.learning.windowed import learn_window

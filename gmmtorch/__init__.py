@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from gmmtorch import sharing as sharing
     from gmmtorch.baselines.occupancy_grid import OccupancyGrid as OccupancyGrid
     from gmmtorch.errors import GmmTorchError as GmmTorchError
-    from gmmtorch.localization.registration import register as register
+    from gmmtorch.localization.registration.registration import register as register
     from gmmtorch.mapping.components import Components as Components
     from gmmtorch.mapping.gaussian_map import GaussianMap as GaussianMap
     from gmmtorch.mapping.learning.rules import IncrementalRule as IncrementalRule
@@ -72,7 +72,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "fit_depth_image": "mixture.depth_image",
         "fit_stream": "mixture.streaming.stream_fit",
         "mixture": "",
-        "register": "localization.registration",
+        "register": "localization.registration.registration",
         "sharing": "",
     },
 )

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from gmmtorch.datasets.recordings.reposed import Reposed
     from gmmtorch.evaluation.events import Event, Row
     from gmmtorch.evaluation.protocol_options import FitOptions
-    from gmmtorch.localization.odometry import Trajectory
+    from gmmtorch.localization.odometry.odometry import Trajectory
     from gmmtorch.scan import Scan
 
 logger = logging.getLogger("gmmtorch")
@@ -166,7 +166,7 @@ def open_with_trajectory(config: DictConfig) -> OpenedDataset:
 
 def _with_odometry(source: Dataset, method: str, motion: str, has_truth: bool) -> OpenedDataset:
     """The data set with estimated poses. Prints the errors against its own poses, if it has some."""
-    from gmmtorch.localization.recorded_poses import with_odometry
+    from gmmtorch.localization.odometry.recorded_poses import with_odometry
 
     with naming({"odometry": "dataset.odometry", "motion": "dataset.motion"}):
         posed, trajectory = with_odometry(source, method, motion=motion)

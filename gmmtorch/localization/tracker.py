@@ -12,8 +12,14 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
 from gmmtorch.linalg import check_rigid
-from gmmtorch.localization.alignment import Alignment, AlignmentTarget, align, merged_below, seen_normals
 from gmmtorch.localization.location import UNSEEN, Location, pose_covariance
+from gmmtorch.localization.registration.alignment import (
+    Alignment,
+    AlignmentTarget,
+    align,
+    merged_below,
+    seen_normals,
+)
 from gmmtorch.localization.rigid_motions import Motions, around, best_distinct, differences, everywhere
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
@@ -51,7 +57,7 @@ _MOST_FREE = 1.5  # times the share that need not be explained: points in free s
 class Tracker:
     """Localises the scans of a sensor, one after the other, in a map that does not change.
 
-    A scan is aligned with the surfaces of the map (`localization.alignment`), from the pose that the last
+    A scan is aligned with the surfaces of the map (`registration.alignment`), from the pose that the last
     motion predicts. If this fails, starts around the prediction are tried, then four times as far. After
     a lost scan, and for the first scan without a pose, the whole map is searched: all headings at the places
     from which the map was seen.

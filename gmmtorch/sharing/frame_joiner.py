@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import check_number, check_whole
-from gmmtorch.localization.registration import register
+from gmmtorch.localization.registration.registration import register
 from gmmtorch.localization.tracker import Tracker
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap

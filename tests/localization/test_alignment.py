@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from gmmtorch.localization import alignment
-from gmmtorch.localization.alignment import AlignmentTarget, align
+from gmmtorch.localization.registration import alignment
+from gmmtorch.localization.registration.alignment import AlignmentTarget, align
 from gmmtorch.localization.rigid_motions import Motions, generators, turns
 from gmmtorch.mixture.em.exact import Parameters
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gmmtorch.localization.free_space import FreeSpace
+from gmmtorch.localization.odometry.free_space import FreeSpace
 
 HALF = 4.0  # metres from the centre of the room to a wall
 

@@ -10,8 +10,8 @@ from gmmtorch.datasets import load
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.evaluation.trajectories import absolute_trajectory_error
 from gmmtorch.localization import Odometry, with_odometry
-from gmmtorch.localization.local_map import Expectation, LocalMap
-from gmmtorch.localization.odometry import _RULE, _scaled
+from gmmtorch.localization.odometry.local_map import Expectation, LocalMap
+from gmmtorch.localization.odometry.odometry import _RULE, _scaled
 
 N_2D, N_3D = 14, 6
 
@@ -132,10 +132,9 @@ def test_steps_that_mislead_the_points_are_found_with_free_space(real_data, log,
 
 @pytest.mark.slow
 @pytest.mark.real_data
-def test_a_narrow_lidar_keeps_its_way_along_a_wall(real_data):
-    scans = load(
-        "scan_folder", real_data / "courtyard"
-    )  # a cone of 70°; with ten keyframes it is lost by 2 m
+def test_the_poses_of_a_narrow_lidar_stay_right_along_a_wall(real_data):
+    # Its field of view is a cone of 70°: with ten keyframes the error is 2 m.
+    scans = load("scan_folder", real_data / "courtyard")
     true = torch.stack([scans.pose(number) for number in range(64)])
     odometry = Odometry()
     for number, pose in enumerate(true):

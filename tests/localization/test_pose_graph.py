@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.localization.pose_graph import Edges, _moved, optimised, residuals
+from gmmtorch.localization.odometry.pose_graph import Edges, _moved, optimised, residuals
 
 FREE = {2: 3, 3: 6}
 

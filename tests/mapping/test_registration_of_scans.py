@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 import gmmtorch as gt
-from gmmtorch.localization.registration import register
+from gmmtorch.localization.registration.registration import register
 from gmmtorch.localization.rigid_motions import generators
 from gmmtorch.mapping.codec import component_batch as codec
 from gmmtorch.mapping.components import Components

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from gmmtorch.datasets import Dataset
     from gmmtorch.evaluation.events import Event, Row
     from gmmtorch.live.live_moments import BuildMoments
-    from gmmtorch.localization.odometry import Trajectory
+    from gmmtorch.localization.odometry.odometry import Trajectory
     from gmmtorch.mapping.components import Components
     from gmmtorch.mapping.gaussian_map import GaussianMap
     from gmmtorch.mapping.map_builder import MapBuilder

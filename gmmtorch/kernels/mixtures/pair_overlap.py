@@ -1,4 +1,4 @@
-"""Overlap of pairs of components under rigid motions: sums of the terms of `localization.overlap`; its twin.
+"""Overlap of pairs of components under rigid motions: sums of the terms of `registration.overlap`; its twin.
 
 The fused kernel evaluates eight pairs at a time and keeps the sums of one motion. Sums differ from the twin's
 by at most 10⁻¹¹ of their largest entry.

@@ -1,4 +1,4 @@
-"""Sums over the points of a scan that is aligned with a mixture (`localization.alignment`); and their twin.
+"""Sums over the points of a scan that is aligned with a mixture (`registration.alignment`); and their twin.
 
 The fused kernel keeps the sums of a part of the points. They differ from the twin's by at most 10⁻¹¹ of their
 largest entry.

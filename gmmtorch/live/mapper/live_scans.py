@@ -22,7 +22,7 @@ from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree, frame
 from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, in_plane, in_space
 from gmmtorch.errors import DataError, check_choice, check_number
 from gmmtorch.localization.location import Location, composed
-from gmmtorch.localization.recorded_poses import METHODS, odometry_of
+from gmmtorch.localization.odometry.recorded_poses import METHODS, odometry_of
 from gmmtorch.localization.tracker import Tracker
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.scan import FARTHEST, Scan

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gmmtorch.kernels import kernels
-from gmmtorch.localization.alignment import AlignmentTarget
+from gmmtorch.localization.registration.alignment import AlignmentTarget
 from gmmtorch.localization.rigid_motions import Motions
 from gmmtorch.mixture.em.exact import Parameters
 

@@ -11,10 +11,10 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
 from gmmtorch.linalg import check_rigid
-from gmmtorch.localization.local_map import LOST, Expectation, Keyframe, LocalMap, nowhere
 from gmmtorch.localization.location import Location
-from gmmtorch.localization.loop_closure import closed, information_of
-from gmmtorch.localization.pose_graph import Edges, optimised
+from gmmtorch.localization.odometry.local_map import LOST, Expectation, Keyframe, LocalMap, nowhere
+from gmmtorch.localization.odometry.loop_closure import closed, information_of
+from gmmtorch.localization.odometry.pose_graph import Edges, optimised
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import WindowedRule
 from gmmtorch.mapping.learning.windowed import learn_window
@@ -59,12 +59,12 @@ class Odometry:
     A scan becomes a small mixture. It is registered with the mixtures of the last keyframes (in 2D, the best
     of a lattice of starts), then the pose that best explains its points is found from there. The
     prediction continues the last motion. `trajectory` finds the places that were seen twice and corrects
-    all poses by a pose graph (`localization.pose_graph`).
+    all poses by a pose graph (`localization.odometry.pose_graph`).
 
     Args:
         n_keyframes: in the local map. None: 10, or 80 for a sensor with a narrow field of view, such as a
-            depth camera, by the directions of the first points. Such a sensor loses its way along a wall if
-            the local map ends at what it saw last.
+            depth camera, by the directions of the first points. Along a wall, the poses of such a sensor
+            drift if the local map has only what it saw last.
         distance, angle: a scan becomes a keyframe after this motion (m, rad).
         n_points: of a scan that are used at most, drawn with a fixed seed.
         least_explained: share of the points that must lie on surfaces of the local map.

@@ -10,11 +10,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.localization.alignment import Alignment, AlignmentTarget, align, seen_normals
-from gmmtorch.localization.free_space import FreeSpace, View
 from gmmtorch.localization.location import Location, pose_covariance
-from gmmtorch.localization.pose_graph import logarithm
-from gmmtorch.localization.registration import register
+from gmmtorch.localization.odometry.free_space import FreeSpace, View
+from gmmtorch.localization.odometry.pose_graph import logarithm
+from gmmtorch.localization.registration.alignment import Alignment, AlignmentTarget, align, seen_normals
+from gmmtorch.localization.registration.registration import register
 from gmmtorch.localization.rigid_motions import Motions, distinct, generators
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import WindowedRule

@@ -10,7 +10,7 @@ from torch import Tensor
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.mixtures.near_pairs import MOST_TESTED, near_pairs
 from gmmtorch.linalg import safe_cholesky
-from gmmtorch.localization.overlap import Overlap, Pairs, deviations, overlap
+from gmmtorch.localization.registration.overlap import Overlap, Pairs, deviations, overlap
 from gmmtorch.localization.rigid_motions import Motions, chosen_rows
 from gmmtorch.mapping.surfaces import touching
 from gmmtorch.mixture.em.exact import Parameters

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels.mixtures.point_alignment import AlignmentSums, alignment_sums
-from gmmtorch.localization.overlap import deviations
+from gmmtorch.localization.registration.overlap import deviations
 from gmmtorch.localization.rigid_motions import Motions, chosen_rows
 from gmmtorch.mapping.components import Components
 from gmmtorch.mixture.em.exact import Parameters

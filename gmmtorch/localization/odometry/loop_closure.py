@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from gmmtorch.localization.local_map import Expectation, Keyframe, LocalMap
 from gmmtorch.localization.location import Location
-from gmmtorch.localization.pose_graph import Edges, optimised
+from gmmtorch.localization.odometry.local_map import Expectation, Keyframe, LocalMap
+from gmmtorch.localization.odometry.pose_graph import Edges, optimised
 from gmmtorch.mapping.learning.rules import WindowedRule
 
 _ROUNDS = 3  # of closing and correcting: corrected poses bring more places together

@@ -13,7 +13,7 @@ from gmmtorch.datasets.recordings.reposed import Reposed, with_poses
 from gmmtorch.datasets.recordings.trajectory import in_plane
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice
 from gmmtorch.localization.location import Location
-from gmmtorch.localization.odometry import Odometry, Trajectory
+from gmmtorch.localization.odometry.odometry import Odometry, Trajectory
 from gmmtorch.optional_packages import needs_extra
 
 METHODS = ("kiss_icp", "mixture")

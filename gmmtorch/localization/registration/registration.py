@@ -11,8 +11,8 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, check_whole
 from gmmtorch.linalg import check_rigid
-from gmmtorch.localization.overlap import deviations
-from gmmtorch.localization.overlap_ascent import Ascent, log_self_overlap
+from gmmtorch.localization.registration.overlap import deviations
+from gmmtorch.localization.registration.overlap_ascent import Ascent, log_self_overlap
 from gmmtorch.localization.rigid_motions import Motions
 from gmmtorch.mapping.surfaces import Surfaces, surface_mixture
 from gmmtorch.mixture.em.exact import Parameters

@@ -1,0 +1,1 @@
+"""The poses of a sensor from its scans alone."""

@@ -1,0 +1,1 @@
+"""Registration of two maps, and alignment of points with a map."""
