@@ -165,7 +165,7 @@ def ray_casting(n_rays: int = 1_000_000, repeats: int = 3) -> None:
         "and counting, block-sparse",
         "peak memory above the rays",
     ]
-    publish("rays", f"{n_rays:,} rays, fused kernels. {hardware()}\n\n{markdown(header, rows)}")
+    publish("rays", f"{n_rays:,} rays. {hardware()}\n\n{markdown(header, rows)}")
 
 
 def hall_by_stage(folder: Path, resolution: float = 0.2) -> None:
