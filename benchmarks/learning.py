@@ -94,8 +94,10 @@ def scikit_learn(points: Tensor, k: int, tol: float) -> Learned:
     from sklearn.mixture import GaussianMixture as Peer
 
     peer = Peer(k, tol=1e-3, reg_covar=REG_COVAR, random_state=0).fit(points.numpy())
-    parameters = (torch.from_numpy(x) for x in (peer.weights_, peer.means_, peer.covariances_))
-    return Learned(*parameters, peer.n_iter_, "0.001")
+    weights, means, covariances = (
+        torch.from_numpy(x) for x in (peer.weights_, peer.means_, peer.covariances_)
+    )
+    return Learned(weights, means, covariances, peer.n_iter_, "0.001")
 
 
 def tgmm(points: Tensor, k: int, tol: float) -> Learned:

@@ -13,6 +13,7 @@ import json
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -111,7 +112,7 @@ def em(n: int, k: int) -> Work:
 
 
 def frames(data: Path) -> tuple[list[tuple[Tensor, Tensor]], Tensor]:
-    dataset = gt.datasets.load("depth_frames", data / "kinect", pixel_stride=2)
+    dataset: Any = gt.datasets.load("depth_frames", data / "kinect", pixel_stride=2)
     return [dataset.image(i) for i in range(len(dataset)) if i % 5], dataset.intrinsics
 
 
@@ -164,7 +165,7 @@ def registration(data: Path) -> Work:
     try:
         from gmmtorch import register
     except ImportError:
-        from gmmtorch.mapping.registration import register
+        from gmmtorch.mapping.registration import register  # type: ignore[no-redef]
     scans = list(gt.datasets.load("scan_folder", data / "hall"))
     made = []
     for place in (10, 14):

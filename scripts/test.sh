@@ -10,6 +10,7 @@ cd "$(dirname "$0")/.."
 .venv/bin/ruff format --check .
 .venv/bin/ruff check .
 .venv/bin/mypy
+.venv/bin/mypy --config-file benchmarks/mypy.ini
 status=0
 # Each test uses one thread. A later -m replaces the first.
 .venv/bin/pytest -n auto --dist worksteal -m "not slow" "$@" || status=$?
