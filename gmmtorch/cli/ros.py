@@ -171,8 +171,8 @@ def _shared_map(config: DictConfig, stack: ExitStack) -> SharedMap | None:
     is_free = config.start == "unknown"
     replica = Replica(robot, own_frame=is_free)
     store.restore(replica)
-    if is_free and replica.earlier_frames:  # the fixed frame of TF is where it was before
-        replica.join(replica.earlier_frames[0], torch.eye(4))
+    if is_free and replica.earlier_frames and replica.n_components:  # the fixed frame is where it was before
+        replica.join(replica.earlier_frames[0], torch.eye(replica.components().dim + 1))
     with common.naming({argument: f"network.{option}" for option, argument in missions.OF_ROBOTS.items()}):
         return SharedMap(
             replica,

@@ -10,18 +10,21 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from command_runs import CHECKOUT, environment, refused, run_here, run_script, succeeded
+from command_runs import CHECKOUT, composed, environment, refused, run_here, run_script, succeeded
 
 pytest.importorskip("rosbags", reason="needs the extra [ros]: rosbags")
 pytest.importorskip("cyclonedds", reason="needs the extra [ros]: cyclonedds")
 
 from exploration.replays import content
+from mapping.random_components import random_components
 
+from gmmtorch.cli import common, ros
 from gmmtorch.cli.from_options import links
 from gmmtorch.datasets.base import Ranges
 from gmmtorch.datasets.recordings.ros.bag_reader import Topic
@@ -63,6 +66,20 @@ def test_a_missing_topic_is_an_error_that_lists_what_is_there(monkeypatch, tmp_p
 def test_wrong_options_are_errors_of_one_line(monkeypatch, tmp_path, ros_domain, option, words):
     options = [f"node.domain={ros_domain}"] if "domain" not in option else []
     assert words in refused(run_here(monkeypatch, "ros", tmp_path, *options, *option.split(), "wait=0.2"))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_robot_that_starts_again_keeps_its_frame(monkeypatch, tmp_path, dim):
+    monkeypatch.setattr(common, "run_dir", lambda: tmp_path)
+    config = composed("ros", "transport=udp", "start=unknown", "link.listen=127.0.0.1:0")
+    made = [random_components(dim, k=3, seed=seed) for seed in range(2)]
+    for number, components in enumerate(made):
+        with ExitStack() as stack:
+            shared = ros._shared_map(config, stack)
+            assert shared is not None
+            shared.replica.add(components)
+            shared.exchange(0.0)
+            assert len(shared.components()) == 3 * (number + 1)
 
 
 @pytest.mark.slow
