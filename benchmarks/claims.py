@@ -273,7 +273,8 @@ RUNS = {
         *of_table(RESULTS, "registration-hall", 1, ALIGNED),
         *of_table(RESULTS, "registration-courtyard", 1, ALIGNED),
     ]),
-    "odometry": Run(f"{ODOMETRY} --seeds 0 --names courtyard street && "
+    "odometry": Run(f"{ODOMETRY} --seeds 0 1 2 --names courtyard && "
+                    f"{ODOMETRY} --seeds 0 --names street && "
                     f"{ODOMETRY} --seeds 0 1 --names hall && "
                     f"{ODOMETRY} --seeds 0 --names intel aces --most 150",
                     of_table(RESULTS, "odometry", 3, FLOWN)),
