@@ -98,7 +98,7 @@ def stop_requests() -> Iterator[Callable[[], bool]]:
 
 def _interrupt() -> None:
     time.sleep(0.01)  # until `__del__` has returned; if it has not, the interrupt is dropped and sent again
-    os.kill(os.getpid(), signal.SIGINT)
+    _thread.interrupt_main()  # on Windows os.kill would end the process at once
 
 
 def _hydra_main(name: str, run: Callable[[DictConfig], Any]) -> None:
