@@ -7,6 +7,7 @@ sweep that fails does not end the sweep.
 from __future__ import annotations
 
 import _thread
+import argparse
 import math
 import os
 import signal
@@ -41,7 +42,7 @@ def start(name: str, run: Callable[[DictConfig], Any]) -> None:
     """
     schema.register()
     try:
-        with interruptible():
+        with interruptible(), _any_help():
             _hydra_main(name, run)
     except KeyboardInterrupt:
         print("gmmtorch: interrupted; all files that were written are complete.", file=sys.stderr)
@@ -75,6 +76,21 @@ def interruptible() -> Iterator[None]:
     finally:
         sys.unraisablehook = hook
         signal.signal(signal.SIGINT, signal.SIG_DFL if handler is None else handler)
+
+
+@contextmanager
+def _any_help() -> Iterator[None]:
+    """argparse accepts help texts that are not strings: Hydra 1.3 has one, which Python 3.14 refuses."""
+    container: Any = argparse._ActionsContainer
+    check = getattr(container, "_check_help", None)
+    if check is None:
+        yield
+        return
+    container._check_help = lambda self, action: isinstance(action.help, str) and check(self, action)
+    try:
+        yield
+    finally:
+        container._check_help = check
 
 
 @contextmanager
