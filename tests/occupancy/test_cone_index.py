@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from occupancy.cone_examples import random_cones, tiled
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.occupancy.cone_index import ConeIndex
 from gmmtorch.occupancy.cones import CUTOFF, Cones
-from gmmtorch.occupancy.index.cone_index import ConeIndex
 
 
 def places_on_rays(cones: Cones, n: int, cutoff: float, seed: int) -> tuple[torch.Tensor, torch.Tensor]:

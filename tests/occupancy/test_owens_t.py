@@ -11,7 +11,7 @@ from hypothesis import given
 from occupancy.polygons import contained, random_polygons
 from scipy import special
 
-from gmmtorch.occupancy.forms.cone.owens_t import owens_t, polygon_probability
+from gmmtorch.occupancy.forms.cone.polygons import owens_t, polygon_probability
 
 
 def square(low: float, high: float) -> tuple[torch.Tensor, torch.Tensor]:

@@ -17,9 +17,13 @@ from scipy.spatial import ConvexHull
 from gmmtorch.evaluation.studies.angular_reference import angular_evidence
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.forms.cone.cone_evidence import cone_evidence
-from gmmtorch.occupancy.forms.cone.owens_t import polygon_probability
-from gmmtorch.occupancy.forms.cone.projection import Planes, approximate_erf, approximate_probability
-from gmmtorch.occupancy.forms.cone.silhouette import Edges, facing, image, meets_disc, outline
+from gmmtorch.occupancy.forms.cone.polygons import (
+    approximate_erf,
+    approximate_probability,
+    polygon_probability,
+)
+from gmmtorch.occupancy.forms.cone.projection import Planes
+from gmmtorch.occupancy.forms.cone.silhouette import facing, image, meets_disc, outline
 
 
 def column(*values: float) -> torch.Tensor:
@@ -76,14 +80,13 @@ def test_the_closed_form_equals_the_integral_of_the_approximation(corners):
         kink = [x1 - y1 / m] if m and min(x1, x2) < x1 - y1 / m < max(x1, x2) else None
         total -= integrate.quad(integrand, x1, x2, points=kink)[0] / math.sqrt(8 * math.pi)
     starts = torch.tensor(corners, dtype=torch.float64)[..., None]
-    assert float(approximate_probability(Edges(starts, starts.roll(-1, 0)))) == pytest.approx(
-        total, abs=1e-10
-    )
+    found = float(approximate_probability(starts, starts.roll(-1, 0)))
+    assert found == pytest.approx(total, abs=1e-10)
 
 
 def test_the_approximation_has_an_error_up_to_0_01_on_random_polygons(generator):
     starts, ends = random_polygons(3000, 6, generator)
-    error = approximate_probability(Edges(starts, ends)) - polygon_probability(starts, ends)
+    error = approximate_probability(starts, ends) - polygon_probability(starts, ends)
     assert 0.008 < float(error.abs().max()) < 0.015
 
 
@@ -91,7 +94,7 @@ def test_the_approximation_has_an_error_up_to_0_01_on_random_polygons(generator)
 def test_steep_edges_and_far_corners_keep_the_error_bound(seed, exponent):
     starts, ends = random_polygons(4, 5, torch.Generator().manual_seed(seed))
     stretch = torch.tensor([10.0**-exponent, 10.0**exponent], dtype=torch.float64)[:, None]
-    near = approximate_probability(Edges(starts * stretch, ends * stretch))
+    near = approximate_probability(starts * stretch, ends * stretch)
     exact = polygon_probability(starts * stretch, ends * stretch)
     assert (near - exact).abs().max() < 0.015
 
@@ -143,9 +146,9 @@ def test_polygons_meet_a_disc_by_their_edges_or_around_it():
     edges = image(outline(low, high)[0])
     nearest = 1.0 / 5.0
     radius = torch.tensor([nearest * 0.99], dtype=torch.float64)
-    assert not meets_disc(edges, radius)
-    assert meets_disc(edges, radius * 1.02)
-    assert meets_disc(image(outline(column(-1.0, -1.0, 4.0), high)[0]), radius * 1e-6)
+    assert not meets_disc(*edges, radius)
+    assert meets_disc(*edges, radius * 1.02)
+    assert meets_disc(*image(outline(column(-1.0, -1.0, 4.0), high)[0]), radius * 1e-6)
 
 
 @given(st.integers(0, 2**31))

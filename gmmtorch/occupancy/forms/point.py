@@ -20,9 +20,9 @@ from gmmtorch.kernels.evidence.point_evidence import (
     pair_evidence,
 )
 from gmmtorch.linalg import safe_cholesky
+from gmmtorch.occupancy.cone_index import ConeIndex
 from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.grid import check_resolution
-from gmmtorch.occupancy.index.cone_index import ConeIndex
 from gmmtorch.occupancy.protocol import check_queries
 
 

@@ -19,6 +19,15 @@ from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.evidence.cell_mass import add_cell_mass
 from gmmtorch.kernels.evidence.face_flux import add_row_flux, whitened_rows
 from gmmtorch.occupancy.cones import CUTOFF, Cones, WhitenedCones, cross, dot, length, outside_cone
+from gmmtorch.occupancy.culling import (
+    FaceRows,
+    Pairs,
+    ball_rows,
+    candidate_pairs,
+    cells_in_chunks,
+    face_rows,
+    in_chunks,
+)
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.forms.flux.adaptive_quadrature import (
     TOLERANCE,
@@ -33,15 +42,6 @@ from gmmtorch.occupancy.forms.flux.adaptive_quadrature import (
 )
 from gmmtorch.occupancy.forms.flux.box_mass import box_mass
 from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.index.culling import (
-    FaceRows,
-    Pairs,
-    ball_rows,
-    candidate_pairs,
-    cells_in_chunks,
-    face_rows,
-    in_chunks,
-)
 
 CHUNK_FACES = 1 << 18
 """Faces, or pairs of a box and a cone, prepared in one pass."""

@@ -16,10 +16,10 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike, as_tensor, is_floating
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.occupancy.cones import CUTOFF, Cones, WhitenedCones, cross, dot
+from gmmtorch.occupancy.culling import candidate_pairs
 from gmmtorch.occupancy.forms.flux.adaptive_quadrature import TOLERANCE, check_tolerance, integrate
 from gmmtorch.occupancy.forms.flux.box_flux import FacePatches
 from gmmtorch.occupancy.forms.flux.box_mass import MassPatches
-from gmmtorch.occupancy.index.culling import candidate_pairs
 
 _CHUNK_FACES = 1 << 16
 
