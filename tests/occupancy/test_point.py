@@ -174,7 +174,7 @@ def test_evidence_does_not_depend_on_the_index(dim, seed, resolution, cutoff):
     same(dense(points), expected)
 
 
-def test_point_evidence_does_not_depend_on_order_and_chunks():
+def test_point_evidence_does_not_depend_on_order_and_chunks(monkeypatch):
     cones = random_cones(3, 60, 0, room=True)
     points = near_rays(cones, 2000, 0)
     form = PointForm(cones, 0.05)
@@ -182,7 +182,9 @@ def test_point_evidence_does_not_depend_on_order_and_chunks():
     order = torch.randperm(2000, generator=torch.Generator().manual_seed(0))
     mixed = form(points[order])
     same(mixed, PointEvidence(whole.hits[order], whole.misses[order]))
-    same(form(points, chunk_pairs=50), whole)
+    with monkeypatch.context() as patch:
+        patch.setattr("gmmtorch.occupancy.forms.point.CHUNK_PAIRS", 50)
+        same(form(points), whole)
     alone = [form(point[None]) for point in points[:40]]
     same(
         PointEvidence(*(torch.cat(part) for part in zip(*alone, strict=True))),

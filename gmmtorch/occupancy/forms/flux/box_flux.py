@@ -42,6 +42,7 @@ from gmmtorch.occupancy.forms.flux.adaptive_quadrature import (
 )
 from gmmtorch.occupancy.forms.flux.box_mass import box_mass
 from gmmtorch.occupancy.grid import VoxelGrid
+from gmmtorch.occupancy.voxels.boxes import row_major
 
 CHUNK_FACES = 1 << 18
 """Faces, or pairs of a box and a cone, prepared in one pass."""
@@ -178,7 +179,7 @@ def flux_evidence(
     for row, cell in cells_in_chunks(balls.first, balls.number, CHUNK_FACES):
         cone, low = balls.cone[row], _world(grid, cell.double())
         mass = box_mass(white.take(cone), low, low + grid.resolution, cutoff, tolerance, dtype)
-        hits = hits.index_add(0, _flat(grid, [*cell]), mass * counts[cone])
+        hits = hits.index_add(0, row_major(cell.unbind(), grid.shape), mass * counts[cone])
     return Evidence(grid, hits.view(grid.shape), misses.view(grid.shape))
 
 
@@ -201,7 +202,7 @@ def _add_faces(
         side = center.new_full((grid.dim, 1), grid.resolution)
         flux = _face_flux(white.take(cone), center, side, axis, forward, cutoff, tolerance, dtype)
         cell = [*cells[:axis], torch.where(forward, plane - 1, plane), *cells[axis:]]
-        misses = misses.index_add(0, _flat(grid, cell), flux * counts[cone])
+        misses = misses.index_add(0, row_major(cell, grid.shape), flux * counts[cone])
     return misses
 
 
@@ -312,11 +313,3 @@ def _face_flux(
 def _world(grid: VoxelGrid, units: Iterable[Tensor]) -> Tensor:
     """Places (D, P), world metres, of grid units (P,) along each axis."""
     return torch.stack([o + i * grid.resolution for o, i in zip(grid.origin, units, strict=True)])
-
-
-def _flat(grid: VoxelGrid, cell: list[Tensor]) -> Tensor:
-    """Row-major index (P,) of cells."""
-    flat = cell[0]
-    for axis in range(1, grid.dim):
-        flat = flat * grid.shape[axis] + cell[axis]
-    return flat
