@@ -16,12 +16,10 @@ from sklearn.base import clone
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mapping.learning.rules import WindowedRule
-from gmmtorch.mapping.learning.windowed import flatness_rule
 from gmmtorch.mixture import GaussianMixture
 from gmmtorch.mixture.em import initialization
 from gmmtorch.mixture.em.initialization import surface_pieces
-from gmmtorch.mixture.em.partition import FlatnessRule, least_support, surface_rule
+from gmmtorch.mixture.em.partition import least_support
 
 NOISE = 0.01
 
@@ -151,18 +149,6 @@ def test_cells_give_nearly_the_number_of_points(monkeypatch):
     assert count(points) == pytest.approx(exact, rel=0.1)
 
 
-def test_maps_use_the_same_rule():
-    """Except for their own limits: a length, and in 2D single points of several surfaces."""
-    plane, space = (flatness_rule(WindowedRule(noise=0.02), dim) for dim in (2, 3))
-    assert plane == FlatnessRule(0.04, 0.3, 6, 1, None, 3.0)
-    assert space == FlatnessRule(0.04, 0.3, 20, 20, None, 3.0)
-    assert surface_rule(0.02, 3) == FlatnessRule(0.04, math.inf, 20, 20, None, 2.0)
-    assert surface_rule(0.02, 3, 50.0).min_weight == 50
-    assert flatness_rule(WindowedRule(min_points=9.0, n_components=4, length=1.0), 3) == FlatnessRule(
-        0.02, 1.0, 9, 9, 4, 10.0
-    )
-
-
 # -- GaussianMixture without a number ---------------------------------------------------------------
 
 
@@ -205,16 +191,6 @@ def test_degenerate_clouds_are_fitted(dim, algorithm):
         check_mixture(mixture, points, at_most=len(points))
         if name != "huge":
             assert len(mixture.means_) <= max(1, len(points) // least_support(dim)) + 1, name
-
-
-def test_fit_is_deterministic_and_commutes_with_shifts():
-    points = room(200)
-    mixture, again = fitted(points), fitted(points)
-    assert torch.equal(mixture.means, again.means)
-    far = torch.tensor([5e5, -4e6, 250.0], dtype=torch.float64)
-    moved = fitted(points + far)
-    assert moved.means_.shape == mixture.means_.shape
-    assert moved.score(points + far) == pytest.approx(mixture.score(points), abs=1e-3)
 
 
 def test_n_components_none_is_kept_by_files_states_and_copies(tmp_path):

@@ -143,23 +143,12 @@ def test_log_likelihood_never_decreases(seed, dim, k):
     points = random_points(60 * k, dim, generator)
     weight = torch.rand(60 * k, generator=generator, dtype=torch.float64) + 0.01
     step = loop.natural_step(quadratic_features(points), weight, 0.0, torch.float64, points)
-    found = loop.run_em(step, random_parameters(k, dim, generator), tol=0, max_iter=15)
+    start = random_parameters(k, dim, generator)
+    found = loop.run_em(step, start, tol=0, max_iter=15)
     assume(torch.linalg.eigvalsh(found.parameters.covariances).min() > 1e-6)  # without regularisation
-    rises = np.diff(found.lower_bounds)
-    assert rises.min() > -1e-12
-    first = np.average(
-        logsumexp(scipy_log_joint(points, random_parameters(k, dim, _replayed(seed, points))), axis=1),
-        weights=weight.numpy(),
-    )
+    assert np.diff(found.lower_bounds).min() > -1e-12
+    first = np.average(logsumexp(scipy_log_joint(points, start), axis=1), weights=weight.numpy())
     assert found.lower_bounds[0] == pytest.approx(first, rel=1e-9)
-
-
-def _replayed(seed: int, points: Tensor) -> torch.Generator:
-    """The generator in its state before the starting parameters were drawn."""
-    generator = torch.Generator().manual_seed(seed)
-    random_points(*points.shape, generator)
-    torch.rand(points.shape[0], generator=generator, dtype=torch.float64)
-    return generator
 
 
 @settings(max_examples=25)
@@ -207,42 +196,6 @@ def test_empty_component_does_not_make_a_step_ill_conditioned():
     means = torch.tensor([[0.0, 0.0], [1e6, 0.0]], dtype=torch.float64)
     assert not em.is_ill_conditioned(Parameters(torch.tensor([1.0, 0.0]).double(), means, covariances))
     assert em.is_ill_conditioned(Parameters(torch.tensor([0.5, 0.5]).double(), means, covariances))
-
-
-def two_thin_walls(generator: torch.Generator) -> tuple[Tensor, Parameters]:
-    """Walls 1 mm thick that cross at an angle, with coordinates on multiples of 2⁻²⁴ m, and a start."""
-    n = 150
-    along = torch.rand(2, n, generator=generator, dtype=torch.float64) * 4 - 2
-    off = torch.randn(2, n, generator=generator, dtype=torch.float64) * 1e-3
-    walls = torch.cat([torch.stack([off[0], along[0]], 1), torch.stack([along[1], off[1] + 0.2], 1)])
-    points = torch.round(walls * 2**24) / 2**24
-    covariances = torch.diag_embed(torch.tensor([[2e-6, 1.0], [1.0, 2e-6]], dtype=torch.float64))
-    return points, Parameters(
-        torch.tensor([0.5, 0.5]).double(), points.new_tensor([[0, 0], [0, 0.2]]), covariances
-    )
-
-
-def test_thin_walls_500_km_apart_are_fitted_independently(generator):
-    local, start = two_thin_walls(generator)
-    shifts = torch.tensor([[-250_000.0, 0.0], [250_000.0, 4096.0]], dtype=torch.float64)
-    points = torch.cat([local + shifts[0], local + shifts[1]])  # exact: 24 fractional bits fit
-    both = Parameters(
-        torch.cat([start.weights, start.weights]) / 2,
-        torch.cat([start.means + shifts[0], start.means + shifts[1]]),
-        torch.cat([start.covariances, start.covariances]),
-    )
-    weight = points.new_ones(points.shape[0])
-    step = loop.natural_step(quadratic_features(points), weight, 1e-8, torch.float64, points)
-    separate = loop.natural_step(quadratic_features(local), weight[: len(local)], 1e-8, torch.float64)
-    far, near = both, start
-    for _ in range(3):
-        far, bound = step(far)
-        near, expected = separate(near)
-        assert bound == pytest.approx(expected - math.log(2), abs=1e-6)
-    for part, shift in ((slice(0, 2), shifts[0]), (slice(2, 4), shifts[1])):
-        torch.testing.assert_close(far.means[part] - shift, near.means, rtol=0, atol=1e-9)
-        torch.testing.assert_close(far.covariances[part], near.covariances, rtol=1e-5, atol=1e-11)
-        torch.testing.assert_close(2 * far.weights[part], near.weights, rtol=1e-6, atol=0)
 
 
 def test_log_joint_far_from_the_origin_equals_exact_arithmetic():
@@ -319,13 +272,6 @@ def test_em_converges_when_the_bound_stops_changing(generator):
     changes = np.abs(np.diff(found.lower_bounds))
     assert changes[-1] < 1e-4
     assert (changes[:-1] >= 1e-4).all()
-
-
-def test_em_stops_at_max_iter(generator):
-    points = random_points(50, 2, generator)
-    step = loop.natural_step(quadratic_features(points), points.new_ones(50), 1e-6, torch.float64)
-    found = loop.run_em(step, random_parameters(2, 2, generator), tol=0, max_iter=3)
-    assert (found.converged, found.n_iter) == (False, 3)
 
 
 @pytest.mark.parametrize("dim", [2, 3])

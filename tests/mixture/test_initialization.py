@@ -133,16 +133,6 @@ def test_kmeans_restarts_keep_the_clustering_of_least_scatter():
     assert min(restarted) < min(once)
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_few_distinct_points_give_copies_that_share_weights(method):
-    points = torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=torch.float64).repeat(10, 1)
-    weights, means, covariances = begin(method, points, 5)
-    assert weights.shape == (5,)
-    assert float(weights.sum()) == pytest.approx(1)
-    assert len({tuple(row) for row in means.tolist()}) == 2
-    assert float(torch.linalg.eigvalsh(covariances).min()) > 0
-
-
 # -- flat pieces -------------------------------------------------------------------------------------
 
 
@@ -180,13 +170,6 @@ def test_flat_pieces_of_cells_have_the_moments_of_their_points():
     found, labels = flat_pieces(means, cells.weight, 10, 1e-6, cells.features)
     assert labels.shape == (len(means),)
     check_moments(found, labels[cells.member], points.numpy(), weight.numpy())
-
-
-@pytest.mark.parametrize("n", [10, 20_000])
-def test_flat_pieces_of_equal_points_are_one(n):
-    found, labels = flat_pieces(torch.zeros(n, 3, dtype=torch.float64), torch.ones(n).double(), 5, 1e-6)
-    assert found.weights.tolist() == [pytest.approx(1)]
-    assert set(labels.tolist()) == {0}
 
 
 def test_moments_of_distant_thin_pieces_keep_their_digits():

@@ -20,14 +20,13 @@ from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.grouping import (
     Rows,
     centered_parameters,
-    choose_candidates,
     group_rows,
     nearest,
     rounding,
     truncated_expectation,
 )
 from gmmtorch.mixture.em.initialization import flat_pieces, moments_of
-from gmmtorch.mixture.em.truncated import Momentum, Settings, fit_truncated, run_truncated
+from gmmtorch.mixture.em.truncated import Settings, fit_truncated, run_truncated
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 
@@ -130,29 +129,6 @@ def test_momentum_converges_faster_than_em(n_iter, share):
     best = loop.run_em(step, parameters, tol=0.0, max_iter=1500).lower_bounds[-1]
     assert best - plain.lower_bounds[-1] > 1e-5  # plain EM converges slowly
     assert best - found.lower_bounds[-1] < share * (best - plain.lower_bounds[-1])
-
-
-def test_momentum_undo_gives_the_em_step_and_resets():
-    parameters, momentum = random_parameters(3, 2), Momentum(1e-6)
-    rows = rows_of(cloud(300, 2))
-
-    def expect(at: Parameters) -> Tensor:
-        groups = group_rows(rows, nearest(rows.points, at.means), at.means, torch.float64)
-        return truncated_expectation(groups, choose_candidates(groups, at, 16), at).statistics
-
-    step = loop.natural_step(rows.features(), rows.weight, 1e-6, torch.float64)
-    for moves in (False, False, True, True):
-        plain = step(parameters)[0]
-        following = momentum.step(expect(parameters), parameters)
-        assert momentum.is_extrapolated is moves
-        close = torch.allclose(following.means, plain.means, rtol=0, atol=1e-9)
-        assert close is not moves
-        parameters = following
-    undone = momentum.undo()
-    torch.testing.assert_close(tuple(undone), tuple(plain), rtol=1e-9, atol=1e-10)
-    assert not momentum.is_extrapolated
-    momentum.step(expect(undone), undone)
-    assert not momentum.is_extrapolated
 
 
 class Spy:

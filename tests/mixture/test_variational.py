@@ -136,18 +136,6 @@ def test_large_concentration_keeps_more_components():
 # -- weights of points -----------------------------------------------------------------------------
 
 
-@types
-def test_integer_weights_equal_repeated_points_in_the_posterior(prior_type):
-    x = blobs(2)
-    weight = np.random.default_rng(0).integers(1, 4, len(x))
-    weighted = variational(4, prior_type).fit(x, sample_weight=weight)
-    repeated = variational(4, prior_type).fit(np.repeat(x, weight, axis=0))
-    for name, value in weighted.state_dict().items():
-        torch.testing.assert_close(value, repeated.state_dict()[name], rtol=1e-8, atol=1e-8)
-    np.testing.assert_allclose(weighted.lower_bounds_, repeated.lower_bounds_, rtol=1e-9)
-    assert np.sum(weighted.support_) == pytest.approx(weight.sum())
-
-
 @settings(max_examples=30)
 @given(total=st.sampled_from([1e-12, 1e-3, 0.5, 1.0, 1.5, 1e12]), dim=st.integers(1, 3), n=st.integers(1, 6))
 def test_any_total_weight_gives_a_valid_mixture(total, dim, n):
