@@ -4,7 +4,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from occupancy.cone_examples import random_cones, tiled
+from occupancy.cone_cases import random_cones, tiled
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.occupancy import cone_index

@@ -6,9 +6,9 @@ import itertools
 
 import pytest
 import torch
-from flux_cases import draw_ends, normal, one_each, only, random_covariances, uniform
 from hypothesis import given
 from hypothesis import strategies as st
+from occupancy.cone_cases import draw_ends, normal, one_each, only, random_covariances, uniform
 
 from gmmtorch.occupancy import culling
 from gmmtorch.occupancy.cones import (
