@@ -88,15 +88,6 @@ def test_value_and_gradient_equal_autograd(dim, generator):
     torch.testing.assert_close(place.gradient, expected, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("dim", [1, 2, 3])
-def test_gradient_is_the_slope_along_geodesics(dim, generator):
-    place = random_iterate(2, dim, generator)
-    for _ in range(3):
-        tangent = torch.randn(place.gradient.shape, generator=generator, dtype=torch.float64)
-        rise = place.move(1e-5 * tangent).value - place.move(-1e-5 * tangent).value
-        assert rise / 2e-5 == pytest.approx(float((place.gradient * tangent).sum()), rel=1e-6)
-
-
 def test_float32_value_and_gradient_are_close(generator):
     state = generator.get_state()
     exact = random_iterate(3, 3, generator)

@@ -193,14 +193,6 @@ def test_only_the_smallest_cells_cross_a_step(at, turn, near, gap, center):
     assert mixed.numel() == 0 or float(mixed.max()) <= 64
 
 
-@pytest.mark.parametrize(("z", "is_merged"), [(0.5, False), (1.0, False), (3.0, True), (6.0, True)])
-def test_noise_grows_with_the_square_of_depth_beyond_one_metre(z, is_merged):
-    noise = torch.randn(64, 64, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    cells = pool_depth_image(z + 0.02 * noise, INTRINSICS, noise=0.01)  # 0.02 is 0.005 z² at 2 m
-    assert (float(cells.weight.median()) == 1024) is is_merged
-    assert (float(cells.weight.median()) == 64) is not is_merged
-
-
 def test_a_step_in_one_column_of_pixels_splits_cells():
     depth = torch.full((50, 1), 1.5)
     assert len(pool_depth_image(depth, INTRINSICS).weight) == 2

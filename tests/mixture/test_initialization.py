@@ -71,28 +71,12 @@ def test_integer_weights_equal_repeated_points_in_any_order(method):
     torch.testing.assert_close(tuple(found), tuple(same), rtol=1e-10, atol=1e-12)
 
 
-def test_random_points_are_distinct():
-    points = cloud(30, 2)
-    means = begin("random_points", points, 30).means
-    assert sorted(means.tolist()) == sorted(points.tolist())
-
-
 def test_random_points_are_drawn_by_weight():
     points = torch.arange(4.0, dtype=torch.float64)[:, None].expand(4, 2)
     weight = torch.tensor([1.0, 2.0, 3.0, 4.0], dtype=torch.float64)
     drawn = [float(begin("random_points", points, 1, weight, seed).means[0, 0]) for seed in range(800)]
     shares = np.bincount(np.array(drawn, dtype=int), minlength=4) / 800
     np.testing.assert_allclose(shares, [0.1, 0.2, 0.3, 0.4], atol=0.07)  # four standard errors
-
-
-def test_bounding_box_means_are_uniform():
-    points = torch.tensor([[-1.0, 2.0], [3.0, 2.5], [0.0, 4.0]], dtype=torch.float64).repeat(300, 1)
-    points = points + 1e-9 * torch.arange(900, dtype=torch.float64)[:, None]
-    means = begin("bounding_box", points, 900).means
-    unit = ((means - points.amin(0)) / (points.amax(0) - points.amin(0))).numpy()
-    for column in unit.T:
-        counts = np.histogram(column, bins=4, range=(0, 1))[0]
-        assert abs(counts - 225).max() < 60  # more than four standard deviations
 
 
 @pytest.mark.parametrize("method", ["random_points", "bounding_box"])

@@ -79,17 +79,6 @@ def test_thin_pieces_keep_min_weight():
     assert int(torch.bincount(labels).min()) >= 40
 
 
-def test_widest_pieces_are_halved_first_within_a_limit():
-    generator = torch.Generator().manual_seed(0)
-    wide = torch.randn(200, 2, generator=generator, dtype=torch.float64)
-    narrow = 0.1 * torch.randn(200, 2, generator=generator, dtype=torch.float64) + 50.0
-    points = torch.cat([wide, narrow])
-    labels, n_pieces = cut(points - points.mean(0), FlatnessRule(0.001, 0.001, 2, max_components=3))
-    assert n_pieces == 3
-    assert len(set(labels[200:].tolist())) == 1
-    assert len(set(labels[:200].tolist())) == 2
-
-
 def test_integer_weights_equal_repeated_points():
     points = cloud(120, 2, 4)
     weight = torch.randint(1, 4, (120,), generator=torch.Generator().manual_seed(0)).double()
@@ -182,13 +171,6 @@ def test_heavier_of_two_equal_shapes_is_halved_first():
     labels, n_pieces = cut(points - center, FlatnessRule(**ALL, max_components=3), weight)
     assert n_pieces == 3
     assert len(set(labels[:400].tolist())) == 1
-
-
-def test_two_sheets_are_separated_if_the_limit_allows():
-    points = sheets(0.3)
-    labels, _ = cut(points - points.mean(0), FlatnessRule(**ALL, max_components=16))
-    upper, lower = set(labels[::2].tolist()), set(labels[1::2].tolist())
-    assert not upper & lower
 
 
 def test_pieces_that_cannot_be_halved_do_not_use_up_the_levels():

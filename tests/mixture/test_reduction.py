@@ -108,10 +108,6 @@ def test_rounds_cost_little_more_than_greedy_merging(dim, n):
     rounds = simplify(parameters, n, most_exact=MOST_EXACT["rounds"])
     assert len(rounds.parameters.weights) == n
     assert rounds.bound < 1.05 * exact.bound
-    labels = torch.arange(300) % n
-    any_groups = Gaussians.of(merge_components(*parameters, labels, n)).half_log_dets[labels]
-    worse = parameters.weights @ (any_groups - Gaussians.of(parameters).half_log_dets)
-    assert float(worse) > 1.5 * exact.bound
 
 
 @costs
@@ -325,13 +321,6 @@ def test_invalid_mixture_is_rejected(change, error, match):
 def test_invalid_options_are_named(options, match):
     with pytest.raises(InvalidArgumentError, match=match):
         simplify(mixture(4, 2), **options)
-
-
-def test_simplify_does_not_modify_its_input():
-    parameters = mixture(30, 2)
-    before = Parameters(*(value.clone() for value in parameters))
-    simplify(parameters, 5)
-    assert all(torch.equal(*pair) for pair in zip(parameters, before, strict=True))
 
 
 # -- estimators ------------------------------------------------------------------------------------

@@ -60,17 +60,6 @@ def is_valid(gmm: GaussianMixture) -> bool:
 
 
 @dims
-@pytest.mark.parametrize("init", ["kmeans", "random_points", "bounding_box"])
-def test_first_batch_equals_one_step_of_batch_em(dim, init):
-    x = blobs(dim=dim)
-    stepped = exact(init_params=init).partial_fit(x, kappa=1.0)
-    fitted = exact(init_params=init, max_iter=1).fit(x)
-    assert_same(stepped, fitted, 1e-12)
-    assert stepped.lower_bounds_ == fitted.lower_bounds_
-    assert stepped.n_samples_seen_ == fitted.n_samples_seen_ == 300
-
-
-@dims
 def test_memory_zero_makes_every_call_a_step_of_batch_em(dim):
     x, weight = blobs(dim=dim, scale=2.0), np.random.default_rng(0).random(300)
     gmm = exact()
@@ -205,12 +194,6 @@ def test_fit_counts_as_its_number_of_points():
     assert_same(roomy, gmm, 0)
 
 
-def test_warm_start_continues_after_partial_fit():
-    x = blobs()
-    gmm = exact(warm_start=True, max_iter=5, tol=0).partial_fit(x).fit(x)
-    assert_same(gmm, exact(max_iter=6, tol=0).fit(x))
-
-
 def test_partial_fit_of_given_parameters_needs_memory():
     fitted = exact().fit(blobs())
     given = GaussianMixture.from_parameters(fitted.weights_, fitted.means_, fitted.covariances_)
@@ -338,16 +321,6 @@ def test_only_the_first_batch_needs_a_point_per_component():
         gmm.partial_fit(blobs(1, seed=seed))
     assert is_valid(gmm)
     assert gmm.n_samples_seen_ == 80
-
-
-def test_component_without_points_stays_unchanged():
-    far = exact().partial_fit(np.concatenate([blobs(90), blobs(90) + 1e4]))
-    k = int(far.means_[:, 0].argmax())
-    mean, covariance, weight = far.means_[k].copy(), far.covariances_[k].copy(), far.weights_[k]
-    far.partial_fit(blobs(180, seed=1), kappa=1.0)
-    np.testing.assert_allclose(far.means_[k], mean, rtol=1e-12)
-    np.testing.assert_allclose(far.covariances_[k], covariance, rtol=1e-9)
-    assert far.weights_[k] == pytest.approx(weight / 2)
 
 
 @pytest.mark.parametrize("kind", [np.asarray, torch.from_numpy])

@@ -158,43 +158,6 @@ def run_spied(monkeypatch: pytest.MonkeyPatch, spy: Spy, k: int = 20, max_iter: 
     return found
 
 
-def test_momentum_that_decreases_the_bound_is_undone(monkeypatch):
-    spy = Spy(failing=(4,))
-    found = run_spied(monkeypatch, spy)
-    assert found.n_iter == 12
-    assert len(spy.given) == 13
-    at, statistics = spy.given[3], spy.found[3].statistics
-    plain = em.maximization(statistics, 1e-6, at)
-    torch.testing.assert_close(spy.given[5].means, plain.means + at.means, rtol=1e-12, atol=1e-12)
-    assert not torch.allclose(spy.given[4].means, spy.given[5].means, rtol=0, atol=1e-9)
-    # The result is also EM's own step, although the momentum has extrapolated again by then.
-    at, statistics = spy.given[-1], spy.found[-1].statistics
-    plain = em.maximization(statistics, 1e-6, at)
-    torch.testing.assert_close(found.parameters.means, plain.means + at.means, rtol=1e-12, atol=1e-12)
-    torch.testing.assert_close(found.parameters.covariances[0], (plain.covariances[0]), rtol=1e-9, atol=0)
-
-
-def test_small_gain_of_an_extrapolated_step_does_not_end_the_run(monkeypatch):
-    points, _ = beads(1500, 20, gap=2.0)
-    rows = rows_of(torch.from_numpy(points - points.mean(0)))
-    first, owner = flat_pieces(rows.points, rows.weight, 20, 1e-6)
-    spy = Spy()
-
-    def weak(*arguments):
-        found = spy(*arguments)
-        if len(spy.found) == 5:  # an extrapolated step that gains a thousandth of tol
-            found = found._replace(value=spy.found[3].value + 1500 * 1e-7)
-        return found
-
-    monkeypatch.setattr(truncated, "truncated_expectation", weak)
-    found, *_ = run_truncated(rows, owner, first, Settings(1e-6, 1e-4, 300, torch.float64))
-    check_run(found, 300)
-    assert found.n_iter > 10
-    at, statistics = spy.given[4], spy.found[4].statistics
-    plain = em.maximization(statistics, 1e-6, at)
-    torch.testing.assert_close(spy.given[5].means, plain.means + at.means, rtol=1e-12, atol=1e-12)
-
-
 @pytest.mark.parametrize("failing", [(2,), (5, 6)])  # without and with momentum
 def test_candidates_that_decrease_the_bound_are_replaced_by_the_old_ones(monkeypatch, failing):
     spy = Spy(failing)

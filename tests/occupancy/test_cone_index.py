@@ -80,13 +80,6 @@ def test_pairs_occur_once_and_ascend_for_any_chunk_size(monkeypatch):
     assert sum(map(len, portions)) == len(set().union(*portions))
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-def test_lists_ascend(dim):
-    index = ConeIndex(random_cones(dim, 100, 0), 0.1)
-    bucket = torch.repeat_interleave(index.list_lengths())
-    assert bool((index.entries.diff()[bucket.diff() == 0] > 0).all())
-
-
 def test_cost_and_memory_do_not_depend_on_the_size_of_the_world():
     small, step = random_cones(3, 60, 4, room=True), 30.0
     large = tiled(small, 16, step)

@@ -238,14 +238,6 @@ def test_all_rays_start_in_the_cube_of_the_sensor_origin(resolution):
     torch.testing.assert_close(hits + misses, torch.full_like(hits, 50.0), rtol=1e-12, atol=0)
 
 
-def test_a_sensor_origin_inside_its_component_gives_finite_evidence():
-    cones = one_cone((1.0, 1.0, 1.0), (0.09, 0.04, 0.01), (1.0, 1.0, 1.0), 100.0)
-    points = torch.cat([cones.origins, near_rays(cones, 50, 0)])
-    hits, misses = point_evidence(cones, points, 0.1)
-    assert bool(torch.isfinite(hits + misses).all())
-    assert float(misses[0] + hits[0]) == pytest.approx(100)
-
-
 def test_evidence_is_zero_beyond_the_cutoff():
     cones = one_cone((3.0, 0.0, 0.0), (0.01, 0.01, 0.01), count=100.0)
     inf = float("inf")
