@@ -47,15 +47,7 @@ def classify(probability: ArrayLike, variance_threshold: float) -> Tensor:
             "0.25 means no dead band, the thesis uses 0.06."
         )
     half_width = 0.5 * math.sqrt(1 - 4 * variance_threshold)
-    return _labels(probability, 0.5 - half_width, 0.5 + half_width)
-
-
-def _labels(values: ArrayLike, free: float, occupied: float) -> Tensor:
-    probability = as_tensor(values, "probability")
-    label = torch.full_like(probability, CellClass.UNKNOWN, dtype=torch.int8)
-    label[probability > occupied] = int(CellClass.OCCUPIED)
-    label[probability < free] = int(CellClass.FREE)
-    return label
+    return Thresholds(0.5 - half_width, 0.5 + half_width).classify(probability)
 
 
 @dataclass(frozen=True)
@@ -74,7 +66,11 @@ class Thresholds:
 
     def classify(self, probability: ArrayLike) -> Tensor:
         """`CellClass` values (int8) of probabilities, any shape."""
-        return _labels(probability, self.free, self.occupied)
+        theta = as_tensor(probability, "probability")
+        label = torch.full_like(theta, CellClass.UNKNOWN, dtype=torch.int8)
+        label[theta > self.occupied] = int(CellClass.OCCUPIED)
+        label[theta < self.free] = int(CellClass.FREE)
+        return label
 
 
 @dataclass(frozen=True, repr=False)

@@ -12,7 +12,7 @@ from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import MemoryLimitError
 from gmmtorch.kernels.rays.ray_counting import count_in_grid
 from gmmtorch.occupancy.grid import BYTES_PER_CELL, MEMORY_LIMIT
-from gmmtorch.occupancy.voxels.boxes import Box, flat_index, to_lattice
+from gmmtorch.occupancy.voxels.boxes import Box, flat_index, intersection, to_lattice
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 
 _CHUNK_VISITS = 1 << 16  # fastest when cores share a cache
@@ -127,8 +127,8 @@ def rays_in_box(
     places = [x for x in (starts, stops, others) if x is not None and len(x)]
     corners = torch.stack([x.amin(0) for x in places] + [x.amax(0) for x in places]).floor().long()
     lowest, highest = corners.amin(0), corners.amax(0) + 1
-    window = Box(torch.maximum(lowest, box.low), torch.minimum(highest, box.high))
-    if bool((window.low >= window.high).any()):
+    window = intersection(Box(lowest, highest), box)
+    if window is None:
         return None
     stops = stops if until is None else until
     if torch.equal(window.low, lowest) and torch.equal(window.high, highest):

@@ -237,10 +237,7 @@ def _cut_triangles(panels: _Panels, ratio: Tensor) -> _Panels:
 
 def square_on(monomials: Tensor, start: Tensor, edges: Tensor) -> Tensor:
     """|start + Σ f_i edge_i|² at the nodes f of a rule with these `monomials`: (n, P)."""
-    terms = [dot(start, start), *(2 * dot(start, edge) for edge in edges)]
-    for i, edge in enumerate(edges):
-        terms += [dot(edge, edge), *(2 * dot(edge, other) for other in edges[i + 1 :])]
-    return monomials @ torch.stack(terms)
+    return product_on(monomials, start, start, edges)
 
 
 def product_on(monomials: Tensor, a: Tensor, b: Tensor, edges: Tensor) -> Tensor:
