@@ -9,7 +9,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from mixture.truncated_cases import cloud
+from mixture.mixture_cases import cloud
 
 from gmmtorch.kernels import kernels
 from gmmtorch.mixture import GaussianMixture

@@ -12,6 +12,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from mixture.fit_contract import check_mixture, degenerate_clouds, move, rigid_motion
+from mixture.mixture_cases import cloud
 from sklearn.base import clone
 from torch import Tensor
 
@@ -52,10 +53,6 @@ def sphere(n: int, seed: int = 0) -> Tensor:
     return points * (1 + 0.002 * torch.randn(n, 1, generator=generator, dtype=torch.float64))
 
 
-def clutter(n: int, dim: int = 3, seed: int = 0) -> Tensor:
-    return torch.randn(n, dim, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
 def count(points: Tensor, noise: float = NOISE, weight: Tensor | None = None) -> int:
     weight = points.new_ones(len(points)) if weight is None else weight
     found, labels = surface_pieces(points - points.mean(0), weight, noise, 1e-6)
@@ -74,7 +71,7 @@ def fitted(points: Tensor | np.ndarray, **options) -> GaussianMixture:
 
 def test_flat_wall_is_one_component_and_clutter_many():
     assert [count(wall(n, (0, 0, 0), 1, 0)) for n in (10, 1000, 30_000)] == [1, 1, 1]
-    assert count(clutter(1000)) > 15
+    assert count(cloud(1000, 3)) > 15
 
 
 def test_room_has_large_pieces_on_walls_and_small_ones_at_edges():
@@ -88,7 +85,7 @@ def test_room_has_large_pieces_on_walls_and_small_ones_at_edges():
     assert float(from_edge[~flat[labels]].max()) < 1
     inside = from_edge > 0.6
     assert float(size[labels][inside].double().mean()) > 6 * least_support(3)
-    assert len(size) < 0.6 * count(clutter(12_000))
+    assert len(size) < 0.6 * count(cloud(12_000, 3))
 
 
 def test_less_noise_gives_more_pieces_of_a_curved_surface():
@@ -102,13 +99,13 @@ def test_less_noise_gives_more_pieces_of_a_curved_surface():
 
 @pytest.mark.parametrize("unit", [1e-6, 1e-3, 1e3])
 def test_number_does_not_depend_on_the_unit(unit):
-    for points in (room(200), sphere(3000), clutter(500)):
+    for points in (room(200), sphere(3000), cloud(500, 3)):
         assert count(unit * points, unit * NOISE) == count(points)
 
 
 def test_noise_in_another_unit_gives_one_or_the_most_components():
-    assert count(1e-3 * clutter(2000)) == 1
-    n = count(1e3 * clutter(2000))
+    assert count(1e-3 * cloud(2000, 3)) == 1
+    n = count(1e3 * cloud(2000, 3))
     assert 2000 / (4 * least_support(3)) <= n <= 2000 / least_support(3)
 
 
@@ -129,16 +126,16 @@ def test_weights_count_as_points():
     weight = torch.randint(1, 4, (len(points),), generator=torch.Generator().manual_seed(1)).double()
     assert count(points, weight=weight) == count(points.repeat_interleave(weight.long(), 0))
     # Ten times the weight supports more components; a thousandth of it supports a single one.
-    assert count(clutter(300), weight=torch.full((300,), 10.0).double()) > 2 * count(clutter(300))
-    assert count(clutter(300), weight=torch.full((300,), 1e-3).double()) == 1
+    assert count(cloud(300, 3), weight=torch.full((300,), 10.0).double()) > 2 * count(cloud(300, 3))
+    assert count(cloud(300, 3), weight=torch.full((300,), 1e-3).double()) == 1
 
 
 @pytest.mark.parametrize("dim", [2, 3, 5])
 def test_number_does_not_depend_on_motion_or_order(dim):
-    points = clutter(600, dim).numpy() * np.array([3.0, 1.0, 0.02, 0.5, 1.0])[:dim]
+    points = cloud(600, dim).numpy() * np.array([3.0, 1.0, 0.02, 0.5, 1.0])[:dim]
     moved = move(rigid_motion(dim, seed=1), points)
     shuffled = np.random.default_rng(0).permutation(points)
-    counts = {count(torch.from_numpy(cloud)) for cloud in (points, moved, shuffled, points + 5e5)}
+    counts = {count(torch.from_numpy(points)) for points in (points, moved, shuffled, points + 5e5)}
     assert len(counts) == 1
 
 

@@ -10,8 +10,8 @@ import pytest
 import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from mixture.mixture_cases import cloud, random_parameters, random_weight, scipy_log_joint
 from scipy.special import logsumexp
-from scipy.stats import multivariate_normal
 from torch import Tensor
 
 from gmmtorch.kernels import chunks
@@ -19,26 +19,6 @@ from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em import loop
 from gmmtorch.mixture.em.cells import pool_into_cells
 from gmmtorch.mixture.em.exact import Parameters, quadratic_features
-
-
-def random_parameters(k: int, dim: int, generator: torch.Generator, spread: float = 2.0) -> Parameters:
-    weights = torch.rand(k, generator=generator, dtype=torch.float64) + 0.1
-    root = torch.randn(k, dim, dim, generator=generator, dtype=torch.float64)
-    means = spread * torch.randn(k, dim, generator=generator, dtype=torch.float64)
-    return Parameters(weights / weights.sum(), means, root @ root.mT + 0.2 * torch.eye(dim).double())
-
-
-def random_points(n: int, dim: int, generator: torch.Generator) -> Tensor:
-    return 2 * torch.randn(n, dim, generator=generator, dtype=torch.float64)
-
-
-def scipy_log_joint(points: Tensor, parameters: Parameters) -> np.ndarray:
-    weights, means, covariances = (p.numpy() for p in parameters)
-    columns = [
-        np.log(w) + multivariate_normal(m, c).logpdf(points.numpy())
-        for w, m, c in zip(weights, means, covariances, strict=True)
-    ]
-    return np.stack(np.atleast_2d(columns), -1).reshape(len(points), -1)
 
 
 def brute_force_statistics(
@@ -60,8 +40,8 @@ def brute_force_statistics(
 
 
 @pytest.mark.parametrize("dim", [1, 2, 3])
-def test_quadratic_features_are_one_x_and_products(dim, generator):
-    x = random_points(4, dim, generator)
+def test_quadratic_features_are_one_x_and_products(dim):
+    x = cloud(4, dim)
     for row, feature in zip(x.tolist(), quadratic_features(x).tolist(), strict=True):
         assert feature == [1.0, *row, *(row[i] * row[j] for i in range(dim) for j in range(i, dim))]
     assert em.feature_dimension(quadratic_features(x).shape[1]) == dim
@@ -69,19 +49,19 @@ def test_quadratic_features_are_one_x_and_products(dim, generator):
 
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("k", [1, 5])
-def test_features_times_natural_parameters_are_weighted_log_densities(dim, k, generator):
-    parameters = random_parameters(k, dim, generator)
-    points = random_points(50, dim, generator)
+def test_features_times_natural_parameters_are_weighted_log_densities(dim, k):
+    parameters = random_parameters(k, dim)
+    points = cloud(50, dim)
     product = quadratic_features(points) @ em.natural_parameters(parameters).T
     np.testing.assert_allclose(product.numpy(), scipy_log_joint(points, parameters), rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize(("dtype", "rtol"), [(torch.float64, 1e-11), (torch.float32, 3e-6)])
-def test_expectation_equals_a_loop_over_points(dim, dtype, rtol, generator):
-    parameters = random_parameters(4, dim, generator)
-    points = random_points(60, dim, generator)
-    weight = torch.rand(60, generator=generator, dtype=torch.float64) * 3
+def test_expectation_equals_a_loop_over_points(dim, dtype, rtol):
+    parameters = random_parameters(4, dim)
+    points = cloud(60, dim)
+    weight = 3 * random_weight(60, 1)
     statistics, total = em.expectation(
         quadratic_features(points), weight, em.natural_parameters(parameters), dtype
     )
@@ -91,10 +71,10 @@ def test_expectation_equals_a_loop_over_points(dim, dtype, rtol, generator):
     assert float(total) == pytest.approx(expected_total, rel=rtol)
 
 
-def test_chunks_do_not_change_the_statistics(generator, monkeypatch):
-    parameters = random_parameters(3, 3, generator)
-    features = quadratic_features(random_points(500, 3, generator))
-    weight = torch.rand(500, generator=generator, dtype=torch.float64)
+def test_chunks_do_not_change_the_statistics(monkeypatch):
+    parameters = random_parameters(3, 3)
+    features = quadratic_features(cloud(500, 3))
+    weight = random_weight(500, 1)
     natural = em.natural_parameters(parameters)
     whole = em.expectation(features, weight, natural, torch.float64)
     labels = em.most_likely(features, parameters)
@@ -104,16 +84,16 @@ def test_chunks_do_not_change_the_statistics(generator, monkeypatch):
     assert torch.equal(em.most_likely(features, parameters), labels)
 
 
-def test_most_likely_equals_scipy(generator):
-    parameters = random_parameters(6, 2, generator)
-    points = random_points(300, 2, generator)
+def test_most_likely_equals_scipy():
+    parameters = random_parameters(6, 2)
+    points = cloud(300, 2)
     labels = em.most_likely(quadratic_features(points), parameters)
     assert labels.tolist() == scipy_log_joint(points, parameters).argmax(1).tolist()
 
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_maximization_gives_weighted_means_and_covariances(dim, generator):
-    points = random_points(40, dim, generator)
+    points = cloud(40, dim)
     gamma = torch.rand(40, 3, generator=generator, dtype=torch.float64)
     found = em.maximization(gamma.T @ quadratic_features(points), reg_covar=0.25)
     for k in range(3):
@@ -131,11 +111,10 @@ def test_maximization_gives_weighted_means_and_covariances(dim, generator):
 @settings(max_examples=25)
 @given(seed=st.integers(0, 10**6), dim=st.integers(2, 3), k=st.integers(1, 5))
 def test_log_likelihood_never_decreases(seed, dim, k):
-    generator = torch.Generator().manual_seed(seed)
-    points = random_points(60 * k, dim, generator)
-    weight = torch.rand(60 * k, generator=generator, dtype=torch.float64) + 0.01
+    points = 2 * cloud(60 * k, dim, seed)
+    weight = random_weight(60 * k, seed + 2)
     step = loop.natural_step(quadratic_features(points), weight, 0.0, torch.float64, points)
-    start = random_parameters(k, dim, generator)
+    start = random_parameters(k, dim, seed + 1, spread=2.0, size=1.0)
     found = loop.run_em(step, start, tol=0, max_iter=15)
     assume(torch.linalg.eigvalsh(found.parameters.covariances).min() > 1e-6)  # without regularisation
     assert np.diff(found.lower_bounds).min() > -1e-12
@@ -146,12 +125,11 @@ def test_log_likelihood_never_decreases(seed, dim, k):
 @settings(max_examples=25)
 @given(seed=st.integers(0, 10**6), dim=st.integers(2, 3), k=st.integers(1, 4))
 def test_bound_on_cells_never_decreases_and_is_below_the_log_likelihood(seed, dim, k):
-    generator = torch.Generator().manual_seed(seed)
-    points = random_points(1000, dim, generator)
+    points = 2 * cloud(1000, dim, seed)
     cells = pool_into_cells(points, 200, 0.05)
     assert cells.weight.shape[0] < 1000
     step = loop.natural_step(cells.features, cells.weight, 0.0, torch.float64)
-    parameters = random_parameters(k, dim, generator)
+    parameters = random_parameters(k, dim, seed + 1, spread=2.0, size=1.0)
     previous = -math.inf
     for _ in range(12):
         likelihood = logsumexp(scipy_log_joint(points, parameters), axis=1).mean()
@@ -164,10 +142,10 @@ def test_bound_on_cells_never_decreases_and_is_below_the_log_likelihood(seed, di
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_direct_and_natural_steps_agree(dim, generator):
-    points = random_points(200, dim, generator)
-    weight = torch.rand(200, generator=generator, dtype=torch.float64)
-    start = random_parameters(4, dim, generator)
+def test_direct_and_natural_steps_agree(dim):
+    points = cloud(200, dim)
+    weight = random_weight(200, 1)
+    start = random_parameters(4, dim)
     natural, bound = loop.natural_step(quadratic_features(points), weight, 1e-4, torch.float64)(start)
     direct, total = em.direct_step(points, weight, start, 1e-4)
     torch.testing.assert_close(natural, direct, rtol=1e-10, atol=1e-12)
@@ -215,9 +193,9 @@ def test_log_joint_far_from_the_origin_equals_exact_arithmetic():
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("direct", [False, True])
-def test_component_of_weight_zero_stays_unchanged(dtype, direct, generator):
-    points = random_points(80, 2, generator)
-    start = random_parameters(3, 2, generator)
+def test_component_of_weight_zero_stays_unchanged(dtype, direct):
+    points = cloud(80, 2)
+    start = random_parameters(3, 2)
     weights = torch.tensor([0.4, 0.0, 0.6], dtype=torch.float64)
     parameters = Parameters(weights, start.means, start.covariances)
     ones = points.new_ones(80)
@@ -237,10 +215,10 @@ def test_component_of_weight_zero_stays_unchanged(dtype, direct, generator):
 # -- the loop -------------------------------------------------------------------------------------
 
 
-def test_em_converges_when_the_bound_stops_changing(generator):
-    points = random_points(300, 2, generator)
+def test_em_converges_when_the_bound_stops_changing():
+    points = cloud(300, 2)
     step = loop.natural_step(quadratic_features(points), points.new_ones(300), 1e-6, torch.float64)
-    start = random_parameters(2, 2, generator)
+    start = random_parameters(2, 2)
     seen: list[tuple[int, float]] = []
     found = loop.run_em(step, start, tol=1e-4, on_iteration=lambda i, bound: seen.append((i, bound)))
     assert found.converged
@@ -252,11 +230,11 @@ def test_em_converges_when_the_bound_stops_changing(generator):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_a_step_from_a_flat_covariance_takes_the_checked_natural_parameters(dim, generator):
+def test_a_step_from_a_flat_covariance_takes_the_checked_natural_parameters(dim):
     """The fused kernel refuses a covariance of rank D − 1; the bound is then that of the checked form."""
-    points = random_points(80, dim, generator)
+    points = cloud(80, dim)
     features, weight = quadratic_features(points), points.new_ones(80)
-    start = random_parameters(3, dim, generator)
+    start = random_parameters(3, dim)
     start.covariances[1, :, -1] = start.covariances[1, -1, :] = 0.0
     new, bound = loop.natural_step(features, weight, 1e-4, torch.float64)(start)
     statistics, value = em.expectation(features, weight, em.natural_parameters(start), torch.float64)

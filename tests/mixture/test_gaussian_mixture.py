@@ -8,8 +8,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from mixture.dtype_recorder import DtypeRecorder
-from mixture.mixture_cases import blobs, fitted, given_start
+from mixture.mixture_cases import DtypeRecorder, blobs, fitted, given_start
 from sklearn import mixture as sklearn_mixture
 from sklearn.model_selection import GridSearchCV
 from sklearn.pipeline import make_pipeline

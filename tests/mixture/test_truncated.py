@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from mixture.dtype_recorder import DtypeRecorder
 from mixture.fit_contract import FitContract, check_mixture
-from mixture.truncated_cases import beads, cloud, room
+from mixture.mixture_cases import DtypeRecorder, beads, cloud, room
 from torch import Tensor
 
 from gmmtorch.datasets.point_files.point_chunks import in_memory

@@ -10,7 +10,7 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from mixture.fit_contract import check_mixture
-from mixture.truncated_cases import beads, cloud, random_parameters, random_weight, room, rows_of
+from mixture.mixture_cases import beads, cloud, random_parameters, random_weight, room, rows_of
 from torch import Tensor
 
 from gmmtorch.mixture import GaussianMixture
