@@ -21,6 +21,7 @@ from gmmtorch.kernels.rays.cell_entropy import occupancy_probability as occupanc
 from gmmtorch.kernels.rays.ray_counting import count_in_grid
 from gmmtorch.kernels.rays.ray_traversal import CHUNK_VISITS
 from gmmtorch.occupancy.grid import VoxelGrid
+from gmmtorch.occupancy.voxels.boxes import flat_index
 
 
 class CellClass(IntEnum):
@@ -48,15 +49,7 @@ def classify(probability: ArrayLike, variance_threshold: float) -> Tensor:
             "0.25 means no dead band, the thesis uses 0.06."
         )
     half_width = 0.5 * math.sqrt(1 - 4 * variance_threshold)
-    return _labels(probability, 0.5 - half_width, 0.5 + half_width)
-
-
-def _labels(values: ArrayLike, free: float, occupied: float) -> Tensor:
-    probability = as_tensor(values, "probability")
-    label = torch.full_like(probability, CellClass.UNKNOWN, dtype=torch.int8)
-    label[probability > occupied] = int(CellClass.OCCUPIED)
-    label[probability < free] = int(CellClass.FREE)
-    return label
+    return Thresholds(0.5 - half_width, 0.5 + half_width).classify(probability)
 
 
 @dataclass(frozen=True)
@@ -75,7 +68,11 @@ class Thresholds:
 
     def classify(self, probability: ArrayLike) -> Tensor:
         """`CellClass` values (int8) of probabilities, any shape."""
-        return _labels(probability, self.free, self.occupied)
+        theta = as_tensor(probability, "probability")
+        label = torch.full_like(theta, CellClass.UNKNOWN, dtype=torch.int8)
+        label[theta > self.occupied] = int(CellClass.OCCUPIED)
+        label[theta < self.free] = int(CellClass.FREE)
+        return label
 
 
 @dataclass(frozen=True, repr=False)
@@ -165,7 +162,7 @@ class Evidence:
             counts = None if weights is None else weights[part]
             misses, shape = self.misses.view(-1), self.grid.shape
             count_in_grid(misses, starts, stops, shape, counts, chunk_visits=chunk_visits, compiled=compiled)
-            cell, counted = self.grid.flat_index_of_units(stops)
+            cell, counted = flat_index(stops.floor(), shape)
             if is_hit is not None:
                 counted = counted & is_hit[part]
             added = counted.double() if counts is None else counts * counted
