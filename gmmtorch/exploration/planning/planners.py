@@ -13,6 +13,7 @@ import torch
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.exploration.information.view_cache import InformationDiscount, ViewCache
 from gmmtorch.exploration.information.view_evaluator import ViewEvaluator
+from gmmtorch.exploration.information.view_library import SPACING
 from gmmtorch.exploration.planning.frontier import FrontierPlanner
 from gmmtorch.exploration.planning.global_planner import Journey
 from gmmtorch.exploration.planning.planner_interface import Plan, Planner, PlanningTask, Waiting, options
@@ -170,7 +171,7 @@ class TreePlanner:
         if self._journey is not None:
             known.append(self._journey.pose[None])
         apart = torch.cdist(poses[:, :3], torch.cat(known)[:, :3])
-        values = values.masked_fill((apart < task.library.spacing).any(1), 0.0)
+        values = values.masked_fill((apart < SPACING).any(1), 0.0)
         task.library.add(poses, values, task.now, self._rule.worthwhile * self._largest, self._rule.n_added)
 
 
