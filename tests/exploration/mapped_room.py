@@ -51,7 +51,7 @@ def mapper(
     belief = BeliefMap(0.2, BOX, torch.ones(BOX.shape, dtype=torch.bool), BeliefRule())
     rule, memo = replace(FrameRule(), **options), Memo(256) if memo is None else memo
     shared = Replica(robot, dim=3, incarnation=0) if codec == "replica" else Broadcast(robot, codec)
-    return GmmMapper(robot, local, belief, CAMERA.width, novelty, rule, memo, shared)
+    return GmmMapper(local, belief, CAMERA.width, novelty, rule, memo, shared)
 
 
 def heard(*datagrams: bytes, sender: int = 0) -> list[ReceivedMessage]:

@@ -28,7 +28,7 @@ from gmmtorch.exploration.robot.agent import Agent
 from gmmtorch.exploration.robot.grid_mapper import GridMapper
 from gmmtorch.exploration.robot.initial_free_space import InitialFreeSpace
 from gmmtorch.exploration.robot.mapper import Mapper, Memo
-from gmmtorch.exploration.robot.robot_state import Robot
+from gmmtorch.exploration.robot.robot_state import Robot, StoppingRule
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 from gmmtorch.sharing.messages.message_registry import (
     PlanMessage,
@@ -82,7 +82,7 @@ def agent(number: int = 0, kind: str = "replica", **options: Any) -> tuple[Agent
         local, belief = made.local, made.belief
         made = GridMapper(number, local, belief, CAMERA.width, NOVELTY, Memo(64), team.shares, team.size)
     library = ViewLibrary(number, incarnation=0)
-    robot = Robot(number, START, made, Ahead(), library, Roadmap(), LAUNCH)
+    robot = Robot(number, START, made, Ahead(), library, Roadmap(), LAUNCH, StoppingRule())
     post = Post()
     return Agent(robot, post, EVALUATOR, PRIMITIVES, team, Memo(256), Stopwatch()), post
 
@@ -272,14 +272,6 @@ def test_a_moving_robot_sends_every_plan_and_the_first_at_rest() -> None:
     told = [decode(datagram).number for _, datagram in post.of("plans")]
     # The plan that comes to rest still moves; the next one is the first at rest.
     assert told == [0, 1, 2, 3, 13, 18, 19, 20]
-
-
-def test_a_proposal_needs_a_snapshot_of_the_map() -> None:
-    one, _ = agent()
-    with pytest.raises(RuntimeError, match="begin_planning"):
-        one.propose(0.0, [], PeerTrajectories.of([]))
-    one.follow()
-    one.send_plan(0.0, 1)
 
 
 # -- what it sends ----------------------------------------------------------------------------------------

@@ -16,7 +16,8 @@ from torch import Tensor
 from gmmtorch.exploration.mission.mission import Mission
 from gmmtorch.exploration.mission.team_setup import assemble
 from gmmtorch.exploration.planning.coordination import PeerTrajectories
-from gmmtorch.exploration.planning.planner_interface import Plan, Waiting, is_boxed_in
+from gmmtorch.exploration.planning.planner_interface import Plan
+from gmmtorch.exploration.planning.recovery import Waiting, is_boxed_in
 from gmmtorch.exploration.robot.agent import Agent
 from gmmtorch.exploration.robot.robot_state import StoppingRule
 from gmmtorch.exploration.world.world import World

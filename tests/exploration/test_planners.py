@@ -21,24 +21,11 @@ from gmmtorch.exploration.planning.collision_checking import feasible
 from gmmtorch.exploration.planning.coordination import PeerTrajectories
 from gmmtorch.exploration.planning.global_planner import Journey
 from gmmtorch.exploration.planning.planner_interface import Plan
-from gmmtorch.exploration.planning.planners import (
-    PLANNERS,
-    RandomPlanner,
-    TreePlanner,
-    TreeRule,
-    make_planner,
-)
-from gmmtorch.exploration.planning.tree_search import SearchRule
-
-SMALL = TreeRule(search=SearchRule(n_rounds=3, n_leaves=24))
+from gmmtorch.exploration.planning.planners import PLANNERS, make_planner
 
 
 def planner_named(name: str):
-    return (
-        TreePlanner(PRIMITIVES, EVALUATOR, SMALL)
-        if name == "mcts"
-        else make_planner(name, PRIMITIVES, EVALUATOR)
-    )
+    return make_planner(name, PRIMITIVES, EVALUATOR)
 
 
 def same(one: Plan, other: Plan) -> bool:
@@ -164,7 +151,7 @@ def test_random_planner_persists_and_changes():
     explorer = Explorer.at(hollow(80, 60, 13), (6.0, 6.0, 1.2, 0.0))
     explorer.misses[~explorer.solid] = 9.0
     explorer.hits[explorer.solid] = 9.0
-    plans = explore(RandomPlanner(PRIMITIVES), explorer, 30)
+    plans = explore(planner_named("random"), explorer, 30)
     speeds = torch.stack([plan.path[-1, 4:] for plan in plans])
     kept = (speeds[1:] == speeds[:-1]).all(1).float().mean()
     assert 0.2 < float(kept) < 0.9
@@ -174,5 +161,3 @@ def test_random_planner_persists_and_changes():
 def test_bad_input_is_named():
     with pytest.raises(InvalidArgumentError, match="planner='best'"):
         make_planner("best", PRIMITIVES, EVALUATOR)
-    with pytest.raises(InvalidArgumentError, match="persistence"):
-        make_planner("random", PRIMITIVES, EVALUATOR, persistence=1.0)

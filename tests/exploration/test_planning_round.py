@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Collection
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -32,7 +33,7 @@ class Recorder:
 
     def __init__(self, number: int, log: list[tuple[str, int, Any]], values: list[float]) -> None:
         self.number, self._log, self._values = number, log, values
-        self.braking = states(2, -float(number + 1))
+        self.robot = SimpleNamespace(braking=states(2, -float(number + 1)))
         self.peers: list[PeerTrajectories] = []
 
     def _note(self, name: str, *about: Any) -> None:

@@ -51,7 +51,6 @@ def task(free: bool = False, trail: Tensor | None = None, **changes: Any) -> Pla
         **changes,
     }
     return PlanningTask(
-        robot=0,
         local_map=local_map,
         residual=torch.ones(500),
         library=ViewLibrary(0),

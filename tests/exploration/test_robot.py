@@ -15,7 +15,7 @@ from gmmtorch.exploration.planning.roadmap import Roadmap
 from gmmtorch.exploration.robot.grid_mapper import GridMapper
 from gmmtorch.exploration.robot.initial_free_space import InitialFreeSpace
 from gmmtorch.exploration.robot.mapper import Memo
-from gmmtorch.exploration.robot.robot_state import Robot
+from gmmtorch.exploration.robot.robot_state import Robot, StoppingRule
 from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule
 from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.occupancy.voxels.boxes import Box
@@ -24,6 +24,7 @@ from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 
 BOX = Box(torch.tensor([0, 0, 0]), torch.tensor([32, 32, 16]))
+WINDOW = (32, 32, 16)
 START = torch.tensor([3.1, 3.1, 1.5, 0.3], dtype=torch.float64)
 
 
@@ -37,11 +38,11 @@ class Idle:
 def robot(start_radius: float = 0.0) -> Robot:
     belief = BeliefMap(0.2, BOX, torch.ones(BOX.shape, dtype=torch.bool), BeliefRule())
     mapper = GridMapper(
-        0, RollingWindow(0.2, (32, 32, 16), 4), belief, 8, NoveltyRule(resolution=0.2), Memo(8), True, 3
+        0, RollingWindow(0.2, WINDOW, 4), belief, 8, NoveltyRule(resolution=0.2), Memo(8), True, 3
     )
     mapper.center_on(START[:3])
     launch = InitialFreeSpace(cells_in_sphere(START[:3], start_radius, 0.2), START[None, :3])
-    return Robot(0, START, mapper, Idle(), ViewLibrary(0), Roadmap(), launch)
+    return Robot(0, START, mapper, Idle(), ViewLibrary(0), Roadmap(), launch, StoppingRule())
 
 
 def plan(path: Tensor) -> Plan:
@@ -147,12 +148,12 @@ def test_a_retreat_shortens_the_trail() -> None:
 def test_recent_returns_are_obstacles() -> None:
     one = robot()
     everywhere(one, 0.0, 50.0)
-    free = one.local_map(0.125, 0.3)
+    free = one.local_map(0.125, 0.3, WINDOW)
     wall = torch.tensor([[4.5, 3.1, 1.5], [4.5, 3.3, 1.5]], dtype=torch.float64)
     thin = torch.tensor([[2.1, 3.1, 1.5]], dtype=torch.float64)  # the end of an empty beam
     ends, is_hit = torch.cat([wall, thin]), torch.tensor([True, True, False])
     one._remember_returns(DepthFrame(START[:3], ends, is_hit, torch.arange(3)))
-    found = one.local_map(0.125, 0.3)
+    found = one.local_map(0.125, 0.3, WINDOW)
     taken = free.free & ~found.free
     cells = (wall / 0.2).floor().long()
     assert (taken.nonzero() + found.low).tolist() == cells.tolist()
@@ -165,15 +166,15 @@ def test_recent_returns_are_obstacles() -> None:
     nothing = DepthFrame(START[:3], ends[2:], is_hit[2:], torch.arange(1))
     for _ in range(20):
         one._remember_returns(nothing)
-    assert not bool(one.local_map(0.125, 0.3).is_passable(wall).any())
+    assert not bool(one.local_map(0.125, 0.3, WINDOW).is_passable(wall).any())
     elsewhere = DepthFrame(START[:3], wall[:1] + 1.0, is_hit[:1], torch.arange(1))
     for _ in range(12):
         one._remember_returns(elsewhere)
-    assert bool(one.local_map(0.125, 0.3).is_passable(wall).all())
+    assert bool(one.local_map(0.125, 0.3, WINDOW).is_passable(wall).all())
 
 
 def test_the_known_sphere_around_the_start_is_free() -> None:
-    found = robot(start_radius=1.4).local_map(0.125, 0.3)
+    found = robot(start_radius=1.4).local_map(0.125, 0.3, WINDOW)
     centers = found.centers(found.free.nonzero())
     assert len(centers) > 100
     assert float((centers - START[:3]).norm(dim=1).max()) <= 1.4

@@ -123,7 +123,7 @@ class Explorer:
         self.roadmap.update(local_map)
         n_blocks = math.prod(-(-n // 4) for n in self.solid.shape)
         return PlanningTask(
-            0, self.state, local_map, peers, torch.ones(n_blocks), self.library, self.roadmap,
+            self.state, local_map, peers, torch.ones(n_blocks), self.library, self.roadmap,
             self.now, generator,
         )  # fmt: skip
 

@@ -122,7 +122,7 @@ def make_agent(
         ViewLibrary(number, incarnation=incarnation),
         Roadmap(),
         start,
-        rest=options.rest,
+        options.rest,
     )
     watch = Stopwatch() if watch is None else watch
     return Agent(robot, transport, evaluator, primitives, options, memo, watch)
@@ -157,4 +157,4 @@ def _mapper(
         shared = Replica(number, dim=3, incarnation=incarnation)
     else:
         shared = Broadcast(number, options.codec)
-    return GmmMapper(number, local, belief, width, options.novelty, options.frame, evidence, shared)
+    return GmmMapper(local, belief, width, options.novelty, options.frame, evidence, shared)

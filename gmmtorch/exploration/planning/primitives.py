@@ -170,9 +170,7 @@ class Primitives:
         return torch.stack([length.flatten(1).amax(1), step[..., 3].abs().flatten(1).amax(1)], 1)
 
     def _follows(self, states: Tensor) -> Tensor | None:
-        """Return the primitive (N,) whose final velocities each state (N, 7) has; None if any state has
-        none.
-        """
+        """Return the primitive (N,) with the velocities of each state (N, 7); None if a state has none."""
         is_end = (states[:, None, 4:] == self.commands).all(-1)
         which = is_end.int().argmax(1)
         return which if bool(is_end.any(1).all()) else None
@@ -197,9 +195,7 @@ def _moved(paths: Tensor, states: Tensor) -> Tensor:
 
 
 def _integrated(states: Tensor, commands: Tensor, dynamics: Dynamics, n_steps: int) -> Tensor:
-    """Return states (..., n_steps, 7) after states (..., 7) while the velocities change to commands (...,
-    3).
-    """
+    """Return states (..., n_steps, 7) while velocities change from states (..., 7) to commands (..., 3)."""
     h = dynamics.step
     velocity = dynamics.velocities(states.double(), commands, n_steps)
     x, y, z, yaw = (states[..., i, None].double() for i in range(4))

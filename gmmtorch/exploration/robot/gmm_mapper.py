@@ -109,7 +109,6 @@ class GmmMapper(Mapper):
 
     def __init__(
         self,
-        robot: int,
         local: RollingWindow,
         belief: BeliefMap,
         width: int,
@@ -118,7 +117,7 @@ class GmmMapper(Mapper):
         memo: Memo,
         shared: Replica | Broadcast,
     ) -> None:
-        super().__init__(robot, local, belief, width, novelty, memo)
+        super().__init__(local, belief, width, novelty, memo)
         self.shared = shared
         self.tiles = MixtureTiles()
         self._rule = rule
@@ -252,8 +251,7 @@ class GmmMapper(Mapper):
         return [self._enter(batch) for batch in batches if len(batch)]
 
     def _rebuild(self) -> None:
-        """Casts the whole mixture again, after components were moved or replaced. None of this is new
-        evidence."""
+        """Casts the whole mixture again, after components were moved or replaced."""
         self.local.clear()
         self.belief.clear()
         self.tiles, self._by_origin, self._by_place = MixtureTiles(), {}, []

@@ -80,8 +80,6 @@ class LocalMap:
 
 
 T = TypeVar("T")
-NOVELTY_BLOCK = 3
-"""Pixels along the side of the blocks whose novelty one beam decides."""
 
 
 class FrameUpdate(NamedTuple):
@@ -123,7 +121,7 @@ class Memo:
 
 
 class SharedMap(Protocol):
-    """The part of a map that robots share: a `Replica`, a `Broadcast`, or the points of voxel maps."""
+    """The part of a map that robots share: a `Replica`, a `Broadcast`, or `SharedPoints`."""
 
     @property
     def version(self) -> int:
@@ -164,7 +162,7 @@ class Mapper(ABC):
     `sense` and `receive` have updated both when they return.
 
     Args:
-        robot: its id. local: the window. belief: the map of the world, which the evaluator reads.
+        local: the window. belief: the map of the world, which the evaluator reads.
         width: of the camera's images, pixels. novelty: when a beam is novel.
         memo: cache of evidence; shared by the robots of a simulation.
 
@@ -175,16 +173,10 @@ class Mapper(ABC):
     shared: SharedMap
 
     def __init__(
-        self,
-        robot: int,
-        local: RollingWindow,
-        belief: BeliefMap,
-        width: int,
-        novelty: NoveltyRule,
-        memo: Memo,
+        self, local: RollingWindow, belief: BeliefMap, width: int, novelty: NoveltyRule, memo: Memo
     ) -> None:
         self.local, self.belief = local, belief
-        self._robot, self._width, self._novelty, self._memo = robot, width, novelty, memo
+        self._width, self._novelty, self._memo = width, novelty, memo
 
     @abstractmethod
     def center_on(self, position: Tensor) -> None:
@@ -214,7 +206,7 @@ def novel_beams(
     rule: NoveltyRule,
     within: Box,
     short: float = 0.0,
-    side: int = NOVELTY_BLOCK,
+    side: int = 3,
 ) -> Tensor:
     """Which beams (N,) of a frame are novel to a map.
 

@@ -50,9 +50,9 @@ class StoppingCriterion:
         rests: whether the robot should rest.
     """
 
-    def __init__(self, rule: StoppingRule | None = None) -> None:
+    def __init__(self, rule: StoppingRule) -> None:
         self.rests = False
-        self._rule = StoppingRule() if rule is None else rule
+        self._rule = rule
         self._window: deque[tuple[float, float]] = deque()  # time (s) and bits learned
         self._best = 0.0  # bits learned in the best window
         self._known_at_rest = 0.0  # bits
@@ -116,7 +116,7 @@ class Robot:
         library: ViewLibrary,
         roadmap: Roadmap,
         start: InitialFreeSpace,
-        rest: StoppingRule | None = None,
+        rest: StoppingRule,
     ) -> None:
         self.number = number
         self.mapper, self.planner, self.library, self.roadmap = mapper, planner, library, roadmap
@@ -188,16 +188,14 @@ class Robot:
         hit[(cells - low).unbind(1)] = True
         self._recent.append((hit.nonzero() + low).cpu())
 
-    def local_map(
-        self, planning_prior: float, radius: float, window: tuple[int, int, int] | None = None
-    ) -> LocalMap:
-        """A snapshot for the planner: `window` cells around the robot; None: its whole window of voxels.
+    def local_map(self, planning_prior: float, radius: float, window: tuple[int, int, int]) -> LocalMap:
+        """A snapshot of `window` cells around the robot, for the planner.
 
         Args:
             planning_prior: occupancy probability of unobserved cells. radius: of the robot, metres.
         """
         local, rule = self.mapper.local, self.mapper.belief.rule
-        box = local.box if window is None else local.around(self.position, window)
+        box = local.around(self.position, window)
         hits, misses = torch.stack(local.evidence(box)).cpu()  # the planner works on the CPU
         recent = list(self._recent)
         return local_map_of(
