@@ -26,9 +26,9 @@ from gmmtorch.exploration.planning.primitives import Primitives
 from gmmtorch.exploration.planning.roadmap import Roadmap
 from gmmtorch.exploration.robot.agent import Agent
 from gmmtorch.exploration.robot.grid_mapper import GridMapper
-from gmmtorch.exploration.robot.initial_free_space import InitialFreeSpace
 from gmmtorch.exploration.robot.mapper import Mapper, Memo
 from gmmtorch.exploration.robot.robot_state import Robot, StoppingRule
+from gmmtorch.exploration.world.starts import InitialFreeSpace
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 from gmmtorch.sharing.messages.message_registry import (
     PlanMessage,

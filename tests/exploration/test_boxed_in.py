@@ -8,8 +8,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from exploration.flying_robots import small_room
-from exploration.furnished_room import SMALL
+from exploration.rooms import SMALL, small_room
 from exploration.voxel_worlds import PRIMITIVES, Explorer, hollow
 from torch import Tensor
 

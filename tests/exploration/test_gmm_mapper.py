@@ -6,13 +6,20 @@ import itertools
 
 import pytest
 import torch
-from exploration.mapped_room import BOX, HIGH, LOW, NOVELTY, PLACES, frame, heard, mapper
-from exploration.mapper_cases import (
+from exploration.mapped_room import (
+    BOX,
+    HIGH,
+    LOW,
+    NOVELTY,
+    PLACES,
     assert_same_components,
     assert_same_evidence,
     by_kind,
     counts_in,
     first_batch,
+    frame,
+    heard,
+    mapper,
     rebuilt,
 )
 from sharing.replica_model import Model, rows

@@ -6,13 +6,18 @@ from dataclasses import replace
 
 import pytest
 import torch
-from exploration.mapped_room import BOX, NOVELTY, PLACES, frame, heard, mapper
-from exploration.mapper_cases import (
+from exploration.mapped_room import (
+    BOX,
+    NOVELTY,
+    PLACES,
     assert_same_components,
     assert_same_evidence,
     by_kind,
     counts_in,
     first_batch,
+    frame,
+    heard,
+    mapper,
     rebuilt,
 )
 from scipy.stats import chi2

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import torch
-from exploration.furnished_room import SHELF, SMALL, room, without_seconds
+from exploration.rooms import SHELF, SMALL, room, without_seconds
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.exploration.mission.driver import SimulatedClock, drive

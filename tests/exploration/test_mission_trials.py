@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import torch
-from exploration.furnished_room import SMALL, without_seconds
+from exploration.rooms import SMALL, without_seconds
 from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError, OutputError

@@ -15,8 +15,8 @@ from gmmtorch.exploration.planning.collision_checking import local_map_of
 from gmmtorch.exploration.planning.planner_interface import Plan, Planner
 from gmmtorch.exploration.planning.recovery import shortened
 from gmmtorch.exploration.planning.roadmap import Roadmap
-from gmmtorch.exploration.robot.initial_free_space import InitialFreeSpace
 from gmmtorch.exploration.robot.mapper import FrameUpdate, LocalMap, Mapper
+from gmmtorch.exploration.world.starts import InitialFreeSpace
 from gmmtorch.sharing.messages.message_registry import PlanMessage
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 

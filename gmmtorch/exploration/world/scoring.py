@@ -90,8 +90,8 @@ class BeliefMap:
         self.known_bits = 0.0  # entropy removed from all cells, observable or not, as a robot computes it
         self.n_observed = 0
 
-    def add(self, evidence: CellEvidence) -> Tensor:
-        """Add evidence; returns which of its cells (C,) are observable."""
+    def add(self, evidence: CellEvidence) -> None:
+        """Add evidence."""
         before = self.grid.add(evidence)
         chosen = flags_of_cells(evidence.cells, self._low, self._observable)
         added = evidence.hits, evidence.misses
@@ -99,7 +99,6 @@ class BeliefMap:
         self.known_bits += removed.bits
         self.entropy_bits -= removed.chosen_bits
         self.n_observed += removed.n_new
-        return chosen
 
     def probability(self, cells: Tensor) -> Tensor:
         """Occupancy (C,) of cells (C, 3), on the device of the cells."""
