@@ -26,7 +26,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.errors import InvalidArgumentError, check_choice, check_whole
 from gmmtorch.exploration.information.beam_templates import beam_templates, depth_kernel, needed_band
 from gmmtorch.exploration.robot.mapper import LocalMap
 from gmmtorch.kernels.rays.beam_information import Beams, Cells, information_by_block
@@ -111,8 +111,7 @@ class ViewEvaluator:
         stride: int = 2,
         device: torch.device | str = "cpu",
     ) -> None:
-        if information not in INFORMATION:
-            raise InvalidArgumentError(f"information={information!r} is not one of {', '.join(INFORMATION)}.")
+        check_choice("information", information, INFORMATION)
         self.resolution = check_resolution(resolution)
         self.n_yaws = check_whole("n_yaws", n_yaws, 1)
         self.stride = check_whole("stride", stride, 1)

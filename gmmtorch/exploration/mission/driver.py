@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from typing import NamedTuple, Protocol
 
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import check_number
 
 _LONGEST_SLEEP = 0.02
 """Seconds between two calls of `idle` at most."""
@@ -70,13 +69,11 @@ class WallClock:
 
 
 def check_pace(*, rate: float = 1.0, speed: float = 1.0, settle: float = 0.0) -> None:
-    """Raises `InvalidArgumentError` unless rate (Hz) and speed are positive and settle (s) is not negative;
-    all must be finite."""
-    for name, value in (("rate", rate), ("speed", speed)):
-        if not 0 < value < math.inf:
-            raise InvalidArgumentError(f"{name}={value} must be above zero, and finite.")
-    if not 0 <= settle < math.inf:
-        raise InvalidArgumentError(f"settle={settle} must be at least zero seconds, and finite.")
+    """Raises `InvalidArgumentError` unless rate (Hz) and speed are above zero, settle (s) is not below, and
+    all are finite."""
+    check_number("rate", rate, above=True)
+    check_number("speed", speed, above=True)
+    check_number("settle", settle)
 
 
 class Stopwatch:

@@ -14,7 +14,8 @@ from torch import Tensor
 from gmmtorch.evaluation.codecs.point_codecs import bytes_of_points
 from gmmtorch.exploration.mission.driver import Stopwatch
 from gmmtorch.exploration.mission.options import TeamOptions
-from gmmtorch.exploration.mission.planning_round import coordination_of, plan_alone, plan_together
+from gmmtorch.exploration.mission.planning_round import plan_alone, plan_together
+from gmmtorch.exploration.planning.coordination import Coordination
 from gmmtorch.exploration.robot.agent import Agent
 from gmmtorch.exploration.robot.mapper import FrameUpdate
 from gmmtorch.exploration.robot.robot_state import Robot
@@ -139,7 +140,10 @@ class Mission:
         """Ticks done."""
         self.trajectories: list[list[Tensor]] = [[robot.state[:4].clone()] for robot in self.robots]
         """Poses (4,) x, y, z, yaw of each robot: at the start, and after each tick."""
-        self.coordination = coordination_of(options)
+        # Robots that share nothing plan independently.
+        self.coordination = Coordination(
+            options.coordination if options.shares else "myopic", options.n_rounds
+        )
         self._network, self._score = network, score
         self._generator = torch.Generator().manual_seed(options.seed)
         self._views_sent_at = 0.0

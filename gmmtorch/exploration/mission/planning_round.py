@@ -12,11 +12,6 @@ from gmmtorch.exploration.planning.planner_interface import Plan
 from gmmtorch.exploration.robot.agent import Agent
 
 
-def coordination_of(options: TeamOptions) -> Coordination:
-    """How the team plans; robots that share nothing plan independently."""
-    return Coordination(options.coordination if options.shares else "myopic", options.n_rounds)
-
-
 def plan_together(
     agents: Sequence[Agent],
     coordination: Coordination,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, check_whole
 from gmmtorch.sharing.messages.message_registry import PlanMessage
 
 if TYPE_CHECKING:
@@ -31,8 +31,7 @@ class Coordination:
     """
 
     def __init__(self, name: str = "greedy", n_rounds: int = 3) -> None:
-        if name not in COORDINATIONS:
-            raise InvalidArgumentError(f"coordination={name!r} is not one of {', '.join(COORDINATIONS)}.")
+        check_choice("coordination", name, COORDINATIONS)
         self.name = name
         self.n_rounds = check_whole("n_rounds", n_rounds, 1)
 
@@ -105,8 +104,7 @@ class PeerTrajectories:
             raise InvalidArgumentError(
                 f"paths has shape {shape}; expected finite metres (M, T, 3), T of 1 or more."
             )
-        if not (math.isfinite(self.separation) and self.separation > 0):
-            raise InvalidArgumentError(f"separation={self.separation} must be above zero metres.")
+        check_number("separation", self.separation, above=True)
 
     @classmethod
     def of(cls, paths: Sequence[Tensor], separation: float = 0.7) -> PeerTrajectories:

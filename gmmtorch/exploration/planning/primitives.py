@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import InvalidArgumentError, check_number
 from gmmtorch.kernels.rays.path_clearance import Motions
 
 _ROUNDING = 1e-9
@@ -46,9 +46,7 @@ class Dynamics:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            value = getattr(self, field.name)
-            if not (math.isfinite(value) and value > 0):
-                raise InvalidArgumentError(f"{field.name}={value} must be finite, above zero.")
+            check_number(field.name, getattr(self, field.name), above=True)
         if self.n_steps < 1 or abs(self.n_steps * self.step - self.duration) > 1e-6 * self.duration:
             raise InvalidArgumentError(
                 f"step={self.step} s does not divide duration={self.duration} s; use a fraction of it."

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import InvalidArgumentError, check_number
 from gmmtorch.exploration.information.view_library import ViewLibrary
 from gmmtorch.exploration.planning.collision_checking import local_map_of
 from gmmtorch.exploration.planning.planner_interface import Plan, Planner
@@ -35,8 +34,7 @@ class StoppingRule:
     def __post_init__(self) -> None:
         if not 0 <= self.share < 1:
             raise InvalidArgumentError(f"planner.rest={self.share} must be at least 0, and below 1.")
-        if not 0 < self.window < math.inf:
-            raise InvalidArgumentError(f"window={self.window} must be above zero seconds, and finite.")
+        check_number("window", self.window, above=True)
 
 
 class StoppingCriterion:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -125,7 +124,7 @@ def disagreement(maps: list[BeliefMap], cells: Tensor) -> float | None:
     return float((classes != classes[0]).any(0).double().mean())
 
 
-def overlap(seen_by: Tensor) -> float:
+def overlap(seen_by: Tensor) -> float | None:
     """Return the share of the seen cells that two or more robots saw; `seen_by` counts robots."""
     seen = int((seen_by > 0).sum())
-    return int((seen_by > 1).sum()) / seen if seen else math.nan
+    return int((seen_by > 1).sum()) / seen if seen else None

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.point_files.mesh_files import read_triangles
-from gmmtorch.errors import InvalidArgumentError, MemoryLimitError, MissingDataError
+from gmmtorch.errors import InvalidArgumentError, MemoryLimitError, MissingDataError, check_choice
 from gmmtorch.evaluation.events import Event, ignore
 from gmmtorch.exploration.world.navigable import (
     ON_PLANE,
@@ -244,8 +244,7 @@ def open_world(
     for an unknown name or an option that the world does not have, and `MissingDataError` for a missing
     file.
     """
-    if name not in ("warehouse", "tunnels", "mesh"):
-        raise InvalidArgumentError(f"world={name!r} is not known; choose warehouse, tunnels or mesh.")
+    check_choice("world", name, ("warehouse", "tunnels", "mesh"))
     if name == "mesh":
         if size is not None:
             raise InvalidArgumentError(f"size={size}: a mesh has its own size; give bounds instead.")
