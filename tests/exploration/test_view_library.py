@@ -16,7 +16,11 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.exploration.information import view_library
 from gmmtorch.exploration.information.view_library import ViewLibrary
 from gmmtorch.sharing.messages.message_registry import ViewsMessage, decode
-from gmmtorch.sharing.replica.record_keys import Intervals
+from gmmtorch.sharing.replica.record_keys import Intervals, first_key, robot_of
+
+
+def key(robot: int, number: int) -> int:
+    return first_key(robot) + number
 
 
 def poses_of(*rows: tuple[float, ...]) -> torch.Tensor:
@@ -25,7 +29,7 @@ def poses_of(*rows: tuple[float, ...]) -> torch.Tensor:
 
 def same(one: ViewLibrary, other: ViewLibrary) -> bool:
     mine, theirs = one.candidates(), other.candidates()
-    equal = mine.ids == theirs.ids and all(map(torch.equal, mine[1:], theirs[1:]))
+    equal = mine.keys == theirs.keys and all(map(torch.equal, mine[1:], theirs[1:]))
     if equal:
         assert one.digest() == other.digest()
     return equal
@@ -40,7 +44,7 @@ def message_of(
         poses_of(*((x, 0.0, 0.0, 0.0) for _, _, x, _, _ in views)),
         torch.tensor([value for *_, value, _ in views], dtype=torch.float64),
         torch.tensor([stamp for *_, stamp in views], dtype=torch.float64),
-        Intervals.of(np.array([robot << 52 | number for robot, number in removed], np.int64)),
+        Intervals.of(np.array([key(*name) for name in removed], np.int64)),
     )
 
 
@@ -84,7 +88,7 @@ def test_views_are_kept_apart_and_the_best_come_first(seed):
     library = ViewLibrary(0)
     library.add(poses, values, 1.0, least=2.0, most=60)
     kept = library.candidates()
-    assert len(kept.ids) > 3
+    assert len(kept.keys) > 3
     assert float(kept.values.min()) >= 1.99
 
     def near(one: torch.Tensor, other: torch.Tensor, metres: float, degrees: float) -> bool:
@@ -105,12 +109,9 @@ def test_own_views_are_bounded_and_the_best_are_kept(monkeypatch):
     library.receive(message_of([(1, n, 100.0 + 5 * n, 0.5, 0.0) for n in range(4)], []), 0.0)
     for n in range(10):
         library.add(poses_of((5.0 * n, 0, 0, 0)), torch.tensor([float(n + 1)]), float(n), 0.0)
-    own = [
-        value
-        for key, value in zip(library.candidates().ids, library.candidates().values, strict=True)
-        if not key[0]
-    ]
-    assert sorted(float(value) for value in own) == [7.0, 8.0, 9.0, 10.0]
+    keys, _, values = library.candidates()
+    own = [value for each, value in zip(keys, values.tolist(), strict=True) if robot_of(each) == 0]
+    assert sorted(own) == [7.0, 8.0, 9.0, 10.0]
     assert len(library) == 8
 
 
@@ -126,7 +127,7 @@ def test_views_in_the_window_are_valued_again_and_worthless_ones_removed():
     library.revalue([a], torch.tensor([1.0]), 20.0, least=0.5)
     assert library.covered(here, 21.0, most=1) == [b]  # the one that waits the longest
     library.revalue([b], torch.tensor([0.1]), 21.0, least=0.5)
-    assert library.candidates().ids == [a, c]
+    assert library.candidates().keys == [a, c]
     assert library.candidates().values.tolist() == [1.0, 1.0]
     passable[5, 5, 5] = False
     assert library.covered(here, 40.0, most=9) == []  # nobody can be there
@@ -163,15 +164,15 @@ def test_only_large_changes_are_sent_and_once():
     (first,) = sent(library)
     assert first.ids.tolist() == [[0, 0], [0, 1]]
     assert sent(library) == []
-    library.revalue([(0, 0)], torch.tensor([4.0]), 2.0, 0.0)
+    library.revalue([key(0, 0)], torch.tensor([4.0]), 2.0, 0.0)
     library.remove([theirs[0]], 3.0)
     (second,) = sent(library)
     assert second.ids.tolist() == [[0, 0]]
-    assert second.removed == Intervals.span(1 << 52, (1 << 52) + 1)
+    assert second.removed == Intervals.span(key(1, 0), key(1, 1))
     for message in (second, first):
         other.receive(message, 3.0)
     assert same(library, other)
-    library.revalue([(0, 1)], library.candidates().values[1:2] * 1.01, 9.0, 0.0)
+    library.revalue([key(0, 1)], library.candidates().values[1:2] * 1.01, 9.0, 0.0)
     assert sent(library) == []
 
 
@@ -182,7 +183,7 @@ def test_without_loss_all_libraries_are_equal_after_a_round(seed):
     libraries = [ViewLibrary(robot) for robot in range(3)]
     for step in range(12):
         library, now = rng.choice(libraries), float(step)
-        known = library.candidates().ids
+        known = library.candidates().keys
         choice = rng.randrange(3)
         if choice == 0 or not known:
             library.add(line(3, rng.uniform(0, 99)), torch.rand(3) + 1, now, 0.0)
@@ -202,18 +203,18 @@ def test_a_removed_view_stays_removed_in_any_order(order, again):
     library = ViewLibrary(0)
     for index in [*order, *again]:
         library.receive(messages[index], 3.0)
-    assert library.candidates().ids == [(1, 0), (1, 1), (1, 3), (1, 4)]
+    assert library.candidates().keys == [key(1, n) for n in (0, 1, 3, 4)]
 
 
 def test_a_lost_removal_is_sent_again_to_a_robot_that_repeats_the_view():
     one, other = ViewLibrary(0), ViewLibrary(1)
     one.add(line(2), torch.tensor([1.0, 2.0]), 1.0, 0.0)
     exchange([one, other], 1.0)
-    one.remove([(0, 0)], 2.0)
+    one.remove([key(0, 0)], 2.0)
     assert one.datagrams(2.0)  # lost
     for second in range(3, 140, 2):
         exchange([one, other], float(second))
-    assert other.candidates().ids == [(0, 1)]
+    assert other.candidates().keys == [key(0, 1)]
     assert same(one, other)
 
 
@@ -240,7 +241,7 @@ def test_a_view_is_removed_after_its_time_to_live(monkeypatch):
         exchange(team, float(second))
         if 310 < second < 500:
             assert [len(library) for library in team] == [1, 1]
-    assert b not in team[0].candidates().ids
+    assert b not in team[0].candidates().keys
     assert [len(library) for library in team] == [1, 1]
     for second in range(700, 1000, 2):
         exchange(team, float(second))
@@ -255,7 +256,7 @@ def test_repetitions_are_few_and_keep_the_budget():
     n_bytes = [exchange(libraries, float(second)) for second in range(60, 120, 2)]
     assert max(n_bytes) < 80
     assert sum(n_bytes) < 40 * 25
-    libraries[0].revalue(libraries[0].candidates().ids, torch.full((40,), 99.0), 120.0, 0.0)
+    libraries[0].revalue(libraries[0].candidates().keys, torch.full((40,), 99.0), 120.0, 0.0)
     assert libraries[0].datagrams(120.0, budget=20) == []
     limited = libraries[0].datagrams(120.0, budget=150)
     assert 0 < sum(map(len, limited)) <= 150

@@ -55,13 +55,12 @@ _SATURATED = 0.25
 class ViewValues(NamedTuple):
     """Values of V views on a local map of G coarse blocks, in row-major order of the blocks.
 
-    values: (V,) nats. gain: (V, G) float32, the part of the value in each block; rows sum to `values`.
+    gain: (V, G) float32, nats, the part of each view's value in each block; rows sum to the value.
     measured: (V, G) float32 in [0, 1], the share of each block's remaining information that the view
     gains. Given other planned views, a view is worth gain @ residual, where residual is the product of
     their 1 − measured.
     """
 
-    values: Tensor
     gain: Tensor
     measured: Tensor
 
@@ -170,7 +169,7 @@ class ViewEvaluator:
         measured = taken.div_(enough).clamp_max_(1)
         if self.device.type != "cpu":
             gain, measured = torch.stack([gain, measured]).cpu()
-        return ViewValues(gain.sum(1), gain, measured)
+        return ViewValues(gain, measured)
 
     def residual(self, local_map: LocalMap, poses: Tensor) -> Tensor:
         """Return what views from poses (M, 4) leave of each block, (G,) float32: Π (1 − measured)."""

@@ -27,9 +27,6 @@ from gmmtorch.sharing.replica.record_keys import (
     robot_of,
 )
 
-Id = tuple[int, int]
-"""(robot that found the view, sequence), as of records: `gmmtorch.sharing.replica.record_keys`."""
-
 SPACING = 1.5
 _TURN = math.pi / 4
 """Metres and radians. A view is not added if another one is nearer than both."""
@@ -66,15 +63,15 @@ class View(NamedTuple):
 
 
 class Candidates(NamedTuple):
-    """Views that a robot may visit: ids, poses (V, 4), values (V,)."""
+    """Views that a robot may visit: keys, poses (V, 4), values (V,)."""
 
-    ids: list[Id]
+    keys: list[int]
     poses: Tensor
     values: Tensor
 
 
 class ViewLibrary:
-    """Views by id, and the ids of removed views, which are never accepted again.
+    """Views by key, as of records (see `record_keys`), and the keys of removed views, which never come back.
 
     The library is best-effort: a stale or missing view costs a detour, but never changes the map. Changes
     made here are sent once, in the next `datagrams`. After a minute without messages of a view, its finder
@@ -84,8 +81,8 @@ class ViewLibrary:
     libraries are equal.
 
     Args:
-        robot: id of the robot, which is part of the ids of its views.
-        incarnation: of the robot's start (`record_keys.drawn_incarnation`), so that no id is given twice.
+        robot: id of the robot, which is part of the keys of its views.
+        incarnation: of the robot's start (`record_keys.drawn_incarnation`), so that no key is given twice.
 
     Attributes:
         refused: number of messages that were not accepted, by reason: "duplicate_id", "full".
@@ -116,19 +113,19 @@ class ViewLibrary:
         return len(self._views)
 
     def candidates(self) -> Candidates:
-        """All views, by id."""
+        """All views, by key."""
         if self._cached is None:
             keys = sorted(self._views)
             views = [self._views[key] for key in keys]
             poses = torch.tensor([view.pose for view in views], dtype=torch.float64).reshape(-1, 4)
             values = torch.tensor([view.value for view in views], dtype=torch.float64)
-            self._cached = Candidates([_id(key) for key in keys], poses, values)
+            self._cached = Candidates(keys, poses, values)
         return self._cached
 
     # -- changes made here ------------------------------------------------------------------------
 
-    def add(self, poses: Tensor, values: Tensor, now: float, least: float, most: int = 8) -> list[Id]:
-        """Add the best `most` of views (N, 4) with values (N,) of at least `least`; return their ids."""
+    def add(self, poses: Tensor, values: Tensor, now: float, least: float, most: int = 8) -> list[int]:
+        """Add the best `most` of views (N, 4) with values (N,) of at least `least`; return their keys."""
         added: list[int] = []
         rows, worth = quantized_poses(poses), values.detach().cpu().double().numpy()
         order = np.argsort(-worth, kind="stable")
@@ -149,15 +146,15 @@ class ViewLibrary:
         self._due.update(added)
         own = sorted((view.value, key) for key, view in self._views.items() if robot_of(key) == self._robot)
         self._remove(key for _, key in own[: max(0, len(own) - MOST_OWN_VIEWS)])
-        return [_id(key) for key in added if key in self._views]
+        return [key for key in added if key in self._views]
 
-    def revalue(self, ids: list[Id], values: Tensor, now: float, least: float) -> None:
+    def revalue(self, keys: list[int], values: Tensor, now: float, least: float) -> None:
         """Set the values of views at the time `now` (s); those below `least` are removed.
 
         A small change is not sent, because it changes no plan; but once in half the time to live the view
         is, so that it is not removed.
         """
-        for key, value in zip(map(_key, ids), values.tolist(), strict=True):
+        for key, value in zip(keys, values.tolist(), strict=True):
             known = self._views.get(key)
             if value < least:
                 self._remove([key])
@@ -172,30 +169,23 @@ class ViewLibrary:
                 self._put(key, View(max(at, after), half, known.pose), now)
                 self._due.add(key)
 
-    def remove(self, ids: list[Id], now: float) -> None:
+    def remove(self, keys: list[int], now: float) -> None:
         """Remove views for good."""
         self._now = now
-        self._remove(map(_key, ids))
+        self._remove(keys)
 
     def visit(self, poses: Tensor, now: float) -> None:
         """Remove the views near poses (N, 4), from which a robot has just observed."""
-        self._now = now
         known = self.candidates()
-        if known.ids:
-            seen = _is_near(poses[:, None], known.poses, *_VISITED).any(0)
-            self.remove([known.ids[row] for row in seen.nonzero()[:, 0].tolist()], now)
+        seen = _is_near(poses[:, None], known.poses, *_VISITED).any(0)
+        self.remove([known.keys[row] for row in seen.nonzero()[:, 0].tolist()], now)
 
-    def covered(self, local_map: LocalMap, now: float, most: int) -> list[Id]:
+    def covered(self, local_map: LocalMap, now: float, most: int) -> list[int]:
         """At most `most` views in the local map whose value is no longer fresh, the oldest first."""
         known = self.candidates()
-        if not known.ids:
-            return []
-        inside = local_map.is_passable(known.poses[:, :3]).tolist()
-        valued = ((self._valued_at[_key(name)], name) for name in known.ids)
-        due = sorted(
-            pair for pair, there in zip(valued, inside, strict=True) if there and pair[0] <= now - _FRESH
-        )
-        return [name for _, name in due[:most]]
+        inside = local_map.is_passable(known.poses[:, :3]).nonzero()[:, 0].tolist()
+        due = sorted((self._valued_at[known.keys[row]], known.keys[row]) for row in inside)
+        return [key for valued, key in due[:most] if valued <= now - _FRESH]
 
     def best(self, metres: Tensor, *, least: float = 0.0) -> int | None:
         """Row of `candidates` that maximizes value / (1 + metres (V,) to it); None if no view is in reach."""
@@ -342,15 +332,6 @@ class ViewLibrary:
         n_before, n_by_end = np.searchsorted(begins, edges).T
         meets = keys.contains(edges[:, 0]) | (n_by_end > n_before)
         return Intervals(edges[meets].reshape(-1))
-
-
-def _key(name: Id) -> int:
-    return first_key(name[0]) + name[1]
-
-
-def _id(key: int) -> Id:
-    robot = robot_of(key)
-    return robot, key - first_key(robot)
 
 
 def _rounded(value: float, now: float) -> tuple[float, float]:

@@ -203,4 +203,4 @@ class FrontierPlanner:
         if len(found.poses):
             apart = torch.cdist(known.poses[:, :3], found.poses[:, :3]).amin(1)
             inside &= apart > _ABOUT
-        task.library.remove([known.ids[row] for row in inside.nonzero()[:, 0].tolist()], task.now)
+        task.library.remove([known.keys[row] for row in inside.nonzero()[:, 0].tolist()], task.now)

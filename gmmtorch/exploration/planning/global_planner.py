@@ -81,7 +81,7 @@ class Journey:
         Returns None if no view worth `least` can be reached. Views close to `given_up` (N, 4) are ignored.
         """
         known = task.library.candidates()
-        if not known.ids:
+        if not known.keys:
             return None
         metres = task.roadmap.distances(task.state[:3], known.poses[:, :3])
         if given_up is not None and len(given_up):
@@ -90,7 +90,7 @@ class Journey:
         row = task.library.best(metres, least=least)
         if row is None:
             return None
-        task.library.remove([known.ids[row]], task.now)
+        task.library.remove([known.keys[row]], task.now)
         return cls(known.poses[row], float(known.values[row]), float(metres[row]), task.now)
 
     def put_back(self, task: PlanningTask) -> None:

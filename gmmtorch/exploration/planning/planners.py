@@ -132,13 +132,13 @@ class TreePlanner:
         return self._branch[1:] if task.now > self._when else self._branch
 
     def _revalue(self, task: PlanningTask, memory: ViewCache) -> None:
-        ids = task.library.covered(task.local_map, task.now, _REVALUED)
-        if ids:
+        keys = task.library.covered(task.local_map, task.now, _REVALUED)
+        if keys:
             known = task.library.candidates()
-            at = {key: row for row, key in enumerate(known.ids)}
-            rows = memory.rows(known.poses[[at[key] for key in ids]])
+            at = {key: row for row, key in enumerate(known.keys)}
+            rows = memory.rows(known.poses[[at[key] for key in keys]])
             values, _ = memory.marginal(rows, self._weights[None])
-            task.library.revalue(ids, values, task.now, _WORTHWHILE * self._largest)
+            task.library.revalue(keys, values, task.now, _WORTHWHILE * self._largest)
 
     def _note(self, task: PlanningTask, memory: ViewCache, found: Found | None) -> None:
         """Store the branch, and add the best views that it leaves out to the library."""

@@ -14,7 +14,7 @@ from gmmtorch.exploration.planning.global_planner import Goal
 from gmmtorch.exploration.planning.planner_interface import PlanningTask, continuations, options
 from gmmtorch.exploration.planning.primitives import Primitives
 
-_FAR = 1e4  # metres
+_FAR = 1e4  # metres, where there is no way to the goal
 _WIDENING = 1.5  # a node tries about `_WIDENING` √visits primitives; the root tries all
 
 
@@ -144,7 +144,7 @@ class _Tree:
         root = _Node(0, None, -1, 0)
         self._nodes = [root]
         if goal is not None:
-            self._metres[0] = _finite(goal.cost(start))
+            self._metres[0] = goal.cost(start).clamp_max(_FAR)
         self._options = options(primitives, start[None], task, may_escape=True)
         self._open([root], self._options.paths[:, :, -1], self._options.feasible)
 
@@ -258,13 +258,8 @@ class _Tree:
         self._ends[rows] = ends
         order = torch.rand(ends.shape[:2], generator=self._task.generator, dtype=torch.float64)
         if self._goal is not None:  # primitives that lead towards it come first
-            self._metres_after[rows] = order = _finite(self._goal.cost(ends))
+            self._metres_after[rows] = order = self._goal.cost(ends).clamp_max(_FAR)
         order = order.masked_fill(~feasible, math.inf).argsort(dim=1, stable=True)
         count = feasible.sum(1).tolist()
         for node, actions, n in zip(nodes, order.tolist(), count, strict=True):
             node.untried, node.closed = actions[:n], n == 0
-
-
-def _finite(metres: Tensor) -> Tensor:
-    """Replace infinite distances to a goal by a large finite one."""
-    return metres.clamp_max(_FAR)
