@@ -252,16 +252,6 @@ def test_a_resting_robot_sends_one_plan_in_ten() -> None:
     assert [plan.number for plan in plans if isinstance(plan, PlanMessage)] == [0, 10, 20]
 
 
-def test_a_resting_robot_needs_no_snapshot_of_the_map() -> None:
-    one, _ = agent()
-    one.robot.should_rest = lambda now: True  # type: ignore[method-assign]
-    one.robot.local_map = None  # type: ignore[assignment,method-assign]
-    one.begin_planning(0.0)
-    plan = one.propose(0.0, [], PeerTrajectories.of([]))
-    assert plan.kind == "wait"
-    assert torch.equal(plan.path[-1, :4], one.robot.state[:4])
-
-
 def test_a_moving_robot_sends_every_plan_and_the_first_at_rest() -> None:
     one, post = agent()
     local = one.robot.mapper.local  # where all is free, nothing keeps it from flying

@@ -127,21 +127,6 @@ def test_counts_scale_evidence_in_proportion() -> None:
     assert len(components) > 1  # across datagrams
 
 
-def test_counts_of_unknown_components_are_ignored() -> None:
-    one, _ = first_batch()
-    held, last = one.components(), int(one.components().ids[-1, 1])
-    belief = [part.clone() for part in one.belief.grid.dense(BOX)]
-    unknown = {(0, last + 1): 5.0, (3, 0): 7.0, (0, 10**6): 1.0}
-    one.receive(heard(*encode_counts(1, unknown, "float"), sender=1))
-    assert_same_components(held, one.components())
-    for a, b in zip(belief, one.belief.grid.dense(BOX), strict=True):
-        assert torch.equal(a, b)
-    one.receive(heard(*encode_counts(1, {**unknown, (0, 2): 4.0}, "float"), sender=1))
-    gained = one.components().support - held.support
-    assert gained.nonzero().flatten().tolist() == [2]
-    assert float(gained[2]) == pytest.approx(4.0)
-
-
 def test_counts_of_two_robots_with_the_same_sequence_are_told_apart() -> None:
     """Two listeners that each know one of two components that a message counts."""
     memo = Memo(64)

@@ -160,17 +160,6 @@ def test_robots_that_learn_too_little_rest(world: World) -> None:
         assert not torch.equal(path[0], path[-1])
 
 
-def test_without_losses_robots_hold_the_same_components(world: World) -> None:
-    mission = flown(world, replace(SMALL, duration=6.0))
-    assert mission.converge(0.0) == 0.0
-    one, other = (robot.mapper.components() for robot in mission.robots)
-    assert isinstance(one, Components)
-    assert isinstance(other, Components)
-    for name, value in vars(one).items():
-        assert torch.equal(value, getattr(other, name)), name
-    assert mission_row(mission, 1.0)["missing_share"][-1] == 0
-
-
 def test_losses_are_repaired_to_the_bit(world: World) -> None:
     """Half of the datagrams are lost; others arrive twice, or late."""
     trouble = {"loss": 0.5, "duplication": 0.3, "jitter": 0.5, "latency": 0.3}
@@ -225,24 +214,6 @@ def test_a_budget_bounds_the_bytes_of_maps(world: World, framework: str) -> None
 def test_no_coordination_collides(world: World, coordination: str) -> None:
     mission = flown(world, replace(SMALL, size=3, duration=6.0, coordination=coordination))
     assert sum(robot.collisions for robot in mission.robots) == 0
-
-
-def test_a_boxed_in_robot_waits_while_the_mission_continues() -> None:
-    cage = box((1.1, 1.1, 0.1), (2.7, 2.7, 2.0))
-    world = World.from_mesh(room(cage), start=(6.0, 4.0, 1.3), cache=False, name="cage")
-    caged = World.from_mesh(room(cage), start=(1.9, 1.9, 1.1), cache=False, name="caged")
-    both = replace(world, navigable=world.navigable | caged.navigable)
-    start = ((6.0, 4.0, 1.3, 0.0), (3.8, 6.0, 1.1, 0.0))
-    mission = assemble(both, replace(SMALL, duration=12.0, start=start))
-    _, shut = mission.robots
-    shut.state[:3] = torch.tensor([1.9, 1.9, 1.1])  # a place where no robot may start
-    shut.trail = shut.state[None, :3].clone()
-    mission.trajectories[1] = [shut.state[:4].clone()]
-    drive(mission, SimulatedClock())
-    assert sum(robot.collisions for robot in mission.robots) == 0
-    path = torch.stack(mission.trajectories[1])[:, :3]
-    assert float((path - path[0]).norm(dim=1).max()) < 0.8
-    assert mission.robots[0].path_length > 2
 
 
 START: dict[str, Callable[[], TeamOptions]] = {

@@ -63,14 +63,6 @@ def zigzag(n: int = 10) -> Tensor:
     return path
 
 
-def test_a_robot_begins_at_rest_at_its_start() -> None:
-    one = robot()
-    assert one.state.tolist() == [*START.tolist(), 0, 0, 0]
-    assert one.position.tolist() == START[:3].tolist()
-    assert one.path_length == 0
-    assert one.collisions == 0
-
-
 def test_path_length_is_the_sum_of_the_steps() -> None:
     one, path = robot(), zigzag()
     one.follow(plan(path))
@@ -100,11 +92,11 @@ def test_a_robot_stays_at_the_end_of_its_path() -> None:
     assert one.path_length == pytest.approx(2 * flown - 0.3)
 
 
-def test_a_robot_without_a_plan_stays() -> None:
+def test_a_robot_without_a_plan_stays_at_its_start() -> None:
     one = robot()
     one.advance(0, 5)
     assert one.path_length == 0
-    assert one.position.tolist() == START[:3].tolist()
+    assert one.state.tolist() == [*START.tolist(), 0, 0, 0]
 
 
 # -- where it fits --------------------------------------------------------------------------------------
@@ -238,20 +230,6 @@ def test_time_boxed_in_does_not_count(gains, share):
         assert returns.rests == (first_rest_by_definition(told, 2.0, rule) is not None)
         if returns.rests:
             break
-
-
-def test_a_robot_that_stays_boxed_in_never_rests():
-    returns = StoppingCriterion(StoppingRule(0.9, window=10.0))
-    for now in (0, 5, 9):
-        returns.note(now, 100.0 * now, 0.0)
-    for now in range(10, 2000):
-        returns.note(now, 900.0, 0.0, boxed_in=True)
-        assert not returns.rests
-    returns.note(2001, 900.0, 0.0)
-    assert not returns.rests  # of all that time 11 s count, in which it learned much
-    for now in (2004, 2012):
-        returns.note(now, 900.0, 0.0)
-    assert returns.rests
 
 
 def resting() -> StoppingCriterion:

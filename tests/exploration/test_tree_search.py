@@ -161,22 +161,6 @@ def test_search_evaluates_each_view_once_in_batches():
     assert 40 < len(keys) <= 129
 
 
-def test_views_planned_by_teammates_have_no_value():
-    evaluator = MadeUp(0)
-    for seen in range(2):
-        residual = torch.zeros(N_BLOCKS)
-        residual[seen] = 1.0
-        task = task_in(ROOM, MIDDLE, residual=residual)
-        rule = SearchRule(depth=1, n_rounds=1)
-        found = TreeSearch(PRIMITIVES, rule).search(task, ViewCache(task, evaluator))
-        ends = PRIMITIVES.rollout(task.state[None])[0, :, -1, :4]
-        here = evaluator.evaluate(None, evaluator.keys(task.state[None, :4])).measured[0, seen]
-        gains = evaluator.evaluate(None, evaluator.keys(ends)).gain[:, seen] * (1 - here)
-        safe = [branch[0] for branch in all_branches(task, 1)]
-        assert found is not None
-        assert found.value == pytest.approx(float(gains[safe].max()), rel=1e-6)
-
-
 def test_rest_of_the_last_branch_is_tried_first():
     task, evaluator = task_in(ROOM, MIDDLE), MadeUp(7)
     full = SearchRule(depth=2, n_rounds=20, n_leaves=64)
