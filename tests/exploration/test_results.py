@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 
+from gmmtorch.exploration.mission.options import TeamOptions
 from gmmtorch.exploration.mission.results import (
     VARIANT,
     Snapshots,
@@ -119,12 +120,7 @@ def mission(lengths: list[float], seen_by: list[int]) -> Any:
     mask = torch.zeros(24, dtype=torch.int16)
     mask[: len(seen_by)] = torch.tensor(seen_by, dtype=torch.int16)
     mask[20:] = 7  # not observable: not counted
-    names = ["framework", "seed", "planner", "information", "planning_prior", "loss", "duration"]
-    names += ["coordination", "latency", "jitter", "bandwidth", "duplication", "reach"]
-    names += ["announce_every", "budget"]
-    options = SimpleNamespace(
-        size=3, codecs=("zip",), partitions=(), learning={"shell": 0.5}, **dict.fromkeys(names, "x")
-    )
+    options = TeamOptions(size=3, codecs=("octree",))
     robots = [
         SimpleNamespace(
             path_length=length,
@@ -146,7 +142,7 @@ def mission(lengths: list[float], seen_by: list[int]) -> Any:
         score=SimpleNamespace(
             union=maps[0],
             seen_by=mask,
-            samples={"raw_points_bytes_over_time": [1, 22], "zip_bytes_over_time": [1, 11]},
+            samples={"raw_points_bytes_over_time": [1, 22], "octree_bytes_over_time": [1, 11]},
         ),
         robots=robots,
         network=SimpleNamespace(
@@ -172,7 +168,7 @@ def test_fields_of_a_mission_row() -> None:
     assert found["map_disagreement"] == pytest.approx(2 / 20)
     assert found["entropy_reduction_bits"] == pytest.approx(20 - made.score.union.entropy_bits)
     assert found["bytes_raw_points"] == 22
-    assert found["bytes_zip"] == 11
+    assert found["bytes_octree"] == 11
     assert found["simulated_per_wall_seconds"] == 3.0
     assert found["n_components"] is None
     assert found["partitions"] == []

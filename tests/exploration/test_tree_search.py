@@ -7,17 +7,15 @@ import math
 
 import pytest
 import torch
-from exploration.voxel_worlds import EVALUATOR, NOBODY, PRIMITIVES, Explorer, surroundings_from
+from exploration.voxel_worlds import EVALUATOR, PRIMITIVES, Explorer, surroundings_from, task_of
 
 from gmmtorch.exploration.information.view_cache import ViewCache
 from gmmtorch.exploration.information.view_evaluator import ViewValues
-from gmmtorch.exploration.information.view_library import ViewLibrary
 from gmmtorch.exploration.planning.collision_checking import feasible
 from gmmtorch.exploration.planning.coordination import PeerTrajectories
 from gmmtorch.exploration.planning.geodesic import DistanceField
 from gmmtorch.exploration.planning.global_planner import Goal
 from gmmtorch.exploration.planning.planner_interface import PlanningTask
-from gmmtorch.exploration.planning.roadmap import Roadmap
 from gmmtorch.exploration.planning.tree_search import SearchRule, TreeSearch
 
 N_BLOCKS = 6
@@ -50,26 +48,13 @@ class MadeUp:
 def task_in(
     passable: torch.Tensor, position: tuple[float, float, float], seed: int = 0, **changed
 ) -> PlanningTask:
-    values = {
-        "state": torch.tensor([*position, 0.3, 0.0, 0.0, 0.0], dtype=torch.float64),
-        "local_map": surroundings_from(passable),
-        "peers": NOBODY,
-        "residual": torch.ones(N_BLOCKS),
-        "library": ViewLibrary(0),
-        "roadmap": Roadmap(),
-        "now": 0.0,
-        "generator": torch.Generator().manual_seed(seed),
-    }
-    return PlanningTask(**{**values, **changed})
+    state = torch.tensor([*position, 0.3, 0.0, 0.0, 0.0], dtype=torch.float64)
+    given = {"residual": torch.ones(N_BLOCKS), "generator": torch.Generator().manual_seed(seed)}
+    return task_of(surroundings_from(passable), state, **{**given, **changed})
 
 
-def small_room() -> torch.Tensor:
-    passable = torch.zeros(30, 30, 12, dtype=torch.bool)
-    passable[3:27, 3:22, 2:10] = True
-    return passable
-
-
-ROOM, MIDDLE = small_room(), (2.0, 2.5, 1.2)
+ROOM, MIDDLE = torch.zeros(30, 30, 12, dtype=torch.bool), (2.0, 2.5, 1.2)
+ROOM[3:27, 3:22, 2:10] = True
 
 
 def all_branches(task: PlanningTask, depth: int) -> list[tuple[int, ...]]:
@@ -129,7 +114,6 @@ def test_found_describes_its_branch():
     torch.testing.assert_close(found.views, torch.stack(states[1:])[:, :4])
     torch.testing.assert_close(found.path, PRIMITIVES.rollout(task.state[None])[0, found.actions[0]])
     torch.testing.assert_close(found.braking, PRIMITIVES.braking(found.path[-1]))
-    assert tuple(found.actions) in set(all_branches(task, 1)) or len(found.actions) > 1
 
 
 def test_search_beats_random_branches_with_few_leaves():
@@ -234,4 +218,3 @@ def test_search_at_the_start_looks_around():
     assert found.information > 0
     looks = [float(yaw) for yaw in found.views[:, 3]]
     assert max(looks) - min(0.0, *looks) > 1.5
-    assert len({PRIMITIVES.commands[action, 2].item() for action in found.actions} - {0.0}) >= 1
