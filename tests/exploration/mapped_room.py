@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 
+from gmmtorch.exploration.mission.options import THESIS
 from gmmtorch.exploration.robot.gmm_mapper import FrameRule, GmmMapper
 from gmmtorch.exploration.robot.mapper import Memo
 from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule
@@ -54,6 +55,13 @@ def mapper(
     rule, memo = replace(FrameRule(), **options), Memo(256) if memo is None else memo
     shared = Replica(robot, dim=3, incarnation=0) if codec == "replica" else Broadcast(robot, codec)
     return GmmMapper(local, belief, CAMERA.width, novelty, rule, memo, shared)
+
+
+def thesis_mapper(robot: int = 0) -> GmmMapper:
+    """One with the options of the thesis, which explains surfaces from anywhere and free space from near."""
+    options = {name: value for name, value in THESIS.items() if name in vars(FrameRule())}
+    near = replace(NOVELTY, distance=0.5, distance_for="free_space")
+    return mapper(robot, "thesis", novelty=near, **options)
 
 
 def heard(*datagrams: bytes, sender: int = 0) -> list[ReceivedMessage]:

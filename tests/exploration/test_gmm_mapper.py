@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -21,6 +22,7 @@ from exploration.mapped_room import (
     heard,
     mapper,
     rebuilt,
+    thesis_mapper,
 )
 from torch import Tensor
 
@@ -175,8 +177,9 @@ def test_sense_returns_the_evidence_it_adds(codec: str, flight: tuple, broadcast
     torch.testing.assert_close(found[1], misses, rtol=1e-5, atol=1e-4)
 
 
-def test_two_robots_that_exchange_messages_hold_the_same_map() -> None:
-    pair = [mapper(robot) for robot in range(2)]
+@pytest.mark.parametrize("make", [mapper, thesis_mapper])
+def test_two_robots_that_exchange_messages_hold_the_same_map(make: Callable[[int], GmmMapper]) -> None:
+    pair = [make(robot) for robot in range(2)]
     for turn, place in enumerate(PLACES * 5):  # so often that each has counts to tell
         speaker, listener = pair[turn % 2], pair[1 - turn % 2]
         speaker.sense(frame(*place, seed=turn))

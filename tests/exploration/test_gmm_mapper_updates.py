@@ -10,7 +10,6 @@ from exploration.mapped_room import (
     BOX,
     NOVELTY,
     PLACES,
-    assert_same_components,
     assert_same_evidence,
     by_kind,
     counts_in,
@@ -19,12 +18,12 @@ from exploration.mapped_room import (
     heard,
     mapper,
     rebuilt,
+    thesis_mapper,
 )
 from scipy.stats import chi2
 from torch import Tensor
 
-from gmmtorch.exploration.mission.options import THESIS
-from gmmtorch.exploration.robot.gmm_mapper import FrameRule, GmmMapper
+from gmmtorch.exploration.robot.gmm_mapper import GmmMapper
 from gmmtorch.exploration.robot.mapper import Memo
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.novelty import beam_novelty
@@ -43,13 +42,6 @@ def replica_of(one: GmmMapper) -> Replica:
 
 
 # -- E0 of the thesis ------------------------------------------------------------------------------
-
-
-def thesis_mapper(robot: int = 0) -> GmmMapper:
-    """One with the options of the thesis, which explains surfaces from anywhere and free space from near."""
-    options = {name: value for name, value in THESIS.items() if name in vars(FrameRule())}
-    near = replace(NOVELTY, distance=0.5, distance_for="free_space")
-    return mapper(robot, "thesis", novelty=near, **options)
 
 
 def explained_by_a_loop(one: GmmMapper, seen: DepthFrame) -> tuple[Tensor, dict[tuple[int, int], float]]:
@@ -100,16 +92,6 @@ def test_in_the_thesis_novel_points_update_the_components_that_explain_them() ->
     assert n_explained > 300
     assert all(size % of_a_record == 0 for size, of_a_record in sizes)  # beside kind, sender and checksum
     assert {record for _, record in sizes} == {57, 8}
-
-
-def test_in_the_thesis_robots_that_exchange_messages_hold_the_same_map() -> None:
-    pair = [thesis_mapper(robot) for robot in range(2)]
-    for turn, place in enumerate(PLACES * 2):
-        speaker, listener = pair[turn % 2], pair[1 - turn % 2]
-        speaker.sense(frame(*place, seed=turn))
-        listener.receive(heard(*speaker.shared.datagrams(), sender=turn % 2))
-    assert_same_components(pair[0].components(), pair[1].components(), exact=False)
-    assert_same_evidence(*pair)
 
 
 # -- counts ----------------------------------------------------------------------------------------

@@ -156,19 +156,6 @@ def test_frames_of_two_robots_with_one_number_are_distinguished() -> None:
     torch.testing.assert_close(believed(one), dense_of(beams(*views)))
 
 
-def test_a_listener_has_the_evidence_of_all_novel_beams() -> None:
-    speaker, listener = mapper(robot=1), mapper()
-    views = [frame(seed) for seed in range(5)]
-    parts = []
-    for view in views:
-        sensed = speaker.sense(view)
-        datagrams = speaker.shared.datagrams()
-        assert listener.receive(heard(*datagrams)) == datagrams
-        parts.append((view.origin, view.ends[sensed.novel], view.is_hit[sensed.novel]))
-    torch.testing.assert_close(believed(listener), dense_of(parts))
-    assert float(believed(listener).sum()) < float(believed(speaker).sum())
-
-
 def test_repeated_parts_count_once() -> None:
     view = frame(0, n=3 * POINTS_PER_DATAGRAM)
     first, second, third = said(view)

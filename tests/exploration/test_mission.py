@@ -19,9 +19,7 @@ from gmmtorch.exploration.mission.team_setup import assemble
 from gmmtorch.exploration.robot.robot_state import StoppingRule
 from gmmtorch.exploration.world.world import World
 from gmmtorch.mapping.components import Components
-from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.sharing.transport.link_conditions import Partition
-from gmmtorch.simulation.sensors.depth_camera import DepthCamera, DepthFrame
 from gmmtorch.simulation.worlds.furniture import box
 
 CONTRACT = """
@@ -121,31 +119,6 @@ def test_reach_depends_on_where_robots_are(world: World) -> None:
     kept = [without_seconds(mission_row(made, 1.0)) for made in (far, flown(world, options))]
     assert [each.pop("reach") for each in kept] == [1e3, None]
     assert kept[0] == kept[1]
-
-
-def test_the_grid_of_one_robot_is_the_sum_of_its_frames(
-    world: World, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    frames: list[DepthFrame] = []
-    sense = DepthCamera.sense
-
-    def noted(self: DepthCamera, *args: Any, **options: Any) -> DepthFrame:
-        frames.append(sense(self, *args, **options))
-        return frames[-1]
-
-    monkeypatch.setattr(DepthCamera, "sense", noted)
-    mission = flown(world, replace(SMALL, framework="grid_isolated", size=1, duration=6.0))
-    grid = mission.robots[0].mapper.belief.grid
-    hits, misses = torch.zeros(world.box.shape), torch.zeros(world.box.shape)
-    for frame in frames:
-        part = cast_evidence(frame.origin, frame.ends, frame.is_hit, world.resolution, world.box)
-        at = (part.cells - world.box.low).unbind(1)
-        hits[at] += part.hits
-        misses[at] += part.misses
-    found = grid.dense(world.box)
-    torch.testing.assert_close(found[0], hits)
-    torch.testing.assert_close(found[1], misses)
-    assert len(frames) == 6
 
 
 def test_robots_that_learn_too_little_rest(world: World) -> None:

@@ -119,15 +119,6 @@ def both(occupancy, depths):
     return csqmi(occupancy, depths, 0.05, needed_band(depths, 0.05)), fsmi(occupancy)
 
 
-@given(beams)
-def test_information_ignores_cells_behind_an_occupied_one(occupancy):
-    walled = torch.cat([occupancy, torch.ones(1, dtype=torch.float64)])
-    deeper = torch.cat([walled, torch.full((3,), 0.3, dtype=torch.float64)])
-    depths = 0.2 * torch.arange(N_CELLS + 4, dtype=torch.float64)
-    for near, far in zip(both(walled, depths[: N_CELLS + 1]), both(deeper, depths), strict=True):
-        torch.testing.assert_close(far, near, rtol=0, atol=1e-12)
-
-
 @pytest.mark.parametrize("n_cells", [64, 400])
 def test_csqmi_in_float32_is_accurate_for_long_beams(n_cells):
     generator = torch.Generator().manual_seed(0)

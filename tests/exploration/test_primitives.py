@@ -144,24 +144,6 @@ def test_limits_hold_at_every_step_and_braking_reaches_rest(
     assert bool(torch.isfinite(whole).all())
 
 
-def test_rollout_is_equivariant_and_independent_of_the_batch():
-    states = random_states(6, 7)
-    together = LIBRARY.rollout(states)
-    alone = torch.cat([LIBRARY.rollout(states[i : i + 1]) for i in range(6)])
-    torch.testing.assert_close(together, alone, rtol=0, atol=1e-12)
-    angle = 0.9
-    turn = torch.tensor(
-        [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]], dtype=torch.float64
-    )
-    moved = states.clone()
-    moved[:, :2] = states[:, :2] @ turn.T + 5
-    moved[:, 3] += angle
-    expected = together.clone()
-    expected[..., :2] = together[..., :2] @ turn.T + 5
-    expected[..., 3] += angle
-    torch.testing.assert_close(LIBRARY.rollout(moved), expected, rtol=0, atol=1e-12)
-
-
 def test_rollout_of_no_states_is_empty():
     none = torch.zeros(0, 7, dtype=torch.float64)
     assert LIBRARY.rollout(none).shape == (0, 25, 10, 7)

@@ -277,26 +277,6 @@ def test_view_values_are_translation_invariant(shift, seed):
         assert torch.equal(one, other)
 
 
-def test_view_values_do_not_depend_on_the_batch(evaluator):
-    around = hall()
-    generator = torch.Generator().manual_seed(0)
-    keys = torch.cat(
-        [torch.randint(-12, 12, (29, 3), generator=generator), torch.arange(29)[:, None] % 16], 1
-    )
-    together = evaluator.evaluate(around, keys)
-    order = torch.randperm(29, generator=generator)
-    shuffled = evaluator.evaluate(around, keys[order])
-    again = evaluator.evaluate(around, keys)
-    for one, two, three in zip(together, shuffled, again, strict=True):
-        assert torch.equal(one, three)
-        torch.testing.assert_close(two, one[order], rtol=1e-5, atol=1e-6)
-    for row in range(0, 29, 5):
-        alone = evaluator.evaluate(around, keys[row : row + 1])
-        torch.testing.assert_close(alone.gain[0], together.gain[row], rtol=1e-5, atol=1e-6)
-    none = evaluator.evaluate(around, keys[:0])
-    assert none.gain.shape == none.measured.shape == (0, together.gain.shape[1])
-
-
 def test_local_maps_are_cached_by_identity_and_released():
     evaluator = ViewEvaluator(*FOV, 2.0, RESOLUTION, n_beams=30, n_yaws=4)
     keys = torch.tensor([[3, 3, 2, 0]])
