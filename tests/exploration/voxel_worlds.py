@@ -43,6 +43,7 @@ def task_of(local_map: LocalMap, state: Tensor, **changes: Any) -> PlanningTask:
         "roadmap": Roadmap(),
         "now": 0.0,
         "generator": torch.Generator().manual_seed(0),
+        "trail": state[None, :3],
         **changes,
     }
     return PlanningTask(state=state, local_map=local_map, **given)

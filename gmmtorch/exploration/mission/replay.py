@@ -8,8 +8,8 @@ import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from typing import Any
 
-from gmmtorch.errors import DataError, check_whole
-from gmmtorch.exploration.mission.driver import Stopwatch, check_pace
+from gmmtorch.errors import DataError, check_number, check_whole
+from gmmtorch.exploration.mission.driver import Stopwatch
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.scan import Scan
 from gmmtorch.sharing.frame_joiner import FrameJoiner
@@ -65,7 +65,7 @@ class ReplayMission:
         keep_every: int = 10,
         joiner: FrameJoiner | None = None,
     ) -> None:
-        check_pace(rate=rate)
+        check_number("rate", rate, above=True)
         self.replica, self.map, self.tick_seconds = replica, make_map(), 1 / rate
         self.shared = SharedMap(
             replica, transport, store=store, announce_every=announce_every, budget=budget, joiner=joiner

@@ -101,7 +101,7 @@ class Trial:
 
 
 def run_mission(
-    trial: Trial, world: World | None = None, on_tick: OnMission | None = None
+    trial: Trial, world: World | None = None, on_tick: OnMission = lambda mission: None
 ) -> tuple[Mission, dict[str, Any]]:
     """Runs a trial; returns the mission at its end, and its row. Keeps nothing.
 
@@ -115,11 +115,8 @@ def run_mission(
     world = trial.world.open(trial.team) if world is None else world
     mission = assemble(world, trial.team)
     begin = time.perf_counter()
-    if on_tick is not None:
-        on_tick(mission)
-        drive(mission, SimulatedClock(), on_step=functools.partial(on_tick, mission))
-    else:
-        drive(mission, SimulatedClock())
+    on_tick(mission)
+    drive(mission, SimulatedClock(), on_step=functools.partial(on_tick, mission))
     row = mission_row(mission, time.perf_counter() - begin)
     # Only maps with a digest can be compared.
     has_digests = any(robot.mapper.shared.digest() for robot in mission.robots)
@@ -204,7 +201,7 @@ def save_trajectories(mission: Mission, path: Path) -> None:
     write_npz(path, **poses)
 
 
-def _run_and_keep(trial: Trial, on_tick: OnMission | None = None) -> dict[str, Any]:
+def _run_and_keep(trial: Trial, on_tick: OnMission = lambda mission: None) -> dict[str, Any]:
     torch.set_num_threads(1)
     mission, row = run_mission(trial, on_tick=on_tick)
     if trial.folder is not None:
@@ -242,8 +239,7 @@ def _run_in_parallel(trials: dict[int, Trial], workers: int) -> Iterator[tuple[i
 
 
 def _run_apart(i: int, trial: Trial, failed: Path) -> tuple[int, dict[str, Any] | Exception | None]:
-    """Runs a trial in a worker process, unless another has failed. Errors are returned: joblib would stop the
-    other trials if they were raised."""
+    """Runs a trial in a worker process, unless another has failed. Returns errors, which would end joblib."""
     end_with_parent()
     if failed.exists():
         return i, None

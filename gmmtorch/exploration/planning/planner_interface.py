@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import torch
@@ -39,7 +39,7 @@ class PlanningTask:
     roadmap: Roadmap
     now: float
     generator: torch.Generator
-    trail: Tensor = field(default_factory=lambda: torch.zeros(0, 3, dtype=torch.float64))
+    trail: Tensor
 
 
 @dataclass(frozen=True, eq=False)
