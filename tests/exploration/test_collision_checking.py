@@ -166,7 +166,7 @@ def test_only_staying_is_feasible_in_unknown_space():
     rollout, braking, _ = with_start(state)
     peers = PeerTrajectories.of([state[None, :3] + 0.1])
     for local_map in (unseen(), elsewhere):
-        for more in ({}, {"start": state}, {"start": state, "radius": RADIUS}):
+        for more in ({"start": state}, {"start": state, "radius": RADIUS}):
             for others in (None, peers):
                 assert torch.equal(feasible(rollout, braking, local_map, others, **more), in_place)
 
@@ -269,7 +269,7 @@ def test_feasible_rejects_steps_too_long_for_the_cells():
     rollout, braking, _ = with_start(state)
     fine = known(torch.zeros(8, 8, 8, dtype=torch.bool), torch.zeros(3, dtype=torch.int64), 0.01, 0.01)
     with pytest.raises(InvalidArgumentError, match="shorter step"):
-        feasible(rollout, braking, fine)
+        feasible(rollout, braking, fine, start=state)
 
 
 def test_feasible_of_no_paths_is_empty():

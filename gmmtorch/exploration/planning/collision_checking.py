@@ -118,7 +118,7 @@ def feasible(
     local_map: LocalMap,
     peers: PeerTrajectories | None = None,
     *,
-    start: Tensor | None = None,
+    start: Tensor,
     radius: float | None = None,
 ) -> Tensor:
     """Flag (...,) the safe paths: states (..., S, 7), followed by braking states (..., B, 7) until rest.
@@ -127,29 +127,23 @@ def feasible(
     does not move, such as a turn in place or a wait, is always safe.
 
     The map may change so that the robot's own cell is no longer passable. The robot may leave that cell
-    if `start` and `radius` are given. Its body, at its exact position, may then touch only free cells and
+    if `radius` is given. Its body, at its exact position, may then touch only free cells and
     the cells that it touches at the start, and it must move away from every point q of those: (x − x₀)·(q
     − x₀) ≤ 0. So no known obstacle comes closer than it is at the start, or than the radius.
 
     Args:
-        start: (..., 7) or broadcastable: the states before the first step. Without it the way to the
-            first state is not checked.
-        radius: of the robot (m).
+        start: (..., 7) or broadcastable: the states before the first step. radius: of the robot (m).
     """
-    states = torch.cat([rollout, braking], -2)
-    origin = None
-    if start is not None:
-        begin = start.to(states).expand(*states.shape[:-2], 7)
-        origin = begin[..., :3]
-        states = torch.cat([begin[..., None, :], states], -2)
+    begin = start.to(rollout).expand(*rollout.shape[:-2], 7)
+    origin = begin[..., :3]
+    states = torch.cat([begin[..., None, :], rollout, braking], -2)
     safe = local_map.is_passable(_points_along(states, _SPACING * local_map.resolution)).all(-1)
-    if origin is not None:
-        stuck = ~local_map.is_passable(origin)
-        safe &= ~stuck
-        if radius is not None:
-            for here in torch.unique(origin[stuck], dim=0):
-                rows = stuck & (origin == here).all(-1)
-                safe[rows] = _leaves(here, states[rows], local_map, radius)
+    stuck = ~local_map.is_passable(origin)
+    safe &= ~stuck
+    if radius is not None:
+        for here in torch.unique(origin[stuck], dim=0):
+            rows = stuck & (origin == here).all(-1)
+            safe[rows] = _leaves(here, states[rows], local_map, radius)
     if peers is not None:
         places = torch.cat([rollout[..., :3], braking[..., :3]], -2)
         safe &= clear_of(places, peers, origin)
