@@ -192,9 +192,3 @@ def test_check_start_names_impossible_poses(divided: World, pose: tuple[float, .
     poses = torch.tensor([(1.1, 1.1, 1.5, 0.0), pose], dtype=torch.float64)
     with pytest.raises(InvalidArgumentError, match=message):
         starts.check_start(divided, poses, PRIMITIVES)
-
-
-def test_check_start_rejects_wrong_shapes(divided: World) -> None:
-    for shape in ((3, 3), (0, 4), (4,)):
-        with pytest.raises(InvalidArgumentError, match="expected"):
-            starts.check_start(divided, torch.zeros(shape), PRIMITIVES)

@@ -127,9 +127,9 @@ def run_mission(
 def run_trials(
     trials: Sequence[Trial],
     workers: int = 1,
-    on_row: Callable[[dict[str, Any]], None] | None = None,
+    on_row: Callable[[dict[str, Any]], object] = lambda row: None,
     on_event: Event = ignore,
-    on_sample: OnMission | None = None,
+    on_sample: OnMission = lambda mission: None,
 ) -> list[dict[str, Any]]:
     """The rows of trials in their order, run in `workers` processes; trials with a kept row are not run.
 
@@ -154,11 +154,10 @@ def run_trials(
     def sampled(i: int, mission: Mission) -> None:
         if mission.has_sampled:
             progress(i, mission.elapsed)
-            if on_sample is not None:
-                on_sample(mission)
+            on_sample(mission)
 
     for row in rows:
-        if row is not None and on_row is not None:
+        if row is not None:
             on_row(row)
     on_event(STAGE, round(sum(seconds)), round(sum(durations)))
     if workers == 1:
@@ -170,8 +169,7 @@ def run_trials(
     for i, row in finished:
         rows[i] = row
         progress(i, durations[i])
-        if on_row is not None:
-            on_row(row)
+        on_row(row)
     return [row for row in rows if row is not None]
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gmmtorch.exploration.information.view_evaluator import BLOCK
 from gmmtorch.exploration.planning.geodesic import COARSE, DistanceField
-from gmmtorch.exploration.planning.global_planner import Journey, looks
+from gmmtorch.exploration.planning.global_planner import Journey, angle, looks
 from gmmtorch.exploration.planning.planner_interface import Plan, PlanningTask
 from gmmtorch.exploration.planning.primitives import Primitives
 from gmmtorch.exploration.planning.recovery import Waiting
@@ -175,8 +175,7 @@ class FrontierPlanner:
         block = (here.cells_of(found.targets) // BLOCK).clamp_min(0)
         counts = [-(-n // BLOCK) for n in here.shape]
         flat = (block[:, 0] * counts[1] + block[:, 1]) * counts[2] + block[:, 2]
-        turn = torch.remainder(found.poses[:, 3] - task.state[3] + math.pi, 2 * math.pi) - math.pi
-        turn = _TURNING * turn.abs()
+        turn = _TURNING * angle(found.poses[:, 3] - task.state[3])
         score = found.sizes.clamp_max(_LARGEST) * task.residual[flat] / (1 + found.metres + turn)
         same = (found.targets - self._target).norm(dim=1) < _SAME
         if self._journey is not None:

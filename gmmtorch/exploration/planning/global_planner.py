@@ -37,12 +37,12 @@ class Goal:
         metres, there = self.distances.way(points, _AHEAD)
         way = there - points
         bearing = torch.atan2(way[..., 1], way[..., 0])
-        into, last = _angle(bearing - yaw) + _angle(self.yaw - bearing), _angle(self.yaw - yaw)
+        into, last = angle(bearing - yaw) + angle(self.yaw - bearing), angle(self.yaw - yaw)
         level = (way[..., :2].norm(dim=-1) / _NEAR).clamp_max(1)
         return metres + _TURNING * torch.lerp(last, into, level)
 
 
-def _angle(radians: Tensor) -> Tensor:
+def angle(radians: Tensor) -> Tensor:
     """Absolute angles, wrapped to at most π."""
     return (torch.remainder(radians + math.pi, 2 * math.pi) - math.pi).abs()
 
@@ -56,8 +56,8 @@ _FACING = 0.7  # radians off the goal's heading at which the robot has arrived
 
 def looks(state: Tensor, poses: Tensor) -> Tensor:
     """Flag (...,) the poses (..., 4) that a robot in a state (7,) has reached, position and heading."""
-    off = torch.remainder(state[3] - poses[..., 3] + math.pi, 2 * math.pi) - math.pi
-    return ((state[:3] - poses[..., :3]).norm(dim=-1) < _THERE) & (off.abs() < _FACING)
+    is_there = (state[:3] - poses[..., :3]).norm(dim=-1) < _THERE
+    return is_there & (angle(state[3] - poses[..., 3]) < _FACING)
 
 
 class Journey:

@@ -71,15 +71,10 @@ def start_poses(world: World, n: int, primitives: Primitives) -> Tensor:
 
 
 def check_start(world: World, poses: Tensor, primitives: Primitives) -> Tensor:
-    """Check that robots can start at poses (n, 4) and return them as float64.
+    """Check that robots can start at poses (n, 4), x, y, z (m) and yaw (rad), float64; return them.
 
     Raises `InvalidArgumentError` that names the first bad pose and a better place for it.
     """
-    if poses.ndim != 2 or poses.shape[1] != 4 or len(poses) == 0:
-        raise InvalidArgumentError(
-            f"start poses have shape {tuple(poses.shape)}; expected (n, 4): x, y, z (m), yaw (rad); n ≥ 1."
-        )
-    poses = poses.detach().cpu().double()
     for i, pose in enumerate(poses):
         others = poses[:i, :3]
         if not bool(torch.isfinite(pose).all()):
