@@ -149,15 +149,14 @@ def _shared_map(config: DictConfig, stack: ExitStack) -> SharedMap | None:
     """
     import torch
 
-    from gmmtorch.errors import check_choice, check_whole
-    from gmmtorch.exploration.mission.driver import check_pace
+    from gmmtorch.errors import check_choice, check_number, check_whole
     from gmmtorch.sharing.frame_joiner import FrameJoiner
     from gmmtorch.sharing.replica.replica import Replica
     from gmmtorch.sharing.shared_map import SharedMap
     from gmmtorch.sharing.store import Store
 
     check_choice("start", config.start, _STARTS)
-    check_pace(settle=config.settle)
+    check_number("settle", config.settle)
     robot = check_whole("id", config.id, 0)
     if config.transport is None:
         return None
