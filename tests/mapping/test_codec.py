@@ -22,7 +22,7 @@ from gmmtorch.mapping.codec.component_batch import decode, encode, lattice, quan
 from gmmtorch.mapping.codec.quantization import COUNT_ERROR, ORIGIN_STEP
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import WindowedRule
-from gmmtorch.mapping.learning.windowed import learn_window
+from gmmtorch.mapping.learning.windows import learn_window
 from gmmtorch.occupancy.evidence import occupancy_probability
 from gmmtorch.occupancy.forms.point import point_evidence
 

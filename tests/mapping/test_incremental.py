@@ -20,10 +20,10 @@ from gmmtorch.evaluation import metrics, queries
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.depth_frame import DepthFrame
-from gmmtorch.mapping.learning.incremental import absorb
 from gmmtorch.mapping.learning.merging import UNNUMBERED, estimated_bytes
 from gmmtorch.mapping.learning.novelty import entropy_reduction
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
+from gmmtorch.mapping.learning.windows import absorb
 from gmmtorch.occupancy.evidence import occupancy_probability
 from gmmtorch.occupancy.forms.point import point_evidence
 from gmmtorch.pinhole import back_project

@@ -16,9 +16,9 @@ from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.depth_frame import DepthFrame
 from gmmtorch.mapping.learning.fitting import fit_window
-from gmmtorch.mapping.learning.incremental import surface_fit
 from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule, read_rule, rule_facts
 from gmmtorch.mapping.learning.viewpoints import all_origins
+from gmmtorch.mapping.learning.windows import surface_fit
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.estimators.sensor_model import measured_sensor
 from gmmtorch.mixture.reduction.pruning import density_share

@@ -12,9 +12,9 @@ from occupancy.protocol_contract import dims, empty_scan, open_scan, wall_scan
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.incremental import absorb
 from gmmtorch.mapping.learning.novelty import entropy_reduction, novel_beams
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule
+from gmmtorch.mapping.learning.windows import absorb
 from gmmtorch.occupancy.forms.point import point_evidence
 from gmmtorch.scan import Scan
 

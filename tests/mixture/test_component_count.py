@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.learning.rules import WindowedRule
-from gmmtorch.mapping.learning.windowed import flatness_rule
+from gmmtorch.mapping.learning.windows import flatness_rule
 from gmmtorch.mixture import GaussianMixture
 from gmmtorch.mixture.em import initialization
 from gmmtorch.mixture.em.initialization import surface_pieces

@@ -23,9 +23,9 @@ from gmmtorch.exploration.world.scoring import BeliefMap
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.association import box_around, count_explained, explained_within, summed
 from gmmtorch.mapping.learning.fitting import SurfaceFit, fit_window
-from gmmtorch.mapping.learning.incremental import cell_fit
 from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.mapping.learning.viewpoints import all_origins
+from gmmtorch.mapping.learning.windows import cell_fit
 from gmmtorch.mapping.rays.component_evidence import component_evidence
 from gmmtorch.mapping.rays.mixture_tiles import MixtureTiles, regenerate
 from gmmtorch.occupancy.voxels.boxes import Box, intersection
