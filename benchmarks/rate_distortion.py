@@ -47,7 +47,7 @@ from gmmtorch.evaluation.codecs.point_codecs import (
 from gmmtorch.evaluation.metrics import psnr_terms, roc
 from gmmtorch.evaluation.queries import FREE, OCCUPIED, Queries
 from gmmtorch.files import write_bytes
-from gmmtorch.mapping.codec.component_batch import spatial_order
+from gmmtorch.mapping.codec.quantization import spatial_order
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.fitting import SurfaceFit, fit_points
 from gmmtorch.mapping.learning.merging import compact

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from gmmtorch.evaluation.codecs.point_codecs import bytes_of_points
 from gmmtorch.exploration.robot.gmm_mapper import FrameRule
-from gmmtorch.mapping.codec.component_batch import spatial_order
+from gmmtorch.mapping.codec.quantization import spatial_order
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.fitting import fit_window
 from gmmtorch.mapping.learning.viewpoints import all_origins

@@ -17,7 +17,7 @@ from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check
 from gmmtorch.files import write_bytes
 from gmmtorch.linalg import check_rigid
 from gmmtorch.mapping.codec import map_file
-from gmmtorch.mapping.codec.component_batch import quantized
+from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.depth_frame import DepthFrame, depth_and_pose
 from gmmtorch.mapping.learning.forgetting import Doubts

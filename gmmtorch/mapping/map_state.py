@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
-from gmmtorch.mapping.codec.component_batch import numbered
 from gmmtorch.mapping.codec.map_file import FileSize, MapSettings, number_after
+from gmmtorch.mapping.codec.quantization import numbered
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.depth_frame import DepthFrame, as_scans
 from gmmtorch.mapping.learning.forgetting import Doubts, Forgetting

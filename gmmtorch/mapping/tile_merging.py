@@ -15,8 +15,8 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
 from gmmtorch.files import write_bytes
 from gmmtorch.mapping.codec import map_file
-from gmmtorch.mapping.codec.component_batch import quantized, spatial_order
 from gmmtorch.mapping.codec.map_file import MapSettings
+from gmmtorch.mapping.codec.quantization import quantized, spatial_order
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.merging import compact_to_bytes
 from gmmtorch.mapping.learning.rules import IncrementalRule

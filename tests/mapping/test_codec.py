@@ -17,9 +17,9 @@ from mapping.random_components import random_components, rotations
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation import metrics, queries
-from gmmtorch.mapping.codec import batch_stream
-from gmmtorch.mapping.codec.component_batch import decode, encode, lattice, quantized, spatial_order
-from gmmtorch.mapping.codec.quantization import COUNT_ERROR, ORIGIN_STEP
+from gmmtorch.mapping.codec import component_batch, lattice
+from gmmtorch.mapping.codec.component_batch import decode, encode
+from gmmtorch.mapping.codec.quantization import COUNT_ERROR, ORIGIN_STEP, quantized, spatial_order
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import WindowedRule
 from gmmtorch.mapping.learning.windows import learn_window
@@ -248,7 +248,7 @@ def test_cells_as_large_as_the_coordinate_range_are_decoded(monkeypatch, exponen
     corners = torch.tensor([[-lattice.FARTHEST] * 3, [lattice.FARTHEST] * 3], dtype=torch.float64)
     wide = random_components(3, k=2, deviations=(2.0**18, 2.0**19))
     components = quantized(replace(wide, means=corners, origins=wide.origins * 0))
-    monkeypatch.setattr(batch_stream, "_cell_exponent", lambda places, in_order: exponent)
+    monkeypatch.setattr(component_batch, "cell_exponent", lambda places, in_order: exponent)
     assert_same_components(decode(encode(components)), components)
 
 

@@ -12,7 +12,8 @@ from mapping.random_components import random_components
 
 from gmmtorch.errors import DataError, GmmTorchError
 from gmmtorch.mapping.codec.bitstream import BitWriter
-from gmmtorch.mapping.codec.component_batch import decode, encode, quantized
+from gmmtorch.mapping.codec.component_batch import decode, encode
+from gmmtorch.mapping.codec.quantization import quantized
 
 
 def sealed(body: bytes) -> bytes:

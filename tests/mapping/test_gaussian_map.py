@@ -14,7 +14,7 @@ from occupancy.protocol_contract import dims, lattice, open_scan, wall_scan
 
 from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError, MemoryLimitError
-from gmmtorch.mapping.codec.component_batch import quantized
+from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule

@@ -12,7 +12,7 @@ from occupancy.protocol_contract import dims, lattice, wall_scan
 from scipy.stats import multivariate_normal
 
 from gmmtorch.errors import GmmTorchError
-from gmmtorch.mapping.codec.component_batch import quantized
+from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.query_options import METHODS
 from gmmtorch.occupancy.grid import VoxelGrid

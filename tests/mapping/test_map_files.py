@@ -19,7 +19,7 @@ from torch import Tensor
 from gmmtorch.errors import DataError, GmmTorchError
 from gmmtorch.files import pack_tensors, read_tensors
 from gmmtorch.mapping.codec import map_file as storage
-from gmmtorch.mapping.codec.component_batch import numbered
+from gmmtorch.mapping.codec.quantization import numbered
 from gmmtorch.mapping.components import UNNUMBERED
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule

@@ -11,7 +11,7 @@ import torch
 from hypothesis import strategies as st
 from mapping.random_components import random_components
 
-from gmmtorch.mapping.codec.component_batch import spatial_order
+from gmmtorch.mapping.codec.quantization import spatial_order
 from gmmtorch.mapping.components import Components
 from gmmtorch.sharing.messages.message_registry import (
     CODECS,

@@ -19,8 +19,7 @@ from sharing.message_examples import (
 )
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mapping.codec.component_batch import quantized
-from gmmtorch.mapping.codec.quantization import COUNT_ERROR, MOST_POINTS, quantize
+from gmmtorch.mapping.codec.quantization import COUNT_ERROR, MOST_POINTS, quantize, quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.sharing.messages.component_messages import MOST_COMPONENTS_SENT, fitted
 from gmmtorch.sharing.messages.envelope import FARTHEST

@@ -16,7 +16,7 @@ from sharing.replica_model import Model, rows
 from sharing.schedules import components, run_schedule
 
 import gmmtorch as gt
-from gmmtorch.mapping.codec.component_batch import quantized
+from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.sharing.replica.replica import Replica
 
 N_SCHEDULES = int(os.environ.get("GMMTORCH_SCHEDULES", "4"))
