@@ -27,6 +27,7 @@ from gmmtorch.mapping.codec.quantization import spatial_order
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.fitting import fit_window
 from gmmtorch.mapping.learning.viewpoints import all_origins
+from gmmtorch.sharing.messages.fields import pose_of
 from gmmtorch.sharing.messages.message_registry import (
     CODECS,
     ViewsMessage,
@@ -38,7 +39,6 @@ from gmmtorch.sharing.messages.message_registry import (
     encode_views,
     quantized_poses,
 )
-from gmmtorch.sharing.messages.pose_fields import pose_of
 from gmmtorch.sharing.messages.record_messages import (
     CorrectionMessage,
     SupersessionMessage,

@@ -136,7 +136,11 @@ class Components:
         """The components on a device."""
         if self.means.device == torch.device(device):
             return self
-        return Components(**{field.name: getattr(self, field.name).to(device) for field in fields(self)})
+        return Components(**{name: value.to(device) for name, value in vars(self).items()})
+
+    def on_cpu(self) -> Components:
+        """The components on the CPU, without gradients."""
+        return Components(**{name: value.detach().cpu() for name, value in vars(self).items()})
 
     def cones(self) -> Cones:
         """One cone for each viewpoint: the argument of the evidence functions."""

@@ -15,9 +15,8 @@ from sharing.message_examples import sealed
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.codec.bitstream import BitWriter
 from gmmtorch.mapping.codec.quantization import COUNT_ERROR
-from gmmtorch.sharing.messages.fields import write_intervals, write_keys
+from gmmtorch.sharing.messages.fields import pose_of, write_intervals, write_keys
 from gmmtorch.sharing.messages.message_registry import MAX_BYTES, decode
-from gmmtorch.sharing.messages.pose_fields import pose_of
 from gmmtorch.sharing.messages.record_messages import (
     AnnouncementMessage,
     CorrectionMessage,

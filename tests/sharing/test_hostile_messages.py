@@ -341,6 +341,6 @@ def test_unexpected_errors_of_a_reader_refuse_the_datagram(sound, monkeypatch):
         def careless(body: bytes, error: type[Exception] = error) -> Message:
             raise error("oh")
 
-        monkeypatch.setitem(messages._READERS, Kind.PLAN, careless)
+        monkeypatch.setitem(messages._KINDS, Kind.PLAN, ("plans", careless))
         with pytest.raises(DataError, match="oh"):
             decode(sound[8])

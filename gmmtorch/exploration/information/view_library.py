@@ -14,9 +14,9 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.exploration.robot.mapper import LocalMap
-from gmmtorch.sharing.messages.fields import LATEST, TICKS
 from gmmtorch.sharing.messages.message_registry import MAX_BYTES, ViewsMessage, encode_views, quantized_poses
 from gmmtorch.sharing.messages.record_messages import check_size
+from gmmtorch.sharing.messages.view_messages import LATEST, TICKS
 from gmmtorch.sharing.replica.record_keys import (
     LARGEST_INCARNATION,
     LARGEST_ROBOT,

@@ -146,9 +146,7 @@ def quantize(components: Components) -> Quantized:
 
 def quantized(components: Components) -> Components:
     """The result of `decode(encode(components))`, on the components' device, without writing bits."""
-    restored = quantize(components).restored()
-    device = components.means.device
-    return Components(**{name: value.to(device) for name, value in vars(restored).items()})
+    return quantize(components).restored().to(components.means.device)
 
 
 def _support_steps(support: Tensor) -> Tensor:

@@ -64,15 +64,23 @@ def parse_datagram(datagram: bytes) -> tuple[Kind, bytes]:
             f"The datagram is of version {version}; this gmmtorch reads version {VERSION}. It is foreign or "
             "damaged, or gmmtorch must be updated on one of the robots."
         )
-    if number not in {int(kind) for kind in Kind}:
-        raise DataError(f"The datagram has the unknown kind {number}: it is foreign or damaged.")
-    kind = Kind(number)
+    try:
+        kind = Kind(number)
+    except ValueError as error:
+        raise DataError(f"The datagram has the unknown kind {number}: it is foreign or damaged.") from error
     if kind in OWN_CHECKSUM:
         return kind, datagram[1:]
     data, checksum = datagram[:-_CHECKSUM_BYTES], datagram[-_CHECKSUM_BYTES:]
     if len(datagram) <= _CHECKSUM_BYTES or zlib.crc32(data) != int.from_bytes(checksum, "little"):
         raise DataError("The datagram does not match its checksum: it is truncated or damaged.")
     return kind, data[1:]
+
+
+def check_datagram(datagram: bytes, least: int = 0) -> None:
+    """Raise `InvalidArgumentError` unless a datagram is bytes, from `least` to `MAX_BYTES`."""
+    if not isinstance(datagram, bytes) or not least <= len(datagram) <= MAX_BYTES:
+        what = f"{len(datagram)} bytes" if isinstance(datagram, bytes) else type(datagram).__name__
+        raise InvalidArgumentError(f"A datagram is {what}; it must be bytes, from {least} to {MAX_BYTES}.")
 
 
 def split(

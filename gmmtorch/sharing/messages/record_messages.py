@@ -19,14 +19,18 @@ from gmmtorch.mapping.codec.quantization import LARGEST_COUNT, NO_COUNT, count_s
 from gmmtorch.sharing.messages.count_messages import counts_of
 from gmmtorch.sharing.messages.envelope import FARTHEST, MAX_BYTES, Kind, make_datagram, split
 from gmmtorch.sharing.messages.fields import (
+    is_motion,
+    matrix_of,
+    motion_dim,
     read_intervals,
     read_keys,
+    read_motion,
     read_number,
     write_intervals,
     write_keys,
+    write_motion,
     write_number,
 )
-from gmmtorch.sharing.messages.pose_fields import is_motion, matrix_of, motion_dim, read_motion, write_motion
 from gmmtorch.sharing.replica.record_keys import (
     END,
     LARGEST_INCARNATION,
