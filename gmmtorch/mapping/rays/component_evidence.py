@@ -10,11 +10,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.rays.component_casting import (
-    THINNING,
-    Seen,
-    cast_components,
-)
+from gmmtorch.kernels.rays.component_casting import THINNING, Seen, cast_components
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.rays.component_rays import RayDensity, counted_viewpoints, drawn_rays, ray_numbers
 from gmmtorch.occupancy.forms.monte_carlo import RayBundle

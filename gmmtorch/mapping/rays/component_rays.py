@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
-from gmmtorch.kernels.rays.component_casting import (
-    hidden_area,
-    truncated_normals,
-)
+from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
+from gmmtorch.kernels.rays.component_casting import hidden_area, truncated_normals
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.forms.monte_carlo import RayBundle
@@ -65,8 +61,7 @@ class RayDensity:
     def __post_init__(self) -> None:
         check_resolution(self.resolution)
         for name in ("rays_per_cell", "cutoff"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise InvalidArgumentError(f"{name}={getattr(self, name)} must be finite, above zero.")
+            check_number(name, getattr(self, name), above=True)
         if check_whole("most", self.most, 1) < check_whole("least", self.least, 1):
             raise InvalidArgumentError(f"most={self.most} must be at least least={self.least}.")
 

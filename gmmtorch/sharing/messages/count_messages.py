@@ -19,9 +19,8 @@ from gmmtorch.mapping.codec.quantization import (
     points_of,
 )
 from gmmtorch.mapping.codec.thesis_message import decode_thesis_updates, encode_thesis_updates
-from gmmtorch.sharing.messages.envelope import Kind, check_codec, make_datagram, split
+from gmmtorch.sharing.messages.envelope import LARGEST_NUMBER, Kind, check_codec, make_datagram, split
 from gmmtorch.sharing.messages.fields import (
-    LARGEST_NUMBER,
     check_ids,
     id_order,
     read_ids,

@@ -1,4 +1,4 @@
-"""The header of all datagrams: a first byte with version and kind. At most 1200 bytes, and a checksum."""
+"""What all datagrams have in common: a first byte with version and kind, a checksum, and limits."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import itertools
 import zlib
 from collections.abc import Callable, Sequence
 from enum import IntEnum
+
+from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 
@@ -15,6 +17,8 @@ MAX_BYTES = 1200
 FARTHEST = 2.0**24
 """Largest coordinate (m) of a position in a message: 16 777 km, so that UTM and earth-centred coordinates
 fit. Moved by a correction, positions stay within 2³² cells of 2 cm, where rays can be cast."""
+LARGEST_NUMBER = (1 << 60) - 1
+"""Largest robot id, and largest number of anything that a robot counts."""
 CODECS = ("quantized", "float", "thesis")
 """Encodings of components and counts."""
 _KIND_BITS = 4
@@ -124,3 +128,16 @@ def check_codec(codec: str) -> str:
     if codec not in CODECS:
         raise InvalidArgumentError(f"codec={codec!r} must be one of {', '.join(CODECS)}.")
     return codec
+
+
+def check_places(name: str, places: Tensor, farthest: float = FARTHEST) -> Tensor:
+    """The positions (N, D), m; raises `InvalidArgumentError` unless all coordinates are at most
+    `farthest`."""
+    bad = ~(places.abs() <= farthest).all(1)
+    if bool(bad.any()):
+        first = int(bad.nonzero()[0])
+        raise InvalidArgumentError(
+            f"{name}[{first}] is {places[first].tolist()}; positions must be finite, and up to "
+            f"{farthest:g} m on each axis. Is it in metres, and the world's origin near?"
+        )
+    return places

@@ -9,11 +9,9 @@ from torch import Tensor
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.linalg import check_rigid
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Ints
-from gmmtorch.sharing.messages.envelope import FARTHEST
+from gmmtorch.sharing.messages.envelope import FARTHEST, LARGEST_NUMBER
 from gmmtorch.sharing.replica.record_keys import END, MOST_RECORDS, NUMBER_BITS, Intervals, authors
 
-LARGEST_NUMBER = (1 << 60) - 1
-"""Largest robot id, and largest number of anything that a robot counts."""
 _LEAST_BITS = 8  # of a number in the stream
 _NUMBERS = {2: 4, 3: 7}
 """Numbers of a rigid motion: in 2D a translation with cos and sin of the yaw; in 3D a translation with a unit
@@ -126,19 +124,6 @@ def read_number(reader: BitReader) -> int:
     if not 0 <= value <= LARGEST_NUMBER:
         raise DataError(f"A number is {value}, not from 0 to {LARGEST_NUMBER}: it is damaged.")
     return value
-
-
-def check_places(name: str, places: Tensor, farthest: float = FARTHEST) -> Tensor:
-    """The positions (N, D), m; raises `InvalidArgumentError` unless all coordinates are at most
-    `farthest`."""
-    bad = ~(places.abs() <= farthest).all(1)
-    if bool(bad.any()):
-        first = int(bad.nonzero()[0])
-        raise InvalidArgumentError(
-            f"{name}[{first}] is {places[first].tolist()}; positions must be finite, and up to "
-            f"{farthest:g} m on each axis. Is it in metres, and the world's origin near?"
-        )
-    return places
 
 
 def motion_dim(pose: Tensor) -> int:

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
-from gmmtorch.sharing.messages.envelope import MAX_BYTES, Kind, make_datagram
-from gmmtorch.sharing.messages.fields import check_places
+from gmmtorch.sharing.messages.envelope import MAX_BYTES, Kind, check_places, make_datagram
 
 _HEADER = struct.Struct("<HI3dHHH")  # sender, frame, origin, part, parts, points
 _POINT_BYTES = 12
