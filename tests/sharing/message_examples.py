@@ -45,6 +45,11 @@ def sealed(data: bytes) -> bytes:
     return data + zlib.crc32(data).to_bytes(4, "little")
 
 
+def forged(datagram: bytes, body: bytes) -> bytes:
+    """A datagram of the same kind with another body and valid checksums."""
+    return datagram[:1] + sealed(body) if datagram[0] == 0x11 else sealed(datagram[:1] + body)
+
+
 def assert_same(one: object, other: object) -> None:
     for field in fields(one):  # type: ignore[arg-type]
         a, b = getattr(one, field.name), getattr(other, field.name)

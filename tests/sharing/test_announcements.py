@@ -147,17 +147,6 @@ def test_corrections_by_half_turns_are_decoded():
 # -- hostile ---------------------------------------------------------------------------------------------
 
 
-def examples() -> list[bytes]:
-    held = Intervals.span(0, 70) | within(3, 5, 6, 900)
-    pose = pose_of(torch.eye(4))
-    return [
-        *encode_announcements(1, 2, held),
-        encode_record(SupersessionMessage(first_key(2, 5), within(2, 0, 1, 2, 7), within(2, 30, 31))),
-        encode_record(counters_message(first_key(1, 9), {1: 5.0, first_key(4) + 3: 800.0})),
-        encode_record(CorrectionMessage(first_key(2, 9), 3, 1, within(2, 4, 5), pose)),
-    ]
-
-
 @pytest.mark.parametrize(
     "numbers",
     [
@@ -341,12 +330,8 @@ def test_a_late_robot_receives_all_records_from_a_third_robot():
         sent.append(relay.datagrams())
         for datagram in sent[-1]:
             assert late.receive(datagram)
-    assert [bool(datagrams) for datagrams in sent] == [
-        False,
-        False,
-        False,
-        True,
-    ]  # it counts as in flight until then
+    # It counts as in flight until then.
+    assert [bool(datagrams) for datagrams in sent] == [False, False, False, True]
     assert late.digest() == relay.digest() == one.digest()
     for datagram in late.announcements():
         relay.receive(datagram)

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapping.random_components import random_components
-from sharing.replica_histories import gossip
+from sharing.replica_histories import gossip, motion
 from sharing.replica_model import rows
 from sharing.schedules import act, components
 
@@ -196,9 +196,7 @@ def test_only_changes_of_known_components_demand_a_rebuild():
     one.add(random_components(3, k=2, seed=1), supersedes=ids[1:2])
     follower.follow(one)
     assert follower.rebuilt == 1
-    motion = torch.eye(4, dtype=torch.float64)
-    motion[0, 3] = 2.0
-    one.correct(0, motion, ids[2:])
+    one.correct(0, motion(2.0), ids[2:])
     follower.follow(one)
     assert follower.rebuilt == 2
     assert follower.agrees(one)
@@ -213,9 +211,7 @@ def test_components_that_arrive_after_their_correction_are_corrected():
     one, other, follower = Replica(0), Replica(1), Follower()
     ids = one.add(random_components(3, k=4))
     shapes = one.datagrams()
-    motion = torch.eye(4, dtype=torch.float64)
-    motion[0, 3] = 2.0
-    one.correct(0, motion, ids)
+    one.correct(0, motion(2.0), ids)
     follower.follow(other)
     for datagram in [*one.datagrams(), *shapes]:
         other.receive(datagram)
@@ -235,21 +231,8 @@ def test_falling_counters_demand_a_rebuild():
     first = 5 << 52 | 2 << 28
     less = CountersMessage(first + 1, np.array([key[1]], np.int64), np.array([8], np.int64))
     assert one.receive(encode_record(less))
-    old, new = (
-        Intervals.span(first, first + 1),
-        Intervals.span(first + 1, first + 2),
-    )
+    old, new = Intervals.span(first, first + 1), Intervals.span(first + 1, first + 2)
     assert one.receive(encode_record(SupersessionMessage(first + 2, old, new)))
     follower.follow(one)
     assert follower.rebuilt == 1
     assert follower.agrees(one)
-
-
-# -- memory ----------------------------------------------------------------------------------------------
-
-
-def tell(replica: Replica, seed: int) -> None:
-    ids = replica.add(random_components(3, k=5, seed=seed))
-    replica.count({tuple(row): 9.0 + seed for row in ids[:2].tolist()})
-    known = replica.components().ids
-    replica.count({tuple(known[0].tolist()): 100.0 * 2**seed})

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapping.random_components import random_components
 from sharing.message_examples import sealed
-from sharing.replica_histories import exchange, gossip, replica_of
+from sharing.replica_histories import exchange, gossip, motion, replica_of
 from sharing.replica_model import rows
 from sharing.schedules import components
 from sharing.test_changes import Follower
@@ -27,14 +27,6 @@ from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.sharing.store import Store
 
 seeds = st.integers(0, 10**6)
-
-
-def motion(x: float, yaw: float = 0.0) -> torch.Tensor:
-    made = torch.eye(4, dtype=torch.float64)
-    made[0, 3] = x
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    made[:2, :2] = torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64)
-    return made
 
 
 def team(n: int) -> list[Replica]:

@@ -15,7 +15,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapping.random_components import random_components
-from sharing.message_examples import examples, sealed
+from sharing.message_examples import examples, forged, sealed
 from sharing.structured_bodies import structured
 
 from gmmtorch.errors import DataError
@@ -186,11 +186,6 @@ def test_noise_is_refused(data):
 @given(kind=st.integers(1, 14), body=st.binary(max_size=400))
 def test_noise_with_a_valid_checksum_is_refused_or_valid(kind, body):
     try_decode(sealed(b"\x11" + sealed(b"\x01" + body)) if kind == 1 else sealed(bytes([0x10 | kind]) + body))
-
-
-def forged(datagram: bytes, body: bytes) -> bytes:
-    """A datagram of the same kind with another body and valid checksums."""
-    return datagram[:1] + sealed(body) if datagram[0] == 0x11 else sealed(datagram[:1] + body)
 
 
 def test_forged_datagrams_are_refused_or_valid(sound):

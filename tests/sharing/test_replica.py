@@ -11,7 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapping.random_components import random_components
-from sharing.replica_histories import exchange, history, replica_of
+from sharing.replica_histories import exchange, history, motion, replica_of
 from sharing.replica_model import Model, rows
 from sharing.schedules import components, run_schedule
 
@@ -128,10 +128,7 @@ def test_a_changed_map_sends_only_its_changes():
     one.datagrams()
     assert len(one.add(m)) == 0
     assert one.datagrams() == []
-    motion = torch.eye(4, dtype=torch.float64)
-    motion[0, 3] = 1.0
-    moved = m.ids[:5].clone()
-    m.transform(motion, moved)
+    m.transform(motion(1.0), m.ids[:5].clone())
     fresh = m.components().selected(torch.arange(3, 60))  # without the first three
     m = gt.GaussianMap.of(fresh)
     assert len(one.add(m)) == 2
@@ -201,9 +198,7 @@ def test_the_last_correction_of_a_scan_counts():
     given_ = random_components(3, k=6)
     ids = one.add(given_)
     turn = torch.tensor([[0.0, -1, 0, 2], [1, 0, 0, 0], [0, 0, 1, -1], [0, 0, 0, 1]], dtype=torch.float64)
-    first = torch.eye(4, dtype=torch.float64)
-    first[0, 3] = 50.0
-    one.correct(7, first, ids[:4])
+    one.correct(7, motion(50.0), ids[:4])
     late = one.datagrams()
     one.correct(7, turn, ids[:4])
     for datagram in [*one.datagrams(), *late]:

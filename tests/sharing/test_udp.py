@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 
 import pytest
+from sharing.transport_cases import KEY, heard, until
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.sharing.transport.security import Sealer
@@ -21,7 +22,6 @@ from gmmtorch.sharing.transport.simulated_network import Network, Traffic, Trans
 from gmmtorch.sharing.transport.team_key import TeamKey
 from gmmtorch.sharing.transport.udp import UdpTransport
 
-KEY = TeamKey(bytes(range(32)))
 GROUP = "239.71.77.7"
 Opening = Callable[..., UdpTransport]
 
@@ -48,21 +48,6 @@ def team(opening: Opening, n: int, **options: object) -> list[UdpTransport]:
     for transport in transports:
         transport.peers = [other.address for other in transports if other is not transport]
     return transports
-
-
-def until(is_done: Callable[[], bool]) -> None:
-    """Waits for a condition; fails after ten seconds."""
-    end = time.monotonic() + 10
-    while not is_done():
-        assert time.monotonic() < end
-        time.sleep(0.002)
-
-
-def heard(transport: UdpTransport, n: int) -> list[tuple[int, bytes]]:
-    """The next n datagrams."""
-    found: list[tuple[int, bytes]] = []
-    until(lambda: len(found.extend(transport.deliver(transport.robot, 0.0)) or found) >= n)
-    return found
 
 
 # -- deliveries and statistics --------------------------------------------------------------------

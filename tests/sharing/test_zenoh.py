@@ -12,7 +12,8 @@ from contextlib import ExitStack
 
 import pytest
 from sharing.schedules import components
-from zenoh_cases import KEY, Opening, endpoint, greet, heard, until, wait_until_connected, zenoh
+from sharing.transport_cases import KEY, heard, until
+from sharing.zenoh_cases import Opening, endpoint, greet, wait_until_connected, zenoh
 
 from gmmtorch.errors import GmmTorchError
 from gmmtorch.sharing.radio import Radio
