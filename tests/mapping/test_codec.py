@@ -47,16 +47,6 @@ drawn = st.builds(
 )
 
 
-def part(components: Components, begin: int, end: int) -> Components:
-    """Components begin … end−1, with the whole table of origins."""
-    c = components
-    kept = (c.seen_by >= begin) & (c.seen_by < end)
-    own = {n: getattr(c, n)[begin:end] for n in ("means", "covariances", "support", "max_range", "ids")}
-    return replace(
-        c, **own, seen_by=c.seen_by[kept] - begin, seen_from=c.seen_from[kept], seen_count=c.seen_count[kept]
-    )
-
-
 def sightings(components: Components) -> list[dict[tuple[float, ...], float]]:
     """Origin → count of each component."""
     found: list[dict[tuple[float, ...], float]] = [{} for _ in range(len(components))]
@@ -175,7 +165,7 @@ def test_quantization_commutes_with_whole_metre_shifts_and_quarter_turns(dim):
 @dims
 def test_splitting_a_batch_does_not_change_its_decoded_components(dim, size):
     whole = quantized(random_components(dim))
-    parts = [decode(encode(part(whole, i, min(i + size, 40)))) for i in range(0, 40, size)]
+    parts = [decode(encode(whole.selected(torch.arange(i, min(i + size, 40))))) for i in range(0, 40, size)]
     joined = quantized(Components.concatenate(parts))
     for name in ("means", "covariances", "support", "max_range", "ids", "seen_by", "seen_count"):
         assert torch.equal(getattr(joined, name), getattr(whole, name)), name
@@ -316,7 +306,7 @@ def test_a_component_with_one_origin_takes_few_bytes(dim, most):
 @dims
 def test_a_small_batch_is_short(dim):
     assert len(encode(random_components(dim, k=1, n_origins=1, max_sightings=1))) <= 80
-    fits = part(random_components(dim, k=200, extent=5.0, max_sightings=1), 0, 90)
+    fits = random_components(dim, k=200, extent=5.0, max_sightings=1).selected(torch.arange(90))
     assert len(encode(fits)) <= 1200
 
 

@@ -43,26 +43,6 @@ def sheet(thickness: float = 0.02, a: float = 0.3, b: float = 0.2) -> torch.Tens
     return q @ torch.diag(torch.tensor([a, b, thickness], dtype=torch.float64) ** 2) @ q.T
 
 
-def subset(components: Components, rows: torch.Tensor) -> Components:
-    """The components of these rows, in this order."""
-    by, viewpoint, count = [], [], []
-    for place, row in enumerate(rows.tolist()):
-        mine = (components.seen_by == row).nonzero().squeeze(1)
-        by += [place] * len(mine)
-        viewpoint.append(components.seen_from[mine])
-        count.append(components.seen_count[mine])
-    picked = {
-        n: getattr(components, n)[rows] for n in ("means", "covariances", "support", "max_range", "ids")
-    }
-    return replace(
-        components,
-        **picked,
-        seen_by=torch.tensor(by),
-        seen_from=torch.cat(viewpoint),
-        seen_count=torch.cat(count),
-    )
-
-
 def rows_of(rays) -> set[tuple[float, ...]]:
     table = torch.cat([rays.origins, rays.ends, rays.weights[:, None], rays.is_hit[:, None].double()], 1)
     return set(map(tuple, table.tolist()))
@@ -147,12 +127,12 @@ def test_draws_of_equal_components_are_independent():
 def test_rays_do_not_depend_on_other_components():
     components = random_components(3, k=40, seed=5)
     together = rows_of(component_rays(components, 0.2))
-    alone = [rows_of(component_rays(subset(components, torch.tensor([k])), 0.2)) for k in range(40)]
+    alone = [rows_of(component_rays(components.selected(torch.tensor([k])), 0.2)) for k in range(40)]
     assert set().union(*alone) == together  # to the last bit
     assert sum(map(len, alone)) == len(together)
     order = torch.randperm(40, generator=torch.Generator().manual_seed(0))
-    assert rows_of(component_rays(subset(components, order), 0.2)) == together
-    pairs = Components.concatenate([subset(components, order[:7]), subset(components, order[7:])])
+    assert rows_of(component_rays(components.selected(order), 0.2)) == together
+    pairs = Components.concatenate([components.selected(order[:7]), components.selected(order[7:])])
     assert rows_of(component_rays(pairs, 0.2)) == together
     renamed = replace(components, ids=components.ids + 1)
     assert rows_of(component_rays(renamed, 0.2)) != together

@@ -200,12 +200,6 @@ def test_a_half_life_needs_times():
         mapped([seen(ROOM, 2.0)], "per_scan", 10.0)
 
 
-@pytest.mark.parametrize("forget", ["never", True, -1.0, 0.0, math.nan, math.inf, None])
-def test_other_values_are_errors(forget):
-    with pytest.raises(InvalidArgumentError, match="forget"):
-        IncrementalRule(forget=forget)
-
-
 def test_depth_images_contradict():
     depth, near = torch.full((24, 32), 4.0), torch.full((24, 32), 4.0)
     near[8:16, 8:20] = 2.0

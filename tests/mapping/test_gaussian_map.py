@@ -9,7 +9,16 @@ import re
 import numpy as np
 import pytest
 import torch
-from mapping.map_cases import FINE, assert_same_components, built, drive, given_parts, names, sightings
+from mapping.map_cases import (
+    FINE,
+    assert_same_components,
+    built,
+    drive,
+    each_value,
+    given_parts,
+    names,
+    sightings,
+)
 from occupancy.protocol_contract import dims, lattice, open_scan, wall_scan
 
 from gmmtorch.baselines.occupancy_grid import OccupancyGrid
@@ -220,47 +229,25 @@ def test_queries_use_quantized_components_and_learning_uses_exact_ones(dim):
 # -- settings --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("window", 0),
-        ("window", 1.5),
-        ("window", "2"),
-        ("n_samples", 0),
-        ("sampling", "halton"),
-        ("resolution", 0.0),
-        ("resolution", math.nan),
-        ("prior", -1.0),
-        ("prior", math.nan),
-        ("random_state", 2**70),
-        ("random_state", None),
-        ("robot", -1),
-        ("robot", "r2"),
-        ("method", "magic"),
-        ("codec", "zip"),
-        ("cutoff", 0.0),
-        ("hit_length", -1.0),
-        ("hit_length", "long"),
-    ],
-)
+INVALID = {
+    "window": [0, 1.5, "2"],
+    "n_samples": [0],
+    "sampling": ["halton"],
+    "resolution": [0.0, math.nan],
+    "prior": [-1.0, math.nan],
+    "random_state": [2**70, None],
+    "robot": [-1, "r2"],
+    "method": ["magic"],
+    "codec": ["zip"],
+    "cutoff": [0.0],
+    "hit_length": [-1.0, "long"],
+}
+
+
+@pytest.mark.parametrize(("name", "value"), each_value(INVALID))
 def test_invalid_settings_are_refused_at_construction(name, value):
     with pytest.raises(InvalidArgumentError, match=name):
         GaussianMap(**{name: value})
-
-
-@pytest.mark.parametrize(
-    "name", ["noise", "length", "min_points", "n_components", "max_origins", "iterations", "max_cells"]
-)
-@pytest.mark.parametrize("value", [0, -1])
-def test_invalid_learning_rules_are_refused(name, value):
-    with pytest.raises(InvalidArgumentError, match=name):
-        WindowedRule(**{name: value})
-
-
-@pytest.mark.parametrize("name", ["noise", "length", "min_points"])
-def test_learning_rules_with_non_numeric_values_are_refused(name):
-    with pytest.raises(InvalidArgumentError, match=name):
-        WindowedRule(**{name: math.nan})
 
 
 def test_the_window_argument_sets_that_of_the_rule():

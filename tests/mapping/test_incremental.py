@@ -225,28 +225,6 @@ def test_a_map_learns_depth_images_like_its_rule():
 # -- bad input and real data ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "bad",
-    [
-        {"noise": 0.0},
-        {"length": float("nan")},
-        {"cell": float("inf")},
-        {"window": 0},
-        {"window_components": 0},
-        {"iterations": 0},
-        {"n_components": 0},
-        {"max_bytes": 0},
-        {"max_origins": 0},
-        {"mean_origins": 0.5},
-        {"max_cost": 1.0},
-        {"max_cost": -0.1},
-    ],
-)
-def test_invalid_incremental_rules_are_refused(bad):
-    with pytest.raises(InvalidArgumentError, match=next(iter(bad))):
-        IncrementalRule(**bad)
-
-
 def test_scans_of_another_dimension_are_refused():
     with pytest.raises(InvalidArgumentError, match="2-dimensional"):
         absorb(Components.empty(3), [wall_scan(2)], RULE)

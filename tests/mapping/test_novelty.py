@@ -10,7 +10,6 @@ from mapping.component_cases import random_components
 from occupancy.exact_dda import voxels_left
 from occupancy.protocol_contract import dims, empty_scan, open_scan, wall_scan
 
-from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.novelty import entropy_reduction, novel_beams
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule
@@ -116,22 +115,3 @@ def test_novelty_is_the_same_far_from_the_world_origin():
     here, _ = entropy_reduction(near, scans[1], RULE)
     there, _ = entropy_reduction(far, moved[1], RULE)
     torch.testing.assert_close(here, there, rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.parametrize(
-    "bad",
-    [
-        {"resolution": 0.0},
-        {"threshold": -1.0},
-        {"threshold": math.nan},
-        {"observed": math.inf},
-        {"prior": -1.0},
-        {"cutoff": 0.0},
-        {"explained": 0.0},
-        {"distance": -0.1},
-        {"distance_for": "some"},
-    ],
-)
-def test_invalid_novelty_rules_are_refused(bad):
-    with pytest.raises(InvalidArgumentError, match=next(iter(bad))):
-        NoveltyRule(**bad)

@@ -82,15 +82,6 @@ def test_association_keeps_moments_and_adds_beam_weights():
     assert torch.equal(found.components.ids, components.ids)
 
 
-def test_only_points_that_free_space_ask_where_a_component_was_seen_from():
-    surface = random_components(1, 3, 0)  # the case: seen from one place, explained from another
-    point, away = surface.means, surface.origins[surface.seen_from[0]] + torch.tensor([0.0, 3.0, 0.0])
-    for frees, explained in ((None, False), (torch.tensor([True]), False), (torch.tensor([False]), True)):
-        found = count_explained(surface, point, away, 2.0, max_range=bool(surface.max_range[0]), frees=frees)
-        assert found.explained.tolist() == [explained], frees
-        assert float(found.components.support - surface.support) == pytest.approx(float(explained))
-
-
 def test_without_components_or_points_nothing_is_explained():
     nothing = Components.empty(2)
     points = torch.zeros(3, 2, dtype=torch.float64)
