@@ -310,12 +310,6 @@ def test_a_small_batch_is_short(dim):
     assert len(encode(fits)) <= 1200
 
 
-def test_spatial_order_is_a_permutation():
-    components = random_components(3)
-    order = spatial_order(components)
-    assert torch.equal(order.sort().values, torch.arange(len(components)))
-
-
 # -- a real map ------------------------------------------------------------------------------------------
 
 

@@ -210,13 +210,6 @@ def test_evidence_does_not_depend_on_the_portion_size(monkeypatch, most):
         assert len(component_evidence(nothing, 0.2, box, **options).cells) == 0
 
 
-def test_no_return_components_have_no_hits():
-    component = replace(one(sheet()), max_range=torch.tensor([True]))
-    evidence = component_evidence(component, 0.2, EVERYTHING)
-    assert float(evidence.hits.sum()) == 0
-    assert float(evidence.misses.sum()) > 100
-
-
 # -- edges ----------------------------------------------------------------------------------------
 
 

@@ -285,19 +285,6 @@ def test_evidence_of_disjoint_boxes_sums_to_the_whole(shell: float, thinned: boo
     )
 
 
-@pytest.mark.parametrize("thinned", [False, True])
-def test_evidence_of_a_component_does_not_depend_on_the_others(thinned: bool) -> None:
-    components = random_components(20, 3, seed=6, empty=0.2)
-    options = {"shell": 1.0, "hits_per_ray": 8, "thinned": thinned}
-    alone = sum_evidence(
-        component_evidence(components.selected(torch.tensor([k])), RESOLUTION, AROUND, **options)
-        for k in range(20)
-    )
-    order = torch.randperm(20, generator=torch.Generator().manual_seed(0))
-    together = component_evidence(components.selected(order), RESOLUTION, AROUND, **options)
-    torch.testing.assert_close(dense(together, AROUND), dense(alone, AROUND), rtol=1e-5, atol=1e-4)
-
-
 def test_invalid_arguments_are_refused() -> None:
     component, _, _ = sheet(*VIEWS["frontal"])
     for options, message in (

@@ -73,16 +73,6 @@ def test_support_equals_the_number_of_points_within_the_budget(n, dim, limit, wi
     assert {tuple(row) for row in found.origins.tolist()} <= places
 
 
-@dims
-def test_the_same_scans_give_the_same_map(dim):
-    scans = drive(4, dim)
-    rule = replace(RULE, n_components=8, max_cost=0.01)
-    whole = grown(scans, rule)
-    assert equal(whole, grown(scans, rule))
-    parts = absorb(grown(scans[:2], rule), scans[2:], rule)
-    assert equal(whole, parts)
-
-
 def test_old_components_keep_their_ids_and_new_ones_have_none():
     scans = drive(4, 3)
     first = grown(scans[:2])

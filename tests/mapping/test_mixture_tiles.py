@@ -104,24 +104,6 @@ def test_a_regenerated_window_equals_a_new_window(seed):
             assert torch.equal(one == 0, other == 0)  # unseen is exactly unseen
 
 
-def test_regenerate_uses_the_given_evidence_function():
-    tiles, batches = many()
-    sliding = RollingWindow(RESOLUTION, SHAPE, 4)
-    asked = []
-
-    def evidence(components: Components, resolution: float, box: Box):
-        asked.append((len(components), resolution, box.shape))
-        return component_evidence(components, resolution, box, rays_per_cell=1.0)
-
-    regenerate(sliding, sliding.center_on(torch.full((3,), -40.0)), tiles, evidence)
-    near = tiles.near(sliding.box, RESOLUTION)
-    assert asked == [(sum(len(each) for _, each in near), RESOLUTION, SHAPE)]
-    assert float(sliding.evidence()[1].sum()) > 0
-    assert len(near) < len(batches)
-    regenerate(sliding, [], tiles, evidence)
-    assert len(asked) == 1
-
-
 def test_invalid_arguments_are_refused():
     with pytest.raises(InvalidArgumentError, match="tile=0"):
         MixtureTiles(0)

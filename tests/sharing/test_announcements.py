@@ -285,15 +285,6 @@ def test_gaps_are_remembered_for_a_bounded_number_of_robots():
     assert len(backlog._gaps) == MOST_PEERS
 
 
-def test_superseded_records_are_not_resent():
-    backlog = Backlog(1)
-    held, dead = within(1, 0, 1, 2, 3), within(1, 1, 2)
-    backlog.announced(says(3, NOTHING), held, dead)
-    assert backlog.due == within(1, 0, 3)
-    backlog.superseded(within(1, 3))
-    assert backlog.due == within(1, 0)
-
-
 def test_the_resend_queue_becomes_empty():
 
     def due() -> Intervals:

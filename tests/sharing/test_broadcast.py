@@ -139,16 +139,6 @@ def test_the_sender_holds_the_decoded_components(codec: str) -> None:
     assert one.digest() == b""
 
 
-def test_repeated_counts_are_added() -> None:
-    one = Broadcast(0, "float")
-    one.add(frame_of_components(3))
-    before = one.components().support
-    (datagram,) = encode_counts(1, {(0, 1): 5.0}, "float")
-    for _ in range(3):
-        one.receive(datagram)
-    assert (one.components().support - before).tolist() == pytest.approx([0.0, 15.0, 0.0])
-
-
 def test_datagrams_beyond_the_budget_are_sent_later() -> None:
     one, other = Broadcast(0, "float"), Broadcast(0, "float")
     for each in (one, other):

@@ -108,19 +108,6 @@ def test_the_example_of_the_docs():
     assert r.datagrams() == []
 
 
-def test_all_replicas_hold_the_bits_of_the_sender():
-    given_ = random_components(3, k=150)
-    one, other = Replica(0), Replica(1)
-    ids = one.add(given_)
-    exchange([one, other], 1)
-    held = other.components()
-    order = torch.tensor([held.ids.tolist().index(row) for row in ids.tolist()])
-    expected = quantized(given_)
-    for name in ("means", "covariances", "support", "max_range"):
-        assert torch.equal(getattr(held, name)[order], getattr(expected, name)), name
-    assert one.map().n_components == 150
-
-
 def test_a_changed_map_sends_only_its_changes():
     one, other = Replica(0), Replica(1)
     m = gt.GaussianMap.of(replace(random_components(3, k=60), ids=torch.tensor([[0, n] for n in range(60)])))
@@ -153,20 +140,6 @@ def test_superseded_components_stay_until_all_successors_arrive():
     assert other.n_components == 7
     assert other.digest() == one.digest()
     assert replica_of([*second, *first]).digest() == one.digest()
-
-
-def test_counters_are_summed_over_robots_and_not_over_messages():
-    robots = [Replica(robot) for robot in range(3)]
-    name = tuple(robots[0].add(random_components(3, k=1))[0].tolist())
-    exchange(robots)
-    support = float(robots[0].components().support)
-    for robot in robots[1:]:
-        robot.count({name: 256.0})
-        robot.count({name: 256.0})
-    exchange(robots)
-    exchange(robots)
-    assert {float(robot.components().support) for robot in robots} == {support + 2 * 512}
-    assert float(robots[0].components().seen_count.sum()) == pytest.approx(support + 1024)
 
 
 def test_counter_records_stay_few():

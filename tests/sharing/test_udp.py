@@ -192,20 +192,6 @@ def test_foreign_datagrams_are_counted_and_ignored(opening, raw):
     assert b.received == Traffic(2 + len(sizes), 2 * 34 + sum(sizes))
 
 
-def test_forged_frames_take_no_memory(opening, raw):
-    a, b = team(opening, 2, key=KEY, max_waiting=10)
-    rng = random.Random(1)
-    for i in range(3000):
-        raw.sendto(b"\xf1" + rng.randbytes(rng.randrange(1300)), b.address)
-        if i % 50 == 0:
-            until(lambda i=i: b.received.datagrams + b.n_overflowed > i)
-    until(lambda: b.received.datagrams == 3000)
-    a.send(0, [b"x"], 0.0, "maps")
-    assert heard(b, 1) == [(0, b"x")]
-    assert len(b._opener._sessions) == 1
-    assert sum(b.refused.values()) == 3000
-
-
 def test_a_full_queue_keeps_the_newest_datagrams(opening):
     a, b = team(opening, 2, key=KEY, max_waiting=100)
     for i in range(250):
