@@ -15,7 +15,8 @@ from gmmtorch.kernels import kernels
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.rays import component_evidence as module
 from gmmtorch.mapping.rays.component_evidence import component_evidence
-from gmmtorch.mapping.rays.component_rays import component_rays
+from gmmtorch.mapping.rays.component_rays import RayDensity, counted_viewpoints, drawn_rays, ray_numbers
+from gmmtorch.occupancy.forms.monte_carlo import RayBundle
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
@@ -41,6 +42,15 @@ def one(covariance, mean=(4.0, 1.0, 0.5), origin=(0.1, 0.2, 0.3), count=100.0, s
 def sheet(thickness: float = 0.02, a: float = 0.3, b: float = 0.2) -> torch.Tensor:
     q, _ = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64))
     return q @ torch.diag(torch.tensor([a, b, thickness], dtype=torch.float64) ** 2) @ q.T
+
+
+def component_rays(
+    components: Components, resolution: float, rays_per_cell=4.0, least=8, most=512, cutoff=2.5
+) -> RayBundle:
+    density = RayDensity(resolution, rays_per_cell, least, most, cutoff)
+    seen = counted_viewpoints(components, resolution)
+    number = ray_numbers(components, seen, density)
+    return drawn_rays(components, seen, density, number, torch.ones_like(seen))[0]
 
 
 def rows_of(rays) -> set[tuple[float, ...]]:

@@ -265,7 +265,7 @@ class GmmMapper(Mapper):
         """Enters a batch of components, or of counts added to some; returns its evidence."""
         grid = self.belief.grid
         there = batch.to(grid.device)
-        self.tiles.add(len(self.tiles), there)
+        self.tiles.add(there)
         for cell in {self._origin_cell(origin) for origin in batch.origins}:
             self._by_origin.setdefault(cell, []).append(there)
         low, high = box_around(there, explained_within(3, self._novelty.explained))
