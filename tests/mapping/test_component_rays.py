@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from mapping.random_components import random_components
+from mapping.ray_cases import EVERYTHING, dense, one
 from scipy import stats
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
@@ -18,25 +19,7 @@ from gmmtorch.mapping.rays.component_evidence import component_evidence
 from gmmtorch.mapping.rays.component_rays import RayDensity, counted_viewpoints, drawn_rays, ray_numbers
 from gmmtorch.occupancy.forms.monte_carlo import RayBundle
 from gmmtorch.occupancy.voxels.boxes import Box
-from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
-
-EVERYTHING = Box(torch.tensor([-4096] * 3), torch.tensor([4096] * 3))
-
-
-def one(covariance, mean=(4.0, 1.0, 0.5), origin=(0.1, 0.2, 0.3), count=100.0, sequence=0) -> Components:
-    """A component with one origin."""
-    return Components(
-        means=torch.tensor([mean], dtype=torch.float64),
-        covariances=torch.as_tensor(covariance, dtype=torch.float64)[None],
-        support=torch.tensor([count], dtype=torch.float64),
-        max_range=torch.tensor([False]),
-        ids=torch.tensor([[2, sequence]]),
-        origins=torch.tensor([origin], dtype=torch.float64),
-        seen_by=torch.tensor([0]),
-        seen_from=torch.tensor([0]),
-        seen_count=torch.tensor([count], dtype=torch.float64),
-    )
 
 
 def sheet(thickness: float = 0.02, a: float = 0.3, b: float = 0.2) -> torch.Tensor:
@@ -149,13 +132,6 @@ def test_rays_do_not_depend_on_other_components():
 
 
 # -- evidence -------------------------------------------------------------------------------------
-
-
-def dense(evidence: CellEvidence, box: Box) -> torch.Tensor:
-    both = torch.zeros(2, *box.shape, dtype=torch.float64)
-    x, y, z = (evidence.cells - box.low).unbind(1)
-    both[0, x, y, z], both[1, x, y, z] = evidence.hits.double(), evidence.misses.double()
-    return both
 
 
 def plain(component: Components, n: int, box: Box, cutoff: float, seed: int) -> torch.Tensor:
