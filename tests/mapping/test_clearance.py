@@ -9,7 +9,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from mapping.component_cases import random_components
+from mapping.random_components import normal_components
 from scipy import optimize, stats
 from scipy.spatial.transform import Rotation
 
@@ -42,7 +42,7 @@ def brute_distance(point: np.ndarray, mean: np.ndarray, covariance: np.ndarray, 
 @pytest.mark.slow
 @dims
 def test_clearance_is_the_distance_to_the_nearest_ellipsoid(dim):
-    c = random_components(6, dim, seed=1, spread=1.0)
+    c = normal_components(6, dim, seed=1, spread=1.0)
     points = torch.randn(6, dim, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     points = torch.cat([points, c.means[:3] + 0.1 * points[:3]])
     found = clearance(c, points, deviations=1.5)
@@ -77,7 +77,7 @@ def test_clearance_on_the_axes_of_an_ellipse_equals_its_closed_form(point, expec
 
 @given(st.integers(0, 10**6), st.sampled_from([2, 3]))
 def test_clearance_is_continuous_and_independent_of_the_frame(seed, dim):
-    c = random_components(5, dim, seed=seed, spread=1.0)
+    c = normal_components(5, dim, seed=seed, spread=1.0)
     generator = torch.Generator().manual_seed(seed)
     points = 2 * torch.randn(8, dim, generator=generator, dtype=torch.float64)
     nearby = points + 0.3 * torch.randn(8, dim, generator=generator, dtype=torch.float64)
@@ -147,7 +147,7 @@ def test_ball_mass_of_thin_sheets_equals_a_finer_quadrature():
 
 @dims
 def test_collision_probability_ignores_no_return_components(dim):
-    c = random_components(8, dim, seed=4, spread=0.7, empty=0.3)
+    c = normal_components(8, dim, seed=4, spread=0.7, empty=0.3)
     points = torch.randn(30, dim, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     expected = torch.zeros(30, dtype=torch.float64)
     for k in range(len(c)):
@@ -161,7 +161,7 @@ def test_collision_probability_ignores_no_return_components(dim):
 
 @given(st.integers(0, 10**6))
 def test_collision_probability_rises_with_the_radius(seed):
-    c = random_components(5, 3, seed=seed, spread=1.0)
+    c = normal_components(5, 3, seed=seed, spread=1.0)
     points = 2 * torch.randn(10, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     small, large = (collision_probability(c, points, r) for r in (0.2, 0.3))
     assert bool((large >= small - 1e-12).all())
@@ -187,7 +187,7 @@ def test_components_below_the_least_density_are_no_obstacles():
 
 
 def test_infinite_queries_are_clear_and_empty_queries_give_empty_results():
-    c = random_components(4, 3, seed=0)
+    c = normal_components(4, 3, seed=0)
     far = torch.tensor([[math.inf, 0.0, 0.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
     assert float(clearance(c, far)[0]) == math.inf
     assert float(collision_probability(c, far, 0.3)[0]) == 0
@@ -212,7 +212,7 @@ def test_infinite_queries_are_clear_and_empty_queries_give_empty_results():
 )
 def test_invalid_queries_are_refused(ask):
     with pytest.raises(InvalidArgumentError):
-        ask(random_components(3, 3, seed=0))
+        ask(normal_components(3, 3, seed=0))
 
 
 # -- bodies -----------------------------------------------------------------------------------------
@@ -236,7 +236,7 @@ def body(dim: int) -> Body:
 @dims
 @given(st.integers(0, 50))
 def test_clearance_of_a_body_is_that_of_its_nearest_ball(dim, seed):
-    c, path, shape = random_components(6, dim, seed), poses(seed, 5, dim), body(dim)
+    c, path, shape = normal_components(6, dim, seed), poses(seed, 5, dim), body(dim)
     found = shape.clearance(c, path)
     for pose, value in zip(path, found, strict=True):
         gaps = [
@@ -248,7 +248,7 @@ def test_clearance_of_a_body_is_that_of_its_nearest_ball(dim, seed):
 
 @dims
 def test_collision_probability_of_apart_balls_is_that_of_independent_balls(dim):
-    c, path, shape = random_components(6, dim, 1), poses(1, 5, dim), body(dim)
+    c, path, shape = normal_components(6, dim, 1), poses(1, 5, dim), body(dim)
     found = shape.collision_probability(c, path)
     clear = torch.ones(5, dtype=torch.float64)
     for centre, radius in zip(shape.centres, shape.radii, strict=True):
@@ -258,7 +258,7 @@ def test_collision_probability_of_apart_balls_is_that_of_independent_balls(dim):
 
 
 def test_gradients_move_the_body_away_from_surfaces():
-    c, path, shape = random_components(6, 3, 2), poses(2, 4, 3).requires_grad_(), body(3)
+    c, path, shape = normal_components(6, 3, 2), poses(2, 4, 3).requires_grad_(), body(3)
     gap = shape.clearance(c, path)
     (slope,) = torch.autograd.grad(gap.sum(), path)
     step = torch.zeros_like(slope)

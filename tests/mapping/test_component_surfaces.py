@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from mapping.component_cases import random_components
+from mapping.random_components import normal_components
 from mapping.ray_cases import EVERYTHING, dense, one
 from torch import Tensor
 
@@ -122,7 +122,7 @@ def test_a_sensor_within_the_shell_frees_no_cells() -> None:
 
 @pytest.mark.parametrize("shell", [0.0, 1.0])
 def test_hits_per_ray_does_not_change_the_misses(shell: float) -> None:
-    components = random_components(25, 3, seed=2, empty=0.3)
+    components = normal_components(25, 3, seed=2, empty=0.3)
     once, often = (
         component_evidence(components, RESOLUTION, EVERYTHING, shell=shell, hits_per_ray=n) for n in (1, 8)
     )
@@ -181,7 +181,7 @@ def test_all_rays_count_as_misses_in_the_cell_of_the_sensor() -> None:
 @pytest.mark.parametrize("shell", [0.0, 1.0])
 def test_evidence_of_disjoint_boxes_sums_to_the_whole(shell: float, thinned: bool) -> None:
     options = {"shell": shell, "hits_per_ray": 8, "thinned": thinned}
-    components = random_components(30, 3, seed=4, empty=0.2)
+    components = normal_components(30, 3, seed=4, empty=0.2)
     whole = Box(torch.tensor([-12] * 3), torch.tensor([12] * 3))
     halves = []
     for octant in itertools.product((0, 1), repeat=3):

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from mapping.component_cases import counts_add_up, random_components
 from mapping.map_cases import assert_same_components, each_value, given_parts, sightings
+from mapping.random_components import counts_add_up, normal_components
 from occupancy.protocol_contract import dims, lattice, wall_scan
 from scipy.stats import multivariate_normal
 from torch import Tensor
@@ -157,7 +157,7 @@ def test_more_than_255_origins_are_stored(tmp_path):
 
 @pytest.mark.parametrize("rows", [[4, 0, 11, 7], [], list(range(12)), list(range(11, -1, -1)), [5]])
 def test_selected_components_equal_those_of_a_loop(rows: list[int]) -> None:
-    components = random_components(12, 3, seed=1, empty=0.3)
+    components = normal_components(12, 3, seed=1, empty=0.3)
     # Sightings in any order, and a component without any.
     order = torch.randperm(len(components.seen_by), generator=torch.Generator().manual_seed(0))
     order = order[components.seen_by[order] != 7]
@@ -174,7 +174,7 @@ def test_selected_components_equal_those_of_a_loop(rows: list[int]) -> None:
 
 def batch(ids: list[tuple[int, int]], counts: list[float], seed: int) -> Components:
     """Components with these ids and counts and one origin."""
-    components = random_components(len(ids), 3, seed, n_origins=1)
+    components = normal_components(len(ids), 3, seed, n_origins=1)
     support = torch.tensor(counts, dtype=torch.float64)
     return replace(
         components, ids=torch.tensor(ids, dtype=torch.int64), support=support, seen_count=support.clone()

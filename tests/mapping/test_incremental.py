@@ -10,7 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mapping.component_cases import counts_add_up
+from mapping.random_components import counts_add_up
 from occupancy.protocol_contract import WALL, dims, open_scan, points, wall_scan
 from torch import Tensor
 

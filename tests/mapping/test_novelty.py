@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from mapping.component_cases import random_components
+from mapping.random_components import normal_components
 from occupancy.exact_dda import voxels_left
 from occupancy.protocol_contract import dims, empty_scan, open_scan, wall_scan
 
@@ -50,7 +50,7 @@ def bits_by_a_walk(components: Components, scan: Scan, rule: NoveltyRule) -> tup
 
 @pytest.mark.parametrize(("dim", "seed"), [(2, 0), (3, 1)])
 def test_entropy_reduction_equals_an_exact_walk(dim, seed):
-    components = random_components(6, dim, seed, empty=0.3)
+    components = normal_components(6, dim, seed, empty=0.3)
     generator = torch.Generator().manual_seed(seed)
     ends = 1.2 * torch.randn(6, dim, generator=generator, dtype=torch.float64)
     scan = Scan(ends[:4], torch.tensor([0.1, -0.2, 0.3][:dim], dtype=torch.float64), ends[4:])

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from sharing.schedules import act
@@ -26,6 +27,13 @@ def history(seed: int, n_acts: int = 14) -> list[bytes]:
     """All datagrams of three robots that receive some of each other's."""
     rng = random.Random(seed)
     robots = [Replica(robot, incarnation=rng.getrandbits(24)) for robot in range(3)]
+    return told(rng, robots, n_acts, act)
+
+
+def told(
+    rng: random.Random, robots: Sequence[Any], n_acts: int, act: Callable[[random.Random, Any], None]
+) -> list[bytes]:
+    """All datagrams of robots that act in turn, at random, and receive some of each other's."""
     sent: list[bytes] = []
     for _ in range(n_acts):
         robot = rng.choice(robots)

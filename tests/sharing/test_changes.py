@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapping.random_components import random_components
-from sharing.replica_histories import gossip, motion
+from sharing.replica_histories import motion, told
 from sharing.replica_model import rows
 from sharing.schedules import act, components
 
@@ -73,19 +73,18 @@ class Follower:
 
 def growth(seed: int, n_acts: int = 14) -> list[bytes]:
     """All datagrams of three robots that add and count, and rewrite counters as soon as possible."""
-    rng = random.Random(seed)
-    robots = [Replica(robot, incarnation=rng.getrandbits(24)) for robot in range(3)]
-    said: list[bytes] = []
-    for _ in range(n_acts):
-        robot = rng.choice(robots)
+
+    def grow(rng: random.Random, robot: Replica) -> None:
         known = robot.components().ids.tolist()
         if not known or rng.random() < 0.4:
             robot.add(components(rng, rng.randint(1, 5)))
         else:
             chosen = rng.sample(known, rng.randint(1, min(4, len(known))))
             robot.count({tuple(row): rng.uniform(0.0, 500.0) for row in chosen})
-        said += gossip(rng, robot, robots)
-    return said
+
+    rng = random.Random(seed)
+    robots = [Replica(robot, incarnation=rng.getrandbits(24)) for robot in range(3)]
+    return told(rng, robots, n_acts, grow)
 
 
 @settings(max_examples=5, deadline=None)

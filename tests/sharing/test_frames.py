@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapping.random_components import random_components
 from sharing.message_examples import sealed
-from sharing.replica_histories import exchange, gossip, motion, replica_of
+from sharing.replica_histories import exchange, motion, replica_of, told
 from sharing.replica_model import rows
 from sharing.schedules import components
 from sharing.test_changes import Follower
@@ -43,10 +43,8 @@ def joined_history(
     seed: int, kinds: Sequence[str] = ("add", "join", "join", "correct"), n_acts: int = 16
 ) -> list[bytes]:
     """All datagrams of robots that add, correct and join each other at random."""
-    rng = random.Random(seed)
-    robots, said = team(3), []
-    for _ in range(n_acts):
-        robot = rng.choice(robots)
+
+    def act(rng: random.Random, robot: Replica) -> None:
         own = robot.components().ids
         own = own[own[:, 0] == robot.robot]
         kind = rng.choice(kinds)
@@ -56,8 +54,8 @@ def joined_history(
             robot.correct(rng.randrange(2), motion(rng.uniform(-1, 1)), own[:2])
         else:
             robot.add(components(rng, 2))
-        said += gossip(rng, robot, robots)
-    return said
+
+    return told(random.Random(seed), team(3), n_acts, act)
 
 
 class Model:
