@@ -1,4 +1,4 @@
-"""MapState: what a map remembers between scans, as a torch module with a state dict; and its learning."""
+"""MapState: what a map remembers between scans, and learns from them; a torch module with a state dict."""
 
 from __future__ import annotations
 
@@ -117,9 +117,8 @@ class MapState(nn.Module):
     def _with_pending(self) -> Components:
         """All components, not rounded."""
         if self._learned is None:
-            self._learned = self._final()
-            if self._pending:
-                self._learned = self._absorbed(self._pending, self.learning.fitted(self._pending))
+            rule = self.learning.fitted(self._pending)
+            self._learned = self._absorbed(self._pending, rule) if self._pending else self._final()
         return self._learned
 
     def _absorbed(
@@ -149,7 +148,6 @@ class MapState(nn.Module):
         try:
             learned = self._with_pending()
         except GmmTorchError:
-            self._forget()
             self._pending.pop()
             raise
         self._commit(learned)

@@ -215,13 +215,6 @@ def test_a_map_learns_depth_images_like_its_rule():
 # -- bad input and real data ----------------------------------------------------------------------
 
 
-def test_scans_of_another_dimension_are_refused():
-    with pytest.raises(InvalidArgumentError, match="2-dimensional"):
-        absorb(Components.empty(3), [wall_scan(2)], RULE)
-    with pytest.raises(InvalidArgumentError, match="2-dimensional"):
-        absorb_depth(Components.empty(2), depth_frames(1), INTRINSICS, RULE)
-
-
 @pytest.mark.slow
 @pytest.mark.real_data
 def test_a_map_of_the_hall_fits_in_eight_kilobytes(real_data: Path):
