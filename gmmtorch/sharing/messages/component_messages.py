@@ -47,15 +47,12 @@ class ComponentsMessage:
     components: Components
 
 
-def encode_components(
-    components: Components, codec: str = "quantized", max_bytes: int = MAX_BYTES
-) -> list[bytes]:
+def encode_components(components: Components, codec: str = "quantized") -> list[bytes]:
     """Datagrams of components in order, each with the sensor origins that it needs; empty without components.
 
     Args:
         codec: "quantized": 8 to 10 bytes per component, rounded as `mapping.codec.quantized` does.
             "float": float64, unchanged. "thesis": 57 bytes for each component and sensor origin.
-        max_bytes: largest size of a datagram.
 
     Raises `InvalidArgumentError` for values that the codec cannot store, for positions beyond
     `envelope.FARTHEST`, and for a component with so many sensor origins that it does not fit into a datagram.
@@ -72,7 +69,7 @@ def encode_components(
     def is_allowed(begin: int, end: int) -> bool:
         return max(end - begin, so_far[end] - so_far[begin]) <= MOST_COMPONENTS_SENT
 
-    return split(len(components), part, "component", max_bytes, is_allowed)
+    return split(len(components), part, "component", is_allowed=is_allowed)
 
 
 def fitted(values: Quantized, max_bytes: int = MAX_BYTES) -> Iterator[tuple[bytes, Quantized]]:
