@@ -26,7 +26,7 @@ from torch import Tensor
 from gmmtorch import GaussianMap, datasets
 from gmmtorch.kernels.rays.ray_traversal import traverse
 from gmmtorch.mapping.learning.rules import WindowedRule
-from gmmtorch.mapping.learning.windowed import learn_window
+from gmmtorch.mapping.learning.windows import learn_window
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em import loop
 from gmmtorch.occupancy.evidence import Evidence

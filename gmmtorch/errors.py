@@ -43,13 +43,14 @@ class NumericalError(GmmTorchError, ArithmeticError, ValueError):
     """A matrix cannot be factorised, even with the largest permitted jitter."""
 
 
-def check_whole(name: str, value: object, least: int) -> int:
+def check_whole(name: str, value: object, least: int, most: int = 2**63 - 1) -> int:
     """Returns `value` as an int.
 
-    Raises `InvalidArgumentError` unless it is a whole number from `least` to below 2⁶³.
+    Raises `InvalidArgumentError` unless it is a whole number from `least` to `most`.
     """
-    if not isinstance(value, numbers.Integral) or not least <= int(value) < 2**63:
-        raise InvalidArgumentError(f"{name}={value!r} must be a whole number of at least {least}.")
+    if not isinstance(value, numbers.Integral) or not least <= int(value) <= most:
+        limits = f"of at least {least}" if most == 2**63 - 1 else f"from {least} to {most}"
+        raise InvalidArgumentError(f"{name}={value!r} must be a whole number {limits}.")
     return int(value)
 
 

@@ -15,7 +15,7 @@ from gmmtorch.datasets import load
 from gmmtorch.datasets.base import DatasetShard, shard_indices
 from gmmtorch.exploration.mission.driver import Drivable, Run, WallClock, drive, settle
 from gmmtorch.exploration.mission.replay import ReplayMission
-from gmmtorch.mapping.codec.component_batch import quantized
+from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule

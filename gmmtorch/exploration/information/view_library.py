@@ -14,8 +14,8 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.exploration.robot.mapper import LocalMap
-from gmmtorch.sharing.messages.fields import LATEST, TICKS
 from gmmtorch.sharing.messages.message_registry import ViewsMessage, encode_views, quantized_poses
+from gmmtorch.sharing.messages.view_messages import LATEST, TICKS
 from gmmtorch.sharing.replica.record_keys import (
     LARGEST_INCARNATION,
     LARGEST_ROBOT,

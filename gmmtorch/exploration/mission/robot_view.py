@@ -17,8 +17,8 @@ from gmmtorch.exploration.robot.gmm_mapper import GmmMapper
 from gmmtorch.files import write_npz
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.sharing.radio import Radio
+from gmmtorch.sharing.replica.materialized_view import robot_of_frame
 from gmmtorch.sharing.replica.replica import Replica
-from gmmtorch.sharing.replica.robot_frames import robot_of_frame
 from gmmtorch.sharing.shared_map import SharedMap
 from gmmtorch.sharing.transport.frames import FramedTransport
 from gmmtorch.sharing.transport.simulated_network import Network

@@ -23,9 +23,9 @@ from gmmtorch.exploration.world.scoring import BeliefMap
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.association import box_around, count_explained, explained_within, summed
 from gmmtorch.mapping.learning.fitting import SurfaceFit, fit_window
-from gmmtorch.mapping.learning.incremental import cell_fit
 from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.mapping.learning.viewpoints import all_origins
+from gmmtorch.mapping.learning.windows import cell_fit
 from gmmtorch.mapping.rays.component_evidence import component_evidence
 from gmmtorch.mapping.rays.mixture_tiles import MixtureTiles, regenerate
 from gmmtorch.occupancy.voxels.boxes import Box, intersection
@@ -261,7 +261,7 @@ class GmmMapper(Mapper):
         """Enters a batch of components, or of counts added to some; returns its evidence."""
         grid = self.belief.grid
         there = batch.to(grid.device)
-        self.tiles.add(len(self.tiles), there)
+        self.tiles.add(there)
         for cell in {self._origin_cell(origin) for origin in batch.origins}:
             self._by_origin.setdefault(cell, []).append(there)
         low, high = box_around(there, explained_within(3, self._novelty.explained))
