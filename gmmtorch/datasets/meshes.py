@@ -1,8 +1,7 @@
-"""Data sets of a triangle mesh: points sampled from its surface, and scans of a simulated sensor in it."""
+"""Points sampled from the surface of a triangle mesh, as a data set."""
 
 from __future__ import annotations
 
-import functools
 import math
 from pathlib import Path
 
@@ -13,9 +12,6 @@ from gmmtorch.datasets.base import Dataset, Ranges, require_path
 from gmmtorch.datasets.point_files.mesh_files import read_triangles
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.scan import Scan
-from gmmtorch.simulation import sense, spinning_lidar
-from gmmtorch.simulation.sensors.range_sensors import depth_camera
-from gmmtorch.simulation.worlds.mesh_world import MeshWorld
 
 
 class MeshSamples(Dataset):
@@ -83,76 +79,3 @@ def sample_surface(triangles: Tensor, n_points: int, generator: torch.Generator)
     u, v = torch.rand(2, n_points, 1, generator=generator, dtype=torch.float64)
     a, b, c = triangles[chosen].unbind(1)
     return a + u.sqrt() * ((1 - v) * (b - a) + v * (c - a))
-
-
-SENSOR_RANGE = 30.0
-_SEEDS_APART = 1_000_003
-
-
-class MeshScans(Dataset):
-    """`n_scans` scans of a lidar (32 × 160 beams) or a depth camera (80 × 64 pixels), range 30 m, noise 1 cm.
-
-    The sensor moves through the largest connected part of the mesh, 1.2 m above the floor (see
-    `MeshWorld.tour`); a camera faces forward. Beams without a surface within the sensor's range, or within
-    `max_range` if that is shorter, have no return. Scan i depends only on the mesh, the seed, the number of
-    scans and i.
-
-    Args:
-        path: PLY, OBJ or STL; metres, z up.
-        ranges: how readings are interpreted.
-        stride: every n-th scan is read.
-        n_scans: number of scans, about 2 m apart. Parts of the mesh beyond the last one are not observed.
-        sensor: "lidar" or "depth_camera".
-        seed: of the sensor's noise.
-    """
-
-    def __init__(
-        self,
-        path: str | Path,
-        ranges: Ranges,
-        stride: int = 1,
-        n_scans: int = 100,
-        sensor: str = "lidar",
-        seed: int = 0,
-    ) -> None:
-        self._path = require_path(
-            path, "file", "a triangle mesh (PLY, OBJ, STL)", "Units are metres, z is up."
-        )
-        super().__init__(self._path.stem, ranges, stride)
-        self.n_scans = check_whole("n_scans", n_scans, 1)
-        self.seed = check_whole("seed", seed, 0)
-        if sensor not in ("lidar", "depth_camera"):
-            raise InvalidArgumentError(f"sensor={sensor!r} is not known; choose lidar or depth_camera.")
-        make = spinning_lidar if sensor == "lidar" else depth_camera
-        self.sensor = make(max_range=SENSOR_RANGE)
-
-    def _count(self) -> int:
-        return self.n_scans
-
-    @functools.cached_property
-    def world(self) -> MeshWorld:
-        """The world of the mesh, which is read at the first access."""
-        return MeshWorld(read_triangles(self._path))
-
-    @functools.cached_property
-    def poses(self) -> Tensor:
-        """Sensor poses (n_scans, 4, 4), world ← sensor, x forward along the path."""
-        places = self.world.tour(self.n_scans)
-        ahead = places.roll(-1, 0) - places if len(places) > 1 else torch.zeros_like(places)
-        if len(places) > 1:
-            ahead[-1] = ahead[-2]
-        heading = torch.atan2(ahead[:, 1], ahead[:, 0])
-        poses = torch.eye(4, dtype=torch.float64).repeat(len(places), 1, 1)
-        cos, sin = heading.cos(), heading.sin()
-        poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = cos, -sin, sin, cos
-        poses[:, :3, 3] = places
-        return poses
-
-    def _known_pose(self, index: int) -> Tensor:
-        return self.poses[index]
-
-    def _read(self, index: int) -> Scan:
-        generator = torch.Generator().manual_seed(self.seed * _SEEDS_APART + 1 + index)
-        pose = self.poses[index]
-        ends, no_return = sense(self.sensor, pose, self.world, generator)
-        return self.ranges.scan(ends, pose[:3, 3], no_return)

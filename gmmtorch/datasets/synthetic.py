@@ -1,21 +1,23 @@
-"""Data sets of simulated buildings, computed when they are accessed; no file is needed.
+"""Data sets of simulated scans, computed when they are accessed: in buildings without a file, or in a mesh.
 
-A scan depends only on the seed and its index, not on the order of reading.
+A scan depends only on the world, the seed and its index, not on the order of reading.
 """
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import torch
 
-from gmmtorch.datasets.base import Dataset, Ranges
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.datasets.base import Dataset, Ranges, require_path
+from gmmtorch.datasets.point_files.mesh_files import read_triangles
+from gmmtorch.errors import InvalidArgumentError, check_choice, check_whole
 from gmmtorch.scan import Scan
 from gmmtorch.simulation import (
+    MeshWorld,
     RangeSensor,
-    World2D,
-    World3D,
+    World,
     building_2d,
     building_3d,
     depth_camera,
@@ -26,10 +28,10 @@ from gmmtorch.simulation import (
     spinning_lidar,
 )
 
-MAX_RANGE_2D = 12.0
-MAX_RANGE_3D = 10.0
+_MAX_RANGE_2D, _MAX_RANGE_3D, _MAX_RANGE_MESH = 12.0, 10.0, 30.0  # metres
 _SEEDS_APART = 1_000_003
 """Difference between the generator seeds of consecutive data set seeds; larger than any number of scans."""
+_MOST_SEEDS = 2**40  # so that the seeds of generators have 63 bits
 
 _LIDAR_HEIGHT = 1.2
 _CAMERA_HEIGHT = 1.4
@@ -44,18 +46,18 @@ class _Simulated(Dataset):
     have no return. No beam is invalid.
     """
 
-    world: World2D | World3D
+    world: World
     sensor: RangeSensor
     poses: torch.Tensor
 
     def __init__(self, name: str, ranges: Ranges, stride: int, seed: int, n_scans: int) -> None:
-        if not 0 <= seed < 2**40:
-            raise InvalidArgumentError(f"seed={seed} must be an integer from 0 to 2^40.")
-        if not 1 <= n_scans < _SEEDS_APART:
-            raise InvalidArgumentError(f"n_scans={n_scans} must be from 1 to {_SEEDS_APART - 1}.")
+        self.seed = check_whole("seed", seed, 0)
+        self.n_scans = check_whole("n_scans", n_scans, 1)
+        if seed >= _MOST_SEEDS or n_scans >= _SEEDS_APART:
+            raise InvalidArgumentError(
+                f"seed={seed} and n_scans={n_scans} must be below {_MOST_SEEDS} and {_SEEDS_APART}."
+            )
         super().__init__(name, ranges, stride)
-        self.seed = seed
-        self.n_scans = n_scans
 
     def _generator(self, number: int) -> torch.Generator:
         """Random number generator of the world (0) or of scan `number` − 1."""
@@ -78,9 +80,9 @@ class SyntheticBuilding2D(_Simulated):
 
     def __init__(self, ranges: Ranges, stride: int = 1, seed: int = 0, n_scans: int = 120) -> None:
         super().__init__("synthetic_building_2d", ranges, stride, seed, n_scans)
-        self.world = building_2d(self._generator(0))
-        self.sensor = laser_2d(max_range=MAX_RANGE_2D)
-        self.poses = poses_2d(self.world.path, n_scans)
+        self.world = world = building_2d(self._generator(0))
+        self.sensor = laser_2d(max_range=_MAX_RANGE_2D)
+        self.poses = poses_2d(world.path, n_scans)
 
 
 class SyntheticBuilding(_Simulated):
@@ -90,13 +92,57 @@ class SyntheticBuilding(_Simulated):
         self, ranges: Ranges, stride: int = 1, seed: int = 0, n_scans: int = 40, sensor: str = "lidar"
     ) -> None:
         super().__init__("synthetic_building", ranges, stride, seed, n_scans)
-        if sensor not in ("lidar", "depth_camera"):
-            raise InvalidArgumentError(f"sensor={sensor!r} is not known; choose lidar or depth_camera.")
-        self.world = building_3d(self._generator(0))
-        path = self.world.path
-        if sensor == "lidar":
-            self.sensor = spinning_lidar(max_range=MAX_RANGE_3D)
-            self.poses = poses_3d(path, n_scans, _LIDAR_HEIGHT)
-        else:
-            self.sensor = depth_camera(max_range=MAX_RANGE_3D)
-            self.poses = poses_3d(path, n_scans, _CAMERA_HEIGHT, _CAMERA_PITCH, _CAMERA_SWING)
+        self.sensor = _sensor_3d(sensor, _MAX_RANGE_3D)
+        self.world = world = building_3d(self._generator(0))
+        mount = (_LIDAR_HEIGHT,) if sensor == "lidar" else (_CAMERA_HEIGHT, _CAMERA_PITCH, _CAMERA_SWING)
+        self.poses = poses_3d(world.path, n_scans, *mount)
+
+
+class MeshScans(_Simulated):
+    """`n_scans` scans of a lidar (32 × 160 beams) or a depth camera (80 × 64 pixels), range 30 m, noise 1 cm.
+
+    The sensor moves through the largest connected part of the mesh, 1.2 m above the floor (see
+    `MeshWorld.tour`); a camera faces forward. Beams without a surface within the sensor's range, or within
+    `max_range` if that is shorter, have no return. Scan i depends only on the mesh, the seed, the number of
+    scans and i.
+
+    Args:
+        path: PLY, OBJ or STL; metres, z up.
+        ranges: how readings are interpreted.
+        stride: every n-th scan is read.
+        n_scans: number of scans, about 2 m apart. Parts of the mesh beyond the last one are not observed.
+        sensor: "lidar" or "depth_camera".
+        seed: of the sensor's noise.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        ranges: Ranges,
+        stride: int = 1,
+        n_scans: int = 100,
+        sensor: str = "lidar",
+        seed: int = 0,
+    ) -> None:
+        file = require_path(path, "file", "a triangle mesh (PLY, OBJ, STL)", "Units are metres, z is up.")
+        super().__init__(file.stem, ranges, stride, seed, n_scans)
+        self.sensor = _sensor_3d(sensor, _MAX_RANGE_MESH)
+        self.world = world = MeshWorld(read_triangles(file))
+        self.poses = _forward(world.tour(n_scans))
+
+
+def _forward(places: torch.Tensor) -> torch.Tensor:
+    """Poses (S, 4, 4), world ← sensor, at places (S, 3) of a path, x towards the next place."""
+    steps = places.diff(dim=0) if len(places) > 1 else torch.zeros_like(places)
+    ahead = torch.cat([steps, steps[-1:]])[: len(places)]
+    heading = torch.atan2(ahead[:, 1], ahead[:, 0])
+    poses = torch.eye(4, dtype=torch.float64).repeat(len(places), 1, 1)
+    cos, sin = heading.cos(), heading.sin()
+    poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = cos, -sin, sin, cos
+    poses[:, :3, 3] = places
+    return poses
+
+
+def _sensor_3d(name: str, max_range: float) -> RangeSensor:
+    check_choice("sensor", name, ("lidar", "depth_camera"))
+    return (spinning_lidar if name == "lidar" else depth_camera)(max_range=max_range)

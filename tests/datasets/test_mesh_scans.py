@@ -58,10 +58,9 @@ def test_mesh_scan_no_return_beams_have_no_return_range(hall):
 def test_mesh_scans_reject_invalid_input(hall, tmp_path):
     with pytest.raises(MissingDataError, match=r"nowhere\.ply"):
         load("mesh_scans", tmp_path / "nowhere.ply")
-    with pytest.raises(InvalidArgumentError, match="sensor='radar'"):
-        load("mesh_scans", hall, sensor="radar")
-    with pytest.raises(InvalidArgumentError, match="n_scans=0"):
-        load("mesh_scans", hall, n_scans=0)
+    for option, value in (("sensor", "radar"), ("n_scans", 0), ("seed", 2**60)):
+        with pytest.raises(InvalidArgumentError, match=f"{option}={value!r}"):
+            load("mesh_scans", hall, **{option: value})
     bad = tmp_path / "bad.ply"
     bad.write_text("not a mesh")
     with pytest.raises(DataError, match=r"bad\.ply"):

@@ -13,8 +13,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmmtorch.datasets.point_files.point_chunks import PointChunks, in_memory, open_points, row_uniform
-from gmmtorch.datasets.point_files.point_survey import merge_surveys, survey
+from gmmtorch.datasets.point_files.point_chunks import (
+    PointChunks,
+    in_memory,
+    merge_surveys,
+    open_points,
+    row_uniform,
+    survey,
+)
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError
 
 N = 23

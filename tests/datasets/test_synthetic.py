@@ -127,7 +127,7 @@ def test_synthetic_range_noise_is_one_centimetre(name, options):
     [
         ({"seed": -1}, "seed=-1"),
         ({"n_scans": 0}, "n_scans=0"),
-        ({"sensor": "sonar"}, "sensor='sonar'.*lidar or depth_camera"),
+        ({"sensor": "sonar"}, "sensor='sonar'.*lidar, depth_camera"),
         ({"stride": 0}, "stride=0"),
         ({"max_range": -1.0}, r"max_range=-1\.0"),
     ],
