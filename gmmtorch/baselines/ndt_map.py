@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gmmtorch.baselines.baseline_map import TensorFileMap, check_length, check_max_range
+from gmmtorch.baselines.baseline_map import TensorFileMap, check_length, optional_length
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, check_whole
 from gmmtorch.files import require
 from gmmtorch.kernels.rays.ray_traversal import traverse
@@ -123,7 +123,7 @@ class NDTMap(TensorFileMap):
         )
         self.max_points = check_whole("max_points", max_points, _MIN_POINTS)
         self.max_log_odds = float(max_log_odds)
-        self.max_range = check_max_range(max_range)
+        self.max_range = optional_length("max_range", max_range)
         self.memory_limit = memory_limit
         self._start(2, torch.device("cpu"))
 

@@ -11,7 +11,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from gmmtorch.baselines.baseline_map import BaselineMap, check_max_range
+from gmmtorch.baselines.baseline_map import BaselineMap, optional_length
 from gmmtorch.baselines.octree_files import read_octree
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
 from gmmtorch.kernels.rays.ray_traversal import traverse
@@ -64,7 +64,7 @@ class OctoMapMap(BaselineMap):
             if not low < value < high:
                 raise InvalidArgumentError(f"{name}={value} must lie between {low} and {high}.")
         self.hit, self.miss, self.clamp_low, self.clamp_high = hit, miss, clamp_low, clamp_high
-        self.max_range = check_max_range(max_range)
+        self.max_range = optional_length("max_range", max_range)
         self.by_ray = by_ray
         self._tree: Any = None
         self._anchor: Tensor | None = None  # (D,) int64, the cell at the octree's centre
