@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import struct
 import sys
+import zlib
 from pathlib import Path
 
 import pytest
@@ -120,6 +122,20 @@ def test_octomap_file_stores_the_settings_exactly(tmp_path: Path):
 def test_octomap_load_rejects_files_of_other_programs(tmp_path: Path):
     (tmp_path / "map.ot").write_bytes(pyoctomap.OcTree(0.1).write())
     with pytest.raises(DataError, match=r"map\.ot"):
+        OctoMapMap.load(tmp_path / "map.ot")
+
+
+def test_octomap_load_rejects_a_tree_that_would_end_the_process(tmp_path: Path):
+    """OctoMap recurses as deep as a file says; a checksum does not show that its writer was honest."""
+    made = OctoMapMap(RESOLUTION)
+    made.insert(wall_scan(3))
+    made.save(tmp_path / "map.ot")
+    head, mark, rest = (tmp_path / "map.ot").read_bytes().partition(b"# gmmtorch.octomap_map 1 ")
+    facts = rest[8:].partition(b"\n")[0]
+    size = b"\nid OcTree\nsize 200000\nres 0.125\ndata\n"
+    tail = facts + size + struct.pack("<fB", 0.0, 1) * 200_000
+    (tmp_path / "map.ot").write_bytes(head + mark + b"%08x" % zlib.crc32(head + mark + tail) + tail)
+    with pytest.raises(DataError, match="deeper than 16"):
         OctoMapMap.load(tmp_path / "map.ot")
 
 
