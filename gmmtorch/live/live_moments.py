@@ -52,11 +52,8 @@ class CurveRecord:
                 self.curves.setdefault(title, {}).setdefault(name, []).append(value)
         if len(self.times) >= _MOST_POINTS:
             self._period = 2 * (self.times[-1] - self.times[0]) / len(self.times)
-            for row in (self.times, *self._lists()):
+            for row in (self.times, *(row for series in self.curves.values() for row in series.values())):
                 del row[1::2]
-
-    def _lists(self) -> list[list[float]]:
-        return [values for series in self.curves.values() for values in series.values()]
 
     def copy(self) -> tuple[list[float], dict[str, dict[str, list[float]]]]:
         """The times and the curves as they are now."""

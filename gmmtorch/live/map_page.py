@@ -20,7 +20,6 @@ from gmmtorch.live import viewer_scene
 from gmmtorch.live.viewer_scene import Frame, Solid
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.report.scenes.ellipsoids import unit_sphere
 from gmmtorch.report.table import byte_text
 
 _TEMPLATE = Path(__file__).with_suffix(".html")
@@ -99,7 +98,7 @@ def _ellipsoids(components: Components, solid: Solid, frame: Frame) -> dict[str,
     places[:, 0, :3] = balls.positions - frame.shift.numpy()
     places[:, 1] = balls.wxyz[:, [1, 2, 3, 0]]
     places[:, 2, :3] = balls.scales / viewer_scene.N_SIGMA
-    vertices, faces = unit_sphere(viewer_scene.sphere_vertices(len(solid.means)))
+    vertices, faces = viewer_scene.sphere(len(solid.means))
     colours = {}
     for by in viewer_scene.COLOURS:
         found = viewer_scene.colours(components, solid, by)

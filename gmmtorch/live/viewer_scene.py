@@ -23,6 +23,7 @@ from gmmtorch.report.scenes.ellipsoids import (
     first_viewpoints,
     height_colour_map,
     principal_axes,
+    unit_sphere,
 )
 from gmmtorch.report.scenes.scene import SOUTH_WEST
 from gmmtorch.report.style import height_scale
@@ -88,9 +89,9 @@ def surfaces(components: Components, below: float = float("inf")) -> Solid:
     return Solid(mean, covariance, rows.cpu())
 
 
-def sphere_vertices(n_components: int) -> int:
-    """Vertices of each drawn ellipsoid; fewer where there are many components."""
-    return next(vertices for most, vertices in _SPHERES if n_components <= most)
+def sphere(n_components: int) -> tuple[Tensor, Tensor]:
+    """Vertices (V, 3) and faces (F, 3) of each drawn ellipsoid; fewer where there are many components."""
+    return unit_sphere(next(vertices for most, vertices in _SPHERES if n_components <= most))
 
 
 def instances(solid: Solid) -> Instances:

@@ -240,20 +240,14 @@ class Node:
     def spin_once(self, timeout: float = 0.0) -> bool:
         """Calls the callback of the oldest waiting message; returns whether one came in `timeout` (s)."""
         with self._arrived:
-            if not self._arrived.wait_for(self._has_waiting, timeout):
+            if not self._arrived.wait_for(lambda: any(s.waiting for s in self.subscriptions), timeout):
                 return False
-            subscription = min(
-                (s for s in self.subscriptions if s.waiting), key=lambda s: s.waiting[0].number
-            )
+            waiting = (s for s in self.subscriptions if s.waiting)
+            subscription = min(waiting, key=lambda s: s.waiting[0].number)
             self.arrival = subscription.waiting.popleft()
             subscription.waiting_bytes -= len(self.arrival.data)
         try:
-            message = self.types.decode(self.arrival.data, subscription.type)
-        except DataError as error:
-            self._note_malformed(subscription, error)
-            return True
-        try:
-            subscription.callback(message)
+            subscription.callback(self.types.decode(self.arrival.data, subscription.type))
         except DataError as error:
             self._note_malformed(subscription, error)
         return True
@@ -272,9 +266,6 @@ class Node:
             s.topic: Counter(received=s.n_received, dropped=s.n_dropped, malformed=s.n_malformed)
             for s in self.subscriptions
         }
-
-    def _has_waiting(self) -> bool:
-        return any(subscription.waiting for subscription in self.subscriptions)
 
     def _receive(self, subscription: Subscription, data: bytes) -> None:
         """Queues a message; called by threads of the middleware."""
