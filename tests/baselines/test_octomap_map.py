@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import struct
-import sys
 import zlib
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from occupancy.protocol_contract import RESOLUTION, OccupancyMapContract, lattic
 
 from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.baselines.octomap_map import OctoMapMap
-from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
+from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.scan import Scan
 
 pyoctomap = pytest.importorskip("pyoctomap")
@@ -156,9 +155,3 @@ def test_a_beam_that_leaves_the_octree_is_rejected_without_a_change():
     with pytest.raises(InvalidArgumentError, match="coarser"):
         made.insert(Scan(torch.tensor([[400.0, 0, 0]]), torch.zeros(3)))
     assert made.nbytes == size
-
-
-def test_without_pyoctomap_the_error_states_the_install_command(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pyoctomap", None)
-    with pytest.raises(GmmTorchError, match=r"pip install .*baselines"):
-        OctoMapMap(0.1).insert(wall_scan(3))

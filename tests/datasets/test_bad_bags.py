@@ -174,11 +174,6 @@ def test_clouds_with_rings_of_nan_keep_the_other_rings(tmp_path):
     assert dataset.skipped == {}
 
 
-def test_a_topic_that_the_bag_does_not_have_lists_its_topics(tmp_path):
-    with pytest.raises(InvalidArgumentError, match=r"/velodyne.*/points .*3 messages"):
-        load("rosbag", clouds(tmp_path / "a.mcap"), topic="/velodyne")
-
-
 def test_texts_of_a_bag_are_neither_unpickled_nor_run(tmp_path, monkeypatch):
     import pickle
 
