@@ -116,28 +116,6 @@ def test_gp_map_equals_a_committee_of_scikit_learn_processes(dim):
 # -- bad input ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "option",
-    [
-        "length",
-        "variance",
-        "noise",
-        "gain",
-        "min_variance",
-        "max_variance",
-        "known_variance",
-        "block_side",
-        "free_resolution",
-        "ds_resolution",
-        "max_range",
-    ],
-)
-@pytest.mark.parametrize("value", [0, -1.0, math.nan, math.inf, "much"])
-def test_gp_map_rejects_invalid_options(option, value):
-    with pytest.raises(InvalidArgumentError, match=option):
-        GPMap(0.1, **{option: value})
-
-
 def test_gp_map_rejects_too_many_samples_per_block():
     scan = Scan(torch.rand(3000, 2, generator=torch.Generator().manual_seed(0)), torch.zeros(2))
     with pytest.raises(InvalidArgumentError, match="ds_resolution"):

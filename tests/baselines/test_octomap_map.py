@@ -141,13 +141,6 @@ def test_octomap_load_rejects_a_tree_that_would_end_the_process(tmp_path: Path):
 # -- bad input -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("value", [0.0, 1.0, -1.0, math.nan])
-@pytest.mark.parametrize("option", ["hit", "miss", "clamp_low", "clamp_high"])
-def test_octomap_rejects_invalid_probabilities(option, value):
-    with pytest.raises(InvalidArgumentError, match=option):
-        OctoMapMap(0.1, **{option: value})
-
-
 def test_a_beam_that_leaves_the_octree_is_rejected_without_a_change():
     made = OctoMapMap(0.01)
     made.insert(Scan(torch.tensor([[1.0, 0, 0]]), torch.zeros(3)))
