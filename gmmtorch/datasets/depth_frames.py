@@ -17,6 +17,7 @@ from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset, Ranges, check_pose, natural_key, require_path
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_number, check_whole
+from gmmtorch.linalg import nearest_rotations
 from gmmtorch.pinhole import back_project, check_intrinsics
 from gmmtorch.scan import Scan
 
@@ -96,8 +97,7 @@ class DepthFrames(Dataset):
         """
         position = self._position(index)
         pose = self._known_pose(position).clone()
-        left, _, right = torch.linalg.svd(pose[:3, :3])
-        pose[:3, :3] = left @ right
+        pose[:3, :3] = nearest_rotations(pose[:3, :3])
         return self._depth(position), pose
 
     def _depth(self, index: int) -> Tensor:

@@ -13,6 +13,7 @@ import torch
 from gmmtorch.datasets.base import Dataset, Ranges, require_path
 from gmmtorch.datasets.point_files.mesh_files import read_triangles
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_whole
+from gmmtorch.linalg import plane_rotations
 from gmmtorch.scan import Scan
 from gmmtorch.simulation import (
     MeshWorld,
@@ -135,10 +136,8 @@ def _forward(places: torch.Tensor) -> torch.Tensor:
     """Poses (S, 4, 4), world ← sensor, at places (S, 3) of a path, x towards the next place."""
     steps = places.diff(dim=0) if len(places) > 1 else torch.zeros_like(places)
     ahead = torch.cat([steps, steps[-1:]])[: len(places)]
-    heading = torch.atan2(ahead[:, 1], ahead[:, 0])
     poses = torch.eye(4, dtype=torch.float64).repeat(len(places), 1, 1)
-    cos, sin = heading.cos(), heading.sin()
-    poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = cos, -sin, sin, cos
+    poses[:, :2, :2] = plane_rotations(torch.atan2(ahead[:, 1], ahead[:, 0]))
     poses[:, :3, 3] = places
     return poses
 

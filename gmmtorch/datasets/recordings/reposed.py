@@ -12,6 +12,7 @@ from torch import Tensor
 from gmmtorch.datasets.base import Dataset
 from gmmtorch.datasets.recordings.trajectory import in_plane, read_trajectory, to_nanoseconds
 from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.linalg import nearest_rotations
 from gmmtorch.scan import Scan
 
 _MAX_GAP = 2.0
@@ -92,8 +93,7 @@ class Reposed(Dataset):
     def _read(self, index: int) -> Scan:
         before = self._source.pose(self._indices[index])
         motion = self._poses[index] @ torch.linalg.inv(before)
-        left, _, right = torch.linalg.svd(motion[:-1, :-1])  # rotations in files are rounded
-        motion[:-1, :-1] = left @ right
+        motion[:-1, :-1] = nearest_rotations(motion[:-1, :-1])  # rotations in files are rounded
         scan: Scan = self._source[self._indices[index]]
         motion[-1] = torch.eye(len(motion), dtype=motion.dtype)[-1]
         motion[:-1, -1] = self._poses[index][:-1, -1] - motion[:-1, :-1] @ before[:-1, -1]
