@@ -16,8 +16,8 @@ from sklearn.linear_model import LogisticRegression
 from torch import Tensor
 
 from gmmtorch.baselines.bgk_map import sparse_kernel
-from gmmtorch.baselines.hilbert.hilbert_features import Features, FourierFeatures, NystroemFeatures
-from gmmtorch.baselines.hilbert.hilbert_map import HilbertMap
+from gmmtorch.baselines.hilbert.hilbert_features import FourierFeatures, NystroemFeatures
+from gmmtorch.baselines.hilbert.hilbert_map import Features, HilbertMap
 from gmmtorch.baselines.hilbert.lattice_features import LatticeFeatures
 from gmmtorch.baselines.hilbert.logistic_regression import logistic_regression, penalised_loss
 from gmmtorch.errors import InvalidArgumentError

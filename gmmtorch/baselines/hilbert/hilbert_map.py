@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.baselines.baseline_map import TensorFileMap, check_length, optional_length
-from gmmtorch.baselines.hilbert.hilbert_features import Features, FourierFeatures, NystroemFeatures
+from gmmtorch.baselines.hilbert.hilbert_features import FourierFeatures, NystroemFeatures
 from gmmtorch.baselines.hilbert.lattice_features import LatticeFeatures, check_lattice
 from gmmtorch.baselines.hilbert.logistic_regression import logistic_regression
 from gmmtorch.baselines.samples import beam_samples
@@ -17,6 +17,7 @@ from gmmtorch.errors import check_choice, check_number, check_whole
 from gmmtorch.files import require
 from gmmtorch.scan import Scan
 
+Features = FourierFeatures | NystroemFeatures | LatticeFeatures
 FeatureKind = Literal["sparse", "nystroem", "fourier"]
 _LENGTHS: dict[str, float] = {"sparse": 0.3, "nystroem": 0.5, "fourier": 0.5}
 
@@ -156,7 +157,7 @@ class HilbertMap(TensorFileMap):
             return lattice, lattice.table.values[:, 0]
         if self._initial is not None:
             return self._initial
-        made: Features
+        made: FourierFeatures | NystroemFeatures
         if self.features == "nystroem":
             made = NystroemFeatures.of_data(points, self.n_features, self.length, self._anchor, generator)
         else:

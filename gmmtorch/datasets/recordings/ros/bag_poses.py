@@ -36,17 +36,8 @@ class Record(NamedTuple):
     frame: str
 
 
-class PoseOptions(NamedTuple):
-    """Options of `open_rosbag`."""
-
-    poses: str | None
-    frame: str | None
-    extrinsic: list[float] | None
-    max_gap: float
-
-
 class BagSurvey:
-    """What one pass over a bag finds.
+    """What one pass over a bag finds. The options are those of `open_rosbag`.
 
     Attributes:
         heads: (time of recording in ns, first bytes) of each message of the sensor.
@@ -55,11 +46,19 @@ class BagSurvey:
     Raises `DataError` or `InvalidArgumentError` if the bag cannot have the poses that the options choose.
     """
 
-    def __init__(self, reader: BagReader, topic: str, options: PoseOptions) -> None:
-        self._reader, self._topic, self._options = reader, topic, options
-        names = {t.name for t in reader.topics}
-        poses = options.poses
-        self._pose_topic = poses if poses in names else None
+    def __init__(
+        self,
+        reader: BagReader,
+        topic: str,
+        poses: str | None,
+        frame: str | None,
+        extrinsic: list[float] | None,
+        max_gap: float,
+    ) -> None:
+        self._reader, self._topic = reader, topic
+        self._poses, self._frame, self._max_gap = poses, frame, max_gap
+        self._extrinsic = mount_matrix(extrinsic)
+        self._pose_topic = poses if poses in {t.name for t in reader.topics} else None
         self._file = None
         transforms = [t.name for t in reader.topics if t.type in TF_TYPES and t.n_messages]
         if poses in (None, "tf"):
@@ -118,15 +117,15 @@ class BagSurvey:
     def source(self, records: Sequence[Record], where: str) -> PoseSource:
         """The poses of the sensor. Raises `DataError` if the sensor's frames are not connected to them."""
         frames = Counter(record.frame for record in records)
-        options, mount = self._options, mount_matrix(self._options.extrinsic)
-        if options.poses in (None, "tf"):
+        mount = self._extrinsic
+        if self._poses in (None, "tf"):
             return self._from_tf(frames, where)
         if self._pose_topic is not None:
             times, matrices = [list(column) for column in zip(*self._samples, strict=True)] or ([], [])
             stamps, poses = np.array(times, np.int64), np.array(matrices).reshape(-1, 4, 4)
             trajectory = Trajectory.from_samples(stamps, poses)
             mounts = {frame: self._mount(frame, where) if mount is None else mount for frame in frames}
-            return BodyPoses(trajectory, mounts, options.max_gap, f"topic {self._pose_topic}")
+            return BodyPoses(trajectory, mounts, self._max_gap, f"topic {self._pose_topic}")
         if len(frames) > 1:
             counts = ", ".join(f"{frame or '(unnamed)'} ({n} scans)" for frame, n in frames.most_common())
             raise InvalidArgumentError(
@@ -139,12 +138,12 @@ class BagSurvey:
         trajectory = read_trajectory(self._file, len(self.heads))
         if not trajectory.has_times:
             return PosesByIndex({r.stamp: trajectory.matrices[r.number] for r in records}, fixed)
-        return BodyPoses(trajectory, dict.fromkeys(frames, fixed), options.max_gap, str(self._file))
+        return BodyPoses(trajectory, dict.fromkeys(frames, fixed), self._max_gap, str(self._file))
 
     def _from_tf(self, frames: Counter[str], where: str) -> PoseSource:
-        source = TfPoses(self.tree, self._options.frame, self._options.max_gap, where)
+        source = TfPoses(self.tree, self._frame, self._max_gap, where)
         chains = [source.chain(frame) for frame in frames]
-        chosen = self._options.poses is not None or self._options.frame is not None
+        chosen = self._poses is not None or self._frame is not None
         if not chosen and not any(self.tree.is_moving(chain) for chain in chains):
             raise DataError(
                 f"{where}: TF has only static transforms from frame {chains[0][0]} up to {chains[0][-1]}, so "

@@ -13,13 +13,13 @@ from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset, Ranges, require_path
 from gmmtorch.datasets.recordings.ros import bag_topics, sensor_messages
-from gmmtorch.datasets.recordings.ros.bag_poses import BagSurvey, PoseOptions, Record
+from gmmtorch.datasets.recordings.ros.bag_poses import BagSurvey, Record
 from gmmtorch.datasets.recordings.ros.bag_reader import BagReader, RawMessage
 from gmmtorch.datasets.recordings.ros.scan_conversion import ScanConversion
 from gmmtorch.datasets.recordings.ros.sensor_messages import Reading
 from gmmtorch.datasets.recordings.ros.transform_tree import frame_name, stamp_of
 from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, in_plane, increasing
-from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_whole
+from gmmtorch.errors import DataError, InvalidArgumentError, check_choice
 from gmmtorch.scan import FARTHEST, Scan
 
 HEADER = "std_msgs/msg/Header"
@@ -64,12 +64,13 @@ def open_rosbag(
         raise InvalidArgumentError(f"dataset.max_gap={max_gap} must be a time above zero seconds.")
     reader = BagReader(file)
     sensor = bag_topics.choose_sensor(reader, topic)
-    options = PoseOptions(poses, frame, extrinsic, max_gap)
-    arguments = (reader, sensor, ranges, stride, options, sensor_frame, clock, deskew)
+    intrinsics = None
     if sensor.is_camera:
         info = bag_topics.choose_camera_info(reader, sensor.topic.name, camera_info)
-        return DepthBag(*arguments, camera_info=info, pixel_stride=pixel_stride)
-    return RosBag(*arguments)
+        intrinsics = sensor_messages.camera_matrix(reader.decode(next(reader.messages([info]))))
+    survey = BagSurvey(reader, sensor.topic.name, poses, frame, extrinsic, max_gap)
+    kind = DepthBag if sensor.is_camera else RosBag
+    return kind(reader, sensor, survey, ranges, stride, sensor_frame, clock, deskew, intrinsics, pixel_stride)
 
 
 class RosBag(Dataset):
@@ -87,14 +88,14 @@ class RosBag(Dataset):
         self,
         reader: BagReader,
         sensor: bag_topics.Sensor,
+        survey: BagSurvey,
         ranges: Ranges,
         stride: int,
-        options: PoseOptions,
         sensor_frame: str | None,
         clock: str,
         deskew: bool,
-        intrinsics: Tensor | None = None,
-        pixel_stride: int = 1,
+        intrinsics: Tensor | None,
+        pixel_stride: int,
     ) -> None:
         super().__init__(reader.path.stem, ranges, stride)
         self._reader, self._sensor, self._clock = reader, sensor, clock
@@ -102,7 +103,6 @@ class RosBag(Dataset):
         self._where = f"{reader.path}, topic {self.topic}"
         self._stream: Iterator[RawMessage] | None = None
         self._next = 0  # number of the message that the stream yields next
-        survey = BagSurvey(reader, self.topic, options)
         self._received = np.array([time for time, _ in survey.heads])
         records = self._ordered(self._of_frame(self._read_headers(survey.heads), sensor_frame))
         self._source = survey.source(records, self._where)
@@ -236,13 +236,11 @@ class DepthBag(RosBag):
     `image` returns the full depth image of a scan. Lens distortion is not removed: record rectified images.
     """
 
-    def __init__(self, *arguments: Any, camera_info: str, pixel_stride: int) -> None:
-        self.pixel_stride = check_whole("dataset.pixel_stride", pixel_stride, 1)
-        reader = arguments[0]
-        message = next(reader.messages([camera_info]))
-        self.intrinsics = sensor_messages.camera_matrix(reader.decode(message))
-        arguments = (*arguments, self.intrinsics, pixel_stride)
-        super().__init__(*arguments)
+    @property
+    def intrinsics(self) -> Tensor:
+        matrix = self._conversion.intrinsics
+        assert matrix is not None
+        return matrix
 
     def image(self, index: int) -> tuple[Tensor, Tensor]:
         """Depth (H, W) in metres, 0 for invalid pixels, and pose (4, 4), world ← camera, of a scan."""
