@@ -35,7 +35,7 @@ _SOURCES = {
     "rosbag": _Source("recordings.ros.rosbag", "open_rosbag"),
     "kitti": _Source("recordings.kitti", "Kitti"),
     "tum": _Source("recordings.tum", "TumRgbd"),
-    "mesh": _Source("meshes", "MeshSamples"),
+    "mesh": _Source("synthetic", "MeshSamples"),
     "mesh_scans": _Source("synthetic", "MeshScans", None, 8.0),
     "synthetic_building": _Source("synthetic", "SyntheticBuilding", None, 8.0, needs_path=False),
     "synthetic_building_2d": _Source("synthetic", "SyntheticBuilding2D", None, 8.0, needs_path=False),
