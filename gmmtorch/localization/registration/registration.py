@@ -11,8 +11,7 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, check_whole
 from gmmtorch.linalg import check_rigid, nearest_rotations, plane_rotations
-from gmmtorch.localization.registration.overlap import deviations
-from gmmtorch.localization.registration.overlap_ascent import Ascent, log_self_overlap
+from gmmtorch.localization.registration.overlap import Ascent, deviations, log_self_overlap
 from gmmtorch.localization.rigid_motions import Motions
 from gmmtorch.mapping.surfaces import Surfaces, surface_mixture
 from gmmtorch.mixture.em.exact import Parameters
