@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_choice
@@ -114,15 +113,12 @@ def _slice(shown: GaussianMap, frame: Frame) -> dict[str, Any]:
     """The picture of occupancy at the sensor's height, as PNG, and its place in the scene."""
     from PIL import Image
 
-    dim = shown.dim or 3
-    low, high = (tuple(corner[:dim].tolist()) for corner in (frame.low, frame.high))
-    picture = viewer_scene.occupancy_slice(shown, shown.resolution, frame.height, low, high)
+    picture = viewer_scene.occupancy_slice(shown, shown.resolution, frame.height, frame)
     file = io.BytesIO()
     Image.fromarray(picture.pixels).save(file, "PNG")
-    place = torch.tensor([*picture.middle, frame.height if dim == 3 else -0.05], dtype=torch.float64)
     return {
         "png": "data:image/png;base64," + base64.b64encode(file.getvalue()).decode(),
-        "middle": (place - frame.shift).tolist(),
+        "middle": (picture.middle - frame.shift).tolist(),
         "size": picture.size,
     }
 

@@ -7,7 +7,7 @@ import io
 import math
 import socket
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +74,7 @@ class MapViewer:
         self._lock = threading.RLock()
         self._nodes: dict[str, Any] = {}
         self.shift = torch.zeros(3, dtype=torch.float64)
-        self._box: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+        self._view: viewer_scene.Frame | None = None
         self._map, self._components = shown, Components.empty(3)
         self._paths: list[Tensor] = []
         self._path_colours: Sequence[Rgb] = ()
@@ -155,9 +155,10 @@ class MapViewer:
         """Fits the camera and the limits of the controls to a frame."""
         flat = self._map.dim == 2
         self._fit(view, flat)
-        self._box = tuple(view.low.tolist()), tuple(view.high.tolist())
+        self._view = view
         low, high = round(float(view.low[2]), 2), round(float(view.high[2]) + 0.1, 2)
-        with self._quiet():
+        self._is_quiet = True
+        try:
             for control in (self._cut, self._height):
                 _assign(control, visible=not flat)
             cut_is_chosen = self._is_chosen(self._cut) and self._cut.value < self._cut.max
@@ -168,6 +169,8 @@ class MapViewer:
             if not cut_is_chosen:
                 _assign(self._cut, value=min(view.open_height, high))
                 self._chosen[self._cut.label] = self._cut.value
+        finally:
+            self._is_quiet = False
 
     def _is_chosen(self, control: Any) -> bool:
         """Whether the user has chosen the value of a control."""
@@ -219,16 +222,12 @@ class MapViewer:
             )
 
     def _draw_slice(self) -> None:
-        if not self._visible.value or self._box is None:
+        if not self._visible.value or self._view is None:
             self._remove("slice")
             return
-        dim = self._components.dim
-        height = self._height.value if dim == 3 else 0.0
-        low, high = (corner[:dim] for corner in self._box)
-        picture = viewer_scene.occupancy_slice(self._map, self._resolution.value, height, low, high)
-        place = torch.tensor([*picture.middle, height if dim == 3 else -0.05], dtype=torch.float64)
-        moved = (place - self.shift).tolist()
-        self._nodes["slice"] = scene_nodes.add_slice(self.server.scene, picture, moved)
+        sides = self._resolution.value, self._height.value
+        picture = viewer_scene.occupancy_slice(self._map, *sides, self._view)
+        self._nodes["slice"] = scene_nodes.add_slice(self.server.scene, picture, self.shift)
 
     def _remove(self, name: str) -> None:
         if name in self._nodes:
@@ -262,13 +261,13 @@ class MapViewer:
 
     def _redraw(self, draw: Any) -> None:
         with self._lock:
-            if not self._is_quiet and self._box is not None:
+            if not self._is_quiet and self._view is not None:
                 draw()
 
     def _show_place(self, origin: Sequence[float], direction: Sequence[float]) -> None:
         """Shows what the map knows where a ray in the scene's frame meets a component or the slice."""
         with self._lock:
-            if self._box is None:
+            if self._view is None:
                 return
             start = torch.tensor(origin, dtype=torch.float64) + self.shift
             along = torch.tensor(direction, dtype=torch.float64)
@@ -293,15 +292,6 @@ class MapViewer:
             self._nodes["place"] = self.server.scene.add_icosphere(
                 "/place", 0.6 * max(resolution, 0.1), (230, 0, 80), position=tuple(spot.tolist())
             )
-
-    @contextlib.contextmanager
-    def _quiet(self) -> Iterator[None]:
-        """Changes of controls draw nothing."""
-        self._is_quiet = True
-        try:
-            yield
-        finally:
-            self._is_quiet = False
 
 
 def _check_address(host: str, port: int) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -96,15 +95,15 @@ def add_cells(scene: Any, centres: np.ndarray, side: float, colours: np.ndarray)
     )
 
 
-def add_slice(scene: Any, picture: Slice, middle: Sequence[float]) -> Any:
-    """A slice of occupancy, with its middle (3,) in the scene's frame, metres."""
+def add_slice(scene: Any, picture: Slice, shift: Tensor) -> Any:
+    """A slice of occupancy; shift (3,): the origin of the scene's frame, metres."""
     return scene.add_image(
         "/slice",
         picture.pixels,
         *picture.size,
         format="png",
         wxyz=(0.0, 1.0, 0.0, 0.0),  # an image's own y points down
-        position=tuple(middle),
+        position=tuple((picture.middle - shift).tolist()),
         **_UNSHADED,
     )
 

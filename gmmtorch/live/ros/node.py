@@ -117,10 +117,9 @@ class Node:
         self._n_arrived = 0
         self.subscriptions: list[Subscription] = []
         self._warned: dict[str, float] = {}
-        self._clock: int | None = None
-        self._use_sim_time = use_sim_time
-        self._clock_topic: Subscription | None = None
         self.arrival = Arrival(0, 0, 0.0, b"")
+        self._clock = 0
+        self._clock_topic: Subscription | None = None
         if use_sim_time:
             self._clock_topic = self.subscribe("/clock", CLOCK, lambda _: None)
 
@@ -210,7 +209,7 @@ class Node:
 
     def now(self) -> int:
         """The time in ns: of the system, or of /clock (0 before its first message)."""
-        return (self._clock or 0) if self._use_sim_time else time.time_ns()
+        return time.time_ns() if self._clock_topic is None else self._clock
 
     def listen_to_transforms(self) -> tuple[Subscription, Subscription]:
         """Collects /tf and /tf_static in `transforms`, whose last 30 s are kept."""
