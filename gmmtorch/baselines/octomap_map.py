@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gmmtorch.baselines.baseline_map import BaselineMap, optional_length
 from gmmtorch.baselines.octree_files import parsed_octree, read_octree_file
+from gmmtorch.baselines.samples import cut_beams
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.kernels.rays.ray_traversal import traverse
 from gmmtorch.occupancy.grid import check_resolution
@@ -108,8 +109,7 @@ class OctoMapMap(BaselineMap):
     def _add_misses(self, origin: Tensor, hits: Tensor, no_return: Tensor) -> None:
         """Adds misses along beams without return, except in cells that the scan's returns have updated."""
         if self.max_range is not None:
-            length = (no_return - origin).norm(dim=1, keepdim=True)
-            no_return = origin + (no_return - origin) * (self.max_range / length.clamp_min(self.max_range))
+            no_return = cut_beams(origin, no_return, self.max_range)
         units = torch.cat([origin, hits, no_return]) / self.resolution
         low = units.floor().amin(0)
         shape = tuple((units.floor().amax(0) - low + 1).long().tolist())

@@ -83,12 +83,17 @@ def thinned_samples(
     no_return = centroids(scan.no_return.double(), ds_resolution)
     if max_range is not None:
         hits = hits[(hits - origin).norm(dim=1) <= max_range]
-        length = (no_return - origin).norm(dim=1, keepdim=True)
-        no_return = origin + (no_return - origin) * (max_range / length.clamp_min(max_range))
+        no_return = cut_beams(origin, no_return, max_range)
     ends = torch.cat([hits, no_return])
     free = torch.cat([_points_along(origin, ends, free_resolution), no_return])
     free = centroids(torch.cat([origin[None], free]), ds_resolution) if ends.shape[0] else free
     return _labelled(hits, free)
+
+
+def cut_beams(origin: Tensor, ends: Tensor, max_range: float) -> Tensor:
+    """The ends (B, D) of beams from an origin; those beyond `max_range` are moved to that distance (m)."""
+    length = (ends - origin).norm(dim=1, keepdim=True)
+    return origin + (ends - origin) * (max_range / length.clamp_min(max_range))
 
 
 def _labelled(hits: Tensor, free: Tensor) -> tuple[Tensor, Tensor]:
