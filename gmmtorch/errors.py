@@ -54,14 +54,21 @@ def check_whole(name: str, value: object, least: int, most: int = 2**63 - 1) -> 
     return int(value)
 
 
-def check_number(name: str, value: object, largest: float = math.inf, above: bool = False) -> None:
-    """Raise `InvalidArgumentError` unless `value` is a finite number from 0 (exclusive if `above`) to
+def check_number(
+    name: str, value: object, largest: float = math.inf, above: bool = False, *, least: float = 0.0
+) -> float:
+    """Returns `value` as a float.
+
+    Raises `InvalidArgumentError` unless it is a finite number from `least` (exclusive if `above`) to
     `largest`.
     """
     number = _as_float(value)
-    if not (0 <= number <= largest and number < math.inf) or (above and number == 0):
-        limit = "above 0" if above else "of at least 0" if largest == math.inf else f"from 0 to {largest:g}"
-        raise InvalidArgumentError(f"{name}={value!r} must be a finite number {limit}.")
+    if not (least <= number <= largest and number < math.inf) or (above and number == least):
+        limit = f"from {least:g} to {largest:g}" if largest < math.inf else f"of at least {least:g}"
+        raise InvalidArgumentError(
+            f"{name}={value!r} must be a finite number {f'above {least:g}' if above else limit}."
+        )
+    return number
 
 
 def _as_float(value: object) -> float:

@@ -14,8 +14,7 @@ from mapping.random_components import normal_components
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
-from gmmtorch.localization.registration.overlap import Pairs, overlap
-from gmmtorch.localization.registration.overlap_ascent import Ascent
+from gmmtorch.localization.registration.overlap import Ascent, Pairs, overlap
 from gmmtorch.localization.registration.registration import register, yaw_starts
 from gmmtorch.localization.rigid_motions import Motions, generators
 from gmmtorch.mapping.components import Components

@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike
-from gmmtorch.datasets.point_files.point_chunks import PointChunks, in_memory
-from gmmtorch.datasets.point_files.point_survey import Survey
+from gmmtorch.datasets.point_files.point_chunks import PointChunks, Survey, in_memory
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em import loop
