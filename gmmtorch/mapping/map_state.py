@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import fields
+from functools import partial
 from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
-from gmmtorch.mapping.codec.map_file import FileSize, MapSettings, number_after
+from gmmtorch.mapping.codec.map_file import MapSettings, file_size, number_after
 from gmmtorch.mapping.codec.quantization import numbered
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.depth_frame import DepthFrame, as_scans
@@ -132,7 +133,7 @@ class MapState(nn.Module):
             new = learn_window(window, rule, generator)
             learned, self._next_doubts = joined(known, new, window, rule, self._doubts)
         else:
-            size = FileSize(rule, self.settings, self._next_number)
+            size = partial(file_size, rule=rule, settings=self.settings, next_number=self._next_number)
             learned, self._next_doubts = absorb(known, scans, rule, size, weight, self._doubts)
         return numbered(learned, self.robot, self._next_number)
 
