@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import Any
 
@@ -90,11 +90,6 @@ def sightings(made: Components) -> list[dict[tuple[float, ...], float]]:
         assert place not in table[k]
         table[k][place] = count
     return table
-
-
-def each_value(table: Mapping[str, Sequence[Any]]) -> list[tuple[str, Any]]:
-    """(name, value) for each value of each name, as parameters of a test."""
-    return [(name, value) for name, values in table.items() for value in values]
 
 
 def names(ids: Tensor) -> set[tuple[int, ...]]:

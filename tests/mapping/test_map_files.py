@@ -11,7 +11,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mapping.map_cases import FINE, assert_same_components, built, each_value, open_drive
+from invalid_values import each_value
+from mapping.map_cases import FINE, assert_same_components, built, open_drive
 from mapping.random_components import random_components
 from occupancy.protocol_contract import lattice, wall_scan
 from torch import Tensor
