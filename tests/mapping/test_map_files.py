@@ -127,21 +127,25 @@ def load_parts(folder: Path, tensors: dict[str, Tensor], facts: dict[str, Any]) 
 
 
 @pytest.mark.slow
-def test_a_float_file_with_any_damaged_byte_is_refused_or_valid(tmp_path):
-    """Batches of the quantized codec have a checksum."""
+@pytest.mark.parametrize(("codec", "mask"), [("quantized", 0x01), ("float", 0x80)])
+def test_a_file_with_any_damaged_byte_is_refused_or_valid(tmp_path, codec, mask):
+    """Damage of the batch, which has a checksum, is always refused."""
     path = tmp_path / "m.safetensors"
-    rule = IncrementalRule(n_components=3, length=0.5)
-    built(open_drive(1), rule, codec="float", n_samples=500).save(path)
+    made = built(open_drive(1), IncrementalRule(n_components=3, length=0.5), codec=codec, n_samples=500)
+    made.save(path)
     data = path.read_bytes()
-    n_refused = 0
+    header = 8 + int.from_bytes(data[:8], "little")
+    refused = []
     for place in range(len(data)):
-        path.write_bytes(data[:place] + bytes([data[place] ^ 0x80]) + data[place + 1 :])
+        path.write_bytes(data[:place] + bytes([data[place] ^ mask]) + data[place + 1 :])
         try:
             theta = GaussianMap.load(path).occupancy(lattice(2)[::20])
             assert 0 <= float(theta.min()) <= float(theta.max()) <= 1
         except GmmTorchError:
-            n_refused += 1
-    assert n_refused > 4 + int.from_bytes(data[:8], "little") / 2  # half of the header
+            refused.append(place)
+    assert len(refused) > header / 2
+    if codec == "quantized":
+        assert set(range(header, len(data))) <= set(refused)
 
 
 DAMAGE = {

@@ -12,7 +12,7 @@ from contextlib import ExitStack
 
 import pytest
 from sharing.schedules import components
-from sharing.transport_cases import KEY, heard, until
+from sharing.transport_cases import KEY, heard, hostile_frames, until
 from sharing.zenoh_cases import Opening, endpoint, greet, wait_until_connected, zenoh
 
 from gmmtorch.errors import GmmTorchError
@@ -157,12 +157,7 @@ def test_hostile_frames_are_counted_and_the_team_continues(opening, stranger):
     until(lambda: b.send(1, [b"one"], 0.0, "maps") or len(frames) > 0)
     b.send(1, [b"two"], 0.0, "maps")
     until(lambda: (1, b"two") in a.deliver(0, 0.0))
-    hostile = {
-        "foreign": [b"", b"hello"],
-        "oversized": [bytes(60000)],
-        "wrong_key": [frames[0][:-1] + b"?", Sealer(5).seal(b"x")],
-        "replayed": [frames[0]] * 2,
-    }
+    hostile = hostile_frames(frames[0], sender=5)
     before = a.received
     waits = {"congestion_control": zenoh.CongestionControl.BLOCK}
     for number, payloads in enumerate(hostile.values()):
