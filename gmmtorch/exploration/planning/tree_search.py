@@ -76,44 +76,37 @@ class _Node:
             raise LookupError("The root has no parent.")
         return self.parent
 
-    def branch(self) -> list[_Node]:
-        """The nodes from the root to this node, without the root."""
-        node, branch = self, []
-        while node.parent is not None:
-            branch.append(node)
-            node = node.parent
-        return branch[::-1]
+    def path(self) -> list[_Node]:
+        """The nodes from the root to this node."""
+        path = [self]
+        while (parent := path[-1].parent) is not None:
+            path.append(parent)
+        return path[::-1]
 
 
-class TreeSearch:
-    """Searches for the branch with the largest return (thesis 4.3).
+def search_tree(
+    primitives: Primitives,
+    rule: SearchRule,
+    task: PlanningTask,
+    memory: ViewCache | None = None,
+    goal: Goal | None = None,
+    first: Sequence[int] = (),
+) -> Found | None:
+    """Search for the branch with the largest return (thesis 4.3); None if no primitive is feasible.
 
     The return of a branch is the information of its views, given each other and the teammates' plans,
     plus the goal's weight for every metre of progress, both discounted by depth. The view from the start
     counts as taken. UCT chooses the primitives (see `_Tree._promising`). A leaf counts as visited with zero
     return until its round ends.
+
+    Args:
+        memory: values of views; None: only the goal counts.
+        goal: the goal; None: only views count.
+        first: primitives of a branch that is tried first, such as the rest of the last plan.
     """
-
-    def __init__(self, primitives: Primitives, rule: SearchRule) -> None:
-        self._primitives, self._rule = primitives, rule
-
-    def search(
-        self,
-        task: PlanningTask,
-        memory: ViewCache | None = None,
-        goal: Goal | None = None,
-        first: Sequence[int] = (),
-    ) -> Found | None:
-        """Return the best branch; None if no primitive is feasible.
-
-        Args:
-            memory: values of views; None: only the goal counts.
-            goal: the goal; None: only views count.
-            first: primitives of a branch that is tried first, such as the rest of the last plan.
-        """
-        tree = _Tree(self._primitives, self._rule, task, memory, goal)
-        tree.grow(first)
-        return tree.best()
+    tree = _Tree(primitives, rule, task, memory, goal)
+    tree.grow(first)
+    return tree.best()
 
 
 class _Tree:
@@ -170,7 +163,7 @@ class _Tree:
         if len(self._nodes) == 1:
             return None
         last = max(self._nodes[1:], key=lambda node: node.value)
-        branch = last.branch()
+        branch = last.path()[1:]
         return Found(
             actions=[node.action for node in branch],
             path=self._options.paths[0, branch[0].action],
@@ -219,7 +212,7 @@ class _Tree:
         child = _Node(len(self._nodes), parent, action, parent.depth + 1, shut=turn)
         parent.children.append(child)
         self._nodes.append(child)
-        for node in (self._nodes[0], *child.branch()):
+        for node in child.path():
             node.visits += 1
         return child
 
@@ -244,7 +237,7 @@ class _Tree:
             node.information = node.above.information + gain
             node.value = node.above.value + later * (gain + weight * metres)
             self._scale = max(self._scale, node.value)
-            for above in (self._nodes[0], *node.branch()):
+            for above in node.path():
                 above.total += node.value
             node.closed = is_last or node.depth == self._rule.depth
         for depth in sorted({node.depth for node in nodes if not node.closed}):

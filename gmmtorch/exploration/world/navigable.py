@@ -128,9 +128,9 @@ def collides(world: MeshWorld, positions: Tensor, radius: float) -> Tensor:
     return world.clearance(positions, threads=torch.get_num_threads()) < radius
 
 
-def finely(positions: Tensor, n: int = 4) -> Tensor:
-    """Interpolate positions (1 + S, 3) to (1 + n S, 3): a robot may collide between states."""
-    share = torch.arange(1, n + 1, dtype=positions.dtype)[:, None] / n
+def finely(positions: Tensor) -> Tensor:
+    """Interpolate positions (1 + S, 3) to (1 + 4 S, 3): a robot may collide between states."""
+    share = torch.arange(1, 5, dtype=positions.dtype)[:, None] / 4
     between = positions[:-1, None] + share * (positions[1:, None] - positions[:-1, None])
     return torch.cat([positions[:1], between.reshape(-1, 3)])
 
