@@ -18,6 +18,7 @@ from gmmtorch.exploration.planning.primitives import Primitives
 from gmmtorch.exploration.planning.recovery import Waiting
 from gmmtorch.exploration.planning.tree_search import SearchRule, search_tree
 from gmmtorch.exploration.robot.mapper import LocalMap
+from gmmtorch.exploration.world.navigable import widened
 
 _SEARCH = SearchRule(depth=3, n_rounds=2, n_leaves=24)
 _LEAST = 20  # cells of the smallest frontier
@@ -50,11 +51,7 @@ class Frontiers(NamedTuple):
 def frontier_cells(local_map: LocalMap) -> Tensor:
     """Return free cells (nx, ny, nz), bool, that share a face with an unobserved cell that is not free."""
     unknown = ~(local_map.observed | local_map.free)
-    beside = torch.zeros_like(unknown)
-    for axis in range(3):
-        n = unknown.shape[axis] - 1
-        beside.narrow(axis, 0, n).logical_or_(unknown.narrow(axis, 1, n))
-        beside.narrow(axis, 1, n).logical_or_(unknown.narrow(axis, 0, n))
+    beside = widened(unknown, 0, 1) | widened(unknown, 1, 1) | widened(unknown, 2, 1)
     return beside & local_map.free
 
 
