@@ -69,8 +69,7 @@ def test_tree_planner_explores_more_than_random():
 def test_tree_planner_travels_to_a_distant_view():
     """A robot that has seen its room knows of a view beyond the corner, and of the way there."""
     explorer = Explorer.at(corridor(), (1.2, 1.2, 1.2, 0.0))
-    explorer.misses[~explorer.solid] = 9.0
-    explorer.hits[explorer.solid] = 9.0
+    explorer.know_all()
     explorer.misses[51:61, 33:41, 1:12] = 0.0  # all but the far end
     pose = torch.tensor([[11.2, 5.2, 1.2, math.pi / 2]], dtype=torch.float64)
     planner, generator = planner_named("mcts"), torch.Generator().manual_seed(0)
@@ -90,8 +89,7 @@ def test_tree_planner_travels_to_a_distant_view():
 
 def test_journey_ends_without_progress():
     explorer = Explorer.at(hollow(30, 20, 13), (1.2, 1.2, 1.2, 0.0))
-    explorer.misses[~explorer.solid] = 9.0
-    explorer.hits[explorer.solid] = 9.0
+    explorer.know_all()
     generator = torch.Generator().manual_seed(0)
     pose = torch.tensor([50.0, 50.0, 1.2, 0.0], dtype=torch.float64)
     journey = Journey(pose, 9.0, 60.0, 0.0)
@@ -140,8 +138,7 @@ def test_the_same_seed_gives_the_same_plans(name):
 
 def test_random_planner_persists_and_changes():
     explorer = Explorer.at(hollow(80, 60, 13), (6.0, 6.0, 1.2, 0.0))
-    explorer.misses[~explorer.solid] = 9.0
-    explorer.hits[explorer.solid] = 9.0
+    explorer.know_all()
     plans = explore(planner_named("random"), explorer, 30)
     speeds = torch.stack([plan.path[-1, 4:] for plan in plans])
     kept = (speeds[1:] == speeds[:-1]).all(1).float().mean()
