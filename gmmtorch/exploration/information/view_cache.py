@@ -61,8 +61,6 @@ class ViewCache:
 
     def views(self, residual: Tensor) -> tuple[Tensor, Tensor]:
         """Return all evaluated poses (V, 4) and their values (V,) given `residual` (G,)."""
-        if not self._keys:
-            return torch.zeros(0, 4, dtype=torch.float64), torch.zeros(0)
         return self._evaluator.poses(torch.cat(self._keys)), self._gain[: len(self._row)] @ residual
 
 

@@ -69,13 +69,6 @@ class _Node:
     closed: bool = False  # no node below remains to be tried
     shut: int = -1  # the round in which no node below can be chosen
 
-    @property
-    def above(self) -> _Node:
-        """The parent; the root has none."""
-        if self.parent is None:
-            raise LookupError("The root has no parent.")
-        return self.parent
-
     def path(self) -> list[_Node]:
         """The nodes from the root to this node."""
         path = [self]
@@ -221,7 +214,8 @@ class _Tree:
     def _extend(self, nodes: list[_Node], is_last: bool = False) -> None:
         """Set the states and values of the newest nodes, and find the primitives that can follow them."""
         rows = slice(nodes[0].number, nodes[-1].number + 1)  # new nodes have consecutive numbers
-        parents = torch.tensor([node.above.number for node in nodes])
+        paths = [node.path() for node in nodes]
+        parents = torch.tensor([path[-2].number for path in paths])
         actions = torch.tensor([node.action for node in nodes])
         self._states[rows] = self._ends[parents, actions]
         self._metres[rows] = self._metres_after[parents, actions]
@@ -232,13 +226,14 @@ class _Tree:
             gains = marginal.tolist()
         weight = 0.0 if self._goal is None else self._goal.weight
         progress = (self._metres[parents] - self._metres[rows]).tolist()
-        for node, gain, metres in zip(nodes, gains, progress, strict=True):
+        for path, gain, metres in zip(paths, gains, progress, strict=True):
+            *_, above, node = path
             later = self._rule.discount ** (node.depth - 1)
-            node.information = node.above.information + gain
-            node.value = node.above.value + later * (gain + weight * metres)
+            node.information = above.information + gain
+            node.value = above.value + later * (gain + weight * metres)
             self._scale = max(self._scale, node.value)
-            for above in node.path():
-                above.total += node.value
+            for each in path:
+                each.total += node.value
             node.closed = is_last or node.depth == self._rule.depth
         for depth in sorted({node.depth for node in nodes if not node.closed}):
             some = [node for node in nodes if node.depth == depth]
