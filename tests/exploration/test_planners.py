@@ -66,6 +66,31 @@ def test_tree_planner_explores_more_than_random():
     assert sum(seen["mcts"]) > sum(seen["random"])
 
 
+def test_tree_planner_flies_around_a_corner():
+    explorer = Explorer.at(corridor(), (1.2, 1.2, 1.2, math.pi))
+    explore(planner_named("mcts"), explorer, 18)
+    seen = (explorer.hits + explorer.misses) > 0
+    assert float(seen[~explorer.solid].float().mean()) > 0.8
+    assert float(seen[51:61, 30:41, 1:12].float().mean()) > 0.5
+
+
+def test_tree_planner_gives_up_a_view_that_shows_nothing():
+    """The end of the corridor stays unknown, however often the robot looks at it."""
+    explorer = Explorer.at(corridor(), (10.0, 1.2, 1.2, 0.0)).know_all()
+    planner, generator = planner_named("mcts"), torch.Generator().manual_seed(0)
+    pose = torch.tensor([[11.2, 5.2, 1.2, math.pi / 2]], dtype=torch.float64)
+    kinds = []
+    for turn in range(14):
+        explorer.misses[51:61, 33:41, 1:12] = 0.0
+        if turn in (0, 9):
+            explorer.library.add(pose, torch.tensor([50.0]), explorer.now, 0.0)
+        plan = planner.plan(explorer.task(generator))
+        kinds.append(plan.kind)
+        explorer.follow(plan)
+    assert "travel" in kinds[:9]
+    assert "travel" not in kinds[9:]  # although another robot values the view again
+
+
 def test_tree_planner_travels_to_a_distant_view():
     """A robot that has seen its room knows of a view beyond the corner, and of the way there."""
     explorer = Explorer.at(corridor(), (1.2, 1.2, 1.2, 0.0))
