@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Callable
 
 import pytest
@@ -215,34 +216,29 @@ def test_frames_of_a_known_place_are_sent_as_counts() -> None:
 def test_counts_are_sent_once_they_have_grown_enough(update_at: float) -> None:
     """Counts computed here are sent, except those that have not grown enough."""
     one = mapper(codec="float", update_at=update_at, update_stride=1)
-    explained: dict[tuple[int, int], float] = {}
-    total: dict[tuple[int, int], float] = {}
-    sent: dict[tuple[int, int], float] = {}
+    explained: Counter[tuple[int, int]] = Counter()
+    sent: Counter[tuple[int, int]] = Counter()
     for seed in range(20):
         view = frame(*PLACES[0], seed=seed)
-        before = one.components()
+        before = counted = one.components()
         sensed = one.sense(view)
-        counted = before
-        for max_range in (False, True):
+        for max_range in (False, True) if len(before) else ():
             ends = view.ends[~sensed.novel & (view.is_hit != max_range)]
-            if len(before):
-                counted = count_explained(
-                    counted, ends, view.origin, NOVELTY.distance, max_range=max_range
-                ).components
-        for key, gain in zip(before.ids.tolist(), (counted.support - before.support).tolist(), strict=True):
-            explained[tuple(key)] = explained.get(tuple(key), 0.0) + gain
-        supports = {tuple(k): s for k, s in zip(before.ids.tolist(), before.support.tolist(), strict=True)}
-        for data in by_kind(one.shared.datagrams())[1]:
-            message = decode(data)
+            counted = count_explained(
+                counted, ends, view.origin, NOVELTY.distance, max_range=max_range
+            ).components
+        ids = [tuple(key) for key in before.ids.tolist()]
+        supports = dict(zip(ids, before.support.tolist(), strict=True))
+        explained.update(dict(zip(ids, (counted.support - before.support).tolist(), strict=True)))
+        for message in map(decode, by_kind(one.shared.datagrams())[1]):
             assert isinstance(message, CountsMessage)
             assert message.sender == 0
             for key, count in message.counts.items():
                 assert count >= (update_at - 1) * supports[key] * (1 - 1e-9)
-                sent[key] = sent.get(key, 0.0) + count
-        total = {k: explained[k] - sent.get(k, 0.0) for k in explained}
-        for key, owed in total.items() if seed % 10 == 9 else ():  # all due counts have been sent
-            now = supports[key]
-            assert owed < (update_at - 1) * now * (1 + 1e-9) or owed == pytest.approx(0, abs=1e-6)
+            sent.update(message.counts)
+        for key, total in explained.items() if seed % 10 == 9 else ():  # all due counts have been sent
+            owed = total - sent[key]
+            assert owed < (update_at - 1) * supports[key] * (1 + 1e-9) or owed == pytest.approx(0, abs=1e-6)
     assert sent
 
 

@@ -25,26 +25,26 @@ corners = st.tuples(*[st.integers(-3, 3).map(lambda n: 4 * n)] * 3)
 @given(lows=st.lists(corners, min_size=1, max_size=5), seed=st.integers(0, 99))
 def test_weights_equal_a_dictionary_for_any_window(lows, seed):
     generator = torch.Generator().manual_seed(seed)
-    fatigue, kept = InformationDiscount(decay=0.3), {}
+    discount, kept = InformationDiscount(), {}
     for now, low in enumerate(lows):
         measured = torch.rand(18, generator=generator) * (torch.rand(18, generator=generator) < 0.5)
-        fatigue.note(window(low), measured, float(now))
+        discount.note(window(low), measured, float(now))
         for share, block in zip(measured.tolist(), itertools.product(*map(range, COUNTS)), strict=True):
             name = tuple(a // 4 + b for a, b in zip(low, block, strict=True))
-            kept[name] = kept.get(name, 1.0) * (1 - 0.3 * share)
+            kept[name] = kept.get(name, 1.0) * (1 - 0.25 * share)
     for low in lows:
         expected = [
             kept.get(tuple(a // 4 + b for a, b in zip(low, block, strict=True)), 1.0)
             for block in itertools.product(*map(range, COUNTS))
         ]
-        torch.testing.assert_close(fatigue.weights(window(low)), torch.tensor(expected))
+        torch.testing.assert_close(discount.weights(window(low)), torch.tensor(expected))
 
 
 def test_note_counts_once_for_each_time():
-    fatigue = InformationDiscount(decay=0.5)
-    assert fatigue.weights(window((0, 0, 0))).tolist() == [1.0] * 18
+    discount = InformationDiscount()
+    assert discount.weights(window((0, 0, 0))).tolist() == [1.0] * 18
     for _ in range(3):
-        fatigue.note(window((0, 0, 0)), torch.ones(18), 2.0)
-    assert fatigue.weights(window((0, 0, 0))).tolist() == [0.5] * 18
-    fatigue.note(window((0, 0, 0)), torch.ones(18), 4.0)
-    assert fatigue.weights(window((0, 0, 0))).tolist() == [0.25] * 18
+        discount.note(window((0, 0, 0)), torch.ones(18), 2.0)
+    assert discount.weights(window((0, 0, 0))).tolist() == [0.75] * 18
+    discount.note(window((0, 0, 0)), torch.ones(18), 4.0)
+    assert discount.weights(window((0, 0, 0))).tolist() == [0.5625] * 18

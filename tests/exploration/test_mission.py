@@ -1,4 +1,4 @@
-"""Small missions in a furnished room, against the robots' own frames and the true world."""
+"""Small missions in a furnished room, against the true world, each other, and the CPU."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from typing import Any
 import pytest
 import torch
 from exploration.rooms import SHELF, SMALL, room, without_seconds
+from pretended_gpu import GPUTensor, pretended_gpu
 
+from gmmtorch.cli.reporting.explore_pictures import _coverage, _team_view
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.exploration.mission.driver import SimulatedClock, drive
 from gmmtorch.exploration.mission.mission import Mission
@@ -18,6 +20,7 @@ from gmmtorch.exploration.mission.results import mission_row, with_times
 from gmmtorch.exploration.mission.team_setup import assemble
 from gmmtorch.exploration.robot.robot_state import StoppingRule
 from gmmtorch.exploration.world.world import World
+from gmmtorch.kernels import kernels
 from gmmtorch.mapping.components import Components
 from gmmtorch.sharing.transport.link_conditions import Partition
 from gmmtorch.simulation.worlds.furniture import box
@@ -211,3 +214,29 @@ def test_a_duration_within_a_frame_is_rejected_with_the_nearest_whole_ones() -> 
         replace(SMALL, duration=0.4)
     with pytest.raises(InvalidArgumentError, match=r"duration=3.0 s .*sensor.rate=0.5 Hz; take 2 or 4\."):
         replace(SMALL, duration=3.0, rate=0.5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"framework": "gmm_shared"},
+        {"framework": "grid_shared", "planner": "frontier", "information": "fsmi", "codecs": ("octree",)},
+    ],
+)
+def test_missions_on_a_gpu_give_the_results_of_the_cpu(world: World, options: dict[str, Any]) -> None:
+    """On a pretended GPU; devices are not mixed."""
+    team = replace(SMALL, duration=2.0, **options)
+    with kernels("torch"):
+        mission = flown(world, team)
+        with pretended_gpu() as gpu:
+            there = flown(world, replace(team, device="cuda"))
+            row = without_seconds(mission_row(there, 1.0))
+            assert isinstance(there.robots[0].mapper.local.counts, GPUTensor)
+            assert isinstance(there.score.seen_by, GPUTensor)
+            assert torch.equal(_team_view(there).image, _team_view(mission).image)
+            assert torch.equal(_coverage(there), _coverage(mission))
+        assert gpu.waits
+        assert row == without_seconds(mission_row(mission, 1.0))
+    for one, other in zip(mission.trajectories, there.trajectories, strict=True):
+        assert torch.equal(torch.stack(one), torch.stack(other))

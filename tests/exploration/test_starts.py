@@ -169,6 +169,8 @@ def test_default_start_poses_lie_at_an_end_and_fit_large_teams(divided: World) -
     one = starts.start_poses(divided, 1, PRIMITIVES)
     assert float((one[0, :2] - torch.tensor([5.0, 3.0])).abs()[0]) > 3
     assert len(starts.check_start(divided, starts.start_poses(divided, 16, PRIMITIVES), PRIMITIVES)) == 16
+    tube = World.from_mesh(box((0.1, 0.1, 0.1), (30.1, 1.7, 1.7)), cache=False, name="tube")
+    assert len(starts.start_poses(tube, 12, PRIMITIVES)) == 12  # one behind another
     with pytest.raises(InvalidArgumentError, match=r"hall has room for \d+ robots .* team.size=500.*a floor"):
         starts.start_poses(divided, 500, PRIMITIVES)
 

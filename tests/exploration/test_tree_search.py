@@ -16,7 +16,7 @@ from gmmtorch.exploration.planning.coordination import PeerTrajectories
 from gmmtorch.exploration.planning.geodesic import DistanceField
 from gmmtorch.exploration.planning.global_planner import Goal
 from gmmtorch.exploration.planning.planner_interface import PlanningTask
-from gmmtorch.exploration.planning.tree_search import SearchRule, TreeSearch
+from gmmtorch.exploration.planning.tree_search import SearchRule, search_tree
 
 N_BLOCKS = 6
 
@@ -90,7 +90,7 @@ def test_search_finds_the_best_of_all_branches():
     rule = SearchRule(depth=2, n_rounds=20, n_leaves=64, discount=0.8)
     for seed in range(3):
         task, evaluator = task_in(ROOM, MIDDLE, seed, residual=torch.rand(N_BLOCKS)), MadeUp(seed)
-        found = TreeSearch(PRIMITIVES, rule).search(task, ViewCache(task, evaluator))
+        found = search_tree(PRIMITIVES, rule, task, ViewCache(task, evaluator))
         assert found is not None
         branches = all_branches(task, 2)
         assert len(branches) > 50
@@ -105,7 +105,7 @@ def test_search_finds_the_best_of_all_branches():
 
 def test_found_describes_its_branch():
     task, evaluator = task_in(ROOM, MIDDLE), MadeUp(0)
-    found = TreeSearch(PRIMITIVES, SearchRule()).search(task, ViewCache(task, evaluator))
+    found = search_tree(PRIMITIVES, SearchRule(), task, ViewCache(task, evaluator))
     assert found is not None
     assert 1 <= len(found.actions) <= 4
     states = [task.state]
@@ -118,7 +118,7 @@ def test_found_describes_its_branch():
 
 def test_search_evaluates_each_view_once_in_batches():
     task, evaluator = task_in(ROOM, MIDDLE), MadeUp(0)
-    TreeSearch(PRIMITIVES, SearchRule(n_rounds=4, n_leaves=32)).search(task, ViewCache(task, evaluator))
+    search_tree(PRIMITIVES, SearchRule(n_rounds=4, n_leaves=32), task, ViewCache(task, evaluator))
     assert len(evaluator.calls) <= 5
     keys = [tuple(key) for key in torch.cat(evaluator.calls).tolist()]
     assert len(keys) == len(set(keys))
@@ -128,12 +128,14 @@ def test_search_evaluates_each_view_once_in_batches():
 def test_rest_of_the_last_branch_is_tried_first():
     task, evaluator = task_in(ROOM, MIDDLE), MadeUp(7)
     full = SearchRule(depth=2, n_rounds=20, n_leaves=64)
-    best = TreeSearch(PRIMITIVES, full).search(task, ViewCache(task, evaluator))
-    brief = TreeSearch(PRIMITIVES, SearchRule(depth=2, n_rounds=1, n_leaves=1))
-    found = brief.search(task, ViewCache(task, evaluator), first=best.actions)
+    best = search_tree(PRIMITIVES, full, task, ViewCache(task, evaluator))
+    brief = SearchRule(depth=2, n_rounds=1, n_leaves=1)
+    found = search_tree(PRIMITIVES, brief, task, ViewCache(task, evaluator), first=best.actions)
     assert found.actions == best.actions
     assert found.value == pytest.approx(best.value)
-    beyond = brief.search(task, ViewCache(task, evaluator), first=[0, 0, 0, 0, 0])  # flies into the wall
+    beyond = search_tree(
+        PRIMITIVES, brief, task, ViewCache(task, evaluator), first=[0, 0, 0, 0, 0]
+    )  # flies into the wall
     assert beyond is not None
     assert len(beyond.actions) <= 2
 
@@ -142,7 +144,7 @@ def test_search_with_a_goal_approaches_it():
     task = task_in(ROOM, MIDDLE)
     goal_at = torch.tensor([[4.6, 3.4, 1.4]], dtype=torch.float64)
     goal = Goal(DistanceField.to(task.local_map, goal_at), weight=2.0, yaw=1.5)
-    found = TreeSearch(PRIMITIVES, SearchRule()).search(task, goal=goal)
+    found = search_tree(PRIMITIVES, SearchRule(), task, goal=goal)
     assert found is not None
     assert found.information == 0
     assert found.progress > 1.5
@@ -175,11 +177,7 @@ def test_goal_cost_includes_the_way_and_the_turns():
 def test_search_keeps_clear_of_peers_in_time():
     other = torch.tensor([[2.9, 2.7, 1.2]], dtype=torch.float64)
     task = task_in(ROOM, MIDDLE, peers=PeerTrajectories.of([other]))
-    free = TreeSearch(PRIMITIVES, SearchRule(depth=1, n_rounds=1)).search(
-        task_in(ROOM, MIDDLE), ViewCache(task, MadeUp(0))
-    )
-    found = TreeSearch(PRIMITIVES, SearchRule()).search(task, ViewCache(task, MadeUp(0)))
-    assert free is not None
+    found = search_tree(PRIMITIVES, SearchRule(), task, ViewCache(task, MadeUp(0)))
     assert found is not None
     apart = (found.path[:, :3] - other).norm(dim=1)
     assert float(apart.min()) > 0.7
@@ -193,7 +191,7 @@ def test_search_at_the_start_looks_around():
     explorer.hits.zero_()
     explorer.misses.zero_()
     task = explorer.task(torch.Generator().manual_seed(0))
-    found = TreeSearch(PRIMITIVES, SearchRule()).search(task, ViewCache(task, EVALUATOR))
+    found = search_tree(PRIMITIVES, SearchRule(), task, ViewCache(task, EVALUATOR))
     assert found is not None
     assert found.information > 0
     looks = [float(yaw) for yaw in found.views[:, 3]]

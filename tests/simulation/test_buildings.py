@@ -121,7 +121,7 @@ def test_place_avoids_the_path_and_other_furniture():
     taken: list[Footprint] = []
     g = generator()
     for _ in range(12):
-        spot = place(room, (0.8, 0.5), path, taken, g, clearance=0.6)
+        spot = place(room, (0.8, 0.5), path, taken, g)
         if spot is not None:
             assert not bool(spot.contains(path, 0.6).any())
             assert not any(bool(other.contains(spot.outline()).any()) for other in taken)

@@ -61,11 +61,10 @@ class ViewCache:
 
     def views(self, residual: Tensor) -> tuple[Tensor, Tensor]:
         """Return all evaluated poses (V, 4) and their values (V,) given `residual` (G,)."""
-        if not self._keys:
-            return torch.zeros(0, 4, dtype=torch.float64), torch.zeros(0)
         return self._evaluator.poses(torch.cat(self._keys)), self._gain[: len(self._row)] @ residual
 
 
+_DECAY = 0.25  # share of what a view promises that is discounted after its image
 _EXTENT = 1 << 20  # blocks along each axis that keys can tell apart
 
 
@@ -74,13 +73,12 @@ class InformationDiscount:
 
     The view from the robot's pose, evaluated right after an image was taken there, should gain nothing.
     What it still promises, the camera cannot resolve: grazing surfaces, and gaps smaller than a cell.
-    Each such image changes the weight w of a block to w (1 − decay · measured), where `measured` is the
+    Each such image changes the weight w of a block to w (1 − ¼ measured), where `measured` is the
     share of the block's remaining information that the view promises. The robot then does not keep
     looking at what it cannot see.
     """
 
-    def __init__(self, decay: float = 0.25) -> None:
-        self._decay = decay
+    def __init__(self) -> None:
         self._keys = torch.zeros(0, dtype=torch.int64)  # rising
         self._weights = torch.zeros(0)
         self._when = -math.inf
@@ -91,7 +89,7 @@ class InformationDiscount:
             return
         self._when = now
         looked = measured > 0
-        fresh = 1 - self._decay * measured[looked].cpu()
+        fresh = 1 - _DECAY * measured[looked].cpu()
         keys = torch.cat([self._keys, _keys(local_map)[looked.cpu()]])
         factors = torch.cat([self._weights, fresh])
         self._keys, row = torch.unique(keys, return_inverse=True)

@@ -153,13 +153,11 @@ class ViewEvaluator:
 
     def poses(self, keys: Tensor) -> Tensor:
         """Return poses (V, 4) float64 of lattice poses (V, 4), yaw in [0, 2π)."""
-        self._check_keys(keys)
         place = (keys[:, :3] * self.stride + 0.5).double() * self.resolution
         return torch.cat([place, keys[:, 3:].double() * (2 * math.pi / self.n_yaws)], 1)
 
     def evaluate(self, local_map: LocalMap, keys: Tensor) -> ViewValues:
         """Evaluate each view (V, 4) alone. Beams end at the map's border; a camera outside sees nothing."""
-        self._check_keys(keys)
         window = self._window(local_map)
         cameras = (keys[:, :3] * self.stride - local_map.low.to(keys.device)).to(self.device)
         gain, taken = information_by_block(
@@ -174,14 +172,6 @@ class ViewEvaluator:
     def residual(self, local_map: LocalMap, poses: Tensor) -> Tensor:
         """Return what views from poses (M, 4) leave of each block, (G,) float32: Π (1 − measured)."""
         return (1 - self.evaluate(local_map, self.keys(poses)).measured).prod(0)
-
-    def _check_keys(self, keys: Tensor) -> None:
-        if keys.ndim != 2 or keys.shape[1] != 4 or keys.dtype != torch.int64:
-            raise InvalidArgumentError(
-                f"keys have shape {tuple(keys.shape)} and {keys.dtype}; expected (V, 4) int64, see `keys`."
-            )
-        if len(keys) and not bool(((keys[:, 3] >= 0) & (keys[:, 3] < self.n_yaws)).all()):
-            raise InvalidArgumentError(f"keys contain headings outside 0 … {self.n_yaws - 1}; see `keys`.")
 
     def _window(self, local_map: LocalMap) -> _Window:
         window = self._windows.get(local_map)

@@ -16,6 +16,7 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.exploration.planning.coordination import PeerTrajectories, clear_of
 from gmmtorch.exploration.robot.mapper import LocalMap
+from gmmtorch.exploration.world.navigable import widened
 from gmmtorch.kernels.rays.path_clearance import Motions, motions_are_clear
 
 _SPACING = 1.0
@@ -41,9 +42,9 @@ def inflated(blocked: Tensor, radius: float, resolution: float) -> Tensor:
     padded = torch.nn.functional.pad(blocked, (reach,) * 6, value=True)
     found = torch.zeros_like(padded)
     for i, same in itertools.groupby(boxes, key=lambda box: box[0]):
-        slab = _widened(padded, 0, i)
+        slab = widened(padded, 0, i)
         for _, j, k in same:
-            found |= _widened(_widened(slab, 1, j), 2, k)
+            found |= widened(widened(slab, 1, j), 2, k)
     inside = slice(reach, -reach)
     return found[inside, inside, inside].contiguous()
 
@@ -187,18 +188,6 @@ def _covering_boxes(square: float) -> list[tuple[int, int, int]]:
         for (i, j), k in depth.items()
         if depth.get((i + 1, j), -1) < k and depth.get((i, j + 1), -1) < k
     ]
-
-
-def _widened(blocked: Tensor, axis: int, cells: int) -> Tensor:
-    """Return cells with a blocked cell within `cells` along an axis; invalid that close to the ends."""
-    size, done = blocked.shape[axis], 0
-    while done < cells:
-        shift = min(2 * done + 1, cells - done)  # 2 · done + 1 cells are covered so far
-        wider = blocked.clone()
-        wider.narrow(axis, shift, size - shift).logical_or_(blocked.narrow(axis, 0, size - shift))
-        wider.narrow(axis, 0, size - shift).logical_or_(blocked.narrow(axis, shift, size - shift))
-        blocked, done = wider, done + shift
-    return blocked
 
 
 def _points_along(states: Tensor, spacing: float) -> Tensor:

@@ -16,9 +16,11 @@ from gmmtorch.exploration.planning.global_planner import Journey, angle, looks
 from gmmtorch.exploration.planning.planner_interface import Plan, PlanningTask
 from gmmtorch.exploration.planning.primitives import Primitives
 from gmmtorch.exploration.planning.recovery import Waiting
-from gmmtorch.exploration.planning.tree_search import SearchRule, TreeSearch
+from gmmtorch.exploration.planning.tree_search import SearchRule, search_tree
 from gmmtorch.exploration.robot.mapper import LocalMap
+from gmmtorch.exploration.world.navigable import widened
 
+_SEARCH = SearchRule(depth=3, n_rounds=2, n_leaves=24)
 _LEAST = 20  # cells of the smallest frontier
 _LARGEST = 400  # cells; larger frontiers count as this large
 _LOYALTY = 1.5  # factor by which another frontier must be better than the present one
@@ -49,11 +51,7 @@ class Frontiers(NamedTuple):
 def frontier_cells(local_map: LocalMap) -> Tensor:
     """Return free cells (nx, ny, nz), bool, that share a face with an unobserved cell that is not free."""
     unknown = ~(local_map.observed | local_map.free)
-    beside = torch.zeros_like(unknown)
-    for axis in range(3):
-        n = unknown.shape[axis] - 1
-        beside.narrow(axis, 0, n).logical_or_(unknown.narrow(axis, 1, n))
-        beside.narrow(axis, 1, n).logical_or_(unknown.narrow(axis, 0, n))
+    beside = widened(unknown, 0, 1) | widened(unknown, 1, 1) | widened(unknown, 2, 1)
     return beside & local_map.free
 
 
@@ -137,7 +135,7 @@ class FrontierPlanner:
     """
 
     def __init__(self, primitives: Primitives) -> None:
-        self._search = TreeSearch(primitives, SearchRule(depth=3, n_rounds=2, n_leaves=24))
+        self._primitives = primitives
         self._waiting = Waiting(primitives)
         self._journey: Journey | None = None
         self._target = torch.zeros(3, dtype=torch.float64)
@@ -153,7 +151,7 @@ class FrontierPlanner:
             if self._journey is None:
                 break
             goal = self._journey.goal(task, weight=1.0)
-            branch = None if goal is None else self._search.search(task, goal=goal)
+            branch = None if goal is None else search_tree(self._primitives, _SEARCH, task, goal=goal)
             if branch is not None and branch.value > 0:
                 self._waiting.over()
                 return Plan(branch.path, branch.braking, branch.views, branch.value, kind)

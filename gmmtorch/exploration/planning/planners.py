@@ -16,7 +16,7 @@ from gmmtorch.exploration.planning.global_planner import Journey
 from gmmtorch.exploration.planning.planner_interface import Plan, Planner, PlanningTask, options
 from gmmtorch.exploration.planning.primitives import Primitives
 from gmmtorch.exploration.planning.recovery import Waiting
-from gmmtorch.exploration.planning.tree_search import Found, SearchRule, TreeSearch
+from gmmtorch.exploration.planning.tree_search import Found, SearchRule, search_tree
 
 # The first five are shares of the largest value seen.
 _NOTHING = 1e-3  # information that counts as zero
@@ -28,6 +28,9 @@ _STUCK = 0.3  # metres of progress that a branch must make
 _ADDED, _REVALUED = 3, 6  # views of the library added and evaluated again in one plan
 _REMEMBERED = 32  # abandoned views that are stored
 
+_EXPLORE, _TRAVEL = SearchRule(), SearchRule(n_rounds=2, n_leaves=24)
+_SQUEEZE = SearchRule(depth=6, n_rounds=6, n_leaves=48)  # by distance only, if travelling makes no progress
+
 
 class TreePlanner:
     """Explores by tree search; travels to the best view of the library when little information is near.
@@ -38,14 +41,8 @@ class TreePlanner:
     """
 
     def __init__(self, primitives: Primitives, evaluator: ViewEvaluator) -> None:
-        self._evaluator = evaluator
-        self._explore = TreeSearch(primitives, SearchRule())
-        self._travel = TreeSearch(primitives, SearchRule(n_rounds=2, n_leaves=24))
-        # By distance only, when travelling makes no progress.
-        self._squeeze = TreeSearch(primitives, SearchRule(depth=6, n_rounds=6, n_leaves=48))
+        self._primitives, self._evaluator = primitives, evaluator
         self._waiting = Waiting(primitives)
-        self._speed = primitives.dynamics.speed
-        self._duration = primitives.dynamics.duration
         self._journey: Journey | None = None
         self._given_up = torch.zeros(0, 4, dtype=torch.float64)
         self._discount, self._weights = InformationDiscount(), torch.zeros(0)
@@ -75,7 +72,8 @@ class TreePlanner:
 
     def _around(self, task: PlanningTask, memory: ViewCache) -> Found | None:
         """Explore here, or start a journey if it promises more."""
-        found = self._explore.search(task, memory, first=self._rest_of_branch(task))
+        first = self._rest_of_branch(task)
+        found = search_tree(self._primitives, _EXPLORE, task, memory, first=first)
         self._measure(memory)
         rate = _rate(found)
         if rate > _LITTLE * self._largest:
@@ -83,7 +81,8 @@ class TreePlanner:
         journey = Journey.chosen(task, _WORTHWHILE * self._largest, self._given_up)
         if journey is None:
             return found
-        legs = 1 + journey.metres / (self._speed * self._duration)
+        dynamics = self._primitives.dynamics
+        legs = 1 + journey.metres / (dynamics.speed * dynamics.duration)
         if journey.value / legs <= rate:
             journey.put_back(task)
             return found
@@ -106,9 +105,9 @@ class TreePlanner:
         if goal is None:
             self._give_up(journey)
             return None
-        found = self._travel.search(task, memory, goal, first=self._rest_of_branch(task))
+        found = search_tree(self._primitives, _TRAVEL, task, memory, goal, self._rest_of_branch(task))
         if found is None or found.progress < _STUCK:
-            found = self._squeeze.search(task, goal=goal)
+            found = search_tree(self._primitives, _SQUEEZE, task, goal=goal)
         if found is None or found.progress < _STUCK:
             self._give_up(journey)
             return None

@@ -69,51 +69,37 @@ class _Node:
     closed: bool = False  # no node below remains to be tried
     shut: int = -1  # the round in which no node below can be chosen
 
-    @property
-    def above(self) -> _Node:
-        """The parent; the root has none."""
-        if self.parent is None:
-            raise LookupError("The root has no parent.")
-        return self.parent
-
-    def branch(self) -> list[_Node]:
-        """The nodes from the root to this node, without the root."""
-        node, branch = self, []
-        while node.parent is not None:
-            branch.append(node)
-            node = node.parent
-        return branch[::-1]
+    def path(self) -> list[_Node]:
+        """The nodes from the root to this node."""
+        path = [self]
+        while (parent := path[-1].parent) is not None:
+            path.append(parent)
+        return path[::-1]
 
 
-class TreeSearch:
-    """Searches for the branch with the largest return (thesis 4.3).
+def search_tree(
+    primitives: Primitives,
+    rule: SearchRule,
+    task: PlanningTask,
+    memory: ViewCache | None = None,
+    goal: Goal | None = None,
+    first: Sequence[int] = (),
+) -> Found | None:
+    """Search for the branch with the largest return (thesis 4.3); None if no primitive is feasible.
 
     The return of a branch is the information of its views, given each other and the teammates' plans,
     plus the goal's weight for every metre of progress, both discounted by depth. The view from the start
     counts as taken. UCT chooses the primitives (see `_Tree._promising`). A leaf counts as visited with zero
     return until its round ends.
+
+    Args:
+        memory: values of views; None: only the goal counts.
+        goal: the goal; None: only views count.
+        first: primitives of a branch that is tried first, such as the rest of the last plan.
     """
-
-    def __init__(self, primitives: Primitives, rule: SearchRule) -> None:
-        self._primitives, self._rule = primitives, rule
-
-    def search(
-        self,
-        task: PlanningTask,
-        memory: ViewCache | None = None,
-        goal: Goal | None = None,
-        first: Sequence[int] = (),
-    ) -> Found | None:
-        """Return the best branch; None if no primitive is feasible.
-
-        Args:
-            memory: values of views; None: only the goal counts.
-            goal: the goal; None: only views count.
-            first: primitives of a branch that is tried first, such as the rest of the last plan.
-        """
-        tree = _Tree(self._primitives, self._rule, task, memory, goal)
-        tree.grow(first)
-        return tree.best()
+    tree = _Tree(primitives, rule, task, memory, goal)
+    tree.grow(first)
+    return tree.best()
 
 
 class _Tree:
@@ -170,7 +156,7 @@ class _Tree:
         if len(self._nodes) == 1:
             return None
         last = max(self._nodes[1:], key=lambda node: node.value)
-        branch = last.branch()
+        branch = last.path()[1:]
         return Found(
             actions=[node.action for node in branch],
             path=self._options.paths[0, branch[0].action],
@@ -219,7 +205,7 @@ class _Tree:
         child = _Node(len(self._nodes), parent, action, parent.depth + 1, shut=turn)
         parent.children.append(child)
         self._nodes.append(child)
-        for node in (self._nodes[0], *child.branch()):
+        for node in child.path():
             node.visits += 1
         return child
 
@@ -228,7 +214,8 @@ class _Tree:
     def _extend(self, nodes: list[_Node], is_last: bool = False) -> None:
         """Set the states and values of the newest nodes, and find the primitives that can follow them."""
         rows = slice(nodes[0].number, nodes[-1].number + 1)  # new nodes have consecutive numbers
-        parents = torch.tensor([node.above.number for node in nodes])
+        paths = [node.path() for node in nodes]
+        parents = torch.tensor([path[-2].number for path in paths])
         actions = torch.tensor([node.action for node in nodes])
         self._states[rows] = self._ends[parents, actions]
         self._metres[rows] = self._metres_after[parents, actions]
@@ -239,13 +226,14 @@ class _Tree:
             gains = marginal.tolist()
         weight = 0.0 if self._goal is None else self._goal.weight
         progress = (self._metres[parents] - self._metres[rows]).tolist()
-        for node, gain, metres in zip(nodes, gains, progress, strict=True):
+        for path, gain, metres in zip(paths, gains, progress, strict=True):
+            *_, above, node = path
             later = self._rule.discount ** (node.depth - 1)
-            node.information = node.above.information + gain
-            node.value = node.above.value + later * (gain + weight * metres)
+            node.information = above.information + gain
+            node.value = above.value + later * (gain + weight * metres)
             self._scale = max(self._scale, node.value)
-            for above in (self._nodes[0], *node.branch()):
-                above.total += node.value
+            for each in path:
+                each.total += node.value
             node.closed = is_last or node.depth == self._rule.depth
         for depth in sorted({node.depth for node in nodes if not node.closed}):
             some = [node for node in nodes if node.depth == depth]

@@ -35,7 +35,10 @@ def occupied_and_clear(
     wider = occupied_cells(triangles, resolution, Box(box.low - reach, box.high + reach))
     inner = tuple(slice(reach, reach + n) for n in box.shape)
     occupied = wider[inner].clone()
-    near = _dilated(wider, reach)[inner]
+    near = wider
+    for axis in range(3):
+        near = widened(near, axis, reach)
+    near = near[inner]
     clear = grounded & ~near
     cells = (grounded & near).nonzero()
     for begin in range(0, len(cells), 1 << 20):
@@ -62,16 +65,16 @@ def above_floor(mesh: MeshWorld, resolution: float, box: Box) -> Tensor:
     return torch.cat(floor)[:, :, None] < centers[2]
 
 
-def _dilated(mask: Tensor, reach: int) -> Tensor:
-    """Return cells (nx, ny, nz) within `reach` cells, on every axis, of a cell that is set."""
-    for axis in range(3):
-        n = mask.shape[axis]
-        spread = mask.clone()
-        for step in range(1, min(reach, n - 1) + 1):
-            spread.narrow(axis, step, n - step).logical_or_(mask.narrow(axis, 0, n - step))
-            spread.narrow(axis, 0, n - step).logical_or_(mask.narrow(axis, step, n - step))
-        mask = spread
-    return mask
+def widened(blocked: Tensor, axis: int, cells: int) -> Tensor:
+    """Return cells with a blocked cell within `cells` along an axis; invalid that close to the ends."""
+    size, done = blocked.shape[axis], 0
+    while done < cells:
+        shift = min(2 * done + 1, cells - done)  # 2 · done + 1 cells are covered so far
+        wider = blocked.clone()
+        wider.narrow(axis, shift, size - shift).logical_or_(blocked.narrow(axis, 0, size - shift))
+        wider.narrow(axis, 0, size - shift).logical_or_(blocked.narrow(axis, shift, size - shift))
+        blocked, done = wider, done + shift
+    return blocked
 
 
 def connected(
@@ -128,9 +131,9 @@ def collides(world: MeshWorld, positions: Tensor, radius: float) -> Tensor:
     return world.clearance(positions, threads=torch.get_num_threads()) < radius
 
 
-def finely(positions: Tensor, n: int = 4) -> Tensor:
-    """Interpolate positions (1 + S, 3) to (1 + n S, 3): a robot may collide between states."""
-    share = torch.arange(1, n + 1, dtype=positions.dtype)[:, None] / n
+def finely(positions: Tensor) -> Tensor:
+    """Interpolate positions (1 + S, 3) to (1 + 4 S, 3): a robot may collide between states."""
+    share = torch.arange(1, 5, dtype=positions.dtype)[:, None] / 4
     between = positions[:-1, None] + share * (positions[1:, None] - positions[:-1, None])
     return torch.cat([positions[:1], between.reshape(-1, 3)])
 

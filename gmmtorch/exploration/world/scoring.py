@@ -11,7 +11,7 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels.rays.cell_counts import flags_of_cells
 from gmmtorch.kernels.rays.cell_entropy import entropy_removed
-from gmmtorch.occupancy.evidence import Thresholds, bernoulli_entropy, check_prior, occupancy_probability
+from gmmtorch.occupancy.evidence import Thresholds, check_prior, occupancy_probability
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
@@ -40,10 +40,6 @@ class BeliefRule:
     def probability(self, hits: Tensor, misses: Tensor) -> Tensor:
         """Occupancy of cells with these hits and misses, any shape."""
         return occupancy_probability(hits, misses, self.prior).clamp(self.clamp, 1 - self.clamp)
-
-    def entropy(self, hits: Tensor, misses: Tensor) -> Tensor:
-        """Entropy of each cell in bits; 1 without evidence."""
-        return bernoulli_entropy(self.probability(hits, misses))
 
     def classes(self, probability: Tensor) -> Tensor:
         """`CellClass` values, int8."""

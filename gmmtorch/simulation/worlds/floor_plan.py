@@ -13,6 +13,8 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 
 _ATTEMPTS = 40
+_CLEARANCE = 0.6
+"""Least distance of furniture from the path, metres."""
 _GAP = 0.2
 """Least distance between two pieces of furniture, metres."""
 
@@ -128,18 +130,17 @@ def place(
     taken: Sequence[Footprint],
     generator: torch.Generator,
     at_wall: bool = False,
-    clearance: float = 0.6,
 ) -> Footprint | None:
     """A free footprint of `size` (length, width) in the room, or None if none was found.
 
-    It stays `clearance` metres away from the path (P, 2) and does not touch the `taken` footprints.
+    It stays `_CLEARANCE` metres away from the path (P, 2) and does not touch the `taken` footprints.
     """
     draw = _at_wall if at_wall else _anywhere
     for _ in range(_ATTEMPTS):
         footprint = draw(room, *size, generator)
         corners = footprint.corners()
         inside = (corners >= torch.tensor(room[:2])) & (corners <= torch.tensor(room[2:]))
-        if not bool(inside.all()) or bool(footprint.contains(path, clearance).any()):
+        if not bool(inside.all()) or bool(footprint.contains(path, _CLEARANCE).any()):
             continue
         outline = footprint.outline()
         if not any(
