@@ -10,7 +10,7 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from mixture.fit_contract import check_mixture
-from mixture.mixture_cases import beads, cloud, random_parameters, random_weight, room, rows_of
+from mixture.mixture_cases import beads, cloud, random_parameters, random_weight, room, rows_of, thin_wall
 from torch import Tensor
 
 from gmmtorch.mixture import GaussianMixture
@@ -175,15 +175,6 @@ def test_run_ends_if_the_em_step_decreases_the_bound(monkeypatch):
 
 
 # -- rounding --------------------------------------------------------------------------------------
-
-
-def thin_wall(n: int, size: float, seed: int = 0) -> Tensor:
-    """Points of an oblique wall with side `size`, 0.1 mm thick."""
-    rng = np.random.default_rng(seed)
-    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    points = (rng.random((n, 3)) - 0.5) * [size, size, 0] + 1e-4 * rng.normal(size=(n, 3))
-    points = points @ turn.T
-    return torch.from_numpy(points - points.mean(0))
 
 
 def two_halves(points: Tensor) -> Parameters:
