@@ -75,11 +75,7 @@ class VoxelGrid:
 
     @classmethod
     def covering(
-        cls,
-        low: ArrayLike,
-        high: ArrayLike,
-        resolution: float,
-        memory_limit: int = MEMORY_LIMIT,
+        cls, low: ArrayLike, high: ArrayLike, resolution: float, memory_limit: int = MEMORY_LIMIT
     ) -> VoxelGrid:
         """The smallest grid that contains the box [low, high] (m), with planes at multiples of `resolution`.
 

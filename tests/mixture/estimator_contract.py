@@ -21,12 +21,24 @@ from gmmtorch.files import pack_tensors
 from gmmtorch.mixture.density import NotFittedError
 from gmmtorch.mixture.estimator import MixtureEstimator
 
+BAD_PARAMETERS: dict[str, tuple[Any, ...]] = {
+    "n_components": (0, -1, 1.5, "many"),
+    "random_state": (-1, 1.5, "seed", 2**64),
+    "max_iter": (-1, 2.5, "long"),
+    "n_init": (0, -1),
+    "tol": (-1e-3, math.nan, "small"),
+    "reg_covar": (-1.0, math.inf, None),
+    "init_params": ("unheard_of", None),
+    "dtype": ("float16", None),
+}
+"""Invalid values of the options of estimators that have them."""
+
 
 class MixtureContract(FitContract):
     """Of an estimator: its fits, and its interface, which does not depend on how it fits."""
 
-    bad_parameters: ClassVar[list[dict[str, Any]]] = []
-    """Further invalid constructor options; the error must name the first option."""
+    bad_parameters: ClassVar[dict[str, tuple[Any, ...]]] = {}
+    """Invalid values of constructor options besides `BAD_PARAMETERS`; the error must name the option."""
 
     # -- the fitted mixture ------------------------------------------------------------------------------
 
@@ -120,12 +132,11 @@ class MixtureContract(FitContract):
     # -- parameters --------------------------------------------------------------------------------------
 
     def test_invalid_parameters_are_named(self):
-        usual: list[dict[str, Any]] = [{"n_components": value} for value in (0, -1, 1.5, "many")]
-        usual += [{"random_state": value} for value in (-1, 1.5, "seed", 2**64)]
-        for options in [*usual, *self.bad_parameters]:
-            name = next(iter(options))
-            with pytest.raises(InvalidArgumentError, match=name):
-                self.make(**options).fit(blobs(2))
+        usual = {name: BAD_PARAMETERS[name] for name in BAD_PARAMETERS.keys() & self.make().get_params()}
+        for name, values in [*usual.items(), *self.bad_parameters.items()]:
+            for value in values:
+                with pytest.raises(InvalidArgumentError, match=name):
+                    self.make(**{name: value}).fit(blobs(2))
 
     def test_every_parameter_is_stored_and_documented(self):
         mixture = self.make()

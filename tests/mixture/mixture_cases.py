@@ -47,6 +47,15 @@ def room(n: int, seed: int = 0, noise: float = 0.005) -> np.ndarray:
     return points + noise * rng.normal(size=points.shape)
 
 
+def thin_wall(n: int, size: float, seed: int = 0, noise: float = 1e-4) -> Tensor:
+    """Centred points of an oblique square wall with side `size`; `noise` (m) in all directions."""
+    rng = np.random.default_rng(seed)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    points = (rng.random((n, 3)) - 0.5) * [size, size, 0] + noise * rng.normal(size=(n, 3))
+    points = points @ turn.T
+    return torch.from_numpy(points - points.mean(0))
+
+
 def beads(n: int, k: int, dim: int = 2, gap: float = 4.0, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Points of k unit clusters with distance `gap` in a square pattern, and the centers of the clusters."""
     rng = np.random.default_rng(seed)

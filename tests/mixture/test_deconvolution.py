@@ -31,13 +31,10 @@ pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceW
 
 
 class TestDeconvolvedGaussianMixture(MixtureContract):
-    bad_parameters: ClassVar[list[dict[str, Any]]] = [
-        *({"max_iter": value} for value in (0, 2.5, "long")),
-        *({"tol": value} for value in (-1e-3, math.nan, "small")),
-        *({"reg_covar": value} for value in (-1.0, math.inf, None)),
-        *({"thickness": value} for value in (-1.0, 0.0, 1e-4, math.nan, math.inf, "thin")),
-        *({"init_params": value} for value in ("unheard_of", None)),
-    ]
+    bad_parameters: ClassVar[dict[str, tuple[Any, ...]]] = {
+        "max_iter": (0,),
+        "thickness": (-1.0, 0.0, 1e-4, math.nan, math.inf, "thin"),
+    }
 
     def make(self, n_components: int = 3, **options: Any) -> DeconvolvedGaussianMixture:
         return DeconvolvedGaussianMixture(n_components, **{"random_state": 0, **options})

@@ -14,12 +14,7 @@ from gmmtorch.kernels import chunks
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em import grouping
 from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.em.grouping import (
-    choose_candidates,
-    group_rows,
-    nearest,
-    truncated_expectation,
-)
+from gmmtorch.mixture.em.grouping import choose_candidates, group_rows, nearest, truncated_expectation
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 dims = pytest.mark.parametrize("dim", [1, 2, 3, 5])

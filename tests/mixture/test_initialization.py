@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from mixture.mixture_cases import cloud, thin_wall
 from torch import Tensor
 
 from gmmtorch.mixture.em import initialization
@@ -21,12 +22,6 @@ from gmmtorch.mixture.em.initialization import (
 
 METHODS = sorted(INITIALIZATIONS)
 SEEDED = [method for method in METHODS if method != "flat_pieces"]
-
-
-def cloud(n: int, dim: int, seed: int = 0) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    points = torch.randn(n, dim, generator=generator, dtype=torch.float64)
-    return points - points.mean(0)
 
 
 def begin(method: str, points: Tensor, k: int, weight: Tensor | None = None, seed: int = 0):
@@ -157,9 +152,7 @@ def test_flat_pieces_of_cells_have_the_moments_of_their_points():
 
 
 def test_moments_of_distant_thin_pieces_keep_their_digits():
-    rng = np.random.default_rng(0)
-    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    wall = (rng.normal(size=(500, 3)) * [1, 1, 1e-3]) @ turn.T
+    wall = thin_wall(500, 3.0, noise=1e-3).numpy()
     points = torch.from_numpy(np.concatenate([wall - 250_000.0, wall + 250_000.0]))
     labels = torch.arange(2).repeat_interleave(500)
     weight = torch.ones(1000, dtype=torch.float64)

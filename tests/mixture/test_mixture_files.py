@@ -10,10 +10,7 @@ import torch
 from mixture.mixture_cases import blobs, fitted, given_start
 from torch import Tensor
 
-from gmmtorch.errors import (
-    DataError,
-    GmmTorchError,
-)
+from gmmtorch.errors import DataError, GmmTorchError
 from gmmtorch.files import pack_tensors
 from gmmtorch.mixture import GaussianMixture
 

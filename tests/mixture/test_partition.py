@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from mixture.mixture_cases import cloud, thin_wall
 from torch import Tensor
 
 from gmmtorch.mixture.em.exact import quadratic_features
@@ -15,23 +16,8 @@ from gmmtorch.mixture.em.partition import FlatnessRule, Partition, partition
 RULE = FlatnessRule(thickness=0.02, length=0.5, min_weight=5)
 
 
-def cloud(n: int, dim: int, seed: int) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    points = torch.randn(n, dim, generator=generator, dtype=torch.float64)
-    return points - points.mean(0)
-
-
 def cut(points: Tensor, rule: FlatnessRule, weight: Tensor | None = None) -> Partition:
     return partition(points, points.new_ones(len(points)) if weight is None else weight, rule)
-
-
-def wall(n: int, seed: int = 0) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    scale = torch.tensor([4.0, 2.0, 0.0], dtype=torch.float64)
-    points = (torch.rand(n, 3, generator=generator, dtype=torch.float64) - 0.5) * scale
-    points[:, 2] = 0.005 * torch.randn(n, generator=generator, dtype=torch.float64)
-    rotation = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64))[0]
-    return (points - points.mean(0)) @ rotation.T
 
 
 @given(
@@ -74,7 +60,7 @@ def test_remaining_pieces_are_flat_and_short_or_cannot_be_halved(seed, dim):
 
 def test_thin_pieces_keep_min_weight():
     rule = FlatnessRule(thickness=0.02, length=0.05, min_weight=40, min_weight_thick=1)
-    labels, n_pieces = cut(wall(1000), rule)
+    labels, n_pieces = cut(thin_wall(1000, 3.0, noise=0.005), rule)
     assert n_pieces > 4
     assert int(torch.bincount(labels).min()) >= 40
 

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from mixture.fit_contract import move, rigid_motion
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
@@ -156,15 +157,12 @@ def test_prune_removes_spurious_components_and_keeps_walls(kind):
 @pytest.mark.parametrize("kind", SENSORS)
 def test_expected_density_does_not_depend_on_the_frame(kind):
     mixture, _, origin = scene(kind)
-    rng = np.random.default_rng(0)
-    dim = len(origin)
-    turn = np.linalg.qr(rng.normal(size=(dim, dim)))[0]
-    turn[:, 0] *= np.sign(np.linalg.det(turn))
-    turn, shift = torch.from_numpy(turn), torch.from_numpy(rng.normal(size=dim) * 1e4)
-    model = SENSORS[kind][1]
+    motion = torch.from_numpy(rigid_motion(len(origin)))
+    motion[:-1, -1] *= 3000
+    turn, model = motion[:-1, :-1], SENSORS[kind][1]
     before = expected_density(mixture.means, mixture.covariances, model, origin)
-    moved = mixture.means @ turn.T + shift, turn @ mixture.covariances @ turn.T
-    after = expected_density(*moved, model, turn @ origin + shift)
+    moved = move(motion, mixture.means), turn @ mixture.covariances @ turn.T
+    after = expected_density(*moved, model, move(motion, origin))
     torch.testing.assert_close(after, before, rtol=1e-5, atol=0)
 
 

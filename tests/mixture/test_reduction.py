@@ -9,6 +9,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mixture.fit_contract import blobs
 from mixture.reduction_cases import assert_same_moments, costs, dims, mixture, numpy_cost, numpy_merge, take
 from torch import Tensor
 
@@ -326,17 +327,11 @@ def test_invalid_options_are_named(options, match):
 # -- estimators ------------------------------------------------------------------------------------
 
 
-def cloud(n: int, seed: int, dim: int = 2) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    centers = np.array([[0.0, 0.0, 0.0], [6.0, 0.0, 1.0], [0.0, 6.0, 2.0]])[:, :dim]
-    return centers[rng.integers(3, size=n)] + rng.normal(size=(n, dim)) * np.linspace(0.3, 1.0, dim)
-
-
 def test_merge_is_the_weighted_sum_of_the_densities():
-    a = GaussianMixture(3, random_state=0).fit(cloud(300, 0))
-    b = GaussianMixture(2, random_state=0).fit(cloud(100, 1) + 1)
+    a = GaussianMixture(3, random_state=0).fit(blobs(2, 300, 0))
+    b = GaussianMixture(2, random_state=0).fit(blobs(2, 100, 1) + 1)
     union = merge(a, b, 300, 100)
-    points = cloud(50, 2)
+    points = blobs(2, 50, 2)
     expected = np.log(0.75 * np.exp(a.score_samples(points)) + 0.25 * np.exp(b.score_samples(points)))
     assert union.n_components == 5
     np.testing.assert_allclose(union.score_samples(points), expected, rtol=1e-9)
@@ -346,24 +341,24 @@ def test_merge_is_the_weighted_sum_of_the_densities():
 
 
 def test_merged_halves_are_nearly_as_good_as_the_whole():
-    halves = [cloud(2000, seed) for seed in (0, 1)]
+    halves = [blobs(2, 2000, seed) for seed in (0, 1)]
     a, b = (GaussianMixture(3, random_state=0).fit(half) for half in halves)
     whole = GaussianMixture(3, random_state=0).fit(np.concatenate(halves))
     merged = merge(a, b, 2000, 2000, n_components=3)
     assert merged.n_components == 3
-    assert merged.score(cloud(1000, 2)) == pytest.approx(whole.score(cloud(1000, 2)), abs=0.005)
+    assert merged.score(blobs(2, 1000, 2)) == pytest.approx(whole.score(blobs(2, 1000, 2)), abs=0.005)
     assert merge(a, b, 2000, 2000, max_cost=0.01).n_components == 3
     assert merge(a, b, 2000, 2000, max_cost=0.1, cost="hellinger").n_components == 3
 
 
 @pytest.mark.parametrize("kind", [np.asarray, torch.from_numpy])
 def test_merge_has_the_kind_of_the_first_and_can_continue(kind):
-    a = GaussianMixture(3, random_state=0).fit(kind(cloud(300, 0)))
-    b = GaussianMixture(3, random_state=0).fit(cloud(100, 1))
+    a = GaussianMixture(3, random_state=0).fit(kind(blobs(2, 300, 0)))
+    b = GaussianMixture(3, random_state=0).fit(blobs(2, 100, 1))
     merged = merge(a, b, 300, 100, n_components=3, reg_covar=1e-3, random_state=5)
     assert type(merged.means_) is type(a.means_)
     assert (merged.reg_covar, merged.random_state) == (1e-3, 5)
-    merged.partial_fit(kind(cloud(50, 2)))
+    merged.partial_fit(kind(blobs(2, 50, 2)))
     assert merged.n_samples_seen_ == 450
 
 
@@ -377,13 +372,13 @@ def test_merge_has_the_kind_of_the_first_and_can_continue(kind):
     ],
 )
 def test_invalid_weights_of_mixtures_are_named(weights, match):
-    a = GaussianMixture(1).fit(cloud(10, 0))
+    a = GaussianMixture(1).fit(blobs(2, 10))
     with pytest.raises(InvalidArgumentError, match=match):
         merge(a, a, *weights)
 
 
 def test_incompatible_mixtures_are_rejected():
-    a, b = (GaussianMixture(1).fit(cloud(10, 0, dim)) for dim in (2, 3))
+    a, b = (GaussianMixture(1).fit(blobs(dim, 10)) for dim in (2, 3))
     with pytest.raises(InvalidArgumentError, match="2D, b in 3D"):
         merge(a, b, 1, 1)
     with pytest.raises(NotFittedError, match="fit"):

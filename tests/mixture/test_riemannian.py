@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mixture.estimator_contract import MixtureContract
 from mixture.fit_contract import FitContract, blobs
-from mixture.test_estimators import BAD_LOOP_PARAMETERS
 from sklearn import mixture as sklearn_mixture
 
 from gmmtorch.errors import NumericalError
@@ -20,20 +19,16 @@ from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em import loop
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.estimators.ascent import SOLVERS
-from gmmtorch.mixture.estimators.riemannian import (
-    Likelihood,
-    RiemannianGaussianMixture,
-)
+from gmmtorch.mixture.estimators.riemannian import Likelihood, RiemannianGaussianMixture
 
 solvers = pytest.mark.parametrize("solver", list(SOLVERS))
 
 
 class TestRiemannianGaussianMixture(MixtureContract):
-    bad_parameters: ClassVar[list[dict[str, Any]]] = [
-        *BAD_LOOP_PARAMETERS,
-        *({"solver": value} for value in ("newton", None)),
-        *({"memory": value} for value in (0, 2.5)),
-    ]
+    bad_parameters: ClassVar[dict[str, tuple[Any, ...]]] = {
+        "solver": ("newton", None),
+        "memory": (0, 2.5),
+    }
 
     def make(self, n_components: int = 3, **options: Any) -> RiemannianGaussianMixture:
         return RiemannianGaussianMixture(n_components, **{"random_state": 0, **options})

@@ -9,6 +9,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from mixture.fit_contract import move, rigid_motion
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
@@ -30,12 +31,6 @@ models = pytest.mark.parametrize(("model", "dim"), MODELS, ids=["camera", "lidar
 
 def vector(*values: float) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
-
-
-def rotation(dim: int, seed: int = 0) -> Tensor:
-    matrix = np.linalg.qr(np.random.default_rng(seed).normal(size=(dim, dim)))[0]
-    matrix[:, 0] *= np.sign(np.linalg.det(matrix))
-    return torch.from_numpy(matrix)
 
 
 # -- noise ------------------------------------------------------------------------------------------------
@@ -129,8 +124,9 @@ def test_covariances_are_positive_definite_and_rotate_with_the_world(model, dim,
     assert found.shape == (12, dim, dim)
     torch.testing.assert_close(found, found.mT)
     assert (torch.linalg.cholesky_ex(found)[1] == 0).all()
-    turn, shift = rotation(dim, seed), torch.from_numpy(rng.normal(size=dim) * 10)
-    moved = model.noise_covariances(points @ turn.T + shift, turn @ origin + shift, normals @ turn.T)
+    motion = torch.from_numpy(rigid_motion(dim, seed))
+    turn = motion[:dim, :dim]
+    moved = model.noise_covariances(move(motion, points), move(motion, origin), normals @ turn.T)
     torch.testing.assert_close(moved[1:], turn @ found[1:] @ turn.T, rtol=1e-6, atol=1e-12)
 
 
@@ -208,7 +204,7 @@ def test_point_density_equals_that_of_the_simulated_sensor(kind, angle):
 @pytest.mark.parametrize("dim", [2, 3])
 def test_normals_of_a_noisy_plane(dim):
     rng = np.random.default_rng(0)
-    turn = rotation(dim)
+    turn = torch.from_numpy(rigid_motion(dim)[:dim, :dim])
     flat = torch.from_numpy(rng.uniform(-1, 1, size=(3000, dim)))
     flat[:, 0] = torch.from_numpy(rng.normal(size=3000) * 3e-4)
     points = flat @ turn.T + torch.tensor([5e5, 4e6, 0.0])[:dim].double()

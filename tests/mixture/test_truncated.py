@@ -19,9 +19,7 @@ from gmmtorch.datasets.point_files.point_chunks import in_memory
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mixture import GaussianMixture, gaussian_mixture
 from gmmtorch.mixture.em import loop
-from gmmtorch.mixture.em.grouping import (
-    Rows,
-)
+from gmmtorch.mixture.em.grouping import Rows
 from gmmtorch.mixture.em.initialization import flat_pieces
 from gmmtorch.mixture.em.truncated import Settings, fit_truncated
 from gmmtorch.mixture.streaming.checkpoints import Checkpoint

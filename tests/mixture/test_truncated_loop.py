@@ -10,7 +10,7 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from mixture.fit_contract import check_mixture
-from mixture.mixture_cases import beads, cloud, random_parameters, random_weight, room, rows_of
+from mixture.mixture_cases import beads, cloud, random_parameters, random_weight, room, rows_of, thin_wall
 from torch import Tensor
 
 from gmmtorch.mixture import GaussianMixture
@@ -134,8 +134,9 @@ def test_momentum_converges_faster_than_em(n_iter, share):
 class Spy:
     """An E-step that records its inputs and results, and decreases the bound at given calls."""
 
-    def __init__(self, failing: tuple[int, ...] = ()) -> None:
-        self.failing, self.given, self.dtypes, self.sets, self.found = failing, [], [], [], []
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, failing: tuple[int, ...] = ()) -> None:
+        self.failing, self.given, self.dtypes, self.sets = failing, [], [], []
+        monkeypatch.setattr(truncated, "truncated_expectation", self)
 
     def __call__(self, groups, candidates, parameters, want_owner=False, *rest):
         found = truncated_expectation(groups, candidates, parameters, want_owner, *rest)
@@ -144,15 +145,13 @@ class Spy:
         self.given.append(parameters)
         self.dtypes.append(groups.features.dtype)
         self.sets.append(candidates)
-        self.found.append(found)
         return found
 
 
-def run_spied(monkeypatch: pytest.MonkeyPatch, spy: Spy, k: int = 20, max_iter: int = 12) -> loop.EMResult:
-    points, _ = beads(1500, k)
+def run_on_beads(max_iter: int) -> loop.EMResult:
+    points, _ = beads(1500, 20)
     rows = rows_of(torch.from_numpy(points - points.mean(0)))
-    first, owner = flat_pieces(rows.points, rows.weight, k, 1e-6)
-    monkeypatch.setattr(truncated, "truncated_expectation", spy)
+    first, owner = flat_pieces(rows.points, rows.weight, 20, 1e-6)
     found, *_ = run_truncated(rows, owner, first, Settings(1e-6, 0.0, max_iter, torch.float64))
     check_run(found, max_iter)
     return found
@@ -160,8 +159,8 @@ def run_spied(monkeypatch: pytest.MonkeyPatch, spy: Spy, k: int = 20, max_iter: 
 
 @pytest.mark.parametrize("failing", [(2,), (5, 6)])  # without and with momentum
 def test_candidates_that_decrease_the_bound_are_replaced_by_the_old_ones(monkeypatch, failing):
-    spy = Spy(failing)
-    found = run_spied(monkeypatch, spy, max_iter=20)
+    spy = Spy(monkeypatch, failing)
+    found = run_on_beads(max_iter=20)
     assert found.n_iter == 20
     old, new = spy.sets[failing[0] - 1], spy.sets[failing[0]]
     assert all(given is new for given in spy.sets[failing[0] : failing[-1] + 1])
@@ -169,22 +168,13 @@ def test_candidates_that_decrease_the_bound_are_replaced_by_the_old_ones(monkeyp
 
 
 def test_run_ends_if_the_em_step_decreases_the_bound(monkeypatch):
-    spy = Spy(failing=(3, 4))
-    found = run_spied(monkeypatch, spy)
+    Spy(monkeypatch, failing=(3, 4))
+    found = run_on_beads(max_iter=12)
     assert found.converged
     assert found.n_iter == 3
 
 
 # -- rounding --------------------------------------------------------------------------------------
-
-
-def thin_wall(n: int, size: float, seed: int = 0) -> Tensor:
-    """Points of an oblique wall with side `size`, 0.1 mm thick."""
-    rng = np.random.default_rng(seed)
-    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    points = (rng.random((n, 3)) - 0.5) * [size, size, 0] + 1e-4 * rng.normal(size=(n, 3))
-    points = points @ turn.T
-    return torch.from_numpy(points - points.mean(0))
 
 
 def two_halves(points: Tensor) -> Parameters:
@@ -200,8 +190,7 @@ def test_large_thin_cloud_uses_float64_and_equals_em(size, dtype, monkeypatch):
     rows, parameters = rows_of(points), two_halves(points)
     setup = Settings(1e-6, 0.0, 1)
     owner = nearest(points, parameters.means)
-    spy = Spy()
-    monkeypatch.setattr(truncated, "truncated_expectation", spy)
+    spy = Spy(monkeypatch)
     found, *_ = run_truncated(rows, owner, parameters, setup)
     assert spy.dtypes == [dtype]
     expected, total = em.direct_step(points, rows.weight, parameters, 1e-6)
@@ -216,8 +205,7 @@ def test_components_that_become_thin_switch_to_float64(monkeypatch):
     rows, parameters = rows_of(points), two_halves(points)
     parameters = parameters._replace(covariances=parameters.covariances + torch.eye(3, dtype=torch.float64))
     owner = nearest(points, parameters.means)
-    spy = Spy()
-    monkeypatch.setattr(truncated, "truncated_expectation", spy)
+    spy = Spy(monkeypatch)
     found, *_ = run_truncated(rows, owner, parameters, Settings(1e-6, 0.0, 2))
     assert spy.dtypes == [torch.float32, torch.float64]
     for at, bound in zip(spy.given, found.lower_bounds, strict=True):
@@ -252,8 +240,7 @@ def test_large_thin_piece_of_low_weight_switches_to_float64(monkeypatch):
         counts.append(len(own))
     assert worst == pytest.approx(max(errors), rel=1e-4)
     assert average == pytest.approx(np.average(errors, weights=counts), rel=1e-4)
-    spy = Spy()
-    monkeypatch.setattr(truncated, "truncated_expectation", spy)
+    spy = Spy(monkeypatch)
     run_truncated(rows_of(points), owner, parameters, Settings(max_iter=1))
     assert spy.dtypes == [torch.float64]
 
@@ -270,7 +257,14 @@ def test_thin_walls_500_km_apart_are_fitted_independently(k):
     assert score + np.log(2) == pytest.approx(float(separate.score_samples(wall).mean()), abs=0.05)
 
 
-# -- from cells to points --------------------------------------------------------------------------
+# -- from cells or a sample to all points ----------------------------------------------------------
+
+
+def recorded_runs(patch: pytest.MonkeyPatch) -> list[Rows]:
+    """The rows of each run of EM from now on."""
+    runs, run = [], truncated.run_truncated
+    patch.setattr(truncated, "run_truncated", lambda rows, *rest: (runs.append(rows), run(rows, *rest))[1])
+    return runs
 
 
 @settings(max_examples=30)
@@ -298,11 +292,7 @@ def test_bounds_never_decrease_from_cells_to_points(seed, k, dim, grain, max_ite
     setup = Settings(1e-6, tol, max_iter, dtype, n_candidates, lambda *call: calls.append(call))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(truncated, "_MANY_POINTS", 1000)
-        runs: list[Rows] = []
-        run = truncated.run_truncated
-        patch.setattr(
-            truncated, "run_truncated", lambda rows, *rest: (runs.append(rows), run(rows, *rest))[1]
-        )
+        runs = recorded_runs(patch)
         found = fit_truncated(Rows(points, weight), owner, first, setup)
     assert [rows.are_points for rows in runs] == [False, True]
     assert float(runs[0].weight.sum()) == pytest.approx(float(weight.sum()))
@@ -334,23 +324,12 @@ def test_fit_through_cells_is_as_good(monkeypatch):
     assert pooled.score(x) == pytest.approx(direct.score(x), abs=0.05)
 
 
-# -- the contract ----------------------------------------------------------------------------------
-
-
 def test_many_points_start_on_a_sample_without_its_bounds(monkeypatch):
     points = torch.from_numpy(beads(6000, 5)[0])
     first, owner = flat_pieces(points, torch.ones(6000).double(), 5, 1e-6)
-    runs, seen = [], []
-    run = truncated.run_truncated
-    monkeypatch.setattr(
-        truncated, "run_truncated", lambda rows, *rest: (runs.append(rows), run(rows, *rest))[1]
-    )
-    found = fit_truncated(
-        Rows(points, torch.ones(6000).double()),
-        owner,
-        first,
-        Settings(on_iteration=lambda *at: seen.append(at)),
-    )
+    runs, seen = recorded_runs(monkeypatch), []
+    setup = Settings(on_iteration=lambda *at: seen.append(at))
+    found = fit_truncated(rows_of(points), owner, first, setup)
     sample, whole = runs
     assert sample.weight.shape[0] == 2000
     assert len(torch.unique(sample.values, dim=0)) == 2000

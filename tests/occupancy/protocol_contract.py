@@ -137,12 +137,6 @@ class OccupancyMapContract(ABC):
         assert self.ask(made, points([3.5625, 3.8125, 5.0, 50.0], dim)).tolist() == [0.5] * 4
         assert self.ask(made, points([-0.5, -3.0], dim)).tolist() == [0.5] * 2  # behind the sensor
 
-    @dims
-    def test_occupancy_is_a_probability(self, dim):
-        theta = self.ask(self.built(wall_scan(dim)), lattice(dim))
-        assert theta.shape == (len(lattice(dim)),)
-        assert 0 <= float(theta.min()) < 0.5 < float(theta.max()) <= 1
-
     @settings(max_examples=8)
     @given(seed=st.integers(0, 10**6), dim=st.integers(2, 3), n=st.integers(1, 30), m=st.integers(0, 10))
     def test_any_scan_gives_probabilities_and_one_half_in_unreached_space(self, seed, dim, n, m):

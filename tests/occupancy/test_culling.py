@@ -20,12 +20,7 @@ from gmmtorch.occupancy.cones import (
     outside_ball,
     outside_cone,
 )
-from gmmtorch.occupancy.culling import (
-    ball_rows,
-    candidate_pairs,
-    cells_in_chunks,
-    face_rows,
-)
+from gmmtorch.occupancy.culling import ball_rows, candidate_pairs, cells_in_chunks, face_rows
 from gmmtorch.occupancy.grid import VoxelGrid
 
 GRIDS = {2: VoxelGrid((-2.0, -1.8), 0.2, (20, 18)), 3: VoxelGrid((-2.0, -1.8, -2.1), 0.4, (10, 9, 11))}

@@ -25,12 +25,7 @@ from gmmtorch.kernels.mixtures.truncated_e_step import (
     fused_expectation,
     is_fused_on,
 )
-from gmmtorch.linalg import (
-    argsort,
-    largest_indices,
-    pack_symmetric,
-    unpack_symmetric,
-)
+from gmmtorch.linalg import argsort, largest_indices, pack_symmetric, unpack_symmetric
 from gmmtorch.mixture.em.exact import (
     Parameters,
     exponent_floor,

@@ -104,10 +104,7 @@ class ConjugateGradients:
         return had_memory
 
 
-SOLVERS: dict[str, Callable[[int], LBFGS | ConjugateGradients]] = {
-    "lbfgs": LBFGS,
-    "cg": ConjugateGradients,
-}
+SOLVERS: dict[str, Callable[[int], LBFGS | ConjugateGradients]] = {"lbfgs": LBFGS, "cg": ConjugateGradients}
 """Solvers by name; the argument is the number of steps to store."""
 
 

@@ -212,10 +212,6 @@ def differentiate(shape: Shape, slices: Slices, dtype: torch.dtype = torch.float
     shape.zero_grad()
     torch.autograd.backward(
         [weights, along, deviations],
-        [
-            moved.by_weight.mean(0).double(),
-            moved.by_mean.double() / n,
-            moved.by_deviation.double() / n,
-        ],
+        [moved.by_weight.mean(0).double(), moved.by_mean.double() / n, moved.by_deviation.double() / n],
     )
     return float(moved.cost.double().mean())

@@ -214,12 +214,7 @@ class VariationalGaussianMixture(MixtureEstimator):
             covariances = constrain(last.covariances, self.covariance_type)
             return last._replace(means=last.means - cloud.center, covariances=covariances)
         first = initialize(
-            self.init_params,
-            cloud.points,
-            cloud.weight,
-            self.n_components,
-            float(self.reg_covar),
-            generator,
+            self.init_params, cloud.points, cloud.weight, self.n_components, float(self.reg_covar), generator
         )
         # Stick-breaking depends on the order of components. With the largest component first the bound is
         # best and does not depend on the frame.

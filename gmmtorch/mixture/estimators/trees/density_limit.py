@@ -7,7 +7,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.estimators.sensor_model import SensorModel
 from gmmtorch.mixture.estimators.trees.nested import Children, Members, keep_children
 from gmmtorch.mixture.reduction.pruning import density_share
@@ -33,14 +32,11 @@ class DensityLimit(NamedTuple):
             children: of G nodes with these centers (G, D).
             members: of the children, which are numbered node · m + child.
         """
-        weights, means, covariances = children
-        found = Parameters(
-            weights.flatten(), (means + centers[:, None]).flatten(0, 1), covariances.flatten(0, 1)
-        )
-        support, counts = members.mass(weights.numel()), None
+        found = children._replace(means=children.means + centers[:, None]).flat()
+        support, counts = members.mass(len(found.weights)), None
         if self.seen is not None:
             seen = self.seen.index_select(0, members.point)
             seen = seen * (members.weight / seen.sum(1).clamp_min(torch.finfo(seen.dtype).tiny))[:, None]
             counts = seen.new_zeros(len(support), seen.shape[1]).index_add_(0, members.node, seen)
         share = density_share(support, found, self.sensor, self.origins, counts)
-        return keep_children(children, (share >= self.least).view_as(weights))
+        return keep_children(children, (share >= self.least).view_as(children.weights))
