@@ -348,8 +348,8 @@ def banded_csqmi(hit: Tensor, hit_sharp: Tensor, kernel: Tensor) -> Tensor:
 
 
 def shannon(hit: Tensor, occupancy: Tensor, delta_occ: float = 1.5, delta_emp: float = 1 / 1.5) -> Tensor:
-    """Compute `fsmi` (...,) from the first hits (..., C) of an occupancy (..., C) whose last cell is
-    occupied.
+    """Shannon information, FSMI (...,), nats, of the first hits (..., C) of an occupancy (..., C) whose last
+    cell is occupied.
 
     Cell i is passed through with probability Σ_{j>i} P(e_j) = Π_{j≤i} (1 − o_j), so the sum runs over cells.
     """
