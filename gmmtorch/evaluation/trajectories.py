@@ -22,6 +22,10 @@ from gmmtorch.linalg import check_rigid
 
 Alignment = Literal["none", "first", "rigid"]
 ALIGNMENTS: tuple[Alignment, ...] = ("none", "first", "rigid")
+UNSCORED = {
+    f"{error}{kind}": None for error in ("ate", "rpe") for kind in ("", "_median", "_max", "_degrees")
+}
+"""The fields of `PoseErrors.scores` of both errors, for poses without a truth."""
 _DEGENERATE = 1e-9  # of the largest singular value: below, positions lie on a line
 
 
