@@ -141,43 +141,28 @@ def height_image(
     return image._replace(image=heights.reshape(image.image.shape))
 
 
-def highest_occupancy(
-    probability: ArrayLike,
-    low: ArrayLike,
-    resolution: float,
-    band: tuple[float, float] = (-math.inf, math.inf),
-) -> MapImage:
-    """Returns the highest occupancy of the known cells in each column within a band; ½ where none is known.
+def highest_occupancy(probability: ArrayLike, low: ArrayLike, resolution: float) -> MapImage:
+    """Returns the highest occupancy of the known cells in each column; ½ where none is known.
 
     Args:
         probability: occupancy (nx, ny, nz) of the cells; within 0.02 of ½ is unknown. Truth values are
             accepted.
         low: corner (3,) of the lowest cell, world metres.
         resolution: side (m) of a cell.
-        band: lowest and highest z (m) of the centres of cells that count.
 
     Raises:
-        InvalidArgumentError: shapes disagree, or the band contains no layer of cells.
+        InvalidArgumentError: shapes disagree, or there is no layer of cells.
     """
     theta, corner = torch.as_tensor(probability).detach().cpu().double(), as_array(low)
-    side = check_resolution(resolution)
-    if theta.ndim != 3 or corner.shape != (3,):
+    if theta.ndim != 3 or corner.shape != (3,) or theta.shape[2] == 0:
         raise InvalidArgumentError(
-            f"probability has shape {tuple(theta.shape)} and low {corner.shape}; expected (nx, ny, nz), (3,)."
+            f"probability has shape {tuple(theta.shape)} and low {corner.shape}; expected (nx, ny, nz) "
+            "with at least one layer of cells, and (3,)."
         )
-    heights = corner[2] + (torch.arange(theta.shape[2]) + 0.5) * side
-    within = (heights >= band[0]) & (heights <= band[1])
-    if not bool(within.any()):
-        raise InvalidArgumentError(
-            f"band={band} contains no layer of cells between {heights.min():g} and {heights.max():g} m."
-            if len(heights)
-            else "probability has no layer of cells."
-        )
-    layers = theta[:, :, within]
-    highest = torch.where(_is_unknown(layers), -1.0, layers).amax(2)
-    shown = (float(heights[within][0]) - side / 2, float(heights[within][-1]) + side / 2)
+    x, y, bottom = corner.tolist()
+    highest = torch.where(_is_unknown(theta), -1.0, theta).amax(2)
     image = torch.where(highest < 0, 0.5, highest)
-    return MapImage(image, (float(corner[0]), float(corner[1])), side, shown)
+    return MapImage(image, (x, y), resolution, (bottom, bottom + theta.shape[2] * resolution))
 
 
 def roof_above(panel: MapPanel, path: np.ndarray, occupied_above: float, headroom: float = 0.5) -> bool:

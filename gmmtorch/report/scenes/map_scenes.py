@@ -17,7 +17,6 @@ from gmmtorch.occupancy.evidence import Thresholds
 from gmmtorch.report import style
 from gmmtorch.report.maps.map_regions import Corners, robust_bounds
 from gmmtorch.report.scenes.ellipsoids import (
-    N_SIGMA,
     cut_away,
     first_viewpoints,
     height_colours,
@@ -32,7 +31,7 @@ from gmmtorch.report.scenes.scene import (
     height_bar,
     path_balls,
 )
-from gmmtorch.report.scenes.scene_renderer import Camera, Canvas
+from gmmtorch.report.scenes.scene_renderer import N_SIGMA, Canvas
 from gmmtorch.report.table import byte_text, count_text
 
 _SIDE = 6.6  # inches, width of a panel
@@ -69,7 +68,6 @@ def map_scene_figure(
     components: Components | None = None,
     *,
     title: str = "",
-    camera: Camera = SOUTH_WEST,
 ) -> Figure:
     """Draws 3D maps side by side in space, coloured by height (thesis Fig 3.6b and Fig 3.7).
 
@@ -84,14 +82,13 @@ def map_scene_figure(
         resolution: side (m) of the cells; a multiple if more than two million cells would be asked.
         components: surfaces of the map; None: the panel of the components is left out.
         title: of the figure.
-        camera: the viewer.
     """
-    hidden = _Hidden(components, camera)
+    hidden = _Hidden(components)
     cloud = points[style.even_sample(len(points), _MAX_POINTS)].double().cpu()
     cloud = cloud[~hidden(cloud)]
     box = low, high = robust_bounds(cloud, trajectory, _SHARE, margin=0.3)
     scale = style.height_scale(cloud[:, 2])
-    canvas = canvas_around(low, high, camera, int(_SIDE * style.SAVED_DPI))
+    canvas = canvas_around(low, high, SOUTH_WEST, int(_SIDE * style.SAVED_DPI))
     size = f"{count_text(len(points), 'point')}, {byte_text(_POINT_BYTES * len(points))}"
     shown = [(f"measured: {size}", _spots(cloud, _POINT_PIXELS / canvas.scale, scale, hidden, box))]
     if components is not None:
@@ -106,7 +103,7 @@ def map_scene_figure(
     path = [path_balls(trajectory.double(), _PATH_PIXELS / canvas.scale, _PATH)] if len(trajectory) else []
     figure, panels = _sheet(len(shown), canvas)
     for axes, (name, part) in zip(panels, shown, strict=False):
-        draw_scene(axes, [part, *path], low, high, camera, canvas)
+        draw_scene(axes, [part, *path], low, high, SOUTH_WEST, canvas)
         axes.set_title(name, fontsize=style.TITLE_SIZE)
     height_bar(figure, panels, scale)
     style.figure_title(figure, title)
@@ -125,14 +122,14 @@ def _sheet(n_panels: int, canvas: Canvas) -> tuple[Figure, list[Axes]]:
     return figure, panels
 
 
-def cells_near(points: Tensor, resolution: float, reach: int = _REACH) -> tuple[Tensor, float]:
-    """Returns the centres (M, 3) of the cells at most `reach` cells from a point along each axis, and their
+def cells_near(points: Tensor, resolution: float) -> tuple[Tensor, float]:
+    """Returns the centres (M, 3) of the cells at most two cells from a point along each axis, and their
     side (m): `resolution`, doubled until there are no more than two million cells."""
     while True:
         cells = torch.unique((points.double() / resolution).floor(), dim=0)
         for axis in range(3):
-            step = torch.zeros(2 * reach + 1, 3, dtype=torch.float64)
-            step[:, axis] = torch.arange(-reach, reach + 1)
+            step = torch.zeros(2 * _REACH + 1, 3, dtype=torch.float64)
+            step[:, axis] = torch.arange(-_REACH, _REACH + 1)
             cells = torch.unique((cells[:, None] + step).flatten(0, 1), dim=0)
             if len(cells) > _MAX_CELLS:
                 break
@@ -145,7 +142,7 @@ class _Hidden:
     """What is left out because it hides the inside: what lies above `top` (m), and what belongs to components
     that `cut_away` leaves out; `kept` (K,) marks the others."""
 
-    def __init__(self, components: Components | None, camera: Camera) -> None:
+    def __init__(self, components: Components | None) -> None:
         self.kept, self.top = torch.ones(0, dtype=torch.bool), math.inf
         if components is None or len(components) == 0:
             return
@@ -154,7 +151,7 @@ class _Hidden:
             components.covariances.double().cpu(),
         )
         seen_from = first_viewpoints(components).double().cpu()
-        self.kept, self.top = cut_away(self._means, self._covariances, seen_from, None, camera)
+        self.kept, self.top = cut_away(self._means, self._covariances, seen_from, None, SOUTH_WEST)
 
     def __call__(self, places: Tensor) -> Tensor:
         """Whether each place (M, 3) is left out."""

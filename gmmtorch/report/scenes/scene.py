@@ -19,7 +19,6 @@ from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.report import style
 from gmmtorch.report.maps.map_regions import robust_bounds
 from gmmtorch.report.scenes.ellipsoids import (
-    N_SIGMA,
     checked_components,
     checked_rows,
     cut_away,
@@ -27,7 +26,7 @@ from gmmtorch.report.scenes.ellipsoids import (
     height_colours,
 )
 from gmmtorch.report.scenes.paths import path_handles, smooth_path
-from gmmtorch.report.scenes.scene_renderer import Camera, Canvas, render
+from gmmtorch.report.scenes.scene_renderer import N_SIGMA, Camera, Canvas, render
 from gmmtorch.report.table import count_text
 from gmmtorch.scan import ArrayLike
 
@@ -110,7 +109,6 @@ def draw_scene(
         torch.cat(colours),
         camera,
         canvas,
-        N_SIGMA,
         tops=torch.cat(tops),
     )
     _draw_floor(axes, np.asarray(low), np.asarray(high), camera, n_ticks)

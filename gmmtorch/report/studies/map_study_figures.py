@@ -10,7 +10,7 @@ import torch
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator
+from matplotlib.ticker import LogLocator
 from torch import Tensor
 
 from gmmtorch.report import style
@@ -49,7 +49,7 @@ def auc_memory_figures(rows: style.Rows) -> dict[str, Figure]:
             ]
         axes.set_xscale("log")
         axes.xaxis.set_major_locator(LogLocator())
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: byte_text(value, digits=1)))
+        style.tick_text(axes.xaxis, lambda value: byte_text(value, digits=1))
         style.label_axes(axes, f"cells of {style.metres(resolution)}", "map size", "")
         style.draw_grid(axes)
     grid[0][0].set_ylabel("area under the ROC curve", fontsize=style.LABEL_SIZE)
@@ -141,10 +141,9 @@ def _length(length: object) -> str:
     return "hits as counts" if length is None else f"hit_length={length}"
 
 
-def closest_look(thin: Tensor, hits: Tensor, side: float = 4.0) -> Corners:
-    """Returns the corners of a box around the most thin points: `side` × `side` metres, as high as its
-    hits."""
-    (low, high), *_ = busiest_regions(thin[:, :2], 1, side)
+def closest_look(thin: Tensor, hits: Tensor) -> Corners:
+    """Returns the corners of a box around the most thin points: 4 m × 4 m, as high as its hits."""
+    (low, high), *_ = busiest_regions(thin[:, :2], 1, 4.0)
     inside = ((hits[:, :2] >= torch.tensor(low)) & (hits[:, :2] <= torch.tensor(high))).all(1)
     heights = np.quantile(hits[inside, 2].numpy(), [0.005, 0.995])
     return (*low, float(heights[0]) - 0.2), (*high, float(heights[1]) + 0.2)
