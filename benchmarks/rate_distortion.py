@@ -46,12 +46,12 @@ from gmmtorch.evaluation.codecs.point_codecs import (
 from gmmtorch.evaluation.metrics import psnr_terms, roc
 from gmmtorch.evaluation.queries import FREE, OCCUPIED, Queries
 from gmmtorch.files import write_bytes
-from gmmtorch.mapping.codec.component_batch import spatial_order
+from gmmtorch.mapping.codec.quantization import spatial_order
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.fitting import SurfaceFit, fit_points
-from gmmtorch.mapping.learning.incremental import surface_fit
 from gmmtorch.mapping.learning.merging import compact
 from gmmtorch.mapping.learning.viewpoints import all_origins
+from gmmtorch.mapping.learning.windows import surface_fit
 from gmmtorch.occupancy.protocol import OccupancyMap
 from gmmtorch.report.studies.rate_distortion_figures import QUALITIES, bytes_for, figures, leads
 from gmmtorch.report.style import label_of, save_figure

@@ -23,10 +23,11 @@ from torch import Tensor
 
 from gmmtorch.evaluation.codecs.point_codecs import bytes_of_points
 from gmmtorch.exploration.robot.gmm_mapper import FrameRule
-from gmmtorch.mapping.codec.component_batch import spatial_order
+from gmmtorch.mapping.codec.quantization import spatial_order
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.fitting import fit_window
 from gmmtorch.mapping.learning.viewpoints import all_origins
+from gmmtorch.sharing.messages.fields import pose_of
 from gmmtorch.sharing.messages.message_registry import (
     CODECS,
     ViewsMessage,
@@ -38,7 +39,6 @@ from gmmtorch.sharing.messages.message_registry import (
     encode_views,
     quantized_poses,
 )
-from gmmtorch.sharing.messages.pose_fields import pose_of
 from gmmtorch.sharing.messages.record_messages import (
     CorrectionMessage,
     SupersessionMessage,

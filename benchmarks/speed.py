@@ -26,7 +26,7 @@ from torch import Tensor
 from gmmtorch import GaussianMap, datasets
 from gmmtorch.kernels.rays.ray_traversal import traverse
 from gmmtorch.mapping.learning.rules import WindowedRule
-from gmmtorch.mapping.learning.windowed import learn_window
+from gmmtorch.mapping.learning.windows import learn_window
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em import loop
 from gmmtorch.occupancy.evidence import Evidence
@@ -83,24 +83,19 @@ def em_iteration(n: int = 100_000, k: int = 100, iterations: int = 10, repeats: 
 
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            short, (long, peer) = run(1)[0], run(iterations + 1)
+            short, long = run(1)[0], run(iterations + 1)[0]
             bound = run(iterations)[1].lower_bounds_[-1]
         # What is not iteration (start, last E-step) is in both, and drops out.
-        del peer
         return (long - short) / iterations, float(bound)
 
     # Turn about, so that a change of the machine's speed meets all alike.
     runs = [(ours(torch.float32), ours(torch.float64), theirs()) for _ in range(repeats)]
     rows = []
-    reference = statistics.median(run[2][0] for run in runs)
     for index, name in enumerate(("gmmtorch, float32 exponentials", "gmmtorch, float64", "scikit-learn")):
-        seconds = statistics.median(run[index][0] for run in runs)
+        times = [run[index][0] for run in runs]
         ratio = statistics.median(run[2][0] / run[index][0] for run in runs)
-        spread = (
-            f"{min(run[index][0] for run in runs) * 1e3:.0f}–{max(run[index][0] for run in runs) * 1e3:.0f}"
-        )
-        rows.append([name, f"{seconds * 1e3:.0f} ({spread})", f"{ratio:.1f}", f"{runs[0][index][1]:.6f}"])
-    del reference
+        seconds = f"{statistics.median(times) * 1e3:.0f} ({min(times) * 1e3:.0f}–{max(times) * 1e3:.0f})"
+        rows.append([name, seconds, f"{ratio:.1f}", f"{runs[0][index][1]:.6f}"])
     header = ["", "ms an iteration, median (range)", "times faster", "mean log-likelihood"]
     publish("em", f"{hardware()}\n\n{markdown(header, rows)}")
 

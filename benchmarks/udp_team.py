@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from gmmtorch.cli.from_options.links import free_addresses
-from gmmtorch.mapping.codec.component_batch import quantized
+from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.report.table import format_table
 from gmmtorch.sharing.replica.component_table import fingerprints

@@ -43,24 +43,32 @@ class NumericalError(GmmTorchError, ArithmeticError, ValueError):
     """A matrix cannot be factorised, even with the largest permitted jitter."""
 
 
-def check_whole(name: str, value: object, least: int) -> int:
+def check_whole(name: str, value: object, least: int, most: int = 2**63 - 1) -> int:
     """Returns `value` as an int.
 
-    Raises `InvalidArgumentError` unless it is a whole number from `least` to below 2⁶³.
+    Raises `InvalidArgumentError` unless it is a whole number from `least` to `most`.
     """
-    if not isinstance(value, numbers.Integral) or not least <= int(value) < 2**63:
-        raise InvalidArgumentError(f"{name}={value!r} must be a whole number of at least {least}.")
+    if not isinstance(value, numbers.Integral) or not least <= int(value) <= most:
+        limits = f"of at least {least}" if most == 2**63 - 1 else f"from {least} to {most}"
+        raise InvalidArgumentError(f"{name}={value!r} must be a whole number {limits}.")
     return int(value)
 
 
-def check_number(name: str, value: object, largest: float = math.inf, above: bool = False) -> None:
-    """Raise `InvalidArgumentError` unless `value` is a finite number from 0 (exclusive if `above`) to
+def check_number(
+    name: str, value: object, largest: float = math.inf, above: bool = False, *, least: float = 0.0
+) -> float:
+    """Returns `value` as a float.
+
+    Raises `InvalidArgumentError` unless it is a finite number from `least` (exclusive if `above`) to
     `largest`.
     """
     number = _as_float(value)
-    if not (0 <= number <= largest and number < math.inf) or (above and number == 0):
-        limit = "above 0" if above else "of at least 0" if largest == math.inf else f"from 0 to {largest:g}"
-        raise InvalidArgumentError(f"{name}={value!r} must be a finite number {limit}.")
+    if not (least <= number <= largest and number < math.inf) or (above and number == least):
+        limit = f"from {least:g} to {largest:g}" if largest < math.inf else f"of at least {least:g}"
+        raise InvalidArgumentError(
+            f"{name}={value!r} must be a finite number {f'above {least:g}' if above else limit}."
+        )
+    return number
 
 
 def _as_float(value: object) -> float:

@@ -1,4 +1,4 @@
-"""Batches of small symmetric matrices (packing, Cholesky with jitter, checks), and fast sorting."""
+"""Batches of small matrices (symmetric ones packed and factorised, rotations), checks, and fast sorting."""
 
 from __future__ import annotations
 
@@ -86,6 +86,18 @@ def check_symmetric(matrices: Tensor, name: str) -> Tensor:
             f"{name} are not symmetric; to symmetrise them, use (C + C.transpose(-2, -1)) / 2."
         )
     return matrices
+
+
+def plane_rotations(angles: Tensor) -> Tensor:
+    """Rotations (…, 2, 2) of the plane by angles (…), rad, counter-clockwise."""
+    cos, sin = angles.cos(), angles.sin()
+    return torch.stack([torch.stack([cos, -sin], -1), torch.stack([sin, cos], -1)], -2)
+
+
+def nearest_rotations(matrices: Tensor) -> Tensor:
+    """The rotations nearest to matrices (…, D, D) that are rotations up to rounding: U Vᵀ of U Σ Vᵀ."""
+    left, _, right = torch.linalg.svd(matrices)
+    return left @ right
 
 
 def check_rigid(transform: Tensor, dim: int, name: str = "transform") -> tuple[Tensor, Tensor]:

@@ -44,13 +44,6 @@ def load_pyoctomap() -> Any:
     return pyoctomap
 
 
-def load_viser() -> Any:
-    """The module viser. Raises `GmmTorchError` if it does not load."""
-    with needs_extra("The browser viewer needs", "viser", "viewer"):
-        import viser
-    return viser
-
-
 def load_ray() -> Any:
     """The module ray. Raises `GmmTorchError` if it does not load."""
     with needs_extra("Several workers and clusters need", "ray", "cluster"):

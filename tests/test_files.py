@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from safetensors.torch import save as save_tensors
 
@@ -104,13 +104,6 @@ def test_an_interrupt_while_the_file_is_created_leaves_no_file(call, tmp_path, m
     assert not list(tmp_path.iterdir())
 
 
-def test_write_onto_a_folder_leaves_no_temporary_file(tmp_path):
-    (tmp_path / "a.bin").mkdir()
-    with pytest.raises(OSError):  # noqa: PT011 - the error depends on the system
-        write_bytes(tmp_path / "a.bin", b"x")
-    assert [p.name for p in tmp_path.iterdir()] == ["a.bin"]
-
-
 def test_old_file_is_complete_until_the_new_one_is(tmp_path):
     path = write_bytes(tmp_path / "a.txt", b"old")
     seen = []
@@ -134,19 +127,16 @@ def umask():
 
 @pytest.mark.skipif(os.name != "posix", reason="file modes")
 @pytest.mark.parametrize(("mask", "expected"), [(0o022, 0o644), (0o077, 0o600), (0o002, 0o664)])
-def test_new_file_has_the_mode_of_the_umask(tmp_path, umask, mask, expected):
+def test_a_new_file_has_the_mode_of_the_umask_and_a_replaced_one_keeps_its_own(
+    tmp_path, umask, mask, expected
+):
     umask(mask)
-    path = write_bytes(tmp_path / "a.bin", b"x")
-    assert stat.S_IMODE(path.stat().st_mode) == expected
-
-
-@pytest.mark.skipif(os.name != "posix", reason="file modes")
-@pytest.mark.parametrize("mode", [0o600, 0o640, 0o666])
-def test_replaced_file_keeps_its_mode(tmp_path, umask, mode):
     path = write_bytes(tmp_path / "a.bin", b"old")
-    path.chmod(mode)
-    write_bytes(path, b"new")
-    assert (path.read_bytes(), stat.S_IMODE(path.stat().st_mode)) == (b"new", mode)
+    assert stat.S_IMODE(path.stat().st_mode) == expected
+    for mode in (0o600, 0o640, 0o666):
+        path.chmod(mode)
+        write_bytes(path, b"new")
+        assert (path.read_bytes(), stat.S_IMODE(path.stat().st_mode)) == (b"new", mode)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="symbolic links")
@@ -168,11 +158,13 @@ def test_write_through_a_link_replaces_its_target(tmp_path, exists):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="special files")
-@pytest.mark.parametrize(("kind", "name"), [("fifo", "FIFO"), ("device", "device"), ("loop", "links")])
+@pytest.mark.parametrize(
+    ("kind", "name"), [("folder", "folder"), ("fifo", "FIFO"), ("device", "device"), ("loop", "links")]
+)
 def test_what_is_not_a_regular_file_is_refused_and_stays(tmp_path, kind, name):
     path = tmp_path / "a.bin"
-    if kind == "fifo":
-        os.mkfifo(path)
+    if kind in ("fifo", "folder"):
+        (os.mkfifo if kind == "fifo" else os.mkdir)(path)
     else:
         path.symlink_to("/dev/null" if kind == "device" else "a.bin")
     before = path.lstat()
@@ -231,17 +223,17 @@ def test_truncated_or_extended_file_is_rejected(tmp_path):
             read_tensors(write(tmp_path, damaged), KIND, VERSION)
 
 
-def test_another_kind_names_both_kinds(tmp_path):
-    path = write(tmp_path, pack_tensors({}, "gmmtorch.other", VERSION))
-    with pytest.raises(DataError, match=r"gmmtorch\.other.*gmmtorch\.test"):
-        read_tensors(path, KIND, VERSION)
-
-
-@pytest.mark.parametrize("version", [2, 4])
-def test_another_version_names_both_versions(tmp_path, version):
-    path = write(tmp_path, pack_tensors({}, KIND, version))
-    with pytest.raises(DataError, match=rf"version {version} .*version 3"):
-        read_tensors(path, KIND, VERSION)
+@pytest.mark.parametrize(
+    ("kind", "version", "message"),
+    [
+        ("gmmtorch.other", VERSION, r"gmmtorch\.other.*gmmtorch\.test"),
+        (KIND, 2, "version 2 .*version 3"),
+        (KIND, 4, "version 4 .*version 3"),
+    ],
+)
+def test_another_kind_or_version_names_both(tmp_path, kind, version, message):
+    with pytest.raises(DataError, match=message):
+        read_tensors(write(tmp_path, pack_tensors({}, kind, version)), KIND, VERSION)
 
 
 def test_foreign_safetensors_file_is_rejected(tmp_path):
@@ -317,20 +309,6 @@ def test_file_above_the_size_limit_is_rejected(tmp_path, monkeypatch):
 def test_random_bytes_raise_only_package_errors(tmp_path, data):
     with pytest.raises(GmmTorchError):
         read_tensors(write(tmp_path, data), KIND, VERSION)
-
-
-@settings(max_examples=200)
-@given(place=st.integers(0, 10**6), value=st.integers(0, 255), second=st.integers(0, 10**6))
-def test_damaged_file_is_rejected_or_gives_tensors(tmp_path, place, value, second):
-    data = bytearray(valid_file())
-    data[place % len(data)] = value
-    data[second % len(data)] ^= 1 << (value % 8)
-    try:
-        tensors, facts = read_tensors(write(tmp_path, bytes(data)), KIND, VERSION)
-    except GmmTorchError:
-        return
-    assert isinstance(facts, dict)
-    assert all(isinstance(t, torch.Tensor) for t in tensors.values())
 
 
 # -- checking -------------------------------------------------------------------------------------

@@ -151,21 +151,6 @@ def check_length(name: str, value: float) -> float:
     return float(value)
 
 
-def check_max_range(max_range: float | None) -> float | None:
-    """The largest range (m), None for no limit. Raises `InvalidArgumentError` unless above zero."""
-    return None if max_range is None else check_length("max_range", max_range)
-
-
-def check_positive(name: str, value: float) -> float:
-    """A number as a float. Raises `InvalidArgumentError` unless it is finite and above zero."""
-    if not isinstance(value, int | float) or not (math.isfinite(value) and value > 0):
-        raise InvalidArgumentError(f"{name}={value!r} must be a finite number above zero.")
-    return float(value)
-
-
-def check_between(name: str, value: float, low: float, high: float = math.inf) -> float:
-    """A number as a float. Raises `InvalidArgumentError` unless it is finite and in [low, high]."""
-    if not isinstance(value, int | float) or not (math.isfinite(value) and low <= value <= high):
-        span = f"of at least {low}" if high == math.inf else f"from {low} to {high}"
-        raise InvalidArgumentError(f"{name}={value!r} must be a finite number {span}.")
-    return float(value)
+def optional_length(name: str, value: float | None) -> float | None:
+    """As `check_length`, or None."""
+    return None if value is None else check_length(name, value)

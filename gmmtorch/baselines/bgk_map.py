@@ -8,9 +8,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gmmtorch.baselines.baseline_map import TensorFileMap, check_length, check_max_range, check_positive
+from gmmtorch.baselines.baseline_map import TensorFileMap, check_length, optional_length
 from gmmtorch.baselines.samples import thinned_samples
-from gmmtorch.errors import DataError, MemoryLimitError
+from gmmtorch.errors import DataError, MemoryLimitError, check_number
 from gmmtorch.files import require
 from gmmtorch.occupancy.grid import MEMORY_LIMIT, check_resolution
 from gmmtorch.occupancy.voxels.cell_table import CellTable
@@ -88,15 +88,15 @@ class BGKMap(TensorFileMap):
     ) -> None:
         self.resolution = check_resolution(resolution)
         self.length = check_length("length", 2 * self.resolution if length is None else length)
-        self.prior = check_positive("prior", prior)
-        self.scale = check_positive("scale", scale)
+        self.prior = check_number("prior", prior, above=True)
+        self.scale = check_number("scale", scale, above=True)
         self.free_resolution = check_length(
             "free_resolution", 2 * self.resolution if free_resolution is None else free_resolution
         )
         self.ds_resolution = check_length(
             "ds_resolution", self.resolution if ds_resolution is None else ds_resolution
         )
-        self.max_range = check_max_range(max_range)
+        self.max_range = optional_length("max_range", max_range)
         self.memory_limit = memory_limit
         self._start(2, torch.device("cpu"))
 

@@ -9,10 +9,10 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from gmmtorch.baselines.baseline_map import check_positive
 from gmmtorch.baselines.bgk_map import BGKMap, beta_mean, sparse_kernel
-from gmmtorch.errors import DataError, check_whole
+from gmmtorch.errors import DataError, check_number, check_whole
 from gmmtorch.files import require
+from gmmtorch.linalg import ragged_index
 from gmmtorch.occupancy.grid import MEMORY_LIMIT
 from gmmtorch.occupancy.voxels.cell_table import CellTable
 from gmmtorch.scan import Scan
@@ -126,7 +126,7 @@ class BGKPointsMap(BGKMap):
     def _from_facts(cls, facts: dict[str, Any], path: str | Path) -> Self:
         options = dict(facts)
         try:
-            growth = check_positive("growth", options.pop("growth"))
+            growth = check_number("growth", options.pop("growth"), above=True)
         except (KeyError, ValueError) as error:
             raise DataError(f"{path}: its settings are damaged ({error!r}).") from error
         made = super()._from_facts(options, path)
@@ -191,9 +191,7 @@ class _Bins:
             near = known.nonzero().squeeze(1)
             count = self.count[rows[near]]
             for chunk in _chunks(count):
-                number = torch.repeat_interleave(count[chunk])
-                begin = torch.cumsum(count[chunk], 0) - count[chunk]
-                within = torch.arange(number.shape[0], device=query.device) - begin[number]
+                number, within = ragged_index(count[chunk])
                 point = self.start[rows[near[chunk]]][number] + within
                 at = near[chunk][number]
                 value = sparse_kernel((query[at] - self.points[point]).norm(dim=1), self.length)

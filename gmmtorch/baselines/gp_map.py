@@ -5,14 +5,13 @@ from __future__ import annotations
 import itertools
 import math
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from gmmtorch.baselines.baseline_map import TensorFileMap, check_length, check_max_range, check_positive
+from gmmtorch.baselines.baseline_map import TensorFileMap, check_length, optional_length
 from gmmtorch.baselines.samples import thinned_samples
-from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
+from gmmtorch.errors import DataError, InvalidArgumentError, check_number, check_whole
 from gmmtorch.files import require
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.occupancy.grid import MEMORY_LIMIT, check_resolution
@@ -21,13 +20,6 @@ from gmmtorch.scan import Scan
 
 _CHUNK_NUMBERS = 1 << 23
 _MAX_SAMPLES_PER_BLOCK = 2048
-
-
-class Prediction(NamedTuple):
-    """Mean (B, M) and variance (B, M) of B Gaussian processes at M points each."""
-
-    mean: Tensor
-    variance: Tensor
 
 
 def matern_kernel(a: Tensor, b: Tensor, length: float, variance: float) -> Tensor:
@@ -48,8 +40,9 @@ def gp_regression(
     length: float,
     variance: float,
     noise: float,
-) -> Prediction:
-    """Zero-mean regression by B separate Gaussian processes (Rasmussen & Williams 2006, algorithm 2.1).
+) -> tuple[Tensor, Tensor]:
+    """Mean (B, M) and variance (B, M) of M predictions of each of B separate zero-mean Gaussian processes
+    (Rasmussen & Williams 2006, algorithm 2.1).
 
     Args:
         points: (B, N, D) positions of the samples, padded to N.
@@ -68,7 +61,7 @@ def gp_regression(
     targets = torch.cat([cross, (values * is_sample)[:, :, None]], 2)
     solved = torch.linalg.solve_triangular(factor, targets, upper=False)
     cross, target = solved[:, :, :-1], solved[:, :, -1:]
-    return Prediction((cross * target).sum(1), variance - cross.square().sum(1))
+    return (cross * target).sum(1), variance - cross.square().sum(1)
 
 
 class GPMap(TensorFileMap):
@@ -121,18 +114,18 @@ class GPMap(TensorFileMap):
     ) -> None:
         self.resolution = check_resolution(resolution)
         self.length = check_length("length", length)
-        self.variance = check_positive("variance", variance)
-        self.noise = check_positive("noise", noise)
-        self.gain = check_positive("gain", gain)
-        self.min_variance = check_positive("min_variance", min_variance)
-        self.max_variance = check_positive("max_variance", max_variance)
-        self.known_variance = check_positive("known_variance", known_variance)
+        self.variance = check_number("variance", variance, above=True)
+        self.noise = check_number("noise", noise, above=True)
+        self.gain = check_number("gain", gain, above=True)
+        self.min_variance = check_number("min_variance", min_variance, above=True)
+        self.max_variance = check_number("max_variance", max_variance, above=True)
+        self.known_variance = check_number("known_variance", known_variance, above=True)
         self.block_side = check_whole("block_side", block_side, 1)
         self.free_resolution = check_length("free_resolution", free_resolution)
         self.ds_resolution = check_length(
             "ds_resolution", self.resolution if ds_resolution is None else ds_resolution
         )
-        self.max_range = check_max_range(max_range)
+        self.max_range = optional_length("max_range", max_range)
         self.memory_limit = memory_limit
         self._start(2, torch.device("cpu"))
 
@@ -168,7 +161,7 @@ class GPMap(TensorFileMap):
             slot = torch.arange(int(count[group].max()), device=self.device)
             is_sample = slot < count[group][:, None]
             chosen = order[(start[group][:, None] + slot).clamp_max(order.shape[0] - 1)]
-            prediction = gp_regression(
+            mean, variance = gp_regression(
                 samples[chosen],
                 values[chosen],
                 is_sample,
@@ -178,7 +171,7 @@ class GPMap(TensorFileMap):
                 noise=self.noise,
             )
             cells = (blocks[group] * self.block_side)[:, None] + inner
-            self._fuse(cells.flatten(0, 1), prediction.mean.flatten(), prediction.variance.flatten())
+            self._fuse(cells.flatten(0, 1), mean.flatten(), variance.flatten())
 
     def _cells_around(self, dim: int) -> tuple[Tensor, Tensor]:
         """Cells of a block and of the blocks that share a face with it.

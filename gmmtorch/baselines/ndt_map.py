@@ -8,7 +8,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gmmtorch.baselines.baseline_map import TensorFileMap, check_length, check_max_range
+from gmmtorch.baselines.baseline_map import TensorFileMap, check_length, optional_length
+from gmmtorch.baselines.samples import cut_beams
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, check_whole
 from gmmtorch.files import require
 from gmmtorch.kernels.rays.ray_traversal import traverse
@@ -123,7 +124,7 @@ class NDTMap(TensorFileMap):
         )
         self.max_points = check_whole("max_points", max_points, _MIN_POINTS)
         self.max_log_odds = float(max_log_odds)
-        self.max_range = check_max_range(max_range)
+        self.max_range = optional_length("max_range", max_range)
         self.memory_limit = memory_limit
         self._start(2, torch.device("cpu"))
 
@@ -142,9 +143,8 @@ class NDTMap(TensorFileMap):
         origin, (ends, is_hit) = scan.origin.double(), scan.ends()
         ends = ends.double()
         if self.max_range is not None:
-            length = (ends - origin).norm(dim=1, keepdim=True)
-            is_hit = is_hit & (length[:, 0] <= self.max_range)
-            ends = origin + (ends - origin) * (self.max_range / length.clamp_min(self.max_range))
+            is_hit = is_hit & ((ends - origin).norm(dim=1) <= self.max_range)
+            ends = cut_beams(origin, ends, self.max_range)
         self._add_misses(origin, ends)
         if bool(is_hit.any()):
             self._add_hits(ends[is_hit])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tempfile
 import zlib
 from pathlib import Path
 from typing import Any, Self
@@ -11,9 +10,10 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from gmmtorch.baselines.baseline_map import BaselineMap, check_max_range
-from gmmtorch.baselines.octree_files import read_octree
-from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
+from gmmtorch.baselines.baseline_map import BaselineMap, optional_length
+from gmmtorch.baselines.octree_files import parsed_octree, read_octree_file
+from gmmtorch.baselines.samples import cut_beams
+from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.kernels.rays.ray_traversal import traverse
 from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.optional_packages import load_pyoctomap
@@ -64,7 +64,7 @@ class OctoMapMap(BaselineMap):
             if not low < value < high:
                 raise InvalidArgumentError(f"{name}={value} must lie between {low} and {high}.")
         self.hit, self.miss, self.clamp_low, self.clamp_high = hit, miss, clamp_low, clamp_high
-        self.max_range = check_max_range(max_range)
+        self.max_range = optional_length("max_range", max_range)
         self.by_ray = by_ray
         self._tree: Any = None
         self._anchor: Tensor | None = None  # (D,) int64, the cell at the octree's centre
@@ -109,8 +109,7 @@ class OctoMapMap(BaselineMap):
     def _add_misses(self, origin: Tensor, hits: Tensor, no_return: Tensor) -> None:
         """Adds misses along beams without return, except in cells that the scan's returns have updated."""
         if self.max_range is not None:
-            length = (no_return - origin).norm(dim=1, keepdim=True)
-            no_return = origin + (no_return - origin) * (self.max_range / length.clamp_min(self.max_range))
+            no_return = cut_beams(origin, no_return, self.max_range)
         units = torch.cat([origin, hits, no_return]) / self.resolution
         low = units.floor().amin(0)
         shape = tuple((units.floor().amax(0) - low + 1).long().tolist())
@@ -171,10 +170,7 @@ class OctoMapMap(BaselineMap):
     @classmethod
     def load(cls, path: str | Path) -> Self:
         """Reads a map that `save` wrote. Raises `DataError` for other or damaged content."""
-        path = Path(path)
-        if not path.is_file():
-            raise MissingDataError(f"{path} does not exist; expected an OctoMap file.")
-        data = path.read_bytes()
+        data = read_octree_file(path)
         at = data.find(_MARK) + len(_MARK)
         if at < len(_MARK) or _checksum(data[:at] + data[at + 8 :]) != data[at : at + 8]:
             raise DataError(f"{path} is damaged, or not an OctoMap file that gmmtorch wrote.")
@@ -186,7 +182,7 @@ class OctoMapMap(BaselineMap):
             raise DataError(f"{path}: its settings are damaged ({error!r}).") from error
         made = cls._from_facts(facts, path)
         made._anchor = anchor
-        made._tree = _read_tree(data)
+        made._tree, _ = parsed_octree(data, path)
         made._tree.setResolution(made.resolution)  # the file has only six digits of it
         made._set_sensor_model()
         return made
@@ -198,7 +194,7 @@ class OctoMapMap(BaselineMap):
         A `.bt` file has two classes: its cells get the probabilities `clamp_low` and `clamp_high`. Raises
         `MissingDataError` for a missing and `DataError` for a damaged or another file.
         """
-        tree, resolution = read_octree(path)
+        tree, resolution = parsed_octree(read_octree_file(path), path)
         made = cls(resolution)
         made._start(3, made.device)
         made.dim, made._tree, made._anchor = 3, tree, torch.zeros(3, dtype=torch.int64)
@@ -217,11 +213,3 @@ def _flat_index(units: Tensor, shape: tuple[int, ...], low: Tensor) -> Tensor:
 
 def _checksum(data: bytes) -> bytes:
     return f"{zlib.crc32(data):08x}".encode()
-
-
-def _read_tree(data: bytes) -> Any:
-    """The octree of an .ot file; OctoMap can only read from disk."""
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "map.ot"
-        file.write_bytes(data)
-        return load_pyoctomap().OcTree(0.1).read(str(file))

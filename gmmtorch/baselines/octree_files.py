@@ -33,18 +33,22 @@ class _Header(NamedTuple):
     begin: int
 
 
-def read_octree(path: str | Path) -> tuple[Any, float]:
-    """OctoMap's octree in a file, and the side of its cells (m).
-
-    Raises `MissingDataError` for a path without file, and `DataError` for files that are not an OcTree, are
-    damaged, or have more than 2²⁵ nodes.
-    """
+def read_octree_file(path: str | Path) -> bytes:
+    """The content of a file. Raises `MissingDataError`, and `DataError` for more than 2²⁵ nodes take."""
     path = Path(path).expanduser()
     if not path.is_file():
         raise MissingDataError(f"{path} does not exist; expected an OctoMap file (.bt or .ot).")
     if path.stat().st_size > _MAX_HEADER_BYTES + _MAX_NODES * _NODE.size:
         raise DataError(f"{path} has {path.stat().st_size:,} bytes, more than {_MAX_NODES:,} nodes take.")
-    data = path.read_bytes()
+    return path.read_bytes()
+
+
+def parsed_octree(data: bytes, path: str | Path) -> tuple[Any, float]:
+    """OctoMap's octree in the content of a file, and the side of its cells (m).
+
+    Raises `DataError` for files that are not an OcTree, are damaged, or have more than 2²⁵ nodes.
+    """
+    path = Path(path)
     header = _header(data, path)
     check = _count_binary if header.binary else _count_full
     n_nodes = check(data, header.begin, path) if header.n_nodes else 0

@@ -11,7 +11,6 @@ import math
 import torch
 from torch import Tensor
 
-from gmmtorch.baselines.baseline_map import check_length
 from gmmtorch.errors import MemoryLimitError
 from gmmtorch.linalg import ragged_index
 from gmmtorch.scan import Scan
@@ -23,32 +22,29 @@ def beam_samples(
     scan: Scan,
     spacing: float,
     *,
+    generator: torch.Generator,
     gap: float = 0.0,
     thin: float | None = None,
-    generator: torch.Generator | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Points (S, D), float64, on the beams of a scan, and whether each (S,) is a hit; hits come first.
 
     The free part of a beam is the whole beam, without the last `gap` metres if it has a return. It is divided
-    into equal segments of at most `spacing`, with one free point in each: at a uniformly random position
-    (Ramos & Ott 2016; Senanayake & Ramos 2017), or in the middle without a generator. A beam without return
-    gives free points only. A beam of zero length gives no point.
+    into equal segments of at most `spacing`, with one free point in each, at a uniformly random position
+    (Ramos & Ott 2016; Senanayake & Ramos 2017). A beam without return gives free points only. A beam of zero
+    length gives no point.
 
     Args:
         scan: world frame.
-        spacing: of the free points of one beam (m); infinite for one point per beam.
+        spacing: of the free points of one beam (m).
+        generator: on the CPU.
         gap: distance (m) before a hit without free points.
         thin: side of cubes (m); the beam ends in one cube are first replaced by their mean. None: no
             thinning.
-        generator: on the CPU.
 
-    Raises `InvalidArgumentError` for an invalid length, and `MemoryLimitError` for too many points.
+    Raises `MemoryLimitError` for too many points.
     """
-    spacing = spacing if spacing == float("inf") else check_length("spacing", spacing)
-    gap = gap if gap == 0 else check_length("gap", gap)
     origin, hits, no_return = scan.origin.double(), scan.points.double(), scan.no_return.double()
     if thin is not None:
-        thin = check_length("thin", thin)
         hits, no_return = centroids(hits, thin), centroids(no_return, thin)
     beams = torch.cat([hits, no_return]) - origin
     length = beams.norm(dim=1)
@@ -62,9 +58,7 @@ def beam_samples(
         )
     count = count.long()
     beam, segment = ragged_index(count)
-    within = torch.full((beam.shape[0],), 0.5, dtype=torch.float64)
-    if generator is not None:
-        within = torch.rand(beam.shape[0], generator=generator, dtype=torch.float64)
+    within = torch.rand(beam.shape[0], generator=generator, dtype=torch.float64)
     share = (segment + within.to(beam.device)) / count[beam] * (free_length / length)[beam]
     return _labelled(hits, origin + beams[beam] * share[:, None])
 
@@ -89,12 +83,17 @@ def thinned_samples(
     no_return = centroids(scan.no_return.double(), ds_resolution)
     if max_range is not None:
         hits = hits[(hits - origin).norm(dim=1) <= max_range]
-        length = (no_return - origin).norm(dim=1, keepdim=True)
-        no_return = origin + (no_return - origin) * (max_range / length.clamp_min(max_range))
+        no_return = cut_beams(origin, no_return, max_range)
     ends = torch.cat([hits, no_return])
     free = torch.cat([_points_along(origin, ends, free_resolution), no_return])
     free = centroids(torch.cat([origin[None], free]), ds_resolution) if ends.shape[0] else free
     return _labelled(hits, free)
+
+
+def cut_beams(origin: Tensor, ends: Tensor, max_range: float) -> Tensor:
+    """The ends (B, D) of beams from an origin; those beyond `max_range` are moved to that distance (m)."""
+    length = (ends - origin).norm(dim=1, keepdim=True)
+    return origin + (ends - origin) * (max_range / length.clamp_min(max_range))
 
 
 def _labelled(hits: Tensor, free: Tensor) -> tuple[Tensor, Tensor]:

@@ -7,6 +7,7 @@ sweep that fails does not end the sweep.
 from __future__ import annotations
 
 import _thread
+import argparse
 import math
 import os
 import signal
@@ -43,7 +44,7 @@ def start(name: str, run: Callable[[DictConfig], Any]) -> None:
     """
     schema.register()
     try:
-        with interruptible():
+        with interruptible(), _any_help():
             _hydra_main(name, run)
     except KeyboardInterrupt:
         print("gmmtorch: interrupted; all files that were written are complete.", file=sys.stderr)
@@ -80,6 +81,21 @@ def interruptible() -> Iterator[None]:
 
 
 @contextmanager
+def _any_help() -> Iterator[None]:
+    """argparse accepts help texts that are not strings: Hydra 1.3 has one, which Python 3.14 refuses."""
+    container: Any = argparse._ActionsContainer
+    check = getattr(container, "_check_help", None)
+    if check is None:
+        yield
+        return
+    container._check_help = lambda self, action: isinstance(action.help, str) and check(self, action)
+    try:
+        yield
+    finally:
+        container._check_help = check
+
+
+@contextmanager
 def stop_requests(by_force: bool = True) -> Iterator[Callable[[], bool]]:
     """Yields whether Ctrl-C was pressed, or the process was asked to end.
 
@@ -102,7 +118,7 @@ def stop_requests(by_force: bool = True) -> Iterator[Callable[[], bool]]:
 
 def _interrupt() -> None:
     time.sleep(0.01)  # until `__del__` has returned; if it has not, the interrupt is dropped and sent again
-    os.kill(os.getpid(), signal.SIGINT)
+    _thread.interrupt_main()  # on Windows os.kill would end the process at once
 
 
 def _hydra_main(name: str, run: Callable[[DictConfig], Any]) -> None:

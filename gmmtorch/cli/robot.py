@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 from gmmtorch.cli import app, common
 from gmmtorch.cli.reporting.robot_report import Outputs, RobotReport, print_refusals, terse
 from gmmtorch.cli.view import open_live_view, serve
-from gmmtorch.errors import InvalidArgumentError, check_choice, check_whole
+from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, check_whole
 
 if TYPE_CHECKING:
     from gmmtorch.exploration.mission.driver import Drivable
@@ -66,7 +66,6 @@ def _option_names(config: DictConfig) -> dict[str, str]:
 def check_options(config: DictConfig) -> None:
     """Raises `InvalidArgumentError` for bad options of a robot or a team, before anything is opened."""
     from gmmtorch.cli.from_options import links
-    from gmmtorch.exploration.mission.driver import check_pace
 
     if common.set_up(config) != "cpu" and config.source == "log":
         raise InvalidArgumentError(
@@ -93,7 +92,9 @@ def check_options(config: DictConfig) -> None:
         raise InvalidArgumentError(f"evaluation.every={config.evaluation.every} must be above zero seconds.")
     rate = config.sensor.rate if config.source == "world" else config.log.rate
     with common.naming({"rate": "sensor.rate" if config.source == "world" else "log.rate"}):
-        check_pace(rate=rate, speed=config.speed, settle=config.settle)
+        check_number("rate", rate, above=True)
+    check_number("speed", config.speed, above=True)
+    check_number("settle", config.settle)
     if config.source == "log" and config.log.dataset is None:
         raise InvalidArgumentError(
             "source=log needs a log: dataset@log.dataset=carmen log.dataset.path=FILE, or another reader."

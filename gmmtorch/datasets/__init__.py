@@ -35,8 +35,8 @@ _SOURCES = {
     "rosbag": _Source("recordings.ros.rosbag", "open_rosbag"),
     "kitti": _Source("recordings.kitti", "Kitti"),
     "tum": _Source("recordings.tum", "TumRgbd"),
-    "mesh": _Source("meshes", "MeshSamples"),
-    "mesh_scans": _Source("meshes", "MeshScans", None, 8.0),
+    "mesh": _Source("synthetic", "MeshSamples"),
+    "mesh_scans": _Source("synthetic", "MeshScans", None, 8.0),
     "synthetic_building": _Source("synthetic", "SyntheticBuilding", None, 8.0, needs_path=False),
     "synthetic_building_2d": _Source("synthetic", "SyntheticBuilding2D", None, 8.0, needs_path=False),
 }
@@ -93,21 +93,15 @@ def load(
             raise InvalidArgumentError(
                 f"{option}={value!r} is not an option of dataset={name}, which {takes}."
             )
-    if source.needs_path:
-        if poses is not None and "poses" not in known:
-            from gmmtorch.datasets.recordings.reposed import with_trajectory
+    if source.needs_path and poses is not None and "poses" not in known:
+        from gmmtorch.datasets.recordings.reposed import with_trajectory
 
-            return with_trajectory(reader(path, ranges, 1, **options), poses, stride)
-        dataset: Dataset = reader(path, ranges, stride, **options)
-        return dataset
-    if poses is not None:
-        raise InvalidArgumentError(
-            f"dataset.poses={poses} is given, but dataset={name} is simulated; drop the poses."
-        )
-    if path is not None:
-        raise InvalidArgumentError(
-            f"dataset.path={path} is given, but dataset={name} is simulated; drop the path, or choose one of "
-            f"{', '.join(n for n, s in _SOURCES.items() if s.needs_path)}."
-        )
-    simulated: Dataset = reader(ranges, stride, **options)
-    return simulated
+        return with_trajectory(reader(path, ranges, 1, **options), poses, stride)
+    for option, value in (("path", path), ("poses", poses)):
+        if value is not None and not source.needs_path:
+            raise InvalidArgumentError(
+                f"dataset.{option}={value} is given, but dataset={name} is simulated; drop it, or choose one "
+                f"of {', '.join(n for n, s in _SOURCES.items() if s.needs_path)}."
+            )
+    dataset: Dataset = reader(*[path] * source.needs_path, ranges, stride, **options)
+    return dataset

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import gzip
 import math
 import re
@@ -79,18 +78,26 @@ class Ranges:
             free_length = free_length.clamp_max(self.max_range)
         return Scan(ends[hit], origin, origin + offset[empty] * (free_length / distance[empty])[:, None])
 
+    def posed(self, points: Tensor, pose: Tensor) -> Scan:
+        """A scan from points (N, 3) in the sensor frame and the pose (4, 4), world ← sensor; see `scan`."""
+        return self.scan(points @ pose[:3, :3].T + pose[:3, 3], pose[:3, 3])
+
 
 class Dataset(Sequence[Scan]):
     """Scans in the order of their recording.
 
-    Subclasses implement `_count` and `_read`. They implement `_known_pose` and `_known_times` if the source
-    has poses and times.
+    Subclasses implement `_count` and `_read`. If the source has poses (N, D+1, D+1), world ← sensor, or
+    times (N,) in seconds, float64, they set `_poses` or `_times`, or implement `_known_pose` or
+    `_known_times`.
 
     Attributes:
         name: of the data set.
         ranges: how readings are interpreted.
         stride: every n-th scan of the source is read.
     """
+
+    _poses: Tensor | None = None
+    _times: Tensor | None = None
 
     def __init__(self, name: str, ranges: Ranges, stride: int = 1) -> None:
         if stride < 1:
@@ -110,15 +117,15 @@ class Dataset(Sequence[Scan]):
 
     def _known_pose(self, index: int) -> Tensor | None:
         """Sensor pose of scan `index` of the source; None if the source has no poses."""
-        return None
+        return None if self._poses is None else self._poses[index]
 
     def _known_times(self) -> Tensor | None:
         """Times (s), float64, of all scans of the source; None if the source has no usable times."""
-        return None
+        return self._times
 
     def _known_time(self, index: int) -> float | None:
         """Time (s) of scan `index` of the source; None if the source has no usable times."""
-        times = self._all_times
+        times = self._known_times()
         return None if times is None else float(times[index])
 
     def pose(self, index: int) -> Tensor | None:
@@ -127,10 +134,6 @@ class Dataset(Sequence[Scan]):
         None if the source does not state it. The translation is the origin of the scan.
         """
         return self._known_pose(self._position(index))
-
-    @functools.cached_property
-    def _all_times(self) -> Tensor | None:
-        return self._known_times()
 
     @property
     def times(self) -> Tensor | None:
@@ -152,9 +155,10 @@ class Dataset(Sequence[Scan]):
         """Whether reading can go on after `n_read` scans that were read in an earlier run."""
         return 0 <= n_read <= len(self)
 
-    def _skip(self, reason: str, index: int) -> None:
-        """Counts message or file `index` of the source as skipped; once, however often it is read."""
-        self._skipped.setdefault(reason, set()).add(index)
+    def _skip(self, reason: str, *indices: int) -> None:
+        """Counts messages or files of the source as skipped; each once, however often it is read."""
+        if indices:
+            self._skipped.setdefault(reason, set()).update(indices)
 
     def __len__(self) -> int:
         return -(-self._count() // self.stride)
@@ -182,7 +186,7 @@ class Dataset(Sequence[Scan]):
 
 
 def require_path(path: str | Path, kind: str, content: str, source: str) -> Path:
-    """The path, with ~ expanded, if a `kind` ("file" or "folder") exists there.
+    """The path, with ~ expanded, if a `kind` ("file", "folder", or any other word for both) exists there.
 
     Raises `InvalidArgumentError` for an empty path and `MissingDataError` for a missing one; the message
     states the expected `content` and a `source` of such data.
@@ -190,8 +194,8 @@ def require_path(path: str | Path, kind: str, content: str, source: str) -> Path
     if path is None or str(path) == "":
         raise InvalidArgumentError(f"dataset.path is not set; give a {kind} with {content}. {source}")
     path = Path(path).expanduser()
-    found = path.is_file() if kind == "file" else path.is_dir()
-    if not found:
+    exists = {"file": path.is_file, "folder": path.is_dir}.get(kind, path.exists)
+    if not exists():
         what = "is not a " + kind if path.exists() else "does not exist"
         raise MissingDataError(f"dataset.path={path} {what}; looked for {content}. {source}")
     return path

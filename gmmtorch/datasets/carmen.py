@@ -29,7 +29,8 @@ def beam_angles(n: int) -> Tensor:
 
 
 class CarmenLog(Dataset):
-    """Scans of a CARMEN log in the order of the file.
+    """Scans of a CARMEN log in the order of the file. Times are the stamps of the logger; there are none if a
+    line lacks one, or if they do not increase.
 
     Readings at or beyond `max_range` have no return; the Radish logs use 81.83, 81.91 or 50 m as code for "no
     return". Readings of zero or less, and NaN, are invalid and dropped.
@@ -43,7 +44,9 @@ class CarmenLog(Dataset):
             "Such logs are published in the Radish repository and the SLAM benchmarking pages of Freiburg.",
         )
         super().__init__(path.name.split(".")[0], ranges, stride)
-        self._records, self._stamps = _read_records(path)
+        self._records, stamps = _read_records(path)
+        ordered = bool((stamps.diff() > 0).all())  # false for NaN
+        self._times = stamps if ordered and bool(torch.isfinite(stamps).all()) else None
 
     def _count(self) -> int:
         return len(self._records)
@@ -61,11 +64,6 @@ class CarmenLog(Dataset):
 
     def _known_pose(self, index: int) -> Tensor:
         return planar_pose(*self._records[index][-3:].tolist())
-
-    def _known_times(self) -> Tensor | None:
-        """The logger's stamps; None if a line lacks one, or if they are not in increasing order."""
-        ordered = bool((self._stamps.diff() > 0).all())  # false for NaN
-        return self._stamps if ordered and bool(torch.isfinite(self._stamps).all()) else None
 
 
 def planar_pose(x: float, y: float, theta: float) -> Tensor:
@@ -105,9 +103,9 @@ def _parse(words: list[str], where: str) -> Tensor:
         if len(words) < 2 + n + 3:
             raise DataError(f"{where}: FLASER announces {n} beams, but the line ends early.")
         record = torch.tensor([float(w) for w in words[2 : 2 + n + 3]], dtype=torch.float64)
+    except DataError:
+        raise
     except (ValueError, IndexError) as error:
-        if isinstance(error, DataError):
-            raise
         raise DataError(f"{where}: not a number in a FLASER line ({error}).") from error
     if not bool(torch.isfinite(record[-3:]).all()):
         raise DataError(f"{where}: the pose {record[-3:].tolist()} is not finite.")

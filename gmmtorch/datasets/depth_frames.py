@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset, Ranges, check_pose, natural_key, require_path
-from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_number
+from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_number, check_whole
+from gmmtorch.linalg import nearest_rotations
 from gmmtorch.pinhole import back_project, check_intrinsics
 from gmmtorch.scan import Scan
 
@@ -62,11 +63,9 @@ class DepthFrames(Dataset):
             "frame-*.depth.png, frame-*.pose.txt and camera-intrinsics.txt",
             "Microsoft's 7-Scenes data set is published in this layout.",
         )
-        if pixel_stride < 1:
-            raise InvalidArgumentError(f"pixel_stride={pixel_stride} must be at least 1.")
         super().__init__(path.name, ranges, stride)
         check_number("depth_scale", depth_scale, above=True)
-        self.pixel_stride = pixel_stride
+        self.pixel_stride = check_whole("dataset.pixel_stride", pixel_stride, 1)
         check_choice("dataset.up", up, _UPRIGHT)
         self._upright = torch.tensor(_UPRIGHT[up], dtype=torch.float64)
         self.depth_scale = float(depth_scale)
@@ -88,9 +87,8 @@ class DepthFrames(Dataset):
         return len(self._files)
 
     def _read(self, index: int) -> Scan:
-        pose = self._known_pose(index)
         points = back_project(self._depth(index), self.intrinsics, self.pixel_stride)
-        return self.ranges.scan(points @ pose[:3, :3].T + pose[:3, 3], pose[:3, 3])
+        return self.ranges.posed(points, self._known_pose(index))
 
     def image(self, index: int) -> tuple[Tensor, Tensor]:
         """Depth (H, W) in metres, 0 for invalid pixels, and pose (4, 4), world ← camera, of a scan.
@@ -99,14 +97,13 @@ class DepthFrames(Dataset):
         """
         position = self._position(index)
         pose = self._known_pose(position).clone()
-        left, _, right = torch.linalg.svd(pose[:3, :3])
-        pose[:3, :3] = left @ right
+        pose[:3, :3] = nearest_rotations(pose[:3, :3])
         return self._depth(position), pose
 
     def _depth(self, index: int) -> Tensor:
         """Depth (H, W) in metres, float64; 0 for invalid pixels."""
         path = self._files[index]
-        depth = _units(path) / (1 / self.depth_scale)  # exact for millimetres
+        depth = metric(read_png(path, str(path)), self.depth_scale)
         size = depth.shape[1], depth.shape[0]
         center = float(self.intrinsics[0, 2]), float(self.intrinsics[1, 2])
         offsets = (abs((c + 0.5) / n - 0.5) for c, n in zip(center, size, strict=True))
@@ -148,10 +145,10 @@ def read_png(source: Path | IO[bytes], where: str) -> np.ndarray:
     return raw
 
 
-def _units(path: Path) -> Tensor:
-    """The image (H, W) in its own unit, float64; 0 for invalid pixels."""
-    raw = read_png(path, str(path))
-    return torch.from_numpy(np.where(np.isin(raw, _INVALID), 0, raw).astype(np.float64))
+def metric(raw: np.ndarray, scale: float) -> Tensor:
+    """Depth (H, W) in metres, float64, of pixels in units of `scale` metres; 0 for invalid pixels."""
+    valid = np.where(np.isin(raw, _INVALID), 0, raw).astype(np.float64)
+    return torch.from_numpy(valid) / (1 / scale)  # exact for millimetres
 
 
 def _matrix(path: Path, size: int) -> Tensor:

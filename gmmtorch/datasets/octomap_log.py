@@ -71,8 +71,7 @@ class OctomapLog(Dataset):
         return len(self._nodes)
 
     def _read(self, index: int) -> Scan:
-        pose, points = self._known_pose(index), self._points(index)
-        return self.ranges.scan(points @ pose[:3, :3].T + pose[:3, 3], pose[:3, 3])
+        return self.ranges.posed(self._points(index), self._known_pose(index))
 
     def _points(self, index: int) -> Tensor:
         """Points (N, 3) of a scan, sensor frame."""

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import torch
 
-from gmmtorch.datasets.base import Dataset, Ranges, check_pose, natural_key, require_path
+from gmmtorch.datasets.base import Dataset, Ranges, natural_key, require_path
 from gmmtorch.datasets.point_files.cloud_files import pcd_header, read_cloud
+from gmmtorch.datasets.recordings.trajectory import kitti_matrices, read_rows
 from gmmtorch.errors import DataError
 from gmmtorch.scan import Scan
 
@@ -24,6 +24,8 @@ class ScanFolder(Dataset):
     Points at or beyond `max_range` have no return. NaN, infinite points and points at the sensor origin are
     invalid and dropped. With `standing`, poses.txt is not read, and every scan is in the frame of the sensor.
     """
+
+    _poses: torch.Tensor
 
     def __init__(self, path: str | Path, ranges: Ranges, stride: int = 1, standing: bool = False) -> None:
         path = require_path(
@@ -50,13 +52,8 @@ class ScanFolder(Dataset):
     def _count(self) -> int:
         return len(self._files)
 
-    def _known_pose(self, index: int) -> torch.Tensor:
-        return self._poses[index]
-
     def _read(self, index: int) -> Scan:
-        pose = self._poses[index]
-        points = read_cloud(self._files[index])
-        return self.ranges.scan(points @ pose[:3, :3].T + pose[:3, 3], pose[:3, 3])
+        return self.ranges.posed(read_cloud(self._files[index]), self._poses[index])
 
 
 def _read_poses(path: Path) -> torch.Tensor:
@@ -66,18 +63,10 @@ def _read_poses(path: Path) -> torch.Tensor:
             f"{path} is missing; write one row of 12 numbers (world ← sensor) for each scan, or "
             "estimate the poses with dataset.odometry=auto."
         )
-    try:
-        lines = [line for line in path.read_text(errors="replace").splitlines() if line.strip()]
-        rows = np.loadtxt(lines, dtype=np.float64, ndmin=2) if lines else np.empty((0, 12))
-    except ValueError as error:
-        raise DataError(f"{path} is not a table of numbers: {error}") from error
-    if rows.size and rows.shape[1] != 12:
+    rows = read_rows(path)
+    if rows.shape[1] != 12:
         raise DataError(f"{path} has {rows.shape[1]} numbers per row; a KITTI pose has 12.")
-    poses = torch.eye(4, dtype=torch.float64).repeat(rows.shape[0], 1, 1)
-    poses[:, :3] = torch.from_numpy(rows.reshape(-1, 3, 4))
-    for number, pose in enumerate(poses, 1):
-        check_pose(pose, f"{path}, row {number}")
-    return poses
+    return torch.from_numpy(kitti_matrices(path, rows))
 
 
 class PcdViewpoint(Dataset):
@@ -110,8 +99,7 @@ class PcdViewpoint(Dataset):
 
     def _read(self, index: int) -> Scan:
         path = self._files[index]
-        origin = _viewpoint(path)
-        return self.ranges.scan(read_cloud(path), origin)
+        return self.ranges.scan(read_cloud(path), _viewpoint(path))
 
 
 def _viewpoint(path: Path) -> torch.Tensor:

@@ -1,21 +1,25 @@
-"""Data sets of simulated buildings, computed when they are accessed; no file is needed.
+"""Data sets of simulated scans, computed when they are accessed: in buildings without a file, or of a mesh.
 
-A scan depends only on the seed and its index, not on the order of reading.
+A scan depends only on the world, the seed and its index, not on the order of reading.
 """
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import torch
+from torch import Tensor
 
-from gmmtorch.datasets.base import Dataset, Ranges
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.datasets.base import Dataset, Ranges, require_path
+from gmmtorch.datasets.point_files.mesh_files import read_triangles
+from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_number, check_whole
+from gmmtorch.linalg import plane_rotations
 from gmmtorch.scan import Scan
 from gmmtorch.simulation import (
+    MeshWorld,
     RangeSensor,
-    World2D,
-    World3D,
+    World,
     building_2d,
     building_3d,
     depth_camera,
@@ -26,10 +30,10 @@ from gmmtorch.simulation import (
     spinning_lidar,
 )
 
-MAX_RANGE_2D = 12.0
-MAX_RANGE_3D = 10.0
+_MAX_RANGE_2D, _MAX_RANGE_3D, _MAX_RANGE_MESH = 12.0, 10.0, 30.0  # metres
 _SEEDS_APART = 1_000_003
 """Difference between the generator seeds of consecutive data set seeds; larger than any number of scans."""
+_MOST_SEEDS = 2**40  # so that the seeds of generators have 63 bits
 
 _LIDAR_HEIGHT = 1.2
 _CAMERA_HEIGHT = 1.4
@@ -44,18 +48,18 @@ class _Simulated(Dataset):
     have no return. No beam is invalid.
     """
 
-    world: World2D | World3D
+    world: World
     sensor: RangeSensor
-    poses: torch.Tensor
+    poses: Tensor
 
     def __init__(self, name: str, ranges: Ranges, stride: int, seed: int, n_scans: int) -> None:
-        if not 0 <= seed < 2**40:
-            raise InvalidArgumentError(f"seed={seed} must be an integer from 0 to 2^40.")
-        if not 1 <= n_scans < _SEEDS_APART:
-            raise InvalidArgumentError(f"n_scans={n_scans} must be from 1 to {_SEEDS_APART - 1}.")
+        self.seed = check_whole("seed", seed, 0)
+        self.n_scans = check_whole("n_scans", n_scans, 1)
+        if seed >= _MOST_SEEDS or n_scans >= _SEEDS_APART:
+            raise InvalidArgumentError(
+                f"seed={seed} and n_scans={n_scans} must be below {_MOST_SEEDS} and {_SEEDS_APART}."
+            )
         super().__init__(name, ranges, stride)
-        self.seed = seed
-        self.n_scans = n_scans
 
     def _generator(self, number: int) -> torch.Generator:
         """Random number generator of the world (0) or of scan `number` − 1."""
@@ -64,7 +68,7 @@ class _Simulated(Dataset):
     def _count(self) -> int:
         return self.n_scans
 
-    def _known_pose(self, index: int) -> torch.Tensor:
+    def _known_pose(self, index: int) -> Tensor:
         return self.poses[index]
 
     def _read(self, index: int) -> Scan:
@@ -78,9 +82,9 @@ class SyntheticBuilding2D(_Simulated):
 
     def __init__(self, ranges: Ranges, stride: int = 1, seed: int = 0, n_scans: int = 120) -> None:
         super().__init__("synthetic_building_2d", ranges, stride, seed, n_scans)
-        self.world = building_2d(self._generator(0))
-        self.sensor = laser_2d(max_range=MAX_RANGE_2D)
-        self.poses = poses_2d(self.world.path, n_scans)
+        self.world = world = building_2d(self._generator(0))
+        self.sensor = laser_2d(max_range=_MAX_RANGE_2D)
+        self.poses = poses_2d(world.path, n_scans)
 
 
 class SyntheticBuilding(_Simulated):
@@ -90,13 +94,120 @@ class SyntheticBuilding(_Simulated):
         self, ranges: Ranges, stride: int = 1, seed: int = 0, n_scans: int = 40, sensor: str = "lidar"
     ) -> None:
         super().__init__("synthetic_building", ranges, stride, seed, n_scans)
-        if sensor not in ("lidar", "depth_camera"):
-            raise InvalidArgumentError(f"sensor={sensor!r} is not known; choose lidar or depth_camera.")
-        self.world = building_3d(self._generator(0))
-        path = self.world.path
-        if sensor == "lidar":
-            self.sensor = spinning_lidar(max_range=MAX_RANGE_3D)
-            self.poses = poses_3d(path, n_scans, _LIDAR_HEIGHT)
-        else:
-            self.sensor = depth_camera(max_range=MAX_RANGE_3D)
-            self.poses = poses_3d(path, n_scans, _CAMERA_HEIGHT, _CAMERA_PITCH, _CAMERA_SWING)
+        self.sensor = _sensor_3d(sensor, _MAX_RANGE_3D)
+        self.world = world = building_3d(self._generator(0))
+        mount = (_LIDAR_HEIGHT,) if sensor == "lidar" else (_CAMERA_HEIGHT, _CAMERA_PITCH, _CAMERA_SWING)
+        self.poses = poses_3d(world.path, n_scans, *mount)
+
+
+class MeshScans(_Simulated):
+    """`n_scans` scans of a lidar (32 × 160 beams) or a depth camera (80 × 64 pixels), range 30 m, noise 1 cm.
+
+    The sensor moves through the largest connected part of the mesh, 1.2 m above the floor (see
+    `MeshWorld.tour`); a camera faces forward. Beams without a surface within the sensor's range, or within
+    `max_range` if that is shorter, have no return. Scan i depends only on the mesh, the seed, the number of
+    scans and i.
+
+    Args:
+        path: PLY, OBJ or STL; metres, z up.
+        ranges: how readings are interpreted.
+        stride: every n-th scan is read.
+        n_scans: number of scans, about 2 m apart. Parts of the mesh beyond the last one are not observed.
+        sensor: "lidar" or "depth_camera".
+        seed: of the sensor's noise.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        ranges: Ranges,
+        stride: int = 1,
+        n_scans: int = 100,
+        sensor: str = "lidar",
+        seed: int = 0,
+    ) -> None:
+        file = require_path(path, "file", "a triangle mesh (PLY, OBJ, STL)", "Units are metres, z is up.")
+        super().__init__(file.stem, ranges, stride, seed, n_scans)
+        self.sensor = _sensor_3d(sensor, _MAX_RANGE_MESH)
+        self.world = world = MeshWorld(read_triangles(file))
+        self.poses = _forward(world.tour(n_scans))
+
+
+class MeshSamples(Dataset):
+    """One scan of `n_points` points, uniform on the surface, with isotropic Gaussian noise.
+
+    The sensor origin is the centre of the bounding box. Points at or beyond `max_range` from it have no
+    return.
+
+    Args:
+        path: PLY, OBJ or STL; metres.
+        ranges: how readings are interpreted.
+        stride: see `Dataset`.
+        n_points: number of points.
+        noise: standard deviation (m) along each axis.
+        seed: of the random numbers.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        ranges: Ranges,
+        stride: int = 1,
+        n_points: int = 100_000,
+        noise: float = 0.0,
+        seed: int = 0,
+    ) -> None:
+        self._path = require_path(
+            path,
+            "file",
+            "a triangle mesh (PLY, OBJ, STL)",
+            "The Stanford 3D scanning repository publishes well-known meshes.",
+        )
+        super().__init__(self._path.stem, ranges, stride)
+        self.n_points = check_whole("n_points", n_points, 1)
+        self.seed = check_whole("seed", seed, 0)
+        self.noise = check_number("noise", noise)
+
+    def _count(self) -> int:
+        return 1
+
+    def _read(self, index: int) -> Scan:
+        triangles = read_triangles(self._path)
+        generator = torch.Generator().manual_seed(self.seed)
+        points = sample_surface(triangles, self.n_points, generator)
+        points += self.noise * torch.randn(points.shape, generator=generator, dtype=points.dtype)
+        corners = triangles.reshape(-1, 3)
+        return self.ranges.scan(points, (corners.amin(0) + corners.amax(0)) / 2)
+
+
+def sample_surface(triangles: Tensor, n_points: int, generator: torch.Generator) -> Tensor:
+    """Points (n_points, 3), uniformly distributed over the area of triangles (T, 3, 3).
+
+    For u and v uniform in [0, 1], a + (1 − v) √u (b − a) + v √u (c − a) is uniform on a triangle. Raises
+    `DataError` if no triangle has an area.
+    """
+    a, b, c = triangles.unbind(1)
+    area = torch.linalg.cross(b - a, c - a).norm(dim=1)
+    if not bool(area.sum() > 0):
+        raise DataError("The mesh has no area: every triangle is a line or a point.")
+    share = torch.cumsum(area, 0)
+    drawn = torch.rand(n_points, generator=generator, dtype=torch.float64) * share[-1]
+    chosen = torch.searchsorted(share, drawn, right=True).clamp_max(len(area) - 1)
+    u, v = torch.rand(2, n_points, 1, generator=generator, dtype=torch.float64)
+    a, b, c = triangles[chosen].unbind(1)
+    return a + u.sqrt() * ((1 - v) * (b - a) + v * (c - a))
+
+
+def _forward(places: Tensor) -> Tensor:
+    """Poses (S, 4, 4), world ← sensor, at places (S, 3) of a path, x towards the next place."""
+    steps = places.diff(dim=0) if len(places) > 1 else torch.zeros_like(places)
+    ahead = torch.cat([steps, steps[-1:]])[: len(places)]
+    poses = torch.eye(4, dtype=torch.float64).repeat(len(places), 1, 1)
+    poses[:, :2, :2] = plane_rotations(torch.atan2(ahead[:, 1], ahead[:, 0]))
+    poses[:, :3, 3] = places
+    return poses
+
+
+def _sensor_3d(name: str, max_range: float) -> RangeSensor:
+    check_choice("sensor", name, ("lidar", "depth_camera"))
+    return (spinning_lidar if name == "lidar" else depth_camera)(max_range=max_range)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from gmmtorch.datasets.recordings.trajectory import to_nanoseconds
+from gmmtorch.datasets.recordings.trajectory import in_space, to_nanoseconds
 from gmmtorch.errors import InvalidArgumentError, OutputError
 from gmmtorch.export.message_fields import built_message, cloud_fields, odometry_fields, transform_fields
 from gmmtorch.optional_packages import needs_extra
@@ -52,9 +52,7 @@ def write_bag(
                 )
             points = scan.points.detach().cpu().double().numpy()
             local = (points - given[:dim, dim]) @ given[:dim, :dim]
-            matrix = np.eye(4)
-            matrix[:dim, :dim], matrix[:dim, 3] = given[:dim, :dim], given[:dim, dim]
-            bag.transforms(time, {("map", "lidar"): matrix})
+            bag.transforms(time, {("map", "lidar"): in_space(given[None])[0]})
             bag.cloud(topic, time, "lidar", np.pad(local, ((0, 0), (0, 3 - dim))))
     return Path(path)
 

@@ -16,15 +16,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, MemoryLimitError, check_number
+from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
 from gmmtorch.linalg import ragged_index
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.grid import check_resolution
 
-EXTENT = 2.0
-"""Default reach of a component along its surface, in its own standard deviations. A uniform square ends at
-√3."""
-
+_EXTENT = 2.0  # deviations that a component reaches along its surface; a uniform square ends at √3
 _BAND = 1.75  # cells on either side of a surface in which its distance counts
 _LEAST_DEVIATION = 0.4  # cells; smaller components would fall between the lattice points
 _BACK = -0.5  # smallest cosine of a crossing's direction with the normal; others lie between two surfaces
@@ -79,9 +76,7 @@ class _Windows(NamedTuple):
     half: Tensor
 
 
-def surface_mesh(
-    components: Components, resolution: float, extent: float = EXTENT, memory_limit: int = 4 << 30
-) -> TriangleMesh:
+def surface_mesh(components: Components, resolution: float, memory_limit: int = 4 << 30) -> TriangleMesh:
     """The surfaces of a 3D map as triangles with sides of about `resolution` metres.
 
     A surface is a sheet that faces the sensors; a wall that was observed from both sides has two sheets.
@@ -90,7 +85,6 @@ def surface_mesh(
     Args:
         components: of a 3D map.
         resolution: side of the lattice's cells (m).
-        extent: reach of a component along its surface, in standard deviations.
         memory_limit: bytes of the lattice, at most.
 
     Raises `InvalidArgumentError` for a 2D map or an invalid argument, and `MemoryLimitError`.
@@ -98,9 +92,8 @@ def surface_mesh(
     if components.dim != 3:
         raise InvalidArgumentError("A mesh needs a 3D map; this map is 2D: export map_server instead.")
     side = check_resolution(resolution)
-    check_number("extent", extent, above=True)
     sheets = _sheets(components, side)
-    field = _field(sheets, side, extent, memory_limit)
+    field = _field(sheets, side, memory_limit)
     return _surface_nets(field, side)
 
 
@@ -122,9 +115,9 @@ def _sheets(components: Components, side: float) -> _Sheets:
     return _Sheets(chosen.means, axes, deviations[:, 1:].clamp_min(_LEAST_DEVIATION * side), weights)
 
 
-def _windows(sheets: _Sheets, side: float, extent: float, memory_limit: int) -> _Windows:
+def _windows(sheets: _Sheets, side: float, memory_limit: int) -> _Windows:
     """The rectangles around all sheets, cut so that the boxes around oblique ones stay small."""
-    reach = extent * sheets.deviations
+    reach = _EXTENT * sheets.deviations
     n = (2 * reach / (_WINDOW * side)).ceil().clamp_min(1)
     if float(n.prod(1).sum()) * _POINT_BYTES > memory_limit:
         raise MemoryLimitError(
@@ -138,10 +131,10 @@ def _windows(sheets: _Sheets, side: float, extent: float, memory_limit: int) -> 
     return _Windows(sheet, (2 * place + 1) * half - reach[sheet], half)
 
 
-def _field(sheets: _Sheets, side: float, extent: float, memory_limit: int) -> _Field:
+def _field(sheets: _Sheets, side: float, memory_limit: int) -> _Field:
     """The averaged distances and normals at all lattice points near a sheet."""
     band = _BAND * side
-    windows = _windows(sheets, side, extent, memory_limit)
+    windows = _windows(sheets, side, memory_limit)
     axes = sheets.axes[windows.sheet]
     middle = sheets.means[windows.sheet] + torch.einsum("wij,wj->wi", axes[:, :, 1:], windows.center)
     reach = torch.cat([torch.full_like(windows.half[:, :1], band), windows.half], 1)
@@ -168,9 +161,7 @@ def _field(sheets: _Sheets, side: float, extent: float, memory_limit: int) -> _F
             )
         rows = slice(begin, end)
         part = _Windows(*(value[rows] for value in windows))
-        for kept, found in zip(
-            (keys, sums), _near(sheets, part, first[rows], size[rows], side, extent), strict=True
-        ):
+        for kept, found in zip((keys, sums), _near(sheets, part, first[rows], size[rows], side), strict=True):
             kept.append(found)
     key, total_sums = _reduced(torch.cat(keys), torch.cat(sums))
     weight = total_sums[:, :1].clamp_min(1e-300)
@@ -178,7 +169,7 @@ def _field(sheets: _Sheets, side: float, extent: float, memory_limit: int) -> _F
 
 
 def _near(
-    sheets: _Sheets, windows: _Windows, first: Tensor, size: Tensor, side: float, extent: float
+    sheets: _Sheets, windows: _Windows, first: Tensor, size: Tensor, side: float
 ) -> tuple[Tensor, Tensor]:
     """Keys (P,) and sums Σw, Σw·d, Σw·n (P, 5) of the lattice points near the sheets, in some windows."""
     band = _BAND * side
@@ -191,7 +182,7 @@ def _near(
     along = (local[:, 1:] / sheets.deviations[sheet]).square().sum(1)
     low, high = windows.center - windows.half, windows.center + windows.half
     inside = ((local[:, 1:] >= low[row]) & (local[:, 1:] < high[row])).all(1)
-    near = (inside & (along <= extent**2) & (local[:, 0].abs() <= band)).nonzero().squeeze(1)
+    near = (inside & (along <= _EXTENT**2) & (local[:, 0].abs() <= band)).nonzero().squeeze(1)
     distance, sheet = local[near, 0], sheet[near]
     falloff = torch.exp(-along[near]) * (1 - (distance / band).square()).square().clamp_min(_LEAST_FALLOFF)
     weight = sheets.weights[sheet] * falloff

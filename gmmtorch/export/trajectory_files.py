@@ -30,15 +30,8 @@ def write_tum(path: str | Path, times: ArrayLike, poses: ArrayLike) -> Path:
 
     Raises `InvalidArgumentError` for other shapes, and for values that are not finite.
     """
-    matrices = _checked(poses)
-    stamp = torch.as_tensor(times).detach().cpu().double().numpy()
-    if stamp.shape != (len(matrices),) or not np.isfinite(stamp).all():
-        raise InvalidArgumentError(
-            f"times has shape {stamp.shape} or holds NaN or infinite values; give one time (s) for each of "
-            f"{len(matrices)} poses."
-        )
-    rows = np.column_stack([matrices[:, :3, 3], _quaternions(matrices)])
-    lines = [f"{t:.9f} " + _numbers(row, 9) for t, row in zip(stamp, rows, strict=True)]
+    rows = _pose_rows(times, _checked(poses))
+    lines = [f"{t:.9f} " + _numbers(row, 9) for t, *row in rows]
     text = "\n".join(["# timestamp x y z qx qy qz qw", *lines]) + "\n"
     return write_bytes(path, text.encode())
 
@@ -76,7 +69,8 @@ def write_pose_table(
 
     Raises `InvalidArgumentError` for other shapes, and for values that are not finite.
     """
-    matrices, stamp = _checked(poses), torch.as_tensor(times).detach().cpu().double().numpy()
+    matrices = _checked(poses)
+    pose_rows = _pose_rows(times, matrices)
     spread = torch.as_tensor(covariances).detach().cpu().double().numpy()
     free = _FREE.get(spread.shape[-1] if spread.ndim == 3 else 0, ())
     if spread.shape != (len(matrices), len(free), len(free)) or not np.isfinite(spread).all():
@@ -90,12 +84,11 @@ def write_pose_table(
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow([*_POSE, *more, *names])
-    numbers = np.column_stack([matrices[:, :3, 3], _quaternions(matrices)])
-    for at in range(len(matrices)):
+    for at, (time, *numbers) in enumerate(pose_rows):
         table.writerow(
             [
-                f"{stamp[at]:.9f}",
-                *_numbers(numbers[at], 9).split(),
+                f"{time:.9f}",
+                *_numbers(numbers, 9).split(),
                 *(values[at] for values in more.values()),
                 *_numbers(spread[at][rows, cols], 6).split(),
             ]
@@ -103,11 +96,18 @@ def write_pose_table(
     return write_bytes(path, text.getvalue().encode())
 
 
-def _quaternions(matrices: np.ndarray) -> np.ndarray:
-    """qx, qy, qz, qw (S, 4) of poses (S, 4, 4)."""
+def _pose_rows(times: ArrayLike, matrices: np.ndarray) -> np.ndarray:
+    """time, x, y, z, qx, qy, qz, qw (S, 8) of poses (S, 4, 4)."""
     from scipy.spatial.transform import Rotation
 
-    return Rotation.from_matrix(matrices[:, :3, :3]).as_quat() if len(matrices) else np.zeros((0, 4))
+    stamp = torch.as_tensor(times).detach().cpu().double().numpy()
+    if stamp.shape != (len(matrices),) or not np.isfinite(stamp).all():
+        raise InvalidArgumentError(
+            f"times has shape {stamp.shape} or holds NaN or infinite values; give one time (s) for each of "
+            f"{len(matrices)} poses."
+        )
+    turns = Rotation.from_matrix(matrices[:, :3, :3]).as_quat() if len(matrices) else np.zeros((0, 4))
+    return np.column_stack([stamp, matrices[:, :3, 3], turns])
 
 
 def _checked(poses: ArrayLike) -> np.ndarray:
@@ -120,5 +120,5 @@ def _checked(poses: ArrayLike) -> np.ndarray:
     return in_space(given)
 
 
-def _numbers(row: np.ndarray, digits: int) -> str:
+def _numbers(row: Sequence[float] | np.ndarray, digits: int) -> str:
     return " ".join(f"{value:.{digits}g}" for value in row)

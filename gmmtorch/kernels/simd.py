@@ -44,26 +44,34 @@ _LOG_PARTS = """
 #endif
 """
 
-SIMD = """
-#if defined(__CUDA_ARCH__)
+SCALAR = """
     typedef double vec;
     typedef bool mask;
+    typedef int64_t whole;
     constexpr int LANES = 1;
     auto any = [](mask m) { return m; };
     auto root = [](vec x) { return sqrt(x); };
     auto down = [](vec x) { return floor(x); };
+    auto absolute = [](vec x) { return fabs(x); };
+    auto integer = [](vec x) { return (whole)x; };
     auto expo = [](vec x) { return exp(x); };
     auto fused = [](vec a, vec b, vec c) { return fma(a, b, c); };
     auto get = [](vec v, int) { return v; };
     auto set = [](vec& v, int, double x) { v = x; };
     auto largest = [](vec v) { return v; };
-#else
+"""
+"""Statements that define a vector of one lane on any device."""
+
+VECTOR = """
     typedef double vec __attribute__((ext_vector_type(8)));
     typedef decltype(vec() < vec()) mask;
+    typedef mask whole;
     constexpr int LANES = 8;
     auto any = [](mask m) { return __builtin_reduce_or(m) != 0; };
     auto root = [](vec x) { return __builtin_elementwise_sqrt(x); };
     auto down = [](vec x) { return __builtin_elementwise_floor(x); };
+    auto absolute = [](vec x) { return __builtin_elementwise_abs(x); };
+    auto integer = [](vec x) { return __builtin_convertvector(x, whole); };
     auto fused = [](vec a, vec b, vec c) { return __builtin_elementwise_fma(a, b, c); };
     auto get = [](vec v, int i) { return v[i]; };
     auto set = [](vec& v, int i, double x) { v[i] = x; };
@@ -88,7 +96,10 @@ SIMD = """
         const mask power = __builtin_bit_cast(mask, shifted) << 52;
         return __builtin_bit_cast(vec, __builtin_bit_cast(mask, p) + power);
     };
-#endif
+"""
+"""Statements that define a vector of eight lanes on a CPU."""
+
+_FUNCTIONS = """
     auto logarithm = [](vec x) {  // natural, of normal numbers above 0; error below 3e-16 (1 + |log x|)
         LOG_PARTS
         const vec t = (part - 1.0) / (part + 1.0), tt = t * t;
@@ -109,4 +120,13 @@ SIMD = """
         return (even + odd * t) * (x + 3.5) * scale;
     };
 """.replace("LOG_PARTS", _LOG_PARTS).replace("MILLS", ", ".join(map(repr, MILLS)))
+
+SIMD = f"""
+#if defined(__CUDA_ARCH__)
+{SCALAR}
+#else
+{VECTOR}
+#endif
+{_FUNCTIONS}
+"""
 """Statements at the start of a kernel's body."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 
 import torch
@@ -20,6 +20,7 @@ from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.map_builder import MapBuilder
 from gmmtorch.sharing.messages.message_registry import PlanMessage
 from gmmtorch.sharing.shared_map import SharedMap
+from gmmtorch.simulation.sensors.depth_camera import DepthCamera
 
 ENTROPY, SENT, RECEIVED = "entropy left [%]", "sent [kB]", "received [kB]"
 SIZE, COMPONENTS = "map [kB]", "components"
@@ -52,11 +53,8 @@ class CurveRecord:
                 self.curves.setdefault(title, {}).setdefault(name, []).append(value)
         if len(self.times) >= _MOST_POINTS:
             self._period = 2 * (self.times[-1] - self.times[0]) / len(self.times)
-            for row in (self.times, *self._lists()):
+            for row in (self.times, *(row for series in self.curves.values() for row in series.values())):
                 del row[1::2]
-
-    def _lists(self) -> list[list[float]]:
-        return [values for series in self.curves.values() for values in series.values()]
 
     def copy(self) -> tuple[list[float], dict[str, dict[str, list[float]]]]:
         """The times and the curves as they are now."""
@@ -131,14 +129,12 @@ class MissionMoments:
     def __call__(self) -> Moment:
         """The present moment of the mission."""
         mission, options = self._mission, self._mission.options
-        camera = options.camera.horizontal_fov, options.camera.vertical_fov
         begin = mission.n_ticks % options.ticks_per_plan * options.steps_per_tick
         robots = [
-            ViewedRobot(
+            _flown(
                 robot.number,
-                torch.stack(trajectory)[:, :3],
-                camera_rotation(float(trajectory[-1][3])),
-                camera,
+                trajectory,
+                options.camera,
                 torch.cat([robot.position[None], robot.path[begin:, :3]]),
             )
             for robot, trajectory in zip(mission.robots, mission.trajectories, strict=True)
@@ -184,19 +180,12 @@ class AgentMoments:
 
     def __call__(self, now: float) -> Moment:
         """The moment at the robot's time (s)."""
-        agent, camera = self._agent, self._agent.options.camera
-        fov = camera.horizontal_fov, camera.vertical_fov
-        robots = []
+        agent, camera, robots = self._agent, self._agent.options.camera, []
         if self._trajectory is not None:
-            poses = torch.stack(self._trajectory)
-            ahead = torch.zeros(0, 3)
-            robots.append(
-                ViewedRobot(agent.number, poses[:, :3], camera_rotation(float(poses[-1, 3])), fov, ahead)
-            )
+            robots.append(_flown(agent.number, self._trajectory, camera, torch.zeros(0, 3)))
         for number, flown in sorted(self._flown.items()):
             pose, ahead = self._flight(agent.robot.plans[number], now)
-            path = torch.stack([*flown, pose])[:, :3]
-            robots.append(ViewedRobot(number, path, camera_rotation(float(pose[3])), fov, ahead))
+            robots.append(_flown(number, [*flown, pose], camera, ahead))
         return Moment(_shown(agent.robot.mapper, agent.robot.mapper.belief), robots, *self._record.copy())
 
 
@@ -238,6 +227,13 @@ def _shown(mapper: Mapper, belief: BeliefMap) -> GaussianMap | ViewedCells:
     stored = belief.grid.cells()
     occupied = belief.rule.probability(stored.hits, stored.misses) > belief.rule.occupied
     return ViewedCells((stored.cells[occupied].double().cpu() + 0.5) * resolution, resolution)
+
+
+def _flown(number: int, poses: Sequence[Tensor], camera: DepthCamera, ahead: Tensor) -> ViewedRobot:
+    """A robot with a level camera after poses (4,): x, y, z, yaw. ahead (A, 3): where it flies."""
+    fov = camera.horizontal_fov, camera.vertical_fov
+    path, yaw = torch.stack(list(poses))[:, :3], float(poses[-1][3])
+    return ViewedRobot(number, path, camera_rotation(yaw), fov, ahead)
 
 
 def camera_rotation(yaw: float) -> Tensor:

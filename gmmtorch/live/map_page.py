@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_choice
@@ -20,7 +19,6 @@ from gmmtorch.live import viewer_scene
 from gmmtorch.live.viewer_scene import Frame, Solid
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.report.scenes.ellipsoids import unit_sphere
 from gmmtorch.report.table import byte_text
 
 _TEMPLATE = Path(__file__).with_suffix(".html")
@@ -99,7 +97,7 @@ def _ellipsoids(components: Components, solid: Solid, frame: Frame) -> dict[str,
     places[:, 0, :3] = balls.positions - frame.shift.numpy()
     places[:, 1] = balls.wxyz[:, [1, 2, 3, 0]]
     places[:, 2, :3] = balls.scales / viewer_scene.N_SIGMA
-    vertices, faces = unit_sphere(viewer_scene.sphere_vertices(len(solid.means)))
+    vertices, faces = viewer_scene.sphere(len(solid.means))
     colours = {}
     for by in viewer_scene.COLOURS:
         found = viewer_scene.colours(components, solid, by)
@@ -115,15 +113,12 @@ def _slice(shown: GaussianMap, frame: Frame) -> dict[str, Any]:
     """The picture of occupancy at the sensor's height, as PNG, and its place in the scene."""
     from PIL import Image
 
-    dim = shown.dim or 3
-    low, high = (tuple(corner[:dim].tolist()) for corner in (frame.low, frame.high))
-    picture = viewer_scene.occupancy_slice(shown, shown.resolution, frame.height, low, high)
+    picture = viewer_scene.occupancy_slice(shown, shown.resolution, frame.height, frame)
     file = io.BytesIO()
     Image.fromarray(picture.pixels).save(file, "PNG")
-    place = torch.tensor([*picture.middle, frame.height if dim == 3 else -0.05], dtype=torch.float64)
     return {
         "png": "data:image/png;base64," + base64.b64encode(file.getvalue()).decode(),
-        "middle": (place - frame.shift).tolist(),
+        "middle": (picture.middle - frame.shift).tolist(),
         "size": picture.size,
     }
 

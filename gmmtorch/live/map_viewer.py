@@ -7,7 +7,7 @@ import io
 import math
 import socket
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +18,10 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_whole
 from gmmtorch.export.mesh import surface_mesh
 from gmmtorch.live import scene_nodes, viewer_scene
-from gmmtorch.live.following_camera import FollowingCamera
 from gmmtorch.live.map_page import write_page
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.optional_packages import load_viser
+from gmmtorch.optional_packages import needs_extra
 
 _PATH_COLOUR, _PATH_WIDTH = (213, 94, 0), 4.0
 _FINEST, _COARSEST = 0.02, 1.0  # m, of the slider of the resolution
@@ -47,6 +46,10 @@ class MapViewer:
     The page has controls for the shape, the colour, the height above which components are hidden, the paths,
     and the height and resolution of the slice. A click shows occupancy, hits and misses at a place.
 
+    Attributes:
+        server: the viser server.
+        shift: (3,) origin of the scene's frame in the world frame, metres.
+
     Raises `GmmTorchError` if viser is not installed, and `InvalidArgumentError` for a host that is not of
     this machine.
     """
@@ -63,47 +66,38 @@ class MapViewer:
     ) -> None:
         check_choice("shape", shape, viewer_scene.SHAPES)
         check_choice("colour", colour, viewer_scene.COLOURS)
-        viser = load_viser()
+        with needs_extra("The browser viewer needs", "viser", "viewer"):
+            import viser
         _check_address(host, port)
         with contextlib.redirect_stdout(io.StringIO()):  # viser prints a box with the address
-            self._server = viser.ViserServer(host, port, label="gmmtorch", verbose=False)
+            self.server: Any = viser.ViserServer(host, port, label="gmmtorch", verbose=False)
         self._lock = threading.RLock()
         self._nodes: dict[str, Any] = {}
-        self._shift = torch.zeros(3, dtype=torch.float64)
-        self._box: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+        self.shift = torch.zeros(3, dtype=torch.float64)
+        self._view: viewer_scene.Frame | None = None
         self._map, self._components = shown, Components.empty(3)
         self._paths: list[Tensor] = []
         self._path_colours: Sequence[Rgb] = ()
         self._is_lit = False
         self._chosen: dict[str, float] = {}  # by control, the value that was set here last
-        self._camera = FollowingCamera(self._server)
+        self._camera = scene_nodes.FollowingCamera(self.server)
         self._add_controls(shape, colour)
         self.update(shown, trajectories)
 
     @property
     def url(self) -> str:
         """The address of the page."""
-        return f"http://{self._server.get_host()}:{self._server.get_port()}"
+        return f"http://{self.server.get_host()}:{self.server.get_port()}"
 
     def stop(self) -> None:
         """Ends the server."""
         with contextlib.redirect_stdout(io.StringIO()):
-            self._server.stop()
-
-    @property
-    def server(self) -> Any:
-        """The viser server."""
-        return self._server
-
-    @property
-    def shift(self) -> Tensor:
-        """The origin (3,) of the scene's frame in the world frame, metres."""
-        return self._shift
+            self.server.stop()
 
     @property
     def n_viewers(self) -> int:
         """Number of browsers that show the page now."""
-        return len(self._server.get_clients())
+        return len(self.server.get_clients())
 
     def update(
         self, shown: GaussianMap, trajectories: Sequence[Tensor] = (), colours: Sequence[Rgb] = ()
@@ -135,8 +129,8 @@ class MapViewer:
                 folder.visible = False
             self._fit(viewer_scene.frame_of(centres, self._paths), flat=False)
             shades = viewer_scene.height_shades(centres)
-            moved = (centres - self._shift).numpy()
-            self._nodes["components"] = scene_nodes.add_cells(self._server.scene, moved, side, shades)
+            moved = (centres - self.shift).numpy()
+            self._nodes["components"] = scene_nodes.add_cells(self.server.scene, moved, side, shades)
             self._draw_paths()
 
     def save_html(self, path: str | Path) -> Path:
@@ -151,9 +145,9 @@ class MapViewer:
     def _fit(self, view: viewer_scene.Frame, flat: bool) -> None:
         """Fits the camera to a frame; the first one moves the origin. flat: the camera looks from above."""
         if not self._is_lit:
-            self._is_lit, self._shift = True, view.shift
-            scene_nodes.add_lights(self._server.scene, view.distance)
-        middle = ((view.low + view.high) / 2 - self._shift).numpy()
+            self._is_lit, self.shift = True, view.shift
+            scene_nodes.add_lights(self.server.scene, view.distance)
+        middle = ((view.low + view.high) / 2 - self.shift).numpy()
         offset = np.array([-0.02, -0.1, 1.0]) if flat else np.array([-0.45, -0.65, 0.6])
         self._camera.show(middle, middle + _ROOM * view.distance * offset)
 
@@ -161,9 +155,10 @@ class MapViewer:
         """Fits the camera and the limits of the controls to a frame."""
         flat = self._map.dim == 2
         self._fit(view, flat)
-        self._box = tuple(view.low.tolist()), tuple(view.high.tolist())
+        self._view = view
         low, high = round(float(view.low[2]), 2), round(float(view.high[2]) + 0.1, 2)
-        with self._quiet():
+        self._is_quiet = True
+        try:
             for control in (self._cut, self._height):
                 _assign(control, visible=not flat)
             cut_is_chosen = self._is_chosen(self._cut) and self._cut.value < self._cut.max
@@ -174,6 +169,8 @@ class MapViewer:
             if not cut_is_chosen:
                 _assign(self._cut, value=min(view.open_height, high))
                 self._chosen[self._cut.label] = self._cut.value
+        finally:
+            self._is_quiet = False
 
     def _is_chosen(self, control: Any) -> bool:
         """Whether the user has chosen the value of a control."""
@@ -185,22 +182,25 @@ class MapViewer:
             _assign(control, value=value)
             self._chosen[control.label] = control.value
 
+    def _highest(self) -> float:
+        """The height (m) above which components are hidden."""
+        return self._cut.value if self._map.dim == 3 and self._cut.value < self._cut.max else math.inf
+
     def _draw_components(self) -> None:
-        below = self._cut.value if self._map.dim == 3 else math.inf
-        below = math.inf if below >= self._cut.max else below
+        below = self._highest()
         solid = viewer_scene.surfaces(self._components, below)
         shape = self._shape.value
         if shape == "none" or len(solid.rows) == 0:
             self._remove("components")
             return
         colours = viewer_scene.colours(self._components, solid, self._colour.value).rgb
-        scene = self._server.scene
-        solid = solid._replace(means=solid.means - self._shift)
+        scene = self.server.scene
+        solid = solid._replace(means=solid.means - self.shift)
         if shape == "surfaces" and self._map.dim == 3:
             mesh = surface_mesh(self._components, self._resolution.value)
             if below < math.inf:
                 mesh = mesh.inside((-math.inf,) * 3, (math.inf, math.inf, below))
-            self._nodes["components"] = scene_nodes.add_mesh(scene, mesh, self._shift)
+            self._nodes["components"] = scene_nodes.add_mesh(scene, mesh, self.shift)
         elif shape == "splats":
             self._nodes["components"] = scene_nodes.add_splats(scene, solid, colours)
         else:
@@ -209,11 +209,11 @@ class MapViewer:
     def _draw_paths(self) -> None:
         given = self._path_colours or [_PATH_COLOUR] * len(self._paths)
         for number, path in enumerate(self._paths):
-            name, lines = f"paths/{number}", viewer_scene.segments([path]) - self._shift
+            name, lines = f"paths/{number}", viewer_scene.segments([path]) - self.shift
             if len(lines) == 0 or not self._with_paths.value:
                 self._remove(name)
                 continue
-            self._nodes[name] = self._server.scene.add_line_segments(
+            self._nodes[name] = self.server.scene.add_line_segments(
                 f"/{name}",
                 lines.float().numpy(),
                 given[number],
@@ -222,16 +222,12 @@ class MapViewer:
             )
 
     def _draw_slice(self) -> None:
-        if not self._visible.value or self._box is None:
+        if not self._visible.value or self._view is None:
             self._remove("slice")
             return
-        dim = self._components.dim
-        height = self._height.value if dim == 3 else 0.0
-        low, high = (corner[:dim] for corner in self._box)
-        picture = viewer_scene.occupancy_slice(self._map, self._resolution.value, height, low, high)
-        place = torch.tensor([*picture.middle, height if dim == 3 else -0.05], dtype=torch.float64)
-        moved = (place - self._shift).tolist()
-        self._nodes["slice"] = scene_nodes.add_slice(self._server.scene, picture, moved)
+        sides = self._resolution.value, self._height.value
+        picture = viewer_scene.occupancy_slice(self._map, *sides, self._view)
+        self._nodes["slice"] = scene_nodes.add_slice(self.server.scene, picture, self.shift)
 
     def _remove(self, name: str) -> None:
         if name in self._nodes:
@@ -240,7 +236,7 @@ class MapViewer:
     # -- controls -------------------------------------------------------------------------------------
 
     def _add_controls(self, shape: str, colour: str) -> None:
-        gui = self._server.gui
+        gui = self.server.gui
         gui.configure_theme(dark_mode=False, show_logo=False, show_share_button=False)
         self._is_quiet = False
         self._folders = [gui.add_folder(name) for name in ("Components", "Occupancy", "Place")]
@@ -261,25 +257,24 @@ class MapViewer:
         self._with_paths.on_update(lambda _: self._redraw(self._draw_paths))
         for control in (self._visible, self._height, self._resolution):
             control.on_update(lambda _: self._redraw(self._draw_slice))
-        self._server.scene.on_click()(lambda event: self._show_place(event.ray_origin, event.ray_direction))
+        self.server.scene.on_click()(lambda event: self._show_place(event.ray_origin, event.ray_direction))
 
     def _redraw(self, draw: Any) -> None:
         with self._lock:
-            if not self._is_quiet and self._box is not None:
+            if not self._is_quiet and self._view is not None:
                 draw()
 
     def _show_place(self, origin: Sequence[float], direction: Sequence[float]) -> None:
         """Shows what the map knows where a ray in the scene's frame meets a component or the slice."""
         with self._lock:
-            if self._box is None:
+            if self._view is None:
                 return
-            start = torch.tensor(origin, dtype=torch.float64) + self._shift
+            start = torch.tensor(origin, dtype=torch.float64) + self.shift
             along = torch.tensor(direction, dtype=torch.float64)
             dim = self._components.dim
-            below = self._cut.value if dim == 3 and self._cut.value < self._cut.max else math.inf
             nearest = math.inf
             if self._shape.value != "none":
-                solid = viewer_scene.surfaces(self._components, below)
+                solid = viewer_scene.surfaces(self._components, self._highest())
                 nearest = viewer_scene.first_hit(solid, start, along)
             if self._visible.value and float(along[2]):
                 plane = (self._height.value if dim == 3 else 0.0) - float(start[2])
@@ -292,20 +287,11 @@ class MapViewer:
             position = (start + nearest * along)[:dim]
             known = viewer_scene.place_at(self._map, position, resolution)
             self._place.content = viewer_scene.place_text(known, resolution)
-            spot = torch.nn.functional.pad(position, (0, 3 - dim)) - self._shift
+            spot = torch.nn.functional.pad(position, (0, 3 - dim)) - self.shift
             self._remove("place")
-            self._nodes["place"] = self._server.scene.add_icosphere(
+            self._nodes["place"] = self.server.scene.add_icosphere(
                 "/place", 0.6 * max(resolution, 0.1), (230, 0, 80), position=tuple(spot.tolist())
             )
-
-    @contextlib.contextmanager
-    def _quiet(self) -> Iterator[None]:
-        """Changes of controls draw nothing."""
-        self._is_quiet = True
-        try:
-            yield
-        finally:
-            self._is_quiet = False
 
 
 def _check_address(host: str, port: int) -> None:

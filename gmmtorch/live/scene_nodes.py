@@ -1,9 +1,8 @@
-"""The nodes of a viser scene: lights, components, and robots."""
+"""What a viser server shows: lights, components, robots, and the cameras of its clients."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,6 @@ from torch import Tensor
 from gmmtorch.export.mesh import TriangleMesh
 from gmmtorch.live import viewer_scene
 from gmmtorch.live.viewer_scene import Slice, Solid
-from gmmtorch.report.scenes.ellipsoids import unit_sphere
 
 _MESH_COLOUR, _BACKGROUND = (205, 205, 210), (240, 242, 245)
 _OPACITY = 0.9  # of a splat
@@ -20,6 +18,8 @@ _UNSHADED = {"cast_shadow": False, "receive_shadow": False}
 _BODY = 0.2  # m, radius of the ball that is a robot
 _FRUSTUM = 0.8  # m, depth of a frustum
 _AHEAD_WIDTH, _FRUSTUM_WIDTH = 2.0, 2.0  # pixels
+_MOVED = 0.02  # share of the distance: a camera that is farther from its place was moved by its user
+_GROWN = 0.08  # share of the distance by which the scene grows or moves before the cameras follow
 
 
 def add_lights(scene: Any, distance: float) -> None:
@@ -43,7 +43,7 @@ def add_lights(scene: Any, distance: float) -> None:
 def add_ellipsoids(scene: Any, solid: Solid, colours: np.ndarray) -> Any:
     """Components in the scene's frame as 2σ ellipsoids with colours (K, 3) uint8."""
     balls = viewer_scene.instances(solid)
-    vertices, faces = unit_sphere(viewer_scene.sphere_vertices(len(colours)))
+    vertices, faces = viewer_scene.sphere(len(colours))
     return scene.add_batched_meshes_simple(
         "/components",
         vertices.float().numpy(),
@@ -95,15 +95,15 @@ def add_cells(scene: Any, centres: np.ndarray, side: float, colours: np.ndarray)
     )
 
 
-def add_slice(scene: Any, picture: Slice, middle: Sequence[float]) -> Any:
-    """A slice of occupancy, with its middle (3,) in the scene's frame, metres."""
+def add_slice(scene: Any, picture: Slice, shift: Tensor) -> Any:
+    """A slice of occupancy; shift (3,): the origin of the scene's frame, metres."""
     return scene.add_image(
         "/slice",
         picture.pixels,
         *picture.size,
         format="png",
         wxyz=(0.0, 1.0, 0.0, 0.0),  # an image's own y points down
-        position=tuple(middle),
+        position=tuple((picture.middle - shift).tolist()),
         **_UNSHADED,
     )
 
@@ -151,3 +151,31 @@ class RobotNodes:
         elif self._ahead is not None:
             self._ahead.remove()
             self._ahead = None
+
+
+class FollowingCamera:
+    """Keeps the cameras of a viser server's clients on a scene that grows.
+
+    New clients begin with the last place. A client whose user has moved the camera keeps it; "reset view" of
+    the page shows the whole scene.
+    """
+
+    def __init__(self, server: Any) -> None:
+        self._server = server
+        self._look_at, self._position = np.zeros(3), np.zeros(3)
+
+    def show(self, look_at: np.ndarray, position: np.ndarray) -> None:
+        """Looks at a point (3,) from a place (3,), in the scene's frame, metres."""
+        before, distance = self._position, float(np.linalg.norm(position - look_at))
+        moved = max(np.linalg.norm(position - before), np.linalg.norm(look_at - self._look_at))
+        if moved <= _GROWN * distance:
+            return
+        reach = _MOVED * float(np.linalg.norm(before - self._look_at))
+        self._look_at, self._position = look_at, position
+        self._server.initial_camera.look_at = tuple(look_at)
+        self._server.initial_camera.position = tuple(position)
+        for client in self._server.get_clients().values():
+            if np.linalg.norm(client.camera.position - before) <= reach:
+                with client.atomic():
+                    client.camera.position = position
+                    client.camera.look_at = look_at

@@ -23,6 +23,7 @@ from gmmtorch.report.scenes.ellipsoids import (
     first_viewpoints,
     height_colour_map,
     principal_axes,
+    unit_sphere,
 )
 from gmmtorch.report.scenes.scene import SOUTH_WEST
 from gmmtorch.report.style import height_scale
@@ -38,6 +39,7 @@ _FLATNESS = 0.01  # m, thickness of a 2D component
 _FREE_ALPHA, _OCCUPIED_ALPHA = 90, 240
 _FAR = 1e4  # m from the origin, above which float32 is too coarse and the scene is moved to the origin
 _SLICE_PIXELS = 1000  # along the longer side of a slice
+_UNDERNEATH = -0.05  # m, height of the slice of a 2D map: below its components
 
 
 class Solid(NamedTuple):
@@ -67,10 +69,10 @@ class Place(NamedTuple):
 
 class Slice(NamedTuple):
     """A picture of occupancy in a plane: RGBA (rows, columns, 4) uint8, highest y first. In 3D unknown is
-    clear, and free is translucent. middle (2,) and size (2,), metres."""
+    clear, and free is translucent. middle (3,), world frame, and size (2,), metres."""
 
     pixels: np.ndarray
-    middle: tuple[float, float]
+    middle: Tensor
     size: tuple[float, float]
 
 
@@ -88,9 +90,9 @@ def surfaces(components: Components, below: float = float("inf")) -> Solid:
     return Solid(mean, covariance, rows.cpu())
 
 
-def sphere_vertices(n_components: int) -> int:
-    """Vertices of each drawn ellipsoid; fewer where there are many components."""
-    return next(vertices for most, vertices in _SPHERES if n_components <= most)
+def sphere(n_components: int) -> tuple[Tensor, Tensor]:
+    """Vertices (V, 3) and faces (F, 3) of each drawn ellipsoid; fewer where there are many components."""
+    return unit_sphere(next(vertices for most, vertices in _SPHERES if n_components <= most))
 
 
 def instances(solid: Solid) -> Instances:
@@ -194,14 +196,13 @@ def _open_height(components: Components, solid: Solid) -> float:
     return cut_away(chosen.means.cpu(), chosen.covariances.cpu(), seen_from, None, SOUTH_WEST)[1]
 
 
-def occupancy_slice(
-    shown: GaussianMap, resolution: float, height: float, low: tuple[float, ...], high: tuple[float, ...]
-) -> Slice:
-    """The occupancy of cells of a side (m), at a height (m), in the box between two corners (D,)."""
+def occupancy_slice(shown: GaussianMap, resolution: float, height: float, view: Frame) -> Slice:
+    """The occupancy of cells of a side (m), in 3D at a height (m), in the box of a view."""
 
     def answer(points: Tensor) -> Tensor:
         return shown.occupancy(points, resolution)  # type: ignore[return-value]
 
+    low, high = (tuple(corner[: shown.dim].tolist()) for corner in (view.low, view.high))
     image = slice_image(MapPanel("", answer, resolution, low, high), height, _SLICE_PIXELS)
     theta = image.image.numpy()
     pixels = np.round(255 * occupancy_colours()(np.ma.masked_invalid(theta))).astype(np.uint8)
@@ -209,7 +210,8 @@ def occupancy_slice(
         pixels[..., 3] = np.where(theta < 0.5, _FREE_ALPHA, _OCCUPIED_ALPHA)
         pixels[np.isnan(theta)] = 0
     left, right, bottom, top = image.extent
-    middle = ((left + right) / 2, (bottom + top) / 2)
+    place = [(left + right) / 2, (bottom + top) / 2, height if shown.dim == 3 else _UNDERNEATH]
+    middle = torch.tensor(place, dtype=torch.float64)
     return Slice(np.flipud(pixels.transpose(1, 0, 2)).copy(), middle, (right - left, top - bottom))
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from gmmtorch.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from gmmtorch.mapping.body import Body as Body
+    from gmmtorch.mapping.clearance import Body as Body
     from gmmtorch.mapping.clearance import collision_probability as collision_probability
     from gmmtorch.mapping.clearance import expected_returns as expected_returns
     from gmmtorch.mapping.components import Components as Components
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
-        "Body": "body",
+        "Body": "clearance",
         "Components": "components",
         "GaussianMap": "gaussian_map",
         "IncrementalRule": "learning.rules",

@@ -136,7 +136,11 @@ class Components:
         """The components on a device."""
         if self.means.device == torch.device(device):
             return self
-        return Components(**{field.name: getattr(self, field.name).to(device) for field in fields(self)})
+        return Components(**{name: value.to(device) for name, value in vars(self).items()})
+
+    def on_cpu(self) -> Components:
+        """The components on the CPU, without gradients."""
+        return Components(**{name: value.detach().cpu() for name, value in vars(self).items()})
 
     def cones(self) -> Cones:
         """One cone for each viewpoint: the argument of the evidence functions."""
@@ -170,6 +174,11 @@ class Components:
             seen_count=self.seen_count[kept],
         )
 
+    def with_used_origins(self) -> Components:
+        """The components without the origins that have no viewpoint."""
+        used, seen_from = torch.unique(self.seen_from, return_inverse=True)
+        return replace(self, origins=self.origins[used], seen_from=seen_from)
+
     def has_id(self, ids: ArrayLike | None) -> Tensor:
         """Which components (K,) have one of the ids (J, 2); None: all."""
         if ids is None:
@@ -190,16 +199,16 @@ class Components:
         moved_viewpoint = chosen[self.seen_by]
         origins = torch.cat([self.origins, self.origins @ rotation.T + translation])
         seen_from = self.seen_from + moved_viewpoint.long() * self.origins.shape[0]
-        used, seen_from = torch.unique(seen_from, return_inverse=True)
-        return replace(
+        moved = replace(
             self,
             means=torch.where(chosen[:, None], self.means @ rotation.T + translation, self.means),
             covariances=torch.where(
                 chosen[:, None, None], rotation @ self.covariances @ rotation.T, self.covariances
             ),
-            origins=origins[used],
+            origins=origins,
             seen_from=seen_from,
         )
+        return moved.with_used_origins()
 
     def checked(self) -> Components:
         """These components, if shapes, indices, signs and covariances are valid.

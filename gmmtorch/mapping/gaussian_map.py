@@ -17,10 +17,10 @@ from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check
 from gmmtorch.files import write_bytes
 from gmmtorch.linalg import check_rigid
 from gmmtorch.mapping.codec import map_file
-from gmmtorch.mapping.codec.component_batch import quantized
+from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.depth_frame import DepthFrame, depth_and_pose
-from gmmtorch.mapping.learning.learner import Learner
+from gmmtorch.mapping.learning.forgetting import Doubts
 from gmmtorch.mapping.learning.rules import IncrementalRule, LearningRule, WindowedRule, read_rule
 from gmmtorch.mapping.map_state import MapState
 from gmmtorch.mapping.query import Query
@@ -109,7 +109,7 @@ class GaussianMap(MapState):
         )
         number = check_whole("robot", robot, 0)
         settings = map_file.MapSettings(check_resolution(resolution), method, codec, number, query)
-        super().__init__(Learner(rule, random_state), settings)
+        super().__init__(rule, settings, random_state)
 
     def __repr__(self) -> str:
         scans = f"{self.n_pending} pending scan{'s' if self.n_pending != 1 else ''}"
@@ -159,10 +159,7 @@ class GaussianMap(MapState):
         """Learns from a scan. Queries use it at once; its components are final when their window is full."""
         check_scan(scan)
         self._prepare(scan.dim, scan.points.device, "scan is")
-        self._forget()
-        learned = self._learner.add(self._final(), scan.copied(self._device), self.settings)
-        if learned is not None:
-            self._set(learned)
+        self._add(scan.copied(self._device))
 
     def insert_depth(
         self,
@@ -184,7 +181,7 @@ class GaussianMap(MapState):
             depth_scale: metres per unit of the images, such as 0.001 for millimetres. Images of integers need
                 it; None: metres, in a floating type.
         """
-        if not self.learning.takes_depth:
+        if not isinstance(self.learning, IncrementalRule):
             raise InvalidArgumentError(
                 "insert_depth needs a map with an IncrementalRule; insert scans instead."
             )
@@ -200,9 +197,9 @@ class GaussianMap(MapState):
         self._prepare(3, first.depth.device, "depth images are")
         if self.n_pending:
             self._commit(self._with_pending())
-        self._learner.rule = self.learning.fitted([first])
+        self.learning = self.learning.fitted([first])
         taken = (frame_of(index).to(self._device) for index in range(len(frames)))
-        self._set(self._learner.absorb(self._final(), taken, self.settings, float(pixel_stride**2)))
+        self._commit(self._absorbed(taken, self.learning, float(pixel_stride**2)))
 
     def finish(self) -> None:
         """Learns from the scans of the unfinished window now instead of at the first query. Changes no
@@ -278,8 +275,8 @@ class GaussianMap(MapState):
     # -- files and state ------------------------------------------------------------------------------
 
     def _file(self) -> bytes:
-        rule = self.learning.fitted(self._learner.pending)
-        return map_file.to_bytes(self.components(), rule, self.settings, self._learner.next_number)
+        rule = self.learning.fitted(self._pending)
+        return map_file.to_bytes(self.components(), rule, self.settings, self._next_number)
 
     @property
     def nbytes(self) -> int:
@@ -300,6 +297,6 @@ class GaussianMap(MapState):
             made = cls(read_rule(**facts.pop("learning")), **facts)
         except (TypeError, KeyError, ValueError) as error:
             raise DataError(f"{path}: its settings are damaged ({error}).") from error
-        made._learner.resume(next_number, time)
+        made._next_number, made._next_doubts = next_number, Doubts.none(time)
         made._commit(components)
         return made

@@ -1,21 +1,26 @@
-"""MapState: what a map remembers between scans, as a torch module with a state dict."""
+"""MapState: what a map remembers between scans, and learns from them; a torch module with a state dict."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import fields
 from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 
-from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
-from gmmtorch.mapping.codec.map_file import MapSettings, number_after
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
+from gmmtorch.mapping.codec.map_file import FileSize, MapSettings, number_after
+from gmmtorch.mapping.codec.quantization import numbered
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.learner import Learner
-from gmmtorch.mapping.learning.rules import LearningRule
+from gmmtorch.mapping.learning.depth_frame import DepthFrame, as_scans
+from gmmtorch.mapping.learning.forgetting import Doubts, Forgetting
+from gmmtorch.mapping.learning.rules import LearningRule, WindowedRule, read_rule, rule_facts
+from gmmtorch.mapping.learning.windows import absorb, learn_window
 from gmmtorch.mapping.query import Query
+from gmmtorch.scan import Scan
 
+_LONGEST_WINDOW = 40  # scans, if no scan yet shows how many points it holds
 _BUFFERS = tuple(f.name for f in fields(Components))
 _STATE = "_extra_state"  # torch's name of it in a state dict
 
@@ -32,11 +37,16 @@ def _field(name: str, about: str) -> Any:
 
 
 class MapState(nn.Module):
-    """The final components of a map (buffers), its learner with the pending scans, and its settings.
+    """The final components of a map (buffers), the pending scans of its unfinished window, and its settings.
 
     Args:
-        learner: learns the scans of unfinished windows.
-        settings: what the map's file states; the learner keeps the time.
+        learning: how scans become components.
+        settings: what the map's file states.
+        random_state: seed. Every window has its own generator, so previews do not change later windows.
+
+    Attributes:
+        learning: the rule, with the options that the first windows determined.
+        resolution, method, codec, robot, query_options: the settings.
     """
 
     means = _field("means", "(K, D) in metres.")
@@ -49,11 +59,16 @@ class MapState(nn.Module):
     seen_from = _field("seen_from", "(E,) the origin of each viewpoint.")
     seen_count = _field("seen_count", "(E,) points of each viewpoint.")
 
-    def __init__(self, learner: Learner, settings: MapSettings) -> None:
+    def __init__(self, learning: LearningRule, settings: MapSettings, random_state: int) -> None:
         super().__init__()
         self.resolution, self.method, self.codec = settings.resolution, settings.method, settings.codec
         self.robot, self.query_options = settings.robot, settings.query
-        self._learner = learner
+        self.learning = learning
+        self._random_state = random_state
+        self._pending: list[Scan] = []
+        self._n_windows = 0
+        self._next_number = 0  # of the next new component
+        self._doubts = self._next_doubts = Doubts.none()  # of the final components; after the pending scans
         self._learned: Components | None = None  # what follows from the buffers and the pending scans
         self._rounded: Components | None = None
         self._query: Query | None = None
@@ -75,11 +90,6 @@ class MapState(nn.Module):
         return None if means is None else means.device
 
     @property
-    def learning(self) -> LearningRule:
-        """The learning rule, with the options that the first windows determined."""
-        return self._learner.rule
-
-    @property
     def n_final(self) -> int:
         """Number of components without those of the unfinished window, which is not learned for it."""
         return 0 if self.dim is None else len(self._final())
@@ -87,13 +97,15 @@ class MapState(nn.Module):
     @property
     def n_pending(self) -> int:
         """Number of scans of the unfinished window. If it is 0, all components are final."""
-        return len(self._learner.pending)
+        return len(self._pending)
 
     @property
     def settings(self) -> MapSettings:
         """What the map's file states about it, besides the components and the learning rule."""
         options = self.resolution, self.method, self.codec, self.robot, self.query_options
-        return MapSettings(*options, self._learner.time)
+        return MapSettings(*options, self._next_doubts.time)
+
+    # -- learning -------------------------------------------------------------------------------------
 
     def _final(self) -> Components:
         """The components without those of the unfinished window, not rounded."""
@@ -105,8 +117,40 @@ class MapState(nn.Module):
     def _with_pending(self) -> Components:
         """All components, not rounded."""
         if self._learned is None:
-            self._learned = self._learner.preview(self._final(), self.settings)
+            rule = self.learning.fitted(self._pending)
+            self._learned = self._absorbed(self._pending, rule) if self._pending else self._final()
         return self._learned
+
+    def _absorbed(
+        self, scans: Iterable[Scan | DepthFrame], rule: LearningRule, weight: float = 1.0
+    ) -> Components:
+        """All components, with those of scans, or of frames with points that each stand for `weight`."""
+        known, forgetting = self._final(), Forgetting(rule, self._doubts)
+        if isinstance(rule, WindowedRule):
+            generator = torch.Generator().manual_seed(hash((self._random_state, self._n_windows)) % 2**63)
+            window = as_scans(scans)
+            learned = forgetting.joined(known, learn_window(window, rule, generator), window)
+        else:
+            size = FileSize(rule, self.settings, self._next_number)
+            learned = absorb(known, scans, rule, size, weight, forgetting)
+        self._next_doubts = forgetting.doubts
+        return numbered(learned, self.robot, self._next_number)
+
+    def _add(self, scan: Scan) -> None:
+        """Adds a scan to the window, and makes the window final once it is full.
+
+        A scan that cannot be learned from is removed again.
+        """
+        self._forget()
+        self._pending.append(scan)
+        if len(self._pending) < (self.learning.fitted(self._pending).window or _LONGEST_WINDOW):
+            return
+        try:
+            learned = self._with_pending()
+        except GmmTorchError:
+            self._pending.pop()
+            raise
+        self._commit(learned)
 
     def _prepare(self, dim: int, device: torch.device, what: str) -> None:
         """Gives an empty map its dimension. Raises if the map has another one."""
@@ -117,7 +161,11 @@ class MapState(nn.Module):
 
     def _commit(self, components: Components) -> None:
         """Replaces all components, those of the unfinished window included."""
-        self._learner.commit(components)
+        self.learning = self.learning.fitted(self._pending)
+        self._doubts = self._next_doubts
+        self._n_windows += bool(self._pending)
+        self._pending = []
+        self._next_number = number_after(components.ids, self._next_number)
         self._set(components)
 
     def _set(self, components: Components) -> None:
@@ -129,17 +177,25 @@ class MapState(nn.Module):
         """Drops what was computed from the components."""
         self._learned, self._rounded, self._query = None, None, None
 
+    # -- torch ----------------------------------------------------------------------------------------
+
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> MapState:
         """Moves the map and its pending scans between devices. Types stay: positions need float64."""
         super()._apply(lambda tensor: tensor.to(fn(tensor.new_empty(0)).device), recurse)
         if self.dim is not None:
-            self._learner.pending = [scan.to(self._device) for scan in self._learner.pending]
+            self._pending = [scan.to(self._device) for scan in self._pending]
         self._forget()
         return self
 
     def get_extra_state(self) -> dict[str, Any]:
         """The learning rule, the pending scans and the counters, as part of `state_dict`."""
-        return self._learner.state()
+        return {
+            "learning": rule_facts(self.learning),
+            "pending": [dict(vars(scan)) for scan in self._pending],
+            "n_windows": self._n_windows,
+            "n_numbered": self._next_number,
+            "doubts": dict(vars(self._doubts)),
+        }
 
     def _load_from_state_dict(
         self,
@@ -162,17 +218,29 @@ class MapState(nn.Module):
             missing_keys += [prefix + name for name in missing]
             return
         try:
-            learner = self._learner if state is None else self._learner.restored(state)
+            extra = None if state is None else _read_extra(state)
             components = None if missing else Components(**{name: own[name] for name in _BUFFERS}).checked()
         except (GmmTorchError, KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise DataError(f"The state of the map is damaged ({error}).") from error
         device = self._device
         for name in _BUFFERS:
             self._buffers.pop(name, None)
-        self._learner = learner
-        if state is None:
-            learner.pending = []
+        self._pending = []
+        if extra is not None:
+            self.learning, self._pending, self._n_windows, self._next_number, self._doubts = extra
+            self._next_doubts = self._doubts
         if components is not None:
             self._set(Components(**{n: v.detach().clone().to(device) for n, v in vars(components).items()}))
-            learner.next_number = number_after(components.ids, learner.next_number)
+            self._next_number = number_after(components.ids, self._next_number)
         self._forget()
+
+
+def _read_extra(state: dict[str, Any]) -> tuple[LearningRule, list[Scan], int, int, Doubts]:
+    """The values of `get_extra_state`. Raises an error of any kind if the state is damaged."""
+    return (
+        read_rule(**state["learning"]),
+        [Scan(**scan) for scan in state["pending"]],
+        check_whole("n_windows", state["n_windows"], 0),
+        check_whole("n_numbered", state["n_numbered"], 0),
+        Doubts.read(state["doubts"]) if "doubts" in state else Doubts.none(),
+    )

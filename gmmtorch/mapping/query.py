@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.mapping.query_options import AUTO, QueryOptions, check_method
+from gmmtorch.occupancy.cone_index import ConeIndex
 from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.evidence import Evidence, occupancy_probability
 from gmmtorch.occupancy.forms.cone.cone_evidence import cone_evidence
@@ -15,7 +16,6 @@ from gmmtorch.occupancy.forms.flux.box_flux import box_flux, flux_evidence
 from gmmtorch.occupancy.forms.monte_carlo import sample_rays
 from gmmtorch.occupancy.forms.point import PointEvidence, PointForm
 from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.index.cone_index import ConeIndex
 from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 
 _RAYS_AT_ONCE = 1 << 20

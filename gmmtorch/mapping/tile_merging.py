@@ -15,8 +15,8 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
 from gmmtorch.files import write_bytes
 from gmmtorch.mapping.codec import map_file
-from gmmtorch.mapping.codec.component_batch import quantized, spatial_order
 from gmmtorch.mapping.codec.map_file import MapSettings
+from gmmtorch.mapping.codec.quantization import quantized, spatial_order
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.merging import compact_to_bytes
 from gmmtorch.mapping.learning.rules import IncrementalRule
@@ -123,7 +123,7 @@ def canonical(components: Components) -> Components:
 
     Ids are (0, 0), (0, 1), … Origins are distinct and sorted, and all used.
     """
-    c = Components(**{name: value.detach().cpu() for name, value in vars(components).items()})
+    c = components.on_cpu()
     origins, seen_from = torch.unique(c.origins[c.seen_from] + 0.0, dim=0, return_inverse=True)  # no −0
     c = replace(c, origins=origins, seen_from=seen_from)
     c = _viewpoints_in_order(c.rearranged(_order(c)))

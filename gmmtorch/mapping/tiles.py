@@ -201,11 +201,10 @@ class TiledMap:
     def _query(self, row: int) -> Query:
         """The query of a tile. If too many are open, the least recently used one is dropped."""
         if row not in self._open:
-            parts = vars(self.components(row))
-            placed = Components(**{name: value.to(self.device) for name, value in parts.items()})
+            cones = self.components(row).to(self.device).cones()
             share = float(self.index.support[row] / self.index.support.sum().clamp_min(1e-300))
             n_samples = max(1, round(share * self.query_options.n_samples))
-            self._open[row] = Query(placed.cones(), replace(self.query_options, n_samples=n_samples))
+            self._open[row] = Query(cones, replace(self.query_options, n_samples=n_samples))
         self._open.move_to_end(row)
         while len(self._open) > self.most_open:
             self._open.popitem(last=False)

@@ -43,32 +43,24 @@ if TYPE_CHECKING:
     from gmmtorch.mixture.streaming.stream_fit import fit_stream as fit_stream
     from gmmtorch.mixture.streaming.stream_fit import score_stream as score_stream
 
+_MODULES = {
+    "density": ["NotFittedError"],
+    "depth_image": ["fit_depth_image"],
+    "em.exact": ["Parameters"],
+    "estimator": ["MixtureEstimator"],
+    "estimators.deconvolved": ["DeconvolvedGaussianMixture"],
+    "estimators.riemannian": ["RiemannianGaussianMixture"],
+    "estimators.sensor_model": ["DepthCameraModel", "LaserModel", "LidarModel", "SensorModel"],
+    "estimators.sliced_wasserstein": ["SlicedWassersteinGaussianMixture"],
+    "estimators.trees.hierarchical": ["HierarchicalGaussianMixture"],
+    "estimators.variational": ["VariationalGaussianMixture"],
+    "gaussian_mixture": ["GaussianMixture"],
+    "reduction.merge": ["Reduction", "merge", "simplify"],
+    "reduction.pruning": ["prune"],
+    "streaming.checkpoints": ["Checkpoint"],
+    "streaming.distributed": ["LostProcessError", "Processes", "joined"],
+    "streaming.stream_fit": ["fit_stream", "score_stream"],
+}
 __getattr__, __dir__, __all__ = lazy_names(
-    __name__,
-    {
-        "Checkpoint": "streaming.checkpoints",
-        "DeconvolvedGaussianMixture": "estimators.deconvolved",
-        "DepthCameraModel": "estimators.sensor_model",
-        "GaussianMixture": "gaussian_mixture",
-        "HierarchicalGaussianMixture": "estimators.trees.hierarchical",
-        "LaserModel": "estimators.sensor_model",
-        "LidarModel": "estimators.sensor_model",
-        "LostProcessError": "streaming.distributed",
-        "MixtureEstimator": "estimator",
-        "NotFittedError": "density",
-        "Parameters": "em.exact",
-        "Processes": "streaming.distributed",
-        "Reduction": "reduction.merge",
-        "RiemannianGaussianMixture": "estimators.riemannian",
-        "SensorModel": "estimators.sensor_model",
-        "SlicedWassersteinGaussianMixture": "estimators.sliced_wasserstein",
-        "VariationalGaussianMixture": "estimators.variational",
-        "fit_depth_image": "depth_image",
-        "fit_stream": "streaming.stream_fit",
-        "joined": "streaming.distributed",
-        "merge": "reduction.merge",
-        "prune": "reduction.pruning",
-        "score_stream": "streaming.stream_fit",
-        "simplify": "reduction.merge",
-    },
+    __name__, {name: module for module, names in _MODULES.items() for name in names}
 )

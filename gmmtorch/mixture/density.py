@@ -173,7 +173,7 @@ class MixtureDensity(DensityMixin, BaseEstimator, nn.Module):
     # -- buffers and conversions ------------------------------------------------------------------
 
     def _set_buffers(self, weights: Tensor, means: Tensor, covariances: Tensor) -> None:
-        for name, value in (("weights", weights), ("means", means), ("covariances", covariances)):
+        for name, value in zip(Parameters._fields, (weights, means, covariances), strict=True):
             self.register_buffer(name, value)
         self._fitted_type = self.covariance_type
 

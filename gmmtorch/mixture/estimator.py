@@ -190,6 +190,10 @@ class MixtureEstimator(MixtureState, ABC):
         """Whether `fit` starts from the last fit."""
         return bool(getattr(self, "warm_start", False)) and hasattr(self, "means")
 
+    def _previous_bound(self) -> float:
+        """The last bound of the fit that `fit` continues; −∞ if it starts anew."""
+        return self.lower_bound_ if self._continues() else -math.inf
+
     def _check_continues(self, points: Tensor) -> None:
         """Raise `InvalidArgumentError` unless the last fit has `n_components` and the points' dimension."""
         k = self.means.shape[0] if self.n_components is None else self.n_components

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from numbers import Integral
 from typing import Any, ClassVar
@@ -28,6 +27,7 @@ from gmmtorch.mixture.em.initialization import (
 from gmmtorch.mixture.em.loop import EMResult, OnIteration
 from gmmtorch.mixture.em.truncated import Settings, fit_truncated
 from gmmtorch.mixture.estimator import ABOVE_ZERO, COUNT, MixtureEstimator
+from gmmtorch.mixture.streaming.distributed import SINGLE_PROCESS, Processes
 from gmmtorch.mixture.validation import (
     Array,
     RandomState,
@@ -241,7 +241,6 @@ class GaussianMixture(MixtureEstimator):
     ) -> EMResult[Parameters]:
         """EM from one start."""
         reg, dtype = float(self.reg_covar), em.SOFTMAX_DTYPES[self.dtype]
-        previous_bound = self.lower_bound_ if self._continues() else -math.inf
         first, owner = self._start(rows, center, generator)
         if not self._truncates(rows.weight.shape[0], first.weights.shape[0]):
             points = rows.points if rows.are_points else None
@@ -251,19 +250,23 @@ class GaussianMixture(MixtureEstimator):
                 tol=self.tol,
                 max_iter=self.max_iter,
                 on_iteration=on_iteration,
-                previous_bound=previous_bound,
+                previous_bound=self._previous_bound(),
             )
         owner = nearest(rows.points, first.means) if owner is None else owner
-        settings = Settings(
-            reg,
+        return fit_truncated(rows, owner, first, self._settings(on_iteration))
+
+    def _settings(self, on_iteration: OnIteration | None, processes: Processes = SINGLE_PROCESS) -> Settings:
+        """The settings of truncated EM."""
+        return Settings(
+            float(self.reg_covar),
             self.tol,
             self.max_iter,
-            dtype,
+            em.SOFTMAX_DTYPES[self.dtype],
             on_iteration=on_iteration,
+            processes=processes,
             compiled=bool(self.compiled),
-            previous_bound=previous_bound,
+            previous_bound=self._previous_bound(),
         )
-        return fit_truncated(rows, owner, first, settings)
 
     def _start(
         self, rows: Rows, center: Tensor, generator: torch.Generator

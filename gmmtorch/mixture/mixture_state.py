@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar, cast
 
@@ -19,32 +18,12 @@ from gmmtorch.files import pack_tensors, read_tensors, require, write_bytes
 from gmmtorch.linalg import check_rigid, check_symmetric, safe_cholesky
 from gmmtorch.mixture.density import MixtureDensity
 from gmmtorch.mixture.em.covariance_types import check_type, expand, type_shape
+from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.validation import Array, checked_parameter
 
 _FILE_KIND, _FILE_VERSION = "gmmtorch.mixture", 1
-_PARTS = ("weights", "means", "covariances")
 _EXTRA = "extra."  # prefix of the names of extra tensors in a file
 _EXTRA_DTYPES = (torch.float64, torch.int64, torch.bool)
-
-
-def _require_extra(tensors: Mapping[str, Tensor], name: str, path: str | Path) -> Tensor:
-    """An extra tensor.
-
-    Raises `DataError` unless it is finite and of an allowed dtype; any shape is allowed.
-    """
-    tensor = tensors[name]
-    if tensor.dtype not in _EXTRA_DTYPES:
-        raise DataError(f"{path}: {name} is {tensor.dtype}; expected one of {_EXTRA_DTYPES}.")
-    return require(tensors, name, (None,) * tensor.ndim, tensor.dtype, path)
-
-
-@contextmanager
-def _errors_naming(path: str | Path) -> Iterator[None]:
-    """Turns errors about the content of a file into a `DataError` that names the file."""
-    try:
-        yield
-    except (KeyError, TypeError, ValueError, GmmTorchError) as error:
-        raise DataError(f"{path} does not hold a mixture: {error}") from error
 
 
 Self = TypeVar("Self", bound="MixtureState")
@@ -86,15 +65,9 @@ class MixtureState(MixtureDensity):
         shape: tuple[int, ...] = (k, dim, dim)
         if len(np.shape(covariances)) < 3:
             shape = type_shape(kind, k, dim)
-        checked = (
-            checked_parameter(value, shape, name, mean.device)
-            for value, shape, name in (
-                (weights, (k,), "weights"),
-                (means, (k, dim), "means"),
-                (covariances, shape, "covariances"),
-            )
-        )
-        weight, mean, covariance = checked
+        weight = checked_parameter(weights, (k,), "weights", mean.device)
+        mean = checked_parameter(means, (k, dim), "means", mean.device)
+        covariance = checked_parameter(covariances, shape, "covariances", mean.device)
         covariance = covariance if len(shape) == 3 else expand(covariance, kind, k, dim)
         if bool((weight < 0).any()) or abs(float(weight.sum()) - 1) > 1e-6:
             raise InvalidArgumentError(f"weights={weight.tolist()} must be at least zero and add up to one.")
@@ -137,7 +110,7 @@ class MixtureState(MixtureDensity):
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
         """Load the state of a fitted mixture with any K and D, whether this one is fitted or not."""
-        given = [state_dict.get(prefix + name) for name in ("weights", "means", "covariances")]
+        given = [state_dict.get(prefix + name) for name in Parameters._fields]
         if all(isinstance(value, Tensor) for value in given):
             weights, means, covariances = (cast(Tensor, value).double().clone() for value in given)
             check_type(covariances, self.covariance_type)
@@ -180,7 +153,7 @@ class MixtureState(MixtureDensity):
     def save(self, path: str | Path) -> None:
         """Write the fitted mixture to a safetensors file, atomically."""
         self._fitted()
-        tensors = {name: getattr(self, name) for name in _PARTS}
+        tensors = {name: getattr(self, name) for name in Parameters._fields}
         tensors |= {_EXTRA + name: value for name, value in self._extra_tensors().items()}
         facts = {
             "lower_bounds": self.lower_bounds_,
@@ -198,13 +171,15 @@ class MixtureState(MixtureDensity):
         k, dim = means.shape
         weights = require(tensors, "weights", (k,), torch.float64, path)
         covariances = require(tensors, "covariances", (k, dim, dim), torch.float64, path)
-        extra = {
-            name.removeprefix(_EXTRA): _require_extra(tensors, name, path)
-            for name in tensors
-            if name.startswith(_EXTRA)
-        }
+        extra = {}
+        for name, tensor in tensors.items():
+            if name.startswith(_EXTRA):
+                if tensor.dtype not in _EXTRA_DTYPES:
+                    raise DataError(f"{path}: {name} is {tensor.dtype}; expected one of {_EXTRA_DTYPES}.")
+                shape = (None,) * tensor.ndim
+                extra[name.removeprefix(_EXTRA)] = require(tensors, name, shape, tensor.dtype, path)
         known = set(cls._get_param_names())
-        with _errors_naming(path):
+        try:
             parameters = dict(facts["parameters"])
             stored_n = parameters.get("n_components", 0)
             if stored_n is not None and not (cls._finds_n_components and isinstance(stored_n, int)):
@@ -219,4 +194,6 @@ class MixtureState(MixtureDensity):
             )
             mixture._set_extra(extra)
             mixture._tensors = not facts["arrays"]
+        except (KeyError, TypeError, ValueError, GmmTorchError) as error:
+            raise DataError(f"{path} does not hold a mixture: {error}") from error
         return mixture

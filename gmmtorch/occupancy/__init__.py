@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from gmmtorch.lazy_names import lazy_names
 
 if TYPE_CHECKING:
+    from gmmtorch.occupancy.cone_index import ConeIndex as ConeIndex
     from gmmtorch.occupancy.cones import Cones as Cones
     from gmmtorch.occupancy.evidence import CellClass as CellClass
     from gmmtorch.occupancy.evidence import Evidence as Evidence
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from gmmtorch.occupancy.forms.point import point_evidence as point_evidence
     from gmmtorch.occupancy.grid import VoxelGrid as VoxelGrid
     from gmmtorch.occupancy.grid import rasterize as rasterize
-    from gmmtorch.occupancy.index.cone_index import ConeIndex as ConeIndex
     from gmmtorch.occupancy.protocol import OccupancyMap as OccupancyMap
     from gmmtorch.occupancy.ray_queries import ExpectedRange as ExpectedRange
     from gmmtorch.occupancy.ray_queries import RayHits as RayHits
@@ -49,7 +49,7 @@ _MODULES = {
     "forms.monte_carlo": ["RayBundle", "sample_rays"],
     "forms.point": ["PointEvidence", "PointForm", "point_evidence"],
     "grid": ["VoxelGrid", "rasterize"],
-    "index.cone_index": ["ConeIndex"],
+    "cone_index": ["ConeIndex"],
     "protocol": ["OccupancyMap"],
     "ray_queries": ["ExpectedRange", "RayHits", "expected_range", "hit_probability"],
     "voxels.boxes": ["Box"],

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gmmtorch.arrays import as_tensor
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.linalg import safe_cholesky
+from gmmtorch.linalg import inverse_factor, safe_cholesky
 
 CUTOFF = 5.0
 """Default cutoff in standard deviations: beyond it a component gives no evidence."""
@@ -76,11 +76,8 @@ def whitening(covariances: Tensor) -> tuple[Tensor, Tensor]:
     the thousands for a component 5 mm thick at 10 m. Subtracting two of them loses digits.
     """
     factors = safe_cholesky(covariances.double())
-    dim = covariances.shape[-1]
-    eye = torch.eye(dim, dtype=torch.float64, device=covariances.device).expand_as(factors)
-    inverse = torch.linalg.solve_triangular(factors, eye, upper=False)
-    log_norm = factors.diagonal(dim1=-2, dim2=-1).log().sum(-1) + 0.5 * dim * math.log(2 * math.pi)
-    return inverse, log_norm
+    log_norm = factors.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    return inverse_factor(factors).mT, log_norm + 0.5 * covariances.shape[-1] * math.log(2 * math.pi)
 
 
 class WhitenedCones(NamedTuple):

@@ -15,11 +15,13 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.errors import check_prior as check_prior
+from gmmtorch.kernels.chunks import chunk_elements
 from gmmtorch.kernels.rays.cell_entropy import bernoulli_entropy as bernoulli_entropy
 from gmmtorch.kernels.rays.cell_entropy import occupancy_probability as occupancy_probability
 from gmmtorch.kernels.rays.ray_counting import count_in_grid
 from gmmtorch.kernels.rays.ray_traversal import CHUNK_VISITS
 from gmmtorch.occupancy.grid import VoxelGrid
+from gmmtorch.occupancy.voxels.boxes import flat_index
 
 
 class CellClass(IntEnum):
@@ -47,15 +49,7 @@ def classify(probability: ArrayLike, variance_threshold: float) -> Tensor:
             "0.25 means no dead band, the thesis uses 0.06."
         )
     half_width = 0.5 * math.sqrt(1 - 4 * variance_threshold)
-    return _labels(probability, 0.5 - half_width, 0.5 + half_width)
-
-
-def _labels(values: ArrayLike, free: float, occupied: float) -> Tensor:
-    probability = as_tensor(values, "probability")
-    label = torch.full_like(probability, CellClass.UNKNOWN, dtype=torch.int8)
-    label[probability > occupied] = int(CellClass.OCCUPIED)
-    label[probability < free] = int(CellClass.FREE)
-    return label
+    return Thresholds(0.5 - half_width, 0.5 + half_width).classify(probability)
 
 
 @dataclass(frozen=True)
@@ -74,7 +68,11 @@ class Thresholds:
 
     def classify(self, probability: ArrayLike) -> Tensor:
         """`CellClass` values (int8) of probabilities, any shape."""
-        return _labels(probability, self.free, self.occupied)
+        theta = as_tensor(probability, "probability")
+        label = torch.full_like(theta, CellClass.UNKNOWN, dtype=torch.int8)
+        label[theta > self.occupied] = int(CellClass.OCCUPIED)
+        label[theta < self.free] = int(CellClass.FREE)
+        return label
 
 
 @dataclass(frozen=True, repr=False)
@@ -154,16 +152,21 @@ class Evidence:
 
         Raises `InvalidArgumentError` for shapes that do not match.
         """
-        rays = checked_rays(origins, ends, weights, is_hit, self.grid.dim, self.misses.device)
-        origins, ends, weights, is_hit = rays
-        starts, stops = self.grid.to_units(origins), self.grid.to_units(ends)
-        misses, shape = self.misses.view(-1), self.grid.shape
-        count_in_grid(misses, starts, stops, shape, weights, chunk_visits=chunk_visits, compiled=compiled)
-        cell, counted = self.grid.flat_index(ends)
-        if is_hit is not None:
-            counted = counted & is_hit
-        source = torch.ones_like(cell, dtype=torch.float64) if weights is None else weights
-        self.hits.view(-1).scatter_add_(0, cell[counted], source[counted])
+        origins, ends, weights, is_hit = checked_rays(
+            origins, ends, weights, is_hit, self.grid.dim, self.misses.device
+        )
+        size = chunk_elements(self.misses.device) // 2  # rays whose positions fit a core's cache
+        for begin in range(0, len(ends), size):
+            part = slice(begin, begin + size)
+            starts, stops = self.grid.to_units(origins[part]), self.grid.to_units(ends[part])
+            counts = None if weights is None else weights[part]
+            misses, shape = self.misses.view(-1), self.grid.shape
+            count_in_grid(misses, starts, stops, shape, counts, chunk_visits=chunk_visits, compiled=compiled)
+            cell, counted = flat_index(stops.floor(), shape)
+            if is_hit is not None:
+                counted = counted & is_hit[part]
+            added = counted.double() if counts is None else counts * counted
+            self.hits.view(-1).scatter_add_(0, cell, added)
 
 
 def checked_rays(

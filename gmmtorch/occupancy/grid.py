@@ -12,6 +12,7 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
 from gmmtorch.errors import check_resolution as check_resolution
+from gmmtorch.occupancy.voxels.boxes import flat_index
 
 BYTES_PER_CELL = 16
 """Bytes of the hits and misses of one cell, float64 each."""
@@ -119,14 +120,7 @@ class VoxelGrid:
 
     def flat_index(self, points: ArrayLike) -> tuple[Tensor, Tensor]:
         """Flat cell index (M,) of points (M, D), world metres, and whether each is inside; else index 0."""
-        cell = self.to_units(points).floor()
-        shape = torch.tensor(self.shape, dtype=torch.float64, device=cell.device)
-        inside = ((cell >= 0) & (cell < shape)).all(1)
-        cell = torch.where(inside[:, None], cell, torch.zeros_like(cell)).long()
-        flat = cell[:, 0]
-        for axis in range(1, self.dim):
-            flat = flat * self.shape[axis] + cell[:, axis]
-        return flat, inside
+        return flat_index(self.to_units(points).floor(), self.shape)
 
     def check_memory(self, memory_limit: int) -> None:
         """Raise `MemoryLimitError` if the evidence of all cells takes more than `memory_limit` bytes."""

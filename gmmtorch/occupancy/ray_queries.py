@@ -70,17 +70,14 @@ def hit_probability(
             zero, a range that is not above zero, or a form made for another resolution.
         MemoryLimitError: R·S cells exceed the memory limit.
     """
-    form = _form(cones, resolution)
-    origins, directions = as_tensor(origins, "origins"), as_tensor(directions, "directions")
-    depth = _depths(max_range, form, origins)
-    if origins.shape[0] * depth.shape[0] * 8 > MEMORY_LIMIT:
+    depth, occupancies = _along(cones, origins, directions, max_range, resolution, prior)
+    if len(origins) * depth.shape[0] * 8 > MEMORY_LIMIT:
         raise MemoryLimitError(
-            f"{origins.shape[0]:,} rays of {depth.shape[0]:,} cells take more than {MEMORY_LIMIT:,} bytes; "
+            f"{len(origins):,} rays of {depth.shape[0]:,} cells take more than {MEMORY_LIMIT:,} bytes; "
             "pass fewer rays per call, or use expected_range, which does not store the cells."
         )
-    parts = [first_hit(o) for o in _along(form, origins, directions, depth, prior)]
-    probability = torch.cat([part[0] for part in parts])
-    return RayHits(depth, probability, torch.cat([part[1] for part in parts]))
+    probability, no_hit = zip(*map(first_hit, occupancies), strict=True)
+    return RayHits(depth, torch.cat(probability), torch.cat(no_hit))
 
 
 def expected_range(
@@ -92,30 +89,34 @@ def expected_range(
     prior: float = 1.0,
 ) -> ExpectedRange:
     """Expected range of a beam, Σ p_i d_i + p_none · max_range; arguments as for `hit_probability`."""
-    form = _form(cones, resolution)
-    origins, directions = as_tensor(origins, "origins"), as_tensor(directions, "directions")
-    depth = _depths(max_range, form, origins)
+    depth, occupancies = _along(cones, origins, directions, max_range, resolution, prior)
     reported = depth.clamp_max(max_range)  # the last cell can extend beyond the range
     means, none = [], []
-    for occupancy in _along(form, origins, directions, depth, prior):
+    for occupancy in occupancies:
         probability, no_hit = first_hit(occupancy)
         means.append(probability @ reported + no_hit * max_range)
         none.append(no_hit)
     return ExpectedRange(torch.cat(means), torch.cat(none))
 
 
-def _form(cones: Cones | PointForm, resolution: float) -> PointForm:
+def _along(
+    cones: Cones | PointForm,
+    origins: ArrayLike,
+    directions: ArrayLike,
+    max_range: float,
+    resolution: float,
+    prior: float,
+) -> tuple[Tensor, Iterator[Tensor]]:
+    """Distance (S,) of the cell centres along a beam (m), and the occupancy (r, S) of chunks of r rays.
+
+    Raises the errors of `hit_probability`.
+    """
     form = cones if isinstance(cones, PointForm) else PointForm(cones, resolution)
     if form.resolution != resolution:
         raise InvalidArgumentError(
             f"resolution={resolution} m differs from that of the PointForm, {form.resolution} m; "
             "make a form for this resolution."
         )
-    return form
-
-
-def _depths(max_range: float, form: PointForm, origins: Tensor) -> Tensor:
-    """Distance (S,) of the cell centres along a beam (m)."""
     if not 0 < max_range < math.inf:
         raise InvalidArgumentError(f"max_range={max_range} must be metres above zero.")
     n_cells = math.ceil(max_range / form.resolution * (1 - 1e-12))
@@ -124,15 +125,8 @@ def _depths(max_range: float, form: PointForm, origins: Tensor) -> Tensor:
             f"max_range={max_range} m at resolution={form.resolution} m is {n_cells:,} cells a ray; "
             "take a larger resolution."
         )
-    steps = torch.arange(n_cells, dtype=torch.float64, device=origins.device)
-    return (steps + 0.5) * form.resolution
-
-
-def _along(
-    form: PointForm, origins: Tensor, directions: Tensor, depth: Tensor, prior: float
-) -> Iterator[Tensor]:
-    """Occupancy (r, S) of the cells along the rays, for chunks of r rays."""
-    start, direction = origins.double(), directions.double()
+    start = as_tensor(origins, "origins", torch.float64)
+    direction = as_tensor(directions, "directions", torch.float64)
     if start.shape != direction.shape or start.ndim != 2 or start.shape[1] != form.dim:
         raise InvalidArgumentError(
             f"origins {tuple(start.shape)} and directions {tuple(direction.shape)} must both be "
@@ -146,9 +140,13 @@ def _along(
     length = direction.norm(dim=1, keepdim=True)
     if bool((length == 0).any()):
         raise InvalidArgumentError("directions contains a vector of length zero; give each ray a direction.")
-    direction = direction / length
-    n_rays = max(1, _CHUNK_CELLS // depth.shape[0])
-    for begin, toward in zip(start.split(n_rays), direction.split(n_rays), strict=True):
-        points = begin[:, None] + toward[:, None] * depth[:, None]
-        evidence = form(points.flatten(0, 1))
-        yield occupancy_probability(*evidence, prior).view(points.shape[:2])
+    steps = torch.arange(n_cells, dtype=torch.float64, device=start.device)
+    depth = (steps + 0.5) * form.resolution
+
+    def occupancies() -> Iterator[Tensor]:
+        n_rays = max(1, _CHUNK_CELLS // n_cells)
+        for begin, toward in zip(start.split(n_rays), (direction / length).split(n_rays), strict=True):
+            points = begin[:, None] + toward[:, None] * depth[:, None]
+            yield occupancy_probability(*form(points.flatten(0, 1)), prior).view(points.shape[:2])
+
+    return depth, occupancies()

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import check_whole
-from gmmtorch.mapping.codec.component_batch import spatial_order
+from gmmtorch.mapping.codec.quantization import spatial_order
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.association import summed
 from gmmtorch.sharing.messages.envelope import check_codec, within

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.files import joined_tensors, pack_tensors, split_tensors, unpack_tensors
-from gmmtorch.sharing.messages.envelope import MAX_BYTES
+from gmmtorch.sharing.messages.envelope import check_datagram
 from gmmtorch.sharing.replica.record_keys import RECORD_KINDS, WORLD, Intervals, keys_in, keys_of_author
 from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.sharing.store_file import explained, open_file, transaction
@@ -154,7 +154,7 @@ class Store:
         """
         rows, kept = [], self._kept
         for datagram in datagrams:
-            _check_datagram(datagram)
+            check_datagram(datagram, least=1)
             if datagram[0] & 15 in RECORD_KINDS and not kept.covers(names := keys_in(datagram)):
                 kept |= names
                 rows.append((datagram,))
@@ -288,12 +288,6 @@ class Store:
             _log.warning("%s is written again.", self.path)
         self._is_failing = False
         return True
-
-
-def _check_datagram(datagram: bytes) -> None:
-    if not isinstance(datagram, bytes) or not 0 < len(datagram) <= MAX_BYTES:
-        what = f"{len(datagram)} bytes" if isinstance(datagram, bytes) else type(datagram).__name__
-        raise InvalidArgumentError(f"A datagram is {what}; it must be bytes, from 1 to {MAX_BYTES}.")
 
 
 def _digest(data: bytes) -> bytes:

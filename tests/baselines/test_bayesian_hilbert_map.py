@@ -1,4 +1,4 @@
-"""Bayesian Hilbert maps: the map contract, the posterior by quadrature, the evidence bound, and intel."""
+"""Bayesian Hilbert maps: the map contract, the posterior by quadrature, and the evidence bound."""
 
 from __future__ import annotations
 
@@ -25,9 +25,7 @@ from gmmtorch.baselines.hilbert.logistic_regression import (
     variational_step,
 )
 from gmmtorch.baselines.samples import beam_samples
-from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
-from gmmtorch.evaluation import metrics, queries
 from gmmtorch.scan import Scan
 
 
@@ -251,26 +249,6 @@ def test_full_covariance_rejects_too_many_hinges(monkeypatch):
         full_map().insert(wall_scan(2))
 
 
-@pytest.mark.parametrize(
-    "option",
-    [
-        {"gamma": 0},
-        {"spacing": -1},
-        {"covariance": "round"},
-        {"prior_variance": math.nan},
-        {"n_iter": 0},
-        {"free_spacing": 0},
-        {"gap": -1},
-        {"thin": 0},
-        {"random_state": -1},
-    ],
-    ids=lambda o: next(iter(o)),
-)
-def test_bayesian_hilbert_map_rejects_invalid_options(option):
-    with pytest.raises(InvalidArgumentError, match=next(iter(option))):
-        BayesianHilbertMap(**option)
-
-
 def test_bayesian_hilbert_map_rejects_hinges_with_gaps():
     with pytest.raises(InvalidArgumentError, match="gaps"):
         BayesianHilbertMap(100.0, spacing=1.0).insert(wall_scan(2))
@@ -281,19 +259,3 @@ def test_damaged_files_of_a_full_covariance_are_refused(tmp_path):
     made.insert(open_scan(2))
     damage = {"means": [lambda v: v * math.inf], "factor": [lambda v: -v - 1]}
     check_damaged_files_are_refused(made, tmp_path, damage, [])
-
-
-@pytest.mark.real_data
-@pytest.mark.slow
-def test_bayesian_hilbert_map_reaches_the_published_auc_on_intel(real_data):
-    """The published AUC at 0.1 m is 0.950."""
-    scans = list(load("carmen", path=real_data / "laser2d" / "intel.log.gz", stride=2))
-    train, test = queries.split_indices(len(scans), 10)
-    tested = queries.hit_and_free(
-        *queries.test_beams([scans[i] for i in test], 4000, 0), free="uniform", resolution=0.1, seed=0
-    )
-    made = BayesianHilbertMap()
-    for i in train:
-        made.insert(scans[i])
-    theta = made.occupancy(tested.points)
-    assert metrics.roc(theta[tested.of(1)], theta[tested.of(0)]).auc > 0.95

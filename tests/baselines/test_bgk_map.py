@@ -1,9 +1,8 @@
-"""BGK inference on a grid and from points: the map contract, a double loop, and the authors' data."""
+"""BGK inference on a grid and from points: the map contract, and a double loop."""
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import ClassVar
 
 import pytest
@@ -13,12 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from occupancy.protocol_contract import RESOLUTION, lattice, wall_scan
 
-from gmmtorch import datasets
 from gmmtorch.baselines.bgk_map import BGKMap, kernel_offsets, sparse_kernel
 from gmmtorch.baselines.bgk_points_map import BGKPointsMap
 from gmmtorch.baselines.samples import thinned_samples
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
-from gmmtorch.evaluation import metrics, queries
 from gmmtorch.files import read_tensors
 from gmmtorch.scan import Scan
 
@@ -168,21 +165,6 @@ def test_bgk_points_map_takes_about_16_bytes_per_point():
 # -- bad input ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", [BGKMap, BGKPointsMap])
-@pytest.mark.parametrize(
-    "option", ["length", "prior", "scale", "free_resolution", "ds_resolution", "max_range"]
-)
-@pytest.mark.parametrize("value", [0, -1.0, math.nan, math.inf, "much"])
-def test_bgk_maps_reject_invalid_options(kind, option, value):
-    with pytest.raises(InvalidArgumentError, match=option):
-        kind(0.1, **{option: value})
-
-
-def test_bgk_points_map_rejects_a_budget_of_zero_points():
-    with pytest.raises(InvalidArgumentError, match="max_points"):
-        BGKPointsMap(0.1, max_points=0)
-
-
 def test_bgk_map_rejects_options_that_exceed_memory_or_range():
     scan = wall_scan(3)
     with pytest.raises(MemoryLimitError, match="length"):
@@ -195,25 +177,3 @@ def test_bgk_map_rejects_options_that_exceed_memory_or_range():
         BGKMap(0.001, length=0.002, free_resolution=1e5).insert(
             Scan(torch.tensor([[1e6, 0, 0]]).double(), torch.zeros(3).double())
         )
-
-
-# -- the authors' data --------------------------------------------------------------------------------
-
-
-@pytest.mark.real_data
-@pytest.mark.parametrize("world", ["sim_structured", "sim_unstructured"])
-def test_bgk_map_is_more_accurate_than_a_grid_on_its_authors_data(real_data: Path, world):
-    """Doherty et al. 2017, Figure 4: it predicts between the beams of sparse scans."""
-    from gmmtorch.baselines.occupancy_grid import OccupancyGrid
-
-    folder = real_data / "la3dm" / world
-    scans = list(datasets.load("pcd_viewpoint", folder, max_range=8.0, no_return_range=8.0))
-    train, test = queries.split_indices(len(scans), 4)
-    tested = queries.hit_and_free(*queries.test_beams([scans[i] for i in test], 4000, 0), "uniform", 0.1, 0)
-    auc = {}
-    for made in (BGKMap(0.1), OccupancyGrid(0.1)):
-        for i in train:
-            made.insert(scans[i])
-        theta = torch.as_tensor(made.occupancy(tested.points))
-        auc[type(made)] = metrics.roc(theta[tested.of(1)], theta[tested.of(0)]).auc
-    assert auc[BGKMap] > auc[OccupancyGrid] + 0.02

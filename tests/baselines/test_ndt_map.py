@@ -16,7 +16,7 @@ from occupancy.protocol_contract import RESOLUTION, lattice, wall_scan
 from scipy.optimize import minimize_scalar
 
 from gmmtorch.baselines.ndt_map import NDTMap, closest_on_line, combine_moments
-from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
+from gmmtorch.errors import MemoryLimitError
 from gmmtorch.files import read_tensors
 from gmmtorch.linalg import unpack_symmetric
 from gmmtorch.scan import Scan
@@ -175,30 +175,6 @@ def test_occupancy_decreases_with_the_mahalanobis_distance():
 
 
 # -- bad input -------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("option", "value"),
-    [
-        *[
-            (name, value)
-            for name in ("spread", "evidence", "max_log_odds")
-            for value in (0, -1.0, math.nan, "x")
-        ],
-        *[("gate", value) for value in (-0.1, 1.0, math.nan)],
-        *[
-            (name, value)
-            for name in ("sensor_noise", "min_deviation", "max_range")
-            for value in (0, math.inf)
-        ],
-        ("evidence", 0.5),
-        ("max_points", 2),
-        ("max_log_odds", math.inf),
-    ],
-)
-def test_ndt_map_rejects_invalid_options(option, value):
-    with pytest.raises(InvalidArgumentError, match=option):
-        NDTMap(0.1, **{option: value})
 
 
 def test_ndt_map_rejects_scans_that_exceed_memory():

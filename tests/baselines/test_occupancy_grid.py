@@ -11,7 +11,6 @@ from baselines.tensor_file_contract import TensorFileContract
 from occupancy.protocol_contract import RESOLUTION, lattice, open_scan, wall_scan
 
 from gmmtorch.baselines.occupancy_grid import LogOdds, OccupancyGrid
-from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import VoxelGrid
 
@@ -73,24 +72,3 @@ class TestOccupancyGridByLogOdds(GridContract):
         hits, misses = counts.evidence().at_points(lattice(2))
         odds = (0.9 / 0.1) ** hits * (0.4 / 0.6) ** misses
         torch.testing.assert_close(self.ask(made, lattice(2)), odds / (1 + odds), rtol=1e-9, atol=1e-15)
-
-
-# -- invalid input ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("resolution", [0, -0.1, math.nan, math.inf])
-def test_occupancy_grid_rejects_an_invalid_resolution(resolution):
-    with pytest.raises(InvalidArgumentError, match="resolution"):
-        OccupancyGrid(resolution)
-
-
-@pytest.mark.parametrize("prior", [-1.0, math.nan, math.inf])
-def test_occupancy_grid_rejects_an_invalid_prior(prior):
-    with pytest.raises(InvalidArgumentError, match="prior"):
-        OccupancyGrid(0.1, prior=prior)
-
-
-@pytest.mark.parametrize("rule", [{"hit": math.nan}, {"miss": math.inf}])
-def test_log_odds_rejects_values_that_are_not_finite(rule):
-    with pytest.raises(InvalidArgumentError, match=next(iter(rule))):
-        OccupancyGrid(0.1, log_odds=LogOdds(**rule))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gmmtorch.baselines.octomap_map import OctoMapMap
-from gmmtorch.baselines.octree_files import read_octree
+from gmmtorch.baselines.octree_files import parsed_octree
 from gmmtorch.errors import DataError, MissingDataError
 from gmmtorch.scan import Scan
 
@@ -77,11 +77,11 @@ def test_a_tree_that_is_cut_off_or_too_long_is_refused(tmp_path, suffix):
     for length in [*range(0, len(whole), 7), len(whole) - 1]:
         path.write_bytes(whole[:length])
         with pytest.raises(DataError, match=r"a\.[ob]t"):
-            read_octree(path)
+            parsed_octree(path.read_bytes(), path)
     for more in (b"\0", bytes(10)):
         path.write_bytes(whole + more)
         with pytest.raises(DataError, match=r"a\.[ob]t"):
-            read_octree(path)
+            parsed_octree(path.read_bytes(), path)
 
 
 DEEP = struct.pack("<fB", 0.0, 1)
@@ -116,8 +116,7 @@ def test_other_and_hostile_files_are_refused(tmp_path, content, words):
 
 def test_the_deepest_tree_is_read(tmp_path):
     leaf = struct.pack("<fB", 2.0, 0)
-    (tmp_path / "a.ot").write_bytes(header(size=17) + DEEP * 16 + leaf)
-    assert read_octree(tmp_path / "a.ot")[0].size() == 17
+    assert parsed_octree(header(size=17) + DEEP * 16 + leaf, "a.ot")[0].size() == 17
 
 
 def test_a_missing_file_is_refused(tmp_path):

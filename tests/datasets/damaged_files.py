@@ -20,8 +20,8 @@ from pathlib import Path
 
 import numpy as np
 import scan_files
+import test_octomap_log
 import test_point_chunks
-import test_scan_graph
 import torch
 from PIL import Image
 
@@ -48,8 +48,8 @@ def octomap(folder: Path) -> None:
 
 
 def octomap_graph(folder: Path) -> None:
-    pose = test_scan_graph.MOVED
-    (folder / "a.graph").write_bytes(test_scan_graph.graph([(pose, POINTS)] * 3, n_edges=2))
+    pose = test_octomap_log.MOVED
+    (folder / "a.graph").write_bytes(test_octomap_log.graph([(pose, POINTS)] * 3, n_edges=2))
 
 
 def frames(folder: Path) -> None:

@@ -158,27 +158,6 @@ def test_a_bag_compressed_as_a_whole_is_unpacked_to_a_limit(tmp_path, monkeypatc
         load("rosbag", folder)
 
 
-def test_clouds_with_rings_of_nan_keep_the_other_rings(tmp_path):
-    """An organized cloud has a row for each ring; rings without return are NaN."""
-    rings = np.zeros((4, 6), np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")]))
-    for row, axis in enumerate("xyz"):
-        rings[axis] = np.arange(1 + row, 25 + row, dtype=np.float32).reshape(4, 6)
-    for axis in "xyz":
-        rings[axis][1::2] = np.nan
-    with BagWriter(tmp_path / "a.mcap") as bag:
-        drive(bag)
-        bag.cloud_table("/points", 0.0, "lidar", rings)
-    dataset = load("rosbag", tmp_path / "a.mcap")
-    kept = np.stack([np.ravel(rings[axis][::2]) for axis in "xyz"], 1)
-    np.testing.assert_allclose(dataset[0].points, np.add(kept, [0, 0, 0.5]))
-    assert dataset.skipped == {}
-
-
-def test_a_topic_that_the_bag_does_not_have_lists_its_topics(tmp_path):
-    with pytest.raises(InvalidArgumentError, match=r"/velodyne.*/points .*3 messages"):
-        load("rosbag", clouds(tmp_path / "a.mcap"), topic="/velodyne")
-
-
 def test_texts_of_a_bag_are_neither_unpickled_nor_run(tmp_path, monkeypatch):
     import pickle
 

@@ -25,6 +25,7 @@ def test_depth_frames_back_project_and_transform_pixels(tmp_path):
     expected = torch.tensor([[-0.01, -0.005, 1.0], [0.0, 0.0, 2.0], [0.04, 0.02, 4.0]], dtype=torch.float64)
     torch.testing.assert_close(first.points, expected)
     assert second.origin.tolist() == [1.0, 2.0, 3.0]
+    assert torch.equal(dataset.pose(1), torch.from_numpy(pose))
     moved = expected @ torch.from_numpy(TURN_LEFT).T + second.origin
     torch.testing.assert_close(second.points, moved)
 

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets import load
-from gmmtorch.datasets.meshes import sample_surface
 from gmmtorch.datasets.point_files.mesh_files import read_triangles
+from gmmtorch.datasets.synthetic import sample_surface
 from gmmtorch.errors import DataError, InvalidArgumentError
 
 # A tetrahedron with faces of different areas.

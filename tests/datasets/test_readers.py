@@ -65,10 +65,28 @@ def test_carmen_reads_a_scan_without_returns(tmp_path):
     assert load("carmen", path, no_return_range=0)[0].n_beams == 0
 
 
-def test_carmen_stride(tmp_path):
+def stamped(stamp: object, x: float = 0.0) -> str:
+    return flaser([1.0, 2.0], (x, 2.0, math.pi / 2)).replace(" 0.0 host", f" {stamp} host")
+
+
+def test_carmen_poses_and_times_follow_the_stride(tmp_path):
     path = tmp_path / "a.log"
-    path.write_text("".join(flaser([1.0], (float(i), 0.0, 0.0)) for i in range(7)))
-    assert [float(scan.origin[0]) for scan in load("carmen", path, stride=3)] == [0.0, 3.0, 6.0]
+    path.write_text("".join(stamped(10.0 + i, float(i)) for i in range(5)))
+    dataset = load("carmen", path, stride=2)
+    assert dataset.times.tolist() == [10.0, 12.0, 14.0]
+    pose = dataset.pose(-1)
+    torch.testing.assert_close(pose[:2, :2], torch.tensor([[0.0, -1.0], [1.0, 0.0]], dtype=torch.float64))
+    assert pose[:2, 2].tolist() == dataset[2].origin.tolist() == [4.0, 2.0]
+    assert dataset.skipped == {}
+    with pytest.raises(IndexError):
+        dataset.pose(3)
+
+
+@pytest.mark.parametrize("stamps", [(1.0, 1.0), (2.0, 1.0), (1.0, "nan"), (1.0, "host")])
+def test_carmen_stamps_that_do_not_increase_are_not_used(tmp_path, stamps):
+    path = tmp_path / "a.log"
+    path.write_text("".join(stamped(stamp) for stamp in stamps))
+    assert load("carmen", path).times is None
 
 
 @pytest.mark.parametrize(
@@ -106,18 +124,11 @@ def test_scan_folder_transforms_points_by_the_pose(tmp_path, write):
     suffix = "ply" if write is ply else "pcd"
     clouds = {f"{i:06d}.{suffix}": write([(1.0, 0.0, 0.0), (0.0, 2.0, float(i))]) for i in range(2)}
     poses = kitti(np.eye(3), [0.0, 0.0, 0.0]) + kitti(TURN_LEFT, [5.0, 0.0, 1.0])
-    first, second = load("scan_folder", scan_folder(tmp_path, clouds, poses))
+    first, second = dataset = load("scan_folder", scan_folder(tmp_path, clouds, poses))
+    assert dataset.pose(1).tolist() == [[0, -1, 0, 5], [1, 0, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1]]
     assert first.points.tolist() == [[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]]
     assert second.origin.tolist() == [5.0, 0.0, 1.0]
     assert second.points.tolist() == [[5.0, 1.0, 1.0], [3.0, 0.0, 2.0]]
-
-
-@needs_open3d
-def test_scan_folder_orders_file_names_naturally(tmp_path):
-    clouds = {f"scan_{i}.pcd": pcd([(float(i), 1.0, 0.0)]) for i in (1, 2, 10)}
-    poses = "".join(kitti(np.eye(3), [0.0, 0.0, float(i)]) for i in range(3))
-    scans = load("scan_folder", scan_folder(tmp_path, clouds, poses))
-    assert [float(scan.points[0, 0]) for scan in scans] == [1.0, 2.0, 10.0]
 
 
 @needs_open3d
@@ -147,7 +158,7 @@ IDENTITY = kitti(np.eye(3), [0.0, 0.0, 0.0])
     ("poses", "message"),
     [
         (IDENTITY * 2, r"2 rows, but there are 1 scans.*one pose for each"),
-        ("", "0 rows"),
+        ("", "contains no row"),
         ("1 0 0 0 0 1 0 0\n", "8 numbers per row; a KITTI pose has 12"),
         ("one two three\n", "not a table of numbers"),
         (kitti(np.eye(3), [math.nan, 0.0, 0.0]), "row 1 is not a rigid pose"),
@@ -155,7 +166,6 @@ IDENTITY = kitti(np.eye(3), [0.0, 0.0, 0.0])
         (kitti(np.diag([1.0, 1.0, -1.0]), [0.0, 0.0, 0.0]), "row 1 is not a rigid pose"),
     ],
 )
-@pytest.mark.filterwarnings("ignore:loadtxt")
 def test_scan_folder_rejects_invalid_poses(tmp_path, poses, message):
     with pytest.raises(DataError, match=rf"poses\.txt.*{message}"):
         load("scan_folder", scan_folder(tmp_path, {"0.pcd": pcd([])}, poses))
@@ -202,6 +212,7 @@ def test_pcd_viewpoint_reads_origins_order_and_no_return(tmp_path):
         (tmp_path / f"scan_{i}.pcd").write_bytes(content)
     scans = load("pcd_viewpoint", tmp_path, max_range=8.0, no_return_range=4.0)
     assert [scan.origin.tolist() for scan in scans] == [[1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [10.0, 0.0, 0.0]]
+    assert scans.pose(2)[:3, 3].tolist() == [10.0, 0.0, 0.0]
     assert scans[0].points.tolist() == [[1.0, 0.0, 1.0]]
     assert float((scans[0].no_return - scans[0].origin).norm()) == pytest.approx(4.0)
     assert load("pcd_viewpoint", tmp_path)[0].points.shape == (2, 3)

@@ -102,17 +102,6 @@ def test_a_bag_of_intel_gives_its_map_to_the_bit(real_data, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_bag_of_hall_gives_its_map_to_the_bit(real_data, tmp_path):
-    """Points are float32 in both files; a trajectory file has the poses, whose rows are not quite rigid."""
-    folder = load("scan_folder", real_data / "hall")
-    with BagWriter(tmp_path / "a.mcap") as bag:
-        for i, cloud in enumerate(sorted((real_data / "hall" / "scans").glob("*.pcd"))):
-            bag.cloud("/points", i / 10, "lidar", read_cloud(cloud).numpy())
-    poses = real_data / "hall" / "poses.txt"
-    assert_same_map(load("rosbag", tmp_path / "a.mcap", poses=poses, stride=3), folder[::3], 15, tmp_path)
-
-
-@pytest.mark.slow
 def test_a_bag_of_kinect_gives_its_map_to_the_bit(real_data, tmp_path):
     """Images of whole millimetres, and the poses of the frames in a trajectory file."""
     frames = load("depth_frames", real_data / "kinect", stride=10, pixel_stride=4)

@@ -191,21 +191,22 @@ def test_times_of_points_are_understood_in_every_unit(values, expected):
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize("suffix", ["mcap", "bag"])
 def test_clouds_have_any_layout_of_fields(tmp_path, order, suffix):
-    """Doubles z, y, x with padding, rows of NaN as some lidars fill missing rings, and points at zero."""
+    """Doubles z, y, x with padding; NaN, also in whole rows, as lidars fill missing rings; points at zero."""
     layout = {
         "names": ["ring", "z", "x", "y"],
         "formats": ["u2", f"{order}f8", f"{order}f8", f"{order}f4"],
         "offsets": [1, 8, 16, 27],
         "itemsize": 40,
     }
-    table = np.zeros((2, 3), np.dtype(layout))
-    table["x"], table["y"], table["z"] = [[1, np.nan, 0], [2, 3, np.inf]], 0.5, -1.5
+    table = np.zeros((3, 3), np.dtype(layout))
+    table["x"], table["y"], table["z"] = [[1, np.nan, 0], [np.nan] * 3, [2, 3, np.inf]], 0.5, -1.5
     table["y"][0, 2] = table["z"][0, 2] = 0
     with BagWriter(tmp_path / f"a.{suffix}") as bag:
         drive(bag)
         bag.cloud_table("/points", 0.0, "lidar", table)
-    points = load("rosbag", tmp_path / f"a.{suffix}")[0].points
-    assert points.tolist() == [[1, 0.5, -1], [2, 0.5, -1], [3, 0.5, -1]]
+    dataset = load("rosbag", tmp_path / f"a.{suffix}")
+    assert dataset[0].points.tolist() == [[1, 0.5, -1], [2, 0.5, -1], [3, 0.5, -1]]
+    assert dataset.skipped == {}
 
 
 def test_clouds_of_one_height_are_2d_scans(tmp_path):

@@ -1,14 +1,15 @@
-"""Simulated data sets: reproducibility, sizes, noise, and beams without return."""
+"""Simulated data sets, in buildings and meshes: reproducibility, sizes, noise, and beams without return."""
 
 from __future__ import annotations
 
 import functools
+from pathlib import Path
 
 import pytest
 import torch
 
 from gmmtorch.datasets import Ranges, load
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
 from gmmtorch.scan import Scan
 
 SETS = [
@@ -43,7 +44,8 @@ def length(ends: torch.Tensor, scan: Scan) -> torch.Tensor:
 )
 def test_synthetic_data_sets_have_the_documented_size(name, n_scans, n_beams):
     dataset = load(name)
-    assert len(dataset) == n_scans
+    assert (len(dataset), dataset.times) == (n_scans, None)
+    assert torch.equal(dataset.pose(1)[:-1, -1], dataset[1].origin)
     scans = dataset[:: n_scans // 8]
     assert all(scan.n_beams == n_beams for scan in scans)
     assert all(scan.points.dtype == torch.float64 for scan in scans)
@@ -67,15 +69,6 @@ def test_another_seed_gives_another_building_on_the_same_path(name, options):
     other = load(name, n_scans=N_SCANS, seed=1, **options)[0]
     assert not same(scans_of(name, **options)[0], other)
     assert torch.equal(scans_of(name, **options)[0].origin, other.origin)
-
-
-def test_synthetic_stride_selects_every_nth_scan():
-    every, third = (
-        load("synthetic_building_2d", n_scans=7),
-        load("synthetic_building_2d", n_scans=7, stride=3),
-    )
-    assert len(third) == 3
-    assert same(every[6], third[2])
 
 
 @each_set
@@ -127,7 +120,7 @@ def test_synthetic_range_noise_is_one_centimetre(name, options):
     [
         ({"seed": -1}, "seed=-1"),
         ({"n_scans": 0}, "n_scans=0"),
-        ({"sensor": "sonar"}, "sensor='sonar'.*lidar or depth_camera"),
+        ({"sensor": "sonar"}, "sensor='sonar'.*lidar, depth_camera"),
         ({"stride": 0}, "stride=0"),
         ({"max_range": -1.0}, r"max_range=-1\.0"),
     ],
@@ -135,3 +128,50 @@ def test_synthetic_range_noise_is_one_centimetre(name, options):
 def test_synthetic_building_rejects_invalid_options(options, message):
     with pytest.raises(InvalidArgumentError, match=message):
         load("synthetic_building", **options)
+
+
+# -- in a mesh -------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def hall(tmp_path_factory) -> Path:
+    """A box of 20 × 6 × 3 m as PLY."""
+    import open3d
+
+    path = tmp_path_factory.mktemp("mesh") / "hall.ply"
+    assert open3d.io.write_triangle_mesh(str(path), open3d.geometry.TriangleMesh.create_box(20, 6, 3))
+    return path
+
+
+@pytest.mark.parametrize("sensor", ["lidar", "depth_camera"])
+def test_mesh_scan_points_lie_on_the_surfaces_within_noise(hall, sensor):
+    dataset = load("mesh_scans", hall, n_scans=4, sensor=sensor)
+    assert len(dataset) == 4
+    size = torch.tensor([20.0, 6.0, 3.0], dtype=torch.float64)
+    for scan in dataset:
+        points = scan.points.double()
+        assert len(points) > 1000
+        distance = torch.minimum(points.abs(), (points - size).abs()).amin(1)
+        assert float(distance.max()) < 0.06  # noise of 1 cm along the beam
+        assert bool(((scan.origin > 0) & (scan.origin < size)).all())
+
+
+def test_mesh_scans_reject_invalid_input(hall, tmp_path):
+    with pytest.raises(MissingDataError, match=r"nowhere\.ply"):
+        load("mesh_scans", tmp_path / "nowhere.ply")
+    for option, value in (("sensor", "radar"), ("n_scans", 0), ("seed", 2**60)):
+        with pytest.raises(InvalidArgumentError, match=f"{option}={value!r}"):
+            load("mesh_scans", hall, **{option: value})
+    bad = tmp_path / "bad.ply"
+    bad.write_text("not a mesh")
+    with pytest.raises(DataError, match=r"bad\.ply"):
+        load("mesh_scans", bad, n_scans=2)[0]
+
+
+@pytest.mark.real_data
+def test_mesh_scans_of_a_real_mine_cover_a_long_path(real_data):
+    dataset = load("mesh_scans", real_data / "meshes" / "edgar_mine.ply", n_scans=50)
+    scan = dataset[25]
+    assert len(scan.points) > 2000
+    travelled = (dataset.poses[-1, :3, 3] - dataset.poses[0, :3, 3]).norm()
+    assert float(travelled) > 40

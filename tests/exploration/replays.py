@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import shutil
 from collections import Counter
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +13,9 @@ import torch
 
 from gmmtorch.datasets import load
 from gmmtorch.datasets.base import DatasetShard, shard_indices
-from gmmtorch.exploration.mission.driver import Drivable, Run, WallClock, drive, never, settle
+from gmmtorch.exploration.mission.driver import Drivable, Run, WallClock, drive, settle
 from gmmtorch.exploration.mission.replay import ReplayMission
-from gmmtorch.mapping.codec.component_batch import quantized
+from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
@@ -68,19 +68,13 @@ class Together:
         return tuple(mission.content() for mission in self._missions)
 
 
-def run(
-    *missions: Drivable,
-    quiet: float = 0.0,
-    clock: WallClock | None = None,
-    stop: Callable[[], bool] = never,
-    on_step: Callable[[], object] = lambda: None,
-) -> Run:
+def run(*missions: Drivable, quiet: float = 0.0, clock: WallClock | None = None) -> Run:
     """Drives missions together, by a fake clock unless one is given, then lets them settle."""
     fake = FakeTime()
     clock = WallClock(clock=fake, sleep=fake.sleep) if clock is None else clock
     together = Together(*missions)
-    done = drive(together, clock, stop=stop, on_step=on_step)
-    settle(together, clock, quiet, on_step=on_step)
+    done = drive(together, clock)
+    settle(together, clock, quiet)
     return done
 
 

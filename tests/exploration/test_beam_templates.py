@@ -64,13 +64,8 @@ def test_solid_angles_tile_the_image(n_beams):
     torch.testing.assert_close(directions.norm(dim=1), torch.ones(len(directions)).double())
     assert bool((directions[:, 1].abs() <= u * directions[:, 0]).all())
     assert bool((directions[:, 2].abs() <= v * directions[:, 0]).all())
-    torch.testing.assert_close(
-        directions[:, 1:].sum(0), torch.zeros(2).double(), rtol=0, atol=1e-9
-    )  # as many to either side
-    if n_beams == 1000:
-        approximate = torch.cos(torch.atan2(directions[:, 2], directions[:, 0]))  # not all alike, yet alike
-        assert float(solid_angles.max() / solid_angles.min()) < 1.7
-        assert bool((approximate > 0).all())
+    assert float(directions[:, 1:].sum(0).abs().max()) < 1e-9  # as many to either side
+    assert float(solid_angles.max() / solid_angles.min()) < 1.7
 
 
 def test_templates_are_rotations_of_one_camera():

@@ -8,15 +8,15 @@ from dataclasses import replace
 
 import pytest
 import torch
-from exploration.flying_robots import small_room
-from exploration.furnished_room import SMALL
+from exploration.rooms import SMALL, small_room
 from exploration.voxel_worlds import PRIMITIVES, Explorer, hollow
 from torch import Tensor
 
 from gmmtorch.exploration.mission.mission import Mission
 from gmmtorch.exploration.mission.team_setup import assemble
 from gmmtorch.exploration.planning.coordination import PeerTrajectories
-from gmmtorch.exploration.planning.planner_interface import Plan, Waiting, is_boxed_in
+from gmmtorch.exploration.planning.planner_interface import Plan
+from gmmtorch.exploration.planning.recovery import Waiting, is_boxed_in
 from gmmtorch.exploration.robot.agent import Agent
 from gmmtorch.exploration.robot.robot_state import StoppingRule
 from gmmtorch.exploration.world.world import World
@@ -111,18 +111,3 @@ def test_a_robot_flies_after_it_was_boxed_in_longer_than_the_window(world: World
 def advance(mission: Mission, until: float = math.inf) -> None:
     while not mission.is_over and mission.elapsed < until:
         mission.tick(mission.elapsed)
-
-
-def test_a_robot_that_stands_in_open_space_rests(world: World) -> None:
-    mission = assemble(world, OPTIONS)
-    agent = mission.agents[0]
-
-    def stand(
-        now: float, final: Collection[int], peers: PeerTrajectories, since: float | None = None
-    ) -> Plan:
-        path = agent.robot.state[None].repeat(PRIMITIVES.dynamics.n_steps, 1)
-        return Plan(path, path[-1:], path[-1:, :4], 0.0, "explore")
-
-    agent.propose = stand  # type: ignore[method-assign]
-    advance(mission)
-    assert agent.robot.stopping.rests

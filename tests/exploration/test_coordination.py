@@ -1,17 +1,26 @@
-"""Coordination on a toy: robots choose sets to cover, and every choice can be enumerated."""
+"""Coordination on a toy whose choices can be enumerated; and paths of peers, at finely spaced times."""
 
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.planning.coordination import COORDINATIONS, Coordination
+from gmmtorch.exploration.planning.coordination import (
+    COORDINATIONS,
+    Coordination,
+    PeerTrajectories,
+    clear_of,
+    predicted_path,
+)
+from gmmtorch.sharing.messages.message_registry import PlanMessage
 
 Choices = list[list[frozenset[int]]]
 """Of each robot, the sets that it may cover."""
@@ -122,3 +131,134 @@ def test_bad_input_is_named():
         Coordination("chaos")
     with pytest.raises(InvalidArgumentError, match="n_rounds=0"):
         Coordination("greedy", 0)
+
+
+# -- paths of peers ---------------------------------------------------------------------------------
+
+FINE = 20
+
+
+def walk(n: int, generator: torch.Generator) -> Tensor:
+    """A path (n, 3) whose steps change little by little."""
+    push = torch.randn(n, 3, generator=generator, dtype=torch.float64) * 0.05
+    return (push.cumsum(0)).cumsum(0) + torch.randn(3, generator=generator, dtype=torch.float64)
+
+
+def at(path: Tensor, time: Tensor) -> Tensor:
+    """Where paths (..., L, 3), positions at times 1 … L, are at times (T,): (..., T, 3)."""
+    time = (time - 1).clamp(0, path.shape[-2] - 1)
+    before = time.floor().long().clamp_max(max(path.shape[-2] - 2, 0))
+    after = (before + 1).clamp_max(path.shape[-2] - 1)
+    return torch.lerp(path[..., before, :], path[..., after, :], (time - before)[:, None])
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    n_path=st.integers(1, 12),
+    lengths=st.lists(st.integers(1, 15), min_size=1, max_size=3),
+    shift=st.floats(-0.5, 0.5),
+)
+def test_clear_paths_tolerate_early_and_late_peers(seed, n_path, lengths, shift):
+    generator = torch.Generator().manual_seed(seed)
+    others = [walk(n, generator) for n in lengths]
+    paths = torch.stack([walk(n_path, generator) for _ in range(20)])
+    clear = clear_of(paths, PeerTrajectories.of(others, 0.7))
+    time = torch.arange(FINE, 16 * FINE, dtype=torch.float64) / FINE
+    for other in others:
+        apart = (at(paths, time) - at(other, time + shift)).norm(dim=-1).amin(1)
+        assert bool((apart[clear] >= 0.7 - 1e-9).all())
+
+
+def test_paths_are_clear_far_from_peers_and_not_on_their_paths():
+    generator = torch.Generator().manual_seed(0)
+    other = walk(10, generator)
+    peers = PeerTrajectories.of([other])
+    paths = torch.stack([other + 30, other, other.flip(0)])
+    assert clear_of(paths, peers).tolist() == [True, False, False]
+    assert clear_of(paths, PeerTrajectories.of([])).tolist() == [True, True, True]
+    assert len(PeerTrajectories.of([])) == 0
+
+
+def test_resting_place_of_a_peer_stays_occupied():
+    waiting = torch.zeros(3, 3, dtype=torch.float64)
+    coming = torch.linspace(6, 0.2, 15, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0, 0])
+    assert not bool(
+        clear_of(waiting[None], PeerTrajectories.of([coming]))
+    )  # it arrives after the path has ended
+    assert not bool(clear_of(coming[None], PeerTrajectories.of([waiting])))  # it arrives where one rests
+    aside = coming + torch.tensor([0, 1.0, 0])
+    assert bool(clear_of(aside[None], PeerTrajectories.of([waiting])))
+
+
+def test_robot_too_close_may_stay_or_move_away():
+    other = torch.zeros(1, 3, dtype=torch.float64)
+    start = torch.tensor([0.5, 0, 0], dtype=torch.float64)
+    step = torch.arange(1, 6, dtype=torch.float64)[:, None] * torch.tensor([0.1, 0, 0])
+    paths = torch.stack([start.expand(5, 3), start + step, start - step, start + step.roll(1, 1)])
+    peers = PeerTrajectories.of([other])
+    assert clear_of(paths, peers, start.expand(4, 3)).tolist() == [True, True, False, True]
+    assert clear_of(paths, peers).tolist() == [False, False, False, False]
+
+
+def test_later_shifts_the_paths():
+    generator = torch.Generator().manual_seed(3)
+    other = walk(8, generator)
+    peers = PeerTrajectories.of([other, walk(5, generator)])
+    assert torch.equal(peers.later(3).paths[0], other[3:])
+    assert torch.equal(peers.later(50).paths[0], other[-1:])
+    assert peers.paths.shape == (2, 8, 3)
+    assert torch.equal(peers.paths[1, 4:], peers.paths[1, 4:5].expand(4, 3))
+
+
+@pytest.mark.parametrize("paths", [torch.zeros(2, 3), torch.zeros(2, 0, 3), torch.full((1, 1, 3), math.nan)])
+def test_peer_trajectories_reject_nonfinite_paths(paths):
+    with pytest.raises(InvalidArgumentError, match="paths"):
+        PeerTrajectories(paths)
+
+
+def test_peer_trajectories_reject_bad_separation():
+    with pytest.raises(InvalidArgumentError, match="separation="):
+        PeerTrajectories.of([], 0.0)
+
+
+# -- plans that were heard --------------------------------------------------------------------------------
+
+
+def plan(n: int, step: float) -> PlanMessage:
+    """A plan of n poses along x, one metre apart."""
+    path = torch.zeros(n, 4, dtype=torch.float64)
+    path[:, 0] = torch.arange(1, n + 1)
+    return PlanMessage(1, 0, 0.0, step, path, torch.zeros(0, 4))
+
+
+def test_a_predicted_path_is_the_rest_of_a_plan() -> None:
+    def xs(age: float, step: float = 0.2, of: float = 0.2) -> list[float]:
+        ahead = predicted_path(plan(6, of), age, step)
+        assert (ahead[:, 1:] == 0).all()
+        return ahead[:, 0].tolist()
+
+    assert xs(0.0) == [1, 2, 3, 4, 5, 6]
+    assert xs(0.4) == [3, 4, 5, 6]
+    assert xs(0.45) == [3, 4, 5, 6]  # 3.25 steps after its start
+    assert xs(0.55) == [4, 5, 6, 6]
+    assert xs(1.2) == xs(7.0) == xs(1e9) == [6]
+    assert xs(0.0, step=0.4) == [2, 4, 6]
+    assert xs(0.1, step=0.2, of=0.4) == [1, 1, 2, 2, 3, 3, 4, 4, 5, 5, 6, 6]
+
+
+@given(
+    n=st.integers(1, 40),
+    of=st.floats(0.01, 2.0),
+    step=st.floats(0.05, 1.0),
+    age=st.floats(0.0, 30.0),
+)
+def test_a_predicted_path_is_at_most_half_a_step_off(n: int, of: float, step: float, age: float) -> None:
+    ahead = predicted_path(plan(n, of), age, step)[:, 0]
+    times = age + step * torch.arange(1, len(ahead) + 1)
+    assert (times[-1] >= n * of - 1e-6) or len(ahead) == 1000
+    flown = times <= n * of  # from then on it is at rest
+    first = times < of
+    off = (ahead.double() * of - times).abs()
+    assert (off[flown & ~first] <= of / 2 + 1e-6).all()
+    assert (ahead[first] == 1).all()
+    assert (ahead[~flown & (times > (n + 0.5) * of)] == n).all()

@@ -48,7 +48,7 @@ def test_frontier_cells_are_free_cells_next_to_unknown_ones():
 def test_frontier_poses_are_reachable_and_see_the_target():
     here = half_known()
     start = torch.tensor([1.0, 2.0, 1.0], dtype=torch.float64)
-    found = find_frontiers(here, start, NONE, least=1, elevation=0.4)
+    found = find_frontiers(here, start, NONE, least=1)
     assert 1 <= len(found.sizes) <= 3  # one wall of unknown, in glances
     assert float(found.sizes.sum()) == float(frontier_cells(here).sum()) == 18 * 8
     for pose, target, metres in zip(found.poses, found.targets, found.metres, strict=True):
@@ -58,16 +58,16 @@ def test_frontier_poses_are_reachable_and_see_the_target():
         assert abs(math.atan2(way[1], way[0]) - float(pose[3])) < 1e-9
         assert abs(math.atan2(way[2], way[:2].norm())) < 0.4
         assert abs(float(metres) - float((place - start).norm())) < 0.8
-    assert len(find_frontiers(here, start, NONE, least=145, elevation=0.4).sizes) == 0
+    assert len(find_frontiers(here, start, NONE, least=145).sizes) == 0
 
 
 def test_exhausted_targets_are_not_frontiers():
     here = half_known()
     start = torch.tensor([1.0, 2.0, 1.0], dtype=torch.float64)
-    first = find_frontiers(here, start, NONE, least=20, elevation=0.4)
+    first = find_frontiers(here, start, NONE)
     given_up = first.targets
     for _ in range(8):
-        found = find_frontiers(here, start, given_up, least=20, elevation=0.4)
+        found = find_frontiers(here, start, given_up)
         if len(found.sizes) == 0:
             break
         assert float(torch.cdist(found.targets, given_up).min()) > 0.8
@@ -80,7 +80,7 @@ def test_known_space_has_no_frontiers():
     here = half_known()
     known = torch.ones_like(here.observed)
     here = LocalMap(here.low, RESOLUTION, here.occupancy, known, here.free, here.passable)
-    found = find_frontiers(here, torch.tensor([1.0, 2.0, 1.0], dtype=torch.float64), NONE, 20, 0.4)
+    found = find_frontiers(here, torch.tensor([1.0, 2.0, 1.0], dtype=torch.float64), NONE)
     assert [len(values) for values in found] == [0, 0, 0, 0]
 
 

@@ -11,7 +11,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.exploration.planning.geodesic import DistanceField, coarsened, geodesic
 from gmmtorch.exploration.robot.mapper import LocalMap
 
@@ -74,12 +73,12 @@ def test_coarsened_cells_are_passable_if_half_is():
 def test_coarsened_keeps_narrow_passages_and_thick_walls():
     passable = torch.zeros(12, 12, 12, dtype=torch.bool)
     passable[:, 5] = True  # wherever it lies, and however the coarse cells do
-    along = geodesic(passable, torch.tensor([[0, 5, 6]]), 0.2)
+    along = geodesic(passable, torch.tensor([[0, 5, 6]]), 0.2, torch.zeros(1))
     assert bool(torch.isfinite(along[:, 2]).all())
     for begin in range(4, 7):
         wall = torch.ones(12, 12, 12, dtype=torch.bool)
         wall[begin : begin + 3] = False
-        beyond = geodesic(wall, torch.tensor([[0, 5, 6]]), 0.2)
+        beyond = geodesic(wall, torch.tensor([[0, 5, 6]]), 0.2, torch.zeros(1))
         assert bool(torch.isinf(beyond[5]).all())
 
 
@@ -91,7 +90,7 @@ def test_geodesic_is_close_to_euclidean_in_open_space(seed):
     size = torch.tensor([4.0, 3.2, 2.0], dtype=torch.float64)
     goal, point = corner + torch.rand(2, 3, generator=generator, dtype=torch.float64) * size
     straight = float((goal - point).norm())
-    found = float(DistanceField.to(here, goal[None]).at(point))
+    found = float(DistanceField.to(here, goal[None]).way(point, 1)[0])
     assert straight - 0.4 < found < 1.13 * straight + 0.8  # to the goal's cell, by steps of 45°
 
 
@@ -100,14 +99,14 @@ def test_way_approaches_the_goal_cell_by_cell():
     passable[18:22, :30] = False
     field = DistanceField.to(local_map(passable), torch.tensor([[1.0, 1.0, 0.6]], dtype=torch.float64))
     point = torch.tensor([[7.0, 1.0, 0.6]], dtype=torch.float64)
-    before = float(field.at(point))
+    before = float(field.way(point, 1)[0])
     for _ in range(60):
         metres, ahead = field.way(point, 3)
         assert float(metres) <= before + 1e-6
         assert float((ahead - point).norm()) < 3.5 * math.sqrt(3) * 0.4
         if float(metres) < 0.7:
             break
-        assert float(field.at(ahead)) < float(metres) - 0.4
+        assert float(field.way(ahead, 1)[0]) < float(metres) - 0.4
         before, point = float(metres), ahead
     else:
         pytest.fail("never arrived")
@@ -124,15 +123,5 @@ def test_geodesic_without_a_way_is_infinite():
     assert torch.isinf(metres).tolist() == [True, True, False]
     torch.testing.assert_close(ahead[:2], points[:2])
     nowhere = DistanceField.to(here, torch.tensor([[50.0, 0.5, 0.5]], dtype=torch.float64))
-    assert bool(torch.isinf(nowhere.at(points)).all())
-    assert bool(torch.isinf(geodesic(passable, torch.zeros(0, 3).long(), 0.2)).all())
-
-
-def test_bad_input_is_named():
-    passable = torch.ones(4, 4, 4, dtype=torch.bool)
-    with pytest.raises(InvalidArgumentError, match="sources"):
-        geodesic(passable, torch.tensor([[4, 0, 0]]), 0.2)
-    with pytest.raises(InvalidArgumentError, match="passable"):
-        geodesic(passable[0], torch.tensor([[0, 0, 0]]), 0.2)
-    with pytest.raises(InvalidArgumentError, match="coarse"):
-        geodesic(passable, torch.tensor([[0, 0, 0]]), 0.2, coarse=0)
+    assert bool(torch.isinf(nowhere.way(points, 1)[0]).all())
+    assert bool(torch.isinf(geodesic(passable, torch.zeros(0, 3).long(), 0.2, torch.zeros(0))).all())

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gmmtorch.exploration.robot.grid_mapper import MOST_INTERVALS, GridMapper, _bounded
+from gmmtorch.exploration.robot.grid_mapper import MOST_INTERVALS, GridMapper
 from gmmtorch.exploration.robot.mapper import Memo
 from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule
 from gmmtorch.mapping.learning.rules import NoveltyRule
@@ -19,7 +18,6 @@ from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.sharing.messages.message_registry import PointsMessage, decode, encode_points
 from gmmtorch.sharing.messages.point_messages import POINTS_PER_DATAGRAM
 from gmmtorch.sharing.radio import ReceivedMessage
-from gmmtorch.sharing.replica.record_keys import Intervals
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 
 WIDTH = 24
@@ -158,19 +156,6 @@ def test_frames_of_two_robots_with_one_number_are_distinguished() -> None:
     torch.testing.assert_close(believed(one), dense_of(beams(*views)))
 
 
-def test_a_listener_has_the_evidence_of_all_novel_beams() -> None:
-    speaker, listener = mapper(robot=1), mapper()
-    views = [frame(seed) for seed in range(5)]
-    parts = []
-    for view in views:
-        sensed = speaker.sense(view)
-        datagrams = speaker.shared.datagrams()
-        assert listener.receive(heard(*datagrams)) == datagrams
-        parts.append((view.origin, view.ends[sensed.novel], view.is_hit[sensed.novel]))
-    torch.testing.assert_close(believed(listener), dense_of(parts))
-    assert float(believed(listener).sum()) < float(believed(speaker).sum())
-
-
 def test_repeated_parts_count_once() -> None:
     view = frame(0, n=3 * POINTS_PER_DATAGRAM)
     first, second, third = said(view)
@@ -191,21 +176,6 @@ def test_points_of_strangers_are_dropped_and_counted() -> None:
     assert one.receive(heard(*said(view, sender=30))) != []
 
 
-@settings(deadline=None, max_examples=20)
-@given(numbers=st.lists(st.integers(0, 60), max_size=60), most=st.integers(1, 8))
-def test_the_oldest_gaps_are_closed_beyond_the_limit(numbers: list[int], most: int) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("gmmtorch.exploration.robot.grid_mapper.MOST_INTERVALS", most)
-        kept = Intervals.of(np.array(numbers, np.int64))
-        bounded = _bounded(kept)
-    pairs = kept.pairs()
-    expected = set(numbers)
-    if len(pairs) > most:  # all up to the last gap that is one too many
-        expected |= set(range(pairs[0][0], pairs[len(pairs) - most][0]))
-    assert set(bounded.numbers().tolist()) == expected
-    assert len(bounded) <= most
-
-
 def test_memory_is_bounded_for_invented_frame_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gmmtorch.exploration.robot.grid_mapper.MOST_INTERVALS", 20)
     one, view = mapper(), frame(0, n=1)
@@ -215,22 +185,6 @@ def test_memory_is_bounded_for_invented_frame_numbers(monkeypatch: pytest.Monkey
     assert one.receive(heard(*said(view, number=7 * 59 - 1))) != []  # and one that is open
     assert one.shared.refused == {"repeated": 1}
     assert MOST_INTERVALS > 3 * 1600  # three parts of each frame of a mission lost
-
-
-def test_points_beyond_the_budget_are_sent_later() -> None:
-    free, bound = mapper(), mapper()
-    for one in (free, bound):
-        one.sense(frame(0))
-    due = free.shared.datagrams()
-    assert len(due) > 3
-    assert bound.shared.datagrams(budget=0) == bound.shared.datagrams(budget=len(due[0]) - 1) == []
-    got: list[bytes] = []
-    for budget in (len(due[0]), len(due[1]) + len(due[2]) + 5, 10**6):
-        sent = bound.shared.datagrams(budget=budget)
-        assert 0 < sum(map(len, sent)) <= budget
-        got += sent
-    assert got == due
-    assert bound.shared.datagrams() == []
 
 
 # -- the window -----------------------------------------------------------------------------------------

@@ -69,11 +69,6 @@ def test_the_first_beam_of_a_block_decides_for_the_block(
     assert found.tolist() == novel_by_a_loop(local, seen, width, short, side)
 
 
-def test_a_random_map_has_novel_and_known_beams() -> None:
-    found = novel_beams(random_window(0), frame(20, 16, 1, 0.1), 20, RULE, WITHIN)
-    assert 0.1 < float(found.double().mean()) < 0.9
-
-
 def test_a_frame_without_beams_has_no_novel_beams() -> None:
     empty = frame(8, 6, 0, 1.1)
     assert len(empty.pixel) == 0
@@ -126,27 +121,3 @@ def test_memo_drops_the_least_recently_used_value(size: int, asked: str, made: s
     maker = Maker(Memo(size))
     maker(asked)
     assert maker.made == made
-
-
-def test_memo_stores_none_and_nested_values() -> None:
-    memo = Memo(2)
-    calls = 0
-
-    def nothing() -> None:
-        nonlocal calls
-        calls += 1
-
-    assert memo("none", nothing) is None
-    assert memo("none", nothing) is None
-    assert calls == 1
-    for size in (1, 2, 3):
-        nested = Memo(size)
-        assert nested("outer", lambda nested=nested: nested("inner", lambda: 4) + 1) == 5
-        assert nested("outer", lambda: 0) == 5
-
-
-def test_memo_does_not_store_failures() -> None:
-    memo = Memo(2)
-    with pytest.raises(ZeroDivisionError):
-        memo("a", lambda: 1 // 0)
-    assert memo("a", lambda: 7) == 7

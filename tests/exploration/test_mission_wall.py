@@ -4,23 +4,57 @@ from __future__ import annotations
 
 import itertools
 import shutil
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from exploration.flying_robots import TEAM, mission_of, small_room, transports
 from exploration.replays import FakeTime, Together
+from exploration.rooms import small_room
 
-from gmmtorch.exploration.mission.driver import WallClock, drive, settle
+from gmmtorch.exploration.mission.driver import Stopwatch, WallClock, drive, settle
 from gmmtorch.exploration.mission.mission import Mission
+from gmmtorch.exploration.mission.options import TeamOptions
 from gmmtorch.exploration.mission.robot_view import DuplicateIdError, FlyingRobotView
+from gmmtorch.exploration.mission.team_setup import make_agent, start_poses
 from gmmtorch.exploration.planning.coordination import PeerTrajectories
 from gmmtorch.exploration.world.world import World
 from gmmtorch.sharing.messages.message_registry import PlanMessage, encode_plan
 from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.sharing.store import Store
 from gmmtorch.sharing.transport.udp import UdpTransport
+from gmmtorch.simulation.sensors.depth_camera import DepthCamera
+
+TEAM = TeamOptions(
+    size=2,
+    duration=4.0,
+    camera=DepthCamera(width=48, height=36, max_range=4.0),
+    window=(64, 64, 32),
+    sample_every=2.0,
+    n_beams=40,
+    latency=0.0,
+)
+
+
+@contextmanager
+def transports(n: int, **options: Any) -> Iterator[list[UdpTransport]]:
+    """Transports that all send to one another."""
+    with ExitStack() as stack:
+        made = [stack.enter_context(UdpTransport.unicast(k, **options)) for k in range(n)]
+        for one in made:
+            one.peers = [other.address for other in made if other is not one]
+        yield made
+
+
+def mission_of(
+    number: int, world: World, options: TeamOptions, transport: UdpTransport, **about: Any
+) -> Mission:
+    """The mission of one robot. about: an incarnation."""
+    watch, pose = Stopwatch(), start_poses(world, options)[number]
+    agent = make_agent(number, pose, world, options, transport, watch=watch, **about)
+    return Mission(world, [agent], options, watch)
 
 
 @pytest.fixture(scope="module")

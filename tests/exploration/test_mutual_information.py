@@ -10,14 +10,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.information.mutual_information import (
-    csqmi,
-    depth_kernel,
-    first_hit,
-    fsmi,
-    needed_band,
-)
+from gmmtorch.exploration.information.beam_templates import depth_kernel, needed_band
+from gmmtorch.kernels.rays.beam_information import banded_csqmi, first_block, shannon, sharpened
 
 N_CELLS = 8
 MAPS = torch.tensor(list(itertools.product([0.0, 1.0], repeat=N_CELLS)), dtype=torch.float64)
@@ -27,6 +21,21 @@ probabilities = st.one_of(st.sampled_from([0.0, 1.0, 0.5, 0.125]), st.floats(0.0
 beams = st.lists(probabilities, min_size=N_CELLS, max_size=N_CELLS).map(
     lambda o: torch.tensor(o, dtype=torch.float64)
 )
+
+
+def ended(occupancy):
+    """Cells (..., C + 1), the last of which stands for no return."""
+    return torch.cat([occupancy, occupancy.new_ones(*occupancy.shape[:-1], 1)], -1)
+
+
+def csqmi(occupancy, depths, sigma, band):
+    lengths = torch.tensor(occupancy.shape[-1]).expand(occupancy.shape[:-1])
+    kernel = depth_kernel(depths.expand_as(occupancy), sigma, band, lengths).to(occupancy)
+    return banded_csqmi(first_block(ended(occupancy)), first_block(sharpened(ended(occupancy))), kernel)
+
+
+def fsmi(occupancy, delta_occ=1.5, delta_emp=1 / 1.5):
+    return shannon(first_block(ended(occupancy)), ended(occupancy), delta_occ, delta_emp)
 
 
 def map_probability(occupancy):
@@ -61,7 +70,7 @@ def enumerated_csqmi(occupancy, depths, sigma):
 def test_first_hit_equals_enumeration_of_maps(occupancy):
     expected = torch.zeros(N_CELLS + 1, dtype=torch.float64)
     expected.index_add_(0, FIRST, map_probability(occupancy))
-    torch.testing.assert_close(first_hit(occupancy), expected, rtol=0, atol=1e-14)
+    torch.testing.assert_close(first_block(ended(occupancy)), expected, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("sigma", [0.02, 0.05, 0.15])
@@ -97,7 +106,7 @@ def test_fsmi_equals_the_expected_divergence_of_updated_cells(delta_occ, delta_e
 
     cells = occupancy.tolist()
     expected = 0.0
-    for first, probability in enumerate(first_hit(occupancy).tolist()):
+    for first, probability in enumerate(first_block(ended(occupancy)).tolist()):
         told = sum(divergence(o, delta_emp) for o in cells[:first])
         told += divergence(cells[first], delta_occ) if first < N_CELLS else 0.0
         expected += probability * told
@@ -106,29 +115,8 @@ def test_fsmi_equals_the_expected_divergence_of_updated_cells(delta_occ, delta_e
     )
 
 
-def both(occupancy, depths=None, **options):
-    depths = 0.2 * torch.arange(occupancy.shape[-1]).to(occupancy) if depths is None else depths
-    return csqmi(occupancy, depths, 0.05, **options), fsmi(occupancy, **options)
-
-
-@given(beams)
-def test_information_ignores_cells_behind_an_occupied_one(occupancy):
-    walled = torch.cat([occupancy, torch.ones(1, dtype=torch.float64)])
-    deeper = torch.cat([walled, torch.full((3,), 0.3, dtype=torch.float64)])
-    for near, far in zip(both(walled), both(deeper), strict=True):
-        torch.testing.assert_close(far, near, rtol=0, atol=1e-12)
-
-
-def test_information_saturates_with_the_prior():
-    """An even prior lets no beam through: 1.08 nats after 4 cells; with 0.125 it grows to 5.3 over 64."""
-    for n_cells, expected in ((4, 1.08), (64, 1.08)):
-        even = csqmi(torch.full((n_cells,), 0.5), 0.2 * torch.arange(n_cells), 0.05)
-        assert float(even) == pytest.approx(expected, abs=0.02)
-    values = [
-        float(csqmi(torch.full((n,), 0.125), 0.2 * torch.arange(n), 0.05)) for n in (0, 1, 4, 16, 32, 48, 64)
-    ]
-    assert values == sorted(set(values))
-    assert values[-1] == pytest.approx(5.3, abs=0.05)
+def both(occupancy, depths):
+    return csqmi(occupancy, depths, 0.05, needed_band(depths, 0.05)), fsmi(occupancy)
 
 
 @pytest.mark.parametrize("n_cells", [64, 400])
@@ -158,7 +146,7 @@ def test_needed_band_follows_the_depths(prior):
         else torch.full((1, 40), prior, dtype=torch.float64)
     )
     full = csqmi(occupancy, depths, 0.05, band=39)
-    torch.testing.assert_close(csqmi(occupancy, depths, 0.05), full, rtol=0, atol=1e-4)
+    torch.testing.assert_close(both(occupancy, depths)[0], full, rtol=0, atol=1e-4)
     narrow = csqmi(occupancy, depths, 0.05, band=2)
     assert float((narrow - full).abs().max()) > 1e-2
     even = 0.2 * torch.arange(40).double()
@@ -176,42 +164,3 @@ def test_depth_kernel_equals_the_dense_kernel_within_its_band():
             there = i + s < length
             expected = math.exp(-(float(depths[i + s] - depths[i]) ** 2) / (4 * 0.01)) if there else 0.0
             assert float(kernel[s - 1, row, i]) == pytest.approx(expected, abs=1e-12)
-
-
-@given(beams, st.integers(0, N_CELLS))
-def test_information_ignores_cells_beyond_the_lengths(occupancy, length):
-    depths = uneven_depths()
-    short = both(occupancy[:length], depths[:length])
-    cleared = both(torch.where(torch.arange(N_CELLS) < length, occupancy, 0), depths)
-    cut = both(occupancy, depths, lengths=torch.tensor(length))
-    for expected, *others in zip(short, cleared, cut, strict=True):
-        for got in others:
-            torch.testing.assert_close(got, expected, rtol=0, atol=1e-12)
-    hit = first_hit(occupancy, torch.tensor(length))
-    torch.testing.assert_close(hit[:length], first_hit(occupancy)[:length])
-    assert not bool(hit[length:-1].any())
-
-
-def test_rejects_bad_input():
-    depths = 0.2 * torch.arange(3)
-    for bad in ([0.5, math.nan, 0.5], [0.5, 1.1, 0.5], [-0.1, 0.5, 0.5]):
-        with pytest.raises(InvalidArgumentError, match="occupancy"):
-            csqmi(torch.tensor(bad), depths, 0.05)
-        with pytest.raises(InvalidArgumentError, match="occupancy"):
-            fsmi(torch.tensor(bad))
-        with pytest.raises(InvalidArgumentError, match="occupancy"):
-            first_hit(torch.tensor(bad))
-    even = torch.full((3,), 0.5)
-    for sigma in (0.0, -1.0, math.nan, math.inf):
-        with pytest.raises(InvalidArgumentError, match="sigma"):
-            csqmi(even, depths, sigma)
-    with pytest.raises(InvalidArgumentError, match="depths"):
-        csqmi(even, torch.tensor([0.1, 0.2, math.inf]), 0.05)
-    with pytest.raises(InvalidArgumentError, match="band"):
-        csqmi(even, depths, 0.05, band=-1)
-    with pytest.raises(InvalidArgumentError, match="delta_occ"):
-        fsmi(even, delta_occ=0.9)
-    with pytest.raises(InvalidArgumentError, match="delta_emp"):
-        fsmi(even, delta_emp=0.0)
-    with pytest.raises(InvalidArgumentError, match="floats"):
-        first_hit(torch.tensor([1, 0]))

@@ -21,24 +21,11 @@ from gmmtorch.exploration.planning.collision_checking import feasible
 from gmmtorch.exploration.planning.coordination import PeerTrajectories
 from gmmtorch.exploration.planning.global_planner import Journey
 from gmmtorch.exploration.planning.planner_interface import Plan
-from gmmtorch.exploration.planning.planners import (
-    PLANNERS,
-    RandomPlanner,
-    TreePlanner,
-    TreeRule,
-    make_planner,
-)
-from gmmtorch.exploration.planning.tree_search import SearchRule
-
-SMALL = TreeRule(search=SearchRule(n_rounds=3, n_leaves=24))
+from gmmtorch.exploration.planning.planners import PLANNERS, make_planner
 
 
 def planner_named(name: str):
-    return (
-        TreePlanner(PRIMITIVES, EVALUATOR, SMALL)
-        if name == "mcts"
-        else make_planner(name, PRIMITIVES, EVALUATOR)
-    )
+    return make_planner(name, PRIMITIVES, EVALUATOR)
 
 
 def same(one: Plan, other: Plan) -> bool:
@@ -77,15 +64,6 @@ def test_tree_planner_explores_more_than_random():
     half = len(seen["mcts"]) // 2
     assert seen["mcts"][half] > seen["random"][half] + 0.05
     assert sum(seen["mcts"]) > sum(seen["random"])
-
-
-def test_tree_planner_flies_around_a_corner():
-    explorer = Explorer.at(corridor(), (1.2, 1.2, 1.2, math.pi))
-    explore(planner_named("mcts"), explorer, 18)
-    open_cells = ~explorer.solid
-    seen = ((explorer.hits + explorer.misses) > 0)[open_cells].float().mean()
-    assert float(seen) > 0.8
-    assert float(((explorer.hits + explorer.misses) > 0)[51:61, 30:41, 1:12].float().mean()) > 0.5
 
 
 def test_tree_planner_travels_to_a_distant_view():
@@ -164,7 +142,7 @@ def test_random_planner_persists_and_changes():
     explorer = Explorer.at(hollow(80, 60, 13), (6.0, 6.0, 1.2, 0.0))
     explorer.misses[~explorer.solid] = 9.0
     explorer.hits[explorer.solid] = 9.0
-    plans = explore(RandomPlanner(PRIMITIVES), explorer, 30)
+    plans = explore(planner_named("random"), explorer, 30)
     speeds = torch.stack([plan.path[-1, 4:] for plan in plans])
     kept = (speeds[1:] == speeds[:-1]).all(1).float().mean()
     assert 0.2 < float(kept) < 0.9
@@ -174,5 +152,3 @@ def test_random_planner_persists_and_changes():
 def test_bad_input_is_named():
     with pytest.raises(InvalidArgumentError, match="planner='best'"):
         make_planner("best", PRIMITIVES, EVALUATOR)
-    with pytest.raises(InvalidArgumentError, match="persistence"):
-        make_planner("random", PRIMITIVES, EVALUATOR, persistence=1.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Collection
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -32,7 +33,7 @@ class Recorder:
 
     def __init__(self, number: int, log: list[tuple[str, int, Any]], values: list[float]) -> None:
         self.number, self._log, self._values = number, log, values
-        self.braking = states(2, -float(number + 1))
+        self.robot = SimpleNamespace(braking=states(2, -float(number + 1)))
         self.peers: list[PeerTrajectories] = []
 
     def _note(self, name: str, *about: Any) -> None:
@@ -114,24 +115,6 @@ def test_each_robot_follows_its_last_proposal(name: str, seed: int) -> None:
         assert plan.path[0, 0] == 100 * robot + len(agents[robot].peers)
 
 
-def test_final_plans_known_to_each_robot() -> None:
-    def fixed(name: str, seed: int = 0) -> list[tuple[int, list[int]]]:
-        return [(robot, about[1]) for robot, about in calls(taken(name, seed)[1], "propose")]
-
-    assert fixed("myopic") == [(robot, []) for robot in range(N)]
-    assert fixed("greedy") == [(robot, list(range(robot))) for robot in range(N)]
-    rounds = Coordination("random_partition", 3).rounds(N, torch.Generator().manual_seed(1))
-    before: list[int] = []
-    expected = []
-    for together in rounds:
-        expected += [(robot, sorted(before)) for robot in together]
-        before += together
-    assert fixed("random_partition", 1) == expected
-    # Of five plans, two become final, then two, then the last.
-    found = fixed("distributed_greedy")
-    assert [len(others) for _, others in found] == [0] * 5 + [2] * 3 + [4]
-
-
 @every_coordination
 @seeds
 def test_peers_are_where_the_others_may_be(name: str, seed: int) -> None:
@@ -159,19 +142,3 @@ def test_peers_are_where_the_others_may_be(name: str, seed: int) -> None:
 def test_robots_do_not_wait_for_a_slow_network() -> None:
     _, log, _ = taken("greedy", 0, TeamOptions(size=N, latency=0.4))
     assert {about for _, about in calls(log, "listen")} == {(NOW,)}
-
-
-def test_a_single_robot_plans_and_sends() -> None:
-    log: list[tuple[str, int, Any]] = []
-    agent: Any = Recorder(0, log, [1.0])
-    plans = plan_together([agent], Coordination("greedy"), OPTIONS, NOW, 3, torch.Generator())
-    assert [what for what, *_ in log] == [
-        "begin_planning",
-        "listen",
-        "propose",
-        "follow",
-        "send_plan",
-        "send_views",
-    ]
-    assert list(plans) == [0]
-    assert len(agent.peers[0]) == 0

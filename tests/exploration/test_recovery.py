@@ -6,19 +6,15 @@ from typing import Any
 
 import pytest
 import torch
+from exploration.voxel_worlds import PRIMITIVES, surroundings_from, task_of
 from torch import Tensor
 
-from gmmtorch.exploration.information.view_library import ViewLibrary
-from gmmtorch.exploration.planning.collision_checking import local_map_of
 from gmmtorch.exploration.planning.coordination import PeerTrajectories
 from gmmtorch.exploration.planning.planner_interface import PlanningTask
-from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
 from gmmtorch.exploration.planning.recovery import retreat, shortened
-from gmmtorch.exploration.planning.roadmap import Roadmap
 
 SHAPE = (40, 40, 20)
 HERE = torch.tensor([4.1, 4.1, 2.1], dtype=torch.float64)
-PRIMITIVES = Primitives(Dynamics())
 
 
 def corner(n: int = 20) -> Tensor:
@@ -32,35 +28,10 @@ def corner(n: int = 20) -> Tensor:
 
 def task(free: bool = False, trail: Tensor | None = None, **changes: Any) -> PlanningTask:
     """A robot at rest at HERE, in a world that it takes for occupied, or free."""
-    hits = torch.zeros(SHAPE) if free else torch.full(SHAPE, 30.0)
-    misses = torch.full(SHAPE, 50.0) if free else torch.zeros(SHAPE)
-    local_map = local_map_of(
-        torch.zeros(3, dtype=torch.int64),
-        0.2,
-        hits,
-        misses,
-        prior=1.0,
-        planning_prior=0.125,
-        free_below=0.2,
-        radius=0.3,
-        obstacles=torch.zeros(0, 3, dtype=torch.int64),
-    )
-    given = {
-        "state": torch.cat([HERE, torch.tensor([0.7, 0, 0, 0], dtype=torch.float64)]),
-        "peers": PeerTrajectories.of([]),
-        **changes,
-    }
-    return PlanningTask(
-        robot=0,
-        local_map=local_map,
-        residual=torch.ones(500),
-        library=ViewLibrary(0),
-        roadmap=Roadmap(),
-        now=3.0,
-        generator=torch.Generator(),
-        trail=corner() if trail is None else trail,
-        **given,
-    )
+    state = torch.cat([HERE, torch.tensor([0.7, 0, 0, 0], dtype=torch.float64)])
+    trail = corner() if trail is None else trail
+    given = {"state": state, "local_map": surroundings_from(torch.full(SHAPE, free)), "trail": trail}
+    return task_of(**{**given, **changes})
 
 
 def test_recovery_flies_back_and_ends_at_rest() -> None:

@@ -103,17 +103,6 @@ def test_a_stream_of_unknown_length_gives_the_map_of_a_list(n_scans):
     assert content(mission.replica.components()) == (content(expected.components()) if n_scans else content())
 
 
-def test_a_late_robot_catches_up_after_the_others_have_finished():
-    network = Network(2)
-    first = robot(0, part(0, 2, 10), network)
-    run(first, quiet=1.0)
-    network.deliver(1, 1e9)  # lost: robot 1 did not run
-    late = robot(1, part(1, 2, 10), network)
-    run(late, first, quiet=10.0)
-    assert late.replica.digest() == first.replica.digest()
-    assert {int(i) for i in late.replica.components().ids[:, 0]} == {0, 1}
-
-
 # -- trouble ---------------------------------------------------------------------------------------
 
 
@@ -160,15 +149,6 @@ def test_a_scan_of_another_dimension_is_an_error():
     with pytest.raises(InvalidArgumentError, match="3-dimensional"):
         run(mission)
     assert content(mission.replica.components()) == content(mapped("per_scan", log(4)).components())
-
-
-def test_damaged_datagrams_are_counted():
-    network = Network(2)
-    mission = robot(0, log(4), network)
-    network.send(1, [b"", b"nonsense", b"\x11" * 1200], 0.0, "noise")
-    network.send(1, robot(1, [], network).replica.announcements(), 0.0, "announcements")
-    run(mission)
-    assert (mission.shared.radio.n_received, mission.shared.radio.n_damaged) == (4, 3)
 
 
 def test_jumping_clocks_do_not_change_the_map():

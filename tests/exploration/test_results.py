@@ -1,16 +1,19 @@
-"""Rows of missions: against values computed by hand."""
+"""Rows of missions, against values computed by hand; and snapshots of missions."""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 
+from gmmtorch.exploration.mission.options import TeamOptions
 from gmmtorch.exploration.mission.results import (
     VARIANT,
+    Snapshots,
     differing,
     mission_row,
     variant_of,
@@ -117,12 +120,7 @@ def mission(lengths: list[float], seen_by: list[int]) -> Any:
     mask = torch.zeros(24, dtype=torch.int16)
     mask[: len(seen_by)] = torch.tensor(seen_by, dtype=torch.int16)
     mask[20:] = 7  # not observable: not counted
-    names = ["framework", "seed", "planner", "information", "planning_prior", "loss", "duration"]
-    names += ["coordination", "latency", "jitter", "bandwidth", "duplication", "reach"]
-    names += ["announce_every", "budget"]
-    options = SimpleNamespace(
-        size=3, codecs=("zip",), partitions=(), learning={"shell": 0.5}, **dict.fromkeys(names, "x")
-    )
+    options = TeamOptions(size=3, codecs=("octree",))
     robots = [
         SimpleNamespace(
             path_length=length,
@@ -144,7 +142,7 @@ def mission(lengths: list[float], seen_by: list[int]) -> Any:
         score=SimpleNamespace(
             union=maps[0],
             seen_by=mask,
-            samples={"raw_points_bytes_over_time": [1, 22], "zip_bytes_over_time": [1, 11]},
+            samples={"raw_points_bytes_over_time": [1, 22], "octree_bytes_over_time": [1, 11]},
         ),
         robots=robots,
         network=SimpleNamespace(
@@ -170,7 +168,7 @@ def test_fields_of_a_mission_row() -> None:
     assert found["map_disagreement"] == pytest.approx(2 / 20)
     assert found["entropy_reduction_bits"] == pytest.approx(20 - made.score.union.entropy_bits)
     assert found["bytes_raw_points"] == 22
-    assert found["bytes_zip"] == 11
+    assert found["bytes_octree"] == 11
     assert found["simulated_per_wall_seconds"] == 3.0
     assert found["n_components"] is None
     assert found["partitions"] == []
@@ -275,3 +273,48 @@ def test_differing_names_the_fields_of_variants_only() -> None:
     assert variant_of(rows[0]) == variant_of(rows[1]) != variant_of(rows[2])
     assert len(variant_of(rows[0], without=["loss"])) == len(VARIANT) - 1
     assert variant_of(rows[2], ["loss"]) == (0.1,)
+
+
+# -- snapshots --------------------------------------------------------------------------------------
+
+OBSERVABLE = 1e6
+
+CURVES: dict[str, Callable[[float], float]] = {
+    "linear": lambda share: share,
+    "early": lambda share: min(1.0, 4 * share),
+    "small": lambda share: share / 1000,
+    "in steps": lambda share: round(10 * share) / 10,
+}
+
+
+def flown(learned: Callable[[float], float], n: int) -> Snapshots:
+    """The snapshots of a mission of n ticks."""
+    snapshots = Snapshots(lambda mission: {"taken at": mission.n_ticks})
+    for tick in range(1, n + 1):
+        union = SimpleNamespace(observable_bits=OBSERVABLE, entropy_bits=OBSERVABLE * (1 - learned(tick / n)))
+        mission: Any = SimpleNamespace(n_ticks=tick, is_over=tick == n, score=SimpleNamespace(union=union))
+        snapshots.update(mission)
+    return snapshots
+
+
+@pytest.mark.parametrize("n", [100, 1600])
+@pytest.mark.parametrize("learned", CURVES.values(), ids=CURVES.keys())
+def test_snapshots_are_few_and_the_chosen_ones_are_at_the_given_shares(learned: Any, n: int) -> None:
+    full = flown(learned, n)
+    assert len(full.taken) <= 17
+    chosen = full.chosen()
+    assert len(chosen) == 4
+    assert chosen[-1].tick == n
+    shares = [snapshot.bits / chosen[-1].bits for snapshot in chosen]
+    assert shares == pytest.approx([0.2, 0.5, 0.8, 1.0], abs=1 / 14)
+    assert all(snapshot.content == {"taken at": snapshot.tick} for snapshot in full.taken)
+
+
+@pytest.mark.parametrize(("n", "ticks"), [(1, [1]), (2, [1, 2]), (3, [1, 2, 3]), (8, [2, 4, 6, 8])])
+def test_short_missions_have_fewer_snapshots(n: int, ticks: list[int]) -> None:
+    assert [snapshot.tick for snapshot in flown(lambda share: share, n).chosen()] == ticks
+
+
+def test_entropy_that_rises_gives_no_snapshot_except_the_last() -> None:
+    full = flown(lambda share: 1 - share / 2, 10)
+    assert [snapshot.tick for snapshot in full.taken] == [1, 10]

@@ -48,27 +48,11 @@ def test_route_lengths_agree_with_cell_distances():
     shift = torch.tensor([-13, 6, 3], dtype=torch.float64) * RESOLUTION
     cells = torch.tensor([[5, 6, 8], [55, 6, 8], [8, 22, 5], [50, 36, 10]])
     points = (cells + 0.5) * RESOLUTION + shift
-    route = roadmap.route(points[0], points)
-    exact = geodesic(passable, cells[:1], RESOLUTION, coarse=1)[cells.unbind(1)].double()
-    for found, true in zip(route.metres.tolist(), exact.tolist(), strict=True):
-        assert true - 2.5 <= found <= 1.3 * true + 2.0
-    assert float(route.metres[3]) > 20  # around both bends, 9 m as the crow flies
-
-
-def test_route_paths_run_through_passable_space():
-    passable = maze()
-    roadmap = seen_through_windows(passable)
-    start, goal = torch.tensor([[1.1, 1.3, 1.7], [10.0, 7.3, 1.7]], dtype=torch.float64)
-    path = roadmap.route(start, goal[None]).path(0)
-    assert float((path[0] - start).norm()) < 2.0
-    assert float((path[-1] - goal).norm()) < 2.0
-    steps = (path[1:] - path[:-1]).norm(dim=1)
-    assert float(steps.max()) < 0.8 * math.sqrt(3) + 1e-9
-    near = torch.tensor(list(itertools.product(range(-2, 3), repeat=3)))
-    for point in path:
-        around = (point / RESOLUTION).floor().long() + near
-        around = around[((around >= 0) & (around < torch.tensor(passable.shape))).all(1)]
-        assert bool(passable[around.unbind(1)].any())
+    found = roadmap.distances(points[0], points)
+    exact = geodesic(passable, cells[:1], RESOLUTION, torch.zeros(1), coarse=1)[cells.unbind(1)].double()
+    for metres, true in zip(found.tolist(), exact.tolist(), strict=True):
+        assert true - 2.5 <= metres <= 1.3 * true + 2.0
+    assert float(found[3]) > 20  # around both bends, 9 m as the crow flies
 
 
 def test_wall_of_three_cells_separates_nodes():
@@ -77,22 +61,22 @@ def test_wall_of_three_cells_separates_nodes():
         passable[begin : begin + 3] = False
         roadmap = seen_through_windows(passable)
         ends = torch.tensor([[1.0, 2.0, 1.0], [9.0, 2.0, 1.0]], dtype=torch.float64)
-        assert math.isinf(float(roadmap.route(ends[0], ends[1:]).metres[0]))
+        assert math.isinf(float(roadmap.distances(ends[0], ends[1:])[0]))
         passable[begin : begin + 3, 10, 5] = True
         roadmap = seen_through_windows(passable)
-        assert math.isfinite(float(roadmap.route(ends[0], ends[1:]).metres[0]))
+        assert math.isfinite(float(roadmap.distances(ends[0], ends[1:])[0]))
 
 
 def test_update_removes_closed_edges():
     passable = torch.ones(48, 24, 12, dtype=torch.bool)
     roadmap = seen_through_windows(passable)
     ends = torch.tensor([[1.0, 2.0, 1.0], [9.0, 2.0, 1.0]], dtype=torch.float64)
-    assert math.isfinite(float(roadmap.route(ends[0], ends[1:]).metres[0]))
+    assert math.isfinite(float(roadmap.distances(ends[0], ends[1:])[0]))
     before = len(roadmap)
     shut = torch.ones(WINDOW, dtype=torch.bool)
     shut[8:16] = False
     roadmap.update(surroundings_from(shut, (12, 0, 0)))
-    assert math.isinf(float(roadmap.route(ends[0], ends[1:]).metres[0]))
+    assert math.isinf(float(roadmap.distances(ends[0], ends[1:])[0]))
     assert len(roadmap) == before - 2 * 6 * 3
 
 
@@ -105,16 +89,14 @@ def test_reaching_agrees_with_route(seed):
     nodes, metres = roadmap.reaching(goal)
     some = torch.randint(len(nodes), (5,), generator=generator)
     for row in some.tolist():
-        route = roadmap.route(nodes[row], goal[None])
-        torch.testing.assert_close(route.metres[0], metres[row])
+        torch.testing.assert_close(roadmap.distances(nodes[row], goal[None])[0], metres[row])
 
 
 def test_empty_roadmap_has_no_route():
     roadmap = Roadmap()
     point = torch.zeros(1, 3, dtype=torch.float64)
     assert len(roadmap) == 0
-    assert math.isinf(float(roadmap.route(point[0], point).metres[0]))
-    assert len(roadmap.route(point[0], point).path(0)) == 0
+    assert math.isinf(float(roadmap.distances(point[0], point)[0]))
     assert len(roadmap.reaching(point[0])[0]) == 0
     tiny = torch.ones(3, 3, 3, dtype=torch.bool)  # holds no node
     roadmap.update(surroundings_from(tiny, (1, 1, 1)))
@@ -127,7 +109,7 @@ def test_roadmap_works_far_from_the_origin():
     roadmap.update(surroundings_from(passable, (2_500_000, -2_500_001, 3)))
     corner = torch.tensor([5e5, -5e5, 0.6], dtype=torch.float64)
     ends = corner + torch.tensor([[1.0, 1.0, 1.0], [4.0, 1.0, 1.0]], dtype=torch.float64)
-    assert 2 < float(roadmap.route(ends[0], ends[1:]).metres[0]) < 5
+    assert 2 < float(roadmap.distances(ends[0], ends[1:])[0]) < 5
 
 
 def test_at_the_rim_selects_points_near_the_border():

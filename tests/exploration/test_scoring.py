@@ -50,14 +50,6 @@ def test_belief_entropy_equals_the_sum_over_observable_cells(seeds: list[int], c
     assert belief.n_observed == int(((h + m) > 0).sum())
 
 
-def test_belief_does_not_depend_on_the_order_of_evidence() -> None:
-    one, other = (BeliefMap(0.5, BOX, observable(), BeliefRule()) for _ in range(2))
-    for seed in range(5):
-        one.add(evidence(seed))
-        other.add(evidence(4 - seed))
-    assert one.entropy_bits == pytest.approx(other.entropy_bits, abs=1e-3)
-
-
 def test_accuracy_equals_a_loop() -> None:
     seen = observable()
     belief = BeliefMap(0.5, BOX, seen, BeliefRule())

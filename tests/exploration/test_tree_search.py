@@ -7,18 +7,15 @@ import math
 
 import pytest
 import torch
-from exploration.voxel_worlds import EVALUATOR, NOBODY, PRIMITIVES, Explorer, surroundings_from
+from exploration.voxel_worlds import EVALUATOR, PRIMITIVES, Explorer, surroundings_from, task_of
 
-from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.exploration.information.view_cache import ViewCache
 from gmmtorch.exploration.information.view_evaluator import ViewValues
-from gmmtorch.exploration.information.view_library import ViewLibrary
 from gmmtorch.exploration.planning.collision_checking import feasible
 from gmmtorch.exploration.planning.coordination import PeerTrajectories
 from gmmtorch.exploration.planning.geodesic import DistanceField
 from gmmtorch.exploration.planning.global_planner import Goal
 from gmmtorch.exploration.planning.planner_interface import PlanningTask
-from gmmtorch.exploration.planning.roadmap import Roadmap
 from gmmtorch.exploration.planning.tree_search import SearchRule, TreeSearch
 
 N_BLOCKS = 6
@@ -45,33 +42,19 @@ class MadeUp:
             drawn = torch.Generator().manual_seed(hash((self.seed, *key)) % 2**31)
             gain.append(torch.rand(N_BLOCKS, generator=drawn) ** 4)
             measured.append(torch.rand(N_BLOCKS, generator=drawn))
-        return ViewValues(torch.stack(gain).sum(1), torch.stack(gain), torch.stack(measured))
+        return ViewValues(torch.stack(gain), torch.stack(measured))
 
 
 def task_in(
     passable: torch.Tensor, position: tuple[float, float, float], seed: int = 0, **changed
 ) -> PlanningTask:
-    values = {
-        "robot": 0,
-        "state": torch.tensor([*position, 0.3, 0.0, 0.0, 0.0], dtype=torch.float64),
-        "local_map": surroundings_from(passable),
-        "peers": NOBODY,
-        "residual": torch.ones(N_BLOCKS),
-        "library": ViewLibrary(0),
-        "roadmap": Roadmap(),
-        "now": 0.0,
-        "generator": torch.Generator().manual_seed(seed),
-    }
-    return PlanningTask(**{**values, **changed})
+    state = torch.tensor([*position, 0.3, 0.0, 0.0, 0.0], dtype=torch.float64)
+    given = {"residual": torch.ones(N_BLOCKS), "generator": torch.Generator().manual_seed(seed)}
+    return task_of(surroundings_from(passable), state, **{**given, **changed})
 
 
-def small_room() -> torch.Tensor:
-    passable = torch.zeros(30, 30, 12, dtype=torch.bool)
-    passable[3:27, 3:22, 2:10] = True
-    return passable
-
-
-ROOM, MIDDLE = small_room(), (2.0, 2.5, 1.2)
+ROOM, MIDDLE = torch.zeros(30, 30, 12, dtype=torch.bool), (2.0, 2.5, 1.2)
+ROOM[3:27, 3:22, 2:10] = True
 
 
 def all_branches(task: PlanningTask, depth: int) -> list[tuple[int, ...]]:
@@ -131,27 +114,6 @@ def test_found_describes_its_branch():
     torch.testing.assert_close(found.views, torch.stack(states[1:])[:, :4])
     torch.testing.assert_close(found.path, PRIMITIVES.rollout(task.state[None])[0, found.actions[0]])
     torch.testing.assert_close(found.braking, PRIMITIVES.braking(found.path[-1]))
-    assert tuple(found.actions) in set(all_branches(task, 1)) or len(found.actions) > 1
-
-
-def test_search_beats_random_branches_with_few_leaves():
-    rule = SearchRule(depth=3, n_rounds=4, n_leaves=32)
-    shares = []
-    for seed in range(6):
-        task, evaluator = task_in(ROOM, MIDDLE, seed), MadeUp(100 + seed)
-        found = TreeSearch(PRIMITIVES, rule).search(task, ViewCache(task, evaluator))
-        assert found is not None
-        full = SearchRule(depth=3, n_rounds=60, n_leaves=64, exploration=2.0)
-        better = TreeSearch(PRIMITIVES, full).search(task, ViewCache(task, evaluator))
-        drawn = torch.Generator().manual_seed(seed)
-        two = all_branches(task, 2)
-        chance = [
-            return_of(task, evaluator, two[int(torch.randint(len(two), (), generator=drawn))], 0.9)
-            for _ in range(64)
-        ]
-        assert found.value > max(chance) * 0.8
-        shares.append(found.value / better.value)
-    assert sum(shares) / len(shares) > 0.8
 
 
 def test_search_evaluates_each_view_once_in_batches():
@@ -161,22 +123,6 @@ def test_search_evaluates_each_view_once_in_batches():
     keys = [tuple(key) for key in torch.cat(evaluator.calls).tolist()]
     assert len(keys) == len(set(keys))
     assert 40 < len(keys) <= 129
-
-
-def test_views_planned_by_teammates_have_no_value():
-    evaluator = MadeUp(0)
-    for seen in range(2):
-        residual = torch.zeros(N_BLOCKS)
-        residual[seen] = 1.0
-        task = task_in(ROOM, MIDDLE, residual=residual)
-        rule = SearchRule(depth=1, n_rounds=1)
-        found = TreeSearch(PRIMITIVES, rule).search(task, ViewCache(task, evaluator))
-        ends = PRIMITIVES.rollout(task.state[None])[0, :, -1, :4]
-        here = evaluator.evaluate(None, evaluator.keys(task.state[None, :4])).measured[0, seen]
-        gains = evaluator.evaluate(None, evaluator.keys(ends)).gain[:, seen] * (1 - here)
-        safe = [branch[0] for branch in all_branches(task, 1)]
-        assert found is not None
-        assert found.value == pytest.approx(float(gains[safe].max()), rel=1e-6)
 
 
 def test_rest_of_the_last_branch_is_tried_first():
@@ -213,15 +159,17 @@ def test_search_with_a_goal_approaches_it():
 def test_goal_cost_includes_the_way_and_the_turns():
     here = surroundings_from(torch.ones(50, 50, 10, dtype=torch.bool))
     goal_at = torch.tensor([[8.2, 5.0, 1.0]], dtype=torch.float64)
-    goal = Goal(DistanceField.to(here, goal_at), weight=1.0, yaw=math.pi / 2, turning=2.0)
+    goal = Goal(DistanceField.to(here, goal_at), weight=1.0, yaw=math.pi / 2)
 
     def cost(x: float, y: float, z: float, yaw: float) -> float:
         return float(goal.cost(torch.tensor([x, y, z, yaw, 0, 0, 0], dtype=torch.float64)))
 
-    assert cost(3.2, 5.0, 1.0, 0.0) == pytest.approx(5.0 + math.pi, abs=0.7)  # straight on, then left
-    assert cost(3.2, 5.0, 1.0, math.pi) == pytest.approx(5.0 + 3 * math.pi, abs=0.7)
+    assert cost(3.2, 5.0, 1.0, 0.0) == pytest.approx(
+        5.0 + 1.25 * math.pi / 2, abs=0.5
+    )  # straight on, then left
+    assert cost(3.2, 5.0, 1.0, math.pi) == pytest.approx(5.0 + 1.25 * 1.5 * math.pi, abs=0.5)
     assert cost(8.2, 5.0, 1.0, math.pi / 2) == pytest.approx(0.0, abs=0.1)
-    assert cost(8.2, 5.0, 1.0, -math.pi / 2) == pytest.approx(2 * math.pi, abs=0.1)
+    assert cost(8.2, 5.0, 1.0, -math.pi / 2) == pytest.approx(1.25 * math.pi, abs=0.1)
 
 
 def test_search_keeps_clear_of_peers_in_time():
@@ -250,11 +198,3 @@ def test_search_at_the_start_looks_around():
     assert found.information > 0
     looks = [float(yaw) for yaw in found.views[:, 3]]
     assert max(looks) - min(0.0, *looks) > 1.5
-    assert len({PRIMITIVES.commands[action, 2].item() for action in found.actions} - {0.0}) >= 1
-
-
-def test_search_rule_rejects_bad_values():
-    with pytest.raises(InvalidArgumentError, match="depth=0"):
-        SearchRule(depth=0)
-    with pytest.raises(InvalidArgumentError, match="exploration"):
-        SearchRule(exploration=math.nan)

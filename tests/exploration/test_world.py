@@ -1,4 +1,4 @@
-"""Worlds: where robots can be, what they can see, where they start, what is kept, and what is refused."""
+"""Worlds: where robots can be, what they can see, what is kept, and what is refused."""
 
 from __future__ import annotations
 
@@ -7,19 +7,14 @@ import math
 
 import pytest
 import torch
+from exploration.rooms import HALL
 
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, MissingDataError
+from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
+from gmmtorch.exploration.world.starts import check_start, start_poses
 from gmmtorch.exploration.world.world import World, open_world
 from gmmtorch.simulation.worlds.furniture import box
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld
-
-HALL = torch.cat(
-    [
-        box((0.1, 0.1, 0.1), (9.9, 5.9, 2.9)),
-        box((4.0, 0.1, 0.1), (4.3, 3.0, 2.9)),  # a wall with a way around it
-        box((7.0, 4.0, 0.1), (8.6, 5.2, 1.6)),  # a solid, large enough for a robot inside
-    ]
-)
 
 
 @pytest.fixture(autouse=True)
@@ -138,61 +133,6 @@ def test_world_rejects_bad_meshes_and_too_many_cells():
         World.from_mesh(1000 * HALL, cache=False)
 
 
-def test_start_poses_are_separated_visible_roomy_and_level(hall):
-    poses = hall.start_poses(4, 1.2, at=(2.0, 3.0, 1.5))
-    assert poses.shape == (4, 4)
-    assert torch.equal(poses, hall.check_start(poses))
-    assert torch.equal(poses, hall.start_poses(4, 1.2, at=(2.0, 3.0, 1.5)))
-    places = poses[:, :3]
-    gaps = torch.pdist(places)
-    assert float(gaps.min()) >= 1.2 - 1e-9
-    assert float((places - places[0]).norm(dim=1).max()) < 4
-    assert float(hall.mesh.clearance(places).min()) >= 0.99
-    way = places[1:] - places[0]
-    sight = hall.mesh.distances(places[0], way / way.norm(dim=1, keepdim=True))
-    assert bool((sight > way.norm(dim=1)).all())
-    turn = torch.remainder(poses[1:, 3] - poses[:-1, 3], 2 * math.pi)
-    assert torch.allclose(turn, torch.full((3,), math.pi / 2, dtype=torch.float64))
-
-
-def test_default_start_poses_lie_at_an_end_and_fit_large_teams(hall):
-    one = hall.start_poses(1)
-    assert float((one[0, :2] - torch.tensor([5.0, 3.0])).abs()[0]) > 3
-    assert len(hall.check_start(hall.start_poses(16, 1.0))) == 16
-    with pytest.raises(InvalidArgumentError, match=r"hall has room for \d+ robots .* team.size=500.*a floor"):
-        hall.start_poses(500)
-    for n in (0, 1.5):
-        with pytest.raises(InvalidArgumentError, match="n="):
-            hall.start_poses(n)
-
-
-@pytest.mark.parametrize(
-    ("pose", "message"),
-    [
-        (
-            (0.25, 3.0, 1.5, 0.0),
-            r"team.start\[1\]=\[0.25, 3, 1.5, 0\] is 0.15 m from .*move it, for instance to \[",
-        ),
-        ((4.1, 2.0, 1.5, 0.0), "from a surface"),
-        ((7.8, 4.6, 0.85, 0.0), "is in a solid, or in another part, which world.bounds="),
-        ((-3.0, 2.0, 1.5, 0.0), r"outside the bounds of hall, \[0, 0, 0\] to \[10, 6, 3\] m"),
-        ((2.0, 2.0, 1.5, math.nan), "not finite"),
-        ((math.inf, 2.0, 1.5, 0.0), "not finite"),
-        ((1.3, 1.0, 1.5, 0.0), r"touches the robot of team.start\[0\]"),
-    ],
-)
-def test_check_start_names_impossible_poses(hall, pose, message):
-    poses = torch.tensor([(1.1, 1.1, 1.5, 0.0), pose], dtype=torch.float64)
-    with pytest.raises(InvalidArgumentError, match=message):
-        hall.check_start(poses)
-
-
-def test_check_start_rejects_wrong_shapes(hall):
-    for shape in ((3, 3), (0, 4), (4,)):
-        with pytest.raises(InvalidArgumentError, match="expected"):
-            hall.check_start(torch.zeros(shape))
-
-
 def same(a: World, b: World) -> bool:
     return all(
         torch.equal(getattr(a, name), getattr(b, name)) for name in ("occupied", "observable", "navigable")
@@ -247,14 +187,20 @@ def test_world_cache_warns_if_it_cannot_write(hall, tmp_path, monkeypatch, caplo
     assert "not cached" in caplog.text
 
 
-def test_open_world_opens_each_name(tmp_path):
+def poses_of(world: World) -> torch.Tensor:
+    """Start poses of three robots, which are checked."""
+    primitives = Primitives(Dynamics())
+    return check_start(world, start_poses(world, 3, primitives), primitives)
+
+
+def test_open_world_opens_each_name():
     store = open_world("warehouse", size=(18.0, 14.0, 5.0), resolution=0.4, cache=False)
     assert store.box.shape == (45, 35, 13)
-    assert len(store.check_start(store.start_poses(3))) == 3
-    assert float(store.start_poses(1)[0, :3].sub(store.start).norm()) < 1.0
+    assert len(poses_of(store)) == 3
+    assert float(poses_of(store)[0, :3].sub(store.start).norm()) < 1.0
     mine = open_world("tunnels", seed=2, size=(40.0, 40.0, 8.0), resolution=0.4, cache=False)
     assert 0.02 < float(mine.navigable.double().mean()) < 0.5
-    assert len(mine.check_start(mine.start_poses(3))) == 3
+    assert len(poses_of(mine)) == 3
     part = open_world(
         "warehouse", size=(18.0, 14.0, 5.0), bounds=(8, 2, 0, 18, 12, 5), resolution=0.4, cache=False
     )
@@ -288,4 +234,4 @@ def test_open_world_reads_real_meshes(real_data, file, bounds, volume):
     assert bool((world.observable & world.occupied).any())
     assert bool(world.observable[world.navigable].all())
     assert float(world.mesh.clearance(world.centers(world.navigable.nonzero())).min()) > 0.3
-    assert len(world.check_start(world.start_poses(3))) == 3
+    assert len(poses_of(world)) == 3

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -30,6 +31,22 @@ def surroundings_from(passable: Tensor, low: tuple[int, int, int] = (0, 0, 0)) -
     known = torch.ones_like(passable)
     occupancy = torch.where(passable, 0.0, 1.0)
     return LocalMap(torch.tensor(low), RESOLUTION, occupancy, known, passable, passable)
+
+
+def task_of(local_map: LocalMap, state: Tensor, **changes: Any) -> PlanningTask:
+    """The task of a robot alone, of which nothing is known but its map."""
+    n_blocks = math.prod(-(-n // 4) for n in local_map.shape)
+    given = {
+        "peers": NOBODY,
+        "residual": torch.ones(n_blocks),
+        "library": ViewLibrary(0),
+        "roadmap": Roadmap(),
+        "now": 0.0,
+        "generator": torch.Generator().manual_seed(0),
+        "trail": state[None, :3],
+        **changes,
+    }
+    return PlanningTask(state=state, local_map=local_map, **given)
 
 
 def hollow(nx: int, ny: int, nz: int) -> Tensor:
@@ -121,11 +138,8 @@ class Explorer:
     def task(self, generator: torch.Generator, peers: PeerTrajectories = NOBODY) -> PlanningTask:
         local_map = self.local_map()
         self.roadmap.update(local_map)
-        n_blocks = math.prod(-(-n // 4) for n in self.solid.shape)
-        return PlanningTask(
-            0, self.state, local_map, peers, torch.ones(n_blocks), self.library, self.roadmap,
-            self.now, generator,
-        )  # fmt: skip
+        memory = {"library": self.library, "roadmap": self.roadmap, "now": self.now}
+        return task_of(local_map, self.state, peers=peers, generator=generator, **memory)
 
     def follow(self, plan: Plan) -> None:
         """Fly the path, looking twice on the way; the body must touch nothing."""

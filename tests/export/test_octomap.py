@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,7 @@ import pytest
 import torch
 from export.map_examples import example_grid, random_probabilities
 
-from gmmtorch.errors import GmmTorchError, InvalidArgumentError
+from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.export.octomap import write_octomap
 from gmmtorch.export.point_cloud import CellCloud
 from gmmtorch.occupancy.evidence import CellClass, Thresholds
@@ -75,13 +74,10 @@ def test_octree_accepts_cells_up_to_the_range_of_its_keys(tmp_path):
         write_octomap(tmp_path / "far.ot", far)
 
 
-def test_octomap_writer_rejects_other_suffixes_unaligned_cells_and_a_missing_package(tmp_path, monkeypatch):
+def test_octomap_writer_rejects_other_suffixes_and_unaligned_cells(tmp_path):
     cells = CellCloud(torch.full((1, 3), 0.05, dtype=torch.float64), torch.ones(1), 0.1)
     with pytest.raises(InvalidArgumentError, match=r"must end in \.bt .* or \.ot"):
         write_octomap(tmp_path / "map.octomap", cells)
     with pytest.raises(InvalidArgumentError, match=r"VoxelGrid\.covering"):
         write_octomap(tmp_path / "map.bt", CellCloud(cells.centers + 0.03, torch.ones(1), 0.1))
-    monkeypatch.setitem(sys.modules, "pyoctomap", None)
-    with pytest.raises(GmmTorchError, match=r"pip install 'gmmtorch\[baselines\]'"):
-        write_octomap(tmp_path / "map.bt", cells)
     assert not list(tmp_path.iterdir())

@@ -77,3 +77,5 @@ def test_a_pose_table_has_poses_columns_and_the_triangle_of_the_covariance(dim, 
     assert sum(name.startswith("cov_") for name in second) == free * (free + 1) // 2
     with pytest.raises(InvalidArgumentError, match="covariances has shape"):
         write_pose_table(tmp_path / "a.csv", [0.5, 1e9], poses, root[:1])
+    with pytest.raises(InvalidArgumentError, match="times has shape"):
+        write_pose_table(tmp_path / "a.csv", [0.5, math.nan], poses, root @ root.mT)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
 
@@ -90,10 +91,11 @@ def test_colours_follow_the_order_of_their_quantity(by, maps):
 
 def test_slice_has_the_occupancy_of_the_map_with_the_highest_y_first(maps):
     built, _ = maps[3]
-    low, high = (0.0, 0.0, 0.0), (8.0, 4.0, 3.0)
-    found = viewer_scene.occupancy_slice(built, 0.5, 1.2, low, high)
+    low, high = torch.tensor([0.0, 0.0, 0.0]), torch.tensor([8.0, 4.0, 3.0])
+    view = viewer_scene.Frame(low, high, torch.zeros(3), 1.0, 1.2, math.inf)
+    found = viewer_scene.occupancy_slice(built, 0.5, 1.2, view)
     assert found.pixels.shape == (8, 16, 4)
-    assert (found.middle, found.size) == ((4.0, 2.0), (8.0, 4.0))
+    assert (found.middle.tolist(), found.size) == ([4.0, 2.0, 1.2], (8.0, 4.0))
     for row, column in ((0, 3), (5, 0), (7, 15), (2, 9)):
         x, y = 0.25 + 0.5 * column, 3.75 - 0.5 * row
         theta = float(built.occupancy(np.array([[x, y, 1.2]]), 0.5)[0])

@@ -36,11 +36,17 @@ class Recording:
         return gt.Scan(scan.origin + 0.05 * ahead / ahead.norm(dim=1, keepdim=True), scan.origin)
 
 
-@pytest.mark.parametrize("use_motion", [False, True])
-def test_a_covered_sensor_and_a_damaged_scan_are_said_and_passed(use_motion):
+@pytest.fixture(scope="module")
+def mapped() -> tuple[Recording, gt.GaussianMap]:
     recording, m = Recording(), gt.GaussianMap()
     for scan in recording.scans:
         m.insert(scan)
+    return recording, m
+
+
+@pytest.mark.parametrize("use_motion", [False, True])
+def test_a_covered_sensor_and_a_damaged_scan_are_said_and_passed(mapped, use_motion):
+    recording, m = mapped
     tracker = Tracker(m, recording.pose(0))
     located = list(locate_scans(recording, tracker, use_motion))
     lost = {scan.number for scan in located if not scan.location.found}

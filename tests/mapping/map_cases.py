@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
@@ -83,6 +84,11 @@ def sightings(made: Components) -> list[dict[tuple[float, ...], float]]:
         assert place not in table[k]
         table[k][place] = count
     return table
+
+
+def each_value(table: Mapping[str, Sequence[Any]]) -> list[tuple[str, Any]]:
+    """(name, value) for each value of each name, as parameters of a test."""
+    return [(name, value) for name, values in table.items() for value in values]
 
 
 def names(ids: Tensor) -> set[tuple[int, ...]]:

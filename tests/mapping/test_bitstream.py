@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Code, best_code, unzigzag, zigzag
+from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Code, best_code, zigzag
 
 whole_numbers = st.lists(st.integers(-(2**59), 2**59) | st.integers(-9, 9), max_size=40)
 
@@ -89,9 +89,3 @@ def test_every_encodable_column_is_decoded(ends, n, rises):
     reader = BitReader(writer.to_bytes())
     assert reader.column(n).tolist() == column.tolist()
     reader.finish()
-
-
-def test_unzigzag_inverts_zigzag():
-    values = np.array([0, -1, 1, -2, 2, 2**60, -(2**60)], np.int64)
-    assert zigzag(values).tolist()[:5] == [0, 1, 2, 3, 4]
-    assert unzigzag(zigzag(values)).tolist() == values.tolist()

@@ -1,4 +1,4 @@
-"""Clearance and collision probability against closed forms, samples and search."""
+"""Clearance and collision probability against closed forms, samples and search; and those of bodies."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from mapping.component_cases import random_components
+from mapping.random_components import normal_components
 from scipy import optimize, stats
+from scipy.spatial.transform import Rotation
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mapping.clearance import clearance, collision_probability, expected_returns
+from gmmtorch.mapping.clearance import Body, clearance, collision_probability, expected_returns
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 
@@ -41,7 +42,7 @@ def brute_distance(point: np.ndarray, mean: np.ndarray, covariance: np.ndarray, 
 @pytest.mark.slow
 @dims
 def test_clearance_is_the_distance_to_the_nearest_ellipsoid(dim):
-    c = random_components(6, dim, seed=1, spread=1.0)
+    c = normal_components(6, dim, seed=1, spread=1.0)
     points = torch.randn(6, dim, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     points = torch.cat([points, c.means[:3] + 0.1 * points[:3]])
     found = clearance(c, points, deviations=1.5)
@@ -76,7 +77,7 @@ def test_clearance_on_the_axes_of_an_ellipse_equals_its_closed_form(point, expec
 
 @given(st.integers(0, 10**6), st.sampled_from([2, 3]))
 def test_clearance_is_continuous_and_independent_of_the_frame(seed, dim):
-    c = random_components(5, dim, seed=seed, spread=1.0)
+    c = normal_components(5, dim, seed=seed, spread=1.0)
     generator = torch.Generator().manual_seed(seed)
     points = 2 * torch.randn(8, dim, generator=generator, dtype=torch.float64)
     nearby = points + 0.3 * torch.randn(8, dim, generator=generator, dtype=torch.float64)
@@ -146,7 +147,7 @@ def test_ball_mass_of_thin_sheets_equals_a_finer_quadrature():
 
 @dims
 def test_collision_probability_ignores_no_return_components(dim):
-    c = random_components(8, dim, seed=4, spread=0.7, empty=0.3)
+    c = normal_components(8, dim, seed=4, spread=0.7, empty=0.3)
     points = torch.randn(30, dim, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     expected = torch.zeros(30, dtype=torch.float64)
     for k in range(len(c)):
@@ -160,7 +161,7 @@ def test_collision_probability_ignores_no_return_components(dim):
 
 @given(st.integers(0, 10**6))
 def test_collision_probability_rises_with_the_radius(seed):
-    c = random_components(5, 3, seed=seed, spread=1.0)
+    c = normal_components(5, 3, seed=seed, spread=1.0)
     points = 2 * torch.randn(10, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     small, large = (collision_probability(c, points, r) for r in (0.2, 0.3))
     assert bool((large >= small - 1e-12).all())
@@ -186,7 +187,7 @@ def test_components_below_the_least_density_are_no_obstacles():
 
 
 def test_infinite_queries_are_clear_and_empty_queries_give_empty_results():
-    c = random_components(4, 3, seed=0)
+    c = normal_components(4, 3, seed=0)
     far = torch.tensor([[math.inf, 0.0, 0.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
     assert float(clearance(c, far)[0]) == math.inf
     assert float(collision_probability(c, far, 0.3)[0]) == 0
@@ -211,4 +212,84 @@ def test_infinite_queries_are_clear_and_empty_queries_give_empty_results():
 )
 def test_invalid_queries_are_refused(ask):
     with pytest.raises(InvalidArgumentError):
-        ask(random_components(3, 3, seed=0))
+        ask(normal_components(3, 3, seed=0))
+
+
+# -- bodies -----------------------------------------------------------------------------------------
+
+
+def poses(seed: int, n: int, dim: int) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    found = torch.eye(dim + 1, dtype=torch.float64).repeat(n, 1, 1)
+    found[:, :dim, dim] = 4 * torch.rand(n, dim, generator=generator, dtype=torch.float64)
+    turns = Rotation.random(n, rng=seed).as_matrix() if dim == 3 else None
+    angles = torch.rand(n, generator=generator, dtype=torch.float64) * 6.28
+    flat = torch.stack([angles.cos(), -angles.sin(), angles.sin(), angles.cos()], 1).view(n, 2, 2)
+    found[:, :dim, :dim] = flat if turns is None else torch.from_numpy(turns)
+    return found
+
+
+def body(dim: int) -> Body:
+    return Body(torch.eye(dim, dtype=torch.float64)[:2] * 0.5, [0.3, 0.1])
+
+
+@dims
+@given(st.integers(0, 50))
+def test_clearance_of_a_body_is_that_of_its_nearest_ball(dim, seed):
+    c, path, shape = normal_components(6, dim, seed), poses(seed, 5, dim), body(dim)
+    found = shape.clearance(c, path)
+    for pose, value in zip(path, found, strict=True):
+        gaps = [
+            float(clearance(c, (pose[:dim, :dim] @ centre + pose[:dim, dim])[None])) - float(radius)
+            for centre, radius in zip(shape.centres, shape.radii, strict=True)
+        ]
+        assert float(value) == pytest.approx(min(gaps), abs=1e-9)
+
+
+@dims
+def test_collision_probability_of_apart_balls_is_that_of_independent_balls(dim):
+    c, path, shape = normal_components(6, dim, 1), poses(1, 5, dim), body(dim)
+    found = shape.collision_probability(c, path)
+    clear = torch.ones(5, dtype=torch.float64)
+    for centre, radius in zip(shape.centres, shape.radii, strict=True):
+        places = path[:, :dim, :dim] @ centre + path[:, :dim, dim]
+        clear *= 1 - collision_probability(c, places, float(radius))
+    torch.testing.assert_close(found, 1 - clear)
+
+
+def test_gradients_move_the_body_away_from_surfaces():
+    c, path, shape = normal_components(6, 3, 2), poses(2, 4, 3).requires_grad_(), body(3)
+    gap = shape.clearance(c, path)
+    (slope,) = torch.autograd.grad(gap.sum(), path)
+    step = torch.zeros_like(slope)
+    step[:, :3, 3] = 1e-4 * slope[:, :3, 3]
+    gained = shape.clearance(c, path.detach() + step) - gap.detach()
+    torch.testing.assert_close(gained, (slope * step).sum((1, 2)), rtol=1e-2, atol=1e-9)
+
+
+def test_a_body_in_an_empty_map_and_on_an_empty_path():
+    nothing, shape = Components.empty(3), body(3)
+    assert shape.clearance(nothing, poses(0, 2, 3)).tolist() == [torch.inf] * 2
+    assert shape.collision_probability(nothing, poses(0, 2, 3)).tolist() == [0.0] * 2
+    assert shape.clearance(nothing, torch.zeros(0, 4, 4)).shape == (0,)
+    assert shape.collision_probability(nothing, torch.zeros(0, 4, 4)).shape == (0,)
+
+
+@pytest.mark.parametrize(
+    ("centres", "radii", "words"),
+    [
+        (torch.zeros(0, 3), torch.zeros(0), r"centres has shape \(0, 3\)"),
+        (torch.zeros(2, 4), [1.0, 1.0], r"centres has shape \(2, 4\)"),
+        (torch.zeros(2, 3), [1.0], r"radii has shape \(1,\)"),
+        (torch.zeros(1, 3), [0.0], "above zero"),
+        (torch.full((1, 3), torch.nan), [1.0], "finite"),
+    ],
+)
+def test_invalid_bodies_are_refused(centres, radii, words):
+    with pytest.raises(InvalidArgumentError, match=words):
+        Body(centres, radii)
+
+
+def test_poses_of_another_dimension_are_refused():
+    with pytest.raises(InvalidArgumentError, match=r"poses has shape \(1, 3, 3\); expected \(S, 4, 4\)"):
+        body(3).clearance(Components.empty(3), torch.eye(3)[None])

@@ -17,12 +17,12 @@ from mapping.random_components import random_components, rotations
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation import metrics, queries
-from gmmtorch.mapping.codec import batch_stream
-from gmmtorch.mapping.codec.component_batch import decode, encode, lattice, quantized, spatial_order
-from gmmtorch.mapping.codec.quantization import COUNT_ERROR, ORIGIN_STEP
+from gmmtorch.mapping.codec import component_batch, lattice
+from gmmtorch.mapping.codec.component_batch import decode, encode
+from gmmtorch.mapping.codec.quantization import COUNT_ERROR, ORIGIN_STEP, quantized, spatial_order
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import WindowedRule
-from gmmtorch.mapping.learning.windowed import learn_window
+from gmmtorch.mapping.learning.windows import learn_window
 from gmmtorch.occupancy.evidence import occupancy_probability
 from gmmtorch.occupancy.forms.point import point_evidence
 
@@ -45,16 +45,6 @@ drawn = st.builds(
     n_origins=st.integers(3, 40),
     max_sightings=st.integers(1, 3),
 )
-
-
-def part(components: Components, begin: int, end: int) -> Components:
-    """Components begin … end−1, with the whole table of origins."""
-    c = components
-    kept = (c.seen_by >= begin) & (c.seen_by < end)
-    own = {n: getattr(c, n)[begin:end] for n in ("means", "covariances", "support", "max_range", "ids")}
-    return replace(
-        c, **own, seen_by=c.seen_by[kept] - begin, seen_from=c.seen_from[kept], seen_count=c.seen_count[kept]
-    )
 
 
 def sightings(components: Components) -> list[dict[tuple[float, ...], float]]:
@@ -175,7 +165,7 @@ def test_quantization_commutes_with_whole_metre_shifts_and_quarter_turns(dim):
 @dims
 def test_splitting_a_batch_does_not_change_its_decoded_components(dim, size):
     whole = quantized(random_components(dim))
-    parts = [decode(encode(part(whole, i, min(i + size, 40)))) for i in range(0, 40, size)]
+    parts = [decode(encode(whole.selected(torch.arange(i, min(i + size, 40))))) for i in range(0, 40, size)]
     joined = quantized(Components.concatenate(parts))
     for name in ("means", "covariances", "support", "max_range", "ids", "seen_by", "seen_count"):
         assert torch.equal(getattr(joined, name), getattr(whole, name)), name
@@ -248,7 +238,7 @@ def test_cells_as_large_as_the_coordinate_range_are_decoded(monkeypatch, exponen
     corners = torch.tensor([[-lattice.FARTHEST] * 3, [lattice.FARTHEST] * 3], dtype=torch.float64)
     wide = random_components(3, k=2, deviations=(2.0**18, 2.0**19))
     components = quantized(replace(wide, means=corners, origins=wide.origins * 0))
-    monkeypatch.setattr(batch_stream, "_cell_exponent", lambda places, in_order: exponent)
+    monkeypatch.setattr(component_batch, "cell_exponent", lambda places, in_order: exponent)
     assert_same_components(decode(encode(components)), components)
 
 
@@ -316,14 +306,8 @@ def test_a_component_with_one_origin_takes_few_bytes(dim, most):
 @dims
 def test_a_small_batch_is_short(dim):
     assert len(encode(random_components(dim, k=1, n_origins=1, max_sightings=1))) <= 80
-    fits = part(random_components(dim, k=200, extent=5.0, max_sightings=1), 0, 90)
+    fits = random_components(dim, k=200, extent=5.0, max_sightings=1).selected(torch.arange(90))
     assert len(encode(fits)) <= 1200
-
-
-def test_spatial_order_is_a_permutation():
-    components = random_components(3)
-    order = spatial_order(components)
-    assert torch.equal(order.sort().values, torch.arange(len(components)))
 
 
 # -- a real map ------------------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import replace
 
@@ -10,7 +9,8 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from mapping.component_cases import counts_add_up, random_components, total_moments
+from mapping.map_cases import sightings
+from mapping.random_components import counts_add_up, normal_components, total_moments
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.components import Components
@@ -48,7 +48,7 @@ def pair(offset: float, deviation: float = 0.1, flags: tuple[bool, bool] = (Fals
     empty=st.sampled_from([0.0, 0.3, 1.0]),
 )
 def test_merging_keeps_the_moments_of_hits_and_no_returns_and_the_budget(k, dim, seed, limit, empty):
-    given_ = random_components(k, dim, seed, empty=empty)
+    given_ = normal_components(k, dim, seed, empty=empty)
     left = compact(given_, limit).checked()
     assert len(left) == min(k, limit)
     assert counts_add_up(left)
@@ -60,7 +60,7 @@ def test_merging_keeps_the_moments_of_hits_and_no_returns_and_the_budget(k, dim,
 
 
 def test_unmerged_components_keep_every_bit_and_their_id():
-    far = random_components(12, 3, 0, spread=100.0)
+    far = normal_components(12, 3, 0, spread=100.0)
     near = replace(far, means=far.means.clone())
     near.means[1] = near.means[0] + 0.01
     left = compact(near, 11)
@@ -73,19 +73,15 @@ def test_unmerged_components_keep_every_bit_and_their_id():
 
 
 def test_a_merged_component_has_the_origins_of_both():
-    given_ = random_components(6, 2, 1)
-    labels = torch.tensor([0, 1, 0, 2, 1, 0])
-    found = merged(given_, labels)
-    expected: dict[tuple[int, int], float] = {}
-    for by, viewpoint, count in zip(given_.seen_by, given_.seen_from, given_.seen_count, strict=True):
-        key = (int(labels[by]), int(viewpoint))
-        expected[key] = expected.get(key, 0.0) + float(count)
-    got = {
-        (int(by), int(viewpoint)): float(count)
-        for by, viewpoint, count in zip(found.seen_by, found.seen_from, found.seen_count, strict=True)
-    }
-    assert got.keys() == expected.keys()
-    assert all(math.isclose(got[key], expected[key]) for key in got)
+    given_ = normal_components(6, 2, 1)
+    labels = [0, 1, 0, 2, 1, 0]
+    expected: list[dict[tuple[float, ...], float]] = [{} for _ in range(3)]
+    for label, seen in zip(labels, sightings(given_), strict=True):
+        for place, count in seen.items():
+            expected[label][place] = expected[label].get(place, 0.0) + count
+    found = merged(given_, torch.tensor(labels))
+    for got, wanted in zip(sightings(found), expected, strict=True):
+        assert got == pytest.approx(wanted)
 
 
 def test_surface_components_never_merge_with_no_return_components():
@@ -118,7 +114,7 @@ def test_the_cheapest_pair_by_support_is_merged_first():
 @pytest.mark.parametrize("bad", [{}, {"max_components": 0}, {"max_components": 2, "max_cost": -1.0}])
 def test_invalid_limits_are_refused(bad):
     with pytest.raises(InvalidArgumentError):
-        compact(random_components(3, 2, 0), **bad)
+        compact(normal_components(3, 2, 0), **bad)
 
 
 def test_empty_and_single_components_are_returned_unchanged():
@@ -162,7 +158,7 @@ def kept_by_a_loop(components: Components, limit: int, mean: float | None) -> se
     mean=st.sampled_from([None, 1.0, 1.7, 3.0]),
 )
 def test_limit_origins_equals_a_greedy_loop(k, dim, seed, limit, mean):
-    given_ = random_components(k, dim, seed, n_origins=7)
+    given_ = normal_components(k, dim, seed, n_origins=7)
     left = limit_origins(given_, limit, mean).checked()
     table = {tuple(row): i for i, row in enumerate(given_.origins.tolist())}
     got = {
@@ -181,18 +177,10 @@ def test_limit_origins_equals_a_greedy_loop(k, dim, seed, limit, mean):
 
 
 def test_kept_origins_keep_the_proportions_of_their_counts():
-    given_ = random_components(8, 2, 3, n_origins=6)
-    left = limit_origins(given_, 2)
-    count = {(int(b), tuple(given_.origins[f].tolist())): float(c) for b, f, c in sightings(given_)}
-    for rows in ((left.seen_by == k).nonzero().squeeze(1) for k in range(8)):
-        for a, b in itertools.combinations(rows.tolist(), 2):
-            keys = [(int(left.seen_by[e]), tuple(left.origins[left.seen_from[e]].tolist())) for e in (a, b)]
-            ratio = float(left.seen_count[a] / left.seen_count[b])
-            assert math.isclose(ratio, count[keys[0]] / count[keys[1]], rel_tol=1e-9)
-
-
-def sightings(components: Components):
-    return zip(components.seen_by, components.seen_from, components.seen_count, strict=True)
+    given_ = normal_components(8, 2, 3, n_origins=6)
+    for kept, before in zip(sightings(limit_origins(given_, 2)), sightings(given_), strict=True):
+        ratios = [count / before[place] for place, count in kept.items()]
+        assert max(ratios) == pytest.approx(min(ratios), rel=1e-9)
 
 
 # -- bytes ----------------------------------------------------------------------------------------
@@ -205,7 +193,7 @@ def sightings(components: Components):
     empty=st.sampled_from([0, 0.5]),
 )
 def test_compact_to_bytes_keeps_the_byte_budget(k, seed, max_bytes, empty):
-    given_ = random_components(k, 3, seed, empty=empty)
+    given_ = normal_components(k, 3, seed, empty=empty)
     left = compact_to_bytes(given_, max_bytes, 3)
     assert len(left) >= 1
     assert estimated_bytes(left) <= max_bytes
@@ -217,7 +205,7 @@ def test_compact_to_bytes_keeps_the_byte_budget(k, seed, max_bytes, empty):
 
 
 def test_compact_to_bytes_accepts_any_measure_of_size():
-    given_ = random_components(50, 2, 0)
+    given_ = normal_components(50, 2, 0)
     left = compact_to_bytes(given_, 1000, 2, size=lambda c: len(c) ** 2)
     assert 10 <= len(left) <= 31
 
@@ -225,9 +213,9 @@ def test_compact_to_bytes_accepts_any_measure_of_size():
 @pytest.mark.parametrize(("limit", "mean"), [(0, None), (2, 0.5), (2, math.nan)])
 def test_invalid_numbers_of_origins_are_refused(limit, mean):
     with pytest.raises(InvalidArgumentError, match="_origins="):
-        limit_origins(random_components(3, 2, 0), limit, mean)
+        limit_origins(normal_components(3, 2, 0), limit, mean)
 
 
 def test_a_budget_below_one_component_is_refused():
     with pytest.raises(InvalidArgumentError, match="max_bytes=10"):
-        compact_to_bytes(random_components(5, 2, 0), 10, 2)
+        compact_to_bytes(normal_components(5, 2, 0), 10, 2)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from mapping.random_components import random_components
+from mapping.ray_cases import EVERYTHING, dense, one
 from scipy import stats
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
@@ -15,27 +16,10 @@ from gmmtorch.kernels import kernels
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.rays import component_evidence as module
 from gmmtorch.mapping.rays.component_evidence import component_evidence
-from gmmtorch.mapping.rays.component_rays import component_rays
+from gmmtorch.mapping.rays.component_rays import RayDensity, counted_viewpoints, drawn_rays, ray_numbers
+from gmmtorch.occupancy.forms.monte_carlo import RayBundle
 from gmmtorch.occupancy.voxels.boxes import Box
-from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
-
-EVERYTHING = Box(torch.tensor([-4096] * 3), torch.tensor([4096] * 3))
-
-
-def one(covariance, mean=(4.0, 1.0, 0.5), origin=(0.1, 0.2, 0.3), count=100.0, sequence=0) -> Components:
-    """A component with one origin."""
-    return Components(
-        means=torch.tensor([mean], dtype=torch.float64),
-        covariances=torch.as_tensor(covariance, dtype=torch.float64)[None],
-        support=torch.tensor([count], dtype=torch.float64),
-        max_range=torch.tensor([False]),
-        ids=torch.tensor([[2, sequence]]),
-        origins=torch.tensor([origin], dtype=torch.float64),
-        seen_by=torch.tensor([0]),
-        seen_from=torch.tensor([0]),
-        seen_count=torch.tensor([count], dtype=torch.float64),
-    )
 
 
 def sheet(thickness: float = 0.02, a: float = 0.3, b: float = 0.2) -> torch.Tensor:
@@ -43,24 +27,13 @@ def sheet(thickness: float = 0.02, a: float = 0.3, b: float = 0.2) -> torch.Tens
     return q @ torch.diag(torch.tensor([a, b, thickness], dtype=torch.float64) ** 2) @ q.T
 
 
-def subset(components: Components, rows: torch.Tensor) -> Components:
-    """The components of these rows, in this order."""
-    by, viewpoint, count = [], [], []
-    for place, row in enumerate(rows.tolist()):
-        mine = (components.seen_by == row).nonzero().squeeze(1)
-        by += [place] * len(mine)
-        viewpoint.append(components.seen_from[mine])
-        count.append(components.seen_count[mine])
-    picked = {
-        n: getattr(components, n)[rows] for n in ("means", "covariances", "support", "max_range", "ids")
-    }
-    return replace(
-        components,
-        **picked,
-        seen_by=torch.tensor(by),
-        seen_from=torch.cat(viewpoint),
-        seen_count=torch.cat(count),
-    )
+def component_rays(
+    components: Components, resolution: float, rays_per_cell=4.0, least=8, most=512, cutoff=2.5
+) -> RayBundle:
+    density = RayDensity(resolution, rays_per_cell, least, most, cutoff)
+    seen = counted_viewpoints(components, resolution)
+    number = ray_numbers(components, seen, density)
+    return drawn_rays(components, seen, density, number, torch.ones_like(seen))[0]
 
 
 def rows_of(rays) -> set[tuple[float, ...]]:
@@ -147,25 +120,18 @@ def test_draws_of_equal_components_are_independent():
 def test_rays_do_not_depend_on_other_components():
     components = random_components(3, k=40, seed=5)
     together = rows_of(component_rays(components, 0.2))
-    alone = [rows_of(component_rays(subset(components, torch.tensor([k])), 0.2)) for k in range(40)]
+    alone = [rows_of(component_rays(components.selected(torch.tensor([k])), 0.2)) for k in range(40)]
     assert set().union(*alone) == together  # to the last bit
     assert sum(map(len, alone)) == len(together)
     order = torch.randperm(40, generator=torch.Generator().manual_seed(0))
-    assert rows_of(component_rays(subset(components, order), 0.2)) == together
-    pairs = Components.concatenate([subset(components, order[:7]), subset(components, order[7:])])
+    assert rows_of(component_rays(components.selected(order), 0.2)) == together
+    pairs = Components.concatenate([components.selected(order[:7]), components.selected(order[7:])])
     assert rows_of(component_rays(pairs, 0.2)) == together
     renamed = replace(components, ids=components.ids + 1)
     assert rows_of(component_rays(renamed, 0.2)) != together
 
 
 # -- evidence -------------------------------------------------------------------------------------
-
-
-def dense(evidence: CellEvidence, box: Box) -> torch.Tensor:
-    both = torch.zeros(2, *box.shape, dtype=torch.float64)
-    x, y, z = (evidence.cells - box.low).unbind(1)
-    both[0, x, y, z], both[1, x, y, z] = evidence.hits.double(), evidence.misses.double()
-    return both
 
 
 def plain(component: Components, n: int, box: Box, cutoff: float, seed: int) -> torch.Tensor:
@@ -228,13 +194,6 @@ def test_evidence_does_not_depend_on_the_portion_size(monkeypatch, most):
     far = replace(components, means=components.means + 1e5, origins=components.origins + 1e5)
     for nothing in (components.selected(torch.arange(0)), far):
         assert len(component_evidence(nothing, 0.2, box, **options).cells) == 0
-
-
-def test_no_return_components_have_no_hits():
-    component = replace(one(sheet()), max_range=torch.tensor([True]))
-    evidence = component_evidence(component, 0.2, EVERYTHING)
-    assert float(evidence.hits.sum()) == 0
-    assert float(evidence.misses.sum()) > 100
 
 
 # -- edges ----------------------------------------------------------------------------------------

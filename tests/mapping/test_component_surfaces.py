@@ -1,4 +1,4 @@
-"""Selected and summed components, and the shell of surfaces that frees no cells."""
+"""Evidence of components: the shell of surfaces that frees no cells, denser hits, and thinned rays."""
 
 from __future__ import annotations
 
@@ -7,88 +7,17 @@ from dataclasses import replace
 
 import pytest
 import torch
-from mapping.component_cases import counts_add_up, random_components
+from mapping.random_components import normal_components
+from mapping.ray_cases import EVERYTHING, dense, one
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.association import summed
 from gmmtorch.mapping.rays.component_evidence import component_evidence
 from gmmtorch.occupancy.voxels.boxes import Box
-from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence, sum_evidence
+from gmmtorch.occupancy.voxels.cell_evidence import sum_evidence
 
 RESOLUTION = 0.2
-
-
-# -- parts and sums -------------------------------------------------------------------------------
-
-
-def sightings(components: Components, row: int) -> list[tuple[tuple[float, ...], float]]:
-    """(origin, count) pairs of a component, in order."""
-    return [
-        (tuple(components.origins[viewpoint].tolist()), count)
-        for by, viewpoint, count in zip(
-            components.seen_by.tolist(),
-            components.seen_from.tolist(),
-            components.seen_count.tolist(),
-            strict=True,
-        )
-        if by == row
-    ]
-
-
-@pytest.mark.parametrize("rows", [[4, 0, 11, 7], [], list(range(12)), list(range(11, -1, -1)), [5]])
-def test_selected_components_equal_those_of_a_loop(rows: list[int]) -> None:
-    components = random_components(12, 3, seed=1, empty=0.3)
-    # Sightings in any order, and a component without any.
-    order = torch.randperm(len(components.seen_by), generator=torch.Generator().manual_seed(0))
-    order = order[components.seen_by[order] != 7]
-    shuffled = {n: getattr(components, n)[order] for n in ("seen_by", "seen_from", "seen_count")}
-    components = replace(components, **shuffled)
-    chosen = components.selected(torch.tensor(rows, dtype=torch.int64)).checked()
-    assert len(chosen) == len(rows)
-    for place, row in enumerate(rows):
-        for name in ("means", "covariances", "support", "max_range", "ids"):
-            assert torch.equal(getattr(chosen, name)[place], getattr(components, name)[row])
-        assert sightings(chosen, place) == sightings(components, row)
-    assert len(chosen.seen_by) == sum(len(sightings(components, row)) for row in rows)
-    assert torch.equal(chosen.origins, components.origins)
-
-
-def batch(ids: list[tuple[int, int]], counts: list[float], seed: int) -> Components:
-    """Components with these ids and counts and one origin."""
-    components = random_components(len(ids), 3, seed, n_origins=1)
-    support = torch.tensor(counts, dtype=torch.float64)
-    return replace(
-        components, ids=torch.tensor(ids, dtype=torch.int64), support=support, seen_count=support.clone()
-    )
-
-
-def test_summed_counts_equal_those_of_a_dictionary() -> None:
-    parts = [
-        batch([(1, 0), (1, 1), (1, 2)], [3.0, 5.0, 7.0], 0),
-        batch([(0, 9), (0, 3)], [11.0, 13.0], 1),
-        batch([(1, 1), (0, 3), (1, 1)], [0.5, 0.25, 2.0], 2),
-    ]
-    found = summed(Components.concatenate(parts)).checked()
-    totals: dict[tuple[int, int], float] = {}
-    first: dict[tuple[int, int], Tensor] = {}
-    for part in parts:
-        for key, count, mean in zip(part.ids.tolist(), part.support.tolist(), part.means, strict=True):
-            totals[tuple(key)] = totals.get(tuple(key), 0.0) + count
-            first.setdefault(tuple(key), mean)
-    assert [tuple(key) for key in found.ids.tolist()] == sorted(totals)
-    assert found.support.tolist() == [totals[key] for key in sorted(totals)]
-    assert torch.equal(found.means, torch.stack([first[key] for key in sorted(totals)]))
-    assert counts_add_up(found)
-
-
-def test_summing_distinct_or_no_components_changes_nothing() -> None:
-    alone = batch([(0, 0), (0, 4), (2, 1)], [1.0, 2.0, 3.0], 0)
-    found = summed(alone)
-    for name in ("means", "support", "ids", "seen_by", "seen_from", "seen_count"):
-        assert torch.equal(getattr(found, name), getattr(alone, name))
-    assert len(summed(Components.empty(3))) == 0
 
 
 # -- the shell ------------------------------------------------------------------------------------
@@ -110,26 +39,9 @@ def sheet(
     q = rotation_to(unit)
     deviations = torch.tensor([0.5, 0.4, 1e-6], dtype=torch.float64)
     covariance = q @ torch.diag(deviations**2) @ q.T
-    mean = torch.tensor([3.03, 0.57, 0.45], dtype=torch.float64)
-    component = Components(
-        means=mean[None],
-        covariances=(covariance + covariance.T)[None] / 2,
-        support=torch.tensor([count], dtype=torch.float64),
-        max_range=torch.tensor([False]),
-        ids=torch.tensor([[1, 5]]),
-        origins=torch.tensor([origin], dtype=torch.float64),
-        seen_by=torch.tensor([0]),
-        seen_from=torch.tensor([0]),
-        seen_count=torch.tensor([count], dtype=torch.float64),
-    )
-    return component, unit, float(unit @ mean)
-
-
-def dense(evidence: CellEvidence, box: Box) -> Tensor:
-    both = torch.zeros(2, *box.shape, dtype=torch.float64)
-    x, y, z = (evidence.cells - box.low).unbind(1)
-    both[0, x, y, z], both[1, x, y, z] = evidence.hits.double(), evidence.misses.double()
-    return both
+    mean = (3.03, 0.57, 0.45)
+    component = one((covariance + covariance.T) / 2, mean, origin, count)
+    return component, unit, float(unit @ component.means[0])
 
 
 AROUND = Box(torch.tensor([-15, -25, -25]), torch.tensor([40, 35, 35]))
@@ -207,14 +119,12 @@ def test_a_sensor_within_the_shell_frees_no_cells() -> None:
 
 # -- hits drawn more densely ----------------------------------------------------------------------
 
-LARGE = Box(torch.tensor([-4096] * 3), torch.tensor([4096] * 3))
-
 
 @pytest.mark.parametrize("shell", [0.0, 1.0])
 def test_hits_per_ray_does_not_change_the_misses(shell: float) -> None:
-    components = random_components(25, 3, seed=2, empty=0.3)
+    components = normal_components(25, 3, seed=2, empty=0.3)
     once, often = (
-        component_evidence(components, RESOLUTION, LARGE, shell=shell, hits_per_ray=n) for n in (1, 8)
+        component_evidence(components, RESOLUTION, EVERYTHING, shell=shell, hits_per_ray=n) for n in (1, 8)
     )
     missed = [dict(zip(map(tuple, e.cells.tolist()), e.misses.tolist(), strict=True)) for e in (once, often)]
     for cell in missed[0].keys() | missed[1].keys():
@@ -271,7 +181,7 @@ def test_all_rays_count_as_misses_in_the_cell_of_the_sensor() -> None:
 @pytest.mark.parametrize("shell", [0.0, 1.0])
 def test_evidence_of_disjoint_boxes_sums_to_the_whole(shell: float, thinned: bool) -> None:
     options = {"shell": shell, "hits_per_ray": 8, "thinned": thinned}
-    components = random_components(30, 3, seed=4, empty=0.2)
+    components = normal_components(30, 3, seed=4, empty=0.2)
     whole = Box(torch.tensor([-12] * 3), torch.tensor([12] * 3))
     halves = []
     for octant in itertools.product((0, 1), repeat=3):
@@ -283,19 +193,6 @@ def test_evidence_of_disjoint_boxes_sums_to_the_whole(shell: float, thinned: boo
     torch.testing.assert_close(
         dense(sum_evidence(halves), whole), dense(expected, whole), rtol=1e-5, atol=1e-4
     )
-
-
-@pytest.mark.parametrize("thinned", [False, True])
-def test_evidence_of_a_component_does_not_depend_on_the_others(thinned: bool) -> None:
-    components = random_components(20, 3, seed=6, empty=0.2)
-    options = {"shell": 1.0, "hits_per_ray": 8, "thinned": thinned}
-    alone = sum_evidence(
-        component_evidence(components.selected(torch.tensor([k])), RESOLUTION, AROUND, **options)
-        for k in range(20)
-    )
-    order = torch.randperm(20, generator=torch.Generator().manual_seed(0))
-    together = component_evidence(components.selected(order), RESOLUTION, AROUND, **options)
-    torch.testing.assert_close(dense(together, AROUND), dense(alone, AROUND), rtol=1e-5, atol=1e-4)
 
 
 def test_invalid_arguments_are_refused() -> None:

@@ -10,7 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mapping.component_cases import counts_add_up
+from mapping.random_components import counts_add_up
 from occupancy.protocol_contract import WALL, dims, open_scan, points, wall_scan
 from torch import Tensor
 
@@ -20,10 +20,10 @@ from gmmtorch.evaluation import metrics, queries
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.depth_frame import DepthFrame
-from gmmtorch.mapping.learning.incremental import absorb
 from gmmtorch.mapping.learning.merging import UNNUMBERED, estimated_bytes
 from gmmtorch.mapping.learning.novelty import entropy_reduction
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
+from gmmtorch.mapping.learning.windows import absorb
 from gmmtorch.occupancy.evidence import occupancy_probability
 from gmmtorch.occupancy.forms.point import point_evidence
 from gmmtorch.pinhole import back_project
@@ -71,16 +71,6 @@ def test_support_equals_the_number_of_points_within_the_budget(n, dim, limit, wi
         assert len(found) <= limit
     places = {tuple(scan.origin.tolist()) for scan in scans}
     assert {tuple(row) for row in found.origins.tolist()} <= places
-
-
-@dims
-def test_the_same_scans_give_the_same_map(dim):
-    scans = drive(4, dim)
-    rule = replace(RULE, n_components=8, max_cost=0.01)
-    whole = grown(scans, rule)
-    assert equal(whole, grown(scans, rule))
-    parts = absorb(grown(scans[:2], rule), scans[2:], rule)
-    assert equal(whole, parts)
 
 
 def test_old_components_keep_their_ids_and_new_ones_have_none():
@@ -223,35 +213,6 @@ def test_a_map_learns_depth_images_like_its_rule():
 
 
 # -- bad input and real data ----------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "bad",
-    [
-        {"noise": 0.0},
-        {"length": float("nan")},
-        {"cell": float("inf")},
-        {"window": 0},
-        {"window_components": 0},
-        {"iterations": 0},
-        {"n_components": 0},
-        {"max_bytes": 0},
-        {"max_origins": 0},
-        {"mean_origins": 0.5},
-        {"max_cost": 1.0},
-        {"max_cost": -0.1},
-    ],
-)
-def test_invalid_incremental_rules_are_refused(bad):
-    with pytest.raises(InvalidArgumentError, match=next(iter(bad))):
-        IncrementalRule(**bad)
-
-
-def test_scans_of_another_dimension_are_refused():
-    with pytest.raises(InvalidArgumentError, match="2-dimensional"):
-        absorb(Components.empty(3), [wall_scan(2)], RULE)
-    with pytest.raises(InvalidArgumentError, match="2-dimensional"):
-        absorb_depth(Components.empty(2), depth_frames(1), INTRINSICS, RULE)
 
 
 @pytest.mark.slow

@@ -7,18 +7,15 @@ from typing import Any
 import pytest
 import torch
 from evaluation.pillar_room import room_scans
-from hypothesis import given
-from hypothesis import strategies as st
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.depth_frame import DepthFrame
 from gmmtorch.mapping.learning.fitting import fit_window
-from gmmtorch.mapping.learning.incremental import surface_fit
-from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule, read_rule, rule_facts
+from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
 from gmmtorch.mapping.learning.viewpoints import all_origins
+from gmmtorch.mapping.learning.windows import surface_fit
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.estimators.sensor_model import measured_sensor
 from gmmtorch.mixture.reduction.pruning import density_share
@@ -58,7 +55,6 @@ def test_pruning_by_support_keeps_the_components_of_enough_points(dim):
 def test_pruning_by_density_keeps_the_components_that_are_dense_for_the_scan(dim):
     scans = scans_of(dim)
     plain, pruned = learned(scans), learned(scans, prune="density", min_density_share=0.5)
-    sensor = measured_sensor(scans[0].points, scans[0].origin)
     largest = max(scans, key=lambda scan: len(scan.points))
     sensor = measured_sensor(largest.points, largest.origin)
     mixture = Parameters(plain.support, plain.means, plain.covariances)
@@ -128,35 +124,6 @@ def test_free_points_lower_the_occupancy_before_a_surface(dim):
     for made in (plain, free):
         made.insert(scans[0])
     assert float(free.occupancy(middle).mean()) < float(plain.occupancy(middle).mean())
-
-
-@given(st.sampled_from(["none", "support", "density"]), st.sampled_from(["flat_pieces", "hierarchical"]))
-def test_rules_are_written_and_read(prune, learner):
-    for rule in (
-        IncrementalRule(prune=prune, learner=learner, free_points=2),
-        WindowedRule(prune=prune, learner=learner, planarity=0.01),
-    ):
-        assert read_rule(**rule_facts(rule)) == rule
-    assert set(rule_facts(IncrementalRule())) == {"kind"}
-
-
-@pytest.mark.parametrize("rule", [IncrementalRule, WindowedRule])
-@pytest.mark.parametrize(
-    ("option", "value"),
-    [
-        ("prune", "weight"),
-        ("min_support", -1.0),
-        ("min_density_share", float("nan")),
-        ("learner", "tree"),
-        ("planarity", 0.0),
-        ("planarity", 2.0),
-        ("free_points", -1),
-        ("free_points", 0.5),
-    ],
-)
-def test_invalid_options_are_named(rule, option, value):
-    with pytest.raises(InvalidArgumentError, match=f"^{option}="):
-        rule(**{option: value})
 
 
 @pytest.mark.parametrize("options", [{"learner": "hierarchical"}, {"prune": "support"}, {"free_points": 1}])

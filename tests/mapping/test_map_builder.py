@@ -10,7 +10,6 @@ import torch
 from gmmtorch.datasets import Dataset, Ranges, load
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.learner import Learner
 from gmmtorch.mapping.learning.rules import IncrementalRule
 from gmmtorch.mapping.map_builder import MapBuilder
 from gmmtorch.scan import Scan
@@ -81,13 +80,13 @@ def test_the_builder_inserts_its_scans_and_counts_them():
 def test_progress_learns_no_unfinished_window(monkeypatch):
     """A preview of the window for each scan would cost more than the map itself."""
     previews: list[int] = []
-    preview = Learner.preview
+    learned = GaussianMap._with_pending
 
-    def counted(self, *arguments):
-        previews.append(len(self.pending))
-        return preview(self, *arguments)
+    def counted(self):
+        previews.append(self.n_pending)
+        return learned(self)
 
-    monkeypatch.setattr(Learner, "preview", counted)
+    monkeypatch.setattr(GaussianMap, "_with_pending", counted)
     one = builder()
     shown = [now.n_components for now in one.insert_all()]
     assert shown[-1] > 0

@@ -11,7 +11,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mapping.map_cases import FINE, assert_same_components, built, names, open_drive
+from mapping.map_cases import FINE, assert_same_components, built, each_value, open_drive
 from mapping.random_components import random_components
 from occupancy.protocol_contract import lattice, wall_scan
 from torch import Tensor
@@ -19,14 +19,11 @@ from torch import Tensor
 from gmmtorch.errors import DataError, GmmTorchError
 from gmmtorch.files import pack_tensors, read_tensors
 from gmmtorch.mapping.codec import map_file as storage
-from gmmtorch.mapping.codec.component_batch import numbered
+from gmmtorch.mapping.codec.quantization import numbered
 from gmmtorch.mapping.components import UNNUMBERED
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
 from gmmtorch.mapping.query_options import QueryOptions
-
-codecs = pytest.mark.parametrize("codec", ["quantized", "float"])
-
 
 # -- saved and loaded ------------------------------------------------------------------------------------
 
@@ -82,15 +79,6 @@ def test_a_file_without_cutoff_and_hit_length_has_the_format_defaults(tmp_path, 
     facts = {key: value for key, value in facts.items() if key not in ("cutoff", "hit_length")}
     options = load_parts(tmp_path, tensors, facts).query_options
     assert (options.cutoff, options.hit_length) == (5.0, None)
-
-
-@codecs
-def test_ids_stay_unique_when_a_loaded_map_continues(codec, tmp_path):
-    built(open_drive(3), window=2, codec=codec).save(tmp_path / "m.safetensors")
-    loaded = GaussianMap.load(tmp_path / "m.safetensors")
-    before = names(loaded.ids)
-    loaded.insert(wall_scan(2))
-    assert names(loaded.components().ids) > before
 
 
 @settings(max_examples=30)
@@ -223,68 +211,47 @@ def test_load_refuses_files_without_a_batch(tmp_path, packed, batch):
         load_parts(tmp_path, {"components": batch}, packed[1])
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"n_samples": -5},
-        {"n_samples": 10**30},
-        {"sampling": "magic"},
-        {"sampling": []},
-        {"resolution": 0},
-        {"resolution": "x"},
-        {"resolution": None},
-        {"prior": "x"},
-        {"prior": -1},
-        {"cutoff": "x"},
-        {"cutoff": 0},
-        {"hit_length": "x"},
-        {"random_state": None},
-        {"random_state": 2**80},
-        {"method": "magic"},
-        {"method": ["point"]},
-        {"codec": "zip"},
-        {"codec": {}},
-        {"robot": "x"},
-        {"robot": 2**70},
-        {"robot": None},
-        {"n_numbered": None},
-        {"n_numbered": "12"},
-        {"n_numbered": -1},
-        {"n_numbered": 1e30},
-        {"n_numbered": []},
-        {"unheard_of": 1},
-        {"learning": None},
-        {"learning": []},
-        {"learning": "incremental"},
-        {"learning": {}},
-        {"learning": {"kind": "magic"}},
-        {"learning": {"kind": []}},
-        *(
-            {"learning": {"kind": kind, **damage}}
-            for kind in ("windowed", "incremental")
-            for damage in (
-                {"noise": -1},
-                {"noise": "x"},
-                {"window": 0},
-                {"window": "x"},
-                {"max_origins": 1.5},
-                {"unheard_of": 1},
-                {"novelty": {"unheard_of": 1}},
-                {"novelty": 3},
-            )
-        ),
-        {"learning": {"kind": "windowed", "window": None}},
-        {"learning": {"kind": "incremental", "max_bytes": 0}},
-        {"learning": {"kind": "incremental", "n_components": "x"}},
-        {"learning": {"kind": "incremental", "max_cost": "x"}},
-        {"learning": {"kind": "incremental", "novelty": {"distance": -1}}},
-    ],
-    ids=str,
-)
-def test_a_file_whose_settings_are_damaged_is_refused(tmp_path, packed, change):
+DAMAGED_FACTS = {
+    "n_samples": [-5, 10**30],
+    "sampling": ["magic", []],
+    "resolution": [0, "x", None],
+    "prior": ["x", -1],
+    "cutoff": ["x", 0],
+    "hit_length": ["x"],
+    "random_state": [None, 2**80],
+    "method": ["magic", ["point"]],
+    "codec": ["zip", {}],
+    "robot": ["x", 2**70, None],
+    "n_numbered": [None, "12", -1, 1e30, []],
+    "unheard_of": [1],
+    "learning": [None, [], "incremental", {}, {"kind": "magic"}, {"kind": []}],
+}
+DAMAGED_RULES = {
+    "noise": [-1, "x"],
+    "window": [0, "x"],
+    "max_origins": [1.5],
+    "unheard_of": [1],
+    "novelty": [{"unheard_of": 1}, 3],
+}
+DAMAGED_FACTS["learning"] += [
+    {"kind": kind, name: value}
+    for kind in ("windowed", "incremental")
+    for name, value in each_value(DAMAGED_RULES)
+]
+DAMAGED_FACTS["learning"] += [
+    {"kind": "windowed", "window": None},
+    {"kind": "incremental", "max_bytes": 0},
+    {"kind": "incremental", "n_components": "x"},
+    {"kind": "incremental", "max_cost": "x"},
+    {"kind": "incremental", "novelty": {"distance": -1}},
+]
+
+
+@pytest.mark.parametrize(("name", "value"), each_value(DAMAGED_FACTS), ids=str)
+def test_a_file_whose_settings_are_damaged_is_refused(tmp_path, packed, name, value):
     tensors, facts = packed
     with pytest.raises(DataError, match=r"m\.safetensors"):
-        load_parts(tmp_path, tensors, {**facts, **change})
+        load_parts(tmp_path, tensors, {**facts, name: value})
 
 
 def test_a_file_that_lacks_a_setting_is_refused(tmp_path, packed):

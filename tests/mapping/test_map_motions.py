@@ -125,16 +125,6 @@ def test_the_inverse_motion_restores_the_map(codec):
     assert torch.equal(made.occupancy(lattice(2)), before)
 
 
-@pytest.mark.parametrize("codec", ["quantized", "float"])
-def test_a_saved_moved_map_has_the_same_components_and_occupancy(codec, tmp_path):
-    made = built(drive(3, 3), window=2, codec=codec)
-    made.transform(some_motion(3))
-    made.save(tmp_path / "m.safetensors")
-    loaded = GaussianMap.load(tmp_path / "m.safetensors")
-    assert_same_components(loaded.components(), made.components())
-    assert torch.equal(loaded.occupancy(lattice(3)), made.occupancy(lattice(3)))
-
-
 def test_a_distant_motion_is_exact_to_10_nm():
     parts, matrix = given_parts(), shifted(2, (500_000.0, 4_000_000.0))
     made = GaussianMap.from_components(**parts)

@@ -6,15 +6,14 @@ import math
 
 import pytest
 import torch
-from mapping.component_cases import random_components
+from mapping.random_components import normal_components
 from occupancy.exact_dda import voxels_left
 from occupancy.protocol_contract import dims, empty_scan, open_scan, wall_scan
 
-from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.incremental import absorb
 from gmmtorch.mapping.learning.novelty import entropy_reduction, novel_beams
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule
+from gmmtorch.mapping.learning.windows import absorb
 from gmmtorch.occupancy.forms.point import point_evidence
 from gmmtorch.scan import Scan
 
@@ -51,7 +50,7 @@ def bits_by_a_walk(components: Components, scan: Scan, rule: NoveltyRule) -> tup
 
 @pytest.mark.parametrize(("dim", "seed"), [(2, 0), (3, 1)])
 def test_entropy_reduction_equals_an_exact_walk(dim, seed):
-    components = random_components(6, dim, seed, empty=0.3)
+    components = normal_components(6, dim, seed, empty=0.3)
     generator = torch.Generator().manual_seed(seed)
     ends = 1.2 * torch.randn(6, dim, generator=generator, dtype=torch.float64)
     scan = Scan(ends[:4], torch.tensor([0.1, -0.2, 0.3][:dim], dtype=torch.float64), ends[4:])
@@ -116,22 +115,3 @@ def test_novelty_is_the_same_far_from_the_world_origin():
     here, _ = entropy_reduction(near, scans[1], RULE)
     there, _ = entropy_reduction(far, moved[1], RULE)
     torch.testing.assert_close(here, there, rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.parametrize(
-    "bad",
-    [
-        {"resolution": 0.0},
-        {"threshold": -1.0},
-        {"threshold": math.nan},
-        {"observed": math.inf},
-        {"prior": -1.0},
-        {"cutoff": 0.0},
-        {"explained": 0.0},
-        {"distance": -0.1},
-        {"distance_for": "some"},
-    ],
-)
-def test_invalid_novelty_rules_are_refused(bad):
-    with pytest.raises(InvalidArgumentError, match=next(iter(bad))):
-        NoveltyRule(**bad)

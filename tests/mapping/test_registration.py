@@ -9,13 +9,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mapping.component_cases import random_components
 from mapping.map_cases import some_motion
+from mapping.random_components import normal_components
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
-from gmmtorch.localization.registration.overlap import Pairs, overlap
-from gmmtorch.localization.registration.overlap_ascent import Ascent
+from gmmtorch.localization.registration.overlap import Ascent, Pairs, overlap
 from gmmtorch.localization.registration.registration import register, yaw_starts
 from gmmtorch.localization.rigid_motions import Motions, generators
 from gmmtorch.mapping.components import Components
@@ -211,7 +210,7 @@ def test_several_starts_recover_an_unknown_heading(dim):
 
 
 def test_no_return_components_of_maps_are_ignored():
-    c = random_components(40, 3, seed=8, empty=0.3)
+    c = normal_components(40, 3, seed=8, empty=0.3)
     moved = c.transformed(some_motion(3), torch.ones(40, dtype=torch.bool))
     solid = ~c.max_range
     by_hand = register(

@@ -15,7 +15,7 @@ from gmmtorch.localization.rigid_motions import generators
 from gmmtorch.mapping.codec import component_batch as codec
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import WindowedRule
-from gmmtorch.mapping.learning.windowed import learn_window
+from gmmtorch.mapping.learning.windows import learn_window
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_data]
 

@@ -13,8 +13,8 @@ from mapping.random_components import random_components
 
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, MissingDataError
 from gmmtorch.files import pack_tensors, read_tensors
-from gmmtorch.mapping.codec.component_batch import quantized
 from gmmtorch.mapping.codec.map_file import MapSettings
+from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.query_options import QueryOptions

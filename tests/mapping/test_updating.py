@@ -8,7 +8,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from mapping.component_cases import counts_add_up, random_components
+from mapping.random_components import counts_add_up, normal_components
 from scipy.stats import chi2
 
 from gmmtorch.mapping.components import Components
@@ -49,7 +49,7 @@ def counts_by_a_loop(components, points, origin, distance, limit, max_range, fre
     asks=st.sampled_from(["all", "some", "none"]),
 )
 def test_association_counts_equal_a_loop(dim, seed, distance, limit, max_range, asks):
-    components = random_components(7, dim, seed, spread=0.5, empty=0.3)
+    components = normal_components(7, dim, seed, spread=0.5, empty=0.3)
     generator = torch.Generator().manual_seed(seed + 1)
     points = torch.randn(15, dim, generator=generator, dtype=torch.float64)
     origin = torch.randn(dim, generator=generator, dtype=torch.float64)
@@ -71,7 +71,7 @@ def test_association_counts_equal_a_loop(dim, seed, distance, limit, max_range, 
 
 
 def test_association_keeps_moments_and_adds_beam_weights():
-    components = random_components(4, 3, 0)
+    components = normal_components(4, 3, 0)
     at_mean = components.means[:1]  # where the thesis's shares divide by zero
     found = count_explained(components, at_mean, components.origins[0], 100.0, weight=16.0)
     assert found.explained.tolist() == [True]
@@ -82,20 +82,11 @@ def test_association_keeps_moments_and_adds_beam_weights():
     assert torch.equal(found.components.ids, components.ids)
 
 
-def test_only_points_that_free_space_ask_where_a_component_was_seen_from():
-    surface = random_components(1, 3, 0)  # the case: seen from one place, explained from another
-    point, away = surface.means, surface.origins[surface.seen_from[0]] + torch.tensor([0.0, 3.0, 0.0])
-    for frees, explained in ((None, False), (torch.tensor([True]), False), (torch.tensor([False]), True)):
-        found = count_explained(surface, point, away, 2.0, max_range=bool(surface.max_range[0]), frees=frees)
-        assert found.explained.tolist() == [explained], frees
-        assert float(found.components.support - surface.support) == pytest.approx(float(explained))
-
-
 def test_without_components_or_points_nothing_is_explained():
     nothing = Components.empty(2)
     points = torch.zeros(3, 2, dtype=torch.float64)
     assert count_explained(nothing, points, points[0], 1.0).explained.tolist() == [False] * 3
-    some = random_components(3, 2, 0)
+    some = normal_components(3, 2, 0)
     found = count_explained(some, points[:0], points[0], 1.0)
     assert found.explained.shape == (0,)
     assert torch.equal(found.components.support, some.support)
@@ -103,7 +94,7 @@ def test_without_components_or_points_nothing_is_explained():
 
 @pytest.mark.parametrize("k", [1, 300])
 def test_association_counts_do_not_depend_on_the_portion_size(k, monkeypatch):
-    components = random_components(k, 2, 1)
+    components = normal_components(k, 2, 1)
     points = torch.randn(200, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     whole = count_explained(components, points, components.origins[0], 100.0)
     monkeypatch.setattr("gmmtorch.mapping.learning.association._PAIRS_AT_ONCE", 7 * k)

@@ -15,7 +15,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mixture.fit_contract import FitContract, blobs, kinds, move, rigid_motion
 from sklearn.base import clone
-from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError
 from gmmtorch.files import pack_tensors
@@ -56,27 +55,17 @@ class MixtureContract(FitContract):
     # -- arrays and tensors ------------------------------------------------------------------------------
 
     @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-    def test_arrays_give_arrays(self, dtype):
-        points = blobs(2).astype(dtype)
+    @kinds
+    def test_queries_have_the_kind_of_the_points_and_their_precision(self, kind, dtype):
+        points = kind(blobs(2).astype(dtype))
         mixture = self.make().fit(points)
         for value in (mixture.weights_, mixture.means_, mixture.covariances_, mixture.precisions_):
-            assert isinstance(value, np.ndarray)
-            assert value.dtype == np.float64
-        assert mixture.score_samples(points).dtype == dtype
-        assert mixture.predict_proba(points).dtype == dtype
-        assert isinstance(mixture.sample(2)[0], np.ndarray)
-
-    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-    def test_tensors_give_tensors(self, dtype):
-        points = torch.from_numpy(blobs(2)).to(dtype)
-        mixture = self.make().fit(points)
-        for value in (mixture.weights_, mixture.means_, mixture.covariances_, mixture.precisions_):
-            assert isinstance(value, Tensor)
-            assert value.dtype == torch.float64
-        assert mixture.score_samples(points).dtype == dtype
-        assert mixture.predict_proba(points).dtype == dtype
-        assert mixture.predict(points).dtype == torch.int64
-        assert isinstance(mixture.sample(2)[0], Tensor)
+            assert type(value) is type(points)
+            assert value.dtype == kind(np.zeros(1)).dtype
+        for value in (mixture.score_samples(points), mixture.predict_proba(points)):
+            assert type(value) is type(points)
+            assert value.dtype == points.dtype
+        assert type(mixture.predict(points)) is type(mixture.sample(2)[0]) is type(points)
 
     def test_tensors_and_arrays_give_equal_fits(self):
         points = blobs(3)

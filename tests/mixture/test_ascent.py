@@ -88,15 +88,6 @@ def test_value_and_gradient_equal_autograd(dim, generator):
     torch.testing.assert_close(place.gradient, expected, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("dim", [1, 2, 3])
-def test_gradient_is_the_slope_along_geodesics(dim, generator):
-    place = random_iterate(2, dim, generator)
-    for _ in range(3):
-        tangent = torch.randn(place.gradient.shape, generator=generator, dtype=torch.float64)
-        rise = place.move(1e-5 * tangent).value - place.move(-1e-5 * tangent).value
-        assert rise / 2e-5 == pytest.approx(float((place.gradient * tangent).sum()), rel=1e-6)
-
-
 def test_float32_value_and_gradient_are_close(generator):
     state = generator.get_state()
     exact = random_iterate(3, 3, generator)
@@ -151,19 +142,6 @@ def test_distant_thin_component_gives_the_value_near_the_centre(generator):
 # -- the manifold ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("size", [2, 4])
-def test_packed_tangents_keep_the_inner_product(size, generator):
-    matrices = torch.randn(2, 5, size, size, generator=generator, dtype=torch.float64)
-    matrices = matrices + matrices.mT
-    change = torch.randn(2, 5, generator=generator, dtype=torch.float64)
-    a, b = (pack_tangent(m, c) for m, c in zip(matrices, change, strict=True))
-    traces = torch.stack([(x @ y).trace() for x, y in zip(*matrices, strict=True)]).sum()
-    assert float((a * b).sum()) == pytest.approx(float(traces + (change[0] * change[1]).sum()))
-    back, back_change = unpack_tangent(a, size)
-    torch.testing.assert_close(back, matrices[0])
-    assert torch.equal(back_change, change[0])
-
-
 @pytest.mark.parametrize("dim", [1, 3])
 def test_move_is_the_exponential_map_with_parallel_transport(dim, generator):
     """S½ exp(S^−½ V S^−½) S½, and transport E Z Eᵀ with E = (S' S⁻¹)½, by scipy's expm and sqrtm."""
@@ -187,18 +165,6 @@ def test_move_is_the_exponential_map_with_parallel_transport(dim, generator):
         np.testing.assert_allclose(S_new, half @ expm(inverse @ V @ inverse) @ half, rtol=1e-8, atol=1e-10)
         E = np.real(sqrtm(S_new @ np.linalg.inv(S)))
         np.testing.assert_allclose(Z_new, E @ Z @ E.T, rtol=1e-8, atol=1e-10)
-
-
-def test_frames_keep_their_decomposition(generator):
-    place = random_iterate(3, 3, generator)
-    linear, means, offset = place.frames
-    assert float((linear.mT @ offset[:, :, None]).abs().max()) < 1e-12
-    S = covariance(place)
-    last = S[:, 3, 3]
-    torch.testing.assert_close(1 / last, offset.square().sum(1))
-    torch.testing.assert_close(S[:, :3, 3] / last[:, None], means)
-    central = S[:, :3, :3] - last[:, None, None] * means[:, :, None] * means[:, None, :]
-    torch.testing.assert_close(place.covariances, central)
 
 
 # -- the ascent on other functions -----------------------------------------------------------------

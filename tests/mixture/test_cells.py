@@ -9,7 +9,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
+from mixture.mixture_cases import cloud
 
 from gmmtorch.kernels import kernels
 from gmmtorch.mixture import GaussianMixture
@@ -17,11 +17,6 @@ from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em import loop
 from gmmtorch.mixture.em.cells import pool_into_cells
 from gmmtorch.mixture.em.exact import quadratic_features
-
-
-def cloud(n: int, dim: int, seed: int) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return torch.randn(n, dim, generator=generator, dtype=torch.float64)
 
 
 @given(
@@ -70,14 +65,6 @@ def test_cells_have_the_finest_side(dim):
     for cell in range(cells.weight.shape[0]):
         own = points[cells.member == cell]
         assert float((own.amax(0) - own.amin(0)).max()) <= 0.3 + 1e-12
-
-
-def test_few_points_are_not_pooled():
-    points = cloud(20, 3, 0)
-    cells = pool_into_cells(points, 20, 10.0)
-    assert torch.equal(cells.features, quadratic_features(points))
-    assert cells.weight.tolist() == [1.0] * 20
-    assert cells.member.tolist() == list(range(20))
 
 
 def test_distant_outlier_gets_its_own_cell():

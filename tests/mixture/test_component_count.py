@@ -12,16 +12,15 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from mixture.fit_contract import check_mixture, degenerate_clouds, move, rigid_motion
+from mixture.mixture_cases import cloud
 from sklearn.base import clone
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mapping.learning.rules import WindowedRule
-from gmmtorch.mapping.learning.windowed import flatness_rule
 from gmmtorch.mixture import GaussianMixture
 from gmmtorch.mixture.em import initialization
 from gmmtorch.mixture.em.initialization import surface_pieces
-from gmmtorch.mixture.em.partition import FlatnessRule, least_support, surface_rule
+from gmmtorch.mixture.em.partition import least_support
 
 NOISE = 0.01
 
@@ -54,10 +53,6 @@ def sphere(n: int, seed: int = 0) -> Tensor:
     return points * (1 + 0.002 * torch.randn(n, 1, generator=generator, dtype=torch.float64))
 
 
-def clutter(n: int, dim: int = 3, seed: int = 0) -> Tensor:
-    return torch.randn(n, dim, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
 def count(points: Tensor, noise: float = NOISE, weight: Tensor | None = None) -> int:
     weight = points.new_ones(len(points)) if weight is None else weight
     found, labels = surface_pieces(points - points.mean(0), weight, noise, 1e-6)
@@ -76,7 +71,7 @@ def fitted(points: Tensor | np.ndarray, **options) -> GaussianMixture:
 
 def test_flat_wall_is_one_component_and_clutter_many():
     assert [count(wall(n, (0, 0, 0), 1, 0)) for n in (10, 1000, 30_000)] == [1, 1, 1]
-    assert count(clutter(1000)) > 15
+    assert count(cloud(1000, 3)) > 15
 
 
 def test_room_has_large_pieces_on_walls_and_small_ones_at_edges():
@@ -90,7 +85,7 @@ def test_room_has_large_pieces_on_walls_and_small_ones_at_edges():
     assert float(from_edge[~flat[labels]].max()) < 1
     inside = from_edge > 0.6
     assert float(size[labels][inside].double().mean()) > 6 * least_support(3)
-    assert len(size) < 0.6 * count(clutter(12_000))
+    assert len(size) < 0.6 * count(cloud(12_000, 3))
 
 
 def test_less_noise_gives_more_pieces_of_a_curved_surface():
@@ -104,13 +99,13 @@ def test_less_noise_gives_more_pieces_of_a_curved_surface():
 
 @pytest.mark.parametrize("unit", [1e-6, 1e-3, 1e3])
 def test_number_does_not_depend_on_the_unit(unit):
-    for points in (room(200), sphere(3000), clutter(500)):
+    for points in (room(200), sphere(3000), cloud(500, 3)):
         assert count(unit * points, unit * NOISE) == count(points)
 
 
 def test_noise_in_another_unit_gives_one_or_the_most_components():
-    assert count(1e-3 * clutter(2000)) == 1
-    n = count(1e3 * clutter(2000))
+    assert count(1e-3 * cloud(2000, 3)) == 1
+    n = count(1e3 * cloud(2000, 3))
     assert 2000 / (4 * least_support(3)) <= n <= 2000 / least_support(3)
 
 
@@ -131,16 +126,16 @@ def test_weights_count_as_points():
     weight = torch.randint(1, 4, (len(points),), generator=torch.Generator().manual_seed(1)).double()
     assert count(points, weight=weight) == count(points.repeat_interleave(weight.long(), 0))
     # Ten times the weight supports more components; a thousandth of it supports a single one.
-    assert count(clutter(300), weight=torch.full((300,), 10.0).double()) > 2 * count(clutter(300))
-    assert count(clutter(300), weight=torch.full((300,), 1e-3).double()) == 1
+    assert count(cloud(300, 3), weight=torch.full((300,), 10.0).double()) > 2 * count(cloud(300, 3))
+    assert count(cloud(300, 3), weight=torch.full((300,), 1e-3).double()) == 1
 
 
 @pytest.mark.parametrize("dim", [2, 3, 5])
 def test_number_does_not_depend_on_motion_or_order(dim):
-    points = clutter(600, dim).numpy() * np.array([3.0, 1.0, 0.02, 0.5, 1.0])[:dim]
+    points = cloud(600, dim).numpy() * np.array([3.0, 1.0, 0.02, 0.5, 1.0])[:dim]
     moved = move(rigid_motion(dim, seed=1), points)
     shuffled = np.random.default_rng(0).permutation(points)
-    counts = {count(torch.from_numpy(cloud)) for cloud in (points, moved, shuffled, points + 5e5)}
+    counts = {count(torch.from_numpy(points)) for points in (points, moved, shuffled, points + 5e5)}
     assert len(counts) == 1
 
 
@@ -149,18 +144,6 @@ def test_cells_give_nearly_the_number_of_points(monkeypatch):
     exact = count(points)
     monkeypatch.setattr(initialization, "_SURFACE_CELLS", 8000)
     assert count(points) == pytest.approx(exact, rel=0.1)
-
-
-def test_maps_use_the_same_rule():
-    """Except for their own limits: a length, and in 2D single points of several surfaces."""
-    plane, space = (flatness_rule(WindowedRule(noise=0.02), dim) for dim in (2, 3))
-    assert plane == FlatnessRule(0.04, 0.3, 6, 1, None, 3.0)
-    assert space == FlatnessRule(0.04, 0.3, 20, 20, None, 3.0)
-    assert surface_rule(0.02, 3) == FlatnessRule(0.04, math.inf, 20, 20, None, 2.0)
-    assert surface_rule(0.02, 3, 50.0).min_weight == 50
-    assert flatness_rule(WindowedRule(min_points=9.0, n_components=4, length=1.0), 3) == FlatnessRule(
-        0.02, 1.0, 9, 9, 4, 10.0
-    )
 
 
 # -- GaussianMixture without a number ---------------------------------------------------------------
@@ -205,16 +188,6 @@ def test_degenerate_clouds_are_fitted(dim, algorithm):
         check_mixture(mixture, points, at_most=len(points))
         if name != "huge":
             assert len(mixture.means_) <= max(1, len(points) // least_support(dim)) + 1, name
-
-
-def test_fit_is_deterministic_and_commutes_with_shifts():
-    points = room(200)
-    mixture, again = fitted(points), fitted(points)
-    assert torch.equal(mixture.means, again.means)
-    far = torch.tensor([5e5, -4e6, 250.0], dtype=torch.float64)
-    moved = fitted(points + far)
-    assert moved.means_.shape == mixture.means_.shape
-    assert moved.score(points + far) == pytest.approx(mixture.score(points), abs=1e-3)
 
 
 def test_n_components_none_is_kept_by_files_states_and_copies(tmp_path):

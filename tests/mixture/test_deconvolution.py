@@ -277,10 +277,3 @@ def test_bound_variances_is_the_constrained_maximum(dim, bounds):
     )
     assert cost(found) <= best + 1e-7
     assert cost(found) == pytest.approx(best, abs=1e-3)  # the search comes close
-
-
-def test_thickness_reduces_thick_components_only():
-    covariances = torch.diag_embed(torch.tensor([[0.04, 1.0, 2.0], [1e-6, 1.0, 2.0]], dtype=torch.float64))
-    found = bound_variances(covariances, 0.0, 0.1)
-    expected = torch.diag_embed(torch.tensor([[0.01, 1.0, 2.0], [1e-6, 1.0, 2.0]], dtype=torch.float64))
-    torch.testing.assert_close(found, expected)

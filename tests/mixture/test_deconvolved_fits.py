@@ -16,7 +16,6 @@ from torch.distributions import MultivariateNormal
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
 from gmmtorch.mixture import DeconvolvedGaussianMixture, GaussianMixture
-from gmmtorch.mixture.estimators import deconvolution
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 
@@ -37,14 +36,6 @@ def test_fit_without_noise_equals_plain_em(dim, noise):
     np.testing.assert_allclose(mine.weights_, plain.weights_, atol=1e-8)
     np.testing.assert_allclose(mine.means_, plain.means_, atol=1e-8)
     np.testing.assert_allclose(mine.covariances_, plain.covariances_, atol=1e-8)
-
-
-def test_shared_and_individual_zero_noise_give_equal_fits(monkeypatch):
-    points, zero = blobs(3), np.zeros((240, 3, 3))
-    usual = DeconvolvedGaussianMixture(3, random_state=0).fit(points, noise_covariances=zero)
-    monkeypatch.setattr(deconvolution, "_WORTH_SHARING", 1)
-    shared = DeconvolvedGaussianMixture(3, random_state=0).fit(points, noise_covariances=zero)
-    np.testing.assert_allclose(usual.covariances_, shared.covariances_, rtol=1e-9)
 
 
 @st.composite

@@ -193,23 +193,11 @@ def test_only_the_smallest_cells_cross_a_step(at, turn, near, gap, center):
     assert mixed.numel() == 0 or float(mixed.max()) <= 64
 
 
-@pytest.mark.parametrize(("z", "is_merged"), [(0.5, False), (1.0, False), (3.0, True), (6.0, True)])
-def test_noise_grows_with_the_square_of_depth_beyond_one_metre(z, is_merged):
-    noise = torch.randn(64, 64, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    cells = pool_depth_image(z + 0.02 * noise, INTRINSICS, noise=0.01)  # 0.02 is 0.005 z² at 2 m
-    assert (float(cells.weight.median()) == 1024) is is_merged
-    assert (float(cells.weight.median()) == 64) is not is_merged
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (1, 50), (50, 1), (3, 5)])
-def test_smallest_images_are_pooled(shape):
-    depth = torch.full(shape, 1.5)
-    cells = pool_depth_image(depth, INTRINSICS)
-    assert float(cells.weight.sum()) == shape[0] * shape[1]
-    assert cells.weight.shape[0] == -(-shape[0] // 32) * -(-shape[1] // 32)
-    if shape[1] == 1:  # a step in one column of pixels also splits cells
-        depth[13:] = 2.5
-        assert float(pool_depth_image(depth, INTRINSICS).weight.max()) < 30
+def test_a_step_in_one_column_of_pixels_splits_cells():
+    depth = torch.full((50, 1), 1.5)
+    assert len(pool_depth_image(depth, INTRINSICS).weight) == 2
+    depth[13:] = 2.5
+    assert float(pool_depth_image(depth, INTRINSICS).weight.max()) < 30
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -224,14 +212,6 @@ def test_tiny_or_huge_pixel_affects_no_other_cell(value, is_seen, dtype):
     assert float(cells.weight.sum()) == 64 * 64 - (not is_seen)
     others = cells.values[cells.weight == 1024]
     assert torch.equal(others[-3:], clean.values[-3:])
-
-
-def test_float32_and_float64_images_give_equal_cells():
-    depth = (plane(70, 90, (0.4, 0.2, 1.0), 2.0) * 1024).round() / 1024  # exact in both
-    depth[30:, 20:60] = 1.0
-    one, other = (pool_depth_image(depth.to(dtype), INTRINSICS) for dtype in (torch.float32, torch.float64))
-    assert torch.equal(one.weight, other.weight)
-    torch.testing.assert_close(one.values, other.values, rtol=1e-7, atol=1e-7)
 
 
 def test_image_is_not_modified():
@@ -323,17 +303,6 @@ def test_oblique_wall_is_as_thin_as_the_noise_at_any_distance(noise, distance, d
     torch.testing.assert_close(thinnest, torch.full_like(thinnest, noise), rtol=0.02, atol=0)
 
 
-def test_moved_moves_the_mixture_to_the_world_frame():
-    depth = corner()[0]
-    mixture, points = fit_depth_image(depth, INTRINSICS, 30), points_of(depth)
-    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = turn * np.sign(np.linalg.det(turn)), [500_000.0, -3.0, 7.0]
-    world = points @ torch.from_numpy(matrix[:3, :3].T) + torch.from_numpy(matrix[:3, 3])
-    moved = mixture.moved(torch.from_numpy(matrix))
-    torch.testing.assert_close(moved.score_samples(world), mixture.score_samples(points), rtol=0, atol=1e-4)
-
-
 def test_one_component_per_cell_is_allowed():
     depth = plane(64, 64, (0.3, 0.1, 1.0), 2.0)
     mixture = fit_depth_image(depth, INTRINSICS, 4)
@@ -345,18 +314,10 @@ def test_one_component_per_cell_is_allowed():
 # -- errors ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "depth",
-    [
-        torch.zeros(4),
-        torch.zeros(1, 4, 4),
-        torch.zeros(0, 4),
-        torch.zeros(4, 0),
-    ],
-)
-def test_invalid_depth_image_is_named(depth):
+@pytest.mark.parametrize("shape", [(4,), (1, 4, 4), (0, 4), (4, 0)])
+def test_invalid_depth_image_is_named(shape):
     with pytest.raises(InvalidArgumentError, match=r"^depth has shape"):
-        pool_depth_image(depth, INTRINSICS)
+        pool_depth_image(torch.zeros(shape), INTRINSICS)
 
 
 @pytest.mark.parametrize("kind", [torch.from_numpy, np.asarray, np.ndarray.tolist])
@@ -379,29 +340,19 @@ def test_image_of_whole_numbers_needs_a_depth_scale(kind, dtype):
         ([[80.0, 0.0, 0.0], [0.0, 75.0, 0.0], [47.3, 30.9, 1.0]], "looks transposed"),
         ([[80.0, 0.0, 47.3], [0.0, 75.0, 30.9], [0.0, 0.0, 2.0]], "last row must be 0 0 1"),
         ([[80.0, 0.0, 47.3], [0.0, 0.0, 30.9], [0.0, 0.0, 1.0]], "focal lengths must be above zero"),
+        ([[80.0, 0.0, 47.3], [0.0, -75.0, 30.9], [0.0, 0.0, 1.0]], "focal lengths must be above zero"),
         ([[80.0, 9.0, 47.3], [0.0, 75.0, 30.9], [0.0, 0.0, 1.0]], "skew"),
         ([[80.0, 0.0, 473.0], [0.0, 75.0, 30.9], [0.0, 0.0, 1.0]], "principal point is far outside"),
         ([[80.0, 0.0, 47.3], [0.0, 75.0, -65.0], [0.0, 0.0, 1.0]], "principal point is far outside"),
+        ([[80.0, 0.0, math.nan], [0.0, 75.0, 30.9], [0.0, 0.0, 1.0]], ""),
+        ([[math.inf, 0.0, 47.3], [0.0, 75.0, 30.9], [0.0, 0.0, 1.0]], ""),
+        (np.zeros((3, 3)), ""),
+        (np.eye(4), ""),
     ],
 )
-def test_impossible_intrinsics_say_why(matrix, reason):
-    with pytest.raises(InvalidArgumentError, match=rf"^intrinsics=.*{reason}"):
+def test_invalid_intrinsics_say_why(matrix, reason):
+    with pytest.raises(InvalidArgumentError, match=rf"^intrinsics.*{reason}"):
         fit_depth_image(plane(64, 96, (0.3, 0.1, 1.0), 2.0), matrix, 3)
-
-
-@pytest.mark.parametrize(
-    "intrinsics",
-    [
-        torch.eye(4),
-        torch.zeros(3, 3),
-        torch.diag(torch.tensor([80.0, -80.0, 1.0])),
-        torch.tensor([[80.0, 0.0, math.nan], [0.0, 80.0, 3.0], [0.0, 0.0, 1.0]]),
-        torch.tensor([[math.inf, 0.0, 3.0], [0.0, 80.0, 3.0], [0.0, 0.0, 1.0]]),
-    ],
-)
-def test_invalid_intrinsics_are_named(intrinsics):
-    with pytest.raises(InvalidArgumentError, match=r"^intrinsics"):
-        pool_depth_image(torch.ones(8, 8), intrinsics)
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,8 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from mixture.truncated_cases import cloud, random_parameters, random_weight, rows_of
+from mixture.mixture_cases import cloud, random_parameters, random_weight, rows_of, scipy_log_joint
 from scipy.special import logsumexp
-from scipy.stats import multivariate_normal
-from torch import Tensor
 
 from gmmtorch.kernels import chunks
 from gmmtorch.mixture.em import exact as em
@@ -26,15 +24,6 @@ from gmmtorch.mixture.em.grouping import (
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 dims = pytest.mark.parametrize("dim", [1, 2, 3, 5])
 kinds = pytest.mark.parametrize("are_points", [True, False])
-
-
-def scipy_joint(points: Tensor, parameters: Parameters) -> np.ndarray:
-    """log π_k + log N(x_n | k), (N, K)."""
-    parts = [
-        np.log(float(w)) + multivariate_normal(m.numpy(), c.numpy()).logpdf(points.numpy()).reshape(-1)
-        for w, m, c in zip(*parameters, strict=True)
-    ]
-    return np.stack(parts, 1)
 
 
 # -- rows in blocks --------------------------------------------------------------------------------
@@ -113,7 +102,7 @@ def test_e_step_over_few_candidates_equals_brute_force(dim, m, dtype):
     groups = group_rows(rows_of(points, weight), owner, parameters.means, dtype)
     found = truncated_expectation(groups, candidates, parameters, want_owner=True)
 
-    joint = scipy_joint(points, parameters)
+    joint = scipy_log_joint(points, parameters)
     offered = np.zeros((n, k), dtype=bool)
     np.put_along_axis(offered, candidates[owner].numpy(), True, axis=1)
     allowed = np.where(offered, joint, -np.inf)
@@ -137,7 +126,7 @@ def test_e_step_over_few_candidates_equals_brute_force(dim, m, dtype):
 def test_candidates_are_the_owner_and_the_most_likely_components(dtype):
     k, m, n = 40, 5, 250  # few rows in each group, so that the sample has all of them
     points, parameters = 2 * cloud(n, 2), random_parameters(k, 2)
-    joint = scipy_joint(points, parameters)
+    joint = scipy_log_joint(points, parameters)
     owner = torch.from_numpy(joint.argmax(1))
     groups = group_rows(rows_of(points), owner, parameters.means, dtype)
     assert int(groups.n_rows.max()) <= 64

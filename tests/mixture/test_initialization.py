@@ -71,28 +71,12 @@ def test_integer_weights_equal_repeated_points_in_any_order(method):
     torch.testing.assert_close(tuple(found), tuple(same), rtol=1e-10, atol=1e-12)
 
 
-def test_random_points_are_distinct():
-    points = cloud(30, 2)
-    means = begin("random_points", points, 30).means
-    assert sorted(means.tolist()) == sorted(points.tolist())
-
-
 def test_random_points_are_drawn_by_weight():
     points = torch.arange(4.0, dtype=torch.float64)[:, None].expand(4, 2)
     weight = torch.tensor([1.0, 2.0, 3.0, 4.0], dtype=torch.float64)
     drawn = [float(begin("random_points", points, 1, weight, seed).means[0, 0]) for seed in range(800)]
     shares = np.bincount(np.array(drawn, dtype=int), minlength=4) / 800
     np.testing.assert_allclose(shares, [0.1, 0.2, 0.3, 0.4], atol=0.07)  # four standard errors
-
-
-def test_bounding_box_means_are_uniform():
-    points = torch.tensor([[-1.0, 2.0], [3.0, 2.5], [0.0, 4.0]], dtype=torch.float64).repeat(300, 1)
-    points = points + 1e-9 * torch.arange(900, dtype=torch.float64)[:, None]
-    means = begin("bounding_box", points, 900).means
-    unit = ((means - points.amin(0)) / (points.amax(0) - points.amin(0))).numpy()
-    for column in unit.T:
-        counts = np.histogram(column, bins=4, range=(0, 1))[0]
-        assert abs(counts - 225).max() < 60  # more than four standard deviations
 
 
 @pytest.mark.parametrize("method", ["random_points", "bounding_box"])
@@ -133,16 +117,6 @@ def test_kmeans_restarts_keep_the_clustering_of_least_scatter():
     assert min(restarted) < min(once)
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_few_distinct_points_give_copies_that_share_weights(method):
-    points = torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=torch.float64).repeat(10, 1)
-    weights, means, covariances = begin(method, points, 5)
-    assert weights.shape == (5,)
-    assert float(weights.sum()) == pytest.approx(1)
-    assert len({tuple(row) for row in means.tolist()}) == 2
-    assert float(torch.linalg.eigvalsh(covariances).min()) > 0
-
-
 # -- flat pieces -------------------------------------------------------------------------------------
 
 
@@ -180,13 +154,6 @@ def test_flat_pieces_of_cells_have_the_moments_of_their_points():
     found, labels = flat_pieces(means, cells.weight, 10, 1e-6, cells.features)
     assert labels.shape == (len(means),)
     check_moments(found, labels[cells.member], points.numpy(), weight.numpy())
-
-
-@pytest.mark.parametrize("n", [10, 20_000])
-def test_flat_pieces_of_equal_points_are_one(n):
-    found, labels = flat_pieces(torch.zeros(n, 3, dtype=torch.float64), torch.ones(n).double(), 5, 1e-6)
-    assert found.weights.tolist() == [pytest.approx(1)]
-    assert set(labels.tolist()) == {0}
 
 
 def test_moments_of_distant_thin_pieces_keep_their_digits():

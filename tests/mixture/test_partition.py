@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from gmmtorch.mixture.em.exact import quadratic_features
-from gmmtorch.mixture.em.partition import FlatnessRule, Partition, partition, pool
+from gmmtorch.mixture.em.partition import FlatnessRule, Partition, partition
 
 RULE = FlatnessRule(thickness=0.02, length=0.5, min_weight=5)
 
@@ -79,28 +79,6 @@ def test_thin_pieces_keep_min_weight():
     assert int(torch.bincount(labels).min()) >= 40
 
 
-def test_wall_gives_few_pieces_and_clutter_many():
-    few = cut(wall(2000), RULE).n_pieces
-    many = cut(cloud(2000, 3, 0), RULE).n_pieces
-    assert 2 <= few <= 16  # 4 m × 2 m: standard deviations 1.15 and 0.58 m, halved to below 0.5 m
-    assert many > 5 * few
-
-
-def test_number_of_pieces_of_a_wall_hardly_grows_with_points():
-    assert cut(wall(8000), RULE).n_pieces <= 2 * cut(wall(1000), RULE).n_pieces
-
-
-def test_widest_pieces_are_halved_first_within_a_limit():
-    generator = torch.Generator().manual_seed(0)
-    wide = torch.randn(200, 2, generator=generator, dtype=torch.float64)
-    narrow = 0.1 * torch.randn(200, 2, generator=generator, dtype=torch.float64) + 50.0
-    points = torch.cat([wide, narrow])
-    labels, n_pieces = cut(points - points.mean(0), FlatnessRule(0.001, 0.001, 2, max_components=3))
-    assert n_pieces == 3
-    assert len(set(labels[200:].tolist())) == 1
-    assert len(set(labels[:200].tolist())) == 2
-
-
 def test_integer_weights_equal_repeated_points():
     points = cloud(120, 2, 4)
     weight = torch.randint(1, 4, (120,), generator=torch.Generator().manual_seed(0)).double()
@@ -122,17 +100,6 @@ def test_line_is_cut_only_along_its_length():
     labels, n_pieces = cut(torch.stack([along, 0 * along], 1), RULE)
     assert 4 <= n_pieces <= 16
     assert (labels[1:] != labels[:-1]).sum() == n_pieces - 1  # pieces are intervals
-
-
-def test_pool_sums_by_label(generator):
-    features = quadratic_features(torch.randn(50, 3, generator=generator, dtype=torch.float64))
-    weight = torch.rand(50, generator=generator, dtype=torch.float64)
-    labels = torch.randint(4, (50,), generator=generator)
-    sums = pool(features, weight, labels, 5)
-    for piece in range(5):
-        own = labels == piece
-        expected = (features[own] * weight[own, None]).sum(0)
-        torch.testing.assert_close(sums[piece], expected, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize(("n_strays", "distance"), [(9, 200.0), (9, 1000.0), (1, 500.0)])
@@ -204,13 +171,6 @@ def test_heavier_of_two_equal_shapes_is_halved_first():
     labels, n_pieces = cut(points - center, FlatnessRule(**ALL, max_components=3), weight)
     assert n_pieces == 3
     assert len(set(labels[:400].tolist())) == 1
-
-
-def test_two_sheets_are_separated_if_the_limit_allows():
-    points = sheets(0.3)
-    labels, _ = cut(points - points.mean(0), FlatnessRule(**ALL, max_components=16))
-    upper, lower = set(labels[::2].tolist()), set(labels[1::2].tolist())
-    assert not upper & lower
 
 
 def test_pieces_that_cannot_be_halved_do_not_use_up_the_levels():

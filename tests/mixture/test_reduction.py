@@ -108,10 +108,6 @@ def test_rounds_cost_little_more_than_greedy_merging(dim, n):
     rounds = simplify(parameters, n, most_exact=MOST_EXACT["rounds"])
     assert len(rounds.parameters.weights) == n
     assert rounds.bound < 1.05 * exact.bound
-    labels = torch.arange(300) % n
-    any_groups = Gaussians.of(merge_components(*parameters, labels, n)).half_log_dets[labels]
-    worse = parameters.weights @ (any_groups - Gaussians.of(parameters).half_log_dets)
-    assert float(worse) > 1.5 * exact.bound
 
 
 @costs
@@ -248,7 +244,7 @@ def test_zero_or_one_component_stays_unchanged(path, k):
 
 
 @costs
-@pytest.mark.parametrize("k", [50, 1200])
+@pytest.mark.parametrize("k", [50, 600])
 def test_equal_components_become_one(cost, k):
     parameters = take(mixture(1, 3), torch.zeros(k, dtype=torch.int64))
     found = simplify(parameters, max_cost=1e-6, cost=cost)
@@ -261,10 +257,10 @@ def test_equal_components_become_one(cost, k):
 
 @costs
 def test_many_components_at_few_places_are_merged(cost):
-    parameters = take(mixture(5, 2, spread=50.0), torch.arange(1000) % 5)
+    parameters = take(mixture(5, 2, spread=50.0), torch.arange(600) % 5)
     found = simplify(parameters, 5, cost=cost)
     assert len(found.labels[:5].unique()) == 5
-    assert torch.equal(found.labels, torch.arange(1000) % 5)
+    assert torch.equal(found.labels, torch.arange(600) % 5)
 
 
 @costs
@@ -325,13 +321,6 @@ def test_invalid_mixture_is_rejected(change, error, match):
 def test_invalid_options_are_named(options, match):
     with pytest.raises(InvalidArgumentError, match=match):
         simplify(mixture(4, 2), **options)
-
-
-def test_simplify_does_not_modify_its_input():
-    parameters = mixture(30, 2)
-    before = Parameters(*(value.clone() for value in parameters))
-    simplify(parameters, 5)
-    assert all(torch.equal(*pair) for pair in zip(parameters, before, strict=True))
 
 
 # -- estimators ------------------------------------------------------------------------------------

@@ -217,12 +217,6 @@ def test_normals_of_a_noisy_plane(dim):
     assert ((normals @ turn[:, 0]).abs() > 0.99).double().mean() > 0.95
 
 
-def test_normals_of_a_sphere():
-    points = torch.nn.functional.normalize(torch.randn(4000, 3, generator=torch.Generator().manual_seed(0)))
-    aligned = (estimate_normals(points, 12) * points.double()).sum(1).abs()
-    assert float(aligned.min()) > 0.97
-
-
 @pytest.mark.parametrize("dim", [2, 3])
 def test_normals_of_degenerate_clouds_are_unit_vectors(dim):
     line = torch.arange(5.0)[:, None] * torch.ones(dim)
@@ -242,6 +236,7 @@ def test_normals_of_degenerate_clouds_are_unit_vectors(dim):
         (lambda: DepthCameraModel(axial=(0.0, 0.0, 0.0)), "axial"),
         (lambda: DepthCameraModel(axial=(0.001, -0.01, 0.001)), "axial"),
         (lambda: DepthCameraModel(axial=(0.001, 0.0, -0.001)), "axial"),
+        (lambda: DepthCameraModel(axial=(0.001, -0.0021, 0.001)), "axial"),  # below zero near 1 m
         (lambda: DepthCameraModel(axial=(math.nan, 0.0, 0.0)), "axial"),
         (lambda: DepthCameraModel(lateral=0.0), "lateral"),
         (lambda: DepthCameraModel(pixel_angle=-1.0), "pixel_angle"),
@@ -257,12 +252,6 @@ def test_normals_of_degenerate_clouds_are_unit_vectors(dim):
 def test_invalid_arguments_are_named(make, name):
     with pytest.raises(InvalidArgumentError, match=f"^{name}="):
         make()
-
-
-def test_axial_noise_may_decrease_but_not_below_zero():
-    DepthCameraModel(axial=(0.001, -0.0019, 0.001))
-    with pytest.raises(InvalidArgumentError, match="axial"):
-        DepthCameraModel(axial=(0.001, -0.0021, 0.001))
 
 
 # -- spacing of beams -------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mixture.fit_contract import CENTERS, FAR
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
@@ -23,7 +24,6 @@ from gmmtorch.mixture.em.exact import Parameters
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 
 dims = pytest.mark.parametrize("dim", [1, 2, 3, 5])
-CENTERS = np.array([[-3.0, 0.0, 1.0, 0.0, 2.0], [3.0, 1.0, -1.0, 1.0, 0.0], [0.0, 4.0, 0.0, -2.0, 0.0]])
 SHARES = np.array([0.5, 0.3, 0.2])
 
 
@@ -57,17 +57,6 @@ def is_valid(gmm: GaussianMixture) -> bool:
 
 
 # -- against batch EM ---------------------------------------------------------------------------------
-
-
-@dims
-@pytest.mark.parametrize("init", ["kmeans", "random_points", "bounding_box"])
-def test_first_batch_equals_one_step_of_batch_em(dim, init):
-    x = blobs(dim=dim)
-    stepped = exact(init_params=init).partial_fit(x, kappa=1.0)
-    fitted = exact(init_params=init, max_iter=1).fit(x)
-    assert_same(stepped, fitted, 1e-12)
-    assert stepped.lower_bounds_ == fitted.lower_bounds_
-    assert stepped.n_samples_seen_ == fitted.n_samples_seen_ == 300
 
 
 @dims
@@ -160,15 +149,14 @@ def test_blend_has_the_blended_moments(seed, dim, step, offset):
 # -- where it leads -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("size", [20, 100])
-def test_many_passes_in_small_batches_converge_to_em(size):
+def test_many_passes_in_small_batches_converge_to_em():
     x = blobs(1000, 2, scale=1.5)
     converged = exact(tol=1e-9, max_iter=2000).fit(x)
     rng, gmm = np.random.default_rng(0), exact()
     for _ in range(20):
-        for part in np.array_split(rng.permutation(1000), 1000 // size):
+        for part in np.array_split(rng.permutation(1000), 20):
             gmm.partial_fit(x[part])
-    first = exact().partial_fit(x[:size])
+    first = exact().partial_fit(x[:50])
     assert gmm.score(x) > converged.score(x) - 0.002
     assert gmm.score(x) > first.score(x) + 0.02
 
@@ -204,18 +192,6 @@ def test_fit_counts_as_its_number_of_points():
     assert capped.n_samples_seen_ == 200
     roomy = exact().fit(x).partial_fit(more, kappa=1.0, memory=10_000)
     assert_same(roomy, gmm, 0)
-
-
-def test_fit_resets_n_samples_seen():
-    gmm = exact().partial_fit(blobs(500)).fit(blobs(300))
-    assert gmm.n_samples_seen_ == 300
-    assert_same(gmm, exact().fit(blobs(300)), 0)
-
-
-def test_warm_start_continues_after_partial_fit():
-    x = blobs()
-    gmm = exact(warm_start=True, max_iter=5, tol=0).partial_fit(x).fit(x)
-    assert_same(gmm, exact(max_iter=6, tol=0).fit(x))
 
 
 def test_partial_fit_of_given_parameters_needs_memory():
@@ -283,7 +259,7 @@ def test_file_with_an_invalid_count_is_rejected(tmp_path, seen):
 @dims
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_partial_fit_far_from_the_origin_is_the_shifted_fit(dim, dtype):
-    offset = np.array([500_000.0, -4_000_000.0, 250.0, 1000.0, -500_000.0])[:dim]
+    offset = FAR[:dim]
     near, far = exact(dtype=dtype), exact(dtype=dtype)
     for batch in range(30):
         x = blobs(40, dim, seed=batch)
@@ -310,18 +286,6 @@ def test_batches_500_km_apart_keep_thin_components():
         np.testing.assert_allclose(gmm.means_[k] - piece, 0, atol=0.06)
         np.testing.assert_allclose(gmm.covariances_[k], np.diag([1e-6, 1 / 3]), rtol=0.15, atol=3e-5)
         assert gmm.covariances_[k][0, 0] == pytest.approx(1.01e-6, rel=0.1)
-
-
-def test_integer_weights_equal_repeated_points():
-    rng = np.random.default_rng(0)
-    weighted, repeated = exact(), exact()
-    for batch in range(4):
-        x, weight = blobs(60, seed=batch), rng.integers(0, 4, 60)
-        polluted = np.where(weight[:, None] > 0, x, 1e3)
-        weighted.partial_fit(polluted, sample_weight=weight)
-        repeated.partial_fit(np.repeat(x, weight, axis=0))
-    assert_same(weighted, repeated)
-    assert weighted.n_samples_seen_ == repeated.n_samples_seen_
 
 
 # -- awkward batches --------------------------------------------------------------------------------------
@@ -357,16 +321,6 @@ def test_only_the_first_batch_needs_a_point_per_component():
         gmm.partial_fit(blobs(1, seed=seed))
     assert is_valid(gmm)
     assert gmm.n_samples_seen_ == 80
-
-
-def test_component_without_points_stays_unchanged():
-    far = exact().partial_fit(np.concatenate([blobs(90), blobs(90) + 1e4]))
-    k = int(far.means_[:, 0].argmax())
-    mean, covariance, weight = far.means_[k].copy(), far.covariances_[k].copy(), far.weights_[k]
-    far.partial_fit(blobs(180, seed=1), kappa=1.0)
-    np.testing.assert_allclose(far.means_[k], mean, rtol=1e-12)
-    np.testing.assert_allclose(far.covariances_[k], covariance, rtol=1e-9)
-    assert far.weights_[k] == pytest.approx(weight / 2)
 
 
 @pytest.mark.parametrize("kind", [np.asarray, torch.from_numpy])

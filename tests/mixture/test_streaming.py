@@ -73,20 +73,6 @@ def test_start_equals_that_of_the_whole_cloud(init_params, random_state):
     assert_same(found, exact(4, init_params=init_params, random_state=state()).fit(points), 1e-10)
 
 
-def test_float32_fit_equals_to_float32_precision(generator):
-    points = blobs(2000, 3)
-    found = fit_stream(exact(4, dtype="float32"), in_memory(points, chunk_points=100))
-    assert_same(found, exact(4).fit(points), 1e-5)
-
-
-def test_fit_far_from_the_origin_is_the_shifted_fit():
-    points = blobs(400, 3) + torch.tensor([5e5, 5.4e6, 100.0])
-    found = fit_stream(exact(4), in_memory(points, chunk_points=64))
-    near = exact(4).fit(points - torch.tensor([5e5, 5.4e6, 100.0]))
-    torch.testing.assert_close(found.covariances, near.covariances, rtol=1e-6, atol=1e-6)
-    torch.testing.assert_close(found.means - torch.tensor([5e5, 5.4e6, 100.0]), near.means, rtol=0, atol=1e-6)
-
-
 def test_direct_form_is_used_where_natural_parameters_cancel():
     """Two thin blobs 200 km apart: relative to their common centre, 1 cm is lost in the squares."""
     points = 0.01 * blobs(200, 3, n_blobs=1)
@@ -136,15 +122,6 @@ def test_score_stream_is_the_mean_over_the_points():
     value, count = score_stream(mixture, in_memory(points, chunk_points=33))
     assert count == 500
     assert value == pytest.approx(float(mixture.score_samples(points).mean()), rel=1e-12)
-
-
-def test_on_iteration_gets_each_lower_bound():
-    seen: list[tuple[int, float]] = []
-    mixture = fit_stream(
-        exact(3), in_memory(blobs(100, 2)), on_iteration=lambda i, bound: seen.append((i, bound))
-    )
-    assert [i for i, _ in seen] == list(range(1, 11))
-    assert [bound for _, bound in seen] == mixture.lower_bounds_
 
 
 # -- chunks and exchange --------------------------------------------------------------------------

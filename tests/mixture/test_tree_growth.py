@@ -16,8 +16,7 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 from torch import Tensor
 
-from gmmtorch.mixture import GaussianMixture, HierarchicalGaussianMixture
-from gmmtorch.mixture.estimators.trees.growth import grow
+from gmmtorch.mixture import GaussianMixture
 from gmmtorch.mixture.estimators.trees.nested import (
     Children,
     Members,
@@ -268,31 +267,3 @@ def test_points_are_assigned_by_responsibility_and_keep_their_weight(seed, thres
         for i, c in zip(found.members.point, found.members.node, strict=True)
     ]
     np.testing.assert_allclose(found.log_density, at, rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.parametrize("soft_threshold", [0.0, 0.1, 1.0])
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_every_level_has_the_whole_weight_of_each_point(soft_threshold, dtype):
-    points = torch.from_numpy(room(600))
-    weight = torch.rand(600, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) + 0.1
-    rule = HierarchicalGaussianMixture(
-        60, branching=4, max_levels=3, soft_threshold=soft_threshold, dtype=dtype
-    )
-    held: list[tuple[Tensor, Members]] = []
-    tree = grow(
-        points, weight, rule, on_level=lambda nodes, members: held.append((nodes.place, members))
-    ).tree
-    assert int(tree.levels().max()) == 3
-    shares = torch.zeros(600, len(tree.parents), dtype=torch.float64)
-    for places, members in held[1:]:
-        shares[members.point, places[members.node]] += members.weight
-    for level in range(1, 4):
-        torch.testing.assert_close(shares[:, tree.at_level(level)].sum(1), weight, rtol=1e-13, atol=0)
-    inner = torch.unique(tree.parents[tree.parents >= 0])
-    for node in inner:
-        torch.testing.assert_close(
-            shares[:, tree.parents == node].sum(1), shares[:, node], rtol=1e-13, atol=0
-        )
-    assert float((shares[:, tree.leaves()] > 0).sum(1).double().mean()) > (
-        1.0 if soft_threshold < 1 else 0.99
-    )

@@ -14,7 +14,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mixture import LaserModel
 from gmmtorch.mixture.estimators.trees.nested import (
     Children,
-    drop_weak_children,
+    keep_children,
 )
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
@@ -40,7 +40,8 @@ def test_flat_or_thin_nodes_are_not_split():
 def test_weak_children_are_removed_in_favour_of_siblings():
     weights = torch.tensor([[0.7, 0.25, 0.05], [0.04, 0.03, 0.93], [0.5, 0.5, 0.0]]).double()
     children = Children(weights, torch.zeros(3, 3, 2), torch.zeros(3, 3, 2, 2))
-    found = drop_weak_children(children, torch.tensor([100.0, 100.0, 3.0]).double(), 6.0).weights
+    support = weights * torch.tensor([[100.0], [100.0], [3.0]])
+    found = keep_children(children, support >= 6.0).weights
     expected = [[0.7 / 0.95, 0.25 / 0.95, 0.0], [0.0, 0.0, 1.0], [0.5, 0.5, 0.0]]
     torch.testing.assert_close(found, torch.tensor(expected).double())
 

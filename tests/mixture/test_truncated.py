@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from mixture.dtype_recorder import DtypeRecorder
 from mixture.fit_contract import FitContract, check_mixture
-from mixture.truncated_cases import beads, cloud, room
+from mixture.mixture_cases import DtypeRecorder, beads, cloud, room
 from torch import Tensor
 
 from gmmtorch.datasets.point_files.point_chunks import in_memory
@@ -75,19 +74,6 @@ def test_auto_selects_truncated_for_many_pairs_only(monkeypatch):
     assert called == [500]
     GaussianMixture(48, max_iter=2, init_params="flat_pieces", algorithm="exact").fit(x)
     assert called == [500]
-
-
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
-@pytest.mark.parametrize("k", [4, 20])
-def test_component_of_weight_zero_stays_unchanged(dtype, k):
-    x, centers = beads(900, k)
-    start = same_start(centers)
-    start["weights_init"] = np.where(np.arange(k) == 1, 0.0, 1 / (k - 1))
-    fit = GaussianMixture(k, **start, algorithm="truncated", dtype=dtype, max_iter=30, tol=0).fit(x)
-    assert fit.weights_[1] == 0
-    np.testing.assert_allclose(fit.means_[1], start["means_init"][1])
-    np.testing.assert_allclose(fit.covariances_[1], np.eye(2))
-    check_mixture(fit, x, at_most=k)
 
 
 def test_component_without_points_gets_weight_zero():

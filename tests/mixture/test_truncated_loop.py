@@ -10,7 +10,7 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from mixture.fit_contract import check_mixture
-from mixture.truncated_cases import beads, cloud, random_parameters, random_weight, room, rows_of
+from mixture.mixture_cases import beads, cloud, random_parameters, random_weight, room, rows_of
 from torch import Tensor
 
 from gmmtorch.mixture import GaussianMixture
@@ -20,14 +20,13 @@ from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.grouping import (
     Rows,
     centered_parameters,
-    choose_candidates,
     group_rows,
     nearest,
     rounding,
     truncated_expectation,
 )
 from gmmtorch.mixture.em.initialization import flat_pieces, moments_of
-from gmmtorch.mixture.em.truncated import Momentum, Settings, fit_truncated, run_truncated
+from gmmtorch.mixture.em.truncated import Settings, fit_truncated, run_truncated
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 
@@ -132,29 +131,6 @@ def test_momentum_converges_faster_than_em(n_iter, share):
     assert best - found.lower_bounds[-1] < share * (best - plain.lower_bounds[-1])
 
 
-def test_momentum_undo_gives_the_em_step_and_resets():
-    parameters, momentum = random_parameters(3, 2), Momentum(1e-6)
-    rows = rows_of(cloud(300, 2))
-
-    def expect(at: Parameters) -> Tensor:
-        groups = group_rows(rows, nearest(rows.points, at.means), at.means, torch.float64)
-        return truncated_expectation(groups, choose_candidates(groups, at, 16), at).statistics
-
-    step = loop.natural_step(rows.features(), rows.weight, 1e-6, torch.float64)
-    for moves in (False, False, True, True):
-        plain = step(parameters)[0]
-        following = momentum.step(expect(parameters), parameters)
-        assert momentum.is_extrapolated is moves
-        close = torch.allclose(following.means, plain.means, rtol=0, atol=1e-9)
-        assert close is not moves
-        parameters = following
-    undone = momentum.undo()
-    torch.testing.assert_close(tuple(undone), tuple(plain), rtol=1e-9, atol=1e-10)
-    assert not momentum.is_extrapolated
-    momentum.step(expect(undone), undone)
-    assert not momentum.is_extrapolated
-
-
 class Spy:
     """An E-step that records its inputs and results, and decreases the bound at given calls."""
 
@@ -180,43 +156,6 @@ def run_spied(monkeypatch: pytest.MonkeyPatch, spy: Spy, k: int = 20, max_iter: 
     found, *_ = run_truncated(rows, owner, first, Settings(1e-6, 0.0, max_iter, torch.float64))
     check_run(found, max_iter)
     return found
-
-
-def test_momentum_that_decreases_the_bound_is_undone(monkeypatch):
-    spy = Spy(failing=(4,))
-    found = run_spied(monkeypatch, spy)
-    assert found.n_iter == 12
-    assert len(spy.given) == 13
-    at, statistics = spy.given[3], spy.found[3].statistics
-    plain = em.maximization(statistics, 1e-6, at)
-    torch.testing.assert_close(spy.given[5].means, plain.means + at.means, rtol=1e-12, atol=1e-12)
-    assert not torch.allclose(spy.given[4].means, spy.given[5].means, rtol=0, atol=1e-9)
-    # The result is also EM's own step, although the momentum has extrapolated again by then.
-    at, statistics = spy.given[-1], spy.found[-1].statistics
-    plain = em.maximization(statistics, 1e-6, at)
-    torch.testing.assert_close(found.parameters.means, plain.means + at.means, rtol=1e-12, atol=1e-12)
-    torch.testing.assert_close(found.parameters.covariances[0], (plain.covariances[0]), rtol=1e-9, atol=0)
-
-
-def test_small_gain_of_an_extrapolated_step_does_not_end_the_run(monkeypatch):
-    points, _ = beads(1500, 20, gap=2.0)
-    rows = rows_of(torch.from_numpy(points - points.mean(0)))
-    first, owner = flat_pieces(rows.points, rows.weight, 20, 1e-6)
-    spy = Spy()
-
-    def weak(*arguments):
-        found = spy(*arguments)
-        if len(spy.found) == 5:  # an extrapolated step that gains a thousandth of tol
-            found = found._replace(value=spy.found[3].value + 1500 * 1e-7)
-        return found
-
-    monkeypatch.setattr(truncated, "truncated_expectation", weak)
-    found, *_ = run_truncated(rows, owner, first, Settings(1e-6, 1e-4, 300, torch.float64))
-    check_run(found, 300)
-    assert found.n_iter > 10
-    at, statistics = spy.given[4], spy.found[4].statistics
-    plain = em.maximization(statistics, 1e-6, at)
-    torch.testing.assert_close(spy.given[5].means, plain.means + at.means, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("failing", [(2,), (5, 6)])  # without and with momentum

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 
 import numpy as np
@@ -136,18 +135,6 @@ def test_large_concentration_keeps_more_components():
 # -- weights of points -----------------------------------------------------------------------------
 
 
-@types
-def test_integer_weights_equal_repeated_points_in_the_posterior(prior_type):
-    x = blobs(2)
-    weight = np.random.default_rng(0).integers(1, 4, len(x))
-    weighted = variational(4, prior_type).fit(x, sample_weight=weight)
-    repeated = variational(4, prior_type).fit(np.repeat(x, weight, axis=0))
-    for name, value in weighted.state_dict().items():
-        torch.testing.assert_close(value, repeated.state_dict()[name], rtol=1e-8, atol=1e-8)
-    np.testing.assert_allclose(weighted.lower_bounds_, repeated.lower_bounds_, rtol=1e-9)
-    assert np.sum(weighted.support_) == pytest.approx(weight.sum())
-
-
 @settings(max_examples=30)
 @given(total=st.sampled_from([1e-12, 1e-3, 0.5, 1.0, 1.5, 1e12]), dim=st.integers(1, 3), n=st.integers(1, 6))
 def test_any_total_weight_gives_a_valid_mixture(total, dim, n):
@@ -248,27 +235,6 @@ def test_moved_moves_the_whole_posterior(prior_type, dim):
         variational(3, prior_type, **prior).fit(x).score_samples_predictive(x),
         atol=1e-8,
     )
-
-
-@types
-def test_files_copies_and_states_keep_the_posterior(prior_type, tmp_path):
-    x = blobs(2)
-    mixture = variational(3, prior_type).fit(x)
-    mixture.save(tmp_path / "m.safetensors")
-    restored = variational(3, prior_type)
-    restored.load_state_dict(mixture.state_dict())
-    for other in (
-        VariationalGaussianMixture.load(tmp_path / "m.safetensors"),
-        copy.deepcopy(mixture),
-        restored,
-    ):
-        assert torch.equal(
-            torch.as_tensor(other.score_samples_predictive(x)),
-            torch.as_tensor(mixture.score_samples_predictive(x)),
-        )
-        np.testing.assert_array_equal(other.weight_concentration_, mixture.weight_concentration_)
-        assert other.n_components_used_ == mixture.n_components_used_
-        np.testing.assert_array_equal(other.covariance_prior_, mixture.covariance_prior_)
 
 
 def test_mixture_of_given_parameters_has_no_posterior(tmp_path):

@@ -169,46 +169,6 @@ def test_prediction_of_one_component_is_the_ratio_of_evidences(dim):
         assert float(mixture.score_samples_predictive(point[None])[0]) == pytest.approx(expected, abs=1e-9)
 
 
-def test_predictive_density_is_the_mean_over_posterior_draws():
-    mixture = variational(3, DISTRIBUTION).fit(blobs(2, 30))
-    fresh, rng, n = blobs(2, 8, seed=1), np.random.default_rng(0), 4000
-    pi = rng.dirichlet(mixture.weight_concentration_, n)
-    density = np.zeros((n, len(fresh)))
-    for k in range(3):
-        beta, nu = mixture.mean_precision_[k], mixture.degrees_of_freedom_[k]
-        scale = np.linalg.inv(nu * mixture.covariances_[k])
-        precisions = stats.wishart(nu, scale).rvs(n, random_state=rng)
-        roots = np.linalg.cholesky(np.linalg.inv(precisions))
-        means = mixture.means_[k] + (roots @ rng.normal(size=(n, 2, 1)))[..., 0] / beta**0.5
-        offset = fresh - means[:, None]
-        squared = np.einsum("nmi,nij,nmj->nm", offset, precisions, offset)
-        norm = np.linalg.det(precisions) ** 0.5 / (2 * math.pi)
-        density += pi[:, k, None] * norm[:, None] * np.exp(-0.5 * squared)
-    error = density.std(0) / n**0.5
-    assert (np.abs(np.exp(mixture.score_samples_predictive(fresh)) - density.mean(0)) < 4 * error).all()
-    assert (error < 0.2 * density.mean(0)).all()
-
-
-@types
-def test_predictive_density_integrates_to_one_and_is_wider(prior_type):
-    x = blobs(1, 25)
-    mixture = variational(4, prior_type).fit(x)
-    value = integrate.quad(
-        lambda t: math.exp(mixture.score_samples_predictive(np.array([[t]]))[0]), -np.inf, np.inf, limit=400
-    )[0]
-    assert value == pytest.approx(1, abs=1e-6)
-    far = np.array([[30.0]])
-    assert mixture.score_samples_predictive(far) > mixture.score_samples(far) + 10
-
-
-def test_predictive_density_of_many_points_is_that_of_the_mixture():
-    x = blobs(2, 20_000)
-    mixture = variational(3, dtype="float32").fit(x)
-    np.testing.assert_allclose(
-        mixture.score_samples_predictive(x[:200]), mixture.score_samples(x[:200]), atol=0.02
-    )
-
-
 def test_predictions_are_differentiable():
     mixture = variational(3).fit(torch.from_numpy(blobs(2, 40)))
     x = torch.from_numpy(blobs(2, 5, seed=1)).requires_grad_()

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 import torch
-from flux_cases import normal, random_covariances, uniform
 from hypothesis import given
 from hypothesis import strategies as st
+from occupancy.cone_cases import normal, random_covariances, uniform
 from scipy.stats import multivariate_normal, norm
 
 from gmmtorch.linalg import safe_cholesky

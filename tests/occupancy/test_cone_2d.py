@@ -8,18 +8,13 @@ import hypothesis.strategies as st
 import pytest
 import torch
 from hypothesis import given
+from occupancy.cone_cases import one_cone
 from scipy import integrate
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.studies.angular_reference import angular_evidence
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.forms.cone.cone_evidence import cone_evidence, share_beyond_2d
-
-
-def one_cone(mean, covariance, origin=(0.0, 0.0), count=1.0, max_range=False) -> Cones:
-    tensors = (torch.tensor([value], dtype=torch.float64) for value in (mean, covariance, origin, count))
-    return Cones(*tensors, torch.tensor([max_range]))
-
 
 ROUND = [[1.0, 0.0], [0.0, 1.0]]
 

@@ -4,11 +4,12 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from occupancy.cone_examples import random_cones, tiled
+from occupancy.cone_cases import random_cones, tiled
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.occupancy import cone_index
+from gmmtorch.occupancy.cone_index import ConeIndex
 from gmmtorch.occupancy.cones import CUTOFF, Cones
-from gmmtorch.occupancy.index.cone_index import ConeIndex
 
 
 def places_on_rays(cones: Cones, n: int, cutoff: float, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -25,10 +26,8 @@ def places_on_rays(cones: Cones, n: int, cutoff: float, seed: int) -> tuple[torc
     return origin + share * (ends - origin), which
 
 
-def pairs_of(
-    index: ConeIndex, low: torch.Tensor, high: torch.Tensor, **options: int
-) -> list[tuple[int, int]]:
-    parts = index.candidates(low, high, **options)
+def pairs_of(index: ConeIndex, low: torch.Tensor, high: torch.Tensor) -> list[tuple[int, int]]:
+    parts = index.candidates(low, high)
     return [pair for box, cone in parts for pair in zip(box.tolist(), cone.tolist(), strict=True)]
 
 
@@ -68,23 +67,17 @@ def test_lists_contain_few_unneeded_cones():
     assert float(length) < 0.45 * 300
 
 
-def test_pairs_occur_once_and_ascend_for_any_chunk_size():
+def test_pairs_occur_once_and_ascend_for_any_chunk_size(monkeypatch):
     cones = random_cones(2, 20, 3)
     index = ConeIndex(cones, 0.1)
     places, _ = places_on_rays(cones, 200, CUTOFF, 0)
     whole = pairs_of(index, places, places)
     assert len(set(whole)) == len(whole) > 200
     assert [box for box, _ in whole] == sorted(box for box, _ in whole)
-    assert pairs_of(index, places, places, chunk_pairs=7) == whole
-    portions = [set(box.tolist()) for box, _ in index.candidates(places, places, chunk_pairs=7)]
+    monkeypatch.setattr(cone_index, "_CHUNK_PAIRS", 7)
+    assert pairs_of(index, places, places) == whole
+    portions = [set(box.tolist()) for box, _ in index.candidates(places, places)]
     assert sum(map(len, portions)) == len(set().union(*portions))
-
-
-@pytest.mark.parametrize("dim", [2, 3])
-def test_lists_ascend(dim):
-    index = ConeIndex(random_cones(dim, 100, 0), 0.1)
-    bucket = torch.repeat_interleave(index.list_lengths())
-    assert bool((index.entries.diff()[bucket.diff() == 0] > 0).all())
 
 
 def test_cost_and_memory_do_not_depend_on_the_size_of_the_world():

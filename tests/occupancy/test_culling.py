@@ -6,10 +6,11 @@ import itertools
 
 import pytest
 import torch
-from flux_cases import draw_ends, normal, one_each, only, random_covariances, uniform
 from hypothesis import given
 from hypothesis import strategies as st
+from occupancy.cone_cases import draw_ends, normal, one_each, only, random_covariances, uniform
 
+from gmmtorch.occupancy import culling
 from gmmtorch.occupancy.cones import (
     CUTOFF,
     Cones,
@@ -19,13 +20,13 @@ from gmmtorch.occupancy.cones import (
     outside_ball,
     outside_cone,
 )
-from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.index.culling import (
+from gmmtorch.occupancy.culling import (
     ball_rows,
     candidate_pairs,
     cells_in_chunks,
     face_rows,
 )
+from gmmtorch.occupancy.grid import VoxelGrid
 
 GRIDS = {2: VoxelGrid((-2.0, -1.8), 0.2, (20, 18)), 3: VoxelGrid((-2.0, -1.8, -2.1), 0.4, (10, 9, 11))}
 
@@ -56,10 +57,11 @@ def test_a_box_that_a_ray_meets_is_a_candidate(dim, seed, inside, size):
     assert torch.cat(met).tolist() == list(range(len(ends)))
 
 
-def test_most_boxes_without_rays_are_no_candidates():
+def test_most_boxes_without_rays_are_no_candidates(monkeypatch):
+    monkeypatch.setattr(culling, "_PAIRS_AT_ONCE", 5000)
     cones = some_cones(3, 30, 0)
     low = GRIDS[3].centers() - 0.2
-    pairs = [torch.stack(pair, 1) for pair in candidate_pairs(cones, low, low + 0.4, chunk_pairs=5000)]
+    pairs = [torch.stack(pair, 1) for pair in candidate_pairs(cones, low, low + 0.4)]
     kept = torch.cat(pairs)
     assert len(torch.unique(kept, dim=0)) == len(kept)  # no pair twice
     assert 0 < len(kept) < 0.25 * len(low) * 30

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 import torch
-from exact_dda import voxels_left
 from hypothesis import given
 from hypothesis import strategies as st
+from occupancy.exact_dda import voxels_left
 from scipy.optimize import brentq
 from scipy.stats import bernoulli
 from torch import Tensor
@@ -152,17 +152,6 @@ def test_counts_do_not_depend_on_order_chunks_and_portions():
         parts.add_rays(origins[part], ends[part], chunk_visits=5)
     assert torch.equal(whole.hits, parts.hits)
     assert torch.equal(whole.misses, parts.misses)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.int64])
-def test_weights_can_have_any_number_type(dtype):
-    grid = GRIDS[2]
-    origins, ends = random_rays(grid, 50)
-    one, other = Evidence.empty(grid), Evidence.empty(grid)
-    one.add_rays(origins, ends, torch.full((50,), 2, dtype=dtype))
-    other.add_rays(origins.repeat(2, 1), ends.repeat(2, 1))
-    assert torch.equal(one.hits, other.hits)
-    assert torch.equal(one.misses, other.misses)
 
 
 def test_lookup_reads_the_cell_and_is_half_outside():

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from occupancy.cone_examples import random_cones
+from occupancy.cone_cases import random_cones
 
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.evidence import Evidence

@@ -64,11 +64,6 @@ def test_covering_is_the_smallest_aligned_grid(sides, resolution):
     assert bool(grid.flat_index(torch.tensor([low, high], dtype=torch.float64))[1].all())
 
 
-def test_covering_accepts_tensors_and_a_single_point():
-    grid = VoxelGrid.covering(torch.tensor([1.0, 2.0]), torch.tensor([1.0, 2.0]), 0.5)
-    assert (grid.origin, grid.shape) == ((1.0, 2.0), (1, 1))
-
-
 @pytest.mark.parametrize(
     ("low", "high"),
     [

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from cone_examples import random_cones
+from occupancy.cone_cases import random_cones
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels.choice import kernels

@@ -115,16 +115,6 @@ def test_counts_do_not_depend_on_order_and_chunks(monkeypatch):
         assert counts(shuffled) == expected[b]
 
 
-def test_rays_count_by_their_weights():
-    starts, stops, is_hit = random_rays(40, 2)
-    weights = 0.1 + torch.rand(40, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-    found = counts(cast_evidence(starts, stops, is_hit, 1.0, SMALL, weights))
-    expected = by_a_walk(starts, stops, is_hit, SMALL, weights)
-    assert found.keys() == expected.keys()
-    for cell, both in expected.items():
-        assert found[cell] == pytest.approx(both, rel=1e-6)
-
-
 def test_one_origin_is_used_for_all_rays():
     _, stops, is_hit = random_rays(20, 4)
     origin = torch.tensor([0.3, -0.2, 1.1], dtype=torch.float64)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from occupancy.cone_examples import random_cones
+from occupancy.cone_cases import random_cones
 
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
 from gmmtorch.occupancy.cones import Cones

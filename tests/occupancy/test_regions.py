@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from flux_cases import draw_ends, normal, one_each, random_covariances
+from occupancy.cone_cases import draw_ends, normal, one_each, random_covariances
 from scipy.spatial import ConvexHull
 from torch import Tensor
 

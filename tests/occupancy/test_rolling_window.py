@@ -90,19 +90,6 @@ def test_the_window_follows_the_robot_and_keeps_the_evidence_of_kept_cells(moves
         assert torch.equal(misses, 3 * kept.float())
 
 
-def test_the_window_moves_only_by_whole_steps():
-    window = new_window(step=4)
-    window.center_on(at(0, 0, 0))
-    start = window.box.low
-    middle = start + torch.tensor(SHAPE) // 2
-    assert window.center_on(at(*(middle + torch.tensor([3, -3, 3])).tolist())) == []
-    assert torch.equal(window.box.low, start)
-    (box,) = window.center_on(at(*(middle + torch.tensor([0, -5, 3])).tolist()))
-    assert (window.box.low - start).tolist() == [0, -4, 0]
-    assert (box.low - start).tolist() == [0, -4, 0]
-    assert box.shape == (12, 4, 10)
-
-
 # -- evidence -----------------------------------------------------------------------------------------
 
 

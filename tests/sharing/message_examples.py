@@ -11,8 +11,9 @@ import torch
 from hypothesis import strategies as st
 from mapping.random_components import random_components
 
-from gmmtorch.mapping.codec.component_batch import spatial_order
+from gmmtorch.mapping.codec.quantization import spatial_order
 from gmmtorch.mapping.components import Components
+from gmmtorch.sharing.messages.fields import pose_of
 from gmmtorch.sharing.messages.message_registry import (
     CODECS,
     ViewsMessage,
@@ -23,7 +24,6 @@ from gmmtorch.sharing.messages.message_registry import (
     encode_views,
     quantized_poses,
 )
-from gmmtorch.sharing.messages.pose_fields import pose_of
 from gmmtorch.sharing.messages.record_messages import (
     CorrectionMessage,
     FrameMessage,
@@ -43,6 +43,11 @@ places = st.sampled_from([0.0, -37.25, 5e5])
 def sealed(data: bytes) -> bytes:
     """The data with a valid checksum."""
     return data + zlib.crc32(data).to_bytes(4, "little")
+
+
+def forged(datagram: bytes, body: bytes) -> bytes:
+    """A datagram of the same kind with another body and valid checksums."""
+    return datagram[:1] + sealed(body) if datagram[0] == 0x11 else sealed(datagram[:1] + body)
 
 
 def assert_same(one: object, other: object) -> None:

@@ -1,10 +1,13 @@
-"""Replicas that exchange some of their datagrams."""
+"""Replicas that exchange some of their datagrams, and motions of their scans."""
 
 from __future__ import annotations
 
+import math
 import random
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
+import torch
 from sharing.schedules import act
 
 from gmmtorch.sharing.replica.replica import Replica
@@ -24,6 +27,13 @@ def history(seed: int, n_acts: int = 14) -> list[bytes]:
     """All datagrams of three robots that receive some of each other's."""
     rng = random.Random(seed)
     robots = [Replica(robot, incarnation=rng.getrandbits(24)) for robot in range(3)]
+    return told(rng, robots, n_acts, act)
+
+
+def told(
+    rng: random.Random, robots: Sequence[Any], n_acts: int, act: Callable[[random.Random, Any], None]
+) -> list[bytes]:
+    """All datagrams of robots that act in turn, at random, and receive some of each other's."""
     sent: list[bytes] = []
     for _ in range(n_acts):
         robot = rng.choice(robots)
@@ -48,3 +58,22 @@ def replica_of(datagrams: list[bytes], robot: int = 1000) -> Replica:
     for datagram in datagrams:
         assert replica.receive(datagram)
     return replica
+
+
+def everything(replica: Replica) -> list[bytes]:
+    """All records, as a replica sends them to a robot that has none."""
+    newcomer, copy = Replica(1000), Replica(replica.robot)
+    assert copy.load(*replica.stored()) == 0
+    for _ in range(2):  # other robots' records are sent after the second announcement
+        for datagram in newcomer.announcements():
+            copy.receive(datagram)
+    return copy.datagrams()
+
+
+def motion(x: float = 0.0, yaw: float = 0.0) -> torch.Tensor:
+    """Metres along x after a turn about z (rad)."""
+    made = torch.eye(4, dtype=torch.float64)
+    made[0, 3] = x
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    made[:2, :2] = torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64)
+    return made

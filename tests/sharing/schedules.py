@@ -133,7 +133,8 @@ def _run(rng: random.Random, n_robots: int, n_steps: int) -> Outcome:
             if rng.randrange(_SNAPSHOT_EVERY) == 0:
                 team.snapshots[robot] = replica.stored()
         team.deliver()
-    rounds = _heal(team, held := _union(team.replicas))
+    held = Intervals.union(replica.held for replica in team.replicas)
+    rounds = _heal(team)
     for robot in range(n_robots):
         team.note_refused(robot)
     return Outcome(
@@ -154,7 +155,7 @@ def _trouble(team: _Team) -> None:
         team.restart(rng.randrange(len(team.replicas)), keeps_disk=rng.random() < 0.5)
 
 
-def _heal(team: _Team, held: Intervals) -> int:
+def _heal(team: _Team) -> int:
     """The number of rounds until all replicas agree."""
     team.loss, team.cut = 0.0, set()
     for done in range(MOST_ROUNDS + 1):
@@ -169,10 +170,3 @@ def _heal(team: _Team, held: Intervals) -> int:
 
 def _agree(replicas: list[Replica]) -> bool:
     return len({replica.digest() for replica in replicas}) == 1
-
-
-def _union(replicas: list[Replica]) -> Intervals:
-    held = Intervals.empty()
-    for replica in replicas:
-        held |= replica.held
-    return held

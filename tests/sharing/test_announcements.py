@@ -15,9 +15,8 @@ from sharing.message_examples import sealed
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.codec.bitstream import BitWriter
 from gmmtorch.mapping.codec.quantization import COUNT_ERROR
-from gmmtorch.sharing.messages.fields import write_intervals, write_keys
+from gmmtorch.sharing.messages.fields import pose_of, write_intervals, write_keys
 from gmmtorch.sharing.messages.message_registry import MAX_BYTES, decode
-from gmmtorch.sharing.messages.pose_fields import pose_of
 from gmmtorch.sharing.messages.record_messages import (
     AnnouncementMessage,
     CorrectionMessage,
@@ -146,17 +145,6 @@ def test_corrections_by_half_turns_are_decoded():
 
 
 # -- hostile ---------------------------------------------------------------------------------------------
-
-
-def examples() -> list[bytes]:
-    held = Intervals.span(0, 70) | within(3, 5, 6, 900)
-    pose = pose_of(torch.eye(4))
-    return [
-        *encode_announcements(1, 2, held),
-        encode_record(SupersessionMessage(first_key(2, 5), within(2, 0, 1, 2, 7), within(2, 30, 31))),
-        encode_record(counters_message(first_key(1, 9), {1: 5.0, first_key(4) + 3: 800.0})),
-        encode_record(CorrectionMessage(first_key(2, 9), 3, 1, within(2, 4, 5), pose)),
-    ]
 
 
 @pytest.mark.parametrize(
@@ -297,15 +285,6 @@ def test_gaps_are_remembered_for_a_bounded_number_of_robots():
     assert len(backlog._gaps) == MOST_PEERS
 
 
-def test_superseded_records_are_not_resent():
-    backlog = Backlog(1)
-    held, dead = within(1, 0, 1, 2, 3), within(1, 1, 2)
-    backlog.announced(says(3, NOTHING), held, dead)
-    assert backlog.due == within(1, 0, 3)
-    backlog.superseded(within(1, 3))
-    assert backlog.due == within(1, 0)
-
-
 def test_the_resend_queue_becomes_empty():
 
     def due() -> Intervals:
@@ -342,12 +321,8 @@ def test_a_late_robot_receives_all_records_from_a_third_robot():
         sent.append(relay.datagrams())
         for datagram in sent[-1]:
             assert late.receive(datagram)
-    assert [bool(datagrams) for datagrams in sent] == [
-        False,
-        False,
-        False,
-        True,
-    ]  # it counts as in flight until then
+    # It counts as in flight until then.
+    assert [bool(datagrams) for datagrams in sent] == [False, False, False, True]
     assert late.digest() == relay.digest() == one.digest()
     for datagram in late.announcements():
         relay.receive(datagram)

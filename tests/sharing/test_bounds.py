@@ -11,10 +11,7 @@ import pytest
 import torch
 from mapping.random_components import random_components
 
-from gmmtorch.sharing.messages.message_registry import (
-    decode,
-    encode_components,
-)
+from gmmtorch.sharing.messages.message_registry import decode, encode_components
 from gmmtorch.sharing.messages.record_messages import (
     RECORD_BYTES,
     AnnouncementMessage,

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapping.random_components import random_components
 from sharing.message_examples import codecs, frame_of_components
-from sharing.replica_histories import gossip
+from sharing.replica_histories import told
 from sharing.replica_model import rows
 
 from gmmtorch.errors import DataError, InvalidArgumentError
@@ -65,19 +65,16 @@ class Model:
 
 def history(seed: int, codec: str, n_acts: int = 8) -> list[bytes]:
     """All datagrams of three robots that receive some of each other's."""
-    rng = random.Random(seed)
-    robots = [Broadcast(robot, codec) for robot in range(3)]
-    said: list[bytes] = []
-    for act in range(n_acts):
-        robot = rng.choice(robots)
+
+    def act(rng: random.Random, robot: Broadcast) -> None:
         held = robot.components()
         if len(held) == 0 or rng.random() < 0.5:
-            robot.add(frame_of_components(rng.randint(1, 30), seed=seed + act))
+            robot.add(frame_of_components(rng.randint(1, 30), seed=rng.getrandbits(20)))
         else:
             chosen = rng.sample(held.ids.tolist(), rng.randint(1, min(4, len(held))))
             robot.count({(key[0], key[1]): rng.uniform(0.0, 500.0) for key in chosen})
-        said += gossip(rng, robot, robots)
-    return said
+
+    return told(random.Random(seed), [Broadcast(robot, codec) for robot in range(3)], n_acts, act)
 
 
 @codecs
@@ -137,16 +134,6 @@ def test_the_sender_holds_the_decoded_components(codec: str) -> None:
     assert one.datagrams() == one.announcements() == []
     assert one.held == Intervals.empty()
     assert one.digest() == b""
-
-
-def test_repeated_counts_are_added() -> None:
-    one = Broadcast(0, "float")
-    one.add(frame_of_components(3))
-    before = one.components().support
-    (datagram,) = encode_counts(1, {(0, 1): 5.0}, "float")
-    for _ in range(3):
-        one.receive(datagram)
-    assert (one.components().support - before).tolist() == pytest.approx([0.0, 15.0, 0.0])
 
 
 def test_datagrams_beyond_the_budget_are_sent_later() -> None:

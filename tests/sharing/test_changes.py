@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapping.random_components import random_components
-from sharing.replica_histories import gossip
+from sharing.replica_histories import motion, told
 from sharing.replica_model import rows
 from sharing.schedules import act, components
 
@@ -73,19 +73,18 @@ class Follower:
 
 def growth(seed: int, n_acts: int = 14) -> list[bytes]:
     """All datagrams of three robots that add and count, and rewrite counters as soon as possible."""
-    rng = random.Random(seed)
-    robots = [Replica(robot, incarnation=rng.getrandbits(24)) for robot in range(3)]
-    said: list[bytes] = []
-    for _ in range(n_acts):
-        robot = rng.choice(robots)
+
+    def grow(rng: random.Random, robot: Replica) -> None:
         known = robot.components().ids.tolist()
         if not known or rng.random() < 0.4:
             robot.add(components(rng, rng.randint(1, 5)))
         else:
             chosen = rng.sample(known, rng.randint(1, min(4, len(known))))
             robot.count({tuple(row): rng.uniform(0.0, 500.0) for row in chosen})
-        said += gossip(rng, robot, robots)
-    return said
+
+    rng = random.Random(seed)
+    robots = [Replica(robot, incarnation=rng.getrandbits(24)) for robot in range(3)]
+    return told(rng, robots, n_acts, grow)
 
 
 @settings(max_examples=5, deadline=None)
@@ -196,9 +195,7 @@ def test_only_changes_of_known_components_demand_a_rebuild():
     one.add(random_components(3, k=2, seed=1), supersedes=ids[1:2])
     follower.follow(one)
     assert follower.rebuilt == 1
-    motion = torch.eye(4, dtype=torch.float64)
-    motion[0, 3] = 2.0
-    one.correct(0, motion, ids[2:])
+    one.correct(0, motion(2.0), ids[2:])
     follower.follow(one)
     assert follower.rebuilt == 2
     assert follower.agrees(one)
@@ -213,9 +210,7 @@ def test_components_that_arrive_after_their_correction_are_corrected():
     one, other, follower = Replica(0), Replica(1), Follower()
     ids = one.add(random_components(3, k=4))
     shapes = one.datagrams()
-    motion = torch.eye(4, dtype=torch.float64)
-    motion[0, 3] = 2.0
-    one.correct(0, motion, ids)
+    one.correct(0, motion(2.0), ids)
     follower.follow(other)
     for datagram in [*one.datagrams(), *shapes]:
         other.receive(datagram)
@@ -235,21 +230,8 @@ def test_falling_counters_demand_a_rebuild():
     first = 5 << 52 | 2 << 28
     less = CountersMessage(first + 1, np.array([key[1]], np.int64), np.array([8], np.int64))
     assert one.receive(encode_record(less))
-    old, new = (
-        Intervals.span(first, first + 1),
-        Intervals.span(first + 1, first + 2),
-    )
+    old, new = Intervals.span(first, first + 1), Intervals.span(first + 1, first + 2)
     assert one.receive(encode_record(SupersessionMessage(first + 2, old, new)))
     follower.follow(one)
     assert follower.rebuilt == 1
     assert follower.agrees(one)
-
-
-# -- memory ----------------------------------------------------------------------------------------------
-
-
-def tell(replica: Replica, seed: int) -> None:
-    ids = replica.add(random_components(3, k=5, seed=seed))
-    replica.count({tuple(row): 9.0 + seed for row in ids[:2].tolist()})
-    known = replica.components().ids
-    replica.count({tuple(known[0].tolist()): 100.0 * 2**seed})

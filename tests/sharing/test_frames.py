@@ -13,28 +13,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapping.random_components import random_components
 from sharing.message_examples import sealed
-from sharing.replica_histories import exchange, gossip, replica_of
+from sharing.replica_histories import exchange, motion, replica_of, told
 from sharing.replica_model import rows
 from sharing.schedules import components
 from sharing.test_changes import Follower
 
 from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.sharing.messages.fields import pose_of
 from gmmtorch.sharing.messages.message_registry import FrameMessage, decode, kind_of
-from gmmtorch.sharing.messages.pose_fields import pose_of
 from gmmtorch.sharing.messages.record_messages import encode_record
 from gmmtorch.sharing.replica.record_keys import WORLD, first_key
 from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.sharing.store import Store
 
 seeds = st.integers(0, 10**6)
-
-
-def motion(x: float, yaw: float = 0.0) -> torch.Tensor:
-    made = torch.eye(4, dtype=torch.float64)
-    made[0, 3] = x
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    made[:2, :2] = torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64)
-    return made
 
 
 def team(n: int) -> list[Replica]:
@@ -51,10 +43,8 @@ def joined_history(
     seed: int, kinds: Sequence[str] = ("add", "join", "join", "correct"), n_acts: int = 16
 ) -> list[bytes]:
     """All datagrams of robots that add, correct and join each other at random."""
-    rng = random.Random(seed)
-    robots, said = team(3), []
-    for _ in range(n_acts):
-        robot = rng.choice(robots)
+
+    def act(rng: random.Random, robot: Replica) -> None:
         own = robot.components().ids
         own = own[own[:, 0] == robot.robot]
         kind = rng.choice(kinds)
@@ -64,8 +54,8 @@ def joined_history(
             robot.correct(rng.randrange(2), motion(rng.uniform(-1, 1)), own[:2])
         else:
             robot.add(components(rng, 2))
-        said += gossip(rng, robot, robots)
-    return said
+
+    return told(random.Random(seed), team(3), n_acts, act)
 
 
 class Model:

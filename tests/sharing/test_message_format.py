@@ -10,13 +10,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from sharing.message_examples import (
-    examples,
-    numbers,
-    places,
-    sealed,
-    views,
-)
+from sharing.message_examples import examples, numbers, places, sealed, views
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.sharing.messages.envelope import FARTHEST, VERSION, Kind

@@ -11,16 +11,10 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from mapping.random_components import random_components
-from sharing.message_examples import (
-    codecs,
-    frame_of_components,
-    numbers,
-    places,
-)
+from sharing.message_examples import codecs, frame_of_components, numbers, places
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mapping.codec.component_batch import quantized
-from gmmtorch.mapping.codec.quantization import COUNT_ERROR, MOST_POINTS, quantize
+from gmmtorch.mapping.codec.quantization import COUNT_ERROR, MOST_POINTS, quantize, quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.sharing.messages.component_messages import MOST_COMPONENTS_SENT, fitted
 from gmmtorch.sharing.messages.envelope import FARTHEST
@@ -90,20 +84,6 @@ def test_a_component_of_a_frame_takes_ten_bytes():
     assert sum(map(len, encode_components(frame_of_components(100)))) <= 10 * 100
 
 
-@codecs
-def test_a_component_with_too_many_origins_is_refused(codec):
-    one = random_components(3, k=1, n_origins=900, max_sightings=1)
-    many = replace(
-        one,
-        origins=torch.rand(900, 3, dtype=torch.float64) * 1e3,
-        seen_by=torch.zeros(900, dtype=torch.int64),
-        seen_from=torch.arange(900),
-        seen_count=one.support.expand(900) / 900,
-    )
-    with pytest.raises(InvalidArgumentError, match="single component"):
-        encode_components(many, codec)
-
-
 @pytest.mark.parametrize("codec", ["float", "thesis"])
 def test_covariances_that_round_to_indefinite_are_refused(codec):
     components = frame_of_components(3)
@@ -167,20 +147,23 @@ def test_datagrams_of_equal_components_are_bounded(max_sightings):
         assert max(len(part) for part in found) > MOST_COMPONENTS_SENT / max_sightings / 4
 
 
+@pytest.mark.parametrize(
+    ("n", "message"),
+    [(900, "single component"), (MOST_COMPONENTS_SENT + 1, f"has {MOST_COMPONENTS_SENT + 1} viewpoints")],
+)
 @codecs
-def test_a_component_too_large_for_a_datagram_is_refused(codec):
-    n = MOST_COMPONENTS_SENT + 1
+def test_a_component_with_too_many_origins_is_refused(codec, n, message):
     one = random_components(3, k=1, n_origins=n, max_sightings=1)
     many = replace(
         one,
-        origins=torch.arange(3 * n, dtype=torch.float64).reshape(n, 3),
+        origins=torch.rand(n, 3, dtype=torch.float64) * 1e3,
         seen_by=torch.zeros(n, dtype=torch.int64),
         seen_from=torch.arange(n),
         seen_count=one.support.expand(n) / n,
     )
-    with pytest.raises(InvalidArgumentError, match=f"has {n} viewpoints"):
+    with pytest.raises(InvalidArgumentError, match=message):
         encode_components(many, codec)
-    with pytest.raises(InvalidArgumentError, match=f"has {n} viewpoints"):
+    with pytest.raises(InvalidArgumentError, match=message):
         list(fitted(quantize(many)))
 
 

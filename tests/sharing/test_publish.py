@@ -8,6 +8,7 @@ import torch
 from exploration.replays import content
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sharing.replica_histories import everything
 from sharing.schedules import components
 
 from gmmtorch.mapping.components import Components
@@ -67,16 +68,6 @@ def test_a_session_continues_a_killed_one(seed):
         for datagram in [*replica.datagrams(), *everything(replica)]:
             team.receive(datagram)
         assert content(team.components()) == content(known)
-
-
-def everything(replica: Replica) -> list[bytes]:
-    """All records, as a replica sends them to a robot that has none."""
-    newcomer, copy = Replica(1000), Replica(replica.robot)
-    assert copy.load(*replica.stored()) == 0
-    for _ in range(2):  # other robots' records are sent after the second announcement
-        for datagram in newcomer.announcements():
-            copy.receive(datagram)
-    return copy.datagrams()
 
 
 def test_counts_of_other_robots_do_not_repeat_records():

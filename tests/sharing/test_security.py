@@ -14,13 +14,12 @@ import pytest
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sharing.transport_cases import KEY, SECRET, Clock
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError, OutputError
 from gmmtorch.sharing.transport.security import PLAIN_OVERHEAD, REFUSALS, SEALED_OVERHEAD, Opener, Sealer
 from gmmtorch.sharing.transport.team_key import TeamKey
 
-SECRET = bytes(range(32))
-KEY = TeamKey(SECRET)
 datagrams = st.binary(max_size=1200)
 
 
@@ -239,7 +238,7 @@ def test_noise_with_a_valid_header_is_refused_without_state(header, data):
     assert len(opener._sessions) == 0
 
 
-def test_each_rejection_reason_is_counted_separately(caplog):
+def test_each_rejection_reason_is_counted_separately():
     other = TeamKey.generate()
     sealer = Sealer(1, KEY)
     frame = Sealer(2, KEY).seal(b"again")
@@ -290,13 +289,6 @@ def test_duplicate_robot_ids_are_reported_and_refused(caplog):
     assert "the id 3" in message
     assert "10.0.0.5:1" in message
     assert "10.0.0.6:1" in message
-
-
-class Clock:
-    now = 0.0
-
-    def __call__(self) -> float:
-        return self.now
 
 
 def test_a_robot_with_this_robots_id_is_reported(caplog):

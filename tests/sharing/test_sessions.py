@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sharing.transport_cases import Clock
 
 from gmmtorch.sharing.transport.sessions import (
     FRESH_FRAMES,
@@ -18,13 +19,6 @@ from gmmtorch.sharing.transport.sessions import (
 )
 
 A, B, C = b"A" * 8, b"B" * 8, b"C" * 8
-
-
-class Clock:
-    now = 0.0
-
-    def __call__(self) -> float:
-        return self.now
 
 
 @settings(max_examples=150)

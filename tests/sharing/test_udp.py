@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 
 import pytest
+from sharing.transport_cases import KEY, heard, until
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.sharing.transport.security import Sealer
@@ -21,7 +22,6 @@ from gmmtorch.sharing.transport.simulated_network import Network, Traffic, Trans
 from gmmtorch.sharing.transport.team_key import TeamKey
 from gmmtorch.sharing.transport.udp import UdpTransport
 
-KEY = TeamKey(bytes(range(32)))
 GROUP = "239.71.77.7"
 Opening = Callable[..., UdpTransport]
 
@@ -48,21 +48,6 @@ def team(opening: Opening, n: int, **options: object) -> list[UdpTransport]:
     for transport in transports:
         transport.peers = [other.address for other in transports if other is not transport]
     return transports
-
-
-def until(is_done: Callable[[], bool]) -> None:
-    """Waits for a condition; fails after ten seconds."""
-    end = time.monotonic() + 10
-    while not is_done():
-        assert time.monotonic() < end
-        time.sleep(0.002)
-
-
-def heard(transport: UdpTransport, n: int) -> list[tuple[int, bytes]]:
-    """The next n datagrams."""
-    found: list[tuple[int, bytes]] = []
-    until(lambda: len(found.extend(transport.deliver(transport.robot, 0.0)) or found) >= n)
-    return found
 
 
 # -- deliveries and statistics --------------------------------------------------------------------
@@ -205,20 +190,6 @@ def test_foreign_datagrams_are_counted_and_ignored(opening, raw):
     assert {reason: n for reason, n in b.refused.items() if n} == {r: len(d) for r, d in hostile.items()}
     sizes = [len(datagram) for datagrams in hostile.values() for datagram in datagrams]
     assert b.received == Traffic(2 + len(sizes), 2 * 34 + sum(sizes))
-
-
-def test_forged_frames_take_no_memory(opening, raw):
-    a, b = team(opening, 2, key=KEY, max_waiting=10)
-    rng = random.Random(1)
-    for i in range(3000):
-        raw.sendto(b"\xf1" + rng.randbytes(rng.randrange(1300)), b.address)
-        if i % 50 == 0:
-            until(lambda i=i: b.received.datagrams + b.n_overflowed > i)
-    until(lambda: b.received.datagrams == 3000)
-    a.send(0, [b"x"], 0.0, "maps")
-    assert heard(b, 1) == [(0, b"x")]
-    assert len(b._opener._sessions) == 1
-    assert sum(b.refused.values()) == 3000
 
 
 def test_a_full_queue_keeps_the_newest_datagrams(opening):

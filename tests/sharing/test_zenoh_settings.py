@@ -11,7 +11,8 @@ import threading
 from pathlib import Path
 
 import pytest
-from zenoh_cases import KEY, endpoint, heard, wait_until_connected, zenoh
+from sharing.transport_cases import KEY, heard
+from sharing.zenoh_cases import endpoint, wait_until_connected, zenoh
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError
 from gmmtorch.sharing.transport import zenoh_transport

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import socket
-import time
 from collections.abc import Callable
 
 import pytest
+from sharing.transport_cases import Heard, until
 
-from gmmtorch.sharing.transport.team_key import TeamKey
 from gmmtorch.sharing.transport.zenoh_transport import ZenohTransport
 
 zenoh = pytest.importorskip("zenoh")
-KEY = TeamKey(bytes(range(32)))
 Opening = Callable[..., ZenohTransport]
-Heard = list[tuple[int, bytes]]
 
 
 def endpoint(protocol: str = "tcp") -> str:
@@ -49,18 +46,3 @@ def wait_until_connected(transports: list[ZenohTransport]) -> None:
 
 def ends(said: Heard, n: int) -> bool:
     return sum(what == b"met" for _, what in said) == n
-
-
-def until(is_done: Callable[[], bool]) -> None:
-    """Waits for a condition; fails after a minute."""
-    end = time.monotonic() + 60
-    while not is_done():
-        assert time.monotonic() < end
-        time.sleep(0.005)
-
-
-def heard(transport: ZenohTransport, n: int) -> Heard:
-    """The next n datagrams."""
-    found: Heard = []
-    until(lambda: len(found.extend(transport.deliver(transport.robot, 0.0)) or found) >= n)
-    return found

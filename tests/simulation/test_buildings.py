@@ -49,9 +49,8 @@ def count_crossings(path: Tensor, segments: Tensor) -> int:
     return int(((side(p, q, a) * side(p, q, b) < 0) & (side(a, b, p) * side(a, b, q) < 0)).sum())
 
 
-@pytest.mark.parametrize("seed", range(1))
-def test_office_path_is_clear_of_walls_and_furniture(seed):
-    world = office(seed)
+def test_office_path_is_clear_of_walls_and_furniture():
+    world = office(0)
     path = world.path[::2]
     assert float(distance_to_segments(path, world.segments).min()) > CLEARANCE
     assert count_crossings(path, world.segments) == 0

@@ -71,17 +71,6 @@ def test_ends_without_noise_lie_on_the_walls(yaw):
     assert bool(((beyond - 6.0).abs() < 1e-12).all())
 
 
-def test_frames_are_exact_far_from_the_origin():
-    shift = torch.tensor([5e5, -4e6, 100.0], dtype=torch.float64)
-    there = MeshWorld(box((0, 0, 0), (9, 7, 4)) + shift)
-    moved = pose(3.0, 2.5, 1.7, 0.4)
-    near = EXACT.sense(ROOM, moved, NO_TEAMMATES, 0.3, seeded())
-    moved[:3] += shift
-    far = EXACT.sense(there, moved, NO_TEAMMATES, 0.3, seeded())
-    assert torch.equal(near.is_hit, far.is_hit)
-    assert float((far.ends - shift - near.ends).abs().max()) < 1e-5
-
-
 @pytest.mark.parametrize("depth", [1.0, 3.5])
 def test_depth_noise_grows_with_the_square_of_depth(depth):
     camera = DepthCamera(160, 120, noise=0.004, dropout=0.0, max_range=8.0)

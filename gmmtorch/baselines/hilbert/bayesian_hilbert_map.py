@@ -9,7 +9,7 @@ from typing import get_args
 import torch
 from torch import Tensor
 
-from gmmtorch.baselines.baseline_map import TensorFileMap, check_between, check_length
+from gmmtorch.baselines.baseline_map import TensorFileMap, check_length, optional_length
 from gmmtorch.baselines.hilbert.lattice_features import LatticeFeatures, check_lattice
 from gmmtorch.baselines.hilbert.logistic_regression import (
     Covariance,
@@ -19,7 +19,7 @@ from gmmtorch.baselines.hilbert.logistic_regression import (
     moments,
 )
 from gmmtorch.baselines.samples import beam_samples
-from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, check_whole
+from gmmtorch.errors import DataError, MemoryLimitError, check_choice, check_number, check_whole
 from gmmtorch.files import require
 from gmmtorch.scan import Scan
 
@@ -65,23 +65,20 @@ class BayesianHilbertMap(TensorFileMap):
         thin: float | None = None,
         random_state: int = 0,
     ) -> None:
-        if covariance not in get_args(Covariance):
-            raise InvalidArgumentError(
-                f"covariance={covariance!r} is not one of {', '.join(get_args(Covariance))}."
-            )
-        self.gamma = check_between("gamma", gamma, 1e-12)
+        check_choice("covariance", covariance, get_args(Covariance))
+        self.gamma = check_number("gamma", gamma, least=1e-12)
         self.spacing = check_length("spacing", spacing)
         self.covariance = covariance
-        self.prior_variance = check_between("prior_variance", prior_variance, 1e-12)
+        self.prior_variance = check_number("prior_variance", prior_variance, least=1e-12)
         self.n_iter = check_whole("n_iter", n_iter, 1)
         self.free_spacing = check_length("free_spacing", free_spacing)
-        self.gap = check_between("gap", gap, 0)
-        self.thin = None if thin is None else check_length("thin", thin)
+        self.gap = check_number("gap", gap)
+        self.thin = optional_length("thin", thin)
         self.random_state = check_whole("random_state", random_state, 0)
         self._generator = torch.Generator().manual_seed(self.random_state)
         # Values of a hinge: mean, and precision that the data adds to the prior's; float32, as in files.
         self._hinges = self._lattice(2, torch.device("cpu"))
-        self._factor: Tensor | None = None  # "full": lower Cholesky factor of the precision (F, F)
+        self._factor = torch.empty(0, 0)  # "full": lower Cholesky factor of the precision (F, F)
 
     def _lattice(self, dim: int, device: torch.device) -> LatticeFeatures:
         return LatticeFeatures("rbf", (2 * self.gamma) ** -0.5, self.spacing, dim, 2, device)
@@ -96,7 +93,7 @@ class BayesianHilbertMap(TensorFileMap):
         mean, added = self._hinges.table.values.double().unbind(1)
         if self.covariance != "full":
             return Posterior(mean, added + 1 / self.prior_variance)
-        return Posterior.from_factor(mean, self._full_factor().double())
+        return Posterior.from_factor(mean, self._factor.double())
 
     @property
     def hinges(self) -> Tensor:
@@ -106,6 +103,7 @@ class BayesianHilbertMap(TensorFileMap):
     def _start(self, dim: int, device: torch.device) -> None:
         check_lattice("rbf", (2 * self.gamma) ** -0.5, self.spacing, dim)
         self._hinges = self._lattice(dim, device)
+        self._factor = torch.empty(0, 0, device=device)
 
     # -- learning ---------------------------------------------------------------------------------
 
@@ -152,16 +150,9 @@ class BayesianHilbertMap(TensorFileMap):
             )
         # New weights are independent of the others. They can be inserted anywhere in the order.
         precision = torch.eye(n, dtype=torch.float64, device=table.keys.device) / self.prior_variance
-        if self._factor is not None:
-            old = torch.searchsorted(table.keys, before)
-            factor = self._factor.double()
-            precision[old[:, None], old] = factor @ factor.mT
+        old, factor = torch.searchsorted(table.keys, before), self._factor.double()
+        precision[old[:, None], old] = factor @ factor.mT
         self._factor = torch.linalg.cholesky(precision).float()
-
-    def _full_factor(self) -> Tensor:
-        if self._factor is None:
-            return torch.empty(0, 0, device=self.device)
-        return self._factor
 
     # -- queries ----------------------------------------------------------------------------------
 
@@ -183,7 +174,7 @@ class BayesianHilbertMap(TensorFileMap):
         tensors = {**self._hinges.tensors(), "means": mean}
         if self.covariance == "full":
             rows, cols = torch.tril_indices(len(mean), len(mean))
-            tensors["factor"] = self._full_factor()[rows, cols]
+            tensors["factor"] = self._factor[rows, cols]
         else:
             tensors["precisions"] = added
         return tensors

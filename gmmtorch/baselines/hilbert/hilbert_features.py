@@ -1,12 +1,11 @@
 """Features of a position for Hilbert maps: random Fourier features and Nyström features.
 
-A set of features computes a `Design` of points: the matrix Φ of φ(x) for each point x. Features on a
-    lattice are in `lattice_features`.
+A set of features computes the design of points: the matrix Φ of φ(x) for each point x. Features on a lattice
+are in `lattice_features`.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,6 +20,9 @@ from gmmtorch.files import require
 CHUNK_VALUES = 1 << 22
 """Values of features that are computed at a time."""
 
+MAX_POINTS = 1 << 16
+"""Largest number of points per dense design, which limits the memory used."""
+
 _NYSTROEM_REACH = 5.0  # distance from the centres, in lengths, beyond which nothing is known
 
 
@@ -29,51 +31,9 @@ def rbf_kernel(distance: Tensor, length: float) -> Tensor:
     return (-0.5 * (distance / length).square()).exp()
 
 
-class Design(ABC):
-    """Features Φ (M, F) of M points."""
-
-    @abstractmethod
-    def dot(self, weights: Tensor) -> Tensor:
-        """Φ w (M,)."""
-
-    @abstractmethod
-    def transpose_dot(self, residuals: Tensor) -> Tensor:
-        """Φᵀ r (F,)."""
-
-    @abstractmethod
-    def rows(self, index: Tensor) -> Design:
-        """The design of a subset of the points."""
-
-    @abstractmethod
-    def in_reach(self) -> Tensor:
-        """Whether each point (M,) is in the reach of the features."""
-
-
-class Features(ABC):
-    """A finite set of features of positions (M, D) in the world frame."""
-
-    @property
-    @abstractmethod
-    def count(self) -> int:
-        """Number of features, F."""
-
-    @property
-    def max_points(self) -> int:
-        """Largest number of points per design, which limits the memory used."""
-        return 1 << 16
-
-    @abstractmethod
-    def design(self, points: Tensor) -> Design:
-        """The design of finite points (M, D), float64."""
-
-    @abstractmethod
-    def tensors(self) -> dict[str, Tensor]:
-        """The tensors from which a file restores the features."""
-
-
 @dataclass(frozen=True)
-class _DenseDesign(Design):
-    """Φ = K mix⁻ᵀ. The rows of K are computed in chunks; the first chunk is cached.
+class DenseDesign:
+    """Features Φ = K mix⁻ᵀ (M, F) of M points. The rows of K are computed in chunks; the first is cached.
 
     points: (M, D). values: computes K of points. mix: (F, F), lower triangular; None: the unit matrix.
     near: tells whether points are in reach; None: all are.
@@ -98,12 +58,14 @@ class _DenseDesign(Design):
             yield self.values(chunk)
 
     def dot(self, weights: Tensor) -> Tensor:
+        """Φ w (M,)."""
         if self.mix is not None:
             weights = torch.linalg.solve_triangular(self.mix.mT, weights[:, None], upper=True)[:, 0]
         # Row by row, because the rounding of a matrix product depends on the number of rows.
         return torch.cat([(values * weights).sum(1) for values in self._values_by_chunk()])
 
     def transpose_dot(self, residuals: Tensor) -> Tensor:
+        """Φᵀ r (F,)."""
         total, start = residuals.new_zeros(self.count), 0
         for values in self._values_by_chunk():
             total += residuals[start : start + len(values)] @ values
@@ -112,16 +74,18 @@ class _DenseDesign(Design):
             total = torch.linalg.solve_triangular(self.mix, total[:, None], upper=False)[:, 0]
         return total
 
-    def rows(self, index: Tensor) -> Design:
-        return _DenseDesign(self.points[index], self.count, self.values, self.mix, self.near)
+    def rows(self, index: Tensor) -> DenseDesign:
+        """The design of a subset of the points."""
+        return DenseDesign(self.points[index], self.count, self.values, self.mix, self.near)
 
     def in_reach(self) -> Tensor:
+        """Whether each point (M,) is in the reach of the features."""
         if self.near is None:
             return torch.ones(len(self.points), dtype=torch.bool, device=self.points.device)
         return torch.cat([self.near(chunk) for chunk in self._chunks()])
 
 
-class FourierFeatures(Features):
+class FourierFeatures:
     """Random Fourier features (Rahimi & Recht 2007): a constant, and √(2/F)·[cos ωᵀx, sin ωᵀx].
 
     With ω ~ N(0, I/ℓ²), φ(x)ᵀφ(y) ≈ exp(−‖x−y‖²/2ℓ²). Every point is in their reach.
@@ -130,6 +94,8 @@ class FourierFeatures(Features):
         frequencies: ω (F/2, D), 1/m.
         anchor: (D,), m, origin of x, so that phases far from the world origin stay exact.
     """
+
+    max_points = MAX_POINTS
 
     def __init__(self, frequencies: Tensor, anchor: Tensor) -> None:
         self.frequencies = frequencies.float()  # rounded as in files
@@ -145,10 +111,12 @@ class FourierFeatures(Features):
 
     @property
     def count(self) -> int:
+        """Number of features, F."""
         return 2 * self.frequencies.shape[0] + 1
 
-    def design(self, points: Tensor) -> Design:
-        return _DenseDesign(points - self.anchor, self.count, self._values)
+    def design(self, points: Tensor) -> DenseDesign:
+        """The design of finite points (M, D), float64, in the world frame."""
+        return DenseDesign(points - self.anchor, self.count, self._values)
 
     def _values(self, points: Tensor) -> Tensor:
         phase = (points[:, None] * self.frequencies.double()).sum(2).float()
@@ -157,6 +125,7 @@ class FourierFeatures(Features):
         return torch.cat([one, phase.cos() * scale, phase.sin() * scale], 1).double()
 
     def tensors(self) -> dict[str, Tensor]:
+        """The tensors from which a file restores the features."""
         return {"frequencies": self.frequencies, "anchor": self.anchor}
 
     @classmethod
@@ -166,7 +135,7 @@ class FourierFeatures(Features):
         return cls(require(tensors, "frequencies", (None, dim), torch.float32, path), anchor)
 
 
-class NystroemFeatures(Features):
+class NystroemFeatures:
     """Nyström features L⁻¹ k(x), with k the kernel of the centres and L Lᵀ = K their kernel matrix.
 
     Williams & Seeger 2001. φ(x)ᵀφ(y) = k(x)ᵀ K⁻¹ k(y) is the exact kernel on the span of the centres.
@@ -177,6 +146,8 @@ class NystroemFeatures(Features):
         anchor: (D,), m.
         length: ℓ of exp(−d²/2ℓ²) (m).
     """
+
+    max_points = MAX_POINTS
 
     def __init__(self, centers: Tensor, anchor: Tensor, length: float) -> None:
         self.centers = centers.float()  # rounded as in files
@@ -198,10 +169,12 @@ class NystroemFeatures(Features):
 
     @property
     def count(self) -> int:
+        """Number of features, F."""
         return self.centers.shape[0]
 
-    def design(self, points: Tensor) -> Design:
-        return _DenseDesign(points - self.anchor, self.count, self._values, self._factor, self._near)
+    def design(self, points: Tensor) -> DenseDesign:
+        """The design of finite points (M, D), float64, in the world frame."""
+        return DenseDesign(points - self.anchor, self.count, self._values, self._factor, self._near)
 
     def _values(self, points: Tensor) -> Tensor:
         return rbf_kernel(self._distance(points), self.length)
@@ -215,6 +188,7 @@ class NystroemFeatures(Features):
         return (self._distance(points) <= _NYSTROEM_REACH * self.length).any(1)
 
     def tensors(self) -> dict[str, Tensor]:
+        """The tensors from which a file restores the features."""
         return {"centers": self.centers, "anchor": self.anchor}
 
     @classmethod

@@ -8,15 +8,16 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from gmmtorch.baselines.baseline_map import TensorFileMap, check_between, check_length
-from gmmtorch.baselines.hilbert.hilbert_features import Features, FourierFeatures, NystroemFeatures
+from gmmtorch.baselines.baseline_map import TensorFileMap, check_length, optional_length
+from gmmtorch.baselines.hilbert.hilbert_features import FourierFeatures, NystroemFeatures
 from gmmtorch.baselines.hilbert.lattice_features import LatticeFeatures, check_lattice
 from gmmtorch.baselines.hilbert.logistic_regression import logistic_regression
 from gmmtorch.baselines.samples import beam_samples
-from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.errors import check_choice, check_number, check_whole
 from gmmtorch.files import require
 from gmmtorch.scan import Scan
 
+Features = FourierFeatures | NystroemFeatures | LatticeFeatures
 FeatureKind = Literal["sparse", "nystroem", "fourier"]
 _LENGTHS: dict[str, float] = {"sparse": 0.3, "nystroem": 0.5, "fourier": 0.5}
 
@@ -72,22 +73,19 @@ class HilbertMap(TensorFileMap):
         learning_rate: float = 0.5,
         random_state: int = 0,
     ) -> None:
-        if features not in get_args(FeatureKind):
-            raise InvalidArgumentError(
-                f"features={features!r} is not one of {', '.join(get_args(FeatureKind))}."
-            )
+        check_choice("features", features, get_args(FeatureKind))
         self.features = features
         self.length = check_length("length", _LENGTHS[features] if length is None else length)
         self.spacing = check_length("spacing", 0.5 * self.length if spacing is None else spacing)
         self.n_features = check_whole("n_features", n_features, 1)
-        self.alpha = check_between("alpha", alpha, 0)
-        self.l1_ratio = check_between("l1_ratio", l1_ratio, 0, 1)
+        self.alpha = check_number("alpha", alpha)
+        self.l1_ratio = check_number("l1_ratio", l1_ratio, 1)
         self.free_spacing = check_length("free_spacing", free_spacing)
-        self.gap = check_between("gap", gap, 0)
-        self.thin = None if thin is None else check_length("thin", thin)
+        self.gap = check_number("gap", gap)
+        self.thin = optional_length("thin", thin)
         self.epochs = check_whole("epochs", epochs, 1)
         self.batch_size = check_whole("batch_size", batch_size, 1)
-        self.learning_rate = check_length("learning_rate", learning_rate)
+        self.learning_rate = check_number("learning_rate", learning_rate, above=True)
         self.random_state = check_whole("random_state", random_state, 0)
         self._generator = torch.Generator().manual_seed(self.random_state)
         self._points: list[Tensor] = []
@@ -159,7 +157,7 @@ class HilbertMap(TensorFileMap):
             return lattice, lattice.table.values[:, 0]
         if self._initial is not None:
             return self._initial
-        made: Features
+        made: FourierFeatures | NystroemFeatures
         if self.features == "nystroem":
             made = NystroemFeatures.of_data(points, self.n_features, self.length, self._anchor, generator)
         else:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.baselines.bgk_map import kernel_offsets, sparse_kernel
-from gmmtorch.baselines.hilbert.hilbert_features import CHUNK_VALUES, Design, Features, rbf_kernel
+from gmmtorch.baselines.hilbert.hilbert_features import CHUNK_VALUES, rbf_kernel
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.occupancy.voxels.cell_table import CellTable
 
@@ -33,8 +33,10 @@ KERNELS: dict[str, tuple[Kernel, float]] = {
 """Name of each kernel of compact support: the kernel, and its support in lengths."""
 
 
-class LatticeDesign(Design):
-    """Kernel values of points at the nodes around their cells, computed at the first access.
+class LatticeDesign:
+    """Features Φ (M, F): kernel values of M points at the nodes around their cells, computed when first used.
+
+    The methods are those of `DenseDesign`, and products with the elementwise square of Φ.
 
     Args:
         features: the lattice.
@@ -91,7 +93,7 @@ def _weighted_sum(values: Tensor, nodes: Tensor, weights: Tensor) -> Tensor:
     return (values * weights[nodes]).sum(1) if weights.numel() else values.sum(1)
 
 
-class LatticeFeatures(Features):
+class LatticeFeatures:
     """Kernels k(‖x − h‖) of compact support, with nodes h at the centres of lattice cells that contain data.
 
     Memory grows with the number of such cells, not with the box around them. Points beyond the support of all

@@ -14,11 +14,12 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from gmmtorch.baselines.hilbert.hilbert_features import Design
+from gmmtorch.baselines.hilbert.hilbert_features import DenseDesign
 from gmmtorch.baselines.hilbert.lattice_features import LatticeDesign
 
 _CONJUGATE_STEPS = 10  # each step lowers the error, and each round starts from the last round's mean
 
+Design = DenseDesign | LatticeDesign
 Covariance = Literal["diagonal", "mean_field", "full"]
 
 

@@ -14,8 +14,8 @@ from gmmtorch.cli import common
 from gmmtorch.cli.from_options import links, maps, missions
 from gmmtorch.cli.from_options.scans import open_dataset
 from gmmtorch.datasets.base import DatasetShard, shard_indices, start_frame
-from gmmtorch.errors import check_choice, check_whole
-from gmmtorch.exploration.mission.driver import Drivable, Stopwatch, check_pace
+from gmmtorch.errors import check_choice, check_number, check_whole
+from gmmtorch.exploration.mission.driver import Drivable, Stopwatch
 from gmmtorch.exploration.mission.mission import Mission
 from gmmtorch.exploration.mission.replay import ReplayMission
 from gmmtorch.exploration.mission.robot_view import FlyingRobotView, ReplayingRobotView, RobotView
@@ -137,7 +137,7 @@ def shared_map(config: DictConfig, stack: ExitStack) -> SharedMap | None:
     The transport and the store are closed with the stack.
     """
     check_choice("start", config.start, ("known", "unknown"))
-    check_pace(settle=config.settle)
+    check_number("settle", config.settle)
     robot = check_whole("id", config.id, 0)
     if config.transport is None:
         return None

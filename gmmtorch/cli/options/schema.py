@@ -28,8 +28,7 @@ from gmmtorch.evaluation.studies.study_options import (
     SensorModelStudy,
     VarianceThresholdStudy,
 )
-from gmmtorch.mapping.learning.mixture_rule import MixtureRule
-from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
+from gmmtorch.mapping.learning.rules import IncrementalRule, MixtureRule, WindowedRule
 from gmmtorch.mapping.query_options import QueryOptions
 from gmmtorch.mixture.reduction.prune_options import PruneOptions
 

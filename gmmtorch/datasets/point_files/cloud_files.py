@@ -107,24 +107,22 @@ def check_length(path: Path, header: CloudHeader) -> None:
 
 def pcd_header(path: Path) -> dict[str, list[str]]:
     """Header fields of a PCD file, such as {"VIEWPOINT": ["0", "0", "0", "1", "0", "0", "0"]}."""
-    fields: dict[str, list[str]] = {}
-    for line in _file_head(path).split(b"\n"):
-        words = line.decode("ascii", errors="replace").split()
-        if words and not words[0].startswith("#"):
-            fields[words[0]] = words[1:]
-            if words[0] == "DATA":
-                return fields
-    raise DataError(f"{path} has no PCD header (no DATA line); it is not a PCD file.")
+    return _pcd_fields(_header_lines(path, "DATA")[0])
+
+
+def _pcd_fields(lines: list[list[str]]) -> dict[str, list[str]]:
+    return {words[0]: words[1:] for words in lines if words and not words[0].startswith("#")}
 
 
 def _pcd_cloud_header(path: Path) -> CloudHeader:
-    header = pcd_header(path)
+    lines, n_bytes = _header_lines(path, "DATA")
+    header = _pcd_fields(lines)
     kind, fields = header["DATA"][0], header["FIELDS"]
     if kind not in ("ascii", "binary", "binary_compressed"):
         raise DataError(f"{path} has DATA {kind}; known are ascii, binary and binary_compressed.")
     if not header.get("POINTS", [""])[0].isdecimal():
         raise DataError(f"{path} does not state its number of points (POINTS); it is damaged.")
-    n_points, n_bytes = int(header["POINTS"][0]), _header_end(path, b"DATA")
+    n_points = int(header["POINTS"][0])
     is_text = kind == "ascii"
     counts = [int(count) for count in header.get("COUNT", ["1"] * len(fields))]
     sizes = [int(size) for size in header["SIZE"]]
@@ -138,7 +136,7 @@ def _pcd_cloud_header(path: Path) -> CloudHeader:
     codes = [f"<{kind.lower()}{size}" for kind, size in zip(header["TYPE"], sizes, strict=True)]
     widths = counts if is_text else [c * s for c, s in zip(counts, sizes, strict=True)]
     axes = _axes(path, fields, widths, None if is_text else codes)
-    layout = Layout(_count_lines(path, n_bytes) if is_text else n_bytes, sum(widths), axes)
+    layout = Layout(len(lines) if is_text else n_bytes, sum(widths), axes)
     return CloudHeader(n_points, is_text, n_bytes, n_points * layout.width, layout)
 
 
@@ -172,23 +170,24 @@ class PlyProperty(NamedTuple):
 
 
 class PlyElements(NamedTuple):
-    """The elements of a PLY file in the order of the file. n_bytes: size of the header."""
+    """The elements of a PLY file in the order of the file. n_lines, n_bytes: size of the header."""
 
     form: str
     counts: dict[str, int]
     properties: dict[str, list[PlyProperty]]
+    n_lines: int
     n_bytes: int
 
 
 def ply_elements(path: Path) -> PlyElements:
     """The elements that the header of a PLY file announces."""
-    lines = [line.decode("ascii", errors="replace").split() for line in _file_head(path).split(b"\n")]
+    lines, n_bytes = _header_lines(path, "end_header")
     if lines[0] != ["ply"]:
         raise DataError(f"{path} does not start with 'ply'; it is not a PLY file.")
     form, element = "", ""
     counts: dict[str, int] = {}
     properties: dict[str, list[PlyProperty]] = {}
-    for words in lines[: lines.index(["end_header"])]:
+    for words in lines:
         if words[:1] == ["format"]:
             form = words[1]
         elif words[:1] == ["element"]:
@@ -200,12 +199,12 @@ def ply_elements(path: Path) -> PlyElements:
             properties[element].append(PlyProperty(words[-1], is_list, _PLY_CODES[code], _PLY_CODES[item]))
     if form not in ("ascii", "binary_little_endian", "binary_big_endian"):
         raise DataError(f"{path} has format {form!r}; known are ascii, and binary of either byte order.")
-    return PlyElements(form, counts, properties, _header_end(path, b"end_header"))
+    return PlyElements(form, counts, properties, len(lines), n_bytes)
 
 
 def _ply_cloud_header(path: Path) -> CloudHeader:
     """The layout is None if points contain lists, or follow elements that do."""
-    form, counts, properties, n_bytes = ply_elements(path)
+    form, counts, properties, n_lines, n_bytes = ply_elements(path)
     if "vertex" not in counts:
         raise DataError(f"{path} does not state its number of points (element vertex); it is damaged.")
     if any(count < 0 or (count > 0 and not properties[name]) for name, count in counts.items()):
@@ -221,12 +220,8 @@ def _ply_cloud_header(path: Path) -> CloudHeader:
         order = ">" if form == "binary_big_endian" else "<"
         codes = None if is_text else [order + p.code for p in properties["vertex"]]
         axes = _axes(path, [p.name for p in properties["vertex"]], widths["vertex"], codes)
-        skip = (
-            _count_lines(path, n_bytes) + sum(counts[name] for name in before)
-            if is_text
-            else n_bytes + sum(counts[name] * sum(widths[name]) for name in before)
-        )
-        layout = Layout(skip, sum(widths["vertex"]), axes)
+        skipped = sum(counts[name] * (1 if is_text else sum(widths[name])) for name in before)
+        layout = Layout((n_lines if is_text else n_bytes) + skipped, sum(widths["vertex"]), axes)
     return CloudHeader(counts["vertex"], is_text, n_bytes, length, layout)
 
 
@@ -241,17 +236,14 @@ def _axes(path: Path, fields: list[str], widths: list[int], codes: list[str] | N
     return [(np.dtype(codes[fields.index(axis)]), start) for axis, start in zip(AXES, starts, strict=True)]
 
 
-def _file_head(path: Path) -> bytes:
+def _header_lines(path: Path, last: str) -> tuple[list[list[str]], int]:
+    """The words of each line of a header, up to the line that begins with `last`, and the header's bytes."""
     with path.open("rb") as file:
-        return file.read(_HEADER_BYTES)
-
-
-def _header_end(path: Path, last_line: bytes) -> int:
-    """Position of the first byte after the line that begins with `last_line`."""
-    head = _file_head(path)
-    return head.index(b"\n", head.index(b"\n" + last_line) + 1) + 1
-
-
-def _count_lines(path: Path, n_bytes: int) -> int:
-    """Number of lines in the first bytes of a file."""
-    return _file_head(path)[:n_bytes].count(b"\n")
+        *whole, _ = file.read(_HEADER_BYTES).split(b"\n")
+    lines, n_bytes = [], 0
+    for line in whole:
+        lines.append(line.decode("ascii", errors="replace").split())
+        n_bytes += len(line) + 1
+        if lines[-1][:1] == [last]:
+            return lines, n_bytes
+    raise DataError(f"{path} has no header that ends with a line {last}; it is another kind of file.")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 
 from gmmtorch.errors import DataError
 
@@ -23,15 +23,8 @@ _MAX_CHUNK_POINTS = 1 << 22
 _CHUNKS_VARY = 0xFFFFFFFF
 
 
-class LasHeader(NamedTuple):
-    """n_points: number of points. point_bytes: size of an uncompressed point."""
-
-    n_points: int
-    point_bytes: int
-
-
-def read_las_header(path: Path) -> LasHeader:
-    """The header of a LAS or LAZ file.
+def read_las_header(path: Path) -> tuple[int, int]:
+    """The number of points of a LAS or LAZ file, and the bytes of an uncompressed point.
 
     Raises `DataError` if the file is shorter than its header, its variable-length records, its chunk table
     or its uncompressed points.
@@ -66,7 +59,7 @@ def read_las_header(path: Path) -> LasHeader:
                 path,
                 f"it announces {n_points} points of {point_bytes} bytes, but has {size - data_start} bytes",
             )
-    return LasHeader(n_points, point_bytes)
+    return n_points, point_bytes
 
 
 def _laszip_record(path: Path, records: bytes, n_records: int, point_bytes: int) -> bytes:

@@ -36,6 +36,8 @@ class Kitti(Dataset):
         max_gap: longest time (s) between two poses of a TUM trajectory that are interpolated.
     """
 
+    _poses: Tensor
+
     def __init__(
         self,
         path: str | Path,
@@ -58,7 +60,7 @@ class Kitti(Dataset):
         if times is not None and len(times) < len(files):
             raise DataError(f"{path / 'times.txt'} has {len(times)} rows for {len(files)} scans.")
         trajectory = read_trajectory(poses or _find_poses(path))
-        if poses is not None and _has_times(poses):
+        if poses is not None and trajectory.has_times:
             if times is None:
                 raise DataError(
                     f"{path / 'times.txt'} is missing; the trajectory {poses} needs times of scans."
@@ -67,44 +69,28 @@ class Kitti(Dataset):
             matrices, known = found.matrices, found.known
         else:
             matrices, known = _of_lidar(path, trajectory, len(files)), np.ones(len(files), bool)
-        self._drop_unknown(path, known, trajectory, times)
-        self._files = [file for file, is_known in zip(files, known, strict=True) if is_known]
-        self._poses = torch.from_numpy(matrices[known])
-        self._times = None if times is None else torch.from_numpy(times[: len(files)][known])
-
-    def _drop_unknown(
-        self, path: Path, known: np.ndarray, trajectory: Trajectory, times: np.ndarray | None
-    ) -> None:
         if not known.any() and times is not None:
             raise DataError(
                 f"{path}: no scan has a pose. Scans are from {times[0]:.3f} to {times[-1]:.3f} s, poses from "
                 f"{trajectory.times[0] / 1e9:.3f} to {trajectory.times[-1] / 1e9:.3f} s."
             )
-        for index in np.flatnonzero(~known).tolist():
-            self._skip("no pose at the time of the scan", index)
+        self._skip("no pose at the time of the scan", *np.flatnonzero(~known).tolist())
+        self._files = [file for file, is_known in zip(files, known, strict=True) if is_known]
+        self._poses = torch.from_numpy(matrices[known])
+        self._times = None if times is None else torch.from_numpy(times[: len(files)][known])
 
     def _count(self) -> int:
         return len(self._files)
 
-    def _known_pose(self, index: int) -> Tensor:
-        return self._poses[index]
-
-    def _known_times(self) -> Tensor | None:
-        return self._times
-
     def _read(self, index: int) -> Scan:
-        path, pose = self._files[index], self._poses[index]
+        path = self._files[index]
         if path.stat().st_size % _POINT_BYTES:
             raise DataError(
                 f"{path} is not a whole number of points of {_POINT_BYTES} bytes; it is truncated."
             )
         points = np.fromfile(path, "<f4").reshape(-1, 4)[:, :3].astype(np.float64)
         valid = np.isfinite(points).all(1) & (points != 0).any(1)
-        return self.ranges.scan(torch.from_numpy(points[valid]) @ pose[:3, :3].T + pose[:3, 3], pose[:3, 3])
-
-
-def _has_times(path: str) -> bool:
-    return read_rows(Path(path).expanduser()).shape[1] == 8
+        return self.ranges.posed(torch.from_numpy(points[valid]), self._poses[index])
 
 
 def _find_poses(path: Path) -> Path:

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset
-from gmmtorch.datasets.recordings.trajectory import in_plane, read_rows, read_trajectory, to_nanoseconds
-from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
+from gmmtorch.datasets.recordings.trajectory import in_plane, read_trajectory, to_nanoseconds
+from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.linalg import nearest_rotations
 from gmmtorch.scan import Scan
 
 _MAX_GAP = 2.0
@@ -31,22 +32,19 @@ def with_trajectory(source: Dataset, path: str | Path, stride: int) -> Dataset:
     path = Path(path).expanduser()
     if len(source) == 0 or source.pose(0) is None:
         raise InvalidArgumentError(
-            f"dataset.poses={path} cannot be used: the data set does not state its own "
-            "poses, from which its "
+            f"dataset.poses={path} cannot be used: the data set does not state its own poses, from which its "
             "points would be moved."
         )
-    if not path.is_file():
-        raise MissingDataError(f"dataset.poses={path} does not exist; give a TUM or KITTI trajectory file.")
-    if read_rows(path).shape[1] == 12:
-        matrices = read_trajectory(path, len(source)).matrices
-        known = np.ones(len(source), bool)
+    trajectory = read_trajectory(path, len(source))
+    if not trajectory.has_times:
+        matrices, known = trajectory.matrices, np.ones(len(source), bool)
     else:
         if source.times is None:
             raise InvalidArgumentError(
                 f"dataset.poses={path} has poses at times, but the scans have no times; give a KITTI "
                 "trajectory, one row for each scan."
             )
-        matrices, known = read_trajectory(path).at(to_nanoseconds(source.times.numpy()), _MAX_GAP)
+        matrices, known = trajectory.at(to_nanoseconds(source.times.numpy()), _MAX_GAP)
         if not known.any():
             first, last = float(source.times[0]), float(source.times[-1])
             raise DataError(f"{path} has no pose for the scans, which are from {first:.3f} to {last:.3f} s.")
@@ -67,13 +65,15 @@ def with_poses(source: Dataset, poses: Tensor, known: Tensor, stride: int = 1) -
 class Reposed(Dataset):
     """Scans of another data set with other poses; made by `with_poses` and `with_trajectory`."""
 
+    _poses: Tensor
+
     def __init__(self, source: Dataset, poses: Tensor, known: Tensor, stride: int) -> None:
         super().__init__(source.name, source.ranges, stride)
         self._source: Any = source
         self._indices = known.nonzero().squeeze(1).tolist()
-        for index in (~known).nonzero().squeeze(1).tolist():
-            self._skip("no pose at the time of the scan", index)
+        self._skip("no pose at the time of the scan", *(~known).nonzero().squeeze(1).tolist())
         self._poses = poses[self._indices]
+        self._times = None if source.times is None else source.times[self._indices]
 
     @property
     def skipped(self) -> dict[str, int]:
@@ -82,26 +82,18 @@ class Reposed(Dataset):
     def _count(self) -> int:
         return len(self._indices)
 
-    def _known_pose(self, index: int) -> Tensor:
-        return self._poses[index]
-
     def own_pose(self, index: int) -> Tensor:
         """The pose (D+1, D+1) that the source states for scan `index`, world ← sensor."""
         pose: Tensor = self._source.pose(self._indices[self._position(index)])
         return pose
 
     def pose(self, index: int) -> Tensor:
-        return self._known_pose(self._position(index))
-
-    def _known_times(self) -> Tensor | None:
-        times: Tensor | None = self._source.times
-        return None if times is None else times[self._indices]
+        return self._poses[self._position(index)]
 
     def _read(self, index: int) -> Scan:
         before = self._source.pose(self._indices[index])
         motion = self._poses[index] @ torch.linalg.inv(before)
-        left, _, right = torch.linalg.svd(motion[:-1, :-1])  # rotations in files are rounded
-        motion[:-1, :-1] = left @ right
+        motion[:-1, :-1] = nearest_rotations(motion[:-1, :-1])  # rotations in files are rounded
         scan: Scan = self._source[self._indices[index]]
         motion[-1] = torch.eye(len(motion), dtype=motion.dtype)[-1]
         motion[:-1, -1] = self._poses[index][:-1, -1] - motion[:-1, :-1] @ before[:-1, -1]

@@ -30,21 +30,23 @@ class Trajectory:
     """Poses of one frame in another at increasing times.
 
     times: (N,) int64, nanoseconds. matrices: (N, 4, 4) float64, metres.
+    has_times: False if the poses are those of scans 0, 1, 2, …, which `times` counts.
     """
 
     times: np.ndarray
     matrices: np.ndarray
+    has_times: bool = True
 
     @staticmethod
-    def from_samples(times: np.ndarray, matrices: np.ndarray) -> tuple[Trajectory, int]:
-        """The trajectory of samples in the order of recording, and the number of samples that are left out.
+    def from_samples(times: np.ndarray, matrices: np.ndarray) -> Trajectory:
+        """The trajectory of samples in the order of recording.
 
         If the clock jumps, the longest sequence of increasing times is kept. Of samples with equal times the
         last one counts.
         """
         order = increasing(times)
         kept = order[np.append(np.diff(times[order]) > 0, True)] if len(order) else order
-        return Trajectory(times[kept], matrices[kept]), len(times) - len(order)
+        return Trajectory(times[kept], matrices[kept])
 
     def __len__(self) -> int:
         return len(self.times)
@@ -122,8 +124,8 @@ def pose_matrix(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
 def read_trajectory(path: str | Path, n_scans: int | None = None) -> Trajectory:
     """A trajectory file: TUM rows (time x y z qx qy qz qw), or KITTI rows (12 numbers, no time).
 
-    Poses without times get the times 0, 1, 2, … ns: one for each scan. Raises `MissingDataError` and
-    `DataError`, which names the row.
+    n_scans: wanted number of poses without times, one for each scan; None: any. Raises `MissingDataError`
+    and `DataError`, which names the row.
     """
     path = Path(path).expanduser()
     if not path.is_file():
@@ -138,11 +140,10 @@ def read_trajectory(path: str | Path, n_scans: int | None = None) -> Trajectory:
         )
     if n_scans is not None and len(rows) != n_scans:
         raise DataError(
-            f"{path} has {len(rows)} poses without times for {n_scans} scans; write one row "
-            "for each scan, or "
-            "a TUM trajectory, which has times."
+            f"{path} has {len(rows)} poses without times for {n_scans} scans; write one row for each scan, "
+            "or a TUM trajectory, which has times."
         )
-    return Trajectory(np.arange(len(rows)), kitti_matrices(path, rows))
+    return Trajectory(np.arange(len(rows)), kitti_matrices(path, rows), has_times=False)
 
 
 def read_rows(path: Path) -> np.ndarray:
@@ -172,7 +173,7 @@ def _tum(path: Path, rows: np.ndarray) -> Trajectory:
         matrices = pose_matrix(rows[:, 1:4], rows[:, 4:])
     except ValueError as error:
         raise DataError(f"{path}: a row is not a pose; a TUM row is: time x y z qx qy qz qw.") from error
-    return Trajectory.from_samples(to_nanoseconds(rows[:, 0]), matrices)[0]
+    return Trajectory.from_samples(to_nanoseconds(rows[:, 0]), matrices)
 
 
 def to_nanoseconds(seconds: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from torch import Tensor
 from gmmtorch.datasets.base import Dataset, Ranges, require_path
 from gmmtorch.datasets.depth_frames import back_project, read_png
 from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, increasing, read_trajectory, to_nanoseconds
-from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
+from gmmtorch.errors import DataError, InvalidArgumentError, check_number, check_whole
 from gmmtorch.scan import Scan
 
 _INTRINSICS = (525.0, 525.0, 319.5, 239.5)
@@ -38,6 +38,8 @@ class TumRgbd(Dataset):
         pixel_stride: every n-th pixel of every n-th row is used.
     """
 
+    _poses: Tensor
+
     def __init__(
         self,
         path: str | Path,
@@ -57,24 +59,19 @@ class TumRgbd(Dataset):
         )
         super().__init__(path.resolve().name, ranges, stride)
         self.pixel_stride = check_whole("dataset.pixel_stride", pixel_stride, 1)
-        if not 0 < depth_scale < np.inf:
-            raise InvalidArgumentError(
-                f"dataset.depth_scale={depth_scale} must be above zero metres per unit."
-            )
+        check_number("dataset.depth_scale", depth_scale, above=True)
         self._scale = depth_scale
         self.intrinsics = _pinhole(_INTRINSICS if intrinsics is None else intrinsics)
         times, files = _listed(path / "depth.txt")
         kept = increasing(times)
-        for index in sorted({*range(len(times))} - {*kept.tolist()}):
-            self._skip("stamp out of order (the clock jumped)", index)
+        self._skip("stamp out of order (the clock jumped)", *({*range(len(times))} - {*kept.tolist()}))
         trajectory = read_trajectory(poses or path / "groundtruth.txt")
-        if len(trajectory) and trajectory.times[-1] < len(trajectory):
+        if not trajectory.has_times:
             raise DataError(
                 f"{poses or path / 'groundtruth.txt'} has poses without times; give a TUM trajectory."
             )
         found = trajectory.at(times[kept], max_gap)
-        for index in kept[~found.known].tolist():
-            self._skip("no pose at the time of the scan", index)
+        self._skip("no pose at the time of the scan", *kept[~found.known].tolist())
         if not found.known.any():
             raise DataError(
                 f"{path}: no depth image has a pose. Images are from {times[0] / NANOSECONDS:.3f} to "
@@ -89,16 +86,9 @@ class TumRgbd(Dataset):
     def _count(self) -> int:
         return len(self._files)
 
-    def _known_pose(self, index: int) -> Tensor:
-        return self._poses[index]
-
-    def _known_times(self) -> Tensor:
-        return self._times
-
     def _read(self, index: int) -> Scan:
-        pose = self._poses[index]
         points = back_project(self._depth(index), self.intrinsics, self.pixel_stride)
-        return self.ranges.scan(points @ pose[:3, :3].T + pose[:3, 3], pose[:3, 3])
+        return self.ranges.posed(points, self._poses[index])
 
     def image(self, index: int) -> tuple[Tensor, Tensor]:
         """Depth (H, W) in metres, 0 for invalid pixels, and pose (4, 4), world ← camera, of a scan."""

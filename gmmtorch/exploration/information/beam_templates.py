@@ -1,6 +1,4 @@
-"""BeamTemplates: the cells that a depth camera's beams meet, for each heading, relative to the camera's
-cell.
-"""
+"""BeamTemplates: the cells that a depth camera's beams meet, relative to the camera's cell."""
 
 from __future__ import annotations
 
@@ -13,6 +11,8 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError, check_whole
 
 _MOST_CELLS = 1 << 22
+_NEGLIGIBLE = 1e-5
+"""Values of the depth kernel below this count as zero."""
 
 
 class BeamTemplates(NamedTuple):
@@ -124,3 +124,30 @@ def cells_along(directions: Tensor, reach: float) -> tuple[Tensor, Tensor, Tenso
     ends = t.new_tensor([0.0, reach]).expand(*t.shape[:-1], 2)
     bounds = torch.cat([ends[..., :1], t.clamp_max(reach), ends[..., 1:]], -1)
     return torch.where(exists[..., None], cells, 0), bounds, lengths
+
+
+def needed_band(depths: Tensor, sigma: float) -> int:
+    """Return the largest distance in cells at which K is not negligible; depths (..., C), not decreasing."""
+    reach = 2 * sigma * math.sqrt(-math.log(_NEGLIGIBLE))
+    n_cells = depths.shape[-1]
+    for band in range(1, n_cells):
+        if not bool((depths[..., band:] - depths[..., :-band] < reach).any()):
+            return band - 1
+    return max(n_cells - 1, 0)
+
+
+def depth_kernel(depths: Tensor, sigma: float, band: int, lengths: Tensor) -> Tensor:
+    """Return K_{i,i+s} for s = 1 … band as (band, ..., C + 1); zero if i + s is beyond the beam's cells.
+
+    K_ij = exp(−(d_i − d_j)²/4σ²): a reading of cell i is normal about its depth d_i, with deviation σ.
+
+    Args:
+        depths: (..., C), metres. sigma: metres. lengths: (...,) number of cells of each beam.
+    """
+    n_cells = depths.shape[-1]
+    kernel = depths.new_zeros(band, *depths.shape[:-1], n_cells + 1)
+    cell = torch.arange(n_cells, device=depths.device)
+    for s in range(1, min(band, n_cells - 1) + 1):
+        near = ((depths[..., s:] - depths[..., :-s]) / (2 * sigma)).square_().neg_().exp_()
+        kernel[s - 1, ..., : n_cells - s] = torch.where(cell[s:] < lengths[..., None], near, 0)
+    return kernel

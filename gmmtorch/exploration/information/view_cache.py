@@ -86,9 +86,7 @@ class InformationDiscount:
         self._when = -math.inf
 
     def note(self, local_map: LocalMap, measured: Tensor, now: float) -> None:
-        """Apply `measured` (G,) of the view that was just taken; repeated calls at one time have no
-        effect.
-        """
+        """Apply `measured` (G,) of the view that was just taken. Only the first call at one time counts."""
         if now <= self._when:
             return
         self._when = now

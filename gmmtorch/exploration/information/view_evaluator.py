@@ -1,5 +1,15 @@
 """ViewEvaluator: the information of depth images from many poses, and what one image leaves for the next.
 
+A beam meets cells that are occupied with probabilities o_i, independently. It measures the depth of the first
+occupied one, or returns nothing. Its information is one of two, in nats:
+
+- CSQMI, the Cauchy–Schwarz quadratic mutual information of the reading and the cells (Charrow et al., ICRA
+  2015): I = log(pᵀKp) − 2 log(pᵀKv), where p are the probabilities of the first hits for o, v those for
+  o²/(o² + (1 − o)²), and K is the `depth_kernel`.
+- FSMI, Shannon mutual information (Zhang et al., IJRR 2020): I = Σ_j P(e_j) C_j over the events e_j that
+  cell j is hit first, C_j = f(δ_occ, r_j) + Σ_{i<j} f(δ_emp, r_i), where r are the odds of a cell and f(δ, r)
+  is the information gained by multiplying them by δ.
+
 A view has few beams; each represents a pencil of the field of view. The information of a beam is
 distributed over the cells it meets, in proportion to the variance o(1 − o) that it is expected to
 resolve, and weighted by the part of the cell that the pencil fills. Close to the camera several beams
@@ -16,14 +26,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
-from gmmtorch.exploration.information.beam_templates import beam_templates
-from gmmtorch.exploration.information.mutual_information import (
-    check_occupancy,
-    check_sigma,
-    depth_kernel,
-    needed_band,
-)
+from gmmtorch.errors import InvalidArgumentError, check_choice, check_whole
+from gmmtorch.exploration.information.beam_templates import beam_templates, depth_kernel, needed_band
 from gmmtorch.exploration.robot.mapper import LocalMap
 from gmmtorch.kernels.rays.beam_information import Beams, Cells, information_by_block
 from gmmtorch.occupancy.grid import check_resolution
@@ -32,6 +36,12 @@ BLOCK = 4
 """Cells along the side of a coarse block."""
 
 INFORMATION = ("csqmi", "fsmi")
+
+_SIGMA = 0.05
+"""Standard deviation of a reading (m), for CSQMI."""
+_KNOWN_FREE, _KNOWN_OCCUPIED = 0.05, 0.5
+"""Observed cells below and above these probabilities count as certain. They do not weaken the beams behind
+them, and they do not attract a robot to space that it has seen well."""
 
 _BEYOND = 1 << 30  # offset of cells that do not exist
 
@@ -45,13 +55,12 @@ _SATURATED = 0.25
 class ViewValues(NamedTuple):
     """Values of V views on a local map of G coarse blocks, in row-major order of the blocks.
 
-    values: (V,) nats. gain: (V, G) float32, the part of the value in each block; rows sum to `values`.
+    gain: (V, G) float32, nats, the part of each view's value in each block; rows sum to the value.
     measured: (V, G) float32 in [0, 1], the share of each block's remaining information that the view
     gains. Given other planned views, a view is worth gain @ residual, where residual is the product of
     their 1 − measured.
     """
 
-    values: Tensor
     gain: Tensor
     measured: Tensor
 
@@ -84,10 +93,6 @@ class ViewEvaluator:
         n_beams: approximate number of beams that represent an image.
         n_yaws: number of headings.
         stride: cells between positions.
-        sigma: standard deviation of a reading (m), for CSQMI.
-        known_free, known_occupied: observed cells below and above these probabilities count as certain.
-            They do not weaken the beams behind them, and they do not attract a robot to space that it has
-            seen well.
         device: of the computation. Poses and values are on the CPU, where the planner's tree is: it decides
             after every few views, so it would wait for each of its operations on another device.
     """
@@ -103,25 +108,14 @@ class ViewEvaluator:
         *,
         n_yaws: int = 16,
         stride: int = 2,
-        sigma: float = 0.05,
-        known_free: float = 0.05,
-        known_occupied: float = 0.5,
         device: torch.device | str = "cpu",
     ) -> None:
-        if information not in INFORMATION:
-            raise InvalidArgumentError(f"information={information!r} is not one of {', '.join(INFORMATION)}.")
-        check_sigma(sigma)
-        if not 0 <= known_free < known_occupied <= 1:
-            raise InvalidArgumentError(
-                f"known_free={known_free} must be at least 0 and below known_occupied={known_occupied}, "
-                "which is at most 1."
-            )
+        check_choice("information", information, INFORMATION)
         self.resolution = check_resolution(resolution)
         self.n_yaws = check_whole("n_yaws", n_yaws, 1)
         self.stride = check_whole("stride", stride, 1)
         self.information = information
         self.device = torch.device(device)
-        self._known = (known_free, known_occupied)
         templates = beam_templates(
             horizontal_fov, vertical_fov, max_range, self.resolution, n_beams, self.n_yaws
         )
@@ -129,8 +123,8 @@ class ViewEvaluator:
         self._offsets = templates.offsets.to(device)
         self._exists = (torch.arange(n_cells) < templates.lengths[..., None]).to(device)
         depths = torch.where(self._exists.cpu(), templates.depths, math.inf)
-        band = needed_band(depths, sigma)
-        kernel = depth_kernel(templates.depths, sigma, band, templates.lengths).float().flatten(1, 2)
+        band = needed_band(depths, _SIGMA)
+        kernel = depth_kernel(templates.depths, _SIGMA, band, templates.lengths).float().flatten(1, 2)
         self._beams = Beams(
             self.n_beams,
             templates.lengths.flatten().to(device),
@@ -164,9 +158,7 @@ class ViewEvaluator:
         return torch.cat([place, keys[:, 3:].double() * (2 * math.pi / self.n_yaws)], 1)
 
     def evaluate(self, local_map: LocalMap, keys: Tensor) -> ViewValues:
-        """Evaluate each view (V, 4) alone. Beams end at the local map's border; a camera outside sees
-        nothing.
-        """
+        """Evaluate each view (V, 4) alone. Beams end at the map's border; a camera outside sees nothing."""
         self._check_keys(keys)
         window = self._window(local_map)
         cameras = (keys[:, :3] * self.stride - local_map.low.to(keys.device)).to(self.device)
@@ -177,13 +169,11 @@ class ViewEvaluator:
         measured = taken.div_(enough).clamp_max_(1)
         if self.device.type != "cpu":
             gain, measured = torch.stack([gain, measured]).cpu()
-        return ViewValues(gain.sum(1), gain, measured)
+        return ViewValues(gain, measured)
 
     def residual(self, local_map: LocalMap, poses: Tensor) -> Tensor:
-        """Return the residual (G,) float32 of each block after views from poses (M, 4), such as
-        teammates' plans.
-        """
-        return residual_of(self.evaluate(local_map, self.keys(poses)))
+        """Return what views from poses (M, 4) leave of each block, (G,) float32: Π (1 − measured)."""
+        return (1 - self.evaluate(local_map, self.keys(poses)).measured).prod(0)
 
     def _check_keys(self, keys: Tensor) -> None:
         if keys.ndim != 2 or keys.shape[1] != 4 or keys.dtype != torch.int64:
@@ -218,20 +208,14 @@ class ViewEvaluator:
         return _Layout(shape, math.prod(counts), _with_end(block), _with_end(offsets, _BEYOND).int())
 
     def _prepared(self, local_map: LocalMap, layout: _Layout) -> _Window:
-        occupancy = check_occupancy(local_map.occupancy).float().to(self.device)
+        occupancy = local_map.occupancy.float().to(self.device)
         observed = local_map.observed.to(self.device)
-        free, occupied = self._known
-        occupancy = occupancy.masked_fill(observed & (occupancy <= free), 0.0)
-        occupancy.masked_fill_(observed & (occupancy >= occupied), 1.0)
+        occupancy = occupancy.masked_fill(observed & (occupancy <= _KNOWN_FREE), 0.0)
+        occupancy.masked_fill_(observed & (occupancy >= _KNOWN_OCCUPIED), 1.0)
         occupancy = _with_end(occupancy.view(-1))
         unresolved = torch.bincount(layout.block, (1 - occupancy).mul_(occupancy), layout.n_blocks)
         cells = Cells(layout.shape, layout.n_blocks, layout.block, occupancy, layout.offsets)
         return _Window(cells, unresolved)
-
-
-def residual_of(values: ViewValues) -> Tensor:
-    """Return the residual of each block (G,) after several views: the product of 1 − measured."""
-    return (1 - values.measured).prod(0)
 
 
 def _with_end(cells: Tensor, value: float = 0) -> Tensor:

@@ -14,9 +14,8 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.exploration.robot.mapper import LocalMap
-from gmmtorch.sharing.messages.fields import LATEST, TICKS
-from gmmtorch.sharing.messages.message_registry import MAX_BYTES, ViewsMessage, encode_views, quantized_poses
-from gmmtorch.sharing.messages.record_messages import check_size
+from gmmtorch.sharing.messages.message_registry import ViewsMessage, encode_views, quantized_poses
+from gmmtorch.sharing.messages.view_messages import LATEST, TICKS
 from gmmtorch.sharing.replica.record_keys import (
     LARGEST_INCARNATION,
     LARGEST_ROBOT,
@@ -28,15 +27,15 @@ from gmmtorch.sharing.replica.record_keys import (
     robot_of,
 )
 
-Id = tuple[int, int]
-"""(robot that found the view, sequence), as of records: `gmmtorch.sharing.replica.record_keys`."""
-
+SPACING = 1.5
+_TURN = math.pi / 4
+"""Metres and radians. A view is not added if another one is nearer than both."""
+MOST_OWN_VIEWS = 256
+"""Views of one robot; the least valuable are removed."""
 TIME_TO_LIVE = 1800.0
-"""Seconds after which a view is removed that no robot has valued again. Views far from all robots stay for
-the length of a mission."""
+"""Seconds without a new value after which a view is removed: the length of a mission, for distant views."""
 REPEAT_AFTER, STAGGER = 60.0, 8.0
-"""Seconds without a message about a view until its finder repeats it; and the further wait of each next
-robot."""
+"""Seconds of silence about a view until its finder repeats it; and the further wait of each next robot."""
 MOST_REPEATED = 4
 """Views that are repeated in one call."""
 MOST_VIEWS = 1 << 14
@@ -45,6 +44,10 @@ MOST_DATAGRAMS = 8
 """Datagrams of one call; the rest waits."""
 _RUN = 96
 """Views, or intervals of removed keys, that are encoded together: about a datagram."""
+_VISITED = 0.8, math.pi / 5
+"""Metres and radians within which a view counts as visited."""
+_FRESH = 10.0
+"""Seconds for which a value needs no new evaluation."""
 _SMALL_CHANGE = 0.2
 """Change of a value, relative to it, that is not sent."""
 _LARGEST_VALUE = float(np.finfo(np.float16).max)
@@ -60,15 +63,15 @@ class View(NamedTuple):
 
 
 class Candidates(NamedTuple):
-    """Views that a robot may visit: ids, poses (V, 4), values (V,)."""
+    """Views that a robot may visit: keys, poses (V, 4), values (V,)."""
 
-    ids: list[Id]
+    keys: list[int]
     poses: Tensor
     values: Tensor
 
 
 class ViewLibrary:
-    """Views by id, and the ids of removed views, which are never accepted again.
+    """Views by key, as of records (see `record_keys`), and the keys of removed views, which never come back.
 
     The library is best-effort: a stale or missing view costs a detour, but never changes the map. Changes
     made here are sent once, in the next `datagrams`. After a minute without messages of a view, its finder
@@ -78,41 +81,24 @@ class ViewLibrary:
     libraries are equal.
 
     Args:
-        robot: id of the robot, which is part of the ids of its views.
-        spacing: metres, and turn: radians: a view is not added if another one is nearer than both.
-        size: largest number of this robot's own views; the least valuable are removed.
-        incarnation: of the robot's start (`record_keys.drawn_incarnation`), so that no id is given twice.
-        time_to_live: seconds after which a view is removed that no robot has valued again.
+        robot: id of the robot, which is part of the keys of its views.
+        incarnation: of the robot's start (`record_keys.drawn_incarnation`), so that no key is given twice.
 
     Attributes:
         refused: number of messages that were not accepted, by reason: "duplicate_id", "full".
         version: rises with every change.
     """
 
-    def __init__(
-        self,
-        robot: int,
-        spacing: float = 1.5,
-        turn: float = math.pi / 4,
-        size: int = 256,
-        *,
-        incarnation: int = 0,
-        time_to_live: float = TIME_TO_LIVE,
-    ) -> None:
-        for name, value in (("spacing", spacing), ("turn", turn), ("time_to_live", time_to_live)):
-            if not 0 <= value < math.inf:
-                raise InvalidArgumentError(f"{name}={value} must be finite, at least zero.")
+    def __init__(self, robot: int, *, incarnation: int = 0) -> None:
         for name, number, most in (
             ("robot", robot, LARGEST_ROBOT),
             ("incarnation", incarnation, LARGEST_INCARNATION),
         ):
             if check_whole(name, number, 0) > most:
                 raise InvalidArgumentError(f"{name}={number} must be at most {most}.")
-        self.spacing, self.turn = spacing, turn
         self.refused: Counter[str] = Counter()
         self.version = 0
         self._robot, self._first = robot, first_key(robot, incarnation)
-        self._size, self._time_to_live = check_whole("size", size, 1), time_to_live
         self._n = 0  # keys that were given
         self._views: dict[int, View] = {}
         self._removed = Intervals.empty()
@@ -127,20 +113,19 @@ class ViewLibrary:
         return len(self._views)
 
     def candidates(self) -> Candidates:
-        """All views, by id."""
+        """All views, by key."""
         if self._cached is None:
             keys = sorted(self._views)
             views = [self._views[key] for key in keys]
             poses = torch.tensor([view.pose for view in views], dtype=torch.float64).reshape(-1, 4)
             values = torch.tensor([view.value for view in views], dtype=torch.float64)
-            self._cached = Candidates([_id(key) for key in keys], poses, values)
+            self._cached = Candidates(keys, poses, values)
         return self._cached
 
     # -- changes made here ------------------------------------------------------------------------
 
-    def add(self, poses: Tensor, values: Tensor, now: float, least: float, most: int = 8) -> list[Id]:
-        """Add views (N, 4) with values (N,) of at least `least`, best first, at most `most`; returns their
-        ids."""
+    def add(self, poses: Tensor, values: Tensor, now: float, least: float, most: int = 8) -> list[int]:
+        """Add the best `most` of views (N, 4) with values (N,) of at least `least`; return their keys."""
         added: list[int] = []
         rows, worth = quantized_poses(poses), values.detach().cpu().double().numpy()
         order = np.argsort(-worth, kind="stable")
@@ -149,7 +134,7 @@ class ViewLibrary:
         for row in order.tolist():
             if len(added) == most:
                 break
-            if bool(_is_near(rows[row], near, self.spacing, self.turn).any()):
+            if bool(_is_near(rows[row], near, SPACING, _TURN).any()):
                 continue
             if self._n == MOST_RECORDS:
                 raise InvalidArgumentError(f"{MOST_RECORDS} views are the most of one incarnation.")
@@ -160,22 +145,22 @@ class ViewLibrary:
             self._put(added[-1], View(*_rounded(worth[row], now), (x, y, z, yaw)), now)
         self._due.update(added)
         own = sorted((view.value, key) for key, view in self._views.items() if robot_of(key) == self._robot)
-        self._remove(key for _, key in own[: max(0, len(own) - self._size)])
-        return [_id(key) for key in added if key in self._views]
+        self._remove(key for _, key in own[: max(0, len(own) - MOST_OWN_VIEWS)])
+        return [key for key in added if key in self._views]
 
-    def revalue(self, ids: list[Id], values: Tensor, now: float, least: float) -> None:
+    def revalue(self, keys: list[int], values: Tensor, now: float, least: float) -> None:
         """Set the values of views at the time `now` (s); those below `least` are removed.
 
         A small change is not sent, because it changes no plan; but once in half the time to live the view
         is, so that it is not removed.
         """
-        for key, value in zip(map(_key, ids), values.tolist(), strict=True):
+        for key, value in zip(keys, values.tolist(), strict=True):
             known = self._views.get(key)
             if value < least:
                 self._remove([key])
             elif known is not None:
                 is_small = abs(value - known.value) <= _SMALL_CHANGE * known.value
-                if is_small and abs(now - known.stamp) <= self._time_to_live / 2:
+                if is_small and abs(now - known.stamp) <= TIME_TO_LIVE / 2:
                     self._valued_at[key] = now
                     continue
                 # Later than the known version, even if that comes from a clock that is ahead.
@@ -184,32 +169,23 @@ class ViewLibrary:
                 self._put(key, View(max(at, after), half, known.pose), now)
                 self._due.add(key)
 
-    def remove(self, ids: list[Id], now: float) -> None:
+    def remove(self, keys: list[int], now: float) -> None:
         """Remove views for good."""
         self._now = now
-        self._remove(map(_key, ids))
+        self._remove(keys)
 
-    def visit(self, poses: Tensor, now: float, reach: float = 0.8, turn: float = math.pi / 5) -> None:
-        """Remove the views that a robot at poses (N, 4) has observed from: nearer than `reach` (m) and
-        `turn`."""
-        self._now = now
+    def visit(self, poses: Tensor, now: float) -> None:
+        """Remove the views near poses (N, 4), from which a robot has just observed."""
         known = self.candidates()
-        if known.ids:
-            seen = _is_near(poses[:, None], known.poses, reach, turn).any(0)
-            self.remove([known.ids[row] for row in seen.nonzero()[:, 0].tolist()], now)
+        seen = _is_near(poses[:, None], known.poses, *_VISITED).any(0)
+        self.remove([known.keys[row] for row in seen.nonzero()[:, 0].tolist()], now)
 
-    def covered(self, local_map: LocalMap, now: float, most: int, age: float = 10.0) -> list[Id]:
-        """Views in the local map that were not valued for `age` seconds, the longest first, at most
-        `most`."""
+    def covered(self, local_map: LocalMap, now: float, most: int) -> list[int]:
+        """At most `most` views in the local map whose value is no longer fresh, the oldest first."""
         known = self.candidates()
-        if not known.ids:
-            return []
-        inside = local_map.is_passable(known.poses[:, :3]).tolist()
-        valued = ((self._valued_at[_key(name)], name) for name in known.ids)
-        due = sorted(
-            pair for pair, there in zip(valued, inside, strict=True) if there and pair[0] <= now - age
-        )
-        return [name for _, name in due[:most]]
+        inside = local_map.is_passable(known.poses[:, :3]).nonzero()[:, 0].tolist()
+        due = sorted((self._valued_at[known.keys[row]], known.keys[row]) for row in inside)
+        return [key for valued, key in due[:most] if valued <= now - _FRESH]
 
     def best(self, metres: Tensor, *, least: float = 0.0) -> int | None:
         """Row of `candidates` that maximizes value / (1 + metres (V,) to it); None if no view is in reach."""
@@ -228,18 +204,14 @@ class ViewLibrary:
             digest.update(repr((key, self._views[key])).encode())
         return digest.digest()
 
-    def datagrams(
-        self, now: float | None = None, max_bytes: int = MAX_BYTES, budget: int | None = None
-    ) -> list[bytes]:
+    def datagrams(self, now: float | None = None, budget: int | None = None) -> list[bytes]:
         """Datagrams of changes made here, of removals that others lack, and of repeated views.
 
         Args:
             now: time (s) by this robot's clock; None: the time of the last call with one.
-            max_bytes: largest size of a datagram, from 1000 to 1200.
             budget: largest size of all together; None: no limit. The rest stays due, as does what exceeds
                 `MOST_DATAGRAMS`.
         """
-        check_size(max_bytes)
         left = math.inf if budget is None else check_whole("budget", budget, 0)
         now = self._now if now is None else now
         self._expire(now)
@@ -250,7 +222,7 @@ class ViewLibrary:
         while begin < len(removed) + len(keys) and len(sent) < MOST_DATAGRAMS:
             some = Intervals(removed.edges[2 * begin : 2 * (begin + n)])
             views = keys[max(begin - len(removed), 0) : max(begin + n - len(removed), 0)]
-            written = encode_views(self._message(views, some), max_bytes)
+            written = encode_views(self._message(views, some))
             if len(written) > 1 or len(written[0]) > left:
                 if n == 1:
                     break
@@ -312,8 +284,7 @@ class ViewLibrary:
         )
 
     def _repeated(self, now: float) -> list[int]:
-        """The keys to repeat, the longest unheard first. Robots wait for different times, the finder
-        least."""
+        """The keys to repeat, the longest unheard first. The finder waits least."""
         n_robots = LARGEST_ROBOT + 1
         silent = sorted(
             (heard, key)
@@ -324,7 +295,7 @@ class ViewLibrary:
 
     def _expire(self, now: float) -> None:
         """Remove the views that were not valued for the time to live."""
-        limit = now - self._time_to_live
+        limit = now - TIME_TO_LIVE
         self._remove([key for key, valued in self._valued_at.items() if valued < limit])
 
     # -- inside -----------------------------------------------------------------------------------
@@ -361,15 +332,6 @@ class ViewLibrary:
         n_before, n_by_end = np.searchsorted(begins, edges).T
         meets = keys.contains(edges[:, 0]) | (n_by_end > n_before)
         return Intervals(edges[meets].reshape(-1))
-
-
-def _key(name: Id) -> int:
-    return first_key(name[0]) + name[1]
-
-
-def _id(key: int) -> Id:
-    robot = robot_of(key)
-    return robot, key - first_key(robot)
 
 
 def _rounded(value: float, now: float) -> tuple[float, float]:

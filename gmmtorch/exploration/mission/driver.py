@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from typing import NamedTuple, Protocol
 
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import check_number
 
 _LONGEST_SLEEP = 0.02
 """Seconds between two calls of `idle` at most."""
@@ -52,7 +51,7 @@ class WallClock:
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], object] = time.sleep,
     ) -> None:
-        check_pace(speed=speed)
+        check_number("speed", speed, above=True)
         self._speed, self._clock, self._sleep = speed, clock, sleep
         self._last, self._elapsed = clock(), 0.0
 
@@ -67,16 +66,6 @@ class WallClock:
             idle()
             seconds = (until - self.now()) / self._speed
             self._sleep(min(max(seconds, _SHORTEST_SLEEP), _LONGEST_SLEEP))
-
-
-def check_pace(*, rate: float = 1.0, speed: float = 1.0, settle: float = 0.0) -> None:
-    """Raises `InvalidArgumentError` unless rate (Hz) and speed are positive and settle (s) is not negative;
-    all must be finite."""
-    for name, value in (("rate", rate), ("speed", speed)):
-        if not 0 < value < math.inf:
-            raise InvalidArgumentError(f"{name}={value} must be above zero, and finite.")
-    if not 0 <= settle < math.inf:
-        raise InvalidArgumentError(f"settle={settle} must be at least zero seconds, and finite.")
 
 
 class Stopwatch:
@@ -144,21 +133,12 @@ class Run(NamedTuple):
     seconds: float
 
 
-def never() -> bool:
-    """The default stop condition."""
-    return False
-
-
-def ignore_step() -> None:
-    """The default callback: ignores every step."""
-
-
 def drive(
     mission: Drivable,
     clock: Clock,
     *,
-    stop: Callable[[], bool] = never,
-    on_step: Callable[[], object] = ignore_step,
+    stop: Callable[[], bool] = lambda: False,
+    on_step: Callable[[], object] = lambda: None,
 ) -> Run:
     """Ticks until the mission is over or `stop` returns True.
 
@@ -194,14 +174,14 @@ def settle(
     clock: Clock,
     quiet: float,
     *,
-    stop: Callable[[], bool] = never,
-    on_step: Callable[[], object] = ignore_step,
+    stop: Callable[[], bool] = lambda: False,
+    on_step: Callable[[], object] = lambda: None,
 ) -> None:
     """Exchanges messages until `mission.content` has not changed for `quiet` seconds, or `stop` returns True.
 
     Raises `InvalidArgumentError` if `quiet` is negative or infinite.
     """
-    check_pace(settle=quiet)
+    check_number("settle", quiet)
 
     def idle() -> None:
         mission.exchange(clock.now())

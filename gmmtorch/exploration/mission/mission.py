@@ -14,7 +14,8 @@ from torch import Tensor
 from gmmtorch.evaluation.codecs.point_codecs import bytes_of_points
 from gmmtorch.exploration.mission.driver import Stopwatch
 from gmmtorch.exploration.mission.options import TeamOptions
-from gmmtorch.exploration.mission.planning_round import coordination_of, plan_alone, plan_together
+from gmmtorch.exploration.mission.planning_round import plan_alone, plan_together
+from gmmtorch.exploration.planning.coordination import Coordination
 from gmmtorch.exploration.robot.agent import Agent
 from gmmtorch.exploration.robot.mapper import FrameUpdate
 from gmmtorch.exploration.robot.robot_state import Robot
@@ -63,9 +64,7 @@ class MissionScore:
         for evidence in update.evidence:
             self.union.add(evidence)
         self._note_seen(robot, frame)
-        self._encoded_bytes["raw_points"] += 12 * int(update.novel.sum())
-        for name, size in self._sizes(frame, update).items():
-            self._encoded_bytes[name] += size
+        self._note_bytes(frame, update)
 
     def sample(self, now: float) -> None:
         """Appends the present values to the curves, at the time `now` (s)."""
@@ -81,18 +80,16 @@ class MissionScore:
         for name, size in self._encoded_bytes.items():
             s[f"{name}_bytes_over_time"].append(size)
 
-    def _sizes(self, frame: DepthFrame, update: FrameUpdate) -> dict[str, int]:
-        """Bytes of the novel beams in each compared codec: of returns, and of the ends of no-return beams."""
-        sizes = dict.fromkeys(self._options.codecs, 0)
+    def _note_bytes(self, frame: DepthFrame, update: FrameUpdate) -> None:
+        """Adds the bytes of the novel beams in each codec: of returns, and of the ends of no-return beams."""
+        self._encoded_bytes["raw_points"] += 12 * int(update.novel.sum())
+        names, noise = self._options.codecs, self._options.frame.noise
         for kind in (frame.is_hit, ~frame.is_hit):
             ends = frame.ends[update.novel & kind].cpu()
-            if sizes and len(ends):
-                encoded = bytes_of_points(
-                    ends, self._world.resolution, self._options.frame.noise, names=tuple(sizes)
-                )
+            if names and len(ends):
+                encoded = bytes_of_points(ends, self._world.resolution, noise, names=names)
                 for name, size in encoded.items():
-                    sizes[name] += size
-        return sizes
+                    self._encoded_bytes[name] += size
 
     def _note_seen(self, robot: Robot, frame: DepthFrame) -> None:
         """Marks the cells that the beams of every few pixels cross, independently of the robot's map."""
@@ -139,7 +136,10 @@ class Mission:
         """Ticks done."""
         self.trajectories: list[list[Tensor]] = [[robot.state[:4].clone()] for robot in self.robots]
         """Poses (4,) x, y, z, yaw of each robot: at the start, and after each tick."""
-        self.coordination = coordination_of(options)
+        # Robots that share nothing plan independently.
+        self.coordination = Coordination(
+            options.coordination if options.shares else "myopic", options.n_rounds
+        )
         self._network, self._score = network, score
         self._generator = torch.Generator().manual_seed(options.seed)
         self._views_sent_at = 0.0

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, check_whole
 from gmmtorch.evaluation.codecs.point_codecs import POINT_CODECS
 from gmmtorch.exploration.information.view_evaluator import INFORMATION
 from gmmtorch.exploration.planning.coordination import Coordination
@@ -26,9 +26,8 @@ _MOST_ROBOTS = 31
 _LATE_JITTERS = 5
 """Mean jitters. Less than 1 % of the datagrams arrive later."""
 
-FRAMEWORKS = {"gmm_shared": "E0", "grid_shared": "E1", "grid_isolated": "E2", "gmm_thesis": "E0"}
-"""Name in the thesis, by framework. `gmm_thesis` is `gmm_shared` with the options of `THESIS`."""
-_MIXTURES = ("gmm_shared", "gmm_thesis")
+FRAMEWORKS = ("gmm_shared", "grid_shared", "grid_isolated", "gmm_thesis")
+"""E0, E1 and E2 of the thesis; and `gmm_shared` with the options of `THESIS`."""
 
 THESIS: dict[str, Any] = {
     "codec": "thesis",
@@ -106,10 +105,11 @@ class TeamOptions:
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        if self.framework not in FRAMEWORKS:
-            raise InvalidArgumentError(f"team={self.framework!r} is not one of {', '.join(FRAMEWORKS)}.")
-        if self.planner not in PLANNERS:
-            raise InvalidArgumentError(f"planner={self.planner!r} is not one of {', '.join(PLANNERS)}.")
+        check_choice("team", self.framework, FRAMEWORKS)
+        check_choice("planner", self.planner, PLANNERS)
+        check_choice("information", self.information, INFORMATION)
+        for name in self.codecs:
+            check_choice("evaluation.codecs", name, tuple(POINT_CODECS))
         if self.framework == "gmm_thesis":
             self._set_thesis()
         check_whole("team.size", self.size, 1)
@@ -119,25 +119,14 @@ class TeamOptions:
         check_whole("n_beams", self.n_beams, 1)
         check_codec(self.codec)
         for name in ("duration", "rate", "sample_every"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise InvalidArgumentError(f"{name}={getattr(self, name)} must be above zero, and finite.")
-        for name in self.codecs:
-            if name not in POINT_CODECS:
-                raise InvalidArgumentError(
-                    f"evaluation.codecs has {name!r}, which is not one of {', '.join(POINT_CODECS)}."
-                )
-        if self.information not in INFORMATION:
-            raise InvalidArgumentError(
-                f"information={self.information!r} is not one of {', '.join(INFORMATION)}."
-            )
+            check_number(name, getattr(self, name), above=True)
+        check_number("margin", self.margin)
         # These check their own arguments.
         Coordination(self.coordination, self.n_rounds)
         AnnouncementSchedule(self.announce_every)
         if self.budget is not None:
             TokenBucket(self.budget)
         self.conditions.check_team(self.size)
-        if not 0 <= self.margin < math.inf:
-            raise InvalidArgumentError(f"margin={self.margin} must be finite metres, at least zero.")
         if not 0 < self.planning_prior < 1:
             raise InvalidArgumentError(f"planner.prior={self.planning_prior} must be between 0 and 1.")
         for name, ratio in (
@@ -212,8 +201,7 @@ class TeamOptions:
 
     @property
     def plan_slack(self) -> float:
-        """Seconds for which a robot waits for the plan of the robot before it; 0 if the network is too slow
-        for all robots to wait in one tick."""
+        """Seconds to wait for the plan of the robot before; 0 if the network is too slow for one tick."""
         slack = 2 * self.latency + _LATE_JITTERS * self.jitter + 0.01
         return slack if slack * self.size <= self.tick_seconds / 2 else 0.0
 
@@ -225,7 +213,7 @@ class TeamOptions:
     @property
     def has_mixtures(self) -> bool:
         """Whether the maps are mixtures; otherwise they are voxels."""
-        return self.framework in _MIXTURES
+        return self.framework.startswith("gmm")
 
     @property
     def shares(self) -> bool:

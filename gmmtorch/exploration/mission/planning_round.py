@@ -12,11 +12,6 @@ from gmmtorch.exploration.planning.planner_interface import Plan
 from gmmtorch.exploration.robot.agent import Agent
 
 
-def coordination_of(options: TeamOptions) -> Coordination:
-    """How the team plans; robots that share nothing plan independently."""
-    return Coordination(options.coordination if options.shares else "myopic", options.n_rounds)
-
-
 def plan_together(
     agents: Sequence[Agent],
     coordination: Coordination,
@@ -96,8 +91,7 @@ def _peer_trajectories(
     coordination: Coordination,
     options: TeamOptions,
 ) -> PeerTrajectories:
-    """Where the other robots may be: on their final or proposed plan. A robot whose plan may still change may
-    also brake at the end of its present path."""
+    """Where the other robots may be: on their final or proposed plan, and braking if that may change."""
     stays_final = coordination.name != "distributed_greedy"
     paths = []
     for other in agents:
@@ -107,5 +101,5 @@ def _peer_trajectories(
         if plan is not None:
             paths.append(torch.cat([plan.path, plan.braking])[:, :3])
         if plan is None or not (stays_final or other.number in final):
-            paths.append(other.braking[:, :3])
+            paths.append(other.robot.braking[:, :3])
     return PeerTrajectories.of(paths, options.separation)

@@ -6,36 +6,19 @@ import itertools
 import json
 import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
-from typing import Any, Protocol
+from typing import Any
 
-from gmmtorch.errors import DataError, check_whole
-from gmmtorch.exploration.mission.driver import Stopwatch, check_pace
+from gmmtorch.errors import DataError, check_number, check_whole
+from gmmtorch.exploration.mission.driver import Stopwatch
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.scan import Scan
 from gmmtorch.sharing.frame_joiner import FrameJoiner
-from gmmtorch.sharing.radio import RecordStore
 from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.sharing.shared_map import SharedMap
+from gmmtorch.sharing.store import Store
 from gmmtorch.sharing.transport.simulated_network import Transport
 
 _log = logging.getLogger(__name__)
-
-
-class ReplayStore(RecordStore, Protocol):
-    """A store that also keeps how far the robot is in its log."""
-
-    @property
-    def farthest(self) -> int | None:
-        """The number of scans of the last progress saved, even if it can no longer be read; None: none."""
-        ...
-
-    def progress(self) -> tuple[int, dict[str, Any]] | None:
-        """Number of scans and state of the last sound progress; None: none."""
-        ...
-
-    def save_progress(self, n_scans: int, state: dict[str, Any]) -> bool:
-        """Whether the state after `n_scans` scans is on disk now."""
-        ...
 
 
 class ReplayMission:
@@ -76,13 +59,13 @@ class ReplayMission:
         make_map: Callable[[], GaussianMap],
         *,
         rate: float = 1.0,
-        store: ReplayStore | None = None,
+        store: Store | None = None,
         announce_every: float = 1.0,
         budget: float | None = None,
         keep_every: int = 10,
         joiner: FrameJoiner | None = None,
     ) -> None:
-        check_pace(rate=rate)
+        check_number("rate", rate, above=True)
         self.replica, self.map, self.tick_seconds = replica, make_map(), 1 / rate
         self.shared = SharedMap(
             replica, transport, store=store, announce_every=announce_every, budget=budget, joiner=joiner

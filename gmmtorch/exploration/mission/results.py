@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -76,7 +75,7 @@ def mission_row(mission: Mission, wall_seconds: float) -> dict[str, Any]:
         "collisions": sum(robot.collisions for robot in mission.robots),
         "path_length": length,
         "coverage_per_metre": volume / length if length > 0 else None,
-        "overlap": _finite(overlap(robots_seeing)),
+        "overlap": overlap(robots_seeing),
         "wall_seconds": wall_seconds,
         "stage_seconds": dict(mission.watch.seconds),
         "simulated_per_wall_seconds": mission.elapsed / wall_seconds if wall_seconds > 0 else None,
@@ -157,10 +156,6 @@ def _hashable(value: Any) -> Any:
     return str(value) if isinstance(value, list) else value
 
 
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
 def _pair_key(row: Mapping[str, Any]) -> tuple[Any, ...]:
     """Equal for a mission and its lossless companion."""
     return (row.get("seed"), *variant_of(row, without=_LOSSES))
@@ -197,6 +192,7 @@ def _missing(row: Mapping[str, Any]) -> list[tuple[float, float]]:
 
 
 _MOST_SNAPSHOTS = 16
+_SHARES = (0.2, 0.5, 0.8)
 
 
 class Snapshot(NamedTuple):
@@ -241,12 +237,11 @@ class Snapshots:
             if snapshot.bits >= self.taken[-1].bits + self._step:
                 self.taken.append(snapshot)
 
-    def chosen(self, shares: Sequence[float] = (0.2, 0.5, 0.8)) -> list[Snapshot]:
-        """The last snapshot, and those nearest to these shares of the final reduction; sorted by time, fewer
-        if there are not enough."""
+    def chosen(self) -> list[Snapshot]:
+        """The last snapshot, and those nearest to `_SHARES` of the final reduction, sorted by time."""
         *left, end = self.taken
         chosen = [end]
-        for share in shares[: len(left)]:
+        for share in _SHARES[: len(left)]:
             bits = [abs(snapshot.bits - share * end.bits) for snapshot in left]
             chosen.append(left.pop(bits.index(min(bits))))
         return sorted(chosen, key=lambda snapshot: snapshot.tick)

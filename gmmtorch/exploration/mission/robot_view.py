@@ -6,7 +6,7 @@ import functools
 from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 
@@ -17,8 +17,8 @@ from gmmtorch.exploration.robot.gmm_mapper import GmmMapper
 from gmmtorch.files import write_npz
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.sharing.radio import Radio
+from gmmtorch.sharing.replica.materialized_view import robot_of_frame
 from gmmtorch.sharing.replica.replica import Replica
-from gmmtorch.sharing.replica.robot_frames import robot_of_frame
 from gmmtorch.sharing.shared_map import SharedMap
 from gmmtorch.sharing.transport.frames import FramedTransport
 from gmmtorch.sharing.transport.simulated_network import Network
@@ -31,36 +31,12 @@ class DuplicateIdError(GmmTorchError):
     """Another robot uses this robot's id."""
 
 
-class RobotView(Protocol):
-    """A robot as its process reports it."""
-
-    @property
-    def robot(self) -> int:
-        """Its id."""
-        ...
-
-    def check_id(self) -> None:
-        """Raises `DuplicateIdError` if another robot uses this robot's id."""
-
-    def status(self) -> str:
-        """One short line for a terminal."""
-        ...
-
-    def scalars(self) -> dict[str, float]:
-        """Numbers for a plot over time."""
-        ...
-
-    def row(self) -> dict[str, Any]:
-        """Its row of results.json."""
-        ...
-
-    def files(self) -> Files:
-        """Its map, and what else it made."""
-        ...
-
-
 class FlyingRobotView:
-    """The robot of a `Mission` without simulated network."""
+    """The robot of a `Mission` without simulated network.
+
+    `status` is one short line for a terminal, `scalars` are numbers for a plot over time, `row` is the row
+    of results.json, and `files` are the robot's map and what else it made.
+    """
 
     def __init__(self, mission: Mission, transport: FramedTransport) -> None:
         (self._agent,) = mission.agents
@@ -69,6 +45,7 @@ class FlyingRobotView:
         self.robot = self._agent.number
 
     def check_id(self) -> None:
+        """Raises `DuplicateIdError` if another robot uses this robot's id."""
         _check_id(self._agent.radio, self._n_conflicts)
 
     @property
@@ -133,7 +110,7 @@ class FlyingRobotView:
 
 
 class ReplayingRobotView:
-    """The robot of a `ReplayMission`."""
+    """The robot of a `ReplayMission`; see `FlyingRobotView`."""
 
     def __init__(self, mission: ReplayMission, transport: FramedTransport | Network) -> None:
         self._mission, self._transport = mission, transport
@@ -183,6 +160,9 @@ class ReplayingRobotView:
         """The team's map as this robot holds it, and the robot's own map."""
         maps = {"map": self._replica.map(codec="quantized"), "own_map": self._mission.map}
         return {name: (f"{name}{made.suffix}", made.save) for name, made in maps.items() if made.n_components}
+
+
+RobotView = FlyingRobotView | ReplayingRobotView
 
 
 def sharing_row(shared: SharedMap) -> dict[str, Any]:

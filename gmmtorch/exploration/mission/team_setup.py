@@ -19,9 +19,9 @@ from gmmtorch.exploration.planning.roadmap import Roadmap
 from gmmtorch.exploration.robot.agent import Agent
 from gmmtorch.exploration.robot.gmm_mapper import GmmMapper
 from gmmtorch.exploration.robot.grid_mapper import GridMapper
-from gmmtorch.exploration.robot.initial_free_space import initial_free_space
 from gmmtorch.exploration.robot.mapper import Mapper, Memo
 from gmmtorch.exploration.robot.robot_state import Robot
+from gmmtorch.exploration.world import starts
 from gmmtorch.exploration.world.scoring import BeliefMap
 from gmmtorch.exploration.world.world import World
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
@@ -64,14 +64,14 @@ def start_poses(world: World, options: TeamOptions) -> Tensor:
     """The start poses (size, 4): x, y, z, yaw. Raises `InvalidArgumentError` where robots cannot start."""
     primitives = Primitives(options.dynamics)
     if options.start is None:
-        return world.start_poses(options.size, primitives=primitives)
+        return starts.start_poses(world, options.size, primitives)
     poses = torch.tensor(options.start, dtype=torch.float64)
     if poses.shape != (options.size, 4):
         raise InvalidArgumentError(
             f"team.start has shape {tuple(poses.shape)}; expected a pose x, y, z, yaw for each of "
             f"{options.size} robots."
         )
-    return world.check_start(poses, primitives)
+    return starts.check_start(world, poses, primitives)
 
 
 def make_agent(
@@ -109,7 +109,7 @@ def make_agent(
         device=options.device,
     )
     primitives = Primitives(options.dynamics)
-    start = initial_free_space(world, pose[:3].double(), primitives)
+    start = starts.initial_free_space(world, pose[:3].double(), primitives)
     if start is None:
         raise InvalidArgumentError(
             f"pose={pose.tolist()} is a place from which a robot cannot take off; choose another."
@@ -122,7 +122,7 @@ def make_agent(
         ViewLibrary(number, incarnation=incarnation),
         Roadmap(),
         start,
-        rest=options.rest,
+        options.rest,
     )
     watch = Stopwatch() if watch is None else watch
     return Agent(robot, transport, evaluator, primitives, options, memo, watch)
@@ -157,4 +157,4 @@ def _mapper(
         shared = Replica(number, dim=3, incarnation=incarnation)
     else:
         shared = Broadcast(number, options.codec)
-    return GmmMapper(number, local, belief, width, options.novelty, options.frame, evidence, shared)
+    return GmmMapper(local, belief, width, options.novelty, options.frame, evidence, shared)

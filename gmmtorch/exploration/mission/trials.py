@@ -101,7 +101,7 @@ class Trial:
 
 
 def run_mission(
-    trial: Trial, world: World | None = None, on_tick: OnMission | None = None
+    trial: Trial, world: World | None = None, on_tick: OnMission = lambda mission: None
 ) -> tuple[Mission, dict[str, Any]]:
     """Runs a trial; returns the mission at its end, and its row. Keeps nothing.
 
@@ -115,11 +115,8 @@ def run_mission(
     world = trial.world.open(trial.team) if world is None else world
     mission = assemble(world, trial.team)
     begin = time.perf_counter()
-    if on_tick is not None:
-        on_tick(mission)
-        drive(mission, SimulatedClock(), on_step=functools.partial(on_tick, mission))
-    else:
-        drive(mission, SimulatedClock())
+    on_tick(mission)
+    drive(mission, SimulatedClock(), on_step=functools.partial(on_tick, mission))
     row = mission_row(mission, time.perf_counter() - begin)
     # Only maps with a digest can be compared.
     has_digests = any(robot.mapper.shared.digest() for robot in mission.robots)
@@ -130,9 +127,9 @@ def run_mission(
 def run_trials(
     trials: Sequence[Trial],
     workers: int = 1,
-    on_row: Callable[[dict[str, Any]], None] | None = None,
+    on_row: Callable[[dict[str, Any]], object] = lambda row: None,
     on_event: Event = ignore,
-    on_sample: OnMission | None = None,
+    on_sample: OnMission = lambda mission: None,
 ) -> list[dict[str, Any]]:
     """The rows of trials in their order, run in `workers` processes; trials with a kept row are not run.
 
@@ -157,11 +154,10 @@ def run_trials(
     def sampled(i: int, mission: Mission) -> None:
         if mission.has_sampled:
             progress(i, mission.elapsed)
-            if on_sample is not None:
-                on_sample(mission)
+            on_sample(mission)
 
     for row in rows:
-        if row is not None and on_row is not None:
+        if row is not None:
             on_row(row)
     on_event(STAGE, round(sum(seconds)), round(sum(durations)))
     if workers == 1:
@@ -173,8 +169,7 @@ def run_trials(
     for i, row in finished:
         rows[i] = row
         progress(i, durations[i])
-        if on_row is not None:
-            on_row(row)
+        on_row(row)
     return [row for row in rows if row is not None]
 
 
@@ -204,7 +199,7 @@ def save_trajectories(mission: Mission, path: Path) -> None:
     write_npz(path, **poses)
 
 
-def _run_and_keep(trial: Trial, on_tick: OnMission | None = None) -> dict[str, Any]:
+def _run_and_keep(trial: Trial, on_tick: OnMission = lambda mission: None) -> dict[str, Any]:
     torch.set_num_threads(1)
     mission, row = run_mission(trial, on_tick=on_tick)
     if trial.folder is not None:
@@ -242,8 +237,7 @@ def _run_in_parallel(trials: dict[int, Trial], workers: int) -> Iterator[tuple[i
 
 
 def _run_apart(i: int, trial: Trial, failed: Path) -> tuple[int, dict[str, Any] | Exception | None]:
-    """Runs a trial in a worker process, unless another has failed. Errors are returned: joblib would stop the
-    other trials if they were raised."""
+    """Runs a trial in a worker process, unless another has failed. Returns errors, which would end joblib."""
     end_with_parent()
     if failed.exists():
         return i, None

@@ -16,21 +16,7 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.exploration.planning.coordination import PeerTrajectories, clear_of
 from gmmtorch.exploration.robot.mapper import LocalMap
-from gmmtorch.exploration.world.navigable import collides
 from gmmtorch.kernels.rays.path_clearance import Motions, motions_are_clear
-from gmmtorch.occupancy.grid import check_resolution
-
-__all__ = [
-    "PeerTrajectories",
-    "cells_in_sphere",
-    "clear_of",
-    "collides",
-    "feasible",
-    "feasible_motions",
-    "inflated",
-    "local_map_of",
-    "passable_cells",
-]
 
 _SPACING = 1.0
 """Cells between the checked points of a path; half of it is the margin around the body."""
@@ -50,9 +36,6 @@ def inflated(blocked: Tensor, radius: float, resolution: float) -> Tensor:
     blocked. A cell at offset (i, j, k) from a blocked cell is included if Σ max(|i| − 1, 0)² < (radius /
     resolution)². That set is a union of boxes; each box is computed one axis after the other.
     """
-    check_resolution(resolution)
-    if not (math.isfinite(radius) and radius > 0):
-        raise InvalidArgumentError(f"radius={radius} must be above zero metres.")
     boxes = _covering_boxes((radius / resolution) ** 2 * (1 - _ROUNDING))
     reach = max(max(box) for box in boxes)
     padded = torch.nn.functional.pad(blocked, (reach,) * 6, value=True)
@@ -110,11 +93,6 @@ def local_map_of(
             with radius √3 (radius + 5/2 resolution) or more makes the cell of its centre passable.
         obstacles: (C, 3) int64, lattice cells that are never free.
     """
-    for name, value in (("planning_prior", planning_prior), ("free_below", free_below)):
-        if not 0 < value < 1:
-            raise InvalidArgumentError(f"{name}={value} must be a probability above 0 and below 1.")
-    if not (math.isfinite(prior) and prior > 0):
-        raise InvalidArgumentError(f"prior={prior} must be above zero rays.")
     total = hits + misses
     observed = total > 0
     struck = (hits >= _STRUCK_RAYS) & (hits >= _STRUCK_SHARE * total)
@@ -140,7 +118,7 @@ def feasible(
     local_map: LocalMap,
     peers: PeerTrajectories | None = None,
     *,
-    start: Tensor | None = None,
+    start: Tensor,
     radius: float | None = None,
 ) -> Tensor:
     """Flag (...,) the safe paths: states (..., S, 7), followed by braking states (..., B, 7) until rest.
@@ -149,29 +127,23 @@ def feasible(
     does not move, such as a turn in place or a wait, is always safe.
 
     The map may change so that the robot's own cell is no longer passable. The robot may leave that cell
-    if `start` and `radius` are given. Its body, at its exact position, may then touch only free cells and
+    if `radius` is given. Its body, at its exact position, may then touch only free cells and
     the cells that it touches at the start, and it must move away from every point q of those: (x − x₀)·(q
     − x₀) ≤ 0. So no known obstacle comes closer than it is at the start, or than the radius.
 
     Args:
-        start: (..., 7) or broadcastable: the states before the first step. Without it the way to the
-            first state is not checked.
-        radius: of the robot (m).
+        start: (..., 7) or broadcastable: the states before the first step. radius: of the robot (m).
     """
-    states = torch.cat([rollout, braking], -2)
-    origin = None
-    if start is not None:
-        begin = start.to(states).expand(*states.shape[:-2], 7)
-        origin = begin[..., :3]
-        states = torch.cat([begin[..., None, :], states], -2)
+    begin = start.to(rollout).expand(*rollout.shape[:-2], 7)
+    origin = begin[..., :3]
+    states = torch.cat([begin[..., None, :], rollout, braking], -2)
     safe = local_map.is_passable(_points_along(states, _SPACING * local_map.resolution)).all(-1)
-    if origin is not None:
-        stuck = ~local_map.is_passable(origin)
-        safe &= ~stuck
-        if radius is not None:
-            for here in torch.unique(origin[stuck], dim=0):
-                rows = stuck & (origin == here).all(-1)
-                safe[rows] = _leaves(here, states[rows], local_map, radius)
+    stuck = ~local_map.is_passable(origin)
+    safe &= ~stuck
+    if radius is not None:
+        for here in torch.unique(origin[stuck], dim=0):
+            rows = stuck & (origin == here).all(-1)
+            safe[rows] = _leaves(here, states[rows], local_map, radius)
     if peers is not None:
         places = torch.cat([rollout[..., :3], braking[..., :3]], -2)
         safe &= clear_of(places, peers, origin)
@@ -230,8 +202,7 @@ def _widened(blocked: Tensor, axis: int, cells: int) -> Tensor:
 
 
 def _points_along(states: Tensor, spacing: float) -> Tensor:
-    """Sample points (..., n, 3) of paths (..., L, 7), so that every point of a path is within spacing / 2
-    of one.
+    """Sample points (..., n, 3) of paths (..., L, 7), at most `spacing` apart along each path.
 
     The first state is left out. Steps are treated as straight; an arc of chord c that turns by φ deviates
     from its chord by c φ/8.
@@ -257,9 +228,7 @@ def _points_of_a_step(longest: float, turn: float, spacing: float) -> int:
 
 
 def _leaves(here: Tensor, states: Tensor, local_map: LocalMap, radius: float) -> Tensor:
-    """Flag (P,) the paths (P, L, 7) from a point (3,) that lead away from every cell the body touches
-    there.
-    """
+    """Flag (P,) the paths (P, L, 7) from a point (3,) that lead away from all cells touched there."""
     resolution = local_map.resolution
     if not bool(local_map.flat_index(here)[1]):
         return torch.zeros(len(states), dtype=torch.bool)
@@ -285,9 +254,7 @@ def _leaves(here: Tensor, states: Tensor, local_map: LocalMap, radius: float) ->
 def _touched(
     points: Tensor, blocked: Tensor, low: Tensor, resolution: float, radius: float
 ) -> tuple[Tensor, Tensor]:
-    """Return rows (T,) of points (N, 3) and the blocked cells (T, 3), relative to `low`, in spheres
-    around them.
-    """
+    """Return the blocked cells (T, 3), relative to `low`, in spheres around points (N, 3); with rows (T,)."""
     reach = math.ceil(radius / resolution)
     offset = torch.arange(-reach, reach + 1)
     cell = (points / resolution).floor().long()

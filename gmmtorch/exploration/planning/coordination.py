@@ -5,25 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, check_whole
 from gmmtorch.sharing.messages.message_registry import PlanMessage
 
+if TYPE_CHECKING:
+    from gmmtorch.exploration.planning.planner_interface import Plan
+
 COORDINATIONS = ("myopic", "greedy", "distributed_greedy", "random_partition")
-
-
-class Valued(Protocol):
-    """A plan with an expected value."""
-
-    @property
-    def value(self) -> float: ...
-
-
-P = TypeVar("P", bound=Valued)
 
 
 class Coordination:
@@ -38,8 +31,7 @@ class Coordination:
     """
 
     def __init__(self, name: str = "greedy", n_rounds: int = 3) -> None:
-        if name not in COORDINATIONS:
-            raise InvalidArgumentError(f"coordination={name!r} is not one of {', '.join(COORDINATIONS)}.")
+        check_choice("coordination", name, COORDINATIONS)
         self.name = name
         self.n_rounds = check_whole("n_rounds", n_rounds, 1)
 
@@ -59,8 +51,11 @@ class Coordination:
         return [robots for robots in rounds if robots]
 
     def coordinate(
-        self, robots: Iterable[int], plan: Callable[[int, dict[int, P]], P], generator: torch.Generator
-    ) -> dict[int, P]:
+        self,
+        robots: Iterable[int],
+        plan: Callable[[int, dict[int, Plan]], Plan],
+        generator: torch.Generator,
+    ) -> dict[int, Plan]:
         """Return the plan of each robot, in the order in which the plans were fixed.
 
         Args:
@@ -69,20 +64,18 @@ class Coordination:
         team = list(robots)
         if self.name == "distributed_greedy":
             return self._distributed(team, plan)
-        settled: dict[int, P] = {}
+        settled: dict[int, Plan] = {}
         for numbers in self.rounds(len(team), generator):
             together = {team[number]: plan(team[number], dict(settled)) for number in numbers}
             settled.update(together)
         return settled
 
-    def _distributed(self, team: list[int], plan: Callable[[int, dict[int, P]], P]) -> dict[int, P]:
-        settled: dict[int, P] = {}
+    def _distributed(self, team: list[int], plan: Callable[[int, dict[int, Plan]], Plan]) -> dict[int, Plan]:
+        settled: dict[int, Plan] = {}
         left = team
         for k in range(self.n_rounds):
             found = {robot: plan(robot, dict(settled)) for robot in left}
-            best = sorted(
-                left, key=lambda robot: -found[robot].value
-            )  # stable: the first of equals comes first
+            best = sorted(left, key=lambda robot: -found[robot].value)  # the first of equals comes first
             best = best[: -(-len(left) // (self.n_rounds - k))]
             settled.update((robot, found[robot]) for robot in best)
             left = [robot for robot in left if robot not in best]
@@ -111,8 +104,7 @@ class PeerTrajectories:
             raise InvalidArgumentError(
                 f"paths has shape {shape}; expected finite metres (M, T, 3), T of 1 or more."
             )
-        if not (math.isfinite(self.separation) and self.separation > 0):
-            raise InvalidArgumentError(f"separation={self.separation} must be above zero metres.")
+        check_number("separation", self.separation, above=True)
 
     @classmethod
     def of(cls, paths: Sequence[Tensor], separation: float = 0.7) -> PeerTrajectories:
@@ -176,9 +168,7 @@ def predicted_path(plan: PlanMessage, age: float, step: float) -> Tensor:
 
 
 def _longer_step(path: Tensor) -> Tensor:
-    """Return metres (..., L) from each position of paths (..., L, 3) to the farther of its neighbours in
-    time.
-    """
+    """Return the longer step, metres (..., L), before or after each position of paths (..., L, 3)."""
     step = (path[..., 1:, :] - path[..., :-1, :]).norm(dim=-1)
     pad = torch.nn.functional.pad
     return torch.maximum(pad(step, (0, 1)), pad(step, (1, 0)))

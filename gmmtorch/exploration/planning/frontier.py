@@ -11,14 +11,18 @@ from scipy import ndimage
 from torch import Tensor
 
 from gmmtorch.exploration.information.view_evaluator import BLOCK
-from gmmtorch.exploration.planning.geodesic import DistanceField
-from gmmtorch.exploration.planning.global_planner import Journey, looks
-from gmmtorch.exploration.planning.planner_interface import Plan, PlanningTask, Waiting
+from gmmtorch.exploration.planning.geodesic import COARSE, DistanceField
+from gmmtorch.exploration.planning.global_planner import Journey, angle, looks
+from gmmtorch.exploration.planning.planner_interface import Plan, PlanningTask
 from gmmtorch.exploration.planning.primitives import Primitives
+from gmmtorch.exploration.planning.recovery import Waiting
 from gmmtorch.exploration.planning.tree_search import SearchRule, TreeSearch
 from gmmtorch.exploration.robot.mapper import LocalMap
 
-_COARSE = 2
+_LEAST = 20  # cells of the smallest frontier
+_LARGEST = 400  # cells; larger frontiers count as this large
+_LOYALTY = 1.5  # factor by which another frontier must be better than the present one
+_ELEVATION = 0.4  # largest angle (rad) above or below the camera at which it can see a frontier
 _SAMPLES = 24  # of a line of sight
 _TURNING = 0.3  # metres that a radian of turning costs
 _TRIES = 3  # unreachable goals that one plan may try
@@ -43,9 +47,7 @@ class Frontiers(NamedTuple):
 
 
 def frontier_cells(local_map: LocalMap) -> Tensor:
-    """Return free cells (nx, ny, nz), bool, that share a face with a cell that is neither observed nor
-    free.
-    """
+    """Return free cells (nx, ny, nz), bool, that share a face with an unobserved cell that is not free."""
     unknown = ~(local_map.observed | local_map.free)
     beside = torch.zeros_like(unknown)
     for axis in range(3):
@@ -55,24 +57,19 @@ def frontier_cells(local_map: LocalMap) -> Tensor:
     return beside & local_map.free
 
 
-def find_frontiers(
-    local_map: LocalMap, start: Tensor, exhausted: Tensor, least: int, elevation: float
-) -> Frontiers:
+def find_frontiers(local_map: LocalMap, start: Tensor, exhausted: Tensor, least: int = _LEAST) -> Frontiers:
     """Find clusters of at least `least` cells that a robot at `start` (3,) can look at, most promising first.
 
     Args:
         exhausted: (E, 3), targets that remained after a look; cells within a metre of them are ignored.
-        elevation: largest angle (rad) above or below the camera at which it can see a target.
     """
-    distances = DistanceField.to(local_map, start[None], coarse=_COARSE)
+    distances = DistanceField.to(local_map, start[None])
     cells = frontier_cells(local_map).nonzero()
     if len(exhausted):
         cells = cells[torch.cdist(local_map.centers(cells), exhausted.double()).amin(1) > _SAME]
     shape = distances.metres.shape
     counts = torch.zeros(shape, dtype=torch.int64)
-    counts.index_put_(
-        (cells // _COARSE).unbind(1), torch.ones(len(cells), dtype=torch.int64), accumulate=True
-    )
+    counts.index_put_((cells // COARSE).unbind(1), torch.ones(len(cells), dtype=torch.int64), accumulate=True)
     label, middles = _parts(distances, counts)
     n = int(label.max()) + 1 if len(label) else 0
     sizes = torch.zeros(n, dtype=torch.int64).index_add_(0, label, counts[counts > 0])
@@ -90,18 +87,19 @@ def find_frontiers(
         way = target - places
         level = way[:, :2].norm(dim=1)
         can_look = (
-            (level >= _CLOSEST) & (level <= _FARTHEST) & (way[:, 2].abs() <= math.tan(elevation) * level)
+            (level >= _CLOSEST) & (level <= _FARTHEST) & (way[:, 2].abs() <= math.tan(_ELEVATION) * level)
         )
         can_look[can_look.clone()] = _sees(local_map, places[can_look], target)
         if bool(can_look.any()):
             row = int(metres.masked_fill(~can_look, math.inf).argmin())
             pose = torch.cat([places[row], torch.atan2(way[row, 1], way[row, 0])[None]])
             found.append((pose, target, float(sizes[k]), float(metres[row])))
+    if not found:
+        nothing = torch.zeros(0, 4, dtype=torch.float64)
+        return Frontiers(nothing, nothing[:, :3], nothing[:, 0], nothing[:, 0])
+    poses, targets, counted, away = zip(*found, strict=True)
     return Frontiers(
-        torch.stack([pose for pose, *_ in found]) if found else torch.zeros(0, 4, dtype=torch.float64),
-        torch.stack([target for _, target, *_ in found]) if found else torch.zeros(0, 3, dtype=torch.float64),
-        torch.tensor([size for *_, size, _ in found], dtype=torch.float64),
-        torch.tensor([away for *_, away in found], dtype=torch.float64),
+        torch.stack(poses), torch.stack(targets), *torch.tensor([counted, away], dtype=torch.float64)
     )
 
 
@@ -132,37 +130,22 @@ def _middles(distances: DistanceField, cells: Tensor) -> Tensor:
 
 
 class FrontierPlanner:
-    """Flies to the frontier with the largest size/(1 + distance), looks at it, and stays with it while it
-    exists.
+    """Flies to the frontier with the largest size/(1 + distance), and stays with it while it exists.
 
     The view library stores the other frontiers with their sizes as values. The robot uses them when its
     window contains no frontier.
-
-    Args:
-        least: cells of the smallest frontier. largest: sizes above it count as this size.
-        loyalty: factor by which another frontier must be better than the present one.
-        elevation: largest angle (rad) above or below the camera at which it can see a frontier.
     """
 
-    def __init__(
-        self,
-        primitives: Primitives,
-        least: int = 20,
-        largest: int = 400,
-        loyalty: float = 1.5,
-        elevation: float = 0.4,
-    ) -> None:
+    def __init__(self, primitives: Primitives) -> None:
         self._search = TreeSearch(primitives, SearchRule(depth=3, n_rounds=2, n_leaves=24))
         self._waiting = Waiting(primitives)
-        self._least, self._largest, self._loyalty = least, largest, loyalty
-        self._elevation = elevation
         self._journey: Journey | None = None
         self._target = torch.zeros(3, dtype=torch.float64)
         self._exhausted = torch.zeros(0, 3, dtype=torch.float64)
 
     def plan(self, task: PlanningTask) -> Plan:
         here = task.local_map
-        found = find_frontiers(here, task.state[:3], self._exhausted, self._least, self._elevation)
+        found = find_frontiers(here, task.state[:3], self._exhausted)
         self._give_up(found.targets[looks(task.state, found.poses)])
         self._forget(task, found)
         for _ in range(_TRIES):
@@ -185,26 +168,25 @@ class FrontierPlanner:
             found = Frontiers(*(values[left] for values in found))
         if len(found.sizes) == 0:
             if self._journey is None:
-                self._journey = Journey.chosen(task, self._least)
+                self._journey = Journey.chosen(task, _LEAST)
                 if self._journey is not None:
                     self._target = self._journey.pose[:3]
             return "travel"
         block = (here.cells_of(found.targets) // BLOCK).clamp_min(0)
         counts = [-(-n // BLOCK) for n in here.shape]
         flat = (block[:, 0] * counts[1] + block[:, 1]) * counts[2] + block[:, 2]
-        turn = torch.remainder(found.poses[:, 3] - task.state[3] + math.pi, 2 * math.pi) - math.pi
-        turn = _TURNING * turn.abs()
-        score = found.sizes.clamp_max(self._largest) * task.residual[flat] / (1 + found.metres + turn)
+        turn = _TURNING * angle(found.poses[:, 3] - task.state[3])
+        score = found.sizes.clamp_max(_LARGEST) * task.residual[flat] / (1 + found.metres + turn)
         same = (found.targets - self._target).norm(dim=1) < _SAME
         if self._journey is not None:
-            score = torch.where(same, self._loyalty * score, score)
+            score = torch.where(same, _LOYALTY * score, score)
         row = int(score.argmax())
         if self._journey is None or not bool(same[row]):
             size, metres = float(found.sizes[row]), float(found.metres[row])
             self._journey = Journey(found.poses[row], size, metres, task.now)
             self._target = found.targets[row]
         others = torch.arange(len(score)) != row
-        task.library.add(found.poses[others], found.sizes[others], task.now, self._least, most=3)
+        task.library.add(found.poses[others], found.sizes[others], task.now, _LEAST, most=3)
         return "explore"
 
     def _give_up(self, targets: Tensor) -> None:
@@ -220,4 +202,4 @@ class FrontierPlanner:
         if len(found.poses):
             apart = torch.cdist(known.poses[:, :3], found.poses[:, :3]).amin(1)
             inside &= apart > _ABOUT
-        task.library.remove([known.ids[row] for row in inside.nonzero()[:, 0].tolist()], task.now)
+        task.library.remove([known.keys[row] for row in inside.nonzero()[:, 0].tolist()], task.now)

@@ -10,10 +10,10 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.exploration.robot.mapper import LocalMap
-from gmmtorch.occupancy.grid import check_resolution
 
+COARSE = 2
+"""Cells of the map along the side of a cell of the field."""
 _AROUND = list(itertools.product((-1, 0, 1), repeat=3))
 _CHECK_EVERY = 4  # rounds of the wave between two convergence checks
 
@@ -31,38 +31,24 @@ class DistanceField:
     metres: Tensor
 
     @classmethod
-    def to(
-        cls, local_map: LocalMap, goals: Tensor, offsets: Tensor | None = None, coarse: int = 2
-    ) -> DistanceField:
+    def to(cls, local_map: LocalMap, goals: Tensor, offsets: Tensor | None = None) -> DistanceField:
         """Compute the distance to the nearest of goals (M, 3), metres; `offsets` (M,) are added to each goal.
 
         Goals outside the local map are ignored. Without a goal inside, all distances are inf.
         """
         _, inside = local_map.flat_index(goals)
         cells = local_map.cells_of(goals[inside])
-        metres = geodesic(
-            local_map.passable,
-            cells,
-            local_map.resolution,
-            None if offsets is None else offsets[inside],
-            coarse,
-        )
+        begin = torch.zeros(len(cells)) if offsets is None else offsets[inside]
+        metres = geodesic(local_map.passable, cells, local_map.resolution, begin)
         origin = local_map.low.double() * local_map.resolution
-        return cls(origin, coarse * local_map.resolution, metres)
-
-    def at(self, points: Tensor) -> Tensor:
-        """Return metres (...,) float64 from points (..., 3).
-
-        It is the smallest value over the cell of a point and its 26 neighbours, so that a point between
-        passable cells also has a way.
-        """
-        return self._entry(points)[0]
+        return cls(origin, COARSE * local_map.resolution, metres)
 
     def way(self, points: Tensor, n_cells: int) -> tuple[Tensor, Tensor]:
-        """Return the metres of `at`, and the points (..., 3) reached after `n_cells` cells of the
-        shortest way.
+        """Return metres (...,) float64 from points (..., 3), and the points (..., 3) reached after `n_cells`
+        cells of the shortest way.
 
-        Without a way, the reached point is the point itself.
+        The metres are the smallest over the cell of a point and its 26 neighbours, so that a point between
+        passable cells also has a way. Without a way, the reached point is the point itself.
         """
         metres, cell = self._entry(points)
         for _ in range(n_cells - 1):
@@ -73,9 +59,7 @@ class DistanceField:
         return metres, torch.where(torch.isfinite(metres)[..., None], there, points)
 
     def _entry(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Return metres (...,) from points, and the flat index (...,) of the first cell on the way of
-        each.
-        """
+        """Return metres (...,) from points, and the flat index (...,) of the first cell on each way."""
         size = torch.tensor(self.metres.shape, device=points.device)
         steps = torch.tensor(_AROUND, device=points.device)
         cell = ((points - self.origin) / self.spacing).floor().long().unsqueeze(-2) + steps
@@ -107,11 +91,7 @@ class DistanceField:
 
 
 def geodesic(
-    passable: Tensor,
-    sources: Tensor,
-    resolution: float,
-    offsets: Tensor | None = None,
-    coarse: int = 2,
+    passable: Tensor, sources: Tensor, resolution: float, offsets: Tensor, coarse: int = COARSE
 ) -> Tensor:
     """Metres (nx', ny', nz') float32 to the nearest source over passable cells `coarse` times as wide.
 
@@ -123,25 +103,14 @@ def geodesic(
     Args:
         passable: (nx, ny, nz) bool. sources: (M, 3) int64, cells of it.
         resolution: side (m) of its cells.
-        offsets: (M,) metres at least zero that each source starts with; zeros if not given.
+        offsets: (M,) metres, at least zero, that each source starts with.
         coarse: nx' = ⌈nx/coarse⌉.
     """
-    check_resolution(resolution)
-    coarse = check_whole("coarse", coarse, 1)
-    if passable.ndim != 3 or sources.ndim != 2 or sources.shape[1] != 3:
-        raise InvalidArgumentError(
-            f"passable {tuple(passable.shape)} must be (nx, ny, nz) and sources {tuple(sources.shape)} "
-            "(M, 3)."
-        )
-    size = torch.tensor(passable.shape, device=sources.device)
-    if not bool(((sources >= 0) & (sources < size)).all()):
-        raise InvalidArgumentError(f"sources must be cells of the lattice of shape {tuple(passable.shape)}.")
     open_cells = coarsened(passable, coarse)
     start = torch.full(open_cells.shape, math.inf, device=passable.device)
     index = (sources // coarse).unbind(1)
-    begin = torch.zeros(len(sources)) if offsets is None else offsets.float()
     flat = (index[0] * start.shape[1] + index[1]) * start.shape[2] + index[2]
-    start.view(-1).scatter_reduce_(0, flat, begin.to(start), "amin")
+    start.view(-1).scatter_reduce_(0, flat, offsets.to(start), "amin")
     open_cells[index] = True
     return _wave(open_cells, start / (coarse * resolution)) * (coarse * resolution)
 
@@ -180,8 +149,8 @@ def _wave(open_cells: Tensor, start: Tensor) -> Tensor:
     count = 0
     while True:
         count += 1
-        for values, stride, out in zip((width, width, width), strides, (x, y, z), strict=True):
-            _least_of_two(values, stride, out)
+        for stride, out in zip(strides, (x, y, z), strict=True):
+            _least_of_two(width, stride, out)
         _least_of_two(x, strides[1], xy)
         _least_of_two(x, strides[2], xz)
         _least_of_two(y, strides[2], yz)

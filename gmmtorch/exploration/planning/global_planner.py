@@ -12,6 +12,7 @@ from gmmtorch.exploration.planning.geodesic import DistanceField
 from gmmtorch.exploration.planning.planner_interface import PlanningTask
 from gmmtorch.exploration.planning.roadmap import at_the_rim
 
+_TURNING = 1.25  # metres that a radian off the direction of the way costs
 _NEAR = 1.0  # horizontal metres from the goal within which a robot turns to the goal's heading
 _AHEAD = 3  # cells of the distance field along which the direction of the way is measured
 
@@ -20,18 +21,15 @@ _AHEAD = 3  # cells of the distance field along which the direction of the way i
 class Goal:
     """A goal and the value of a metre of progress towards it.
 
-    distances: to the goal. yaw: heading at the goal; None: any. weight: value of a metre of progress.
-    turning: metres that a radian off the direction of the way costs.
+    distances: to the goal. weight: value of a metre of progress. yaw: heading at the goal.
     """
 
     distances: DistanceField
     weight: float
-    yaw: float | None = None
-    turning: float = 1.25
+    yaw: float
 
     def cost(self, states: Tensor) -> Tensor:
-        """Remaining cost (...,) in metres from states (..., 7): the way, the turn into it, the turn to
-        the goal's yaw.
+        """Remaining cost (...,) in metres from states (..., 7): the way, the turn into it, and the last turn.
 
         Close to the goal, and directly above or below it, only the last turn counts.
         """
@@ -39,14 +37,12 @@ class Goal:
         metres, there = self.distances.way(points, _AHEAD)
         way = there - points
         bearing = torch.atan2(way[..., 1], way[..., 0])
-        into, last = _angle(bearing - yaw), torch.zeros_like(yaw)
-        if self.yaw is not None:
-            into, last = into + _angle(self.yaw - bearing), _angle(self.yaw - yaw)
+        into, last = angle(bearing - yaw) + angle(self.yaw - bearing), angle(self.yaw - yaw)
         level = (way[..., :2].norm(dim=-1) / _NEAR).clamp_max(1)
-        return metres + self.turning * torch.lerp(last, into, level)
+        return metres + _TURNING * torch.lerp(last, into, level)
 
 
-def _angle(radians: Tensor) -> Tensor:
+def angle(radians: Tensor) -> Tensor:
     """Absolute angles, wrapped to at most π."""
     return (torch.remainder(radians + math.pi, 2 * math.pi) - math.pi).abs()
 
@@ -60,8 +56,8 @@ _FACING = 0.7  # radians off the goal's heading at which the robot has arrived
 
 def looks(state: Tensor, poses: Tensor) -> Tensor:
     """Flag (...,) the poses (..., 4) that a robot in a state (7,) has reached, position and heading."""
-    off = torch.remainder(state[3] - poses[..., 3] + math.pi, 2 * math.pi) - math.pi
-    return ((state[:3] - poses[..., :3]).norm(dim=-1) < _THERE) & (off.abs() < _FACING)
+    is_there = (state[:3] - poses[..., :3]).norm(dim=-1) < _THERE
+    return is_there & (angle(state[3] - poses[..., 3]) < _FACING)
 
 
 class Journey:
@@ -80,22 +76,21 @@ class Journey:
 
     @classmethod
     def chosen(cls, task: PlanningTask, least: float, given_up: Tensor | None = None) -> Journey | None:
-        """Start a journey to the view of the library with the largest value/(1 + metres), and remove that
-        view.
+        """Start a journey to the view with the largest value/(1 + metres), and take it from the library.
 
         Returns None if no view worth `least` can be reached. Views close to `given_up` (N, 4) are ignored.
         """
         known = task.library.candidates()
-        if not known.ids:
+        if not known.keys:
             return None
-        metres = task.roadmap.route(task.state[:3], known.poses[:, :3]).metres
+        metres = task.roadmap.distances(task.state[:3], known.poses[:, :3])
         if given_up is not None and len(given_up):
             apart = torch.cdist(known.poses[:, :3], given_up[:, :3]).amin(1)
             metres = metres.masked_fill(apart < _THERE, math.inf)
         row = task.library.best(metres, least=least)
         if row is None:
             return None
-        task.library.remove([known.ids[row]], task.now)
+        task.library.remove([known.keys[row]], task.now)
         return cls(known.poses[row], float(known.values[row]), float(metres[row]), task.now)
 
     def put_back(self, task: PlanningTask) -> None:

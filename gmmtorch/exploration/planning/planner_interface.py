@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import torch
@@ -25,14 +24,13 @@ LEAST = 0.05
 class PlanningTask:
     """The input of a planner.
 
-    robot: number of the robot. state: (7,), its state when the plan begins. peers: paths of the other robots.
+    state: (7,), of the robot when the plan begins. peers: paths of the other robots.
     residual: (G,) float32, share of the information in each block of the local map that teammates' plans
     leave.
     now: time (s). generator: random numbers of the planner. trail: (N, 3), metres, recent positions,
     latest last.
     """
 
-    robot: int
     state: Tensor
     local_map: LocalMap
     peers: PeerTrajectories
@@ -41,7 +39,7 @@ class PlanningTask:
     roadmap: Roadmap
     now: float
     generator: torch.Generator
-    trail: Tensor = field(default_factory=lambda: torch.zeros(0, 3, dtype=torch.float64))
+    trail: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,55 +108,3 @@ def continuations(
         return there.paths[:, :, -1], there.feasible
     steps = after * primitives.dynamics.n_steps
     return continued[0].ends, feasible_motions(*continued, task.local_map, task.peers, steps)
-
-
-def is_boxed_in(primitives: Primitives, task: PlanningTask) -> bool:
-    """Return whether no primitive that moves the robot is feasible. Turning in place at rest always is."""
-    here = options(primitives, task.state[None].double(), task, may_escape=True)
-    leads = (here.paths[0, :, -1, :3] - task.state[:3]).norm(dim=1) > LEAST
-    return not bool((here.feasible[0] & leads).any())
-
-
-class Waiting:
-    """The fallback when no primitive is feasible: come to rest, then look around after some plans at rest.
-
-    Stopping is safe because it is the braking of the last plan, which was feasible. A robot at rest that
-    turns in place occupies no new space.
-    """
-
-    def __init__(self, primitives: Primitives, patience: int = 2) -> None:
-        self._primitives, self._patience = primitives, patience
-        self._last = -math.inf
-        self._count = 0
-
-    def plan(self, task: PlanningTask) -> Plan:
-        """Rest, or turn in place after `patience` plans."""
-        if task.now > self._last:  # a robot may plan several times at one time
-            self._count, self._last = self._count + 1, task.now
-        at_rest = not bool(task.state[4:].any())
-        if at_rest and self._count > self._patience:
-            turn = self._primitives.commands.clone()
-            turn[:, 2] = turn[:, 2].where((turn[:, :2] == 0).all(1), 0)
-            path = self._primitives.rollout(task.state[None])[0, int(turn[:, 2].argmax())]
-        else:
-            return self.rest(task.state)
-        return Plan(path, self._primitives.braking(path[-1]), path[-1:, :4], 0.0, "wait")
-
-    def boxed_in(self, task: PlanningTask) -> Plan | None:
-        """Return a turn in place for a robot at rest that was boxed in for longer than `patience` plans,
-        or None.
-        """
-        if bool(task.state[4:6].any()) or not is_boxed_in(self._primitives, task):
-            self.over()
-            return None
-        plan = self.plan(task)
-        return replace(plan, kind="boxed_in") if self._count > self._patience else None
-
-    def rest(self, state: Tensor) -> Plan:
-        """Come to rest from a state (7,) and stay."""
-        path = self._primitives.rollout(state[None])[0, self._primitives.stop]
-        return Plan(path, self._primitives.braking(path[-1]), path[-1:, :4], 0.0, "wait")
-
-    def over(self) -> None:
-        """Reset the count: the robot moves again."""
-        self._count = 0

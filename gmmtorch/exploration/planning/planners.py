@@ -1,50 +1,32 @@
-"""Planners with the same primitives and collision checks: tree search over views, frontiers, random
-motion.
-"""
+"""Planners with the same primitives and collision checks: tree search over views, and random motion."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import replace
 
 import torch
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.exploration.information.view_cache import InformationDiscount, ViewCache
 from gmmtorch.exploration.information.view_evaluator import ViewEvaluator
+from gmmtorch.exploration.information.view_library import SPACING
 from gmmtorch.exploration.planning.frontier import FrontierPlanner
 from gmmtorch.exploration.planning.global_planner import Journey
-from gmmtorch.exploration.planning.planner_interface import Plan, Planner, PlanningTask, Waiting, options
+from gmmtorch.exploration.planning.planner_interface import Plan, Planner, PlanningTask, options
 from gmmtorch.exploration.planning.primitives import Primitives
+from gmmtorch.exploration.planning.recovery import Waiting
 from gmmtorch.exploration.planning.tree_search import Found, SearchRule, TreeSearch
 
-_NOTHING = 1e-3  # share of the largest value below which information counts as zero
+# The first five are shares of the largest value seen.
+_NOTHING = 1e-3  # information that counts as zero
+_LITTLE = 0.1  # information per primitive below which a robot looks for a better place
+_PLENTY = 0.25  # information per primitive from which on a travelling robot stays
+_WORTHWHILE = 0.15  # smallest value of a view in the library
+_METRE = 0.2  # value of a metre of progress, compared with information
 _STUCK = 0.3  # metres of progress that a branch must make
+_ADDED, _REVALUED = 3, 6  # views of the library added and evaluated again in one plan
 _REMEMBERED = 32  # abandoned views that are stored
-
-
-@dataclass(frozen=True)
-class TreeRule:
-    """When a robot explores locally and when it travels. Values are shares of the largest value seen.
-
-    search: tree search while exploring. travel: tree search while travelling. squeeze: tree search by
-    distance only, when `travel` makes no progress. little: information per primitive below which a robot
-    looks for a better place. plenty: information per primitive from which on a travelling robot stays.
-    worthwhile: smallest value of a view in the library. metre: value of a metre of progress, compared with
-    information.
-    n_added, n_revalued: views of the library added and evaluated again in one plan.
-    """
-
-    search: SearchRule = field(default_factory=SearchRule)
-    travel: SearchRule = field(default_factory=lambda: SearchRule(n_rounds=2, n_leaves=24))
-    squeeze: SearchRule = field(default_factory=lambda: SearchRule(depth=6, n_rounds=6, n_leaves=48))
-    little: float = 0.1
-    plenty: float = 0.25
-    worthwhile: float = 0.15
-    metre: float = 0.2
-    n_added: int = 3
-    n_revalued: int = 6
 
 
 class TreePlanner:
@@ -55,14 +37,12 @@ class TreePlanner:
     no other robot goes there, and puts it back when it finds enough information on the way.
     """
 
-    def __init__(
-        self, primitives: Primitives, evaluator: ViewEvaluator, rule: TreeRule | None = None
-    ) -> None:
-        self._rule = TreeRule() if rule is None else rule
+    def __init__(self, primitives: Primitives, evaluator: ViewEvaluator) -> None:
         self._evaluator = evaluator
-        self._explore = TreeSearch(primitives, self._rule.search)
-        self._travel = TreeSearch(primitives, self._rule.travel)
-        self._squeeze = TreeSearch(primitives, self._rule.squeeze)
+        self._explore = TreeSearch(primitives, SearchRule())
+        self._travel = TreeSearch(primitives, SearchRule(n_rounds=2, n_leaves=24))
+        # By distance only, when travelling makes no progress.
+        self._squeeze = TreeSearch(primitives, SearchRule(depth=6, n_rounds=6, n_leaves=48))
         self._waiting = Waiting(primitives)
         self._speed = primitives.dynamics.speed
         self._duration = primitives.dynamics.duration
@@ -98,9 +78,9 @@ class TreePlanner:
         found = self._explore.search(task, memory, first=self._rest_of_branch(task))
         self._measure(memory)
         rate = _rate(found)
-        if rate > self._rule.little * self._largest:
+        if rate > _LITTLE * self._largest:
             return found
-        journey = Journey.chosen(task, self._rule.worthwhile * self._largest, self._given_up)
+        journey = Journey.chosen(task, _WORTHWHILE * self._largest, self._given_up)
         if journey is None:
             return found
         legs = 1 + journey.metres / (self._speed * self._duration)
@@ -119,10 +99,10 @@ class TreePlanner:
         if bool(task.local_map.is_passable(journey.pose[:3])):
             row = memory.rows(journey.pose[None])
             value = float(memory.marginal(row, self._weights[None])[0])
-        if value is not None and value < self._rule.worthwhile * self._largest:
+        if value is not None and value < _WORTHWHILE * self._largest:
             self._journey = None
             return None
-        goal = journey.goal(task, self._rule.metre * self._largest)
+        goal = journey.goal(task, _METRE * self._largest)
         if goal is None:
             self._give_up(journey)
             return None
@@ -132,7 +112,7 @@ class TreePlanner:
         if found is None or found.progress < _STUCK:
             self._give_up(journey)
             return None
-        if _rate(found) >= self._rule.plenty * self._largest:
+        if _rate(found) >= _PLENTY * self._largest:
             journey.put_back(task)
             self._journey = None
             return None
@@ -141,8 +121,7 @@ class TreePlanner:
     def _measure(self, memory: ViewCache) -> None:
         """Update the largest value."""
         _, values = memory.views(self._weights)
-        if len(values):
-            self._largest = max(self._largest, float(values.max()))
+        self._largest = max(self._largest, float(values.max()))
 
     def _give_up(self, journey: Journey) -> None:
         """End the journey and exclude its view: it was taken or cannot be reached."""
@@ -153,13 +132,13 @@ class TreePlanner:
         return self._branch[1:] if task.now > self._when else self._branch
 
     def _revalue(self, task: PlanningTask, memory: ViewCache) -> None:
-        ids = task.library.covered(task.local_map, task.now, self._rule.n_revalued)
-        if ids:
+        keys = task.library.covered(task.local_map, task.now, _REVALUED)
+        if keys:
             known = task.library.candidates()
-            at = {key: row for row, key in enumerate(known.ids)}
-            rows = memory.rows(known.poses[[at[key] for key in ids]])
+            at = {key: row for row, key in enumerate(known.keys)}
+            rows = memory.rows(known.poses[[at[key] for key in keys]])
             values, _ = memory.marginal(rows, self._weights[None])
-            task.library.revalue(ids, values, task.now, self._rule.worthwhile * self._largest)
+            task.library.revalue(keys, values, task.now, _WORTHWHILE * self._largest)
 
     def _note(self, task: PlanningTask, memory: ViewCache, found: Found | None) -> None:
         """Store the branch, and add the best views that it leaves out to the library."""
@@ -170,24 +149,19 @@ class TreePlanner:
         if self._journey is not None:
             known.append(self._journey.pose[None])
         apart = torch.cdist(poses[:, :3], torch.cat(known)[:, :3])
-        values = values.masked_fill((apart < task.library.spacing).any(1), 0.0)
-        task.library.add(poses, values, task.now, self._rule.worthwhile * self._largest, self._rule.n_added)
+        values = values.masked_fill((apart < SPACING).any(1), 0.0)
+        task.library.add(poses, values, task.now, _WORTHWHILE * self._largest, _ADDED)
 
 
 _TURNING = 0.1  # metres that a turn in place counts as in a random choice
+_PERSISTENCE = 0.7  # probability of repeating the last primitive if it is feasible
 
 
 class RandomPlanner:
-    """Repeats a primitive for a while, then draws another feasible one with probability proportional to
-    its length.
+    """Repeats a primitive for a while, then draws another one, a long one more often than a short one."""
 
-    persistence: probability of repeating the last primitive if it is feasible.
-    """
-
-    def __init__(self, primitives: Primitives, persistence: float = 0.7) -> None:
-        if not 0 <= persistence < 1:
-            raise InvalidArgumentError(f"persistence={persistence} must be at least 0 and below 1.")
-        self._primitives, self._persistence = primitives, persistence
+    def __init__(self, primitives: Primitives) -> None:
+        self._primitives = primitives
         self._waiting = Waiting(primitives)
         self._last = -1
 
@@ -200,7 +174,7 @@ class RandomPlanner:
             self._last = -1
             return self._waiting.plan(task)
         self._waiting.over()
-        goes_on = float(torch.rand((), generator=task.generator)) < self._persistence
+        goes_on = float(torch.rand((), generator=task.generator)) < _PERSISTENCE
         if not (goes_on and self._last >= 0 and possible[self._last] > 0):
             self._last = int(torch.multinomial(possible, 1, generator=task.generator))
         path = here.paths[0, self._last]
@@ -210,14 +184,14 @@ class RandomPlanner:
 PLANNERS = ("mcts", "frontier", "random")
 
 
-def make_planner(name: str, primitives: Primitives, evaluator: ViewEvaluator, **rule: Any) -> Planner:
-    """Make the planner `name`; `rule`: fields of `TreeRule`, or arguments of the other planners."""
+def make_planner(name: str, primitives: Primitives, evaluator: ViewEvaluator) -> Planner:
+    """Make the planner `name`, one of `PLANNERS`."""
     if name == "mcts":
-        return TreePlanner(primitives, evaluator, TreeRule(**rule))
+        return TreePlanner(primitives, evaluator)
     if name == "frontier":
-        return FrontierPlanner(primitives, **rule)
+        return FrontierPlanner(primitives)
     if name == "random":
-        return RandomPlanner(primitives, **rule)
+        return RandomPlanner(primitives)
     raise InvalidArgumentError(f"planner={name!r} is not one of {', '.join(PLANNERS)}.")
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import InvalidArgumentError, check_number
 from gmmtorch.kernels.rays.path_clearance import Motions
 
 _ROUNDING = 1e-9
@@ -46,9 +46,7 @@ class Dynamics:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            value = getattr(self, field.name)
-            if not (math.isfinite(value) and value > 0):
-                raise InvalidArgumentError(f"{field.name}={value} must be finite, above zero.")
+            check_number(field.name, getattr(self, field.name), above=True)
         if self.n_steps < 1 or abs(self.n_steps * self.step - self.duration) > 1e-6 * self.duration:
             raise InvalidArgumentError(
                 f"step={self.step} s does not divide duration={self.duration} s; use a fraction of it."
@@ -170,9 +168,7 @@ class Primitives:
         return torch.stack([length.flatten(1).amax(1), step[..., 3].abs().flatten(1).amax(1)], 1)
 
     def _follows(self, states: Tensor) -> Tensor | None:
-        """Return the primitive (N,) whose final velocities each state (N, 7) has; None if any state has
-        none.
-        """
+        """Return the primitive (N,) with the velocities of each state (N, 7); None if a state has none."""
         is_end = (states[:, None, 4:] == self.commands).all(-1)
         which = is_end.int().argmax(1)
         return which if bool(is_end.any(1).all()) else None
@@ -197,9 +193,7 @@ def _moved(paths: Tensor, states: Tensor) -> Tensor:
 
 
 def _integrated(states: Tensor, commands: Tensor, dynamics: Dynamics, n_steps: int) -> Tensor:
-    """Return states (..., n_steps, 7) after states (..., 7) while the velocities change to commands (...,
-    3).
-    """
+    """Return states (..., n_steps, 7) while velocities change from states (..., 7) to commands (..., 3)."""
     h = dynamics.step
     velocity = dynamics.velocities(states.double(), commands, n_steps)
     x, y, z, yaw = (states[..., i, None].double() for i in range(4))

@@ -1,22 +1,72 @@
-"""Recovery: a robot that no longer fits at its position, according to its map, flies back along its trail."""
+"""What a robot does that finds no motion: it waits, looks around, or flies back along its trail."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from gmmtorch.exploration.planning.coordination import clear_of
-from gmmtorch.exploration.planning.planner_interface import LEAST, Plan, PlanningTask, is_boxed_in
+from gmmtorch.exploration.planning.planner_interface import LEAST, Plan, PlanningTask, options
 from gmmtorch.exploration.planning.primitives import Primitives
 
 _METRES = 0.8  # largest distance of one plan
 
 
+def is_boxed_in(primitives: Primitives, task: PlanningTask) -> bool:
+    """Return whether no primitive that moves the robot is feasible. Turning in place at rest always is."""
+    here = options(primitives, task.state[None].double(), task, may_escape=True)
+    leads = (here.paths[0, :, -1, :3] - task.state[:3]).norm(dim=1) > LEAST
+    return not bool((here.feasible[0] & leads).any())
+
+
+class Waiting:
+    """The fallback when no primitive is feasible: come to rest, then look around after some plans at rest.
+
+    Stopping is safe because it is the braking of the last plan, which was feasible. A robot at rest that
+    turns in place occupies no new space.
+    """
+
+    def __init__(self, primitives: Primitives, patience: int = 2) -> None:
+        self._primitives, self._patience = primitives, patience
+        self._last = -math.inf
+        self._count = 0
+
+    def plan(self, task: PlanningTask) -> Plan:
+        """Rest, or turn in place after `patience` plans."""
+        if task.now > self._last:  # a robot may plan several times at one time
+            self._count, self._last = self._count + 1, task.now
+        if bool(task.state[4:].any()) or self._count <= self._patience:
+            return self.rest(task.state)
+        in_place = (self._primitives.commands[:, :2] == 0).all(1)
+        turns = self._primitives.commands[:, 2].where(in_place, 0)
+        return self._standing(task.state, int(turns.argmax()))
+
+    def boxed_in(self, task: PlanningTask) -> Plan | None:
+        """Return a turn in place for a robot boxed in for more than `patience` plans; None for others."""
+        if bool(task.state[4:6].any()) or not is_boxed_in(self._primitives, task):
+            self.over()
+            return None
+        plan = self.plan(task)
+        return replace(plan, kind="boxed_in") if self._count > self._patience else None
+
+    def rest(self, state: Tensor) -> Plan:
+        """Come to rest from a state (7,) and stay."""
+        return self._standing(state, self._primitives.stop)
+
+    def _standing(self, state: Tensor, primitive: int) -> Plan:
+        path = self._primitives.rollout(state[None])[0, primitive]
+        return Plan(path, self._primitives.braking(path[-1]), path[-1:, :4], 0.0, "wait")
+
+    def over(self) -> None:
+        """Reset the count: the robot moves again."""
+        self._count = 0
+
+
 def retreat(primitives: Primitives, task: PlanningTask) -> Plan | None:
-    """Plan a flight back along the robot's trail; None if it fits, is not at rest, or can leave by a
-    primitive.
+    """Plan a flight back along the trail; None if the robot fits, moves, or can leave by a primitive.
 
     A cell nearby may become occupied in the map, so that no primitive is safe because all are longer than
     the gap. The trail is safe because the robot has flown it. The robot starts and ends at rest and
@@ -42,9 +92,7 @@ def retreat(primitives: Primitives, task: PlanningTask) -> Plan | None:
 
 
 def shortened(trail: Tensor, path: Tensor) -> Tensor:
-    """Return the rest of a trail (N, 3), latest last, after the robot flew back along it to the end of a
-    path (S, 3).
-    """
+    """Return the rest of a trail (N, 3), latest last, after a flight back along it by a path (S, 3)."""
     nearest = int((trail - path[-1]).norm(dim=1).argmin())
     return torch.cat([trail[:nearest], path[-1:]]) if nearest else path[-1:]
 

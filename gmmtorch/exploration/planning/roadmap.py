@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -13,45 +12,25 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gmmtorch.errors import check_whole
 from gmmtorch.exploration.robot.mapper import LocalMap
 from gmmtorch.occupancy.voxels.boxes import Box
 
+_FACTOR = 4  # cells along each side of a node
 _BLOCK = 8  # nodes along each side of a block of storage
 _PASSABLE = 1
 _EDGES = (2, 4, 8)  # flags of an edge to the next node along x, y, z
 _REACH = 2.5  # node spacings from a point within which it joins the roadmap
 
 
-class Route(NamedTuple):
-    """Shortest routes from a start to M goals. metres: (M,) float64, inf if there is none."""
-
-    metres: Tensor
-    nodes: np.ndarray
-    before: np.ndarray
-    last: np.ndarray
-
-    def path(self, goal: int) -> Tensor:
-        """Return the nodes (L, 3), metres, from the start to a goal; empty if there is no route."""
-        rows = []
-        node = int(self.last[goal]) if math.isfinite(float(self.metres[goal])) else -1
-        while node >= 0:
-            rows.append(node)
-            node = int(self.before[node])
-        return torch.from_numpy(self.nodes[rows[::-1]])
-
-
 class Roadmap:
-    """A graph on a lattice `factor` times as coarse as the map's; a node exists if one of its cells is
-    passable.
+    """A graph on a lattice `_FACTOR` times as coarse as the map's. A node has a passable cell.
 
     Two nodes that share a face are joined if passable cells meet on it. Nodes that share an edge or a
     corner are joined if two or three such steps connect them. Nodes are stored in blocks: the cost of an
     update depends on the local map, not on the world; the cost of a query grows with the explored space.
     """
 
-    def __init__(self, factor: int = 4) -> None:
-        self._factor = check_whole("factor", factor, 1)
+    def __init__(self) -> None:
         self._resolution = 1.0
         self._blocks: dict[tuple[int, int, int], np.ndarray] = {}
         self._cached: _Graph | None = None
@@ -63,20 +42,20 @@ class Roadmap:
     @property
     def spacing(self) -> float:
         """Metres between neighbouring nodes."""
-        return self._factor * self._resolution
+        return _FACTOR * self._resolution
 
     def update(self, local_map: LocalMap) -> None:
         """Replace the nodes inside the local map, including those that are no longer passable."""
         if self._resolution != local_map.resolution:
             self._resolution, self._cached = local_map.resolution, None
         passable, low = local_map.passable.cpu().numpy(), local_map.low.cpu().numpy()
-        first = -(-low // self._factor)
-        last = (low + passable.shape) // self._factor
+        first = -(-low // _FACTOR)
+        last = (low + passable.shape) // _FACTOR
         if (first >= last).any():
             return
-        begin = first * self._factor - low
-        whole = tuple(slice(b, b + n) for b, n in zip(begin, (last - first) * self._factor, strict=True))
-        flags, known = _flags(passable[whole], self._factor)
+        begin = first * _FACTOR - low
+        whole = tuple(slice(b, b + n) for b, n in zip(begin, (last - first) * _FACTOR, strict=True))
+        flags, known = _flags(passable[whole])
         for block, inside, outside in _blocks_between(first, last):
             kept = self._blocks.setdefault(block, np.zeros((_BLOCK,) * 3, np.uint8))
             new = (kept[inside] & ~known[outside]) | flags[outside]
@@ -84,31 +63,29 @@ class Roadmap:
                 kept[inside] = new
                 self._cached = None
 
-    def route(self, start: Tensor, goals: Tensor) -> Route:
-        """Return the shortest routes from `start` (3,) to goals (M, 3), metres."""
+    def distances(self, start: Tensor, goals: Tensor) -> Tensor:
+        """Return metres (M,) of the shortest routes from `start` (3,) to goals (M, 3); inf: none."""
         graph = self._graph
         source, gap = graph.nearest(start.cpu().numpy()[None])
         ends, rest = graph.nearest(goals.cpu().numpy().reshape(-1, 3))
-        metres, before = graph.from_node(int(source[0]))
+        metres = graph.from_node(int(source[0]))
         total = np.full(len(ends), math.inf)
         joined = ends >= 0
         total[joined] = metres[ends[joined]] + gap[0] + rest[joined]
-        return Route(torch.from_numpy(total), graph.points, before, ends)
+        return torch.from_numpy(total)
 
     def reaching(self, goal: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the nodes (N, 3), metres, from which a goal (3,) can be reached, and their distances
-        (N,).
-        """
+        """Return the nodes (N, 3) from which a goal (3,) can be reached, and their distances (N,), metres."""
         graph = self._graph
         source, gap = graph.nearest(goal.cpu().numpy()[None])
-        metres, _ = graph.from_node(int(source[0]))
+        metres = graph.from_node(int(source[0]))
         good = np.isfinite(metres)
         return torch.from_numpy(graph.points[good]), torch.from_numpy(metres[good] + gap[0])
 
     @property
     def _graph(self) -> _Graph:
         if self._cached is None:
-            self._cached = _Graph.of(self._blocks, self.spacing)
+            self._cached = _Graph(self._blocks, self.spacing)
         return self._cached
 
 
@@ -122,45 +99,38 @@ def at_the_rim(points: Tensor, box: Box, resolution: float, width: float) -> Ten
 class _Graph:
     """The nodes as points (N, 3), metres, in the order of their cells, and the edges between them."""
 
-    def __init__(self, points: np.ndarray, ways: csr_matrix, spacing: float) -> None:
-        self.points, self.ways, self.spacing = points, ways, spacing
-        self._tree = cKDTree(points) if len(points) else None
-
-    @classmethod
-    def of(cls, blocks: dict[tuple[int, int, int], np.ndarray], spacing: float) -> _Graph:
+    def __init__(self, blocks: dict[tuple[int, int, int], np.ndarray], spacing: float) -> None:
         cells, flags = _nodes(blocks)
-        return cls((cells + 0.5) * spacing, _ways(cells, flags) * spacing, spacing)
+        self.points = (cells + 0.5) * spacing
+        self._ways = _ways(cells, flags) * spacing
+        self._reach = _REACH * spacing
+        self._tree = cKDTree(self.points) if len(cells) else None
 
     def nearest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the nearest node (M,) of each point and its distance; −1 and inf if none is near."""
         if self._tree is None:
             return np.full(len(points), -1), np.full(len(points), math.inf)
-        gap, node = self._tree.query(points, distance_upper_bound=_REACH * self.spacing)
+        gap, node = self._tree.query(points, distance_upper_bound=self._reach)
         return np.where(np.isfinite(gap), node, -1), gap
 
-    def from_node(self, source: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return metres (N,) from a node to all nodes, inf if not connected, and each node's predecessor."""
-        if source < 0:
-            return np.full(len(self.points), math.inf), np.full(len(self.points), -1)
-        metres, before = dijkstra(self.ways, indices=source, return_predecessors=True)
-        return metres, before
+    def from_node(self, source: int) -> np.ndarray:
+        """Return metres (N,) from a node to all nodes, inf if not connected."""
+        return np.full(len(self.points), math.inf) if source < 0 else dijkstra(self._ways, indices=source)
 
 
-def _flags(passable: np.ndarray, factor: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the flags of each node (a, b, c), uint8, and a mask of the flags that the local map
-    determines.
-    """
+def _flags(passable: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the flags of each node (a, b, c), uint8, and a mask of those that the local map determines."""
     node = passable
     for axis in range(3):
-        node = _any(node, axis, factor)
+        node = _any(node, axis)
     flags = node.astype(np.uint8)
     known = np.full_like(flags, _PASSABLE + sum(_EDGES))
     for axis, flag in enumerate(_EDGES):
-        behind = np.take(passable, range(factor - 1, passable.shape[axis] - 1, factor), axis)
-        before = np.take(passable, range(factor, passable.shape[axis], factor), axis)
+        behind = np.take(passable, range(_FACTOR - 1, passable.shape[axis] - 1, _FACTOR), axis)
+        before = np.take(passable, range(_FACTOR, passable.shape[axis], _FACTOR), axis)
         joined = behind & before
         for other in {0, 1, 2} - {axis}:
-            joined = _any(joined, other, factor)
+            joined = _any(joined, other)
         inner = tuple(slice(None, -1) if a == axis else slice(None) for a in range(3))
         rim = tuple(slice(-1, None) if a == axis else slice(None) for a in range(3))
         flags[inner] |= joined.astype(np.uint8) * np.uint8(flag)
@@ -168,22 +138,16 @@ def _flags(passable: np.ndarray, factor: int) -> tuple[np.ndarray, np.ndarray]:
     return flags, known
 
 
-def _any(values: np.ndarray, axis: int, factor: int) -> np.ndarray:
-    """Reduce groups of `factor` values along an axis by logical or."""
-    cut = [slice(None)] * 3
-    parts = []
-    for i in range(factor):
-        cut[axis] = slice(i, None, factor)
-        parts.append(values[tuple(cut)])
-    return np.logical_or.reduce(parts)
+def _any(values: np.ndarray, axis: int) -> np.ndarray:
+    """Reduce groups of `_FACTOR` values along an axis by logical or."""
+    before = (slice(None),) * axis
+    return np.logical_or.reduce([values[(*before, slice(i, None, _FACTOR))] for i in range(_FACTOR)])
 
 
 def _blocks_between(
     first: np.ndarray, last: np.ndarray
 ) -> list[tuple[tuple[int, int, int], tuple[slice, ...], tuple[slice, ...]]]:
-    """Return the blocks that contain nodes `first` to `last` (exclusive), with the slices in block and
-    nodes.
-    """
+    """Return the blocks of nodes `first` to `last` (exclusive), with the slices in block and nodes."""
     ranges = [range(int(a) // _BLOCK, (int(b) - 1) // _BLOCK + 1) for a, b in zip(first, last, strict=True)]
     found = []
     for block in itertools.product(*ranges):

@@ -9,13 +9,13 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.exploration.information.view_cache import ViewCache
 from gmmtorch.exploration.planning.global_planner import Goal
 from gmmtorch.exploration.planning.planner_interface import PlanningTask, continuations, options
 from gmmtorch.exploration.planning.primitives import Primitives
 
-_FAR = 1e4  # metres
+_FAR = 1e4  # metres, where there is no way to the goal
+_WIDENING = 1.5  # a node tries about `_WIDENING` √visits primitives; the root tries all
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,6 @@ class SearchRule:
     depth: primitives on a branch. n_rounds, n_leaves: batches, and new nodes in each. exploration: c of
     UCT, as a share of the largest return found so far. discount: factor on the gain of each further
     primitive.
-    widening: a node tries about `widening` √visits primitives; the root tries all.
     """
 
     depth: int = 4
@@ -33,14 +32,6 @@ class SearchRule:
     n_leaves: int = 32
     exploration: float = 0.5
     discount: float = 0.9
-    widening: float = 1.5
-
-    def __post_init__(self) -> None:
-        for name in ("depth", "n_rounds", "n_leaves"):
-            check_whole(name, getattr(self, name), 1)
-        for name in ("exploration", "discount", "widening"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise InvalidArgumentError(f"{name}={getattr(self, name)} must be finite, at least zero.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +144,7 @@ class _Tree:
         root = _Node(0, None, -1, 0)
         self._nodes = [root]
         if goal is not None:
-            self._metres[0] = _finite(goal.cost(start))
+            self._metres[0] = goal.cost(start).clamp_max(_FAR)
         self._options = options(primitives, start[None], task, may_escape=True)
         self._open([root], self._options.paths[:, :, -1], self._options.feasible)
 
@@ -197,7 +188,7 @@ class _Tree:
         root = self._nodes[0]
         node = root
         while not root.closed and root.shut != turn:
-            may_widen = len(node.children) < self._width(node)
+            may_widen = node is root or len(node.children) < _WIDENING * math.sqrt(node.visits)
             child = None if node.untried and may_widen else self._promising(node, turn)
             if child is not None:
                 node = child
@@ -207,9 +198,6 @@ class _Tree:
                 node.shut, node.closed = turn, all(child.closed for child in node.children)
                 node = root
         return None
-
-    def _width(self, node: _Node) -> float:
-        return math.inf if node.parent is None else self._rule.widening * math.sqrt(node.visits)
 
     def _promising(self, node: _Node, turn: int) -> _Node | None:
         """Return the child that UCT prefers among those that are neither exhausted nor waiting.
@@ -270,13 +258,8 @@ class _Tree:
         self._ends[rows] = ends
         order = torch.rand(ends.shape[:2], generator=self._task.generator, dtype=torch.float64)
         if self._goal is not None:  # primitives that lead towards it come first
-            self._metres_after[rows] = order = _finite(self._goal.cost(ends))
+            self._metres_after[rows] = order = self._goal.cost(ends).clamp_max(_FAR)
         order = order.masked_fill(~feasible, math.inf).argsort(dim=1, stable=True)
         count = feasible.sum(1).tolist()
         for node, actions, n in zip(nodes, order.tolist(), count, strict=True):
             node.untried, node.closed = actions[:n], n == 0
-
-
-def _finite(metres: Tensor) -> Tensor:
-    """Replace infinite distances to a goal by a large finite one."""
-    return metres.clamp_max(_FAR)

@@ -12,9 +12,9 @@ from gmmtorch.exploration.information.view_evaluator import ViewEvaluator
 from gmmtorch.exploration.mission.driver import Stopwatch
 from gmmtorch.exploration.mission.options import TeamOptions
 from gmmtorch.exploration.planning.coordination import PeerTrajectories
-from gmmtorch.exploration.planning.planner_interface import Plan, PlanningTask, Waiting
+from gmmtorch.exploration.planning.planner_interface import Plan, PlanningTask
 from gmmtorch.exploration.planning.primitives import Primitives
-from gmmtorch.exploration.planning.recovery import retreat
+from gmmtorch.exploration.planning.recovery import Waiting, retreat
 from gmmtorch.exploration.robot.mapper import FrameUpdate, LocalMap, Memo
 from gmmtorch.exploration.robot.robot_state import Robot
 from gmmtorch.sharing.messages.message_registry import (
@@ -75,10 +75,7 @@ class Agent:
         self._generator = torch.Generator().manual_seed(seed)
         self._local_map: LocalMap | None = None  # none is needed at rest
         self._rests = False
-        self._begun = False
-        self._seen_from: tuple[Tensor, Tensor] | None = (
-            None  # the last pose, and the distances along its beams
-        )
+        self._seen_from: tuple[Tensor, Tensor] | None = None  # the last pose, and the distances there
         self._plan: Plan | None = None
         self._sent_pose: Tensor | None = None  # where it rests, according to the last plan sent
         self._n_unsent = 0  # plans at that pose since
@@ -87,11 +84,6 @@ class Agent:
     def number(self) -> int:
         """The robot's id."""
         return self.robot.number
-
-    @property
-    def braking(self) -> Tensor:
-        """(B, 7) how the robot comes to rest after its present path."""
-        return self.robot.braking
 
     def digest(self) -> bytes:
         """Equal for robots that hold the same map."""
@@ -186,7 +178,7 @@ class Agent:
         """Takes the snapshot of the map that `propose` uses. Later messages do not change it."""
         robot, options = self.robot, self.options
         with self.watch("planning"):
-            self._begun, self._rests = True, robot.should_rest(now)
+            self._rests = robot.should_rest(now)
             self._local_map = None
             if not self._rests:
                 self._local_map = robot.local_map(
@@ -203,11 +195,7 @@ class Agent:
             final: ids of the teammates whose views are discounted, if their plan arrived at the time `since`
                 (s) or later; None: `now`.
             peers: committed paths of the other robots, which the plan avoids.
-
-        Raises `RuntimeError` before the first `begin_planning`.
         """
-        if not self._begun:
-            raise RuntimeError("begin_planning() must come before propose().")
         with self.watch("planning"):
             if self._local_map is None:
                 self._plan = self._waiting.rest(self.robot.state)
@@ -218,7 +206,6 @@ class Agent:
                 if number in final and self.heard_at[number] >= (now if since is None else since)
             ]
             task = PlanningTask(
-                robot=self.number,
                 state=self.robot.state,
                 local_map=self._local_map,
                 peers=peers,

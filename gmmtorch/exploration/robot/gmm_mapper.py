@@ -17,15 +17,15 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
 from gmmtorch.exploration.robot.mapper import FrameUpdate, Mapper, Memo, novel_beams
 from gmmtorch.exploration.world.scoring import BeliefMap
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.association import box_around, count_explained, explained_within, summed
 from gmmtorch.mapping.learning.fitting import SurfaceFit, fit_window
-from gmmtorch.mapping.learning.incremental import cell_fit
 from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.mapping.learning.viewpoints import all_origins
+from gmmtorch.mapping.learning.windows import cell_fit
 from gmmtorch.mapping.rays.component_evidence import component_evidence
 from gmmtorch.mapping.rays.mixture_tiles import MixtureTiles, regenerate
 from gmmtorch.occupancy.voxels.boxes import Box, intersection
@@ -78,10 +78,8 @@ class FrameRule:
         for name in ("noise", "length", "cell"):
             if not getattr(self, name) > 0:
                 raise InvalidArgumentError(f"{name}={getattr(self, name)} must be above zero metres.")
-        if not self.rays > 0 or not self.shell >= 0:
-            raise InvalidArgumentError(
-                f"rays={self.rays} must be above zero, shell={self.shell} at least zero."
-            )
+        check_number("rays", self.rays, above=True)
+        check_number("shell", self.shell)
         for name in ("components", "iterations", "hits_per_ray", "novelty_block", "update_every"):
             check_whole(name, getattr(self, name), 1)
         if self.update_stride is not None:
@@ -109,7 +107,6 @@ class GmmMapper(Mapper):
 
     def __init__(
         self,
-        robot: int,
         local: RollingWindow,
         belief: BeliefMap,
         width: int,
@@ -118,7 +115,7 @@ class GmmMapper(Mapper):
         memo: Memo,
         shared: Replica | Broadcast,
     ) -> None:
-        super().__init__(robot, local, belief, width, novelty, memo)
+        super().__init__(local, belief, width, novelty, memo)
         self.shared = shared
         self.tiles = MixtureTiles()
         self._rule = rule
@@ -252,8 +249,7 @@ class GmmMapper(Mapper):
         return [self._enter(batch) for batch in batches if len(batch)]
 
     def _rebuild(self) -> None:
-        """Casts the whole mixture again, after components were moved or replaced. None of this is new
-        evidence."""
+        """Casts the whole mixture again, after components were moved or replaced."""
         self.local.clear()
         self.belief.clear()
         self.tiles, self._by_origin, self._by_place = MixtureTiles(), {}, []
@@ -265,7 +261,7 @@ class GmmMapper(Mapper):
         """Enters a batch of components, or of counts added to some; returns its evidence."""
         grid = self.belief.grid
         there = batch.to(grid.device)
-        self.tiles.add(len(self.tiles), there)
+        self.tiles.add(there)
         for cell in {self._origin_cell(origin) for origin in batch.origins}:
             self._by_origin.setdefault(cell, []).append(there)
         low, high = box_around(there, explained_within(3, self._novelty.explained))

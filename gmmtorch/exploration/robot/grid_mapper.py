@@ -84,7 +84,7 @@ class GridMapper(Mapper):
     The grid behind the window is `belief.grid`.
 
     Args:
-        shares: whether the robot sends its novel points. size: robots of the team.
+        robot: its id. shares: whether the robot sends its novel points. size: robots of the team.
         decode: turns a datagram into a message; a memo's, where robots share one.
     """
 
@@ -102,7 +102,7 @@ class GridMapper(Mapper):
         size: int,
         decode: Callable[[bytes], Message] = decode,
     ) -> None:
-        super().__init__(robot, local, belief, width, novelty, memo)
+        super().__init__(local, belief, width, novelty, memo)
         self.shared = SharedPoints(robot, size)
         self._shares, self._decode = shares, decode
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -20,10 +20,14 @@ from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
+from gmmtorch.sharing.broadcast import Broadcast
 from gmmtorch.sharing.messages.message_registry import Message, decode
 from gmmtorch.sharing.radio import ReceivedMessage
-from gmmtorch.sharing.replica.record_keys import Intervals
+from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
+
+if TYPE_CHECKING:
+    from gmmtorch.exploration.robot.grid_mapper import SharedPoints
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,8 +84,6 @@ class LocalMap:
 
 
 T = TypeVar("T")
-NOVELTY_BLOCK = 3
-"""Pixels along the side of the blocks whose novelty one beam decides."""
 
 
 class FrameUpdate(NamedTuple):
@@ -122,49 +124,13 @@ class Memo:
         return self(("message", datagram), lambda: decode(datagram))
 
 
-class SharedMap(Protocol):
-    """The part of a map that robots share: a `Replica`, a `Broadcast`, or the points of voxel maps."""
-
-    @property
-    def version(self) -> int:
-        """Changes whenever `held` changes."""
-        ...
-
-    @property
-    def held(self) -> Intervals:
-        """Names of the records held; empty for maps that repair no losses."""
-        ...
-
-    @property
-    def missing(self) -> Intervals:
-        """Names of the records that other robots have announced, and that are not here."""
-        ...
-
-    @property
-    def refused(self) -> Mapping[str, int]:
-        """Number of messages that were not merged, by reason."""
-        ...
-
-    def datagrams(self, *, budget: int | None = None) -> list[bytes]:
-        """What is due to be sent, at most `budget` bytes; the rest stays due."""
-        ...
-
-    def announcements(self) -> list[bytes]:
-        """Datagrams that announce `held`."""
-        ...
-
-    def digest(self) -> bytes:
-        """Equal for robots that hold the same records; empty for maps that may differ for good."""
-        ...
-
-
 class Mapper(ABC):
     """One robot's map: a window of voxels to plan in, and a map of the whole world behind it.
 
     `sense` and `receive` have updated both when they return.
 
     Args:
-        robot: its id. local: the window. belief: the map of the world, which the evaluator reads.
+        local: the window. belief: the map of the world, which the evaluator reads.
         width: of the camera's images, pixels. novelty: when a beam is novel.
         memo: cache of evidence; shared by the robots of a simulation.
 
@@ -172,19 +138,13 @@ class Mapper(ABC):
         shared: what teammates receive.
     """
 
-    shared: SharedMap
+    shared: Replica | Broadcast | SharedPoints
 
     def __init__(
-        self,
-        robot: int,
-        local: RollingWindow,
-        belief: BeliefMap,
-        width: int,
-        novelty: NoveltyRule,
-        memo: Memo,
+        self, local: RollingWindow, belief: BeliefMap, width: int, novelty: NoveltyRule, memo: Memo
     ) -> None:
         self.local, self.belief = local, belief
-        self._robot, self._width, self._novelty, self._memo = robot, width, novelty, memo
+        self._width, self._novelty, self._memo = width, novelty, memo
 
     @abstractmethod
     def center_on(self, position: Tensor) -> None:
@@ -214,7 +174,7 @@ def novel_beams(
     rule: NoveltyRule,
     within: Box,
     short: float = 0.0,
-    side: int = NOVELTY_BLOCK,
+    side: int = 3,
 ) -> Tensor:
     """Which beams (N,) of a frame are novel to a map.
 

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import InvalidArgumentError, check_number
 from gmmtorch.exploration.information.view_library import ViewLibrary
 from gmmtorch.exploration.planning.collision_checking import local_map_of
 from gmmtorch.exploration.planning.planner_interface import Plan, Planner
 from gmmtorch.exploration.planning.recovery import shortened
 from gmmtorch.exploration.planning.roadmap import Roadmap
-from gmmtorch.exploration.robot.initial_free_space import InitialFreeSpace
 from gmmtorch.exploration.robot.mapper import FrameUpdate, LocalMap, Mapper
+from gmmtorch.exploration.world.starts import InitialFreeSpace
 from gmmtorch.sharing.messages.message_registry import PlanMessage
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 
@@ -35,8 +34,7 @@ class StoppingRule:
     def __post_init__(self) -> None:
         if not 0 <= self.share < 1:
             raise InvalidArgumentError(f"planner.rest={self.share} must be at least 0, and below 1.")
-        if not 0 < self.window < math.inf:
-            raise InvalidArgumentError(f"window={self.window} must be above zero seconds, and finite.")
+        check_number("window", self.window, above=True)
 
 
 class StoppingCriterion:
@@ -50,9 +48,9 @@ class StoppingCriterion:
         rests: whether the robot should rest.
     """
 
-    def __init__(self, rule: StoppingRule | None = None) -> None:
+    def __init__(self, rule: StoppingRule) -> None:
         self.rests = False
-        self._rule = StoppingRule() if rule is None else rule
+        self._rule = rule
         self._window: deque[tuple[float, float]] = deque()  # time (s) and bits learned
         self._best = 0.0  # bits learned in the best window
         self._known_at_rest = 0.0  # bits
@@ -116,7 +114,7 @@ class Robot:
         library: ViewLibrary,
         roadmap: Roadmap,
         start: InitialFreeSpace,
-        rest: StoppingRule | None = None,
+        rest: StoppingRule,
     ) -> None:
         self.number = number
         self.mapper, self.planner, self.library, self.roadmap = mapper, planner, library, roadmap
@@ -188,16 +186,14 @@ class Robot:
         hit[(cells - low).unbind(1)] = True
         self._recent.append((hit.nonzero() + low).cpu())
 
-    def local_map(
-        self, planning_prior: float, radius: float, window: tuple[int, int, int] | None = None
-    ) -> LocalMap:
-        """A snapshot for the planner: `window` cells around the robot; None: its whole window of voxels.
+    def local_map(self, planning_prior: float, radius: float, window: tuple[int, int, int]) -> LocalMap:
+        """A snapshot of `window` cells around the robot, for the planner.
 
         Args:
             planning_prior: occupancy probability of unobserved cells. radius: of the robot, metres.
         """
         local, rule = self.mapper.local, self.mapper.belief.rule
-        box = local.box if window is None else local.around(self.position, window)
+        box = local.around(self.position, window)
         hits, misses = torch.stack(local.evidence(box)).cpu()  # the planner works on the CPU
         recent = list(self._recent)
         return local_map_of(

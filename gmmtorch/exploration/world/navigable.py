@@ -27,9 +27,7 @@ def occupied_and_clear(
     radius: float,
     on_event: Event,
 ) -> tuple[Tensor, Tensor]:
-    """Return cells (nx, ny, nz) that the mesh meets, and grounded cells whose centre is beyond `radius`
-    of it.
-    """
+    """Return cells (nx, ny, nz) that the mesh meets; and grounded ones with centres beyond `radius` of it."""
     # A cell m cells away on some axis is at least (m − ½) cells from a cell's centre. Distances are therefore
     # computed only for cells that close to the mesh. The mesh just outside the box counts too.
     reach = math.floor(radius / resolution + 0.5 + ON_PLANE)
@@ -131,9 +129,7 @@ def collides(world: MeshWorld, positions: Tensor, radius: float) -> Tensor:
 
 
 def finely(positions: Tensor, n: int = 4) -> Tensor:
-    """Interpolate positions (1 + S, 3) to (1 + n S, 3), n steps for each: a robot may collide between
-    states.
-    """
+    """Interpolate positions (1 + S, 3) to (1 + n S, 3): a robot may collide between states."""
     share = torch.arange(1, n + 1, dtype=positions.dtype)[:, None] / n
     between = positions[:-1, None] + share * (positions[1:, None] - positions[:-1, None])
     return torch.cat([positions[:1], between.reshape(-1, 3)])
@@ -154,9 +150,7 @@ _RAYS_AT_ONCE = 1 << 18
 
 
 def viewpoints(navigable: Tensor, step: int) -> Tensor:
-    """Return cells (V, 3): in each block of `step`³ cells, the navigable one nearest to the block's
-    middle.
-    """
+    """Return the navigable cell nearest to the middle of each block of `step`³ cells, (V, 3)."""
     cells = navigable.nonzero()
     shape = torch.tensor(navigable.shape)
     block = (cells // step * torch.tensor(row_major_strides(tuple(-(-shape // step))))).sum(1)
@@ -234,10 +228,10 @@ def observable_cells(
 
 
 def _crossed(direction: Tensor, reach: float, strides: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the distances (K,), in cells, at which a ray from a cell's centre enters cells, and their
-    offsets.
+    """Return the distances (K,), in cells, at which a ray from a cell's centre enters cells, and the offsets
+    (K,) of their flat indices.
 
-    Offsets are differences of flat indices, (K,). The first cell is the start, entered at distance 0.
+    The first cell is the start, entered at distance 0.
     """
     plane = torch.arange(math.ceil(reach) + 1, dtype=torch.float64) + 0.5
     distance = (plane / direction.abs()[:, None]).flatten()  # infinite along planes

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -90,8 +89,8 @@ class BeliefMap:
         self.known_bits = 0.0  # entropy removed from all cells, observable or not, as a robot computes it
         self.n_observed = 0
 
-    def add(self, evidence: CellEvidence) -> Tensor:
-        """Add evidence; returns which of its cells (C,) are observable."""
+    def add(self, evidence: CellEvidence) -> None:
+        """Add evidence."""
         before = self.grid.add(evidence)
         chosen = flags_of_cells(evidence.cells, self._low, self._observable)
         added = evidence.hits, evidence.misses
@@ -99,7 +98,6 @@ class BeliefMap:
         self.known_bits += removed.bits
         self.entropy_bits -= removed.chosen_bits
         self.n_observed += removed.n_new
-        return chosen
 
     def probability(self, cells: Tensor) -> Tensor:
         """Occupancy (C,) of cells (C, 3), on the device of the cells."""
@@ -126,7 +124,7 @@ def disagreement(maps: list[BeliefMap], cells: Tensor) -> float | None:
     return float((classes != classes[0]).any(0).double().mean())
 
 
-def overlap(seen_by: Tensor) -> float:
+def overlap(seen_by: Tensor) -> float | None:
     """Return the share of the seen cells that two or more robots saw; `seen_by` counts robots."""
     seen = int((seen_by > 0).sum())
-    return int((seen_by > 1).sum()) / seen if seen else math.nan
+    return int((seen_by > 1).sum()) / seen if seen else None

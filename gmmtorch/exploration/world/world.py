@@ -12,9 +12,8 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.point_files.mesh_files import read_triangles
-from gmmtorch.errors import InvalidArgumentError, MemoryLimitError, MissingDataError
+from gmmtorch.errors import InvalidArgumentError, MemoryLimitError, MissingDataError, check_choice
 from gmmtorch.evaluation.events import Event, ignore
-from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
 from gmmtorch.exploration.world.navigable import (
     ON_PLANE,
     above_floor,
@@ -24,7 +23,6 @@ from gmmtorch.exploration.world.navigable import (
     view_directions,
     viewpoints,
 )
-from gmmtorch.exploration.world.starts import check_start, start_poses
 from gmmtorch.exploration.world.world_cache import cached_cells
 from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.occupancy.voxels.boxes import Box
@@ -110,7 +108,7 @@ class World:
         triangles = checked_triangles(triangles, name)
         mesh = MeshWorld(triangles)
         box = _lattice_box(mesh, bounds, resolution, name)
-        place = None if start is None else _point(start, "start")
+        place = None if start is None else _point(start)
         options = _CellOptions(
             resolution,
             box.low.tolist(),
@@ -133,24 +131,6 @@ class World:
 
         cells = cached_cells(triangles, options._asdict(), _CELLS, box.shape, compute) if cache else compute()
         return cls(name, mesh, resolution, box, **cells, robot_radius=robot_radius, start=place)
-
-    def start_poses(
-        self,
-        n: int,
-        spacing: float = 1.5,
-        at: Sequence[float] | Tensor | None = None,
-        primitives: Primitives | None = None,
-    ) -> Tensor:
-        """See `starts.start_poses`. Defaults: `at` (3,) is `start`; the primitives are the standard set."""
-        place = self.start if at is None else _point(at, "at")
-        return start_poses(self, n, spacing, place, self._flown(primitives))
-
-    def check_start(self, poses: Tensor, primitives: Primitives | None = None) -> Tensor:
-        """See `starts.check_start`. Default primitives: the standard set."""
-        return check_start(self, poses, self._flown(primitives))
-
-    def _flown(self, primitives: Primitives | None) -> Primitives:
-        return Primitives(Dynamics(radius=self.robot_radius)) if primitives is None else primitives
 
     def centers(self, cells: Tensor) -> Tensor:
         """Centres (..., 3), metres, of cells (..., 3) relative to the low corner of the box."""
@@ -179,7 +159,7 @@ def _compute_cells(
     occupied, clear = occupied_and_clear(mesh, triangles, resolution, box, grounded, radius, on_event)
     if not bool(occupied.any()):
         return None
-    start = None if options.start is None else _point(options.start, "start")
+    start = None if options.start is None else _point(options.start)
     navigable = connected(clear, mesh, resolution, box, start, radius, name)
     places = viewpoints(navigable, max(1, round(options.spacing / resolution)))
     angle = max(resolution / (_SHARP * options.max_range), _FINEST)
@@ -205,10 +185,10 @@ def _check_sizes(
         )
 
 
-def _point(place: Sequence[float] | Tensor, name: str) -> Tensor:
-    point = torch.as_tensor(place, dtype=torch.float64)
+def _point(start: Sequence[float] | Tensor) -> Tensor:
+    point = torch.as_tensor(start, dtype=torch.float64)
     if point.shape != (3,) or not bool(torch.isfinite(point).all()):
-        raise InvalidArgumentError(f"{name}={place} must be three finite numbers: x, y, z in metres.")
+        raise InvalidArgumentError(f"start={start} must be three finite numbers: x, y, z in metres.")
     return point
 
 
@@ -264,8 +244,7 @@ def open_world(
     for an unknown name or an option that the world does not have, and `MissingDataError` for a missing
     file.
     """
-    if name not in ("warehouse", "tunnels", "mesh"):
-        raise InvalidArgumentError(f"world={name!r} is not known; choose warehouse, tunnels or mesh.")
+    check_choice("world", name, ("warehouse", "tunnels", "mesh"))
     if name == "mesh":
         if size is not None:
             raise InvalidArgumentError(f"size={size}: a mesh has its own size; give bounds instead.")

@@ -1,7 +1,7 @@
 """Pairs of components within reach of each other: those that the sums of `pair_overlap` run over.
 
 The fused kernel tests all pairs, which is faster than a k-d tree for the few hundred components of a scan.
-The twin is in `Ascent.pairs` of `registration.overlap_ascent`. Both give the same pairs, in another order.
+The twin is in `Ascent.pairs` of `registration.overlap`. Both give the same pairs, in another order.
 """
 
 from __future__ import annotations

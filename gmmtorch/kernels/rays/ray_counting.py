@@ -1,7 +1,7 @@
 """Counting of rays: adds the weight of each ray to every voxel that it leaves, in a grid or in blocks.
 
-The fused kernels keep no list of visits. On a CPU they fetch the memory of a voxel when the walk meets it and
-add to it up to 256 visits later, so that the walk does not wait.
+The fused kernels keep no list of visits. On a CPU they walk eight rays side by side, fetch the memory of a
+voxel when a walk meets it, and add to it up to 256 visits later, so that the walks do not wait.
 """
 
 from __future__ import annotations
@@ -16,37 +16,57 @@ from torch import Tensor
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.compiler import FusedKernel
 from gmmtorch.kernels.rays.ray_traversal import CHUNK_VISITS, grid_arguments, row_major_strides, traverse
-from gmmtorch.kernels.rays.ray_walk import PARAMETERS, walk
+from gmmtorch.kernels.rays.ray_walk import PARAMETERS, walk, walk_lanes
+from gmmtorch.kernels.simd import CPU_LANES
+
+_WAITING = 256
 
 
-def _counting(place: str) -> str:
-    """C++ that adds the weight of ray `item` to *(place), an expression of `voxel`, for each visit."""
+_WAITING = 256  # visits
+
+
+def _counting(kind: str, place: str, place_in_lane: str) -> str:
+    """C++ that adds the weight of each ray to the count, of type `kind`, of each voxel that it leaves.
+
+    `place` is the place in the counts of a `voxel`, and `place_in_lane` that of the voxel in lane `l`.
+    """
+    add = "for (int i = 0; i < n_waiting; ++i) counts[waiting[i]] += added[i];"
+    visits = f"""
+        for (int l = 0; l < LANES; ++l) {{
+            waiting[n_waiting] = {place_in_lane};
+            added[n_waiting] = weight[l];
+            __builtin_prefetch(counts + waiting[n_waiting], 1);
+            n_waiting += active[l] != 0;
+        }}
+        if (n_waiting > {_WAITING - CPU_LANES}) {{
+            {add}
+            n_waiting = 0;
+        }}
+    """
     return f"""
-    const auto weight = weights ? weights[item] : 1;
+    auto count_ray = [=](const int64_t item) {{
+        const {kind} weight = weights ? weights[item] : 1;
+        {walk(f"GMM_ADD(counts + {place}, weight);")}
+    }};
 #if defined(__CUDA_ARCH__)
-    {walk(f"GMM_ADD({place}, weight);")}
+    count_ray(item);
 #else
-    decltype(counts) waiting[256];
+    const int64_t ray0 = item * {CPU_LANES};
+    {kind} weight[{CPU_LANES}], added[{_WAITING}];
+    int64_t waiting[{_WAITING}];
     int n_waiting = 0;
-    {
-        walk(f'''
-    waiting[n_waiting] = {place};
-    __builtin_prefetch(waiting[n_waiting], 1);
-    if (++n_waiting == 256) {{
-        for (int i = 0; i < 256; ++i) *waiting[i] += weight;
-        n_waiting = 0;
-    }}
-    ''')
-    }
-    for (int i = 0; i < n_waiting; ++i) *waiting[i] += weight;
+    for (int l = 0; l < {CPU_LANES}; ++l)
+        weight[l] = weights && ray0 + l < n_rays ? weights[ray0 + l] : 1;
+    {walk_lanes(visits, one_ray="count_ray(ray);")}
+    {add}
 #endif
 """
 
 
 _IN_GRID = FusedKernel(
     "count_rays_in_grid",
-    PARAMETERS + ", const double* weights, double* counts",
-    _counting("counts + voxel"),
+    "int64 n_rays, " + PARAMETERS + ", const double* weights, double* counts",
+    _counting("double", "voxel", "voxel[l]"),
     shares=True,
 )
 
@@ -56,26 +76,25 @@ _BLOCK_PARAMETERS = (
 )
 _PLACE_IN_BLOCK = """
     const int64_t z_bits = dim == 3 ? local_bits : 0, in_block = ((int64_t)1 << local_bits) - 1;
-    const int64_t x_mask = in_block << (local_bits + z_bits), y_mask = in_block << z_bits;
-    const int64_t z_mask = mask2 & in_block, x_down = shift0 - local_bits - z_bits, y_down = shift1 - z_bits;
-    const int64_t local_mask = (in_block << shift0) | (in_block << shift1) | z_mask;
-    int64_t block = -1;
-    decltype(counts) base = counts;
-    auto place_of = [&](int64_t voxel) {
-        if ((voxel & ~local_mask) != block) {
-            block = voxel & ~local_mask;
-            const int64_t x = block >> shift0, y = (block >> shift1) & mask1, z = block & mask2;
-            base = counts + stored_at[
-                ((x >> local_bits) << above0) | ((y >> local_bits) << above1) | (z >> local_bits)];
-        }
-        return base + (((voxel >> x_down) & x_mask) | ((voxel >> y_down) & y_mask) | (voxel & z_mask));
+    auto block_of = [=](auto voxel) {
+        return (((voxel >> shift0) >> local_bits) << above0)
+            | ((((voxel >> shift1) & mask1) >> local_bits) << above1) | ((voxel & mask2) >> local_bits);
+    };
+    auto place_of = [=](auto voxel) {
+        return (((voxel >> shift0) & in_block) << (local_bits + z_bits))
+            | (((voxel >> shift1) & in_block) << z_bits) | (voxel & mask2 & in_block);
     };
 """
 _IN_BLOCKS = {
     dtype: FusedKernel(
         f"count_rays_in_blocks_{kind}",
-        PARAMETERS + _BLOCK_PARAMETERS + f", const {kind}* weights, {kind}* counts",
-        _PLACE_IN_BLOCK + _counting("place_of(voxel)"),
+        "int64 n_rays, " + PARAMETERS + _BLOCK_PARAMETERS + f", const {kind}* weights, {kind}* counts",
+        _PLACE_IN_BLOCK
+        + _counting(
+            kind,
+            "stored_at[block_of(voxel)] + place_of(voxel)",
+            "stored_at[block_of(voxel)[l]] + place_of(voxel)[l]",
+        ),
         shares=True,
     )
     for dtype, kind in ((torch.float64, "double"), (torch.float32, "float"))
@@ -106,7 +125,8 @@ def count_in_grid(
     starts, ends = starts.double(), ends.double()
     if is_fused(counts, starts, ends, weights, low):
         grid = grid_arguments(starts, ends, shape, row_major_strides(shape), low)
-        _IN_GRID(starts.shape[0], *grid, weights, counts, device=counts.device)
+        n_items = _n_items(len(starts), counts.device)
+        _IN_GRID(n_items, len(starts), *grid, weights, counts, device=counts.device)
         return
     one = torch.ones((), dtype=torch.float64, device=counts.device)
     for visit in traverse(starts, ends, shape, chunk_visits, compiled=compiled, low=low):
@@ -194,7 +214,13 @@ def _count_in_blocks_fused(
     mask2 = (1 << bits[2]) - 1 if dim == 3 else 0
     fields = [table.local_bits, shifts[0], shifts[1], (1 << bits[1]) - 1, mask2, above[0], above[1]]
     kernel = _IN_BLOCKS[counts().dtype]
-    kernel(n_rays, *voxels, table.first, *fields, weights, counts(), device=device)
+    n_items = _n_items(n_rays, device)
+    kernel(n_items, n_rays, *voxels, table.first, *fields, weights, counts(), device=device)
+
+
+def _n_items(n_rays: int, device: torch.device) -> int:
+    """On a CPU an item is a group of rays that are walked side by side; on CUDA it is a ray."""
+    return -(-n_rays // CPU_LANES) if device.type == "cpu" else n_rays
 
 
 def _split(voxel: Tensor, block_bits: tuple[int, ...], local_bits: int) -> tuple[Tensor, Tensor]:

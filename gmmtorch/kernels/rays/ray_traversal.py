@@ -257,7 +257,7 @@ _LIST_VISITS = FusedKernel(
     const int64_t ray = item + first_ray, before = first_ray ? stops[first_ray - 1] : 0;
     int64_t place = (ray ? stops[ray - 1] : 0) - before;
     """
-    + walk("voxels[place] = voxel; rays[place] = ray; ++place;").replace("item * dim", "ray * dim"),
+    + walk("voxels[place] = voxel; rays[place] = ray; ++place;", "ray"),
 )
 
 

@@ -117,10 +117,9 @@ class Node:
         self._n_arrived = 0
         self.subscriptions: list[Subscription] = []
         self._warned: dict[str, float] = {}
-        self._clock: int | None = None
-        self._use_sim_time = use_sim_time
-        self._clock_topic: Subscription | None = None
         self.arrival = Arrival(0, 0, 0.0, b"")
+        self._clock = 0
+        self._clock_topic: Subscription | None = None
         if use_sim_time:
             self._clock_topic = self.subscribe("/clock", CLOCK, lambda _: None)
 
@@ -210,7 +209,7 @@ class Node:
 
     def now(self) -> int:
         """The time in ns: of the system, or of /clock (0 before its first message)."""
-        return (self._clock or 0) if self._use_sim_time else time.time_ns()
+        return time.time_ns() if self._clock_topic is None else self._clock
 
     def listen_to_transforms(self) -> tuple[Subscription, Subscription]:
         """Collects /tf and /tf_static in `transforms`, whose last 30 s are kept."""
@@ -240,20 +239,14 @@ class Node:
     def spin_once(self, timeout: float = 0.0) -> bool:
         """Calls the callback of the oldest waiting message; returns whether one came in `timeout` (s)."""
         with self._arrived:
-            if not self._arrived.wait_for(self._has_waiting, timeout):
+            if not self._arrived.wait_for(lambda: any(s.waiting for s in self.subscriptions), timeout):
                 return False
-            subscription = min(
-                (s for s in self.subscriptions if s.waiting), key=lambda s: s.waiting[0].number
-            )
+            waiting = (s for s in self.subscriptions if s.waiting)
+            subscription = min(waiting, key=lambda s: s.waiting[0].number)
             self.arrival = subscription.waiting.popleft()
             subscription.waiting_bytes -= len(self.arrival.data)
         try:
-            message = self.types.decode(self.arrival.data, subscription.type)
-        except DataError as error:
-            self._note_malformed(subscription, error)
-            return True
-        try:
-            subscription.callback(message)
+            subscription.callback(self.types.decode(self.arrival.data, subscription.type))
         except DataError as error:
             self._note_malformed(subscription, error)
         return True
@@ -272,9 +265,6 @@ class Node:
             s.topic: Counter(received=s.n_received, dropped=s.n_dropped, malformed=s.n_malformed)
             for s in self.subscriptions
         }
-
-    def _has_waiting(self) -> bool:
-        return any(subscription.waiting for subscription in self.subscriptions)
 
     def _receive(self, subscription: Subscription, data: bytes) -> None:
         """Queues a message; called by threads of the middleware."""

@@ -1,17 +1,21 @@
-"""ZenohMiddleware: ROS 2 topics over Zenoh, as rmw_zenoh carries them."""
+"""ZenohMiddleware: ROS 2 topics over Zenoh, as rmw_zenoh carries them.
+
+Messages of a topic have the key DOMAIN/TOPIC/TYPE/HASH. Each endpoint declares a liveliness token,
+@ros2_lv/DOMAIN/SESSION/NODE/ENTITY/KIND/ENCLAVE/NAMESPACE/NAME/TOPIC/TYPE/HASH/QOS, where % stands for /.
+"""
 
 from __future__ import annotations
 
 import itertools
 import json
+import struct
 import time
 import uuid
 from collections.abc import Callable
 from typing import Any
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
-from gmmtorch.live.ros import zenoh_keys
-from gmmtorch.live.ros.message_types import MessageTypes
+from gmmtorch.live.ros.message_types import MessageTypes, dds_type, ros_type
 from gmmtorch.live.ros.middleware import MAX_MESSAGE_BYTES, Endpoint
 from gmmtorch.live.ros.quality import Quality
 from gmmtorch.live.ros.topic_names import TopicNames
@@ -20,6 +24,11 @@ from gmmtorch.optional_packages import needs_extra
 ROUTER = "tcp/127.0.0.1:7447"
 _ANY_VERSION = "*"
 _TIMEOUT = 2.0  # s, for the tokens of other nodes
+_NODE, _PUBLISHER, _SUBSCRIBER = "NN", "MP", "MS"
+_SPACE = "@ros2_lv"
+_DEPTH = 42  # of rmw_zenoh's default quality
+_BEST_EFFORT, _TRANSIENT_LOCAL = "2", "1"
+_N_PARTS = 13
 
 
 class ZenohMiddleware:
@@ -48,7 +57,7 @@ class ZenohMiddleware:
         self._id = str(self._session.zid())
         self._numbers = itertools.count(1)
         self._entities: list[Any] = []
-        token = zenoh_keys.node_token(domain, self._id, names.namespace, names.node)
+        token = node_token(domain, self._id, names.namespace, names.node)
         self._entities.append(self._session.liveliness().declare_token(token))
 
     def publisher(self, topic: str, message_type: str, quality: Quality) -> Callable[[bytes], None]:
@@ -69,7 +78,7 @@ class ZenohMiddleware:
         self._declared(publisher, Endpoint(topic, message_type, quality, True))
 
         def send(message: bytes) -> None:
-            tag = zenoh_keys.attachment(next(sequence), time.time_ns(), source)
+            tag = attachment(next(sequence), time.time_ns(), source)
             try:
                 publisher.put(message, attachment=tag)
             except self._zenoh.ZError as error:
@@ -94,8 +103,8 @@ class ZenohMiddleware:
         self._declared(subscriber, Endpoint(topic, message_type, quality, False))
 
     def endpoints(self) -> list[Endpoint]:
-        tokens = self._session.liveliness().get(zenoh_keys.all_tokens(self._domain), timeout=_TIMEOUT)
-        found = [zenoh_keys.parsed_token(str(reply.ok.key_expr)) for reply in tokens if reply.ok is not None]
+        tokens = self._session.liveliness().get(all_tokens(self._domain), timeout=_TIMEOUT)
+        found = [parsed_token(str(reply.ok.key_expr)) for reply in tokens if reply.ok is not None]
         return [endpoint for endpoint in found if endpoint is not None]
 
     def close(self) -> None:
@@ -104,11 +113,11 @@ class ZenohMiddleware:
 
     def _key(self, topic: str, message_type: str, type_hash: str) -> str:
         self._types.check(message_type)
-        return zenoh_keys.message_key(self._domain, topic, message_type, type_hash)
+        return message_key(self._domain, topic, message_type, type_hash)
 
     def _declared(self, entity: Any, endpoint: Endpoint) -> None:
         """Announces an endpoint to other nodes."""
-        token = zenoh_keys.endpoint_token(
+        token = endpoint_token(
             self._domain,
             self._id,
             next(self._numbers),
@@ -159,3 +168,68 @@ def _settings(
     for name, value in settings.items():
         config.insert_json5(name, json.dumps(value))
     return config
+
+
+# -- keys -----------------------------------------------------------------------------------------
+
+
+def message_key(domain: int, topic: str, message_type: str, type_hash: str) -> str:
+    """The key of a topic's messages; hash "*": of any version of the type."""
+    return f"{domain}/{topic.strip('/')}/{dds_type(message_type)}/{type_hash}"
+
+
+def all_tokens(domain: int) -> str:
+    """A key that matches all liveliness tokens of a domain."""
+    return f"{_SPACE}/{domain}/**"
+
+
+def node_token(domain: int, session: str, namespace: str, name: str) -> str:
+    """The liveliness token of a node."""
+    return f"{_SPACE}/{domain}/{session}/0/0/{_NODE}/%/{namespace.replace('/', '%')}/{name}"
+
+
+def endpoint_token(
+    domain: int, session: str, entity: int, namespace: str, name: str, endpoint: Endpoint, type_hash: str
+) -> str:
+    """The liveliness token of a publisher or subscriber of a node."""
+    kind = _PUBLISHER if endpoint.is_publisher else _SUBSCRIBER
+    space, topic = (path.replace("/", "%") for path in (namespace, endpoint.topic))
+    return (
+        f"{_SPACE}/{domain}/{session}/0/{entity}/{kind}/%/{space}/{name}/"
+        f"{topic}/{dds_type(endpoint.type)}/{type_hash}/{quality_text(endpoint.quality)}"
+    )
+
+
+def parsed_token(token: str) -> Endpoint | None:
+    """The endpoint of a liveliness token; None if it is not one of a ROS topic."""
+    parts = token.split("/")
+    if len(parts) != _N_PARTS or parts[5] not in (_PUBLISHER, _SUBSCRIBER):
+        return None
+    kind = ros_type(parts[10])
+    if kind is None:
+        return None
+    return Endpoint(parts[9].replace("%", "/"), kind, parsed_quality(parts[12]), parts[5] == _PUBLISHER)
+
+
+def quality_text(quality: Quality) -> str:
+    """reliability:durability:history,depth:deadline:lifespan:liveliness; what equals the default is empty."""
+    reliability = "" if quality.reliable else _BEST_EFFORT
+    durability = _TRANSIENT_LOCAL if quality.latched else ""
+    depth = "" if quality.depth == _DEPTH else str(quality.depth)
+    return f"{reliability}:{durability}:,{depth}:,:,:,,"
+
+
+def parsed_quality(text: str) -> Quality:
+    """The inverse of `quality_text`; what is missing or unknown is the default."""
+    reliability, durability, history, *_ = [*text.split(":"), "", "", ""]
+    depth = history.rpartition(",")[2]
+    return Quality(
+        reliability != _BEST_EFFORT,
+        durability == _TRANSIENT_LOCAL,
+        int(depth) if depth.isascii() and depth.isdecimal() else _DEPTH,
+    )
+
+
+def attachment(sequence: int, time: int, source: bytes) -> bytes:
+    """What a message carries beside its content: number, time (ns), and id (16 bytes) of its publisher."""
+    return struct.pack("<qqB", sequence, time, len(source)) + source

@@ -18,7 +18,7 @@ from gmmtorch.localization.registration.registration import register
 from gmmtorch.localization.rigid_motions import Motions, distinct, generators
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import WindowedRule
-from gmmtorch.mapping.learning.windowed import learn_window
+from gmmtorch.mapping.learning.windows import learn_window
 from gmmtorch.mapping.surfaces import surface_mixture
 from gmmtorch.scan import Scan
 

@@ -17,7 +17,7 @@ from gmmtorch.localization.odometry.loop_closure import closed, information_of
 from gmmtorch.localization.odometry.pose_graph import Edges, optimised
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import WindowedRule
-from gmmtorch.mapping.learning.windowed import learn_window
+from gmmtorch.mapping.learning.windows import learn_window
 from gmmtorch.scan import Scan
 
 _RULE = WindowedRule(window=1, noise=0.02, length=0.4, max_cells=5000)

@@ -24,8 +24,8 @@ from gmmtorch.localization.rigid_motions import Motions, chosen_rows
 from gmmtorch.mapping.components import Components
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.reduction.moments import merge_components
+from gmmtorch.occupancy.cone_index import ConeIndex
 from gmmtorch.occupancy.cones import Cones
-from gmmtorch.occupancy.index.cone_index import ConeIndex
 
 CUTOFF = 3.5
 """Deviations beyond which a component is left out of a point."""

@@ -10,9 +10,8 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, check_whole
-from gmmtorch.linalg import check_rigid
-from gmmtorch.localization.registration.overlap import deviations
-from gmmtorch.localization.registration.overlap_ascent import Ascent, log_self_overlap
+from gmmtorch.linalg import check_rigid, nearest_rotations, plane_rotations
+from gmmtorch.localization.registration.overlap import Ascent, deviations, log_self_overlap
 from gmmtorch.localization.rigid_motions import Motions
 from gmmtorch.mapping.surfaces import Surfaces, surface_mixture
 from gmmtorch.mixture.em.exact import Parameters
@@ -158,8 +157,7 @@ def yaw_starts(source: Surfaces, target: Surfaces, n: int = 12) -> Tensor:
     dim = f.means.shape[1]
     angle = torch.arange(n, device=f.means.device, dtype=torch.float64) * (2 * math.pi / n)
     starts = torch.eye(dim + 1, device=f.means.device, dtype=torch.float64).repeat(n, 1, 1)
-    starts[:, 0, 0], starts[:, 1, 1] = angle.cos(), angle.cos()
-    starts[:, 1, 0], starts[:, 0, 1] = angle.sin(), -angle.sin()
+    starts[:, :2, :2] = plane_rotations(angle)
     (_, here), (_, there) = _centered(f), _centered(g)
     starts[:, :dim, dim] = there - starts[:, :dim, :dim] @ here
     return starts
@@ -261,8 +259,7 @@ def _between(poses: Tensor, here: Tensor, there: Tensor) -> Motions:
 def _world(motions: Motions, here: Tensor, there: Tensor) -> Tensor:
     """The inverse of `_between`, (B, D+1, D+1), rotations orthonormal to rounding."""
     dim = len(here)
-    u, _, v = torch.linalg.svd(motions.rotations)
-    rotations = u @ v
+    rotations = nearest_rotations(motions.rotations)
     poses = torch.eye(dim + 1).to(here).repeat(len(rotations), 1, 1)
     poses[:, :dim, :dim] = rotations
     poses[:, :dim, dim] = motions.translations + there - rotations @ here

@@ -4,26 +4,54 @@ A component takes about 10 bytes in 3D and 7 in 2D. Its rounding error is bounde
 deviations (see `lattice`), and its covariance stays positive definite. A component decodes to the same values
 in every batch: `decode(encode(c))` is `quantized(c)`, and encoding decoded components again, in any grouping,
 changes nothing.
+
+A batch is a bit stream: columns of whole numbers for components, origins and viewpoints. A mean is written as
+the number of a cell of a common grid, and its place in the cell. The side of the cells is the one that takes
+the fewest bits.
 """
 
 from __future__ import annotations
 
+import math
 import zlib
 from dataclasses import replace
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError
-from gmmtorch.linalg import argsort
-from gmmtorch.mapping.codec import lattice
-from gmmtorch.mapping.codec.batch_stream import order_of, read_values, write_values
-from gmmtorch.mapping.codec.bitstream import BitCounter, BitReader, BitWriter
-from gmmtorch.mapping.codec.quantization import Quantized, quantize
+from gmmtorch.mapping.codec.bitstream import BitCounter, BitReader, BitWriter, Ints
+from gmmtorch.mapping.codec.lattice import (
+    AXIS_ORDERS,
+    LARGEST_DEVIATION,
+    LARGEST_RATIO,
+    LEAST_DEVIATION,
+    Lattice,
+    shear_exponents,
+)
+from gmmtorch.mapping.codec.quantization import (
+    LARGEST_COUNT,
+    LARGEST_SIDE,
+    LEAST_SHARE,
+    NO_COUNT,
+    ORIGIN_STEP,
+    RASTER_BITS,
+    Quantized,
+    box_of,
+    cell_exponent,
+    cells_of,
+    ints,
+    quantize,
+    raster,
+)
 from gmmtorch.mapping.components import Components
+from gmmtorch.scan import FARTHEST
 
 BATCH_VERSION = 1
 _VERSION_BYTES, _CHECKSUM_BYTES = 1, 4
+_ORDER_BITS = {2: 1, 3: 3}
 
 
 def encode(components: Components) -> bytes:
@@ -34,7 +62,7 @@ def encode(components: Components) -> bytes:
 def encode_quantized(values: Quantized) -> bytes:
     """A batch of components that `quantize` has rounded. The values are not checked again."""
     writer = BitWriter()
-    write_values(writer, values)
+    _write_values(writer, values)
     body = bytes([BATCH_VERSION]) + writer.to_bytes()
     return body + zlib.crc32(body).to_bytes(_CHECKSUM_BYTES, "little")
 
@@ -42,7 +70,7 @@ def encode_quantized(values: Quantized) -> bytes:
 def batch_bytes(values: Quantized) -> int:
     """The length of `encode_quantized(values)`, without writing it."""
     counter = BitCounter()
-    write_values(counter, values)
+    _write_values(counter, values)
     return _VERSION_BYTES + -(-counter.n_bits // 8) + _CHECKSUM_BYTES
 
 
@@ -63,55 +91,166 @@ def decode(data: bytes) -> Components:
     if zlib.crc32(body) != int.from_bytes(checksum, "little"):
         raise DataError("The batch of components does not match its checksum: it is truncated or damaged.")
     try:
-        return read_values(BitReader(body[1:])).restored().checked()
+        return _read_values(BitReader(body[1:])).restored().checked()
     except DataError:
         raise
     except GmmTorchError as error:
         raise DataError(f"The batch of components is damaged: {error}") from error
 
 
-def quantized(components: Components) -> Components:
-    """The result of `decode(encode(components))`, on the components' device, without writing bits."""
-    restored = quantize(components).restored()
-    device = components.means.device
-    return Components(**{name: value.to(device) for name, value in vars(restored).items()})
+# -- writing ---------------------------------------------------------------------------------------------
 
 
-# -- order and numbers -----------------------------------------------------------------------------------
+def _write_values(writer: BitWriter, values: Quantized) -> None:
+    """Writes a batch without its version and checksum."""
+    dim, k = values.places.dim, len(values)
+    writer.number(dim)
+    writer.number(k)
+    writer.number(len(values.origins))
+    writer.fixed(ints(values.places.axis_order), _ORDER_BITS[dim])
+    writer.column(ints(values.ids[:, 0]))
+    # Consecutive ids become equal numbers, which take no bits.
+    writer.column(ints(values.ids[:, 1]) - np.arange(k))
+    _write_covariances(writer, values.places)
+    _write_means(writer, values.places)
+    writer.column(ints(values.count))
+    writer.column(ints(values.max_range))
+    _write_viewpoints(writer, ints(values.n_viewpoints), ints(values.seen_from), ints(values.share))
+    for axis in range(dim):
+        writer.column(ints(values.origins[:, axis]))
 
 
-def spatial_order(components: Components) -> Tensor:
-    """An order (K,) of components by place, which saves log₂ K! bits in all, about a byte a component.
-
-    Use it before components are numbered: ids take few bits only if they are consecutive.
-    """
-    places = lattice.nearest(components.means.double().cpu(), components.covariances.double().cpu())
-    return order_of(places).to(components.means.device)
-
-
-def numbered(components: Components, robot: int, first: int) -> Components:
-    """Components with ids for those that have none: (robot, first), (robot, first + 1), …
-
-    New components come last, in their spatial order.
-    """
-    ids, order = _numbering(components.ids, spatial_order(components), robot, first)
-    return replace(components.rearranged(order), ids=ids)
+def _write_covariances(writer: BitWriter, places: Lattice) -> None:
+    writer.column(ints(places.deviation[:, 0]))
+    for axis in range(1, places.dim):
+        writer.column(ints(places.deviation[:, axis - 1] - places.deviation[:, axis]))
+    exponents = ints(shear_exponents(places.deviation))
+    for pair in range(exponents.shape[1]):
+        writer.scaled(ints(places.shear[:, pair]), -exponents[:, pair])
 
 
-def quantize_numbered(components: Components, robot: int, first: int) -> Quantized:
-    """The same as `quantize(numbered(components, robot, first))`, rounding every component once."""
-    values = quantize(components)
-    ids, order = _numbering(values.ids, order_of(values.places), robot, first)
-    return replace(values.reordered(order), ids=ids)
+def _write_means(writer: BitWriter, places: Lattice) -> None:
+    """Writes the cells of a common grid that contain the means, then the place of each mean in its cell."""
+    exponent = cell_exponent(places, in_order=True)
+    cells = cells_of(places, np.array([exponent]))[0]
+    least, extent = box_of(cells)
+    writer.number(exponent)
+    for axis in range(places.dim):
+        writer.number(int(least[axis]))
+        writer.number(int(extent[axis]))
+    writer.column(raster(cells, least, extent))
+    width = np.maximum(exponent - ints(places.world_exponents()), 0)
+    within = ints(places.by_world_axis(places.mean)) & ((np.int64(1) << width) - 1)
+    for axis in range(places.dim):
+        writer.fixed(within[:, axis], width[:, axis])
 
 
-def _numbering(ids: Tensor, by_place: Tensor, robot: int, first: int) -> tuple[Tensor, Tensor]:
-    """Ids (K, 2) after numbering, and the order (K,) of the components: numbered ones, then new ones."""
-    is_new = ids[:, 1] < 0
-    rank = torch.zeros_like(ids[:, 0])
-    rank[by_place] = torch.arange(len(ids), device=ids.device)
-    order = argsort(torch.where(is_new, len(ids) + rank, 0))
-    ids = ids[order].clone()
-    numbers = first + torch.arange(int(is_new.sum()), device=ids.device)
-    ids[len(ids) - len(numbers) :] = torch.stack([torch.full_like(numbers, robot), numbers], 1)
-    return ids, order
+def _write_viewpoints(writer: BitWriter, n_viewpoints: Ints, seen_from: Ints, share: Ints) -> None:
+    """Writes the number of viewpoints of each component, the origin of its first one, the steps from one
+    origin to the next, and the shares."""
+    writer.column(n_viewpoints)
+    is_first = _firsts(n_viewpoints)
+    writer.column(seen_from[is_first])
+    writer.column(np.diff(seen_from, prepend=0)[~is_first])
+    writer.rice_column(share[np.repeat(n_viewpoints, n_viewpoints) > 1])
+
+
+def _firsts(n_viewpoints: Ints) -> NDArray[np.bool_]:
+    """Which viewpoints (E,) are the first of their component."""
+    first = np.zeros(int(n_viewpoints.sum()), np.bool_)
+    first[(np.cumsum(n_viewpoints) - n_viewpoints)[n_viewpoints > 0]] = True
+    return first
+
+
+# -- reading ---------------------------------------------------------------------------------------------
+
+
+def _read_values(reader: BitReader) -> Quantized:
+    """Reads a batch. Raises `DataError` for one that `_write_values` did not write."""
+    dim, k, n_origins = reader.number(), reader.number(), reader.number()
+    if dim not in (2, 3):
+        raise DataError(f"The components are {dim}-dimensional; a map has 2 or 3 dimensions.")
+    if min(k, n_origins) < 0:
+        raise DataError(f"{k} components and {n_origins} origins are announced.")
+    reader.require(max(k * _ORDER_BITS[dim], n_origins))
+    axis_order = _within(reader.fixed(k, _ORDER_BITS[dim]), "axis orders", 0, len(AXIS_ORDERS[dim]) - 1)
+    ids = np.stack([reader.column(k), reader.column(k) + np.arange(k)], 1)
+    places = _read_means(reader, *_read_covariances(reader, axis_order, dim))
+    if not bool(places.is_valid().all()):
+        raise DataError("A mean or a covariance is out of range: it is damaged.")
+    count = _within(reader.column(k), "counts", NO_COUNT, LARGEST_COUNT)
+    max_range = _within(reader.column(k), "max_range flags", 0, 1)
+    n_viewpoints, seen_from, share = _read_viewpoints(reader, k, n_origins)
+    farthest = int(FARTHEST / ORIGIN_STEP)
+    origins = [_within(reader.column(n_origins), "origins", -farthest, farthest) for _ in range(dim)]
+    reader.finish()
+    return Quantized(
+        places=places,
+        count=torch.from_numpy(count),
+        max_range=torch.from_numpy(max_range).bool(),
+        ids=torch.from_numpy(ids),
+        origins=torch.from_numpy(np.stack(origins, 1)),
+        n_viewpoints=torch.from_numpy(n_viewpoints),
+        seen_from=torch.from_numpy(seen_from),
+        share=torch.from_numpy(share),
+    )
+
+
+def _read_covariances(reader: BitReader, axis_order: Ints, dim: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Reads axis orders, deviations and shears."""
+    k = len(axis_order)
+    deviation = [_within(reader.column(k), "deviations", LEAST_DEVIATION, LARGEST_DEVIATION)]
+    for _ in range(1, dim):
+        deviation.append(deviation[-1] - _within(reader.column(k), "deviations", 0, LARGEST_RATIO))
+    steps = torch.from_numpy(np.stack(deviation, 1))
+    exponents = ints(shear_exponents(steps))
+    shear = [reader.scaled(-exponents[:, pair]) for pair in range(exponents.shape[1])]
+    return torch.from_numpy(axis_order), steps, torch.from_numpy(np.stack(shear, 1))
+
+
+def _read_means(reader: BitReader, axis_order: Tensor, deviation: Tensor, shear: Tensor) -> Lattice:
+    k, dim = deviation.shape
+    exponent = reader.number()
+    least, extent = zip(*((reader.number(), reader.number()) for _ in range(dim)), strict=True)
+    # A box of cells may exceed the largest possible map by one cell on each side.
+    reach = 2 * FARTHEST / 2.0**exponent + 2 if abs(exponent) <= LARGEST_SIDE else 0.0
+    if max(map(abs, least + extent)) > reach or min(extent) < 1 or math.prod(extent) >> RASTER_BITS:
+        raise DataError(f"Cells of side 2^{exponent} m, {extent} of them from {least} on: out of range.")
+    number = _within(reader.column(k), "cells", 0, math.prod(extent) - 1)
+    cells = np.empty((k, dim), np.int64)
+    for axis in reversed(range(dim)):
+        number, cells[:, axis] = np.divmod(number, extent[axis])
+    blank = Lattice(axis_order, deviation, shear, torch.zeros_like(deviation))
+    finer = exponent - ints(blank.world_exponents())
+    width, coarser = np.maximum(finer, 0), np.maximum(-finer, 0)
+    mean = (cells + np.array(least)) << width
+    if (mean & ((np.int64(1) << coarser) - 1)).any():
+        raise DataError("A mean lies between the steps of its lattice: it is damaged.")
+    mean >>= coarser
+    for axis in range(dim):
+        mean[:, axis] |= reader.fixed(k, width[:, axis])
+    return replace(blank, mean=torch.from_numpy(mean).gather(1, blank.axes()))
+
+
+def _read_viewpoints(reader: BitReader, k: int, n_origins: int) -> tuple[Ints, Ints, Ints]:
+    n_viewpoints = _within(reader.column(k), "viewpoints", 0, n_origins)
+    reader.require(int(n_viewpoints.sum(dtype=np.float64)) - k)  # shares take at least a bit each
+    is_first = _firsts(n_viewpoints)
+    first = reader.column(int(is_first.sum()))
+    step = np.zeros(len(is_first), np.int64)
+    step[~is_first] = _within(reader.column(int((~is_first).sum())), "steps", -n_origins, n_origins)
+    total = np.cumsum(step)
+    start = first - total[is_first]  # the steps of a component begin at its own first origin
+    seen_from = total + np.repeat(start, n_viewpoints[n_viewpoints > 0])
+    _within(seen_from, "origins seen from", 0, n_origins - 1)
+    several = np.repeat(n_viewpoints, n_viewpoints) > 1
+    share = np.zeros(len(seen_from), np.int64)
+    share[several] = _within(reader.rice_column(int(several.sum())), "shares", 0, LEAST_SHARE)
+    return n_viewpoints, seen_from, share
+
+
+def _within(values: Ints, name: str, least: int, largest: int) -> Ints:
+    """The values, if all are from `least` to `largest`; otherwise raises `DataError`."""
+    if len(values) and not (int(values.min()) >= least and int(values.max()) <= largest):
+        raise DataError(f"The {name} reach from {values.min()} to {values.max()}, not {least} to {largest}.")
+    return values

@@ -83,6 +83,14 @@ class Lattice:
         """log2 (K, D) of a step of the mean, m."""
         return floor_divide(self.deviation, PER_OCTAVE) - PRECISION
 
+    def by_world_axis(self, values: Tensor) -> Tensor:
+        """Values (K, D) of the axes, in the order of the world axes."""
+        return torch.empty_like(values).scatter_(1, self.axes(), values)
+
+    def world_exponents(self) -> Tensor:
+        """`mean_exponents` in the order of the world axes."""
+        return self.by_world_axis(self.mean_exponents())
+
     def taken(self, rows: Tensor) -> Lattice:
         """These rows."""
         return Lattice(self.axis_order[rows], self.deviation[rows], self.shear[rows], self.mean[rows])
@@ -119,7 +127,7 @@ class Lattice:
         axes = self.axes()
         covariances = torch.empty_like(lower)
         covariances[_pairs(axes)] = lower + lower.tril(-1).transpose(1, 2)
-        return torch.empty_like(mean).scatter_(1, axes, mean), covariances
+        return self.by_world_axis(mean), covariances
 
 
 def nearest(means: Tensor, covariances: Tensor) -> Lattice:

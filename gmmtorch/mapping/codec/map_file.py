@@ -21,7 +21,8 @@ from gmmtorch.errors import (
     check_whole,
 )
 from gmmtorch.files import pack_tensors, read_tensors, require, unpack_tensors
-from gmmtorch.mapping.codec.component_batch import batch_bytes, decode, encode, quantize_numbered
+from gmmtorch.mapping.codec.component_batch import batch_bytes, decode, encode
+from gmmtorch.mapping.codec.quantization import quantize_numbered
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import LearningRule, changed_options, rule_facts
 from gmmtorch.mapping.query_options import QueryOptions, check_method

@@ -7,6 +7,7 @@ multiples of 2⁻⁸ m. Every number is rounded by itself, so components can be 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,8 +15,9 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.linalg import argsort
 from gmmtorch.mapping.codec import lattice
-from gmmtorch.mapping.codec.bitstream import Ints
+from gmmtorch.mapping.codec.bitstream import Ints, fewest_bits
 from gmmtorch.mapping.codec.lattice import PER_OCTAVE, Lattice
 from gmmtorch.mapping.components import Components
 from gmmtorch.scan import FARTHEST
@@ -32,6 +34,12 @@ NO_COUNT = LEAST_COUNT - 1
 """The number that encodes a count of zero."""
 COUNT_ERROR = lattice.DEVIATION_ERROR
 """Largest relative error of a count."""
+RASTER_BITS = 60
+"""Largest number of bits of a cell's number in a batch."""
+LARGEST_SIDE = 30
+"""Largest log2 of a cell's side (m); few such cells cover the largest possible map."""
+_SIDES_TRIED = 10
+_WORSE_IN_A_ROW = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +90,7 @@ class Quantized:
     def restored(self) -> Components:
         """The components, float64 on the CPU."""
         means, covariances = self.places.restored()
-        support = torch.where(self.count == NO_COUNT, 0.0, lattice.power(self.count.clamp_min(LEAST_COUNT)))
+        support = points_of(self.count)
         seen_by = torch.from_numpy(np.arange(len(self)).repeat(self.n_viewpoints.numpy()))
         weight = lattice.power(-self.share * (PER_OCTAVE // SHARES_PER_OCTAVE))
         total = support.new_zeros(len(support)).index_add_(0, seen_by, weight)
@@ -108,7 +116,7 @@ def quantize(components: Components) -> Quantized:
     """
     c = components
     places = lattice.nearest(c.means.double().cpu(), c.covariances.double().cpu())
-    count = _count_steps(c.support.double().cpu())
+    count = _support_steps(c.support.double().cpu())
     seen_by, seen_from, seen_count = c.seen_by.cpu(), c.seen_from.cpu(), c.seen_count.double().cpu()
     by, seen, counts = seen_by.numpy(), seen_from.numpy(), seen_count.numpy()
     largest = _largest(seen_count, seen_by, len(c)).numpy()
@@ -136,7 +144,12 @@ def quantize(components: Components) -> Quantized:
     )
 
 
-def _count_steps(support: Tensor) -> Tensor:
+def quantized(components: Components) -> Components:
+    """The result of `decode(encode(components))`, on the components' device, without writing bits."""
+    return quantize(components).restored().to(components.means.device)
+
+
+def _support_steps(support: Tensor) -> Tensor:
     given = support.numpy()
     bad = ~((given >= 0) & (given <= MOST_POINTS))
     if bad.any():
@@ -145,9 +158,19 @@ def _count_steps(support: Tensor) -> Tensor:
             f"support[{first}]={float(support[first])} cannot be stored; it must be from 0 to "
             f"{MOST_POINTS:g}."
         )
+    return count_steps(support)
+
+
+def count_steps(counts: Tensor) -> Tensor:
+    """log2 of counts ≥ 0 in steps, or `NO_COUNT`."""
     least = 2.0 ** (LEAST_COUNT / PER_OCTAVE)
-    steps = (torch.log2(support.clamp_min(least)) * PER_OCTAVE).round().long()
-    return torch.where(support < least / 2, NO_COUNT, steps)
+    steps = (torch.log2(counts.clamp_min(least)) * PER_OCTAVE).round().long()
+    return torch.where(counts < least / 2, NO_COUNT, steps)
+
+
+def points_of(steps: Tensor) -> Tensor:
+    """The inverse of `count_steps`: numbers of points."""
+    return torch.where(steps == NO_COUNT, 0.0, lattice.power(steps.clamp_min(LEAST_COUNT)))
 
 
 def _origin_steps(origins: Tensor) -> Tensor:
@@ -180,3 +203,120 @@ def _first_uses(rows: Ints) -> tuple[Ints, Ints]:
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
     return first[order], rank[which.reshape(-1)]
+
+
+# -- order and numbers -----------------------------------------------------------------------------------
+
+
+def spatial_order(components: Components) -> Tensor:
+    """An order (K,) of components by place, which saves log₂ K! bits in all, about a byte a component.
+
+    Use it before components are numbered: ids take few bits only if they are consecutive.
+    """
+    places = lattice.nearest(components.means.double().cpu(), components.covariances.double().cpu())
+    return order_of(places).to(components.means.device)
+
+
+def numbered(components: Components, robot: int, first: int) -> Components:
+    """Components with ids for those that have none: (robot, first), (robot, first + 1), …
+
+    New components come last, in their spatial order.
+    """
+    ids, order = _numbering(components.ids, spatial_order(components), robot, first)
+    return replace(components.rearranged(order), ids=ids)
+
+
+def quantize_numbered(components: Components, robot: int, first: int) -> Quantized:
+    """The same as `quantize(numbered(components, robot, first))`, rounding every component once."""
+    values = quantize(components)
+    ids, order = _numbering(values.ids, order_of(values.places), robot, first)
+    return replace(values.reordered(order), ids=ids)
+
+
+def _numbering(ids: Tensor, by_place: Tensor, robot: int, first: int) -> tuple[Tensor, Tensor]:
+    """Ids (K, 2) after numbering, and the order (K,) of the components: numbered ones, then new ones."""
+    is_new = ids[:, 1] < 0
+    rank = torch.zeros_like(ids[:, 0])
+    rank[by_place] = torch.arange(len(ids), device=ids.device)
+    order = argsort(torch.where(is_new, len(ids) + rank, 0))
+    ids = ids[order].clone()
+    numbers = first + torch.arange(int(is_new.sum()), device=ids.device)
+    ids[len(ids) - len(numbers) :] = torch.stack([torch.full_like(numbers, robot), numbers], 1)
+    return ids, order
+
+
+# -- cells ----------------------------------------------------------------------------------------------
+
+
+def order_of(places: Lattice) -> Tensor:
+    """The `spatial_order` (K,) of components on the lattice."""
+    cells = cells_of(places, np.array([cell_exponent(places, in_order=False)]))[0]
+    return torch.from_numpy(np.lexsort(cells.T[::-1]))
+
+
+def cells_of(places: Lattice, exponents: Ints) -> Ints:
+    """The cells (T, K, D) that contain the means, for cells of side 2^exponent m with exponents (T,)."""
+    mean, step = ints(places.by_world_axis(places.mean)), ints(places.world_exponents())
+    finer = exponents[:, None, None] - step
+    return np.where(finer >= 0, mean >> np.maximum(finer, 0), mean << np.maximum(-finer, 0))
+
+
+def cell_exponent(places: Lattice, in_order: bool) -> int:
+    """log2 of the side (m) of the cells with which means take the fewest bits, in this order or sorted."""
+    exponents = ints(places.world_exponents())
+    if not len(exponents):
+        return 0
+    rising = np.sort(exponents, axis=None)
+    first = int((rising[(len(rising) - 1) // 2] + rising[len(rising) // 2]) / 2)
+    while True:
+        tried = np.arange(first, min(first + _SIDES_TRIED, LARGEST_SIDE + 1))
+        cells = cells_of(places, tried)
+        least, extent = box_of(cells)
+        if first == LARGEST_SIDE or not _too_many(extent[0]):
+            break
+        first += 1
+    rasters = raster(cells, least, extent)
+    within = np.maximum(tried[:, None, None] - exponents, 0).sum((1, 2))
+    sizes = fewest_bits(rasters if in_order else np.sort(rasters, axis=1)) + within
+    best = 0
+    for row in range(len(tried)):
+        if sizes[row] < sizes[best]:
+            best = row
+        if row - best >= _WORSE_IN_A_ROW:
+            break
+    return int(tried[best])
+
+
+def box_of(cells: Ints) -> tuple[Ints, Ints]:
+    """The lowest cell (…, D) of (…, K, D), and the number of cells on each axis."""
+    if not cells.shape[-2]:
+        shape = (*cells.shape[:-2], cells.shape[-1])
+        return np.zeros(shape, np.int64), np.ones(shape, np.int64)
+    least = cells.min(-2)
+    return least, cells.max(-2) - least + 1
+
+
+def _too_many(extent: Ints) -> bool:
+    """Whether a box (D,) has more cells than `RASTER_BITS` can number."""
+    return bool(math.prod(extent.tolist()) >> RASTER_BITS)
+
+
+def raster(cells: Ints, least: Ints, extent: Ints) -> Ints:
+    """Row-major numbers (…, K) of cells in their box."""
+    number = cells[..., 0] - least[..., None, 0]
+    for axis in range(1, cells.shape[-1]):
+        number = number * extent[..., None, axis] + (cells[..., axis] - least[..., None, axis])
+    return number
+
+
+def world_exponents(places: Lattice) -> Tensor:
+    return places.by_world_axis(places.mean_exponents())
+
+
+def by_world_axis(places: Lattice, values: Tensor) -> Tensor:
+    """Values (K, D), ordered by falling deviation, in the order of the world axes."""
+    return torch.empty_like(values).scatter_(1, places.axes(), values)
+
+
+def ints(values: Tensor) -> Ints:
+    return values.long().numpy()

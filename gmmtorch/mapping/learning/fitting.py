@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gmmtorch.mapping.components import UNNUMBERED, Components
 from gmmtorch.mapping.learning.depth_frame import DepthFrame, pool_frames
-from gmmtorch.mapping.learning.mixture_rule import MixtureRule
+from gmmtorch.mapping.learning.rules import MixtureRule
 from gmmtorch.mapping.learning.viewpoints import AssignedViewpoints, AssignViewpoints
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em import loop

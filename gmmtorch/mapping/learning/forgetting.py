@@ -30,8 +30,7 @@ from gmmtorch.kernels.evidence.beam_passes import PassLimits, beam_passes
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.association import explained_within
 from gmmtorch.mapping.learning.depth_frame import DepthFrame, as_scans
-from gmmtorch.mapping.learning.mixture_rule import CONTRADICTION, FORGET_OFF
-from gmmtorch.mapping.learning.rules import LearningRule
+from gmmtorch.mapping.learning.rules import CONTRADICTION, FORGET_OFF, LearningRule
 from gmmtorch.occupancy.cones import whitening
 from gmmtorch.scan import Scan
 
@@ -58,9 +57,9 @@ class Doubts:
     time: float | None = None
 
     @classmethod
-    def none(cls) -> Doubts:
+    def none(cls, time: float | None = None) -> Doubts:
         """No component is in doubt."""
-        return cls(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0, dtype=torch.float64))
+        return cls(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0, dtype=torch.float64), time)
 
     @classmethod
     def read(cls, state: dict[str, Any]) -> Doubts:

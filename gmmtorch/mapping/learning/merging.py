@@ -137,7 +137,6 @@ def compact_to_bytes(
 
     Raises `InvalidArgumentError` if a single component with one origin is too large.
     """
-    check_whole("max_bytes", max_bytes, 1)
     components = limit_origins(components, max_origins, mean_origins)
     fixed = None
     while len(components) and (taken := size(components)) > max_bytes:

@@ -5,26 +5,27 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args
 
-from gmmtorch.errors import InvalidArgumentError, check_prior, check_resolution, check_whole
-from gmmtorch.mapping.learning.mixture_rule import MixtureRule
+from gmmtorch.errors import (
+    InvalidArgumentError,
+    check_choice,
+    check_number,
+    check_prior,
+    check_resolution,
+    check_whole,
+)
+from gmmtorch.mixture.reduction.prune_options import PruneOptions
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    import torch
-
-    from gmmtorch.mapping.components import Components
     from gmmtorch.mapping.learning.depth_frame import DepthFrame
-    from gmmtorch.mapping.learning.forgetting import Forgetting
-    from gmmtorch.mapping.learning.merging import Size
     from gmmtorch.scan import Scan
+
+FORGET_OFF, CONTRADICTION = "off", "contradiction"
+LearnerName = Literal["flat_pieces", "hierarchical"]
 
 SOFTMAX_DTYPES = ("float32", "float64")
 """Names of the types in which EM can compute exponentials."""
-
-DISTANCE_FOR = ("all", "free_space")
 
 
 @dataclass(frozen=True)
@@ -56,17 +57,50 @@ class NoveltyRule:
     def __post_init__(self) -> None:
         check_resolution(self.resolution)
         check_prior(self.prior)
-        if self.distance_for not in DISTANCE_FOR:
-            raise InvalidArgumentError(
-                f"distance_for={self.distance_for!r} is not one of {', '.join(DISTANCE_FOR)}."
-            )
+        check_choice("distance_for", self.distance_for, ("all", "free_space"))
         for name in ("threshold", "observed", "distance"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise InvalidArgumentError(f"{name}={getattr(self, name)} must be finite, at least zero.")
-        for name in ("cutoff", "explained"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise InvalidArgumentError(f"{name}={value} must be finite, above zero.")
+            check_number(name, getattr(self, name))
+        check_number("cutoff", self.cutoff, above=True)
+        if self.explained is not None:
+            check_number("explained", self.explained, above=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MixtureRule(PruneOptions):
+    """How the mixture of a window is learned. Components of no-return beams are not pruned.
+
+    learner: "flat_pieces", EM that starts from flat pieces; "hierarchical", the leaves of a tree of mixtures
+        (thesis 2.1.2).
+    planarity: the tree does not split a node whose smallest variance is a smaller share of the sum of its
+        variances (2.9). None: it does not split a node that is at most as thick as a flat piece.
+    free_points: points at equal distances on each beam with a return, from which components of free space
+        are learned, as from the ends of no-return beams (thesis 3.5).
+    forget: what leaves the map. "off": nothing. "contradiction": surfaces that later beams pass through, see
+        `mapping.learning.forgetting`. A number: all evidence, with this half-life (s) of the scans' times.
+    """
+
+    learner: LearnerName = "flat_pieces"
+    planarity: float | None = None
+    free_points: int = 0
+    forget: int | float | str = FORGET_OFF
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_choice("learner", self.learner, get_args(LearnerName))
+        if self.planarity is not None:
+            check_number("planarity", self.planarity, largest=1.0, above=True)
+        check_whole("free_points", self.free_points, 0)
+        if self.forget is False:  # YAML reads `off` as False
+            object.__setattr__(self, "forget", FORGET_OFF)
+        if isinstance(self.forget, str | bool):
+            check_choice("forget", self.forget, (FORGET_OFF, CONTRADICTION, "a half-life in seconds"))
+        else:
+            check_number("forget", self.forget, above=True)
+
+    @property
+    def needs_points(self) -> bool:
+        """Whether learning needs the points of depth images, and not only their sums over cells."""
+        return self.learner != "flat_pieces" or self.prune != "none" or self.free_points > 0
 
 
 @dataclass(frozen=True)
@@ -86,7 +120,6 @@ class WindowedRule(MixtureRule):
     """
 
     kind: ClassVar[str] = "windowed"
-    takes_depth: ClassVar[bool] = False
 
     noise: float = 0.01
     length: float = 0.3
@@ -109,28 +142,11 @@ class WindowedRule(MixtureRule):
             check_whole("n_components", self.n_components, 1)
         if self.min_points is not None and not 1 <= self.min_points < math.inf:
             raise InvalidArgumentError(f"min_points={self.min_points} must be at least 1, or null.")
-        if self.dtype not in SOFTMAX_DTYPES:
-            raise InvalidArgumentError(f"dtype={self.dtype!r} is not one of {', '.join(SOFTMAX_DTYPES)}.")
+        check_choice("dtype", self.dtype, SOFTMAX_DTYPES)
 
     def fitted(self, scans: Sequence[Scan | DepthFrame]) -> WindowedRule:
         """The rule itself: none of its options is derived from scans."""
         return self
-
-    def absorb(
-        self,
-        known: Components,
-        scans: Iterable[Scan | DepthFrame],
-        generator: torch.Generator,
-        size: Size,
-        weight: float,
-        forgetting: Forgetting,
-    ) -> Components:
-        """The components of a map with those of one window added. `size` and `weight` are not used."""
-        from gmmtorch.mapping.learning.depth_frame import as_scans
-        from gmmtorch.mapping.learning.windowed import learn_window
-
-        window = as_scans(scans)
-        return forgetting.joined(known, learn_window(window, self, generator), window)
 
 
 @dataclass(frozen=True)
@@ -154,7 +170,6 @@ class IncrementalRule(MixtureRule):
     """
 
     kind: ClassVar[str] = "incremental"
-    takes_depth: ClassVar[bool] = True
 
     noise: float | None = None
     length: float | None = None
@@ -219,26 +234,9 @@ class IncrementalRule(MixtureRule):
             window=window if self.window is None else self.window,
         )
 
-    def absorb(
-        self,
-        known: Components,
-        scans: Iterable[Scan | DepthFrame],
-        generator: torch.Generator,
-        size: Size,
-        weight: float,
-        forgetting: Forgetting,
-    ) -> Components:
-        """The components of a map with scans added and merged, see `incremental.absorb`."""
-        from gmmtorch.mapping.learning.incremental import absorb
-
-        return absorb(known, scans, self, size, weight, forgetting)
-
 
 LearningRule = WindowedRule | IncrementalRule
-"""How scans become components.
-
-`kind` is the rule's name in files, `takes_depth` says whether `GaussianMap.insert_depth` accepts it.
-"""
+"""How scans become components. `kind` is the rule's name in files."""
 
 _RULES: dict[str, type[LearningRule]] = {rule.kind: rule for rule in (WindowedRule, IncrementalRule)}
 

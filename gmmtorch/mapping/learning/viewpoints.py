@@ -111,14 +111,8 @@ def limit_origins(components: Components, max_origins: int, mean_origins: float 
         by, count, seen_from = by[kept], count[kept], seen_from[kept]
     total = count.new_zeros(len(components)).index_add_(0, by, count)
     share = components.support / total.clamp_min(torch.finfo(total.dtype).tiny)
-    used, seen_from = torch.unique(seen_from, return_inverse=True)
-    return replace(
-        components,
-        origins=components.origins[used],
-        seen_by=by,
-        seen_from=seen_from,
-        seen_count=count * share[by],
-    )
+    limited = replace(components, seen_by=by, seen_from=seen_from, seen_count=count * share[by])
+    return limited.with_used_origins()
 
 
 def _kept_viewpoints(components: Components, max_origins: int, mean_origins: float | None) -> Tensor | None:

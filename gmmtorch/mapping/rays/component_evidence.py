@@ -10,11 +10,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.rays.component_casting import (
-    THINNING,
-    Seen,
-    cast_components,
-)
+from gmmtorch.kernels.rays.component_casting import THINNING, Seen, cast_components
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.rays.component_rays import RayDensity, counted_viewpoints, drawn_rays, ray_numbers
 from gmmtorch.occupancy.forms.monte_carlo import RayBundle
@@ -42,11 +38,12 @@ def component_evidence(
     empty_rays_per_cell: float | None = None,
     empty_cutoff: float | None = None,
 ) -> CellEvidence:
-    """Evidence of components in the cells of a box, from their rays: see `component_rays`.
+    """Evidence of components in the cells of a box, from their rays.
 
     Viewpoints whose rays cannot reach the box are skipped, which does not change the result. Rays are
     drawn in portions, which bounds the memory.
 
+    rays_per_cell, least, most, cutoff: see `component_rays`.
     shell: cells. Within this distance of its component's surface a ray adds no misses. Otherwise rays at flat
         angles add misses to the cells that contain the surface, and most cells of a floor become free. 0
         is the thesis's choice.

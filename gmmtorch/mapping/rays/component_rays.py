@@ -1,18 +1,22 @@
-"""Rays drawn from components. A component gets the same rays in every batch, box and order."""
+"""Rays from the sensor origins of components to points drawn from the components (thesis 3.2.3).
+
+A viewpoint gets about `rays_per_cell` rays for each cell that its component hides from the sensor. A Gaussian
+hides the area 4π √|Σ₂| (the inverse of ∫p² of its shadow p), Σ₂ its covariance across the view. Each ray has
+an equal share of the viewpoint's count. End points are the first points of one Sobol sequence, rotated on the
+unit cube by a hash of the component's id (Cranley and Patterson 1976), and transformed to normal draws
+truncated at the radius `cutoff` (deviations). The rays of a component therefore depend only on the component,
+and the rays of several batches can be added or removed one by one.
+"""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
-from gmmtorch.kernels.rays.component_casting import (
-    hidden_area,
-    truncated_normals,
-)
+from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
+from gmmtorch.kernels.rays.component_casting import hidden_area, truncated_normals
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.forms.monte_carlo import RayBundle
@@ -20,41 +24,12 @@ from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.occupancy.voxels.boxes import to_lattice
 
 
-def component_rays(
-    components: Components,
-    resolution: float,
-    *,
-    rays_per_cell: float = 4.0,
-    least: int = 8,
-    most: int = 512,
-    cutoff: float = 2.5,
-) -> RayBundle:
-    """Rays from the sensor origins of components to points drawn from the components (thesis 3.2.3).
-
-    A viewpoint gets about `rays_per_cell` rays for each cell that its component hides from the sensor. A
-    Gaussian hides the area 4π √|Σ₂| (the inverse of ∫p² of its shadow p), Σ₂ its covariance across the view.
-    Each ray has an equal share of the viewpoint's count. End points are the first points of one Sobol
-    sequence, rotated on the unit cube by a hash of the component's id (Cranley and Patterson 1976), and
-    transformed to normal draws truncated at the radius `cutoff` (deviations). The rays of a component
-    therefore depend only on the component, and the rays of several batches can be added or removed one by
-    one.
-
-    Args:
-        components: in 3D. Viewpoints without a count get no rays.
-        resolution: side (m) of the cells.
-        least, most: bounds on the number of rays of a viewpoint.
-
-    Raises `InvalidArgumentError` for components in 2D, or numbers out of range.
-    """
-    density = RayDensity(resolution, rays_per_cell, least, most, cutoff)
-    seen = counted_viewpoints(components, resolution)
-    number = ray_numbers(components, seen, density)
-    return drawn_rays(components, seen, density, number, torch.ones_like(seen))[0]
-
-
 @dataclass(frozen=True)
 class RayDensity:
-    """The density of rays, see `component_rays`."""
+    """The density of rays.
+
+    resolution: side (m) of the cells. least, most: bounds on the number of rays of a viewpoint.
+    """
 
     resolution: float
     rays_per_cell: float
@@ -65,8 +40,7 @@ class RayDensity:
     def __post_init__(self) -> None:
         check_resolution(self.resolution)
         for name in ("rays_per_cell", "cutoff"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise InvalidArgumentError(f"{name}={getattr(self, name)} must be finite, above zero.")
+            check_number(name, getattr(self, name), above=True)
         if check_whole("most", self.most, 1) < check_whole("least", self.least, 1):
             raise InvalidArgumentError(f"most={self.most} must be at least least={self.least}.")
 

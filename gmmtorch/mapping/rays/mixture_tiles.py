@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Hashable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.rays.component_evidence import component_evidence
 from gmmtorch.occupancy.cones import cone_bounds
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
@@ -20,7 +19,6 @@ _MOST_TILES = 4096  # a batch in more tiles is tested in every search
 
 
 class _Batch(NamedTuple):
-    key: Hashable
     components: Components
     low: list[float]  # corners of the box around its rays, metres
     high: list[float]
@@ -40,47 +38,29 @@ class MixtureTiles:
             raise InvalidArgumentError(f"tile={tile} must be finite metres above zero.")
         self.tile = tile
         self._batches: list[_Batch] = []
-        self._keys: set[Hashable] = set()
         self._tiles: dict[tuple[int, ...], list[int]] = {}  # rows of the batches in each cube
         self._everywhere: list[int] = []
 
-    def __len__(self) -> int:
-        return len(self._batches)
-
-    def __contains__(self, key: Hashable) -> bool:
-        return key in self._keys
-
-    def items(self) -> Iterator[tuple[Hashable, Components]]:
-        """All batches, in the order of `add`."""
-        return ((batch.key, batch.components) for batch in self._batches)
-
-    def all(self) -> Components:
-        """All components, in the order of `add`."""
-        return Components.concatenate([batch.components for batch in self._batches] or [Components.empty(3)])
-
-    def add(self, key: Hashable, components: Components) -> None:
-        """Adds a batch. Raises `InvalidArgumentError` for a key that exists, components that are not in 3D,
-        and means, covariances or origins that are not finite."""
-        if key in self._keys:
-            raise InvalidArgumentError(f"key={key!r} already names a batch, and batches do not change.")
+    def add(self, components: Components) -> None:
+        """Adds a batch. Raises `InvalidArgumentError` for components that are not in 3D, and means,
+        covariances or origins that are not finite."""
         if components.dim != 3:
             raise InvalidArgumentError(f"components have {components.dim} dimensions; tiles need 3.")
-        low, high = [0.0] * 3, [0.0] * 3
-        if len(components.seen_by):
-            lows, highs = cone_bounds(components.cones(), _REACH)
-            low, high = lows.amin(0).tolist(), highs.amax(0).tolist()
-            if not all(map(math.isfinite, (*low, *high))):
-                raise InvalidArgumentError(f"The components of key={key!r} hold NaN or infinite values.")
-            spans = self._spans(low, high)
-            if math.prod(map(len, spans)) > _MOST_TILES:
-                self._everywhere.append(len(self._batches))
-            else:
-                for place in itertools.product(*spans):
-                    self._tiles.setdefault(place, []).append(len(self._batches))
-        self._keys.add(key)
-        self._batches.append(_Batch(key, components, low, high))
+        if not len(components.seen_by):
+            return  # it has no rays
+        lows, highs = cone_bounds(components.cones(), _REACH)
+        low, high = lows.amin(0).tolist(), highs.amax(0).tolist()
+        if not all(map(math.isfinite, (*low, *high))):
+            raise InvalidArgumentError("The components of a batch hold NaN or infinite values.")
+        spans = self._spans(low, high)
+        if math.prod(map(len, spans)) > _MOST_TILES:
+            self._everywhere.append(len(self._batches))
+        else:
+            for place in itertools.product(*spans):
+                self._tiles.setdefault(place, []).append(len(self._batches))
+        self._batches.append(_Batch(components, low, high))
 
-    def near(self, box: Box, resolution: float) -> list[tuple[Hashable, Components]]:
+    def near(self, box: Box, resolution: float) -> list[Components]:
         """Batches whose rays may reach a box of cells of side `resolution` (m), in the order of `add`.
 
         Rays must end within three deviations of their means, as those of `component_rays` do.
@@ -98,7 +78,7 @@ class MixtureTiles:
                     found.update(numbers)
         batches = [self._batches[number] for number in sorted(found)]
         return [
-            (batch.key, batch.components)
+            batch.components
             for batch in batches
             if all(a <= d and c <= b for a, b, c, d in zip(batch.low, batch.high, low, high, strict=True))
         ]
@@ -115,13 +95,12 @@ def regenerate(
     sliding: RollingWindow,
     boxes: Iterable[Box],
     tiles: MixtureTiles,
-    evidence: Callable[[Components, float, Box], CellEvidence] = component_evidence,
+    evidence: Callable[[Components, float, Box], CellEvidence],
 ) -> None:
     """Fills empty boxes that the window has uncovered with the evidence of the mixture (thesis Fig 4.2).
 
     Rays are clipped to the boxes, so nothing is counted twice. `evidence(components, resolution, box)`.
     """
     for box in boxes:
-        near = [components for _, components in tiles.near(box, sliding.resolution)]
-        if near:
+        if near := tiles.near(box, sliding.resolution):
             sliding.add(evidence(Components.concatenate(near), sliding.resolution, box))

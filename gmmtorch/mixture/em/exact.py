@@ -77,9 +77,9 @@ def natural_parameters(parameters: Parameters) -> Tensor:
     half_log_det = torch.log(factors.diagonal(dim1=-2, dim2=-1)).sum(-1)
     constant = log_weight - half_log_det - 0.5 * (dim * _LOG_2PI + (linear * means).sum(1))
     rows, cols = triangle_indices(dim, means.device)
-    doubled = means.new_ones(rows.shape[0])
-    doubled[rows == cols] = 0.5  # φ has each off-diagonal product once, for two matrix entries
-    return torch.cat([constant[:, None], linear, -doubled * precision[:, rows, cols]], 1)
+    # φ has each off-diagonal product once, for two matrix entries.
+    quadratic = torch.where(rows == cols, -0.5, -1.0) * precision[:, rows, cols]
+    return torch.cat([constant[:, None], linear, quadratic], 1)
 
 
 def unchecked_expectation(
@@ -118,7 +118,7 @@ def maximization(statistics: Tensor, reg_covar: float, previous: Parameters | No
 
 
 def _keep_empty(new: Parameters, alive: Tensor, previous: Parameters | None) -> Parameters:
-    if previous is None or bool(alive.all()):
+    if previous is None:
         return new
     return Parameters(
         torch.where(alive, new.weights, 0.0),

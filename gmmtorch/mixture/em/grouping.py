@@ -128,16 +128,9 @@ def group_rows(rows: Rows, owner: Tensor, centers: Tensor, dtype: torch.dtype) -
     sums = torch.stack([weight, weight * squared]).view(2, -1, block).sum(2).double()
     owner_of_block = torch.repeat_interleave(torch.arange(k, device=owner.device), blocks)
     mass, spread = sums.new_zeros(2, k).index_add_(1, owner_of_block, sums)
+    blocks_of_features, blocks_of_weights = features.view(-1, block, n_features), weight.view(-1, block)
     return Groups(
-        features.view(-1, block, n_features),
-        weight.view(-1, block),
-        owner_of_block,
-        centers,
-        count,
-        mass,
-        spread,
-        row,
-        slot,
+        blocks_of_features, blocks_of_weights, owner_of_block, centers, count, mass, spread, row, slot
     )
 
 
@@ -230,7 +223,7 @@ def truncated_expectation(
     n_groups, m = candidates.shape
     n_blocks, block, n_features = groups.features.shape
     dtype = groups.features.dtype
-    natural = local_parameters(parameters, groups.centers, candidates).to(dtype)
+    natural = _local_parameters(own, parameters.means, groups.centers, candidates).to(dtype)
     sums = torch.zeros(n_groups, n_features * m, dtype=dtype, device=candidates.device)
     value = torch.zeros((), dtype=torch.float64, device=candidates.device)
     likeliest = torch.empty_like(groups.weight, dtype=torch.int64) if want_owner else None
@@ -274,16 +267,18 @@ def centered_parameters(parameters: Parameters) -> Tensor:
     return natural_parameters(parameters._replace(means=torch.zeros_like(means)))
 
 
-def local_parameters(parameters: Parameters, centers: Tensor, candidates: Tensor) -> Tensor:
-    """Natural parameters (K, m, F) of the candidates (K, m), relative to each group's center (K, D)."""
-    natural = centered_parameters(parameters)
+def _local_parameters(own: Tensor, means: Tensor, centers: Tensor, candidates: Tensor) -> Tensor:
+    """Natural parameters (K, m, F) of the candidates (K, m), relative to each group's center (K, D).
+
+    own (K, F): natural parameters of the components about their own means (K, D).
+    """
     dim = centers.shape[1]
-    doubled = natural[:, 1 + dim :]
-    scale = pack_symmetric(0.5 + 0.5 * torch.eye(dim, dtype=natural.dtype, device=natural.device))
+    doubled = own[:, 1 + dim :]
+    scale = pack_symmetric(0.5 + 0.5 * torch.eye(dim, dtype=own.dtype, device=own.device))
     precision = unpack_symmetric(-2 * doubled * scale, dim)
-    offset = parameters.means[candidates] - centers[:, None]
+    offset = means[candidates] - centers[:, None]
     linear = (precision[candidates] @ offset[..., None]).squeeze(-1)
-    constant = natural[:, 0][candidates] - 0.5 * (linear * offset).sum(-1)
+    constant = own[:, 0][candidates] - 0.5 * (linear * offset).sum(-1)
     return torch.cat([constant[..., None], linear, doubled[candidates]], -1)
 
 

@@ -6,6 +6,7 @@ and the same point given twice therefore give exactly the same start.
 
 from __future__ import annotations
 
+import functools
 import warnings
 from collections.abc import Callable
 
@@ -59,18 +60,11 @@ def from_kmeans(
     return moments_of(quadratic_features(points), weight, labels, n_components, reg_covar, points)
 
 
-def from_kmeans_restarts(
-    points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator
-) -> Parameters:
-    """The moments of the best of ten k-means clusterings."""
-    return from_kmeans(points, weight, n_components, reg_covar, generator, n_init=10)
-
-
 def from_random_points(
     points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator
 ) -> Parameters:
     """Means at distinct random points, drawn by weight; isotropic covariance, uniform weights."""
-    return _isotropic(points[_draw(weight, n_components, generator)], points, weight, reg_covar)
+    return _tiling(points[_draw(weight, n_components, generator)], points, weight, reg_covar)
 
 
 def _draw(weight: Tensor, n: int, generator: torch.Generator) -> Tensor:
@@ -83,7 +77,7 @@ def from_single_points(
     points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator
 ) -> Parameters:
     """Components of one random point each, with variance `reg_covar`: scikit-learn's "random_from_data"."""
-    return _single_points(points[_draw(weight, n_components, generator)], reg_covar)
+    return _isotropic(points[_draw(weight, n_components, generator)], reg_covar)
 
 
 def from_kmeans_plus_plus(
@@ -96,13 +90,7 @@ def from_kmeans_plus_plus(
     means, _ = kmeans_plusplus(
         points.cpu().numpy(), n_components, sample_weight=weight.cpu().numpy(), random_state=seed
     )
-    return _single_points(torch.from_numpy(means).to(points.device), reg_covar)
-
-
-def _single_points(means: Tensor, reg_covar: float) -> Parameters:
-    k, dim = means.shape
-    covariances = (torch.eye(dim, dtype=means.dtype, device=means.device) * reg_covar).repeat(k, 1, 1)
-    return Parameters(means.new_full((k,), 1 / k), means, covariances)
+    return _isotropic(torch.from_numpy(means).to(points.device), reg_covar)
 
 
 def from_random_responsibilities(
@@ -121,18 +109,22 @@ def from_bounding_box(
     """Means uniform in the bounding box; isotropic covariance, uniform weights."""
     low, high = points.amin(0), points.amax(0)
     uniform = torch.rand(n_components, points.shape[1], generator=generator, dtype=torch.float64)
-    return _isotropic(low + (high - low) * uniform.to(points.device), points, weight, reg_covar)
+    return _tiling(low + (high - low) * uniform.to(points.device), points, weight, reg_covar)
 
 
-def _isotropic(means: Tensor, points: Tensor, weight: Tensor, reg_covar: float) -> Parameters:
+def _tiling(means: Tensor, points: Tensor, weight: Tensor, reg_covar: float) -> Parameters:
     """Components with the cloud's mean variance, reduced as if they tile the cloud: σ² K^(−2/D)."""
     n_components, dim = means.shape
     center = (weight[:, None] * points).sum(0) / weight.sum()
     spread = (weight[:, None] * (points - center) ** 2).sum() / weight.sum() / dim
-    variance = spread * n_components ** (-2 / dim) + reg_covar
-    covariances = torch.eye(dim, dtype=means.dtype, device=means.device) * variance
-    weights = means.new_full((n_components,), 1 / n_components)
-    return Parameters(weights, means, covariances.expand(n_components, dim, dim).clone())
+    return _isotropic(means, spread * n_components ** (-2 / dim) + reg_covar)
+
+
+def _isotropic(means: Tensor, variance: Tensor | float) -> Parameters:
+    """Components of equal weight and variance at the means (K, D)."""
+    k, dim = means.shape
+    covariances = (torch.eye(dim, dtype=means.dtype, device=means.device) * variance).repeat(k, 1, 1)
+    return Parameters(means.new_full((k,), 1 / k), means, covariances)
 
 
 def from_flat_pieces(
@@ -229,7 +221,7 @@ def moments_of(
 
 INITIALIZATIONS: dict[str, Initialization] = {
     "kmeans": from_kmeans,
-    "kmeans_restarts": from_kmeans_restarts,
+    "kmeans_restarts": functools.partial(from_kmeans, n_init=10),
     "k-means++": from_kmeans_plus_plus,
     "random": from_random_responsibilities,
     "random_from_data": from_single_points,

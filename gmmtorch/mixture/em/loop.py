@@ -85,49 +85,45 @@ def natural_step(
     If `points` (N, D), the points of the features, are given, a step whose natural parameters would lose
     digits to cancellation uses the direct form instead.
     """
-
     rows = in_spatial_order(features, sample_weight)
+    total = float(sample_weight.sum())
 
     def gather(parameters: Parameters) -> tuple[Tensor, Tensor]:
         return exact.expectation(*rows, exact.natural_parameters(parameters), softmax_dtype)
 
-    total = float(sample_weight.sum())
     if points is not None:
         direct = functools.partial(exact.direct_step, points, sample_weight, reg_covar=reg_covar)
         return guarded_step(gather, direct, reg_covar, total, covariance_type)
-    checked = guarded_step(gather, None, reg_covar, total, covariance_type)
-    unchecked = guarded_step(
-        lambda parameters: exact.unchecked_expectation(*rows, parameters, softmax_dtype),
-        None,
-        reg_covar,
-        total,
-        covariance_type,
-    )
+
+    def maximized(parameters: Parameters, statistics: Tensor, value: Tensor) -> tuple[Parameters, float]:
+        new = of_type(exact.maximization(statistics, reg_covar, parameters), covariance_type)
+        return new, float(value) / total
 
     def step(parameters: Parameters) -> tuple[Parameters, float]:
-        new, bound = unchecked(parameters)
-        return checked(parameters) if math.isnan(bound) else (new, bound)
+        unchecked = exact.unchecked_expectation(*rows, parameters, softmax_dtype)
+        new, bound = maximized(parameters, *unchecked)
+        return maximized(parameters, *gather(parameters)) if math.isnan(bound) else (new, bound)
 
     return step
 
 
 def guarded_step(
     gather: Callable[[Parameters], tuple[Tensor, Tensor]],
-    direct: Callable[[Parameters], tuple[Parameters, Tensor]] | None,
+    direct: Callable[[Parameters], tuple[Parameters, Tensor]],
     reg_covar: float,
     total: float,
     covariance_type: str = "full",
 ) -> Step[Parameters]:
     """EM steps with an E-step `gather`: parameters → S (K, F) and Σ_n p_n log p(x_n). `total` is Σ_n p_n.
 
-    If the natural parameters or S lose digits to cancellation, `direct` takes the step, if it is given.
+    If the natural parameters or S lose digits to cancellation, `direct` takes the step.
     """
 
     def step(parameters: Parameters) -> tuple[Parameters, float]:
-        if direct is None or not exact.is_ill_conditioned(parameters):
+        if not exact.is_ill_conditioned(parameters):
             statistics, value = gather(parameters)
             new = of_type(exact.maximization(statistics, reg_covar, parameters), covariance_type)
-            if direct is None or not exact.has_cancelled(statistics, new):
+            if not exact.has_cancelled(statistics, new):
                 return new, float(value) / total
         new, value = direct(parameters)
         return of_type(new, covariance_type), float(value) / total

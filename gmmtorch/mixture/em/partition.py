@@ -26,6 +26,8 @@ from gmmtorch.linalg import unpack_symmetric
 from gmmtorch.mixture.em.exact import quadratic_features
 
 _MAX_LEVELS = 64
+_MOST_ON_CPU = 1 << 17
+"""Cells of another device that are cut on the CPU: each level of cuts waits for the one before it."""
 _THICKNESS_PRIORITY = 30.0
 """Weight of a piece's smallest variance, relative to its largest, in the priority of halving it. Thick
 pieces span several surfaces, and so put matter into free space (BENCHMARKS.md, "Where EM starts")."""
@@ -100,6 +102,9 @@ def partition(
     """
     n, dim = points.shape
     features = quadratic_features(points) if features is None else features
+    if points.device.type != "cpu" and n <= _MOST_ON_CPU:
+        found = partition(points.cpu(), weight.cpu(), rule, features.cpu())
+        return found._replace(labels=found.labels.to(points.device))
     if is_fused_on(points, weight, features):
         return Partition(*piece_cuts(points, weight, features, _cut_rule(rule)))
     labels = torch.zeros(n, dtype=torch.int64, device=points.device)

@@ -8,8 +8,9 @@ of components. Each group is computed relative to its owner's mean, so that floa
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -32,8 +33,7 @@ from gmmtorch.mixture.em.grouping import (
 from gmmtorch.mixture.em.loop import EMResult, has_converged
 from gmmtorch.mixture.streaming.distributed import SINGLE_PROCESS, Processes
 
-_FIRST_SETS = (2, 3, 3, 4, 4)  # iterations with the same candidates; afterwards _LATER_SETS
-_LATER_SETS = 8
+_FIRST_SETS, _LATER_SETS = (2, 3, 3, 4, 4), 8  # iterations for which each set of candidates is used
 _AVERAGE_ROUNDING, _WORST_ROUNDING = 0.02, 0.2  # nats of float32 error above which float64 is used
 _SAMPLED_OF_A_COMPONENT = 400  # points a component in the random sample that EM starts on
 _MANY_POINTS = 1 << 19  # from this number of points on, EM starts on cells
@@ -110,14 +110,20 @@ def _steps(
     share: float,
 ) -> tuple[Parameters, Parameters | None]:
     """EM's own step and the extrapolated one; the twin of `kernels.mixtures.m_step.fused_steps`."""
-    em_step = _moved(maximization(statistics, reg_covar, _centered(parameters)), parameters.means)
+    centered = parameters._replace(means=torch.zeros_like(parameters.means))
+
+    def maximized(sums: Tensor) -> Parameters:
+        found = maximization(sums, reg_covar, centered)
+        return found._replace(means=found.means + parameters.means)
+
+    em_step = maximized(statistics)
     if last is None:
         return em_step, None
     before = shift_features(last[0], last[1] - parameters.means)
     ahead = statistics + share * (statistics - before)
     trusted = ahead[:, 0] > 0.2 * statistics[:, 0]
     ahead = torch.where(trusted[:, None], ahead, statistics)
-    moved = _moved(maximization(ahead, reg_covar, _centered(parameters)), parameters.means)
+    moved = maximized(ahead)
     thickness, em_thickness = (torch.linalg.eigvalsh(p.covariances)[:, 0] for p in (moved, em_step))
     trusted &= thickness > 0.3 * em_thickness
     weights = torch.where(trusted, moved.weights, em_step.weights)
@@ -126,14 +132,6 @@ def _steps(
         torch.where(trusted[:, None], moved.means, em_step.means),
         torch.where(trusted[:, None, None], moved.covariances, em_step.covariances),
     )
-
-
-def _centered(parameters: Parameters) -> Parameters:
-    return Parameters(parameters.weights, torch.zeros_like(parameters.means), parameters.covariances)
-
-
-def _moved(parameters: Parameters, means: Tensor) -> Parameters:
-    return Parameters(parameters.weights, parameters.means + means, parameters.covariances)
 
 
 # -- the loop -------------------------------------------------------------------------------------
@@ -151,7 +149,7 @@ def run_truncated(
     total = float(settings.processes.sum(rows.weight.sum()[None]))
     momentum = Momentum(settings.reg_covar)
     bounds: list[float] = []
-    lengths = _set_lengths()
+    lengths = itertools.chain(_FIRST_SETS, itertools.repeat(_LATER_SETS))
     sets = new_sets = _candidate_sets(rows, owner, parameters, settings, candidates)
     left, converged, frozen = next(lengths), False, False
     while len(bounds) < settings.max_iter:
@@ -192,8 +190,6 @@ def run_truncated(
 
 def _summed(found: Expectation, processes: Processes) -> tuple[Tensor, float]:
     """Statistics (K, F) and value, summed over all processes."""
-    if processes.size == 1:
-        return found.statistics, found.value
     statistics = found.statistics
     packed = processes.sum(torch.cat([statistics.flatten(), statistics.new_tensor([found.value])]))
     return packed[:-1].view_as(statistics), float(packed[-1])
@@ -274,10 +270,3 @@ def _sample(rows: Rows, n: int) -> Tensor:
     generator = torch.Generator().manual_seed(0)
     chosen = torch.randperm(rows.weight.shape[0], generator=generator)[:n]
     return chosen.sort().values.to(rows.weight.device)
-
-
-def _set_lengths() -> Iterator[int]:
-    """Iterations for which each set of candidates is used."""
-    yield from _FIRST_SETS
-    while True:
-        yield _LATER_SETS

@@ -132,7 +132,8 @@ def ascend(
         values.append(point.value)
         if on_iteration is not None:
             on_iteration(iteration + 1, point.value)
-        if gain == 0 or max(gain, _predicted_gain(point)) < tol:
+        predicted = 0.5 * _dot(point.gradient, point.inverse_hessian * point.gradient)
+        if gain == 0 or max(gain, predicted) < tol:
             return point, values, True
     return point, values, False
 
@@ -164,7 +165,10 @@ def search(point: P, direction: Tensor, slope_left: float) -> tuple[float, P]:
         return best
     low, high, length = 0.0, math.inf, 1.0
     for _ in range(_TRIALS):
-        found = _moved(point, length * direction)
+        try:
+            found = point.move(length * direction)
+        except NumericalError:  # the point cannot be computed
+            found = None
         if found is None or not found.value >= point.value + _ARMIJO * length * slope:
             high = length
         else:
@@ -173,18 +177,6 @@ def search(point: P, direction: Tensor, slope_left: float) -> tuple[float, P]:
                 break
         length = (low + high) / 2 if high < math.inf else 2 * low
     return best
-
-
-def _moved(point: P, tangent: Tensor) -> P | None:
-    """The point for a tangent vector, or None if it cannot be computed."""
-    try:
-        return point.move(tangent)
-    except NumericalError:
-        return None
-
-
-def _predicted_gain(point: Point) -> float:
-    return 0.5 * _dot(point.gradient, point.inverse_hessian * point.gradient)
 
 
 def _dot(a: Tensor, b: Tensor) -> float:

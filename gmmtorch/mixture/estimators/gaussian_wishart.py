@@ -251,12 +251,8 @@ def _expected_moments(
         natural = em.natural_parameters(gaussians)
         natural[:, 0] += log_weight
         sums, value = em.expectation(features, sample_weight, natural, softmax_dtype)
-        found = em.maximization(sums, reg_covar)
-        found = found._replace(weights=sums[:, 0])
-        least = torch.linalg.eigvalsh(found.covariances)[:, 0]
-        second = sums[:, 1:].abs().amax(1) / sums[:, 0].clamp_min(1e-300)
-        has_cancelled = torch.finfo(least.dtype).eps * second > 1e-6 * least
-        if not bool((has_cancelled & (sums[:, 0] > 1e-9)).any()):
+        found = em.maximization(sums, reg_covar)._replace(weights=sums[:, 0])
+        if not em.has_cancelled(sums, found._replace(weights=(sums[:, 0] > 1e-9).to(sums))):
             return found, value
     found, value = em.direct_step(points, sample_weight, unnormalised, reg_covar)
     total = sample_weight.sum()

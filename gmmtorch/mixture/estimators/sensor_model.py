@@ -26,7 +26,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
-from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
 
 _CLOSEST = 1e-3
 """Metres. Nearer readings are treated as at this range, so that noise and density stay finite."""
@@ -73,6 +73,10 @@ class _BeamModel(ABC):
             raise InvalidArgumentError(
                 f"max_incidence={self.max_incidence} must be an angle from 0 to below π/2 radians."
             )
+
+    def _check_above_zero(self, *names: str) -> None:
+        for name in names:
+            check_number(name, getattr(self, name), above=True)
 
     @abstractmethod
     def deviations(self, distance: ArrayLike) -> Deviations:
@@ -130,7 +134,7 @@ class DepthCameraModel(_BeamModel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _above_zero(lateral=self.lateral, pixel_angle=self.pixel_angle)
+        self._check_above_zero("lateral", "pixel_angle")
         a, b, c = self.axial
         # Positive at every range: at 0, at infinity, and at the minimum if that is between them.
         if not (a > 0 and c >= 0 and b > -2 * math.sqrt(a * c) and all(map(math.isfinite, self.axial))):
@@ -166,13 +170,8 @@ class LidarModel(_BeamModel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _above_zero(
-            noise=self.noise,
-            divergence=self.divergence,
-            azimuth_step=self.azimuth_step,
-            elevation_step=self.elevation_step,
-        )
-        _not_negative(proportional_noise=self.proportional_noise)
+        self._check_above_zero("noise", "divergence", "azimuth_step", "elevation_step")
+        check_number("proportional_noise", self.proportional_noise)
 
     def deviations(self, distance: ArrayLike) -> Deviations:
         return _laser(distance, self.noise, self.proportional_noise, self.divergence)
@@ -195,8 +194,8 @@ class LaserModel(_BeamModel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _above_zero(noise=self.noise, divergence=self.divergence, angular_step=self.angular_step)
-        _not_negative(proportional_noise=self.proportional_noise)
+        self._check_above_zero("noise", "divergence", "angular_step")
+        check_number("proportional_noise", self.proportional_noise)
 
     def deviations(self, distance: ArrayLike) -> Deviations:
         return _laser(distance, self.noise, self.proportional_noise, self.divergence)
@@ -273,15 +272,3 @@ def _laser(distance: ArrayLike, noise: float, proportional: float, divergence: f
 def _ranges(distance: ArrayLike) -> Tensor:
     """Ranges (m) of any shape, at least `_CLOSEST`."""
     return as_tensor(distance, "distance").clamp_min(_CLOSEST)
-
-
-def _above_zero(**values: float) -> None:
-    for name, value in values.items():
-        if not 0 < value < math.inf:
-            raise InvalidArgumentError(f"{name}={value} must be above zero and finite.")
-
-
-def _not_negative(**values: float) -> None:
-    for name, value in values.items():
-        if not 0 <= value < math.inf:
-            raise InvalidArgumentError(f"{name}={value} must be at least zero and finite.")

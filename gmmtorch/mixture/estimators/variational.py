@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from numbers import Integral
 from typing import Any, ClassVar
@@ -189,7 +188,7 @@ class VariationalGaussianMixture(MixtureEstimator):
                 tol=self.tol,
                 max_iter=self.max_iter,
                 on_iteration=report,
-                previous_bound=self.lower_bound_ if self._continues() else -math.inf,
+                previous_bound=self._previous_bound(),
             )
 
         best = self._best_start(run, on_iteration)

@@ -119,9 +119,18 @@ def prune(
     kept = support >= min_support
     largest = f"the largest support is {float(support.max()):.4g} points"
     if min_density_share > 0:
-        counts = None if counts is None else as_tensor(counts, "counts").to(means)
-        sensor, origins = _checked(means, sensor, origins, counts)
-        share = density_share(support, parameters, sensor, origins, counts)
+        k, dim = means.shape
+        if dim not in (2, 3):
+            raise InvalidArgumentError(
+                f"min_density_share needs a mixture in 2D or 3D; this one has D = {dim}."
+            )
+        if sensor is None or origins is None:
+            raise InvalidArgumentError("min_density_share needs sensor and origins; pass both.")
+        origins = checked_origins(origins, means)
+        seen = None if counts is None else as_tensor(counts, "counts").to(means)
+        if seen is not None and seen.shape != (k, len(origins)):
+            raise InvalidArgumentError(f"counts has shape {tuple(seen.shape)}; expected {(k, len(origins))}.")
+        share = density_share(support, parameters, sensor, origins, seen)
         kept &= share >= min_density_share
         largest += f", the largest share of the expected density {float(share.max()):.3g}"
     if not bool((kept & (weights > 0)).any()):
@@ -147,20 +156,15 @@ def _as_given_type(mixture: Mixture, remaining: Parameters) -> Mixture:
     return cast(Mixture, pruned)
 
 
-def _checked(
-    means: Tensor, sensor: SensorModel | None, origins: ArrayLike | None, counts: Tensor | None
-) -> tuple[SensorModel, Tensor]:
-    k, dim = means.shape
-    if dim not in (2, 3):
-        raise InvalidArgumentError(f"min_density_share needs a mixture in 2D or 3D; this one has D = {dim}.")
-    if sensor is None or origins is None:
-        raise InvalidArgumentError("min_density_share needs sensor and origins; pass both.")
-    origins = as_tensor(origins, "origins").to(means)
-    if origins.ndim not in (1, 2) or origins.shape[-1] != dim or origins.numel() == 0:
+def checked_origins(origins: ArrayLike, like: Tensor) -> Tensor:
+    """Sensor origins (S, D), given as (D,) or (S, D), in the dtype and on the device of `like` (…, D).
+
+    Raises `InvalidArgumentError` for another shape.
+    """
+    dim = like.shape[-1]
+    found = as_tensor(origins, "origins").to(like)
+    if found.ndim not in (1, 2) or found.shape[-1] != dim or found.numel() == 0:
         raise InvalidArgumentError(
-            f"origins has shape {tuple(origins.shape)}; expected ({dim},) or (S, {dim})."
+            f"origins has shape {tuple(found.shape)}; expected ({dim},) or (S, {dim})."
         )
-    expected = (k, origins.numel() // dim)
-    if counts is not None and tuple(counts.shape) != expected:
-        raise InvalidArgumentError(f"counts has shape {tuple(counts.shape)}; expected {expected}.")
-    return sensor, origins
+    return found.reshape(-1, dim)

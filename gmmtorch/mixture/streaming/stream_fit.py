@@ -7,7 +7,6 @@ that of `GaussianMixture.fit` on the whole cloud, to rounding.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,14 +16,13 @@ import torch
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike
-from gmmtorch.datasets.point_files.point_chunks import PointChunks, in_memory
-from gmmtorch.datasets.point_files.point_survey import Survey
+from gmmtorch.datasets.point_files.point_chunks import PointChunks, Survey, in_memory
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em import loop
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.grouping import Rows, nearest
-from gmmtorch.mixture.em.truncated import Settings, fit_truncated
+from gmmtorch.mixture.em.truncated import fit_truncated
 from gmmtorch.mixture.estimator import MixtureEstimator
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 from gmmtorch.mixture.streaming.checkpoints import Checkpoint, CheckpointWriter
@@ -125,7 +123,6 @@ def fit_stream(
             processes,
             first.center.to(device),
             Parameters(*(value.to(device) for value in first.parameters)),
-            mixture.lower_bound_ if mixture._continues() else -math.inf,
             on_iteration,
         )
         if mixture.algorithm == "truncated":
@@ -199,7 +196,6 @@ class _Run(NamedTuple):
     processes: Processes
     center: Tensor
     first: Parameters
-    previous_bound: float
     on_iteration: Callable[[int, float], None] | None
 
 
@@ -223,7 +219,7 @@ def _exact(
         max_iter=run.mixture.max_iter,
         on_iteration=run.on_iteration,
         lower_bounds=earlier,
-        previous_bound=run.previous_bound,
+        previous_bound=run.mixture._previous_bound(),
     )
     if writer is not None:
         writer.write_if_due(result.parameters, result.lower_bounds, final=True)
@@ -236,18 +232,9 @@ def _truncated(run: _Run) -> loop.EMResult[Parameters]:
     held = [chunk.points.to(center.device) - center for chunk in run.source]
     points = torch.cat(held) if held else center.new_empty(0, run.source.dim)
     del held
-    owner = nearest(points, run.first.means)
-    settings = Settings(
-        float(mixture.reg_covar),
-        mixture.tol,
-        mixture.max_iter,
-        em.SOFTMAX_DTYPES[mixture.dtype],
-        on_iteration=run.on_iteration,
-        processes=run.processes,
-        compiled=bool(mixture.compiled),
-        previous_bound=run.previous_bound,
-    )
-    return fit_truncated(Rows(points, points.new_ones(points.shape[0])), owner, run.first, settings)
+    rows = Rows(points, points.new_ones(points.shape[0]))
+    settings = mixture._settings(run.on_iteration, run.processes)
+    return fit_truncated(rows, nearest(points, run.first.means), run.first, settings)
 
 
 # -- one iteration --------------------------------------------------------------------------------

@@ -7,9 +7,8 @@ from typing import Any
 
 import torch
 
-from gmmtorch.datasets.point_files.point_chunks import PointChunks
-from gmmtorch.datasets.point_files.point_survey import Survey, merge_surveys
-from gmmtorch.datasets.point_files.point_survey import survey as survey_source
+from gmmtorch.datasets.point_files.point_chunks import PointChunks, Survey, merge_surveys
+from gmmtorch.datasets.point_files.point_chunks import survey as survey_source
 from gmmtorch.errors import check_whole
 from gmmtorch.mixture.em.grouping import Rows
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture

@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.occupancy.cone_index import ConeIndex
 from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.forms.point import PointEvidence, PointForm
 from gmmtorch.occupancy.grid import VoxelGrid, check_resolution
-from gmmtorch.occupancy.index.cone_index import ConeIndex
 
 _ENTRIES_PER_CONE = {2: 16, 3: 64}  # fewer than for one map: its lists are made again and again
 _DENSE = 4  # times as many entries, after which the index is made anew

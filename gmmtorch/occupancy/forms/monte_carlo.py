@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple, get_args
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import InvalidArgumentError, check_choice
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.occupancy.cones import Cones
 
@@ -49,8 +49,7 @@ def sample_rays(
     Raises:
         InvalidArgumentError: fewer than one sample, or an unknown kind of sampling.
     """
-    if sampling not in SAMPLINGS:
-        raise InvalidArgumentError(f"sampling={sampling!r} is not one of {', '.join(SAMPLINGS)}.")
+    check_choice("sampling", sampling, SAMPLINGS)
     if n_samples < 1:
         raise InvalidArgumentError(f"n_samples={n_samples} must be at least 1.")
     cones = cones.checked()

@@ -20,9 +20,9 @@ from gmmtorch.kernels.evidence.point_evidence import (
     pair_evidence,
 )
 from gmmtorch.linalg import safe_cholesky
+from gmmtorch.occupancy.cone_index import ConeIndex
 from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.grid import check_resolution
-from gmmtorch.occupancy.index.cone_index import ConeIndex
 from gmmtorch.occupancy.protocol import check_queries
 
 
@@ -63,9 +63,9 @@ class PointBlocks(NamedTuple):
         owner = torch.repeat_interleave(touched, n_blocks)
         return cls(gathered.permute(2, 1, 0).contiguous(), owner, centers, radius, point, slot)
 
-    def chunks(self, index: ConeIndex, chunk_pairs: int) -> Iterator[slice]:
-        """Runs of blocks whose lists together have about `chunk_pairs` entries, or a single block."""
-        chunk = torch.cumsum(index.list_lengths()[self.bucket], 0) // chunk_pairs
+    def chunks(self, index: ConeIndex) -> Iterator[slice]:
+        """Runs of blocks whose lists together have about `CHUNK_PAIRS` entries, or a single block."""
+        chunk = torch.cumsum(index.list_lengths()[self.bucket], 0) // CHUNK_PAIRS
         begin = 0
         for count in torch.unique_consecutive(chunk, return_counts=True)[1].tolist():
             yield slice(begin, begin + count)
@@ -154,9 +154,7 @@ class PointForm:
         entries = None if indexed else 0
         self.index = ConeIndex(cones, self.resolution, cutoff, smoothed=True, entries_per_cone=entries)
 
-    def __call__(
-        self, points: ArrayLike, hit_length: float | None = None, chunk_pairs: int = CHUNK_PAIRS
-    ) -> PointEvidence:
+    def __call__(self, points: ArrayLike, hit_length: float | None = None) -> PointEvidence:
         """Hits and misses at points (M, D), world metres; zero at infinite points.
 
         hit_length: ℓ (m); hits are multiplied by ℓ/h. It recalibrates the evidence of thin surfaces.
@@ -165,7 +163,7 @@ class PointForm:
         query = check_queries(points, self.dim)
 
         def evaluated(part: slice) -> PointEvidence:
-            return self._evaluate(query[part], chunk_pairs)
+            return self._evaluate(query[part])
 
         parts = list(chunked(len(query), _CHUNK_POINTS, evaluated)) or [evaluated(slice(0))]
         hits, misses = parts[0] if len(parts) == 1 else map(torch.cat, zip(*parts, strict=True))
@@ -173,7 +171,7 @@ class PointForm:
             hits = hits * (_check_length(hit_length) / self.resolution)
         return PointEvidence(hits, misses)
 
-    def _evaluate(self, points: Tensor, chunk_pairs: int) -> PointEvidence:
+    def _evaluate(self, points: Tensor) -> PointEvidence:
         bucket = self.index.buckets(points)
         if is_fused(points, self.rows):
             lists = self.index.starts, self.index.entries
@@ -184,9 +182,7 @@ class PointForm:
         if not bool((bucket >= 0).any()):
             return PointEvidence(zeros, zeros.clone())
         blocks = PointBlocks.of(points, bucket, self.index)
-        parts = [
-            self._of_blocks(blocks, part, chunk_pairs) for part in blocks.chunks(self.index, chunk_pairs)
-        ]
+        parts = [self._of_blocks(blocks, part) for part in blocks.chunks(self.index)]
         evidence = torch.cat(parts, 1).flatten(1)[:, blocks.slot]
         hits, misses = (zeros.index_copy(0, blocks.point, values) for values in evidence)
         return PointEvidence(hits, misses)
@@ -198,7 +194,7 @@ class PointForm:
         near = self.index.hulls.near(cone, centers[block], radius[block], self.compiled)
         return block[near], cone[near]
 
-    def _of_blocks(self, blocks: PointBlocks, part: slice, chunk_pairs: int) -> Tensor:
+    def _of_blocks(self, blocks: PointBlocks, part: slice) -> Tensor:
         """Hits and misses (2, b, B) of the blocks in `part`."""
         block, cone = self._near_cones(blocks, part)
         points = blocks.points[..., part]
@@ -206,21 +202,20 @@ class PointForm:
         misses = hits.clone()
         evaluate = compiled_pair_evidence() if self.compiled else pair_evidence
         settings = (self.resolution, self.cutoff, self._table.oblique)
-        n_rows = max(1, chunk_pairs // points.shape[1])
+        n_rows = max(1, CHUNK_PAIRS // points.shape[1])
         for rows, cones in zip(block.split(n_rows), cone.split(n_rows), strict=True):
             hit, miss = evaluate(points, rows, self._table.columns, cones, *settings)
             hits, misses = hits.index_add(0, rows, hit.T), misses.index_add(0, rows, miss.T)
         return torch.stack([hits, misses])
 
-    def visited(self, points: Tensor, chunk_pairs: int = CHUNK_PAIRS) -> float:
+    def visited(self, points: Tensor) -> float:
         """Average number of cones evaluated for each of the points (M, D)."""
         query = check_queries(points, self.dim)
         bucket = self.index.buckets(query)
         if not bool((bucket >= 0).any()):
             return 0.0
         blocks = PointBlocks.of(query, bucket, self.index)
-        parts = blocks.chunks(self.index, chunk_pairs)
-        n_rows = sum(self._near_cones(blocks, part)[0].shape[0] for part in parts)
+        n_rows = sum(self._near_cones(blocks, part)[0].shape[0] for part in blocks.chunks(self.index))
         return n_rows * blocks.points.shape[1] / query.shape[0]
 
 

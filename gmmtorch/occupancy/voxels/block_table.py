@@ -26,10 +26,23 @@ def count_misses(
     the memory limit of the store; the message names a resolution that fits.
     """
     earlier = store.n_blocks
-    table = _Blocks(store, origins, ends)
+    table = _empty_table(store, origins, ends)
     try:
-        table.open_ends(ends)
-        table.count(origins, ends, weights, chunk_visits)
+        block = (store.cells_of(ends).div(store.block_side).floor() - table.low).long()
+        index = (block * torch.tensor(packed_strides(table.bits), device=block.device)).sum(1)
+        touched = torch.zeros_like(table.first, dtype=torch.bool)
+        touched[index] = True
+        table.open(touched.nonzero().squeeze(1))
+        # In cells of the lattice, not relative to the table: the traversal finds the same cells as a query.
+        count_in_blocks(
+            lambda: store.counts[1].view(-1),
+            table,
+            origins.double() / store.resolution,
+            ends.double() / store.resolution,
+            weights,
+            chunk_visits=chunk_visits,
+            compiled=store.compiled,
+        )
     except MemoryLimitError:
         needed = _bytes_needed(store, origins, ends, store.resolution, earlier)
         raise MemoryLimitError(
@@ -39,58 +52,31 @@ def count_misses(
         ) from None
 
 
-class _Blocks:
-    """The box of blocks that rays can touch, and the storage index of the first cell of each."""
-
-    def __init__(self, store: SparseEvidence, origins: Tensor, ends: Tensor) -> None:
-        self.store, side = store, store.block_side
-        starts, stops = store.cells_of(origins), store.cells_of(ends)
-        self.low = torch.minimum(starts.amin(0), stops.amin(0)).div(side).floor()  # (D,) lowest block
-        high = torch.maximum(starts.amax(0), stops.amax(0)).div(side).floor()
-        shape = (high - self.low + 1).long().tolist()
-        self.bits = tuple((n - 1).bit_length() for n in shape)  # of the block coordinate along each axis
-        n_bytes = 8 << sum(self.bits)
-        if n_bytes > store.memory_limit:
-            cells = [n * side for n in shape]
-            fits = store.resolution * (n_bytes / store.memory_limit) ** (1 / store.dim) * 1.02
-            raise MemoryLimitError(
-                f"resolution={store.resolution} m over rays that span {cells} cells needs a table of "
-                f"{n_bytes:,} bytes, above the limit of {store.memory_limit:,}; a resolution of {fits:.3g} m "
-                "or more fits, or set dataset.max_range to drop stray far returns."
-            )
-        store.check_reachable(torch.stack([self.low, high]) * side)
-        self.first = torch.full((1 << sum(self.bits),), -1, device=self.low.device)
-
-    def open_ends(self, ends: Tensor) -> None:
-        """Store the blocks of the ends of rays."""
-        block = (self.store.cells_of(ends).div(self.store.block_side).floor() - self.low).long()
-        index = (block * torch.tensor(packed_strides(self.bits), device=block.device)).sum(1)
-        touched = torch.zeros_like(self.first, dtype=torch.bool)
-        touched[index] = True
-        self._open(touched.nonzero().squeeze(1))
-
-    def _open(self, index: Tensor) -> None:
-        """Store blocks (M,) of the table, distinct, and enter the storage index of their first cells."""
-        size = torch.tensor([1 << width for width in self.bits], device=index.device)
-        blocks = index[:, None] // torch.tensor(packed_strides(self.bits), device=index.device) % size
-        cells = (blocks + self.low.long()) * self.store.block_side
-        self.first[index] = self.store.open_blocks(self.store.block_keys(self.store.columns(cells)))
-
-    def count(self, origins: Tensor, ends: Tensor, weights: Tensor | None, chunk_visits: int) -> None:
-        """Add the misses."""
-        store = self.store
-        # In cells of the lattice, not relative to the table: the traversal finds the same cells as a query.
-        starts, stops = origins.double() / store.resolution, ends.double() / store.resolution
-        table = BlockTable(self.first, self.low, self.bits, store.local_bits, self._open)
-        count_in_blocks(
-            lambda: store.counts[1].view(-1),
-            table,
-            starts,
-            stops,
-            weights,
-            chunk_visits=chunk_visits,
-            compiled=store.compiled,
+def _empty_table(store: SparseEvidence, origins: Tensor, ends: Tensor) -> BlockTable:
+    """The table of the box of blocks that rays can touch. It opens blocks in the store."""
+    side = store.block_side
+    cells = torch.cat([store.cells_of(origins), store.cells_of(ends)])
+    low, high = (corner.div(side).floor() for corner in (cells.amin(0), cells.amax(0)))
+    shape = (high - low + 1).long().tolist()
+    bits = tuple((n - 1).bit_length() for n in shape)
+    n_bytes = 8 << sum(bits)
+    if n_bytes > store.memory_limit:
+        fits = store.resolution * (n_bytes / store.memory_limit) ** (1 / store.dim) * 1.02
+        raise MemoryLimitError(
+            f"resolution={store.resolution} m over rays that span {[n * side for n in shape]} cells needs a "
+            f"table of {n_bytes:,} bytes, above the limit of {store.memory_limit:,}; a resolution of "
+            f"{fits:.3g} m or more fits, or set dataset.max_range to drop stray far returns."
         )
+    store.check_reachable(torch.stack([low, high]) * side)
+    first = torch.full((1 << sum(bits),), -1, device=low.device)
+
+    def open_blocks(index: Tensor) -> None:
+        size = torch.tensor([1 << width for width in bits], device=index.device)
+        blocks = index[:, None] // torch.tensor(packed_strides(bits), device=index.device) % size
+        cells = (blocks + low.long()) * side
+        first[index] = store.open_blocks(store.block_keys(store.columns(cells)))
+
+    return BlockTable(first, low, bits, store.local_bits, open_blocks)
 
 
 def _bytes_needed(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -69,9 +70,22 @@ def to_lattice(points: ArrayLike, resolution: float, name: str = "points") -> Te
     return units
 
 
-def flat_index(local: Tensor, shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
-    """Row-major index (C,) of cells (C, 3) in a block of `shape`, 0 outside, and whether each is inside."""
-    nx, ny, nz = shape
-    x, y, z = local.unbind(1)
-    inside = (x >= 0) & (x < nx) & (y >= 0) & (y < ny) & (z >= 0) & (z < nz)
-    return torch.where(inside, (x * ny + y) * nz + z, 0), inside
+def row_major(columns: Sequence[Tensor], shape: tuple[int, ...]) -> Tensor:
+    """Index (C,) of cells in an array of `shape`, from their coordinates (C,) along each axis."""
+    index = columns[0]
+    for column, n in zip(columns[1:], shape[1:], strict=True):
+        index = index * n + column
+    return index
+
+
+def flat_index(cells: Tensor, shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+    """`row_major` index (C,) of cells (C, D), 0 outside, and whether each is inside (C,).
+
+    The cells can be of a floating type, with NaN and infinite coordinates, which are outside.
+    """
+    columns = cells.unbind(1)
+    inside = torch.ones_like(columns[0], dtype=torch.bool)
+    # One comparison for each axis: reductions over a dimension of three are slow.
+    for column, n in zip(columns, shape, strict=True):
+        inside &= (column >= 0) & (column < n)
+    return torch.where(inside, row_major(columns, shape), 0).long(), inside

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -12,9 +11,8 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import MemoryLimitError
 from gmmtorch.kernels.rays.ray_counting import count_in_grid
-from gmmtorch.kernels.rays.ray_traversal import Visits, traverse
 from gmmtorch.occupancy.grid import BYTES_PER_CELL, MEMORY_LIMIT
-from gmmtorch.occupancy.voxels.boxes import Box, flat_index, to_lattice
+from gmmtorch.occupancy.voxels.boxes import Box, flat_index, intersection, to_lattice
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 
 _CHUNK_VISITS = 1 << 16  # fastest when cores share a cache
@@ -83,8 +81,8 @@ def cast_evidence(
 class RaysInBox(NamedTuple):
     """Rays through a box of cells.
 
-    window: the part of the box that the rays span. block: the cells that the visits number, row-major: the
-    window, or the window with a margin of one cell. starts, stops: (r, 3) in cells, cut near the window. low:
+    window: the part of the box that the rays span. block: the cells in which rays are counted: the window,
+    or the window with a margin of one cell. starts, stops: (r, 3) in cells, cut near the window. low:
     (3,) lowest cell of the block, None if the coordinates are relative to it. ray: (r,) indices of the rays
     given, None if these are all.
     """
@@ -95,11 +93,6 @@ class RaysInBox(NamedTuple):
     stops: Tensor
     low: Tensor | None
     ray: Tensor | None
-
-    def visits(self) -> Iterator[Visits]:
-        """The cells of the block that the rays leave."""
-        for visit in traverse(self.starts, self.stops, self.block.shape, _CHUNK_VISITS, low=self.low):
-            yield visit if self.ray is None else Visits(visit.voxel, self.ray[visit.ray])
 
     def count_rays(self, weights: Tensor) -> Tensor:
         """The sum (cells,) float64 of the weights (R,) of the rays that leave each cell of the block."""
@@ -134,8 +127,8 @@ def rays_in_box(
     places = [x for x in (starts, stops, others) if x is not None and len(x)]
     corners = torch.stack([x.amin(0) for x in places] + [x.amax(0) for x in places]).floor().long()
     lowest, highest = corners.amin(0), corners.amax(0) + 1
-    window = Box(torch.maximum(lowest, box.low), torch.minimum(highest, box.high))
-    if bool((window.low >= window.high).any()):
+    window = intersection(Box(lowest, highest), box)
+    if window is None:
         return None
     stops = stops if until is None else until
     if torch.equal(window.low, lowest) and torch.equal(window.high, highest):

@@ -54,9 +54,7 @@ class SparseEvidence(SparseLattice):
         self._bounds: tuple[Tensor | None, Box | None, Tensor | None] = (None, None, None)
         if box is not None:
             self._check_box(box)
-        self._slots = torch.empty(
-            0, dtype=torch.int64, device=device
-        )  # of the blocks, in the order of `keys`
+        self._slots = torch.empty_like(self.keys)  # of the blocks, in the order of `keys`
         self.counts = torch.zeros(2, 1, self.cells_per_block, dtype=dtype, device=device)
         """Hits and misses (2, slots, cells). Slot 0 stays empty; cells that are not stored read it."""
 

@@ -18,6 +18,7 @@ from torch import Tensor
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.kernels.rays.ray_traversal import row_major_strides
 from gmmtorch.linalg import ragged_index
+from gmmtorch.occupancy.culling import cells_in_chunks
 from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.occupancy.voxels.boxes import Box
 
@@ -75,7 +76,10 @@ def _cells_met(corners: Tensor, size: Tensor) -> Iterator[Tensor]:
     above = corners[:, 0, 2] - (slope * corners[:, 0, :2]).sum(1)
     spread = slope.abs().sum(1) / 2 + _NUDGE
     floor, ceiling = corners[:, :, 2].amin(1), corners[:, :, 2].amax(1)
-    for triangle, column in _columns(corners, size):
+    first = corners[:, :, :2].amin(1).floor().clamp_min(0).long()
+    last = torch.minimum(corners[:, :, :2].amax(1).floor(), size[:2] - 1).long()
+    for triangle, columns in cells_in_chunks(first, (last - first + 1).clamp_min(0), _CHUNK):
+        column = columns.T.double()
         center = column + 0.5
         height = above[triangle] + (slope[triangle] * center).sum(1)
         reach = torch.where(flat[triangle], torch.inf, spread[triangle])
@@ -97,18 +101,3 @@ def _slabs(corners: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     along = torch.einsum("tad,tcd->tac", axes, corners)
     reach = _HALF * axes.abs().sum(2)
     return axes, along.amin(2) - reach, along.amax(2) + reach
-
-
-def _columns(corners: Tensor, size: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-    """Chunks of triangles (P,) and the columns (P, 2) of cells in their bounding rectangles."""
-    first = corners[:, :, :2].amin(1).floor().clamp_min(0)
-    last = torch.minimum(corners[:, :, :2].amax(1).floor(), size[:2] - 1)
-    span = (last - first + 1).clamp_min(0).long()
-    stop = (span[:, 0] * span[:, 1]).cumsum(0)
-    total = int(stop[-1]) if len(stop) else 0
-    for begin in range(0, total, _CHUNK):
-        place = torch.arange(begin, min(begin + _CHUNK, total), device=corners.device)
-        triangle = torch.searchsorted(stop, place, right=True)
-        index = place - (stop - span[:, 0] * span[:, 1])[triangle]
-        width = span[triangle, 1]
-        yield triangle, first[triangle] + torch.stack([index // width, index % width], 1)

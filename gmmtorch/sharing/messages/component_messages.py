@@ -18,8 +18,16 @@ from gmmtorch.mapping.codec.quantization import MOST_POINTS, ORIGIN_STEP, Quanti
 from gmmtorch.mapping.codec.thesis_message import FARTHEST as THESIS_FARTHEST
 from gmmtorch.mapping.codec.thesis_message import decode_thesis, encode_thesis
 from gmmtorch.mapping.components import Components
-from gmmtorch.sharing.messages.envelope import FARTHEST, MAX_BYTES, Kind, check_codec, make_datagram, split
-from gmmtorch.sharing.messages.fields import LARGEST_NUMBER, check_places
+from gmmtorch.sharing.messages.envelope import (
+    FARTHEST,
+    LARGEST_NUMBER,
+    MAX_BYTES,
+    Kind,
+    check_codec,
+    check_places,
+    make_datagram,
+    split,
+)
 
 MOST_COMPONENTS_SENT = 1024
 """Components, and viewpoints of them, in a datagram, as a receiver may cast hundreds of rays for each. A
@@ -39,15 +47,12 @@ class ComponentsMessage:
     components: Components
 
 
-def encode_components(
-    components: Components, codec: str = "quantized", max_bytes: int = MAX_BYTES
-) -> list[bytes]:
+def encode_components(components: Components, codec: str = "quantized") -> list[bytes]:
     """Datagrams of components in order, each with the sensor origins that it needs; empty without components.
 
     Args:
         codec: "quantized": 8 to 10 bytes per component, rounded as `mapping.codec.quantized` does.
             "float": float64, unchanged. "thesis": 57 bytes for each component and sensor origin.
-        max_bytes: largest size of a datagram.
 
     Raises `InvalidArgumentError` for values that the codec cannot store, for positions beyond
     `envelope.FARTHEST`, and for a component with so many sensor origins that it does not fit into a datagram.
@@ -58,12 +63,13 @@ def encode_components(
     write = {"quantized": _quantized, "float": _float, "thesis": _thesis}[check_codec(codec)]
 
     def part(begin: int, end: int) -> bytes:
-        return write(_part(components, begin, end))
+        rows = torch.arange(begin, end, device=components.means.device)
+        return write(components.selected(rows).with_used_origins())
 
     def is_allowed(begin: int, end: int) -> bool:
         return max(end - begin, so_far[end] - so_far[begin]) <= MOST_COMPONENTS_SENT
 
-    return split(len(components), part, "component", max_bytes, is_allowed)
+    return split(len(components), part, "component", is_allowed=is_allowed)
 
 
 def fitted(values: Quantized, max_bytes: int = MAX_BYTES) -> Iterator[tuple[bytes, Quantized]]:
@@ -94,23 +100,6 @@ def fitted(values: Quantized, max_bytes: int = MAX_BYTES) -> Iterator[tuple[byte
                 f"A single component takes {len(datagram)} bytes; a datagram has room for {max_bytes}. "
                 "Give it fewer sensor origins."
             )
-
-
-def _part(components: Components, begin: int, end: int) -> Components:
-    """Components begin … end − 1, with viewpoints in their order, and the origins that they use."""
-    c = components
-    kept = ((c.seen_by >= begin) & (c.seen_by < end)).nonzero().squeeze(1)
-    kept = kept[torch.argsort(c.seen_by[kept], stable=True)]
-    used, seen_from = torch.unique(c.seen_from[kept], return_inverse=True)
-    rows = {n: getattr(c, n)[begin:end] for n in ("means", "covariances", "support", "max_range", "ids")}
-    return replace(
-        c,
-        **rows,
-        origins=c.origins[used],
-        seen_by=c.seen_by[kept] - begin,
-        seen_from=seen_from,
-        seen_count=c.seen_count[kept],
-    )
 
 
 def _quantized(components: Components) -> bytes:

@@ -11,12 +11,16 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Ints
-from gmmtorch.mapping.codec.lattice import PER_OCTAVE, power
-from gmmtorch.mapping.codec.quantization import LARGEST_COUNT, LEAST_COUNT, MOST_POINTS, NO_COUNT
+from gmmtorch.mapping.codec.quantization import (
+    LARGEST_COUNT,
+    MOST_POINTS,
+    NO_COUNT,
+    count_steps,
+    points_of,
+)
 from gmmtorch.mapping.codec.thesis_message import decode_thesis_updates, encode_thesis_updates
-from gmmtorch.sharing.messages.envelope import Kind, check_codec, make_datagram, split
+from gmmtorch.sharing.messages.envelope import LARGEST_NUMBER, Kind, check_codec, make_datagram, split
 from gmmtorch.sharing.messages.fields import (
-    LARGEST_NUMBER,
     check_ids,
     id_order,
     read_ids,
@@ -65,7 +69,7 @@ def _quantized_counts(sender: int, ids: Tensor, counts: Tensor) -> bytes:
     writer = BitWriter()
     write_number(writer, "sender", sender)
     write_ids(writer, ids.numpy())
-    writer.column(count_steps(counts))
+    writer.column(count_steps(counts).numpy())
     return make_datagram(Kind.COUNTS, writer.to_bytes())
 
 
@@ -77,19 +81,11 @@ def read_quantized_counts(body: bytes) -> CountsMessage:
     return _counts(sender, ids, counts_of(steps))
 
 
-def count_steps(counts: Tensor) -> Ints:
-    """log2 of the counts in steps, as `mapping.codec.quantization` rounds the support of components."""
-    least = 2.0 ** (LEAST_COUNT / PER_OCTAVE)
-    steps = (torch.log2(counts.clamp_min(least)) * PER_OCTAVE).round().long()
-    return torch.where(counts < least / 2, NO_COUNT, steps).numpy()
-
-
 def counts_of(steps: Ints) -> np.ndarray:
-    """The inverse of `count_steps`. Raises `DataError` for steps out of range."""
+    """The numbers of points of `count_steps`. Raises `DataError` for steps out of range."""
     if len(steps) and not NO_COUNT <= int(steps.min()) <= int(steps.max()) <= LARGEST_COUNT:
         raise DataError(f"Counts reach from {steps.min()} to {steps.max()} steps: it is damaged.")
-    counts = power(torch.from_numpy(np.maximum(steps, LEAST_COUNT))).numpy()
-    return np.where(steps == NO_COUNT, 0.0, counts)
+    return points_of(torch.from_numpy(steps)).numpy()
 
 
 def _float_counts(sender: int, ids: Tensor, counts: Tensor) -> bytes:

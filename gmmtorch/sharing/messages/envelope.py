@@ -1,4 +1,4 @@
-"""The header of all datagrams: a first byte with version and kind. At most 1200 bytes, and a checksum."""
+"""What all datagrams have in common: a first byte with version and kind, a checksum, and limits."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import itertools
 import zlib
 from collections.abc import Callable, Sequence
 from enum import IntEnum
+
+from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 
@@ -15,6 +17,8 @@ MAX_BYTES = 1200
 FARTHEST = 2.0**24
 """Largest coordinate (m) of a position in a message: 16 777 km, so that UTM and earth-centred coordinates
 fit. Moved by a correction, positions stay within 2³² cells of 2 cm, where rays can be cast."""
+LARGEST_NUMBER = (1 << 60) - 1
+"""Largest robot id, and largest number of anything that a robot counts."""
 CODECS = ("quantized", "float", "thesis")
 """Encodings of components and counts."""
 _KIND_BITS = 4
@@ -64,15 +68,23 @@ def parse_datagram(datagram: bytes) -> tuple[Kind, bytes]:
             f"The datagram is of version {version}; this gmmtorch reads version {VERSION}. It is foreign or "
             "damaged, or gmmtorch must be updated on one of the robots."
         )
-    if number not in {int(kind) for kind in Kind}:
-        raise DataError(f"The datagram has the unknown kind {number}: it is foreign or damaged.")
-    kind = Kind(number)
+    try:
+        kind = Kind(number)
+    except ValueError as error:
+        raise DataError(f"The datagram has the unknown kind {number}: it is foreign or damaged.") from error
     if kind in OWN_CHECKSUM:
         return kind, datagram[1:]
     data, checksum = datagram[:-_CHECKSUM_BYTES], datagram[-_CHECKSUM_BYTES:]
     if len(datagram) <= _CHECKSUM_BYTES or zlib.crc32(data) != int.from_bytes(checksum, "little"):
         raise DataError("The datagram does not match its checksum: it is truncated or damaged.")
     return kind, data[1:]
+
+
+def check_datagram(datagram: bytes, least: int = 0) -> None:
+    """Raise `InvalidArgumentError` unless a datagram is bytes, from `least` to `MAX_BYTES`."""
+    if not isinstance(datagram, bytes) or not least <= len(datagram) <= MAX_BYTES:
+        what = f"{len(datagram)} bytes" if isinstance(datagram, bytes) else type(datagram).__name__
+        raise InvalidArgumentError(f"A datagram is {what}; it must be bytes, from {least} to {MAX_BYTES}.")
 
 
 def split(
@@ -116,3 +128,16 @@ def check_codec(codec: str) -> str:
     if codec not in CODECS:
         raise InvalidArgumentError(f"codec={codec!r} must be one of {', '.join(CODECS)}.")
     return codec
+
+
+def check_places(name: str, places: Tensor, farthest: float = FARTHEST) -> Tensor:
+    """The positions (N, D), m; raises `InvalidArgumentError` unless all coordinates are at most
+    `farthest`."""
+    bad = ~(places.abs() <= farthest).all(1)
+    if bool(bad.any()):
+        first = int(bad.nonzero()[0])
+        raise InvalidArgumentError(
+            f"{name}[{first}] is {places[first].tolist()}; positions must be finite, and up to "
+            f"{farthest:g} m on each axis. Is it in metres, and the world's origin near?"
+        )
+    return places

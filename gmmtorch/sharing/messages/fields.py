@@ -1,30 +1,22 @@
-"""Fields of several messages in a bit stream: sets of ids and keys, intervals, poses and times."""
+"""Fields of several messages in a bit stream: sets of ids and keys, intervals, numbers and rigid motions."""
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
+from gmmtorch.linalg import check_rigid
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Ints
-from gmmtorch.sharing.messages.envelope import FARTHEST
+from gmmtorch.sharing.messages.envelope import FARTHEST, LARGEST_NUMBER
 from gmmtorch.sharing.replica.record_keys import END, MOST_RECORDS, NUMBER_BITS, Intervals, authors
 
-LARGEST_NUMBER = (1 << 60) - 1
-"""Largest robot id, and largest number of anything that a robot counts."""
-STEPS_PER_METRE = 100
-"""Positions are whole centimetres."""
-YAW_STEPS = 256
-"""Steps of a full turn."""
-TICKS = 1000
-"""Times are whole milliseconds."""
-LATEST = 1e9
-"""Latest time (s)."""
 _LEAST_BITS = 8  # of a number in the stream
-_FARTHEST_STEP = FARTHEST * STEPS_PER_METRE
+_NUMBERS = {2: 4, 3: 7}
+"""Numbers of a rigid motion: in 2D a translation with cos and sin of the yaw; in 3D a translation with a unit
+quaternion x, y, z, w; metres."""
+_UNIT = 1e-9
 
 
 def check_ids(name: str, ids: Tensor) -> Tensor:
@@ -121,85 +113,9 @@ def read_intervals(reader: BitReader, begin: int, end: int) -> Intervals:
     return Intervals(np.array(edges[1:], np.int64))
 
 
-def quantized_poses(poses: Tensor) -> Tensor:
-    """Poses (N, 4) as messages round them: to 1 cm and 1/256 of a turn, yaw in [−π, π)."""
-    return _poses(pose_steps("poses", poses))
-
-
-def pose_steps(name: str, poses: Tensor) -> Ints:
-    """Poses (N, 4) in steps, yaw from 0 to 255."""
-    if poses.ndim != 2 or poses.shape[1] != 4:
-        raise InvalidArgumentError(f"{name} has shape {tuple(poses.shape)}; expected (N, 4): x, y, z, yaw.")
-    rows = poses.detach().double().cpu()
-    bad = ~((rows[:, :3].abs() <= FARTHEST).all(1) & rows[:, 3].isfinite())
-    if bool(bad.any()):
-        first = int(bad.nonzero()[0])
-        raise InvalidArgumentError(
-            f"{name}[{first}] is {rows[first].tolist()}; positions reach {FARTHEST:g} m, and yaw is finite."
-        )
-    scaled = rows * rows.new_tensor([STEPS_PER_METRE] * 3 + [YAW_STEPS / (2 * math.pi)])
-    scaled[:, 3] = scaled[:, 3].remainder(YAW_STEPS)
-    steps = scaled.round().long().numpy()
-    steps[:, 3] %= YAW_STEPS
-    return steps
-
-
-def write_poses(writer: BitWriter, steps: Ints) -> None:
-    """Write unrelated poses (N, 4) as four columns."""
-    for axis in range(4 if len(steps) else 0):
-        writer.column(steps[:, axis])
-
-
-def read_poses(reader: BitReader, n: int) -> Tensor:
-    """Poses (n, 4). Columns may take no bits at all, so the caller must bound n."""
-    steps = np.zeros((n, 4), np.int64)
-    for axis in range(4 if n else 0):
-        steps[:, axis] = reader.column(n)
-    return _checked_poses(steps)
-
-
-def write_path(writer: BitWriter, steps: Ints) -> None:
-    """Write poses (S, 4) along a path: the first, then four columns of the steps from each pose to the next.
-
-    At constant speed and turn rate the steps are nearly equal.
-    """
-    for axis in range(4 if len(steps) else 0):
-        ways = np.diff(steps[:, axis])
-        if axis == 3:  # the shorter direction
-            ways = (ways + YAW_STEPS // 2) % YAW_STEPS - YAW_STEPS // 2
-        writer.number(int(steps[0, axis]))
-        writer.column(ways)
-
-
-def read_path(reader: BitReader, n: int) -> Tensor:
-    """Poses (n, 4) of a path. The caller must bound n, as in `read_poses`."""
-    steps = np.zeros((n, 4), np.int64)
-    for axis in range(4 if n else 0):
-        ways = np.concatenate([np.array([reader.number()], np.int64), reader.column(n - 1)])
-        if float(np.abs(ways.astype(np.float64)).sum()) > _FARTHEST_STEP * 2 * n:
-            raise DataError("A path leaves the world: it is damaged.")
-        steps[:, axis] = np.cumsum(ways)
-    return _checked_poses(steps)
-
-
-def ticks(name: str, seconds: Tensor) -> Ints:
-    """Times (N,) in milliseconds, of times in seconds."""
-    times = seconds.detach().double().cpu()
-    if times.ndim != 1 or not bool((times.abs() <= LATEST).all()):
-        raise InvalidArgumentError(f"{name} must be a row of times (s) of at most {LATEST:g}, and finite.")
-    return (times * TICKS).round().long().numpy()
-
-
-def seconds_of(steps: Ints) -> Tensor:
-    """Times (N,) in seconds, of times in milliseconds."""
-    if len(steps) and int(np.abs(steps).max()) > LATEST * TICKS:
-        raise DataError(f"Times are later than {LATEST:g} s: it is damaged.")
-    return torch.from_numpy(steps.astype(np.float64) / TICKS)
-
-
 def write_number(writer: BitWriter, name: str, value: int) -> None:
     """Write a robot id, or another whole number ≥ 0."""
-    writer.number(_check_number(name, value))
+    writer.number(check_whole(name, value, 0, LARGEST_NUMBER))
 
 
 def read_number(reader: BitReader) -> int:
@@ -210,33 +126,62 @@ def read_number(reader: BitReader) -> int:
     return value
 
 
-def check_places(name: str, places: Tensor, farthest: float = FARTHEST) -> Tensor:
-    """The positions (N, D), m; raises `InvalidArgumentError` unless all coordinates are at most
-    `farthest`."""
-    bad = ~(places.abs() <= farthest).all(1)
-    if bool(bad.any()):
-        first = int(bad.nonzero()[0])
-        raise InvalidArgumentError(
-            f"{name}[{first}] is {places[first].tolist()}; positions must be finite, and up to "
-            f"{farthest:g} m on each axis. Is it in metres, and the world's origin near?"
-        )
-    return places
+def motion_dim(pose: Tensor) -> int:
+    """2 or 3."""
+    return {n: dim for dim, n in _NUMBERS.items()}[len(pose)]
 
 
-def _check_number(name: str, value: int) -> int:
-    if check_whole(name, value, 0) > LARGEST_NUMBER:
-        raise InvalidArgumentError(f"{name}={value} must be at most {LARGEST_NUMBER}.")
-    return int(value)
+def is_motion(pose: Tensor) -> bool:
+    """Whether it is a valid pose."""
+    for dim, n in _NUMBERS.items():
+        if pose.shape == (n,):
+            near = bool((pose[:dim].abs() <= FARTHEST).all())
+            return near and abs(float(pose[dim:].norm()) - 1) <= _UNIT
+    return False
 
 
-def _checked_poses(steps: Ints) -> Tensor:
-    if len(steps) and int(np.abs(steps[:, :3]).max()) > _FARTHEST_STEP:
-        raise DataError(f"Positions lie farther out than {FARTHEST:g} m: it is damaged.")
-    return _poses(steps)
+def pose_of(transform: Tensor) -> Tensor:
+    """The pose of a rigid motion (3, 3) or (4, 4).
+
+    Raises `InvalidArgumentError` if it is not rigid or moves too far.
+    """
+    if transform.shape not in ((3, 3), (4, 4)):
+        raise InvalidArgumentError(f"transform has shape {tuple(transform.shape)}; give (3, 3) or (4, 4).")
+    rotation, translation = check_rigid(transform.detach().cpu().double(), len(transform) - 1)
+    if not bool((translation.abs() <= FARTHEST).all()):
+        raise InvalidArgumentError(f"transform moves by {translation.tolist()}; {FARTHEST:g} m is the most.")
+    if len(rotation) == 2:
+        turn = rotation[:, 0] / rotation[:, 0].norm()
+    else:
+        from scipy.spatial.transform import Rotation
+
+        turn = torch.from_numpy(Rotation.from_matrix(rotation.numpy()).as_quat(canonical=True))
+    return torch.cat([translation, turn]) + 0.0  # no −0
 
 
-def _poses(steps: Ints) -> Tensor:
-    positions = steps[:, :3].astype(np.float64) / STEPS_PER_METRE
-    half = YAW_STEPS // 2
-    yaw = ((steps[:, 3] + half) % YAW_STEPS - half) * (2 * math.pi / YAW_STEPS)
-    return torch.from_numpy(np.concatenate([positions, yaw[:, None]], 1))
+def matrix_of(pose: Tensor) -> Tensor:
+    """The motion (D+1, D+1) of a pose."""
+    dim = motion_dim(pose)
+    matrix = torch.eye(dim + 1, dtype=torch.float64)
+    matrix[:-1, -1] = pose[:dim]
+    if dim == 2:
+        cos, sin = pose[2:].tolist()
+        turn = torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64)
+    else:
+        from scipy.spatial.transform import Rotation
+
+        turn = torch.from_numpy(Rotation.from_quat(pose[3:].numpy()).as_matrix())
+    matrix[:-1, :-1] = turn
+    return matrix
+
+
+def write_motion(writer: BitWriter, pose: Tensor) -> None:
+    """A bit for the dimension, then the numbers of a valid pose as float64."""
+    writer.one(int(motion_dim(pose) == 3), 1)
+    writer.fixed(pose.numpy().astype("<f8").view("<u4").astype(np.int64), 32)
+
+
+def read_motion(reader: BitReader) -> Tensor:
+    """What `write_motion` wrote; it may be no valid pose."""
+    halves = reader.fixed(2 * _NUMBERS[2 + reader.one(1)], 32)
+    return torch.from_numpy(halves.astype("<u4").view("<f8").astype(np.float64))

@@ -19,7 +19,6 @@ from gmmtorch.sharing.messages import (
 from gmmtorch.sharing.messages.component_messages import ComponentsMessage, encode_components
 from gmmtorch.sharing.messages.count_messages import CountsMessage, encode_counts
 from gmmtorch.sharing.messages.envelope import CODECS, MAX_BYTES, Kind, parse_datagram
-from gmmtorch.sharing.messages.fields import quantized_poses
 from gmmtorch.sharing.messages.point_messages import PointsMessage, encode_points
 from gmmtorch.sharing.messages.record_messages import (
     AnnouncementMessage,
@@ -28,7 +27,13 @@ from gmmtorch.sharing.messages.record_messages import (
     FrameMessage,
     SupersessionMessage,
 )
-from gmmtorch.sharing.messages.view_messages import PlanMessage, ViewsMessage, encode_plan, encode_views
+from gmmtorch.sharing.messages.view_messages import (
+    PlanMessage,
+    ViewsMessage,
+    encode_plan,
+    encode_views,
+    quantized_poses,
+)
 
 __all__ = [
     "CODECS",
@@ -67,45 +72,28 @@ Message = (
     | FrameMessage
 )
 
-_READERS: dict[Kind, Callable[[bytes], Message]] = {
-    Kind.COMPONENTS: component_messages.read_quantized,
-    Kind.FLOAT_COMPONENTS: component_messages.read_float,
-    Kind.THESIS_COMPONENTS: component_messages.read_thesis,
-    Kind.COUNTS: count_messages.read_quantized_counts,
-    Kind.FLOAT_COUNTS: count_messages.read_float_counts,
-    Kind.THESIS_COUNTS: count_messages.read_thesis_counts,
-    Kind.POINTS: point_messages.read_points,
-    Kind.VIEWS: view_messages.read_views,
-    Kind.PLAN: view_messages.read_plan,
-    Kind.ANNOUNCEMENT: record_messages.read_announcement,
-    Kind.SUPERSESSION: record_messages.read_supersession,
-    Kind.COUNTERS: record_messages.read_counters,
-    Kind.CORRECTION: record_messages.read_correction,
-    Kind.FRAME: record_messages.read_frame,
+_KINDS: dict[Kind, tuple[str, Callable[[bytes], Message]]] = {
+    Kind.COMPONENTS: ("components", component_messages.read_quantized),
+    Kind.FLOAT_COMPONENTS: ("components", component_messages.read_float),
+    Kind.THESIS_COMPONENTS: ("components", component_messages.read_thesis),
+    Kind.COUNTS: ("counts", count_messages.read_quantized_counts),
+    Kind.FLOAT_COUNTS: ("counts", count_messages.read_float_counts),
+    Kind.THESIS_COUNTS: ("counts", count_messages.read_thesis_counts),
+    Kind.POINTS: ("points", point_messages.read_points),
+    Kind.VIEWS: ("views", view_messages.read_views),
+    Kind.PLAN: ("plans", view_messages.read_plan),
+    Kind.ANNOUNCEMENT: ("announcements", record_messages.read_announcement),
+    Kind.SUPERSESSION: ("supersessions", record_messages.read_supersession),
+    Kind.COUNTERS: ("counts", record_messages.read_counters),
+    Kind.CORRECTION: ("corrections", record_messages.read_correction),
+    Kind.FRAME: ("frames", record_messages.read_frame),
 }
-
-
-_NAMES: dict[Kind, str] = {
-    Kind.COMPONENTS: "components",
-    Kind.FLOAT_COMPONENTS: "components",
-    Kind.THESIS_COMPONENTS: "components",
-    Kind.COUNTS: "counts",
-    Kind.FLOAT_COUNTS: "counts",
-    Kind.THESIS_COUNTS: "counts",
-    Kind.COUNTERS: "counts",
-    Kind.POINTS: "points",
-    Kind.VIEWS: "views",
-    Kind.PLAN: "plans",
-    Kind.ANNOUNCEMENT: "announcements",
-    Kind.SUPERSESSION: "supersessions",
-    Kind.CORRECTION: "corrections",
-    Kind.FRAME: "frames",
-}
+"""Name of the contents for statistics, and reader of the body."""
 
 
 def kind_of(datagram: bytes) -> str:
     """The contents of a valid datagram, by a name for statistics."""
-    return _NAMES[Kind(datagram[0] & 15)]
+    return _KINDS[Kind(datagram[0] & 15)][0]
 
 
 def decode(datagram: bytes) -> Message:
@@ -116,7 +104,7 @@ def decode(datagram: bytes) -> Message:
     """
     kind, body = parse_datagram(datagram)
     try:
-        return _READERS[kind](body)
+        return _KINDS[kind][1](body)
     except DataError:
         raise
     except (GmmTorchError, ValueError, ArithmeticError, LookupError, RuntimeError) as error:

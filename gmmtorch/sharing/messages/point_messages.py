@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
-from gmmtorch.sharing.messages.envelope import MAX_BYTES, Kind, make_datagram
-from gmmtorch.sharing.messages.fields import check_places
+from gmmtorch.sharing.messages.envelope import MAX_BYTES, Kind, check_places, make_datagram
 
 _HEADER = struct.Struct("<HI3dHHH")  # sender, frame, origin, part, parts, points
 _POINT_BYTES = 12
@@ -48,8 +47,8 @@ def encode_points(sender: int, frame: int, origin: Tensor, ends: Tensor, is_hit:
 
     Raises `InvalidArgumentError` for values out of range, and for positions beyond `envelope.FARTHEST`.
     """
-    _check_fits("sender", sender, LARGEST_ROBOT)
-    _check_fits("frame", frame, LARGEST_FRAME)
+    check_whole("sender", sender, 0, LARGEST_ROBOT)
+    check_whole("frame", frame, 0, LARGEST_FRAME)
     if ends.shape[1:] != (3,) or origin.shape != (3,) or is_hit.shape != ends.shape[:1]:
         raise InvalidArgumentError(
             f"origin {tuple(origin.shape)}, ends {tuple(ends.shape)} and is_hit {tuple(is_hit.shape)} must "
@@ -97,8 +96,3 @@ def read_points(body: bytes) -> PointsMessage:
         ends=check_places("ends", origin + torch.from_numpy(offsets)),
         is_hit=torch.from_numpy(bits[:n] != 0),
     )
-
-
-def _check_fits(name: str, value: int, largest: int) -> None:
-    if check_whole(name, value, 0) > largest:
-        raise InvalidArgumentError(f"{name}={value} must be at most {largest}.")

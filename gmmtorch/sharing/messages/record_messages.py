@@ -15,18 +15,22 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter
-from gmmtorch.mapping.codec.quantization import LARGEST_COUNT, NO_COUNT
-from gmmtorch.sharing.messages.count_messages import count_steps, counts_of
+from gmmtorch.mapping.codec.quantization import LARGEST_COUNT, NO_COUNT, count_steps
+from gmmtorch.sharing.messages.count_messages import counts_of
 from gmmtorch.sharing.messages.envelope import FARTHEST, MAX_BYTES, Kind, make_datagram, split
 from gmmtorch.sharing.messages.fields import (
+    is_motion,
+    matrix_of,
+    motion_dim,
     read_intervals,
     read_keys,
+    read_motion,
     read_number,
     write_intervals,
     write_keys,
+    write_motion,
     write_number,
 )
-from gmmtorch.sharing.messages.pose_fields import is_motion, matrix_of, motion_dim, read_motion, write_motion
 from gmmtorch.sharing.replica.record_keys import (
     END,
     LARGEST_INCARNATION,
@@ -262,7 +266,7 @@ def counters_message(key: int, points: dict[int, float]) -> CountersMessage:
     """Record `key` with the points of components by their keys, rounded as counts are."""
     components = np.array(sorted(points), np.int64)
     counts = torch.tensor([points[int(component)] for component in components], dtype=torch.float64)
-    return CountersMessage(key, components, count_steps(counts))
+    return CountersMessage(key, components, count_steps(counts).numpy())
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,28 +11,30 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Ints
-from gmmtorch.sharing.messages.envelope import MAX_BYTES, Kind, make_datagram, split
+from gmmtorch.sharing.messages.envelope import FARTHEST, MAX_BYTES, Kind, make_datagram, split
 from gmmtorch.sharing.messages.fields import (
     check_ids,
-    pose_steps,
     read_intervals,
     read_keys,
     read_number,
-    read_path,
-    read_poses,
-    seconds_of,
-    ticks,
     write_intervals,
     write_keys,
     write_number,
-    write_path,
-    write_poses,
 )
 from gmmtorch.sharing.replica.record_keys import END, Intervals, ids_of, keys_of
 
 MOST_POSES = 1000
 """Poses of a path, and of the views of a plan. The poses of a robot at rest take no bits, so data do not
 bound their number."""
+STEPS_PER_METRE = 100
+"""Positions are whole centimetres."""
+YAW_STEPS = 256
+"""Steps of a full turn."""
+TICKS = 1000
+"""Times are whole milliseconds."""
+LATEST = 1e9
+"""Latest time (s)."""
+_FARTHEST_STEP = FARTHEST * STEPS_PER_METRE
 _HALF_BITS = 16
 
 
@@ -85,8 +88,8 @@ def encode_views(message: ViewsMessage, max_bytes: int = MAX_BYTES) -> list[byte
     keys = _keys(m.ids)
     order, removed = np.argsort(keys), m.removed
     keys = keys[order]
-    steps, halves = pose_steps("poses", m.poses)[order], _halves(m.values)[order]
-    times = ticks("stamps", m.stamps)[order]
+    steps, halves = _pose_steps("poses", m.poses)[order], _halves(m.values)[order]
+    times = _ticks("stamps", m.stamps)[order]
 
     def part(begin: int, end: int) -> bytes:
         """Items begin … end − 1 of all views, followed by all intervals of removed keys."""
@@ -94,7 +97,7 @@ def encode_views(message: ViewsMessage, max_bytes: int = MAX_BYTES) -> list[byte
         edges = slice(2 * max(begin - len(keys), 0), 2 * max(end - len(keys), 0))
         writer = BitWriter()
         write_keys(writer, keys[views])
-        write_poses(writer, steps[views])
+        _write_poses(writer, steps[views])
         writer.fixed(halves[views], _HALF_BITS)
         writer.column(times[views])
         write_intervals(writer, Intervals(removed.edges[edges]), 0)
@@ -106,9 +109,9 @@ def encode_views(message: ViewsMessage, max_bytes: int = MAX_BYTES) -> list[byte
 def read_views(body: bytes) -> ViewsMessage:
     reader = BitReader(body)
     keys = read_keys(reader)
-    poses = read_poses(reader, len(keys))
+    poses = _read_poses(reader, len(keys))
     values = _values(reader.fixed(len(keys), _HALF_BITS))
-    stamps = seconds_of(reader.column(len(keys)))
+    stamps = _seconds_of(reader.column(len(keys)))
     removed = read_intervals(reader, 0, END)
     reader.finish()
     return ViewsMessage(ids_of(keys), poses, values, stamps, removed)
@@ -131,19 +134,19 @@ def encode_plan(
     writer = BitWriter()
     write_number(writer, "sender", sender)
     write_number(writer, "number", number)
-    writer.number(int(ticks("time", torch.tensor([time], dtype=torch.float64))[0]))
-    pace = int(ticks("step", torch.tensor([step], dtype=torch.float64))[0])
+    writer.number(int(_ticks("time", torch.tensor([time], dtype=torch.float64))[0]))
+    pace = int(_ticks("step", torch.tensor([step], dtype=torch.float64))[0])
     if pace < 1:
         raise InvalidArgumentError(f"step={step} must be at least a millisecond.")
     writer.number(pace)
     for name, poses, write in (
-        ("path", path, write_path),
-        ("views", path[:0] if views is None else views, write_poses),
+        ("path", path, _write_path),
+        ("views", path[:0] if views is None else views, _write_poses),
     ):
         if len(poses) > MOST_POSES:
             raise InvalidArgumentError(f"{name} has {len(poses)} poses; {MOST_POSES} are the most.")
         writer.number(len(poses))
-        write(writer, pose_steps(name, poses))
+        write(writer, _pose_steps(name, poses))
     datagram = make_datagram(Kind.PLAN, writer.to_bytes())
     if len(datagram) > MAX_BYTES:
         raise InvalidArgumentError(
@@ -156,11 +159,11 @@ def encode_plan(
 def read_plan(body: bytes) -> PlanMessage:
     reader = BitReader(body)
     sender, number = read_number(reader), read_number(reader)
-    time, step = seconds_of(np.array([reader.number(), reader.number()])).tolist()
+    time, step = _seconds_of(np.array([reader.number(), reader.number()])).tolist()
     if not step > 0:
         raise DataError(f"The poses of a path are {step} s apart: it is damaged.")
-    path = read_path(reader, _read_size(reader))
-    views = read_poses(reader, _read_size(reader))
+    path = _read_path(reader, _read_size(reader))
+    views = _read_poses(reader, _read_size(reader))
     reader.finish()
     return PlanMessage(sender, number, time, step, path, views)
 
@@ -192,3 +195,95 @@ def _values(bits: Ints) -> Tensor:
     if not np.isfinite(values).all():
         raise DataError("Values are NaN or infinite: it is damaged.")
     return torch.from_numpy(values)
+
+
+# -- poses and times ------------------------------------------------------------------------------------
+
+
+def quantized_poses(poses: Tensor) -> Tensor:
+    """Poses (N, 4) as messages round them: to 1 cm and 1/256 of a turn, yaw in [−π, π)."""
+    return _poses(_pose_steps("poses", poses))
+
+
+def _pose_steps(name: str, poses: Tensor) -> Ints:
+    """Poses (N, 4) in steps, yaw from 0 to 255."""
+    if poses.ndim != 2 or poses.shape[1] != 4:
+        raise InvalidArgumentError(f"{name} has shape {tuple(poses.shape)}; expected (N, 4): x, y, z, yaw.")
+    rows = poses.detach().double().cpu()
+    bad = ~((rows[:, :3].abs() <= FARTHEST).all(1) & rows[:, 3].isfinite())
+    if bool(bad.any()):
+        first = int(bad.nonzero()[0])
+        raise InvalidArgumentError(
+            f"{name}[{first}] is {rows[first].tolist()}; positions reach {FARTHEST:g} m, and yaw is finite."
+        )
+    scaled = rows * rows.new_tensor([STEPS_PER_METRE] * 3 + [YAW_STEPS / (2 * math.pi)])
+    scaled[:, 3] = scaled[:, 3].remainder(YAW_STEPS)
+    steps = scaled.round().long().numpy()
+    steps[:, 3] %= YAW_STEPS
+    return steps
+
+
+def _write_poses(writer: BitWriter, steps: Ints) -> None:
+    """Write unrelated poses (N, 4) as four columns."""
+    for axis in range(4 if len(steps) else 0):
+        writer.column(steps[:, axis])
+
+
+def _read_poses(reader: BitReader, n: int) -> Tensor:
+    """Poses (n, 4). Columns may take no bits at all, so the caller must bound n."""
+    steps = np.zeros((n, 4), np.int64)
+    for axis in range(4 if n else 0):
+        steps[:, axis] = reader.column(n)
+    return _checked_poses(steps)
+
+
+def _write_path(writer: BitWriter, steps: Ints) -> None:
+    """Write poses (S, 4) along a path: the first, then four columns of the steps from each pose to the next.
+
+    At constant speed and turn rate the steps are nearly equal.
+    """
+    for axis in range(4 if len(steps) else 0):
+        ways = np.diff(steps[:, axis])
+        if axis == 3:  # the shorter direction
+            ways = (ways + YAW_STEPS // 2) % YAW_STEPS - YAW_STEPS // 2
+        writer.number(int(steps[0, axis]))
+        writer.column(ways)
+
+
+def _read_path(reader: BitReader, n: int) -> Tensor:
+    """Poses (n, 4) of a path. The caller must bound n, as in `_read_poses`."""
+    steps = np.zeros((n, 4), np.int64)
+    for axis in range(4 if n else 0):
+        ways = np.concatenate([np.array([reader.number()], np.int64), reader.column(n - 1)])
+        if float(np.abs(ways.astype(np.float64)).sum()) > _FARTHEST_STEP * 2 * n:
+            raise DataError("A path leaves the world: it is damaged.")
+        steps[:, axis] = np.cumsum(ways)
+    return _checked_poses(steps)
+
+
+def _ticks(name: str, seconds: Tensor) -> Ints:
+    """Times (N,) in milliseconds, of times in seconds."""
+    times = seconds.detach().double().cpu()
+    if times.ndim != 1 or not bool((times.abs() <= LATEST).all()):
+        raise InvalidArgumentError(f"{name} must be a row of times (s) of at most {LATEST:g}, and finite.")
+    return (times * TICKS).round().long().numpy()
+
+
+def _seconds_of(steps: Ints) -> Tensor:
+    """Times (N,) in seconds, of times in milliseconds."""
+    if len(steps) and int(np.abs(steps).max()) > LATEST * TICKS:
+        raise DataError(f"Times are later than {LATEST:g} s: it is damaged.")
+    return torch.from_numpy(steps.astype(np.float64) / TICKS)
+
+
+def _checked_poses(steps: Ints) -> Tensor:
+    if len(steps) and int(np.abs(steps[:, :3]).max()) > _FARTHEST_STEP:
+        raise DataError(f"Positions lie farther out than {FARTHEST:g} m: it is damaged.")
+    return _poses(steps)
+
+
+def _poses(steps: Ints) -> Tensor:
+    positions = steps[:, :3].astype(np.float64) / STEPS_PER_METRE
+    half = YAW_STEPS // 2
+    yaw = ((steps[:, 3] + half) % YAW_STEPS - half) * (2 * math.pi / YAW_STEPS)
+    return torch.from_numpy(np.concatenate([positions, yaw[:, None]], 1))

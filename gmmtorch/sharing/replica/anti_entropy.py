@@ -6,11 +6,13 @@ from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from gmmtorch.mapping.codec.quantization import quantize
+from gmmtorch.mapping.components import Components
 from gmmtorch.sharing.messages.component_messages import fitted
 from gmmtorch.sharing.messages.record_messages import AnnouncementMessage, CountersMessage
-from gmmtorch.sharing.replica.materialized_view import information
 from gmmtorch.sharing.replica.record_keys import Intervals, Ints, authors, evict, keys_of, keys_of_robot
 from gmmtorch.sharing.replica.records import Records
 
@@ -116,7 +118,7 @@ def packets(
         ready: datagrams of components that were encoded before; they are sent unchanged.
         max_bytes: largest size of a datagram.
         by_information: False: components in the order of their keys, which takes the fewest bytes. True: in
-            runs of consecutive keys, the runs with most `information` first, which takes few more.
+            runs of consecutive keys, the runs with most `_information` first, which takes few more.
     """
     due &= records.held
     if not due:
@@ -149,10 +151,22 @@ def _in_order(
     found: list[Packet | Ints] = [*ready, *runs]
     members = [*(packet[1].numbers() for packet in ready), *runs]
     if by_information:
-        rank = [-float(information(records.table.selected(one)).sum()) for one in members]
+        rank = [-float(_information(records.table.selected(one)).sum()) for one in members]
     else:
         rank = [float(one[0]) for one in members]
     return [found[row] for row in np.argsort(np.array(rank), kind="stable")]
+
+
+def _information(components: Components) -> Tensor:
+    """The approximate space (K,), m³ or m², that each component shows: its face times its sensor distance.
+
+    Large components seen from afar leave the largest hole in a map that lacks them.
+    """
+    deviation = torch.linalg.eigvalsh(components.covariances).clamp_min(0).sqrt()
+    face = deviation[:, 1:].prod(1)
+    apart = components.means[components.seen_by] - components.origins[components.seen_from]
+    reach = face.new_zeros(len(face)).scatter_reduce_(0, components.seen_by, apart.norm(dim=1), "amax")
+    return face * reach
 
 
 def _runs(keys: Ints, most: int | None) -> list[Ints]:

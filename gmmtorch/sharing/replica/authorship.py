@@ -11,13 +11,12 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mapping.codec.component_batch import order_of, quantized
-from gmmtorch.mapping.codec.quantization import NO_COUNT, quantize
+from gmmtorch.mapping.codec.quantization import NO_COUNT, order_of, quantize, quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.sharing.messages.component_messages import fitted
 from gmmtorch.sharing.messages.envelope import split
+from gmmtorch.sharing.messages.fields import pose_of
 from gmmtorch.sharing.messages.message_registry import decode
-from gmmtorch.sharing.messages.pose_fields import pose_of
 from gmmtorch.sharing.messages.record_messages import (
     RECORD_BYTES,
     CorrectionMessage,

@@ -22,9 +22,8 @@ from gmmtorch.sharing.messages.record_messages import (
     encode_record,
 )
 from gmmtorch.sharing.replica.component_table import ComponentTable, Counters, fingerprints, most_viewpoints
-from gmmtorch.sharing.replica.materialized_view import ChangeLog, Changes, corrected, with_gains
+from gmmtorch.sharing.replica.materialized_view import ChangeLog, Changes, Frames, corrected, with_gains
 from gmmtorch.sharing.replica.record_keys import WORLD, Intervals, Ints, authors, keys_of, robot_of
-from gmmtorch.sharing.replica.robot_frames import Frames
 
 MOST_VIEWPOINTS = 48
 """Viewpoints of a component. One component then fits into `RECORD_BYTES`, so that every robot can send it."""

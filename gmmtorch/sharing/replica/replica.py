@@ -19,16 +19,15 @@ from gmmtorch.sharing.messages.envelope import MAX_BYTES
 from gmmtorch.sharing.messages.message_registry import ComponentsMessage, Message, decode
 from gmmtorch.sharing.messages.record_messages import (
     AnnouncementMessage,
-    CorrectionMessage,
-    CountersMessage,
     FrameMessage,
+    RecordMessage,
     SupersessionMessage,
     check_size,
     encode_announcements,
 )
 from gmmtorch.sharing.replica.anti_entropy import Backlog, packets
 from gmmtorch.sharing.replica.authorship import Author, Published
-from gmmtorch.sharing.replica.materialized_view import Changes
+from gmmtorch.sharing.replica.materialized_view import Changes, Placement, robot_of_frame
 from gmmtorch.sharing.replica.record_keys import (
     LARGEST_INCARNATION,
     LARGEST_ROBOT,
@@ -45,7 +44,6 @@ from gmmtorch.sharing.replica.record_keys import (
     robot_of,
 )
 from gmmtorch.sharing.replica.records import MOST_COMPONENTS, Records, RefusedError
-from gmmtorch.sharing.replica.robot_frames import Placement, robot_of_frame
 
 
 class Replica:
@@ -84,14 +82,11 @@ class Replica:
         most_components: limit on the components; this robot's own are always added.
         own_frame: whether positions are in a frame of this robot, which `join` places, and not in `WORLD`.
         """
-        if check_whole("robot", robot, 0) > LARGEST_ROBOT:
-            raise InvalidArgumentError(f"robot={robot} must be at most {LARGEST_ROBOT}.")
+        self.robot = check_whole("robot", robot, 0, LARGEST_ROBOT)
         number = drawn_incarnation() if incarnation is None else incarnation
-        if check_whole("incarnation", number, 0) > LARGEST_INCARNATION:
-            raise InvalidArgumentError(f"incarnation={number} must be at most {LARGEST_INCARNATION}.")
+        self.incarnation = check_whole("incarnation", number, 0, LARGEST_INCARNATION)
         if dim not in (None, 2, 3):
             raise InvalidArgumentError(f"dim={dim} must be 2 or 3, or None.")
-        self.robot, self.incarnation = int(robot), int(number)
         self._own = author_of(first_key(self.robot, self.incarnation))
         self._records = Records(dim, check_whole("most_components", most_components, 1), self._own)
         self._author = Author(self._records, self.robot, self.incarnation)
@@ -125,7 +120,7 @@ class Replica:
                 )
             return self.publish(components, whole=False)
         old = Intervals.empty() if supersedes is None else Intervals.of(_keys("supersedes", supersedes))
-        return self._due(self._author.publish(_on_cpu(self._checked(new)), old, self._max_bytes))
+        return self._due(self._author.publish(self._checked(new), old, self._max_bytes))
 
     def publish(self, components: Components, *, whole: bool) -> Tensor:
         """Make this robot's records equal to the components of its own map; returns the ids (K, 2) of new
@@ -138,7 +133,7 @@ class Replica:
         """
         if not len(components) and not self.n_components:
             return ids_of(np.zeros(0, np.int64))
-        made = self._author.publish_map(_on_cpu(self._checked(components)), whole, self._max_bytes)
+        made = self._author.publish_map(self._checked(components), whole, self._max_bytes)
         return self._due(made._replace(keys=np.sort(made.keys)))
 
     def count(self, gains: Mapping[tuple[int, int], float]) -> None:
@@ -267,7 +262,7 @@ class Replica:
         elif isinstance(message, ComponentsMessage) and datagram[:1] == _QUANTIZED:
             self._check_keys(keys_of(message.components.ids))
             self._backlog.received(self._records.add_components(message.components))
-        elif isinstance(message, _RECORDS):
+        elif isinstance(message, RecordMessage):
             self._check_keys(np.array([message.key]))
             if isinstance(message, SupersessionMessage) and message.key not in self._author.written:
                 self._check_supersession(message)
@@ -400,7 +395,7 @@ class Replica:
             self._records.load_batch(datagram[1:], self.robot)
             return
         message = decode(datagram)
-        if not isinstance(message, _RECORDS):
+        if not isinstance(message, RecordMessage):
             raise DataError(f"{type(message).__name__} is no record.")
         self._records.add_record(message, bounded=robot_of(message.key) != self.robot)
 
@@ -410,10 +405,9 @@ class Replica:
             raise InvalidArgumentError(
                 f"The components are {components.dim}-dimensional; this map is in {self._records.dim}D."
             )
-        return components
+        return components.on_cpu()
 
 
-_RECORDS = SupersessionMessage | CountersMessage | CorrectionMessage | FrameMessage
 _QUANTIZED = b"\x11"
 """First byte of a datagram of components that every robot encodes equally."""
 
@@ -427,7 +421,3 @@ def _keys(name: str, ids: ArrayLike) -> Ints:
         return keys_of(rows.long())
     except DataError as error:
         raise InvalidArgumentError(f"{name}: {error}") from error
-
-
-def _on_cpu(components: Components) -> Components:
-    return Components(**{name: value.detach().cpu() for name, value in vars(components).items()})

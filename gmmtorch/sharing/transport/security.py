@@ -16,7 +16,7 @@ from typing import NoReturn
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.optional_packages import needs_extra
-from gmmtorch.sharing.messages.envelope import MAX_BYTES
+from gmmtorch.sharing.messages.envelope import MAX_BYTES, check_datagram
 from gmmtorch.sharing.transport.sessions import OwnIdWatch, Sessions
 from gmmtorch.sharing.transport.team_key import TeamKey
 
@@ -86,9 +86,7 @@ class Sealer:
     """
 
     def __init__(self, sender: int, key: TeamKey | None = None) -> None:
-        if check_whole("sender", sender, 0) > MAX_SENDER:
-            raise InvalidArgumentError(f"sender={sender} must be at most {MAX_SENDER}.")
-        self.sender = int(sender)
+        self.sender = check_whole("sender", sender, 0, MAX_SENDER)
         self.overhead = PLAIN_OVERHEAD if key is None else SEALED_OVERHEAD
         self._cipher = None if key is None else _Cipher(key)
         self._first = bytes([(_PLAIN if key is None else _SEALED) << 4 | FRAME_VERSION])
@@ -101,9 +99,7 @@ class Sealer:
 
     def seal(self, datagram: bytes) -> bytes:
         """The frame of a datagram of at most 1200 bytes, `overhead` longer."""
-        if not isinstance(datagram, bytes) or len(datagram) > MAX_BYTES:
-            size = f"{len(datagram)} bytes" if isinstance(datagram, bytes) else type(datagram).__name__
-            raise InvalidArgumentError(f"A datagram is {size}; it must be bytes, {MAX_BYTES} at most.")
+        check_datagram(datagram)
         with self._lock:
             if self._number == _NUMBERS or self._process != os.getpid():
                 self._begin()

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol
 import torch
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
-from gmmtorch.sharing.messages.envelope import MAX_BYTES
+from gmmtorch.sharing.messages.envelope import check_datagram
 from gmmtorch.sharing.transport.link_conditions import LinkConditions
 
 HEADER_BYTES = 28
@@ -118,9 +118,7 @@ class Network:
         """Broadcast datagrams of at most 1200 bytes at the time `now` (s); see `Transport`."""
         self._check("sender", sender, now)
         for data in datagrams:
-            if not isinstance(data, bytes) or len(data) > MAX_BYTES:
-                size = f"{len(data)} bytes" if isinstance(data, bytes) else type(data).__name__
-                raise InvalidArgumentError(f"A datagram is {size}; it must be bytes, {MAX_BYTES} at most.")
+            check_datagram(data)
         others = [robot for robot in range(self.n_robots) if robot != sender]
         near = self._near(sender, others)
         for data in datagrams:

@@ -197,8 +197,7 @@ def unicast_socket(address: Address) -> socket.socket:
 
 def multicast_socket(group: Address, interface: str, ttl: int) -> socket.socket:
     """A socket that has joined one group on one interface. Many sockets may share the port."""
-    if check_whole("ttl", ttl, 0) > 255:
-        raise InvalidArgumentError(f"ttl={ttl} must be at most 255.")
+    check_whole("ttl", ttl, 0, 255)
     bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     if sys.platform == "linux":  # else it would receive what other sockets joined on other interfaces
@@ -251,8 +250,7 @@ def check_address(name: str, address: Address, least_port: int = 0) -> ipaddress
             f"{name}={address!r} must be an IPv4 address, such as '10.0.0.3', and a port; names are not "
             "looked up."
         ) from error
-    if check_whole(f"port of {name}", port, least_port) > 65535:
-        raise InvalidArgumentError(f"port of {name}={port} must be at most 65535.")
+    check_whole(f"port of {name}", port, least_port, 65535)
     return parsed
 
 

@@ -119,9 +119,8 @@ class DepthCamera:
             radius: radius of a teammate's body (m).
             truth: the `distances` from this pose, if they are known.
         """
-        pose = _checked_pose(pose)
-        others = as_tensor(others, "others", torch.float64)
-        _check_finite("others", others, (len(others), 3))
+        pose = _finite(pose, "pose", 4)
+        others = _finite(others, "others", -1, 3)
         origin, directions = pose[:3], self._turned(float(pose[3]))
         error = torch.randn(len(directions), generator=generator, dtype=torch.float64) * self.noise
         kept = torch.rand(len(directions), generator=generator, dtype=torch.float64) >= self.dropout
@@ -140,7 +139,7 @@ class DepthCamera:
 
     def distances(self, world: MeshWorld, pose: ArrayLike) -> Tensor:
         """Distances (height · width,), metres, to the first surface along the beams from a pose (4,)."""
-        pose = _checked_pose(pose)
+        pose = _finite(pose, "pose", 4)
         return world.distances(pose[:3], self._turned(float(pose[3])), threads=torch.get_num_threads())
 
     def image(self, frame: DepthFrame) -> Tensor:
@@ -174,12 +173,10 @@ def _distance_to_spheres(centers: Tensor, radius: float, directions: Tensor) -> 
     return torch.where(distance <= radius**2, 0.0, entry).amin(1)
 
 
-def _checked_pose(pose: ArrayLike) -> Tensor:
-    pose = as_tensor(pose, "pose", torch.float64)
-    _check_finite("pose", pose, (4,))
-    return pose
-
-
-def _check_finite(name: str, value: Tensor, shape: tuple[int, ...]) -> None:
-    if tuple(value.shape) != shape or not bool(torch.isfinite(value).all()):
+def _finite(given: ArrayLike, name: str, *shape: int) -> Tensor:
+    """The array as float64. Raises `InvalidArgumentError` unless it is finite and of the shape; −1: any."""
+    value = as_tensor(given, name, torch.float64)
+    fits = value.ndim == len(shape) and all(n in (-1, m) for n, m in zip(shape, value.shape, strict=True))
+    if not fits or not bool(torch.isfinite(value).all()):
         raise InvalidArgumentError(f"{name}={value.tolist()} must be finite, of shape {shape}, in metres.")
+    return value

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.scan import Scan
 
 _CLOSEST_READING = 1e-3
@@ -62,8 +62,8 @@ def laser_2d(
     dropout: float = 0.0,
 ) -> RangeSensor:
     """A planar laser: `n_beams` beams spread evenly over `field_of_view` radians, from right to left."""
-    _at_least_one(n_beams=n_beams)
-    _angle(field_of_view=field_of_view, limit=2 * math.pi)
+    check_whole("n_beams", n_beams, 1)
+    _check_field_of_view(field_of_view, 2 * math.pi)
     angles = (torch.arange(n_beams, dtype=torch.float64) + 0.5) / n_beams * field_of_view - field_of_view / 2
     return RangeSensor(torch.stack([angles.cos(), angles.sin()], 1), max_range, range_noise, dropout)
 
@@ -77,7 +77,8 @@ def spinning_lidar(
     dropout: float = 0.0,
 ) -> RangeSensor:
     """A lidar of `n_rings` × `n_azimuths` beams, ring by ring from the lower to the upper elevation (rad)."""
-    _at_least_one(n_rings=n_rings, n_azimuths=n_azimuths)
+    check_whole("n_rings", n_rings, 1)
+    check_whole("n_azimuths", n_azimuths, 1)
     elevation = torch.linspace(*elevations, n_rings, dtype=torch.float64)[:, None]
     azimuth = torch.arange(n_azimuths, dtype=torch.float64) * (2 * math.pi / n_azimuths)
     directions = torch.stack(
@@ -103,8 +104,9 @@ def depth_camera(
 
     `field_of_view` is the horizontal angle (rad) between the left and right edges of the image.
     """
-    _at_least_one(width=width, height=height)
-    _angle(field_of_view=field_of_view, limit=math.radians(179))
+    check_whole("width", width, 1)
+    check_whole("height", height, 1)
+    _check_field_of_view(field_of_view, math.radians(179))
     focal = width / 2 / math.tan(field_of_view / 2)
     return RangeSensor(pixel_rays(width, height, (focal, focal)), max_range, range_noise, dropout)
 
@@ -146,13 +148,7 @@ def simulate_scan(sensor: RangeSensor, pose: ArrayLike, world: World, generator:
     return Scan(ends[~no_return], as_tensor(pose, "pose", torch.float64)[:-1, -1], ends[no_return])
 
 
-def _at_least_one(**counts: int) -> None:
-    for name, value in counts.items():
-        if value < 1:
-            raise InvalidArgumentError(f"{name}={value} must be at least 1.")
-
-
-def _angle(field_of_view: float, limit: float) -> None:
+def _check_field_of_view(field_of_view: float, limit: float) -> None:
     if not 0 < field_of_view <= limit:
         raise InvalidArgumentError(
             f"field_of_view={field_of_view} must be an angle above 0 and at most {limit:.4g} radians."

@@ -10,6 +10,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gmmtorch.errors import InvalidArgumentError
+
 _ATTEMPTS = 40
 _GAP = 0.2
 """Least distance between two pieces of furniture, metres."""
@@ -68,6 +70,16 @@ class Piece(NamedTuple):
     size: tuple[float, float]
     at_wall: bool
     build: Callable[[Footprint], list[Tensor]]
+
+
+def checked_size(size: Sequence[float], least: Sequence[float], most: float) -> tuple[float, float, float]:
+    """Length, width and height (m) of a generated world. Raises `InvalidArgumentError` for a wrong size."""
+    values = tuple(float(x) for x in size)
+    if len(values) != 3 or not all(low <= x <= most for low, x in zip(least, values, strict=True)):
+        raise InvalidArgumentError(
+            f"size={size} must be length, width and height of at least {least} and at most {most:.0f} m."
+        )
+    return values
 
 
 DrawPiece = Callable[[torch.Generator], Piece]

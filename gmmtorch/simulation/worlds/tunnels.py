@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.errors import check_whole
 from gmmtorch.optional_packages import load_open3d
-from gmmtorch.simulation.worlds.floor_plan import uniform
+from gmmtorch.simulation.worlds.floor_plan import checked_size, uniform
 from gmmtorch.simulation.worlds.mesh_world import have_area
 
 _CELL = 0.4
@@ -50,12 +50,7 @@ def tunnels(seed: int = 0, size: Sequence[float] = (60.0, 60.0, 10.0)) -> Tensor
     `InvalidArgumentError` for a size below 40 × 40 × 7 m or above 600 m, and `GmmTorchError` if
     Open3D does not load.
     """
-    extent = tuple(float(x) for x in size)
-    if len(extent) != 3 or not all(low <= x <= _MAX_SIZE for low, x in zip(_MIN_SIZE, extent, strict=True)):
-        raise InvalidArgumentError(
-            f"size={size} must be length, width and height of at least {_MIN_SIZE} and at most "
-            f"{_MAX_SIZE:.0f} m."
-        )
+    extent = checked_size(size, _MIN_SIZE, _MAX_SIZE)
     generator = torch.Generator().manual_seed(check_whole("seed", seed, 0))
     nodes = _junctions(extent, generator)
     pairs, is_dead_end = _galleries(nodes, generator)

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
-from gmmtorch.simulation.worlds.floor_plan import Room, circle, uniform
+from gmmtorch.errors import check_whole
+from gmmtorch.simulation.worlds.floor_plan import Room, checked_size, circle, uniform
 from gmmtorch.simulation.worlds.furniture import RACK_DEPTH, UNIT_CUBE, Bays, box, copies, prism, racks
 
 _SHELL = 0.13
@@ -37,7 +37,7 @@ def warehouse(seed: int = 0, size: Sequence[float] = (50.0, 40.0, 8.0)) -> Tenso
     The same seed and size give the same warehouse. Raises `InvalidArgumentError` for a size below
     15 × 12 × 4 m or above 2 km.
     """
-    length, width, height = _checked(size)
+    length, width, height = checked_size(size, _MIN_SIZE, _MAX_SIZE)
     generator = torch.Generator().manual_seed(check_whole("seed", seed, 0))
     ceiling = height - _SHELL
     xs, ys = _cuts(length, 25.0, (1.5, 1.0), generator), _cuts(width, 40.0, (1.0, 1.0), generator)
@@ -61,18 +61,8 @@ def warehouse(seed: int = 0, size: Sequence[float] = (50.0, 40.0, 8.0)) -> Tenso
 
 def warehouse_start(size: Sequence[float] = (50.0, 40.0, 8.0)) -> Tensor:
     """Start position (3,), metres, in the open corner of a warehouse, with room for several robots."""
-    _checked(size)
+    checked_size(size, _MIN_SIZE, _MAX_SIZE)
     return torch.tensor([4.6, 4.6, 1.3], dtype=torch.float64)
-
-
-def _checked(size: Sequence[float]) -> tuple[float, float, float]:
-    values = tuple(float(x) for x in size)
-    if len(values) != 3 or not all(low <= x <= _MAX_SIZE for low, x in zip(_MIN_SIZE, values, strict=True)):
-        raise InvalidArgumentError(
-            f"size={size} must be length, width and height of at least {_MIN_SIZE} and at most "
-            f"{_MAX_SIZE:.0f} m."
-        )
-    return values
 
 
 def _cuts(

@@ -9,9 +9,9 @@ from scipy.special import erfcx
 
 from gmmtorch.kernels import kernels
 from gmmtorch.kernels.simd import MILLS
+from gmmtorch.occupancy.cone_index import Hulls
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.forms.point import PointForm
-from gmmtorch.occupancy.index.cone_index import Hulls
 
 
 def points_of(cones: Cones) -> torch.Tensor:

@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from gmmtorch.kernels import kernels
-from gmmtorch.localization.registration.overlap import overlap
-from gmmtorch.localization.registration.overlap_ascent import Ascent
+from gmmtorch.localization.registration.overlap import Ascent, overlap
 from gmmtorch.localization.rigid_motions import Motions
 from gmmtorch.mixture.em.exact import Parameters
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
 
 from gmmtorch.kernels import kernels
+from gmmtorch.kernels.rays.ray_counting import count_in_grid
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import VoxelGrid
 from gmmtorch.occupancy.voxels.boxes import Box
@@ -44,6 +47,33 @@ def test_fused_counts_in_a_grid_equal_the_twin(dim, kind, weighted):
     assert found[0].misses.sum() > 1000
     torch.testing.assert_close(found[1].misses, found[0].misses, rtol=0, atol=0)
     torch.testing.assert_close(found[1].hits, found[0].hits, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -1e300])
+def test_rays_that_are_not_finite_leave_the_counts_of_the_others_as_they_are(bad):
+    origins, ends = rays(3, "any")
+    good = torch.arange(3000) % 5 != 2
+    spoilt = torch.where(good[:, None], origins, bad)
+    counts = torch.zeros(2, 40**3).double()
+    with kernels("fused"):
+        count_in_grid(counts[0], spoilt / 0.25, ends / 0.25, (40,) * 3)
+        count_in_grid(counts[1], origins[good] / 0.25, ends[good] / 0.25, (40,) * 3)
+    assert counts[0].sum() > 1000
+    assert torch.equal(counts[0], counts[1])
+
+
+@pytest.mark.parametrize("choice", ["torch", "fused"])
+def test_evidence_of_many_rays_is_that_of_their_parts(choice):
+    origins, ends = rays(2, "any", 150_000)
+    weights, is_hit = torch.arange(150_000) % 3, torch.arange(150_000) % 4 > 0
+    grid = VoxelGrid((0.0,) * 2, 1.0, (10,) * 2)
+    whole, parts = Evidence.empty(grid), Evidence.empty(grid)
+    with kernels(choice):
+        whole.add_rays(origins, ends, weights, is_hit)
+        for part in torch.arange(150_000).split(7_001):
+            parts.add_rays(origins[part], ends[part], weights[part], is_hit[part])
+    assert torch.equal(whole.misses, parts.misses)
+    assert torch.equal(whole.hits, parts.hits)
 
 
 @pytest.mark.parametrize("dim", [2, 3])

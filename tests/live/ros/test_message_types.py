@@ -12,7 +12,7 @@ pytest.importorskip("rosbags", reason="needs the extra [ros]: rosbags")
 from rosbags.typesys import Stores, get_typestore
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.live.ros import zenoh_keys
+from gmmtorch.live.ros import zenoh_middleware
 from gmmtorch.live.ros.message_types import MessageTypes, dds_type, ros_type
 from gmmtorch.live.ros.middleware import Endpoint
 from gmmtorch.live.ros.quality import Quality, mismatch
@@ -46,7 +46,7 @@ def test_cut_messages_are_refused():
 
 def test_every_type_becomes_a_dds_type():
     pytest.importorskip("cyclonedds", reason="needs the extra [ros]: cyclonedds")
-    from gmmtorch.live.ros.idl_types import IdlTypes
+    from gmmtorch.live.ros.dds import IdlTypes
 
     idl = IdlTypes(TYPES.definitions)
     for name in (
@@ -78,19 +78,21 @@ def test_the_hash_of_a_type_is_that_of_ros():
 
 def test_keys_of_rmw_zenoh():
     """The keys that the documentation of rmw_zenoh gives for a talker."""
-    key = zenoh_keys.message_key(0, "/chatter", "std_msgs/msg/String", "RIHS01_ab")
+    key = zenoh_middleware.message_key(0, "/chatter", "std_msgs/msg/String", "RIHS01_ab")
     assert key == "0/chatter/std_msgs::msg::dds_::String_/RIHS01_ab"
     endpoint = Endpoint("/chatter", "std_msgs/msg/String", Quality(depth=7), True)
-    token = zenoh_keys.endpoint_token(2, "8b20", 10, "/", "talker", endpoint, "RIHS01_ab")
+    token = zenoh_middleware.endpoint_token(2, "8b20", 10, "/", "talker", endpoint, "RIHS01_ab")
     assert token == (
         "@ros2_lv/2/8b20/0/10/MP/%/%/talker/%chatter/std_msgs::msg::dds_::String_/RIHS01_ab/::,7:,:,:,,"
     )
-    assert zenoh_keys.parsed_token(token) == endpoint
+    assert zenoh_middleware.parsed_token(token) == endpoint
     for quality in (Quality(False, False, 5), Quality(True, True, 1), Quality(depth=42)):
-        assert zenoh_keys.parsed_quality(zenoh_keys.quality_text(quality)) == quality
+        assert zenoh_middleware.parsed_quality(zenoh_middleware.quality_text(quality)) == quality
     for damaged in ("", "a/b", token.replace("MP", "SS"), token.replace("dds_", "")):
-        assert zenoh_keys.parsed_token(damaged) is None
-    assert zenoh_keys.attachment(5, 6, bytes(16)) == b"\5" + bytes(7) + b"\6" + bytes(7) + b"\x10" + bytes(16)
+        assert zenoh_middleware.parsed_token(damaged) is None
+    assert zenoh_middleware.attachment(5, 6, bytes(16)) == b"\5" + bytes(7) + b"\6" + bytes(
+        7
+    ) + b"\x10" + bytes(16)
 
 
 def test_qualities_match_by_the_rules_of_dds():

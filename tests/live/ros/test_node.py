@@ -60,6 +60,14 @@ def make_node(request, ros_domain) -> Iterator[MakeNode]:
         router.close()
 
 
+@pytest.fixture
+def node(ros_domain) -> Iterator[Node]:
+    """A node over DDS, whose messages a test hands in itself."""
+    pytest.importorskip("cyclonedds", reason="needs the extra [ros]: cyclonedds")
+    with Node("test", domain=ros_domain) as made:
+        yield made
+
+
 def test_a_cloud_arrives_as_it_was_published(make_node):
     talker, listener = make_node("talker"), make_node("listener")
     received = []
@@ -71,9 +79,8 @@ def test_a_cloud_arrives_as_it_was_published(make_node):
 
     def is_received() -> bool:
         nonlocal sent
-        if (
-            time.monotonic() > sent and not received
-        ):  # the first ones may come before the nodes know each other
+        # The first ones may come before the nodes know each other.
+        if time.monotonic() > sent and not received:
             publish(cloud_fields("lidar", table), stamp=1_500_000_007)
             sent = time.monotonic() + 0.1
         return bool(received)
@@ -140,33 +147,29 @@ def test_transforms_are_collected(make_node):
     assert listener.transforms.chain("lidar") == ["lidar", "base", "odom"]
 
 
-def test_damaged_messages_and_floods_are_counted(ros_domain):
-    pytest.importorskip("cyclonedds", reason="needs the extra [ros]: cyclonedds")
-    with Node("test", domain=ros_domain) as node:
-        received = []
-        subscription = node.subscribe("/text", STRING, received.append, Quality(depth=3))
-        whole = node.types.encode(STRING, {"data": "x" * 10})
-        for data in (whole[:9], b"", whole):
-            node._receive(subscription, data)
-        while node.spin_once():
-            pass
-        assert subscription.n_malformed == 2
-        assert [message["data"] for message in received] == ["x" * 10]
-        for _ in range(8):
-            node._receive(subscription, whole)
-        assert (len(subscription.waiting), subscription.n_dropped) == (3, 5)
-        assert node.counts["/text"] == {"received": 11, "dropped": 5, "malformed": 2}
+def test_damaged_messages_and_floods_are_counted(node):
+    received = []
+    subscription = node.subscribe("/text", STRING, received.append, Quality(depth=3))
+    whole = node.types.encode(STRING, {"data": "x" * 10})
+    for data in (whole[:9], b"", whole):
+        node._receive(subscription, data)
+    while node.spin_once():
+        pass
+    assert subscription.n_malformed == 2
+    assert [message["data"] for message in received] == ["x" * 10]
+    for _ in range(8):
+        node._receive(subscription, whole)
+    assert (len(subscription.waiting), subscription.n_dropped) == (3, 5)
+    assert node.counts["/text"] == {"received": 11, "dropped": 5, "malformed": 2}
 
 
-def test_messages_that_are_too_large_are_counted(ros_domain, monkeypatch, caplog):
-    pytest.importorskip("cyclonedds", reason="needs the extra [ros]: cyclonedds")
+def test_messages_that_are_too_large_are_counted(node, monkeypatch, caplog):
     monkeypatch.setattr("gmmtorch.live.ros.node.MAX_MESSAGE_BYTES", 20)
-    with Node("test", domain=ros_domain) as node:
-        subscription = node.subscribe("/text", STRING, lambda _: None)
-        for text in ("x" * 40, "x"):
-            node._receive(subscription, node.types.encode(STRING, {"data": text}))
-        assert (subscription.n_malformed, len(subscription.waiting)) == (1, 1)
-        assert "49 bytes are more than 20" in caplog.text
+    subscription = node.subscribe("/text", STRING, lambda _: None)
+    for text in ("x" * 40, "x"):
+        node._receive(subscription, node.types.encode(STRING, {"data": text}))
+    assert (subscription.n_malformed, len(subscription.waiting)) == (1, 1)
+    assert "49 bytes are more than 20" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -223,16 +226,14 @@ def test_unknown_types_and_names_are_refused(make_node):
     assert issubclass(DataError, GmmTorchError)
 
 
-def test_an_error_of_a_callback_is_raised_and_one_of_a_message_is_counted(ros_domain):
-    pytest.importorskip("cyclonedds", reason="needs the extra [ros]: cyclonedds")
-    with Node("test", domain=ros_domain) as node:
-        wrong = node.subscribe("/text", STRING, lambda message: message["no such field"])
-        unusable = node.subscribe("/name", STRING, reading(lambda message: float(message["data"])))
-        whole = node.types.encode(STRING, {"data": "x"})
-        node._receive(unusable, whole)
+def test_an_error_of_a_callback_is_raised_and_one_of_a_message_is_counted(node):
+    wrong = node.subscribe("/text", STRING, lambda message: message["no such field"])
+    unusable = node.subscribe("/name", STRING, reading(lambda message: float(message["data"])))
+    whole = node.types.encode(STRING, {"data": "x"})
+    node._receive(unusable, whole)
+    node.spin_once()
+    assert unusable.n_malformed == 1
+    node._receive(wrong, whole)
+    with pytest.raises(KeyError, match="no such field"):
         node.spin_once()
-        assert unusable.n_malformed == 1
-        node._receive(wrong, whole)
-        with pytest.raises(KeyError, match="no such field"):
-            node.spin_once()
-        assert wrong.n_malformed == 0
+    assert wrong.n_malformed == 0

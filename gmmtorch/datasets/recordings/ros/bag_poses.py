@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,35 +21,23 @@ from gmmtorch.datasets.recordings.ros.pose_sources import (
     pose_sample,
 )
 from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree
-from gmmtorch.datasets.recordings.trajectory import Trajectory, read_rows, read_trajectory
+from gmmtorch.datasets.recordings.trajectory import Trajectory, read_trajectory
 from gmmtorch.errors import DataError, InvalidArgumentError
 
 _HEAD_BYTES = 1024
-_KITTI_COLUMNS = 12
 
 
-class Stamped(Protocol):
-    """A message of the sensor: its number in the topic, its stamp (ns) and its frame."""
+class Record(NamedTuple):
+    """A message of the sensor. number: in its topic. time: of recording; stamp: of measurement, in ns."""
 
-    @property
-    def number(self) -> int: ...
-    @property
-    def stamp(self) -> int: ...
-    @property
-    def frame(self) -> str: ...
-
-
-class PoseOptions(NamedTuple):
-    """Options of `open_rosbag`."""
-
-    poses: str | None
-    frame: str | None
-    extrinsic: list[float] | None
-    max_gap: float
+    number: int
+    time: int
+    stamp: int
+    frame: str
 
 
 class BagSurvey:
-    """What one pass over a bag finds.
+    """What one pass over a bag finds. The options are those of `open_rosbag`.
 
     Attributes:
         heads: (time of recording in ns, first bytes) of each message of the sensor.
@@ -58,11 +46,19 @@ class BagSurvey:
     Raises `DataError` or `InvalidArgumentError` if the bag cannot have the poses that the options choose.
     """
 
-    def __init__(self, reader: BagReader, topic: str, options: PoseOptions) -> None:
-        self._reader, self._topic, self._options = reader, topic, options
-        names = {t.name for t in reader.topics}
-        poses = options.poses
-        self._pose_topic = poses if poses in names else None
+    def __init__(
+        self,
+        reader: BagReader,
+        topic: str,
+        poses: str | None,
+        frame: str | None,
+        extrinsic: list[float] | None,
+        max_gap: float,
+    ) -> None:
+        self._reader, self._topic = reader, topic
+        self._poses, self._frame, self._max_gap = poses, frame, max_gap
+        self._extrinsic = mount_matrix(extrinsic)
+        self._pose_topic = poses if poses in {t.name for t in reader.topics} else None
         self._file = None
         transforms = [t.name for t in reader.topics if t.type in TF_TYPES and t.n_messages]
         if poses in (None, "tf"):
@@ -107,32 +103,29 @@ class BagSurvey:
         types = [t.type for t in self._reader.topics if t.name == self._pose_topic]
         if not set(types) <= set(POSE_TYPES):
             raise InvalidArgumentError(
-                f"dataset.poses={self._pose_topic} has messages of type {', '.join(types)}, "
-                "which are not poses. "
-                f"{self._remedy()}"
+                f"dataset.poses={self._pose_topic} has messages of type {', '.join(types)}, which are not "
+                f"poses. {self._remedy()}"
             )
 
     def _remedy(self) -> str:
         topics = [t for t in self._reader.topics if t.type in POSE_TYPES and t.n_messages]
         return (
-            "Choose dataset.poses=standing for a sensor that does not move, "
-            "dataset.poses=FILE for a TUM or KITTI "
-            f"trajectory, or dataset.poses=TOPIC; topics of poses: {listed(topics)}."
+            "Choose dataset.poses=standing for a sensor that does not move, dataset.poses=FILE for a TUM or "
+            f"KITTI trajectory, or dataset.poses=TOPIC; topics of poses: {listed(topics)}."
         )
 
-    def source(self, records: Sequence[Stamped], where: str) -> PoseSource:
+    def source(self, records: Sequence[Record], where: str) -> PoseSource:
         """The poses of the sensor. Raises `DataError` if the sensor's frames are not connected to them."""
         frames = Counter(record.frame for record in records)
-        options, mount = self._options, mount_matrix(self._options.extrinsic)
-        if options.poses in (None, "tf"):
+        mount = self._extrinsic
+        if self._poses in (None, "tf"):
             return self._from_tf(frames, where)
         if self._pose_topic is not None:
             times, matrices = [list(column) for column in zip(*self._samples, strict=True)] or ([], [])
-            trajectory, _ = Trajectory.from_samples(
-                np.array(times, np.int64), np.array(matrices).reshape(-1, 4, 4)
-            )
+            stamps, poses = np.array(times, np.int64), np.array(matrices).reshape(-1, 4, 4)
+            trajectory = Trajectory.from_samples(stamps, poses)
             mounts = {frame: self._mount(frame, where) if mount is None else mount for frame in frames}
-            return BodyPoses(trajectory, mounts, options.max_gap, f"topic {self._pose_topic}")
+            return BodyPoses(trajectory, mounts, self._max_gap, f"topic {self._pose_topic}")
         if len(frames) > 1:
             counts = ", ".join(f"{frame or '(unnamed)'} ({n} scans)" for frame, n in frames.most_common())
             raise InvalidArgumentError(
@@ -142,21 +135,19 @@ class BagSurvey:
         if self._file is None:
             return Standing()
         fixed = np.eye(4) if mount is None else mount
-        if read_rows(self._file).shape[1] == _KITTI_COLUMNS:
-            matrices_of = read_trajectory(self._file, len(self.heads)).matrices
-            return PosesByIndex({r.stamp: matrices_of[r.number] for r in records}, fixed)
-        mounts = dict.fromkeys(frames, fixed)
-        return BodyPoses(read_trajectory(self._file), mounts, options.max_gap, str(self._file))
+        trajectory = read_trajectory(self._file, len(self.heads))
+        if not trajectory.has_times:
+            return PosesByIndex({r.stamp: trajectory.matrices[r.number] for r in records}, fixed)
+        return BodyPoses(trajectory, dict.fromkeys(frames, fixed), self._max_gap, str(self._file))
 
     def _from_tf(self, frames: Counter[str], where: str) -> PoseSource:
-        source = TfPoses(self.tree, self._options.frame, self._options.max_gap, where)
+        source = TfPoses(self.tree, self._frame, self._max_gap, where)
         chains = [source.chain(frame) for frame in frames]
-        chosen = self._options.poses is not None or self._options.frame is not None
+        chosen = self._poses is not None or self._frame is not None
         if not chosen and not any(self.tree.is_moving(chain) for chain in chains):
             raise DataError(
-                f"{where}: TF has only static transforms from frame {chains[0][0]} up to "
-                f"{chains[0][-1]}, so the "
-                f"sensor's motion is unknown. {self._remedy()}"
+                f"{where}: TF has only static transforms from frame {chains[0][0]} up to {chains[0][-1]}, so "
+                f"the sensor's motion is unknown. {self._remedy()}"
             )
         return source
 
@@ -171,11 +162,10 @@ class BagSurvey:
             chain = []
         if not chain or self.tree.is_moving(chain):
             raise DataError(
-                f"{where}: dataset.poses={self._pose_topic} states poses of frame {body}, but "
-                "TF has no static "
-                f"transform from there to the sensor's frame {frame or '(unnamed)'}. State "
-                "the sensor's pose on the "
-                "body: dataset.extrinsic=[x,y,z,qx,qy,qz,qw], which is [0,0,0,0,0,0,1] if they are the same."
+                f"{where}: dataset.poses={self._pose_topic} states poses of frame {body}, but TF has no "
+                f"static transform from there to the sensor's frame {frame or '(unnamed)'}. State the "
+                "sensor's pose on the body: dataset.extrinsic=[x,y,z,qx,qy,qz,qw], which is [0,0,0,0,0,0,1] "
+                "if they are the same."
             )
         matrix: np.ndarray = self.tree.lookup(chain, np.zeros(1, np.int64), np.inf).matrices[0]
         return matrix

@@ -55,9 +55,8 @@ def choose_sensor(reader: BagReader, wanted: str | None) -> Sensor:
         )
     if len(named) > 1:
         raise DataError(
-            f"{reader.path}: topic {wanted} has messages of {len(named)} types: "
-            f"{listed(named)}. Choose another "
-            "dataset.topic, or write each type to a topic of its own."
+            f"{reader.path}: topic {wanted} has messages of {len(named)} types: {listed(named)}. Choose "
+            "another dataset.topic, or write each type to a topic of its own."
         )
     found = [
         sensor for topic in named or reader.topics if topic.n_messages and (sensor := _sensor(reader, topic))
@@ -65,10 +64,9 @@ def choose_sensor(reader: BagReader, wanted: str | None) -> Sensor:
     if not found:
         what = f"dataset.topic={wanted} is not" if wanted else "has no topic of"
         raise DataError(
-            f"{reader.path} {what} a range sensor with messages (PointCloud2, LaserScan, "
-            "depth Image, or a list "
-            f"of points). Its topics are {listed(reader.topics)}. Record such a topic, or "
-            "choose dataset.topic."
+            f"{reader.path} {what} a range sensor with messages (PointCloud2, LaserScan, depth Image, or a "
+            f"list of points). Its topics are {listed(reader.topics)}. Record such a topic, or choose "
+            "dataset.topic."
         )
     kind = min((sensor.kind for sensor in found), key=_PREFERENCE.index)
     found = [sensor for sensor in found if sensor.kind == kind]
@@ -126,14 +124,13 @@ def _camera(reader: BagReader, topic: Topic) -> Sensor | None:
 def choose_camera_info(reader: BagReader, image: str, wanted: str | None) -> str:
     """The topic of the camera parameters: `wanted`, or the one that shares most of the image topic's name."""
     infos = [topic.name for topic in reader.topics if topic.type == INFO_TYPE and topic.n_messages]
-    if wanted is not None and wanted in infos:
+    if wanted in infos:
         return wanted
     best = nearest_names(infos, image)
     if wanted is not None or len(best) != 1:
         raise InvalidArgumentError(
-            f"{reader.path}: dataset.camera_info={wanted} is not clear for the images of "
-            f"{image}; topics of type "
-            f"CameraInfo are {', '.join(infos) or 'none: record the one of the camera'}."
+            f"{reader.path}: dataset.camera_info={wanted} is not clear for the images of {image}; topics of "
+            f"type CameraInfo are {', '.join(infos) or 'none: record the one of the camera'}."
         )
     return best[0]
 

@@ -58,11 +58,9 @@ class TfPoses:
         if frame not in self._chains:
             if frame not in self._tree.frames:
                 raise DataError(
-                    f"{self._where}: TF has no frame {frame or '(unnamed)'}, in which the "
-                    "sensor measures; its "
-                    f"frames are {self._tree.describe()}. State the sensor's frame "
-                    "(dataset.sensor_frame), or choose other "
-                    "poses: dataset.poses=TOPIC, FILE or standing."
+                    f"{self._where}: TF has no frame {frame or '(unnamed)'}, in which the sensor measures; "
+                    f"its frames are {self._tree.describe()}. State the sensor's frame "
+                    "(dataset.sensor_frame), or choose other poses: dataset.poses=TOPIC, FILE or standing."
                 )
             try:
                 self._chains[frame] = self._tree.chain(frame, self._top)
@@ -148,6 +146,6 @@ def mount_matrix(extrinsic: list[float] | None) -> np.ndarray | None:
         return pose_matrix(numbers[:3], numbers[3:])
     except (TypeError, ValueError) as error:
         raise InvalidArgumentError(
-            f"dataset.extrinsic={extrinsic} is not the sensor's pose on the body: give x, y, "
-            "z (m), qx, qy, qz, qw."
+            f"dataset.extrinsic={extrinsic} is not the sensor's pose on the body: give x, y, z (m), qx, qy, "
+            "qz, qw."
         ) from error

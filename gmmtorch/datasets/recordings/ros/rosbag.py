@@ -5,34 +5,25 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets.base import Dataset, Ranges
+from gmmtorch.datasets.base import Dataset, Ranges, require_path
 from gmmtorch.datasets.recordings.ros import bag_topics, sensor_messages
-from gmmtorch.datasets.recordings.ros.bag_poses import BagSurvey, PoseOptions
+from gmmtorch.datasets.recordings.ros.bag_poses import BagSurvey, Record
 from gmmtorch.datasets.recordings.ros.bag_reader import BagReader, RawMessage
 from gmmtorch.datasets.recordings.ros.scan_conversion import ScanConversion
 from gmmtorch.datasets.recordings.ros.sensor_messages import Reading
 from gmmtorch.datasets.recordings.ros.transform_tree import frame_name, stamp_of
 from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, in_plane, increasing
-from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError, check_choice, check_whole
+from gmmtorch.errors import DataError, InvalidArgumentError, check_choice
 from gmmtorch.scan import FARTHEST, Scan
 
 HEADER = "std_msgs/msg/Header"
 _SHORT_SKIP = 16
-
-
-class _Record(NamedTuple):
-    """A message of the sensor. number: in its topic. time: of recording; stamp: of measurement, in ns."""
-
-    number: int
-    time: int
-    stamp: int
-    frame: str
 
 
 def open_rosbag(
@@ -66,26 +57,20 @@ def open_rosbag(
         camera_info: topic of the camera parameters of depth images.
         pixel_stride: every n-th pixel of every n-th row of depth images is used.
     """
-    if path is None or str(path) == "":
-        raise InvalidArgumentError(
-            "dataset.path is not set; give a .bag, .mcap or .db3 file, or a bag's folder."
-        )
-    file = Path(path).expanduser()
-    if not file.exists():
-        raise MissingDataError(
-            f"dataset.path={path} does not exist; looked for a ROS bag (.bag, .mcap, .db3)."
-        )
+    source = "A bag of ROS 1 is a file; one of ROS 2 is a file or its folder."
+    file = require_path(path, "file or folder", "a ROS bag (.bag, .mcap, .db3)", source)
     check_choice("dataset.clock", clock, ("header", "received"))
     if not max_gap > 0:
         raise InvalidArgumentError(f"dataset.max_gap={max_gap} must be a time above zero seconds.")
     reader = BagReader(file)
     sensor = bag_topics.choose_sensor(reader, topic)
-    options = PoseOptions(poses, frame, extrinsic, max_gap)
-    arguments = (reader, sensor, ranges, stride, options, sensor_frame, clock, deskew)
+    intrinsics = None
     if sensor.is_camera:
         info = bag_topics.choose_camera_info(reader, sensor.topic.name, camera_info)
-        return DepthBag(*arguments, camera_info=info, pixel_stride=pixel_stride)
-    return RosBag(*arguments)
+        intrinsics = sensor_messages.camera_matrix(reader.decode(next(reader.messages([info]))))
+    survey = BagSurvey(reader, sensor.topic.name, poses, frame, extrinsic, max_gap)
+    kind = DepthBag if sensor.is_camera else RosBag
+    return kind(reader, sensor, survey, ranges, stride, sensor_frame, clock, deskew, intrinsics, pixel_stride)
 
 
 class RosBag(Dataset):
@@ -97,18 +82,20 @@ class RosBag(Dataset):
     is the sensor's topic.
     """
 
+    _poses: Tensor
+
     def __init__(
         self,
         reader: BagReader,
         sensor: bag_topics.Sensor,
+        survey: BagSurvey,
         ranges: Ranges,
         stride: int,
-        options: PoseOptions,
         sensor_frame: str | None,
         clock: str,
         deskew: bool,
-        intrinsics: Tensor | None = None,
-        pixel_stride: int = 1,
+        intrinsics: Tensor | None,
+        pixel_stride: int,
     ) -> None:
         super().__init__(reader.path.stem, ranges, stride)
         self._reader, self._sensor, self._clock = reader, sensor, clock
@@ -116,19 +103,19 @@ class RosBag(Dataset):
         self._where = f"{reader.path}, topic {self.topic}"
         self._stream: Iterator[RawMessage] | None = None
         self._next = 0  # number of the message that the stream yields next
-        survey = BagSurvey(reader, self.topic, options)
         self._received = np.array([time for time, _ in survey.heads])
         records = self._ordered(self._of_frame(self._read_headers(survey.heads), sensor_frame))
         self._source = survey.source(records, self._where)
         self._conversion = ScanConversion(sensor, ranges, self._source, deskew, intrinsics, pixel_stride)
         delay = float(np.median([record.time - record.stamp for record in records]))
         self._delay = None if clock == "received" else delay
-        self._records, matrices = self._posed(records)
-        self._matrices = matrices
-        self._is_flat = self._conversion.is_flat(matrices, self._first_reading())
-        self._poses = torch.from_numpy(in_plane(matrices) if self._is_flat else matrices)
+        self._records, self._matrices = self._posed(records)
+        self._is_flat = self._conversion.is_flat(self._matrices, self._first_reading())
+        self._poses = torch.from_numpy(in_plane(self._matrices) if self._is_flat else self._matrices)
+        seconds = [record.stamp / NANOSECONDS for record in self._records]
+        self._times = torch.tensor(seconds, dtype=torch.float64)
 
-    def _read_headers(self, messages: list[tuple[int, bytes]]) -> list[_Record]:
+    def _read_headers(self, messages: list[tuple[int, bytes]]) -> list[Record]:
         records = []
         for number, (time, head) in enumerate(messages):
             try:
@@ -137,12 +124,12 @@ class RosBag(Dataset):
                 self._skip("message that cannot be decoded", number)
                 continue
             stamp = stamp_of(header) if self._clock == "header" else time
-            records.append(_Record(number, time, stamp, frame_name(header["frame_id"])))
+            records.append(Record(number, time, stamp, frame_name(header["frame_id"])))
         if not records:
             raise DataError(f"{self._where}: none of {len(messages)} messages can be decoded; it is damaged.")
         return records
 
-    def _of_frame(self, records: list[_Record], frame: str | None) -> list[_Record]:
+    def _of_frame(self, records: list[Record], frame: str | None) -> list[Record]:
         if frame is None:
             return records
         wanted = frame_name(frame)
@@ -152,20 +139,17 @@ class RosBag(Dataset):
             raise InvalidArgumentError(
                 f"dataset.sensor_frame={frame} is not a frame of {self._where}, whose frames are {frames}."
             )
-        for record in records:
-            if record.frame != wanted:
-                self._skip("message of another frame", record.number)
+        self._skip("message of another frame", *(r.number for r in records if r.frame != wanted))
         return kept
 
-    def _ordered(self, records: list[_Record]) -> list[_Record]:
+    def _ordered(self, records: list[Record]) -> list[Record]:
         """The longest series of messages whose stamps do not run backwards."""
-        kept = set(increasing(np.array([record.stamp for record in records])).tolist())
-        for position, record in enumerate(records):
-            if position not in kept:
-                self._skip("stamp out of order (the clock jumped)", record.number)
-        return [record for position, record in enumerate(records) if position in kept]
+        kept = [records[i] for i in increasing(np.array([record.stamp for record in records])).tolist()]
+        left_out = {record.number for record in records} - {record.number for record in kept}
+        self._skip("stamp out of order (the clock jumped)", *left_out)
+        return kept
 
-    def _posed(self, records: list[_Record]) -> tuple[list[_Record], np.ndarray]:
+    def _posed(self, records: list[Record]) -> tuple[list[Record], np.ndarray]:
         """The messages whose pose is known, and their poses (N, 4, 4)."""
         matrices, known = np.empty((len(records), 4, 4)), np.empty(len(records), bool)
         for frame in dict.fromkeys(record.frame for record in records):
@@ -178,14 +162,13 @@ class RosBag(Dataset):
             raise DataError(
                 f"{self._where}: no scan has a pose. Frame {first.frame or '(unnamed)'}, stamps from "
                 f"{first.stamp / NANOSECONDS:.3f} to {last.stamp / NANOSECONDS:.3f} s; "
-                f"{self._source.explain(first.stamp, first.frame)}. If the sensor has a clock "
-                "of its own, use "
-                "the times of recording: dataset.clock=received; if poses are rare, raise dataset.max_gap."
+                f"{self._source.explain(first.stamp, first.frame)}. If the sensor has a clock of its own, "
+                "use the times of recording: dataset.clock=received; if poses are rare, raise "
+                "dataset.max_gap."
             )
-        for record, is_known in zip(records, known, strict=True):
-            if not is_known:
-                self._skip("no pose at the time of the scan", record.number)
-        return [record for record, is_known in zip(records, known, strict=True) if is_known], matrices[known]
+        unknown = (records[i].number for i in np.flatnonzero(~known))
+        self._skip("no pose at the time of the scan", *unknown)
+        return [records[i] for i in np.flatnonzero(known)], matrices[known]
 
     def _first_reading(self) -> Reading:
         """The first of ten readings that has points. Raises `DataError` if none of them can be decoded."""
@@ -205,12 +188,6 @@ class RosBag(Dataset):
 
     def _count(self) -> int:
         return len(self._records)
-
-    def _known_pose(self, index: int) -> Tensor:
-        return self._poses[index]
-
-    def _known_times(self) -> Tensor:
-        return torch.tensor([record.stamp / NANOSECONDS for record in self._records], dtype=torch.float64)
 
     def _read(self, index: int) -> Scan:
         record, matrix = self._records[index], self._matrices[index]
@@ -259,13 +236,11 @@ class DepthBag(RosBag):
     `image` returns the full depth image of a scan. Lens distortion is not removed: record rectified images.
     """
 
-    def __init__(self, *arguments: Any, camera_info: str, pixel_stride: int) -> None:
-        self.pixel_stride = check_whole("dataset.pixel_stride", pixel_stride, 1)
-        reader = arguments[0]
-        message = next(reader.messages([camera_info]))
-        self.intrinsics = sensor_messages.camera_matrix(reader.decode(message))
-        arguments = (*arguments, self.intrinsics, pixel_stride)
-        super().__init__(*arguments)
+    @property
+    def intrinsics(self) -> Tensor:
+        matrix = self._conversion.intrinsics
+        assert matrix is not None
+        return matrix
 
     def image(self, index: int) -> tuple[Tensor, Tensor]:
         """Depth (H, W) in metres, 0 for invalid pixels, and pose (4, 4), world ← camera, of a scan."""

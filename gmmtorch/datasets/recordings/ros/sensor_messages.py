@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets.depth_frames import MAX_PIXELS, read_png
+from gmmtorch.datasets.depth_frames import MAX_PIXELS, metric, read_png
 from gmmtorch.errors import DataError
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -21,7 +21,7 @@ _UNITS = (1_000_000_000, 1_000_000, 1_000, 1)  # nanoseconds in s, ms, µs, ns
 _SWEEP = (2_000_000, 600_000_000)
 """Shortest and longest plausible sweep of a sensor in ns; at most one unit of time falls into it."""
 _NEAR = 10_000_000_000
-_EMPTY_DEPTH = (0, 65535)
+_MILLIMETRE = 0.001
 _COMPRESSED_DEPTH_BYTES = 12
 _PNG = b"\x89PNG"
 
@@ -145,7 +145,7 @@ def depth_image(message: dict[str, Any]) -> Tensor:
     if (height - 1) * step + width * dtype.itemsize > len(data):
         raise DataError(f"{width} × {height} pixels are announced, but the image has {len(data)} bytes")
     raw = np.ndarray((height, width), dtype, bytes(data), 0, (step, dtype.itemsize))
-    return _metres(raw) if kind == "u2" else _finite(raw.astype(np.float64))
+    return metric(raw, _MILLIMETRE) if kind == "u2" else _finite(raw.astype(np.float64))
 
 
 def compressed_depth_image(message: dict[str, Any]) -> Tensor:
@@ -161,14 +161,10 @@ def compressed_depth_image(message: dict[str, Any]) -> Tensor:
         )
     raw = read_png(io.BytesIO(data[start:]), "the compressed image")
     if "32FC1" not in form or start == 0:
-        return _metres(raw)
+        return metric(raw, _MILLIMETRE)
     a, b = np.frombuffer(data, "<f4", 2, 4).astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         return _finite(np.where(raw > 0, a / (raw.astype(np.float64) - b), 0))
-
-
-def _metres(raw: np.ndarray) -> Tensor:
-    return torch.from_numpy(np.where(np.isin(raw, _EMPTY_DEPTH), 0, raw) / 1000.0)
 
 
 def _finite(depth: np.ndarray) -> Tensor:

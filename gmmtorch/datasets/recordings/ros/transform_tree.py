@@ -91,17 +91,15 @@ class TransformTree:
             parent = next(iter(parents))
             if parent in found:
                 raise DataError(
-                    f"TF loops: {' → '.join([*found, parent])}; record only one of these "
-                    "transforms, or choose "
-                    "other poses: dataset.poses=TOPIC, FILE or standing."
+                    f"TF loops: {' → '.join([*found, parent])}; record only one of these transforms, or "
+                    "choose other poses: dataset.poses=TOPIC, FILE or standing."
                 )
             found.append(parent)
         if top is not None and found[-1] != top:
             raise DataError(
                 f"TF has no transform between frame {top} and frame {frame}, whose tree is "
                 f"{' → '.join(found)}; all frames: {self.describe()}. Choose dataset.frame, "
-                "dataset.sensor_frame "
-                "or dataset.poses."
+                "dataset.sensor_frame or dataset.poses."
             )
         return found
 
@@ -151,7 +149,7 @@ class TransformTree:
             numbers = numbers.reshape(-1, 7)
             valid = np.isfinite(numbers).all(1) & (np.linalg.norm(numbers[:, 3:], axis=1) > MIN_NORM)
             poses = pose_matrix(numbers[valid, :3], numbers[valid, 3:])
-            self._edges[child], _ = Trajectory.from_samples(times[valid], poses)
+            self._edges[child] = Trajectory.from_samples(times[valid], poses)
         return self._edges[child]
 
 

@@ -19,8 +19,8 @@ from gmmtorch.mixture.estimators.trees.nested import (
     Members,
     Packed,
     assign_members,
-    drop_weak_children,
     expectation,
+    keep_children,
     maximization,
     pack,
     principal_axes_start,
@@ -106,7 +106,6 @@ def grow(
     weight: Tensor,
     rule: Rule,
     on_iteration: Callable[[int, float], None] | None = None,
-    on_level: Callable[[Nodes, Members], None] | None = None,
     density: DensityLimit | None = None,
 ) -> Growth:
     """Grow the tree of centred points (N, D) with weights (N,) above zero, float64.
@@ -115,7 +114,6 @@ def grow(
         points, weight: the cloud.
         rule: an estimator; its parameters say when a node is split, and how children are fitted.
         on_iteration: called with the EM iteration, from 1, and the lower bound, nats per point.
-        on_level: called with the nodes of each level, starting with the root (level 0), and their members.
         density: removes sparse children before the points are assigned to them.
     """
     nodes, members = _root(points, weight, rule.reg_covar)
@@ -129,21 +127,18 @@ def grow(
             on_iteration(len(bounds), bounds[-1])
 
     report_bound(score)
-    if on_level is not None:
-        on_level(nodes, members)
     for _ in range(rule.max_levels):
         free = math.inf if rule.n_components is None else rule.n_components - n_leaves
         if free < 1:
             break
         m = int(min(rule.branching, free + 1))
         chosen = _splittable(nodes, members.mass(nodes.n), rule)
-        if chosen.numel() * (m - 1) > free:
-            chosen = _shortlist(
-                points, members.select(chosen, nodes.n), nodes.select(chosen), chosen, m, free, rule
-            )
-        if chosen.numel() == 0:
-            break
         members, nodes = members.select(chosen, nodes.n), nodes.select(chosen)
+        if nodes.n * (m - 1) > free:
+            chosen = _shortlist(points, members, nodes, m, free, rule)
+            members, nodes = members.select(chosen, nodes.n), nodes.select(chosen)
+        if nodes.n == 0:
+            break
         rest = score - nodes.own.sum()
         split = _split(points, members, nodes, m, rule, report_bound, rest, density)
         accepted = _accepted_splits(split, nodes, members.mass(nodes.n), free, rule)
@@ -155,8 +150,6 @@ def grow(
         n_leaves += nodes.n - int(accepted.sum())
         converged &= split.converged
         report_bound(score)
-        if on_level is not None:
-            on_level(nodes, members)
     if n_leaves == 1:
         return Growth(Tree(root.place, *root.parameters), bounds, converged)
     return Growth(Tree(*(torch.cat(values) for values in zip(*levels, strict=True))), bounds, converged)
@@ -183,19 +176,11 @@ def _splittable(nodes: Nodes, mass: Tensor, rule: Rule) -> Tensor:
     return (~is_flat & (mass >= 2 * rule.min_support)).nonzero().squeeze(1)
 
 
-def _shortlist(
-    points: Tensor,
-    members: Members,
-    nodes: Nodes,
-    chosen: Tensor,
-    m: int,
-    free: float,
-    rule: Rule,
-) -> Tensor:
-    """Of the nodes `chosen` for splitting, those that gain most in a few trial iterations."""
+def _shortlist(points: Tensor, members: Members, nodes: Nodes, m: int, free: float, rule: Rule) -> Tensor:
+    """The nodes that gain most by a split in a few trial iterations."""
     n_kept = _SHORTLIST * math.ceil(free / (m - 1))
     if nodes.n <= n_kept:
-        return chosen
+        return torch.arange(nodes.n, device=nodes.place.device)
     dtype = SOFTMAX_DTYPES[rule.dtype]
     packed = pack(points, members, nodes.parameters.means, dtype)
     children = principal_axes_start(packed, nodes.n, m, rule.reg_covar)
@@ -203,7 +188,7 @@ def _shortlist(
         statistics, value = expectation(packed, children)
         children, _ = maximization(statistics, rule.reg_covar, dtype, children)
     best = (value - nodes.own).argsort(descending=True, stable=True)[:n_kept]
-    return chosen[best.sort().values]
+    return best.sort().values
 
 
 class _Split(NamedTuple):
@@ -247,7 +232,7 @@ def _split(
     packed, found = learn(SOFTMAX_DTYPES[rule.dtype], None, rule.max_iter)
     if found.is_coarse:
         packed, found = learn(torch.float64, found.children, max(1, rule.max_iter - found.n_iter))
-    children = drop_weak_children(found.children, mass, rule.min_support)
+    children = keep_children(found.children, found.children.weights * mass[:, None] >= rule.min_support)
     assignment = assign_members(packed, children, members, rule.soft_threshold)
     value = assignment.value
     if density is not None:

@@ -10,7 +10,7 @@ import torch
 from sklearn.utils._param_validation import HasMethods, Interval
 from torch import Tensor
 
-from gmmtorch.arrays import ArrayLike, as_tensor
+from gmmtorch.arrays import ArrayLike
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.estimator import AT_LEAST_ZERO, COUNT, MixtureEstimator
@@ -18,6 +18,7 @@ from gmmtorch.mixture.estimators.sensor_model import SensorModel
 from gmmtorch.mixture.estimators.trees.density_limit import DensityLimit
 from gmmtorch.mixture.estimators.trees.growth import Tree, grow
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
+from gmmtorch.mixture.reduction.pruning import checked_origins
 from gmmtorch.mixture.validation import Array, RandomState
 
 
@@ -158,12 +159,7 @@ class HierarchicalGaussianMixture(MixtureEstimator):
                 f"min_density_share={self.min_density_share} needs points in 2D or 3D (D = {dim}), sensor, "
                 "and origins in fit."
             )
-        positions = as_tensor(origins, "origins", torch.float64, center.device)
-        if positions.ndim not in (1, 2) or positions.shape[-1] != dim or positions.numel() == 0:
-            raise InvalidArgumentError(
-                f"origins has shape {tuple(positions.shape)}; expected ({dim},) or (S, {dim})."
-            )
-        return DensityLimit(self.min_density_share, self.sensor, positions.reshape(-1, dim) - center)
+        return DensityLimit(self.min_density_share, self.sensor, checked_origins(origins, center) - center)
 
     # -- the tree ---------------------------------------------------------------------------------
 

@@ -167,10 +167,8 @@ def principal_axes_start(packed: Packed, n_nodes: int, n_children: int, reg_cova
     dim = feature_dimension(packed.features.shape[1])
     while n_pieces < n_children:
         statistics = _pool(packed, label, n_nodes, n_pieces)
-        count, means = (
-            statistics[..., 0],
-            statistics[..., 1 : 1 + dim] / statistics[..., :1].clamp_min(1e-300),
-        )
+        count = statistics[..., 0]
+        means = statistics[..., 1 : 1 + dim] / count[..., None].clamp_min(1e-300)
         second = unpack_symmetric(statistics[..., 1 + dim :] / count[..., None].clamp_min(1e-300), dim)
         variances, axes = torch.linalg.eigh(second - means[..., :, None] * means[..., None, :])
         longest, across = variances[..., -1], axes[..., -1]
@@ -257,14 +255,6 @@ def run_em(
         if not bool(going_on.all()):
             packed, active = packed.select(going_on), active[going_on]
     return Fitted(children, False, max_iter, False)
-
-
-def drop_weak_children(children: Children, mass: Tensor, min_support: float) -> Children:
-    """Set children with less support than `min_support` to weight 0, in favour of their siblings.
-
-    mass (G,): of the nodes.
-    """
-    return keep_children(children, children.weights * mass[:, None] >= min_support)
 
 
 def keep_children(children: Children, kept: Tensor) -> Children:

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike
 from gmmtorch.occupancy.cones import CUTOFF, Cones, WhitenedCones, cross, dot, length, outside_cone
+from gmmtorch.occupancy.culling import Pairs, candidate_pairs, in_chunks
 from gmmtorch.occupancy.forms.cone.projection import Planes, share_beyond_3d
 from gmmtorch.occupancy.forms.cone.silhouette import facing, image, meets_disc, outline
 from gmmtorch.occupancy.forms.flux.box_flux import checked_boxes
 from gmmtorch.occupancy.forms.flux.box_mass import box_mass
-from gmmtorch.occupancy.index.culling import Pairs, candidate_pairs, in_chunks
 
 CHUNK_PAIRS = 1 << 13
 """Pairs of a box and a cone evaluated in one pass; each takes about 10 kB."""
@@ -93,7 +93,7 @@ def _reached(white: WhitenedCones, low: Tensor, high: Tensor, cutoff: float) -> 
     frame = facing(mean / distance.clamp_min(1e-300))
     turned = (frame[None] * torch.stack([white.apply(c) for c in corners])[:, None]).sum(2)
     tangent = cutoff / (distance**2 - cutoff**2).clamp_min(1e-300).sqrt()
-    return near & (inside | (distance <= cutoff) | meets_disc(image(turned), tangent))
+    return near & (inside | (distance <= cutoff) | meets_disc(*image(turned), tangent))
 
 
 def share_beyond_2d(corners: Tensor, mean: Tensor, inside: Tensor, cutoff: float) -> Tensor:

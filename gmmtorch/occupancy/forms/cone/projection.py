@@ -9,12 +9,10 @@ import torch
 from torch import Tensor
 
 from gmmtorch.occupancy.cones import Cones
-from gmmtorch.occupancy.forms.cone.owens_t import polygon_probability
-from gmmtorch.occupancy.forms.cone.silhouette import Edges, image, outline
+from gmmtorch.occupancy.forms.cone.polygons import approximate_probability, polygon_probability
+from gmmtorch.occupancy.forms.cone.silhouette import image, outline
 
-_FAR = 9.0  # |x| beyond which e^(−x²/2) is negligible
 _EDGE_ON = 1e-3  # least distance, in deviations, of a component's plane from the sensor origin
-_ROOT_TWO_PI = math.sqrt(2 * math.pi)
 
 
 class Planes(NamedTuple):
@@ -65,59 +63,12 @@ def share_beyond_3d(planes: Planes, low: Tensor, high: Tensor, exact: bool, cuto
     """
     corners, inside = outline(low, high)
     corners = (planes.frame[None] * corners[:, None]).sum(2)
-    edges = image(corners)
     depth = planes.mean[2]
-    starts, ends = ((depth * part - planes.mean[:2]) / planes.deviation[:2] for part in edges)
-    share = polygon_probability(starts, ends) if exact else approximate_probability(Edges(starts, ends))
+    edges = ((depth * part - planes.mean[:2]) / planes.deviation[:2] for part in image(corners))
+    share = polygon_probability(*edges) if exact else approximate_probability(*edges)
     share = torch.where(inside, 1.0, share)
     box = torch.where(planes.frame[2] > 0, low, high)
     nearest = (planes.frame[2] * box).sum(0).clamp_min(0)
     beyond = (nearest - depth) / planes.deviation[2]
     radial = 0.5 * torch.special.erfc(beyond / math.sqrt(2))
     return torch.where(beyond > cutoff, 0.0, share * radial)
-
-
-def approximate_erf(x: Tensor) -> Tensor:
-    """ê(x) = sign(x) (1 − exp(−2|x|/√π − 2x²/π)) (3.5), an approximation of erf with errors up to 0.014."""
-    size = x.abs()
-    return torch.sign(x) * -torch.expm1(-2 / math.sqrt(math.pi) * size - 2 / math.pi * size * size)
-
-
-def approximate_probability(edges: Edges) -> Tensor:
-    """Probability (P,) that a standard normal point lies in a counter-clockwise polygon, by (3.6) and (3.7).
-
-    By Green's theorem it is −1/√8π Σ ∫ e^{−x²/2} ê((mx + c)/√2) dx over the edges y = mx + c.
-    """
-    (x1, y1), (x2, y2) = edges.starts.unbind(1), edges.ends.unbind(1)
-    width = x2 - x1
-    upright = width.abs() < 1e-12  # contributes nothing
-    slope = (y2 - y1) / torch.where(upright, 1.0, width)
-    near = x1.abs() < x2.abs()
-    at = torch.where(near, x1, x2), torch.where(near, y1, y2)  # an end may lie at the horizon
-    # ê(mx + c) changes sign where the edge crosses the x axis: integrate the two parts separately.
-    crosses = y1 * y2 < 0
-    root = torch.where(crosses, x1 + y1 / torch.where(crosses, y1 - y2, 1.0) * width, x2)
-    total = torch.zeros_like(x1)
-    sign = torch.sign(torch.where(y1 == 0, y2, y1))
-    for begin, end, side in ((x1, root, sign), (root, x2, -sign)):
-        begin, end = begin.clamp(-_FAR, _FAR), end.clamp(-_FAR, _FAR)
-        total = total + torch.where(upright, 0.0, _edge_integral(begin, end, slope, at, side))
-    return (-total.sum(0) / math.sqrt(8 * math.pi)).clamp(0, 1)
-
-
-def _edge_integral(
-    begin: Tensor, end: Tensor, slope: Tensor, at: tuple[Tensor, Tensor], sign: Tensor
-) -> Tensor:
-    """∫ e^{−x²/2} ê((mx + c)/√2) dx from `begin` to `end`, where mx + c has the given sign; any shape."""
-    x0, y0 = at
-    intercept = y0 - slope * x0
-    d = 2 * slope * slope + math.pi
-    scale = torch.exp((slope * slope - intercept * (intercept + sign * _ROOT_TWO_PI)) / d)
-
-    def primitive(x: Tensor) -> Tensor:
-        y = y0 + slope * (x - x0)
-        reduced = (math.pi * x + slope * (2 * y + sign * _ROOT_TWO_PI)) / (2 * math.pi * d).sqrt()
-        gaussian = math.sqrt(math.pi / 2) * torch.erf(x / math.sqrt(2))
-        return gaussian - math.pi / (2 * d).sqrt() * scale * torch.erf(reduced)
-
-    return sign * (primitive(end) - primitive(begin))

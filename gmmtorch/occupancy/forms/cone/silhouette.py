@@ -4,20 +4,12 @@ from __future__ import annotations
 
 import functools
 import itertools
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 _TOUCHING = 1e-6  # relative to a side: distance at which a viewpoint on a face is placed from it
 _GRAZING = 1e-9  # directions with a smaller cosine to the normal count as parallel to the plane
-
-
-class Edges(NamedTuple):
-    """P polygons: starts and ends (E, 2, P) of their edges; an edge can have zero length."""
-
-    starts: Tensor
-    ends: Tensor
 
 
 def outline(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
@@ -41,8 +33,10 @@ def outline(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
     return corners, code == 13
 
 
-def image(corners: Tensor) -> Edges:
-    """Perspective image of convex outlines on the plane at depth 1, clipped to positive depth; n + 1 edges.
+def image(corners: Tensor) -> tuple[Tensor, Tensor]:
+    """Perspective image of convex outlines on the plane at depth 1, clipped to positive depth.
+
+    Returns the starts and the ends (n + 1, 2, P) of its edges. An edge can have zero length.
 
     Args:
         corners: (n, 3, P) of the outlines relative to the viewpoint; the last coordinate is the depth.
@@ -65,20 +59,17 @@ def image(corners: Tensor) -> Edges:
         flat = parts[:, :2] / parts[:, 2:].clamp_min(_GRAZING)
         gap = gap[:, :2] / gap[:, 2:].clamp_min(_GRAZING)
         points.append(torch.cat([torch.where(shown, flat, 0.0), torch.where(cut, gap, 0.0)]))
-    return Edges(*points)
+    return points[0], points[1]
 
 
-def meets_disc(edges: Edges, radius: Tensor) -> Tensor:
-    """Whether each polygon (P,) meets the disc of `radius` (P,) around the origin."""
-    starts, ends = edges
+def meets_disc(starts: Tensor, ends: Tensor, radius: Tensor) -> Tensor:
+    """Whether each polygon (P,), with edges (E, 2, P), meets the disc of `radius` (P,) around the origin."""
     step = ends - starts
     share = -(starts * step).sum(1) / (step * step).sum(1).clamp_min(1e-300)
     nearest = (starts + share.clamp(0, 1)[:, None] * step).norm(dim=1)
     drawn = (step != 0).any(1)
     turned = torch.atan2(starts[:, 0] * ends[:, 1] - starts[:, 1] * ends[:, 0], (starts * ends).sum(1))
-    around = (
-        torch.where(drawn, turned, 0.0).sum(0).abs() > 3
-    )  # the sum is 2π if the polygon surrounds the origin, else 0
+    around = torch.where(drawn, turned, 0.0).sum(0).abs() > 3  # the sum is 2π around the origin, else 0
     return around | (drawn & (nearest < radius)).any(0)
 
 

@@ -35,9 +35,7 @@ _ORDERS = (1, 2, 3, 4)
 # Error bound of an n-point rule on a Gaussian κ deviations wide: (n!)⁴/((2n+1)(2n)!³) max|He₂ₙ| κ²ⁿ.
 _ERROR = tuple(math.factorial(n) ** 3 / ((2 * n + 1) * math.factorial(2 * n) ** 2 * 2**n) for n in _ORDERS)
 _MAX_SPLIT = 4  # parts per cut and axis: panels outside the component are dropped between two cuts
-_SMALLEST = (
-    1e-15  # smallest panel, relative to its patch: stops the cutting of patches close to the sensor origin
-)
+_SMALLEST = 1e-15  # smallest panel relative to its patch: ends the cutting close to the sensor origin
 
 
 class Rule(NamedTuple):
@@ -59,14 +57,18 @@ class Patches(ABC):
 
     f lies in [−½, ½]^{D−1}, or with `triangular` in the triangle {f ≥ 0, Σf ≤ 1}. The integrand is exactly
     zero beyond `cutoff` standard deviations of the component.
+
+    offset: W(q − μ) of the centre q (first corner of a triangle), (D, P).
+    edges: whitened edges, (D−1, D, P).
     """
 
     cutoff: float
+    offset: Tensor
+    edges: Tensor
     triangular: bool = field(default=False, kw_only=True)
 
-    @abstractmethod
     def __len__(self) -> int:
-        """Number of patches."""
+        return self.offset.shape[-1]
 
     def take(self, index: Tensor) -> Self:
         """The patches with indices (Q,)."""
@@ -92,6 +94,10 @@ class Patches(ABC):
     @abstractmethod
     def sums(self, rule: Rule, simple: bool) -> Tensor:
         """Integral over each patch (P,) by `rule`; `simple` states that the cheaper form is valid on all."""
+
+    def shift_to_middle(self) -> Tensor | float:
+        """The vector from the centre of `offset` to the middle of the patch."""
+        return 0.5 * self.edges.sum(0) if self.triangular else 0.0
 
 
 class _Panels(NamedTuple):
@@ -123,15 +129,15 @@ def variation_limits(tolerance: float) -> tuple[float, ...]:
     return tuple((tolerance / error) ** (0.5 / n) for n, error in zip(_ORDERS, _ERROR, strict=True))
 
 
-def integrate(patches: Patches, like: Tensor, tolerance: float = TOLERANCE) -> Tensor:
-    """Integral over each patch (P,); `like` (D, P) gives the dimension, dtype and device.
+def integrate(patches: Patches, tolerance: float = TOLERANCE) -> Tensor:
+    """Integral over each patch (P,), float64, computed in the dtype of the patches.
 
     Differentiable: cuts and orders depend on detached values only. Panels to cut further are kept on a stack;
     a pass works on about `CHUNK_PANELS` of them.
     """
-    total = like.new_zeros(len(patches))
-    index = torch.arange(len(patches), device=like.device)
-    whole = like.new_zeros(like.shape[0] - 1, len(patches))
+    total = patches.offset.new_zeros(len(patches))
+    index = torch.arange(len(patches), device=total.device)
+    whole = total.new_zeros(len(patches.edges), len(patches))
     stack = list(_Panels(index, whole, whole + 1).chunks()) if len(index) else []
     while stack:
         panels = _next_panels(stack)
@@ -139,7 +145,7 @@ def integrate(patches: Patches, like: Tensor, tolerance: float = TOLERANCE) -> T
         for patch, sums, cut in chunked(len(panels.patch), len(panels.patch), compute):
             total = total.index_add(0, patch, sums) if len(patch) else total
             stack.extend(cut.chunks() if cut else ())
-    return total
+    return total.double()
 
 
 def _pass(
@@ -231,10 +237,7 @@ def _cut_triangles(panels: _Panels, ratio: Tensor) -> _Panels:
 
 def square_on(monomials: Tensor, start: Tensor, edges: Tensor) -> Tensor:
     """|start + Σ f_i edge_i|² at the nodes f of a rule with these `monomials`: (n, P)."""
-    terms = [dot(start, start), *(2 * dot(start, edge) for edge in edges)]
-    for i, edge in enumerate(edges):
-        terms += [dot(edge, edge), *(2 * dot(edge, other) for other in edges[i + 1 :])]
-    return monomials @ torch.stack(terms)
+    return product_on(monomials, start, start, edges)
 
 
 def product_on(monomials: Tensor, a: Tensor, b: Tensor, edges: Tensor) -> Tensor:

@@ -19,6 +19,15 @@ from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.evidence.cell_mass import add_cell_mass
 from gmmtorch.kernels.evidence.face_flux import add_row_flux, whitened_rows
 from gmmtorch.occupancy.cones import CUTOFF, Cones, WhitenedCones, cross, dot, length, outside_cone
+from gmmtorch.occupancy.culling import (
+    FaceRows,
+    Pairs,
+    ball_rows,
+    candidate_pairs,
+    cells_in_chunks,
+    face_rows,
+    in_chunks,
+)
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.forms.flux.adaptive_quadrature import (
     TOLERANCE,
@@ -33,15 +42,7 @@ from gmmtorch.occupancy.forms.flux.adaptive_quadrature import (
 )
 from gmmtorch.occupancy.forms.flux.box_mass import box_mass
 from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.index.culling import (
-    FaceRows,
-    Pairs,
-    ball_rows,
-    candidate_pairs,
-    cells_in_chunks,
-    face_rows,
-    in_chunks,
-)
+from gmmtorch.occupancy.voxels.boxes import row_major
 
 CHUNK_FACES = 1 << 18
 """Faces, or pairs of a box and a cone, prepared in one pass."""
@@ -58,18 +59,12 @@ class FacePatches(Patches):
     The integrand is the flux density of N(μ, Σ) seen from s: the rays per unit area that pass the place q and
     end beyond it, (u·n) ∫_1^∞ t^{D−1} N(s + tu | μ, Σ) dt with u = q − s and face normal n.
 
-    ray, offset: W(q − s) and W(q − μ) of the centre q (first corner of a triangle), (D, P).
-    edges: whitened edges, (D−1, D, P).
+    ray: W(q − s) of the place q of `offset`, (D, P).
     strength: (u·n) dA / √det 2πΣ of the whole parallelogram, (P,); constant over the face.
     """
 
     ray: Tensor
-    offset: Tensor
-    edges: Tensor
     strength: Tensor
-
-    def __len__(self) -> int:
-        return len(self.strength)
 
     def cut(self, base: Tensor, scale: Tensor) -> FacePatches:
         shift = (base[:, None] * self.edges).sum(0)
@@ -82,7 +77,7 @@ class FacePatches(Patches):
         )
 
     def _middle(self) -> tuple[Tensor, Tensor]:
-        shift = 0.5 * self.edges.sum(0) if self.triangular else 0.0
+        shift = self.shift_to_middle()
         return self.ray + shift, self.offset + shift
 
     def outside(self) -> Tensor:
@@ -182,9 +177,9 @@ def flux_evidence(
         misses = _add_faces(misses, white, counts, grid, axis, rows, cutoff, tolerance, dtype)
     hits = torch.zeros_like(misses)
     for row, cell in cells_in_chunks(balls.first, balls.number, CHUNK_FACES):
-        cone, low = balls.cone[row], _corner(grid, cell)
+        cone, low = balls.cone[row], _world(grid, cell.double())
         mass = box_mass(white.take(cone), low, low + grid.resolution, cutoff, tolerance, dtype)
-        hits = hits.index_add(0, _flat(grid, [*cell]), mass * counts[cone])
+        hits = hits.index_add(0, row_major(cell.unbind(), grid.shape), mass * counts[cone])
     return Evidence(grid, hits.view(grid.shape), misses.view(grid.shape))
 
 
@@ -202,10 +197,12 @@ def _add_faces(
     """misses (cells,) and the flux through rows of faces; the twin of `kernels.evidence.face_flux`."""
     for row, cells in cells_in_chunks(rows.first, rows.number, CHUNK_FACES):
         cone, plane, forward = rows.cone[row], rows.plane[row], rows.forward[row]
-        patches = _grid_faces(white, grid, axis, cone, plane, forward, cells, cutoff, dtype)
-        flux = integrate(patches, patches.ray, tolerance).double()
-        indices = [*cells[:axis], torch.where(forward, plane - 1, plane), *cells[axis:]]
-        misses = misses.index_add(0, _flat(grid, indices), flux * counts[cone])
+        middle = cells.double() + 0.5
+        center = _world(grid, [*middle[:axis], plane.double(), *middle[axis:]])
+        side = center.new_full((grid.dim, 1), grid.resolution)
+        flux = _face_flux(white.take(cone), center, side, axis, forward, cutoff, tolerance, dtype)
+        cell = [*cells[:axis], torch.where(forward, plane - 1, plane), *cells[axis:]]
+        misses = misses.index_add(0, row_major(cell, grid.shape), flux * counts[cone])
     return misses
 
 
@@ -271,46 +268,6 @@ def checked_boxes(low: ArrayLike, high: ArrayLike, cones: Cones) -> tuple[Tensor
     return low, high
 
 
-def _grid_faces(
-    white: WhitenedCones,
-    grid: VoxelGrid,
-    axis: int,
-    cone: Tensor,
-    plane: Tensor,
-    forward: Tensor,
-    cells: Tensor,
-    cutoff: float,
-    dtype: torch.dtype,
-) -> FacePatches:
-    """Faces of a grid perpendicular to `axis`."""
-    middle = cells.double() + 0.5
-    position = [*middle[:axis], plane.double(), *middle[axis:]]
-    center = torch.stack([o + i * grid.resolution for o, i in zip(grid.origin, position, strict=True)])
-    side = center.new_full((len(center), 1), grid.resolution)
-    return _face_patches(white.take(cone), center, side, axis, forward, cutoff, dtype)
-
-
-def _face_patches(
-    white: WhitenedCones,
-    center: Tensor,
-    side: Tensor,
-    axis: int,
-    forward: Tensor | bool,
-    cutoff: float,
-    dtype: torch.dtype,
-) -> FacePatches:
-    """Faces perpendicular to `axis` with centres and sides (D, P), crossed along or against the axis."""
-    others = [b for b in range(len(center)) if b != axis]
-    ray = center - white.origin
-    edges = torch.stack([white.matrix[:, b] * side[b] for b in others])
-    area = side[others].prod(0)
-    height = torch.where(torch.as_tensor(forward, device=ray.device), ray[axis], -ray[axis])
-    strength = height * area * torch.exp(-white.log_norm)
-    white_ray = white.apply(ray)
-    tensors = (white_ray, white_ray - white.toward, edges, strength)
-    return FacePatches(cutoff, *(part.to(dtype) for part in tensors))
-
-
 def _box_face_flux(
     white: WhitenedCones,
     corners: tuple[Tensor, Tensor],
@@ -328,19 +285,31 @@ def _box_face_flux(
     low, high, face = low[:, out], high[:, out], face[out]
     middle = 0.5 * (low + high)
     center = torch.cat([middle[:axis], face[None], middle[axis + 1 :]])
-    patches = _face_patches(white.take(out), center, high - low, axis, forward, cutoff, dtype)
-    flux = integrate(patches, patches.ray, tolerance).double()
+    flux = _face_flux(white.take(out), center, high - low, axis, forward, cutoff, tolerance, dtype)
     return flux.new_zeros(corners[0].shape[1]).index_add(0, out, flux)
 
 
-def _corner(grid: VoxelGrid, cell: Tensor) -> Tensor:
-    """Lowest corner (D, P) of cells (D, P), world metres."""
-    return torch.stack([o + i * grid.resolution for o, i in zip(grid.origin, cell.double(), strict=True)])
+def _face_flux(
+    white: WhitenedCones,
+    center: Tensor,
+    side: Tensor,
+    axis: int,
+    forward: Tensor | bool,
+    cutoff: float,
+    tolerance: float,
+    dtype: torch.dtype,
+) -> Tensor:
+    """Flux (P,) through faces across `axis`, along or against it, with centres and sides (D, P), metres."""
+    others = [b for b in range(len(center)) if b != axis]
+    ray = center - white.origin
+    edges = torch.stack([white.matrix[:, b] * side[b] for b in others])
+    height = torch.where(torch.as_tensor(forward, device=ray.device), ray[axis], -ray[axis])
+    strength = height * side[others].prod(0) * torch.exp(-white.log_norm)
+    white_ray = white.apply(ray)
+    tensors = (white_ray - white.toward, edges, white_ray, strength)
+    return integrate(FacePatches(cutoff, *(part.to(dtype) for part in tensors)), tolerance)
 
 
-def _flat(grid: VoxelGrid, cell: list[Tensor]) -> Tensor:
-    """Row-major index (P,) of cells."""
-    flat = cell[0]
-    for axis in range(1, grid.dim):
-        flat = flat * grid.shape[axis] + cell[axis]
-    return flat
+def _world(grid: VoxelGrid, units: Iterable[Tensor]) -> Tensor:
+    """Places (D, P), world metres, of grid units (P,) along each axis."""
+    return torch.stack([o + i * grid.resolution for o, i in zip(grid.origin, units, strict=True)])

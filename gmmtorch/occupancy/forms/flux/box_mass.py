@@ -48,21 +48,14 @@ class MassPatches(Patches):
     Whitened, coordinates first. The mass above a cross-section is
     ∫ (2π)^{−(D−1)/2} e^{−½ across²} P(along < Z < along + span) over its projection.
 
-    offset: W(q − μ) of the centre q of the cross-section (first corner of a triangle), (D, P).
-    edges: whitened edges of the cross-section, (D−1, D, P).
     direction: unit vector of the direction with the closed form, (D, P).
     span: whitened length of the box along it, (P,); infinite for a face.
     area: whitened area of the projection, (P,); signed for faces.
     """
 
-    offset: Tensor
-    edges: Tensor
     direction: Tensor
     span: Tensor
     area: Tensor
-
-    def __len__(self) -> int:
-        return len(self.area)
 
     def cut(self, base: Tensor, scale: Tensor) -> MassPatches:
         return replace(
@@ -72,11 +65,8 @@ class MassPatches(Patches):
             area=scale.abs().prod(0) * self.area,
         )
 
-    def _middle(self) -> Tensor:
-        return self.offset + 0.5 * self.edges.sum(0) if self.triangular else self.offset
-
     def outside(self) -> Tensor:
-        middle = self._middle()
+        middle = self.offset + self.shift_to_middle()
         slope = 0.5 * dot(self.edges, self.direction[None]).abs().sum(0)
         along = dot(middle, self.direction)
         across = length(cross(middle, self.direction))
@@ -86,10 +76,8 @@ class MassPatches(Patches):
 
     def simple(self) -> Tensor:
         """Patches (P,) both ends of which, along the direction, lie beyond the component."""
-        slope, along = (
-            0.5 * dot(self.edges, self.direction[None]).abs().sum(0),
-            dot(self._middle(), self.direction),
-        )
+        slope = 0.5 * dot(self.edges, self.direction[None]).abs().sum(0)
+        along = dot(self.offset + self.shift_to_middle(), self.direction)
         return torch.minimum(along.abs(), (along + self.span).abs()) - slope > _BEYOND
 
     def variation(self, simple: Tensor) -> Tensor:
@@ -146,5 +134,5 @@ def box_mass(
     volume = side.prod(0) * torch.exp(-white.log_norm) * (2 * math.pi) ** (0.5 * len(low))
     offset, edges, volume = (part[..., kept].to(dtype) for part in (offset, edges, volume))
     patches = _cross_sections(offset, edges, volume, cutoff)
-    mass = integrate(patches, patches.offset, tolerance).double()
+    mass = integrate(patches, tolerance)
     return mass.new_zeros(low.shape[1]).index_add(0, kept, mass)

@@ -16,10 +16,10 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike, as_tensor, is_floating
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.occupancy.cones import CUTOFF, Cones, WhitenedCones, cross, dot
+from gmmtorch.occupancy.culling import candidate_pairs
 from gmmtorch.occupancy.forms.flux.adaptive_quadrature import TOLERANCE, check_tolerance, integrate
 from gmmtorch.occupancy.forms.flux.box_flux import FacePatches
 from gmmtorch.occupancy.forms.flux.box_mass import MassPatches
-from gmmtorch.occupancy.index.culling import candidate_pairs
 
 _CHUNK_FACES = 1 << 16
 
@@ -142,9 +142,9 @@ def _face_integrals(
     height = dot(ray, cross(edge[0], edge[1])) if triangular else cross(ray, edge[0])[0]
     strength = height * torch.exp(-part.log_norm)
     out = (strength > 0).nonzero().squeeze(1)
-    tensors = (part.apply(ray), offset, edges, strength)
+    tensors = (offset, edges, part.apply(ray), strength)
     faces = FacePatches(cutoff, *(x[..., out].to(dtype) for x in tensors), triangular=triangular)
-    flux = torch.zeros_like(strength).index_add(0, out, integrate(faces, faces.ray, tolerance).double())
+    flux = torch.zeros_like(strength).index_add(0, out, integrate(faces, tolerance))
 
     upward = torch.zeros_like(offset)
     upward[0] = 1.0
@@ -152,7 +152,7 @@ def _face_integrals(
     span = torch.full_like(area, torch.inf)
     parts = (x.to(dtype) for x in (offset, edges, upward, span, area))
     sections = MassPatches(cutoff, *parts, triangular=triangular)
-    return flux, integrate(sections, sections.offset, tolerance).double()
+    return flux, integrate(sections, tolerance)
 
 
 def _check_vertices(vertices: Tensor, dim: int) -> None:

@@ -60,6 +60,7 @@ _ENTRIES_PER_CONE = {2: 64, 3: 512}  # limits memory and build time to a multipl
 _SPAN = 4  # the search for a cone's buckets starts with at most this many along an axis
 _KEY_BITS = {2: 31, 3: 21}  # bits of one bucket coordinate in a packed key
 _TESTS_AT_ONCE = 1 << 13
+_CHUNK_PAIRS = 1 << 20  # about as many candidates are listed at once, or those of a single box
 _SUBCELLS = 4  # points are sorted into this many parts of a bucket along each axis
 
 
@@ -194,13 +195,10 @@ class ConeIndex:
         place, within = ragged_index(self.list_lengths()[buckets])
         return place, self.entries[self.starts[buckets][place] + within]
 
-    def candidates(
-        self, low: Tensor, high: Tensor, chunk_pairs: int = 1 << 20
-    ) -> Iterator[tuple[Tensor, Tensor]]:
+    def candidates(self, low: Tensor, high: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
         """Chunks of pairs, box (P,) and cone (P,): all cones whose hull meets a box [low, high], (M, D) each.
 
-        Each pair occurs once, boxes ascend, and all pairs of a box are in the same chunk. A chunk has about
-        `chunk_pairs` pairs, or those of a single box.
+        Each pair occurs once, boxes ascend, and all pairs of a box are in the same chunk.
 
         Raises `InvalidArgumentError` for boxes larger than `extent`.
         """
@@ -213,7 +211,7 @@ class ConeIndex:
         bucket = self.buckets(0.5 * (low + high))
         box = (bucket >= 0).nonzero().squeeze(1)
         bucket = bucket[box]
-        chunk = torch.cumsum(self.list_lengths()[bucket], 0) // chunk_pairs
+        chunk = torch.cumsum(self.list_lengths()[bucket], 0) // _CHUNK_PAIRS
         sizes = torch.unique_consecutive(chunk, return_counts=True)[1].tolist()
         for boxes, buckets in zip(box.split(sizes), bucket.split(sizes), strict=True):
             place, cone = self.listed(buckets)
@@ -248,47 +246,39 @@ def _search(hulls: Hulls, lattice: _Lattice, budget: float) -> tuple[Tensor, Ten
     before there are more than `budget` entries, if the largest buckets allow that.
     """
     extent = (lattice.high - lattice.low).amax(1)
+    cone = torch.zeros(0, dtype=torch.int64, device=extent.device)
+    cell = cone.new_zeros(0, hulls.dim)
     if extent.numel() == 0:
-        none = torch.zeros(0, dtype=torch.int64, device=extent.device)
-        return none, none.new_zeros(0, hulls.dim), lattice.finest
+        return cone, cell, lattice.finest
     level = (extent / (lattice.finest * (_SPAN - 1))).clamp_min(1).log2().ceil().long()
     corners = torch.cartesian_prod(*[torch.arange(2, device=extent.device)] * hulls.dim)
-    none = torch.zeros(0, dtype=torch.int64, device=extent.device)
-    entries = _Entries(none, none.new_zeros(0, hulls.dim))
     for now in range(int(level.amax()), -1, -1):
         side = lattice.finest * 2**now
-        halves = (2 * entries.cell[:, None] + corners).flatten(0, 1)
-        cone, cell = lattice.covering((level == now).nonzero().squeeze(1), side)
-        pairs = _Entries(
-            torch.cat([entries.cone.repeat_interleave(len(corners)), cone]), torch.cat([halves, cell])
-        )
-        finer, fits = _near(hulls, lattice, pairs, side, budget if entries.cone.numel() else math.inf)
-        if not fits:
+        halves = (2 * cell[:, None] + corners).flatten(0, 1)
+        new_cone, new_cell = lattice.covering((level == now).nonzero().squeeze(1), side)
+        pairs = torch.cat([cone.repeat_interleave(len(corners)), new_cone]), torch.cat([halves, new_cell])
+        finer = _near(hulls, lattice, *pairs, side, budget if cone.numel() else math.inf)
+        if finer is None:
             # All buckets have one size: cones whose search starts at this level or below use the larger one.
-            pairs = _Entries(*lattice.covering((level <= now).nonzero().squeeze(1), 2 * side))
-            rest, _ = _near(hulls, lattice, pairs, 2 * side, math.inf)
-            return torch.cat([entries.cone, rest.cone]), torch.cat([entries.cell, rest.cell]), 2 * side
-        entries = finer
-    return entries.cone, entries.cell, lattice.finest
-
-
-class _Entries(NamedTuple):
-    """Pairs of a cone (P,) and a bucket (P, D)."""
-
-    cone: Tensor
-    cell: Tensor
+            pairs = lattice.covering((level <= now).nonzero().squeeze(1), 2 * side)
+            rest = _near(hulls, lattice, *pairs, 2 * side, math.inf)
+            assert rest is not None
+            return torch.cat([cone, rest[0]]), torch.cat([cell, rest[1]]), 2 * side
+        cone, cell = finer
+    return cone, cell, lattice.finest
 
 
 def _near(
-    hulls: Hulls, lattice: _Lattice, pairs: _Entries, side: float, budget: float
-) -> tuple[_Entries, bool]:
-    """The pairs whose hull meets the bucket, and True; nothing and False if they exceed `budget`."""
+    hulls: Hulls, lattice: _Lattice, cone: Tensor, cell: Tensor, side: float, budget: float
+) -> tuple[Tensor, Tensor] | None:
+    """The pairs of a cone (P,) and a bucket (P, D) that its hull meets; None if they exceed `budget`."""
     radius = 0.5 * side * hulls.dim**0.5
-    found, n_found = [_Entries(pairs.cone[:0], pairs.cell[:0])], 0
-    for cone, cell in zip(*(part.split(_TESTS_AT_ONCE) for part in pairs), strict=True):
-        near = hulls.near(cone, (cell.double() + 0.5) * side + lattice.origin, radius)
-        found.append(_Entries(cone[near], cell[near]))
-        n_found += found[-1].cone.shape[0]
+    found, n_found = [(cone[:0], cell[:0])], 0
+    for cones, cells in zip(cone.split(_TESTS_AT_ONCE), cell.split(_TESTS_AT_ONCE), strict=True):
+        near = hulls.near(cones, (cells.double() + 0.5) * side + lattice.origin, radius)
+        found.append((cones[near], cells[near]))
+        n_found += found[-1][0].shape[0]
         if n_found > budget:
-            return found[0], False
-    return _Entries(*(torch.cat(part) for part in zip(*found, strict=True))), True
+            return None
+    near_cones, near_cells = zip(*found, strict=True)
+    return torch.cat(near_cones), torch.cat(near_cells)

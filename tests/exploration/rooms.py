@@ -1,4 +1,4 @@
-"""A furnished room, small missions in it, and what of a row does not depend on a clock."""
+"""Rooms, small missions in them, and what of a row does not depend on a clock."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.exploration.mission.options import TeamOptions
+from gmmtorch.exploration.world.world import World
 from gmmtorch.simulation.sensors.depth_camera import DepthCamera
 from gmmtorch.simulation.worlds.furniture import box
 
@@ -21,11 +22,24 @@ SMALL = TeamOptions(
     n_beams=60,
 )
 SHELF = box((4.5, 2.5, 0.1), (5.1, 8.1, 3.1))
+HALL = torch.cat(
+    [
+        box((0.1, 0.1, 0.1), (9.9, 5.9, 2.9)),
+        box((4.0, 0.1, 0.1), (4.3, 3.0, 2.9)),  # a wall with a way around it
+        box((7.0, 4.0, 0.1), (8.6, 5.2, 1.6)),  # a solid, large enough for a robot inside
+    ]
+)
 
 
 def room(*pieces: Tensor) -> Tensor:
     """A hall of 10 by 8 by 3 metres, its walls half a cell off the lattice, with pieces in it."""
     return torch.cat([box((0.1, 0.1, 0.1), (10.1, 8.1, 3.1)), *pieces])
+
+
+def small_room() -> World:
+    """A room of 7 by 6 by 3 metres, whose walls lie half a cell off the lattice."""
+    walls = box((0.1, 0.1, 0.1), (7.1, 6.1, 3.1))
+    return World.from_mesh(walls, start=(2.0, 2.0, 1.3), cache=False, name="room")
 
 
 def without_seconds(row: dict[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Learning by an `IncrementalRule`: windows are learned, added to the map, and merged under a budget."""
+"""Learning from windows of scans: their components are added to those of a map, and merged under a budget."""
 
 from __future__ import annotations
 
@@ -17,10 +17,13 @@ from gmmtorch.mapping.learning.fitting import SurfaceFit, fit_frames, fit_window
 from gmmtorch.mapping.learning.forgetting import Doubts, Forgetting
 from gmmtorch.mapping.learning.merging import Size, compact, compact_to_bytes, estimated_bytes
 from gmmtorch.mapping.learning.novelty import novel_beams
-from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule
-from gmmtorch.mapping.learning.viewpoints import all_origins, limit_origins
-from gmmtorch.mixture.em.partition import FlatnessRule
+from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
+from gmmtorch.mapping.learning.viewpoints import all_origins, limit_origins, sampled_origins
+from gmmtorch.mixture.em.exact import SOFTMAX_DTYPES
+from gmmtorch.mixture.em.partition import FlatnessRule, surface_rule
 from gmmtorch.scan import Scan
+
+# -- an IncrementalRule ---------------------------------------------------------------------------------
 
 
 def absorb(
@@ -44,8 +47,6 @@ def absorb(
         size: number of bytes of given components, for `rule.max_bytes`.
         weight: number of measured points for which each point of the scans stands.
         forgetting: drops what is gone, as `rule.forget` says; None: a new one.
-
-    Raises `InvalidArgumentError` for scans of another dimension.
     """
     if None in (rule.noise, rule.length, rule.cell, rule.window):
         scans = as_scans(scans)
@@ -57,28 +58,6 @@ def absorb(
     return components
 
 
-def surface_fit(rule: IncrementalRule, dim: int) -> SurfaceFit:
-    """How a window is learned in `dim` dimensions. Raises `InvalidArgumentError` if `rule` is not fitted."""
-    if rule.noise is None or rule.length is None or rule.cell is None:
-        raise InvalidArgumentError("noise, length or cell is None; take rule.fitted(scans).")
-    fit = cell_fit(rule.noise, rule.length, rule.cell, rule.window_components, rule.iterations, dim)
-    return replace(fit, rule=rule)
-
-
-def cell_fit(
-    noise: float, length: float, cell: float, max_components: int, iterations: int, dim: int
-) -> SurfaceFit:
-    """A fit on cells; the arguments are those of `IncrementalRule`, in metres."""
-    flatness = FlatnessRule(
-        thickness=2 * noise,
-        length=length,
-        min_weight=3 * (dim - 1),
-        max_components=max_components,
-        outlier_gap=10 * length,
-    )
-    return SurfaceFit(noise, cell, flatness, iterations)
-
-
 def _absorb_window(
     components: Components,
     window: Sequence[Scan | DepthFrame],
@@ -87,12 +66,6 @@ def _absorb_window(
     weight: float,
     forgetting: Forgetting,
 ) -> Components:
-    for scan in window:
-        if scan.dim != components.dim:
-            raise InvalidArgumentError(
-                f"The scan is {scan.dim}-dimensional and the map {components.dim}-dimensional; give the "
-                "scans of one sensor to one map."
-            )
     frames = [frame for frame in window if isinstance(frame, DepthFrame)]
     if rule.novelty is None and len(frames) == len(window):
         learned = fit_frames(frames, surface_fit(rule, components.dim), all_origins(weight))
@@ -153,3 +126,60 @@ def _within_budget(components: Components, rule: IncrementalRule, size: Size) ->
     if rule.max_bytes is not None:
         components = compact_to_bytes(components, rule.max_bytes, rule.max_origins, rule.mean_origins, size)
     return components
+
+
+def surface_fit(rule: IncrementalRule, dim: int) -> SurfaceFit:
+    """How a window is learned in `dim` dimensions. Raises `InvalidArgumentError` if `rule` is not fitted."""
+    if rule.noise is None or rule.length is None or rule.cell is None:
+        raise InvalidArgumentError("noise, length or cell is None; take rule.fitted(scans).")
+    fit = cell_fit(rule.noise, rule.length, rule.cell, rule.window_components, rule.iterations, dim)
+    return replace(fit, rule=rule)
+
+
+def cell_fit(
+    noise: float, length: float, cell: float, max_components: int, iterations: int, dim: int
+) -> SurfaceFit:
+    """A fit on cells; the arguments are those of `IncrementalRule`, in metres."""
+    flatness = FlatnessRule(
+        thickness=2 * noise,
+        length=length,
+        min_weight=3 * (dim - 1),
+        max_components=max_components,
+        outlier_gap=10 * length,
+    )
+    return SurfaceFit(noise, cell, flatness, iterations)
+
+
+# -- a WindowedRule -------------------------------------------------------------------------------------
+
+
+def learn_window(scans: Sequence[Scan], rule: WindowedRule, generator: torch.Generator) -> Components:
+    """Components of the returns, and `max_range` components of the no-return beams, of neighbouring scans.
+
+    `generator` draws the origins that are kept. Components are not numbered; the owner of the map does that.
+    """
+    fit = SurfaceFit(
+        noise=rule.noise,
+        cell=rule.noise,
+        flatness=flatness_rule(rule, scans[0].dim),
+        iterations=rule.iterations,
+        max_cells=rule.max_cells,
+        dtype=SOFTMAX_DTYPES[rule.dtype],
+        partition_by_moments=False,
+        rule=rule,
+    )
+    return fit_window(scans, fit, sampled_origins(rule.max_origins, generator))
+
+
+def flatness_rule(rule: WindowedRule, dim: int) -> FlatnessRule:
+    """When a piece of a window's points is cut further, in `dim` dimensions."""
+    flatness = surface_rule(rule.noise, dim, rule.min_points)
+    # In 2D, few points that span several surfaces are better separated, down to single points
+    # (5 % of intel, 0.1 m: AUC 0.948 against 0.940). In 3D this only adds components.
+    return replace(
+        flatness,
+        length=rule.length,
+        min_weight_thick=1 if dim == 2 else flatness.min_weight,
+        max_components=rule.n_components,
+        outlier_gap=10 * rule.length,
+    )

@@ -1,19 +1,24 @@
-"""GaussianMap.from_components: stored values, evidence and bad input."""
+"""Components: given to GaussianMap.from_components, selected and summed."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from mapping.map_cases import assert_same_components, given_parts, sightings
+from mapping.map_cases import assert_same_components, each_value, given_parts, sightings
+from mapping.random_components import counts_add_up, normal_components
 from occupancy.protocol_contract import dims, lattice, wall_scan
 from scipy.stats import multivariate_normal
+from torch import Tensor
 
 from gmmtorch.errors import GmmTorchError
-from gmmtorch.mapping.codec.component_batch import quantized
+from gmmtorch.mapping.codec.quantization import quantized
+from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping.learning.association import summed
 from gmmtorch.mapping.query_options import METHODS
 from gmmtorch.occupancy.grid import VoxelGrid
 
@@ -83,33 +88,31 @@ def test_hits_of_given_components_follow_their_density(method, tolerance):
     np.testing.assert_allclose(hits, expected, atol=tolerance)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("means", torch.zeros(4)),
-        ("means", torch.zeros(4, 2, 1)),
-        ("means", torch.full((4, 2), math.nan)),
-        ("covariances", torch.zeros(3, 2, 2)),
-        ("covariances", torch.full((4, 2, 2), math.inf)),
-        ("covariances", -torch.eye(2).repeat(4, 1, 1)),
-        ("covariances", torch.tensor([[1.0, 0.9], [-0.9, 1.0]]).repeat(4, 1, 1)),
-        ("support", torch.ones(3)),
-        ("support", -torch.ones(4)),
-        ("support", torch.full((4,), math.nan)),
-        ("origins", torch.zeros(3, 2)),
-        ("origins", torch.zeros(4, 3)),
-        ("origins", torch.full((4, 2), math.nan)),
-        ("origins", [[([0.0, 0.0], 1.0)]] * 3),
-        ("origins", [[([0.0, 0.0], 1.0)]] * 5),
-        ("origins", [[([0.0, 0.0], 0.0)]] * 4),
-        ("origins", [[([0.0, 0.0], 2.0), ([1.0, 0.0], -1.0)]] * 4),
-        ("origins", [[]] * 4),
-        ("max_range", [True]),
-        ("robot", -1),
-        ("robot", "r2"),
-        ("robot", 1.5),
+INCONSISTENT = {
+    "means": [torch.zeros(4), torch.zeros(4, 2, 1), torch.full((4, 2), math.nan)],
+    "covariances": [
+        torch.zeros(3, 2, 2),
+        torch.full((4, 2, 2), math.inf),
+        -torch.eye(2).repeat(4, 1, 1),
+        torch.tensor([[1.0, 0.9], [-0.9, 1.0]]).repeat(4, 1, 1),
     ],
-)
+    "support": [torch.ones(3), -torch.ones(4), torch.full((4,), math.nan)],
+    "origins": [
+        torch.zeros(3, 2),
+        torch.zeros(4, 3),
+        torch.full((4, 2), math.nan),
+        [[([0.0, 0.0], 1.0)]] * 3,
+        [[([0.0, 0.0], 1.0)]] * 5,
+        [[([0.0, 0.0], 0.0)]] * 4,
+        [[([0.0, 0.0], 2.0), ([1.0, 0.0], -1.0)]] * 4,
+        [[]] * 4,
+    ],
+    "max_range": [[True]],
+    "robot": [-1, "r2", 1.5],
+}
+
+
+@pytest.mark.parametrize(("name", "value"), each_value(INCONSISTENT))
 def test_inconsistent_components_are_refused(name, value):
     with pytest.raises(GmmTorchError, match=name if name == "robot" else None):
         GaussianMap.from_components(**{**given_parts(), name: value})
@@ -147,3 +150,59 @@ def test_more_than_255_origins_are_stored(tmp_path):
         assert_same_components(loaded.components(), made.components())
         assert loaded.seen_count.shape == (k * n,)
         np.testing.assert_allclose(loaded.origins.numpy(), made.origins.numpy(), atol=2**-9)
+
+
+# -- selected and summed ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rows", [[4, 0, 11, 7], [], list(range(12)), list(range(11, -1, -1)), [5]])
+def test_selected_components_equal_those_of_a_loop(rows: list[int]) -> None:
+    components = normal_components(12, 3, seed=1, empty=0.3)
+    # Sightings in any order, and a component without any.
+    order = torch.randperm(len(components.seen_by), generator=torch.Generator().manual_seed(0))
+    order = order[components.seen_by[order] != 7]
+    shuffled = {n: getattr(components, n)[order] for n in ("seen_by", "seen_from", "seen_count")}
+    components = replace(components, **shuffled)
+    chosen = components.selected(torch.tensor(rows, dtype=torch.int64)).checked()
+    assert len(chosen) == len(rows)
+    for place, row in enumerate(rows):
+        for name in ("means", "covariances", "support", "max_range", "ids"):
+            assert torch.equal(getattr(chosen, name)[place], getattr(components, name)[row])
+        assert list(sightings(chosen)[place].items()) == list(sightings(components)[row].items())
+    assert torch.equal(chosen.origins, components.origins)
+
+
+def batch(ids: list[tuple[int, int]], counts: list[float], seed: int) -> Components:
+    """Components with these ids and counts and one origin."""
+    components = normal_components(len(ids), 3, seed, n_origins=1)
+    support = torch.tensor(counts, dtype=torch.float64)
+    return replace(
+        components, ids=torch.tensor(ids, dtype=torch.int64), support=support, seen_count=support.clone()
+    )
+
+
+def test_summed_counts_equal_those_of_a_dictionary() -> None:
+    parts = [
+        batch([(1, 0), (1, 1), (1, 2)], [3.0, 5.0, 7.0], 0),
+        batch([(0, 9), (0, 3)], [11.0, 13.0], 1),
+        batch([(1, 1), (0, 3), (1, 1)], [0.5, 0.25, 2.0], 2),
+    ]
+    found = summed(Components.concatenate(parts)).checked()
+    totals: dict[tuple[int, int], float] = {}
+    first: dict[tuple[int, int], Tensor] = {}
+    for part in parts:
+        for key, count, mean in zip(part.ids.tolist(), part.support.tolist(), part.means, strict=True):
+            totals[tuple(key)] = totals.get(tuple(key), 0.0) + count
+            first.setdefault(tuple(key), mean)
+    assert [tuple(key) for key in found.ids.tolist()] == sorted(totals)
+    assert found.support.tolist() == [totals[key] for key in sorted(totals)]
+    assert torch.equal(found.means, torch.stack([first[key] for key in sorted(totals)]))
+    assert counts_add_up(found)
+
+
+def test_summing_distinct_or_no_components_changes_nothing() -> None:
+    alone = batch([(0, 0), (0, 4), (2, 1)], [1.0, 2.0, 3.0], 0)
+    found = summed(alone)
+    for name in ("means", "support", "ids", "seen_by", "seen_from", "seen_count"):
+        assert torch.equal(getattr(found, name), getattr(alone, name))
+    assert len(summed(Components.empty(3))) == 0

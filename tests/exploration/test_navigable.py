@@ -1,4 +1,4 @@
-"""What can be seen at all: against rays followed one by one through the triangles, and lines of sight."""
+"""Cells that can be seen, against rays followed one by one and lines of sight; and collisions of robots."""
 
 from __future__ import annotations
 
@@ -7,7 +7,13 @@ import math
 import torch
 from torch import Tensor
 
-from gmmtorch.exploration.world.navigable import observable_cells, view_directions, viewpoints
+from gmmtorch.exploration.world.navigable import (
+    collides,
+    meets_others,
+    observable_cells,
+    view_directions,
+    viewpoints,
+)
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.occupancy.voxels.voxelize import occupied_cells
@@ -118,3 +124,35 @@ def test_viewpoints_are_nearest_to_block_middles(generator):
 def test_observable_cells_without_viewpoints_are_empty():
     nowhere = torch.zeros(0, 3, dtype=torch.int64)
     assert not bool(seen_from(nowhere, view_directions(1.0, 0.3), 3.0).any())
+
+
+# -- collisions --------------------------------------------------------------------------------------
+
+
+def test_collides_flags_surfaces_within_the_radius():
+    room = MeshWorld(torch.cat([box((0, 0, 0), (8, 6, 3)), box((4, 2, 0), (5, 3, 3))]))
+    generator = torch.Generator().manual_seed(4)
+    size = torch.tensor([8.0, 6, 3], dtype=torch.float64)
+    points = torch.rand(2000, 3, generator=generator, dtype=torch.float64) * size
+    to_walls = torch.minimum(points, size - points).amin(1)
+    pillar = points[:, :2].clamp(torch.tensor([4.0, 2.0]), torch.tensor([5.0, 3.0]))
+    to_pillar = (points[:, :2] - pillar).norm(dim=1)
+    outside = to_pillar > 0
+    expected = torch.minimum(to_walls, to_pillar) < 0.3
+    found = collides(room, points, 0.3)
+    sure = outside & ((torch.minimum(to_walls, to_pillar) - 0.3).abs() > 1e-4)
+    assert torch.equal(found[sure], expected[sure])
+    assert bool(found[sure].any())
+    assert collides(room, points[:0], 0.3).shape == (0,)
+
+
+def test_meets_others_flags_overlapping_bodies():
+    generator = torch.Generator().manual_seed(5)
+    positions = torch.rand(4, 50, 3, generator=generator, dtype=torch.float64) * 1.5
+    found = meets_others(positions, 0.3)
+    for i in range(4):
+        for s in range(50):
+            near = [math.dist(positions[i, s].tolist(), positions[j, s].tolist()) for j in range(4) if j != i]
+            assert bool(found[i, s]) == (min(near) < 0.6)
+    assert 0 < int(found.sum()) < 200
+    assert not bool(meets_others(positions[:1], 0.3).any())

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gmmtorch.linalg import ragged_index
 from gmmtorch.occupancy.cones import CUTOFF, Cones, WhitenedCones, cone_bounds, outside_cone
 from gmmtorch.occupancy.grid import VoxelGrid
 
@@ -18,9 +19,10 @@ Pairs = tuple[Tensor, Tensor]
 """Indices of boxes and indices of cones, (P,) int64 each."""
 
 
-def candidate_pairs(
-    cones: Cones, low: Tensor, high: Tensor, cutoff: float = CUTOFF, chunk_pairs: int = 1 << 18
-) -> Iterator[Pairs]:
+_PAIRS_AT_ONCE = 1 << 18  # pairs of a box and a cone that are tested in one pass
+
+
+def candidate_pairs(cones: Cones, low: Tensor, high: Tensor, cutoff: float = CUTOFF) -> Iterator[Pairs]:
     """All pairs of a box [low, high], (M, D) each, and a cone that can meet, by testing all pairs."""
     if not len(cones.counts) or not len(low):
         return
@@ -28,7 +30,7 @@ def candidate_pairs(
     low, high = low.detach().double(), high.detach().double()
     below, above = cone_bounds(cones, cutoff)
     white = WhitenedCones.of(cones)
-    for rows in torch.arange(len(low), device=low.device).split(max(1, chunk_pairs // len(cones.counts))):
+    for rows in torch.arange(len(low), device=low.device).split(max(1, _PAIRS_AT_ONCE // len(cones.counts))):
         met = (low[rows, None] <= above).all(-1) & (high[rows, None] >= below).all(-1)
         box, cone = met.nonzero(as_tuple=True)
         box = rows[box]
@@ -94,11 +96,8 @@ def _rows_of_axis(
     begin = torch.stack([begin[0].clamp(1, n + 1), begin[1].clamp(0, n)]).long()
     stop = torch.stack([stop[0].clamp(1, n + 1), stop[1].clamp(0, n)]).long()
     planes = (stop - begin).clamp_min(0).flatten()
-    row = torch.repeat_interleave(planes)
-    plane = (
-        torch.arange(len(row), device=sensor.device)
-        - (torch.cumsum(planes, 0) - planes - begin.flatten())[row]
-    )
+    row, within = ragged_index(planes)
+    plane = within + begin.flatten()[row]
     cone, forward = row % len(sensor), row < len(sensor)
     height = plane - sensor[cone, axis]
     first, count = [], []

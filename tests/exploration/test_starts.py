@@ -1,12 +1,13 @@
-"""Robots that start near walls, near the floor and in corridors take off, or are rejected."""
+"""Starts: robots near walls, near the floor and in corridors take off or are rejected; poses of teams."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
-from exploration.furnished_room import SMALL, room
+from exploration.rooms import HALL, SMALL, room
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -16,7 +17,8 @@ from gmmtorch.exploration.mission.mission import Mission
 from gmmtorch.exploration.mission.team_setup import assemble, start_poses
 from gmmtorch.exploration.planning.collision_checking import cells_in_sphere
 from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
-from gmmtorch.exploration.robot.initial_free_space import initial_free_space
+from gmmtorch.exploration.world import starts
+from gmmtorch.exploration.world.starts import initial_free_space
 from gmmtorch.exploration.world.world import World
 from gmmtorch.simulation.worlds.furniture import box
 
@@ -27,6 +29,11 @@ ALONE = replace(SMALL, framework="grid_isolated", size=1)
 @pytest.fixture(scope="module")
 def hall() -> World:
     return World.from_mesh(room(), cache=False, name="hall")
+
+
+@pytest.fixture(scope="module")
+def divided() -> World:
+    return World.from_mesh(HALL, cache=False, name="hall")
 
 
 def corridor(width: float, height: float) -> World:
@@ -135,3 +142,53 @@ def test_start_without_a_floor_is_rejected() -> None:
         flown(world, size=9)
     with pytest.raises(InvalidArgumentError, match=r"team.start\[0\].* has no surface of hall below it"):
         flown(world, (6.0, 5.0, 1.5, 0.0))
+
+
+# -- start poses of a team --------------------------------------------------------------------------
+
+
+def test_start_poses_are_separated_visible_roomy_and_level(divided: World) -> None:
+    near = replace(divided, start=place(3.0, 3.0, 1.5))
+    poses = starts.start_poses(near, 4, PRIMITIVES)
+    assert poses.shape == (4, 4)
+    assert torch.equal(poses, starts.check_start(divided, poses, PRIMITIVES))
+    assert torch.equal(poses, starts.start_poses(near, 4, PRIMITIVES))
+    places = poses[:, :3]
+    gaps = torch.pdist(places)
+    assert float(gaps.min()) >= 1.5 - 1e-9
+    assert float((places - places[0]).norm(dim=1).max()) < 4
+    assert float(divided.mesh.clearance(places).min()) >= 0.99
+    way = places[1:] - places[0]
+    sight = divided.mesh.distances(places[0], way / way.norm(dim=1, keepdim=True))
+    assert bool((sight > way.norm(dim=1)).all())
+    turn = torch.remainder(poses[1:, 3] - poses[:-1, 3], 2 * math.pi)
+    assert torch.allclose(turn, torch.full((3,), math.pi / 2, dtype=torch.float64))
+
+
+def test_default_start_poses_lie_at_an_end_and_fit_large_teams(divided: World) -> None:
+    one = starts.start_poses(divided, 1, PRIMITIVES)
+    assert float((one[0, :2] - torch.tensor([5.0, 3.0])).abs()[0]) > 3
+    assert len(starts.check_start(divided, starts.start_poses(divided, 16, PRIMITIVES), PRIMITIVES)) == 16
+    with pytest.raises(InvalidArgumentError, match=r"hall has room for \d+ robots .* team.size=500.*a floor"):
+        starts.start_poses(divided, 500, PRIMITIVES)
+
+
+@pytest.mark.parametrize(
+    ("pose", "message"),
+    [
+        (
+            (0.25, 3.0, 1.5, 0.0),
+            r"team.start\[1\]=\[0.25, 3, 1.5, 0\] is 0.15 m from .*move it, for instance to \[",
+        ),
+        ((4.1, 2.0, 1.5, 0.0), "from a surface"),
+        ((7.8, 4.6, 0.85, 0.0), "is in a solid, or in another part, which world.bounds="),
+        ((-3.0, 2.0, 1.5, 0.0), r"outside the bounds of hall, \[0, 0, 0\] to \[10, 6, 3\] m"),
+        ((2.0, 2.0, 1.5, math.nan), "not finite"),
+        ((math.inf, 2.0, 1.5, 0.0), "not finite"),
+        ((1.3, 1.0, 1.5, 0.0), r"touches the robot of team.start\[0\]"),
+    ],
+)
+def test_check_start_names_impossible_poses(divided: World, pose: tuple[float, ...], message: str) -> None:
+    poses = torch.tensor([(1.1, 1.1, 1.5, 0.0), pose], dtype=torch.float64)
+    with pytest.raises(InvalidArgumentError, match=message):
+        starts.check_start(divided, poses, PRIMITIVES)
