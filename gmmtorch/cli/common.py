@@ -114,17 +114,6 @@ def write_results(command: str, config: DictConfig, rows: list[Row], folder: Pat
     return write_json(folder / "results.json", results)
 
 
-def headline(rows: Sequence[Row]) -> str:
-    """The title of a table of fits."""
-    return f"{rows[0]['dataset']}: {rows[0]['n_points']:,} points"
-
-
-def log_likelihood(row: Row) -> float:
-    """The log-likelihood of a fit's held-out points, or of its training points if none are held out."""
-    held_out = row["held_out_log_likelihood"]
-    return float(row["log_likelihood"] if held_out is None else held_out)
-
-
 def save_figures(config: DictConfig, figures: Mapping[str, Any], folder: Path) -> None:
     """Write every figure as NAME.png if `report.figures` is set."""
     if not config.report.figures:

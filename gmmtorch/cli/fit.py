@@ -42,10 +42,11 @@ def _quiet_worker() -> Iterator[None]:
 
 
 def run(config: DictConfig) -> float | None:
-    """Run the command; returns `common.log_likelihood` of the last row, which a sweep can optimize.
+    """Run the command; returns `fit_outputs.log_likelihood` of the last row, which a sweep can optimize.
 
     Workers of a streamed fit return None.
     """
+    from gmmtorch.cli.reporting import fit_outputs
     from gmmtorch.cli.runs import fit_stream
     from gmmtorch.cli.studies import fit_studies, study
 
@@ -62,7 +63,7 @@ def run(config: DictConfig) -> float | None:
             else:
                 row = study.run("fit", fit_studies.STUDIES, config, device, folder, bars)[-1]
     common.print_files(folder)
-    return common.log_likelihood(row)
+    return fit_outputs.log_likelihood(row)
 
 
 def _compare(config: DictConfig, device: str, folder: Path, on_event: Event) -> list[Row]:
@@ -85,7 +86,7 @@ def _compare(config: DictConfig, device: str, folder: Path, on_event: Event) -> 
     for method, mixture in outcome.mixtures.items():
         mixture.save(folder / f"{method}.safetensors")
     fit_outputs.draw(config, data.train, outcome, folder)
-    common.print_table(outcome.rows, TABLE.split(), common.headline(outcome.rows))
+    common.print_table(outcome.rows, TABLE.split(), fit_outputs.headline(outcome.rows))
     return outcome.rows
 
 

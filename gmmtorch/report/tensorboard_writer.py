@@ -102,7 +102,7 @@ class Board:
         curves = {name: (false_rate, true_rate, float(roc_auc_score(truth, theta)))}
         self.figure(f"{tag}/roc", roc_figure(curves))
 
-    def figure(self, tag: str, figure: Figure, step: int = 0) -> None:
+    def figure(self, tag: str, figure: Figure) -> None:
         """Writes a figure as an image."""
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -110,7 +110,7 @@ class Board:
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
         pixels = np.asarray(canvas.buffer_rgba())[..., :3].copy()
-        self._writer.add_image(tag, pixels, step, dataformats="HWC")
+        self._writer.add_image(tag, pixels, 0, dataformats="HWC")
 
     def cloud(self, tag: str, points: ArrayLike, colors: ArrayLike | None = None, step: int = 0) -> None:
         """Writes points (N, D), metres, with colours (N, 3) from 0 to 255; writes nothing for no points."""

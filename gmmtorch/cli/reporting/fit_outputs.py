@@ -1,7 +1,8 @@
-"""The figures of gmmtorch-fit, as PNG and in TensorBoard."""
+"""The outputs of gmmtorch-fit: title and score of its rows, and figures as PNG and in TensorBoard."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +10,23 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from gmmtorch.cli import common
+from gmmtorch.evaluation.events import Row
 from gmmtorch.evaluation.fits.fit_comparison import NO_LIKELIHOODS, FitOutcome, in_use
 from gmmtorch.report.maps.accuracy_figures import comparison_figure, convergence_figure
 from gmmtorch.report.scenes.mixture_figures import mixture_figure
 from gmmtorch.report.style import label_of
 from gmmtorch.report.tensorboard_writer import Board
+
+
+def headline(rows: Sequence[Row]) -> str:
+    """The title of a table of fits."""
+    return f"{rows[0]['dataset']}: {rows[0]['n_points']:,} points"
+
+
+def log_likelihood(row: Row) -> float:
+    """The log-likelihood of a fit's held-out points, or of its training points if none are held out."""
+    held_out = row["held_out_log_likelihood"]
+    return float(row["log_likelihood"] if held_out is None else held_out)
 
 
 def draw(config: DictConfig, points: Tensor, outcome: FitOutcome, folder: Path) -> None:

@@ -216,7 +216,6 @@ def _figure(built: GaussianMap, located: Sequence[ScanLocation], truth: Truth | 
         truth=true,
         lost=lost if len(lost) else None,
         title=title,
-        occupied_above=map_outputs.OCCUPIED_ABOVE,
     )
 
 

@@ -45,8 +45,6 @@ EXPORTS = {
 
 _MESH_CELLS = 0.5  # sides of a mesh's cells, relative to the resolution of the map
 _MOST_CELLS = 1600  # along a side of a picture
-OCCUPIED_ABOVE = 0.4
-"""Of pictures: grazing beams count more misses than hits in a surface cell, so ½ would hide thin surfaces."""
 _STANDING = 1.0  # m of a path, below which bytes a metre say nothing
 
 
@@ -278,7 +276,7 @@ def _figures(built: GaussianMap, trajectories: Sequence[Tensor], row: Row) -> di
     title = f"{row['dataset']}: {row['n_components']:,} components, {byte_text(row['nbytes'])}"
     title += f", {row['metres']:,.0f} m travelled" if row["metres"] >= _STANDING else ""
     panel = map_panel(built, trajectories)
-    figures = {"above": map_figure([panel], trajectories, title=title, occupied_above=OCCUPIED_ABOVE)}
+    figures = {"above": map_figure([panel], trajectories, title=title)}
     shown = surfaces.means.cpu(), surfaces.covariances.cpu()
     if surfaces.dim == 3:
         seen_from = first_viewpoints(surfaces).cpu()

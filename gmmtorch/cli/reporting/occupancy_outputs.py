@@ -48,10 +48,7 @@ def _figures(config: DictConfig, scans: Sequence[Scan], outcome: Outcome) -> dic
     for resolution in dict.fromkeys(built.row["resolution"] for built in outcome.shown):
         shown = [built for built in outcome.shown if built.row["resolution"] == resolution]
         panels = [MapPanel(_label(built), built.answer, resolution, low, high) for built in shown]
-        # Grazing beams count more misses than hits in a surface cell, so ½ would hide thin surfaces.
-        figures[f"map_{resolution:g}m"] = map_figure(
-            panels, [trajectory], occupied_above=0.4, **_image_limits(shown)
-        )
+        figures[f"map_{resolution:g}m"] = map_figure(panels, [trajectory], **_image_limits(shown))
         regions = busiest_regions(points, config.report.magnify) if len(low) == 2 else []
         for number, (corner, other) in enumerate(regions, 1):
             close = [MapPanel(p.title, p.occupancy, resolution, corner, other) for p in panels]

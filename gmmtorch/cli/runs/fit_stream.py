@@ -54,7 +54,7 @@ def run(config: DictConfig, columns: Sequence[str], folder: Path) -> Row | None:
     common.write_results("fit", config, [row], folder)
     outcome = FitOutcome([row], {"em": mixture}, {"em": mixture.lower_bounds_})
     fit_outputs.draw(config, sample.train, outcome, folder)
-    common.print_table([row], columns, common.headline([row]))
+    common.print_table([row], columns, fit_outputs.headline([row]))
     return row
 
 

@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 from gmmtorch.cli import common
 from gmmtorch.cli.from_options.scans import fit_data, fit_data_of, fit_options, selected_scans
 from gmmtorch.cli.options.structured import build
+from gmmtorch.cli.reporting import fit_outputs
 from gmmtorch.cli.studies.study import Found, Study
 from gmmtorch.evaluation.events import Event, OnRows, Row
 from gmmtorch.evaluation.fits.fit_comparison import means
@@ -85,11 +86,11 @@ def _found(rows: list[Row], figures: Figures, line: str, columns: str) -> Found:
         rows,
         figures,
         f"{line} n_components n_seeds {columns}",
-        common.headline(rows),
+        fit_outputs.headline(rows),
         shown=table,
         line=line,
         step="n_components",
-        scores={"best_log_likelihood": max(common.log_likelihood(row) for row in table)},
+        scores={"best_log_likelihood": max(fit_outputs.log_likelihood(row) for row in table)},
     )
 
 

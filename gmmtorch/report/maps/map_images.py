@@ -24,6 +24,13 @@ MAX_PIXELS = 2000
 MAX_QUERIES = 4_000_000
 """Largest number of cells queried for one image of heights."""
 
+OCCUPIED_ABOVE = 0.4
+"""Occupied cells of views from above: grazing beams count more misses than hits in a surface cell, so ½ would
+hide thin surfaces."""
+
+HEADROOM = 0.5
+"""Metres above a path at which a roof begins."""
+
 _BATCH = 1 << 18  # queries at a time
 _UNKNOWN_BAND = 0.02  # around θ = ½: the tails of a component are no evidence
 _TOLERANCE = 1e-3  # of a cell: float32 corners on a boundary between cells count as exact
@@ -113,10 +120,8 @@ def slice_image(
     return _reduced(image, factor) if factor > 1 else image
 
 
-def height_image(
-    panel: MapPanel, occupied_above: float, max_pixels: int = MAX_PIXELS, max_queries: int = MAX_QUERIES
-) -> MapImage:
-    """Returns the height (m) of the highest known cell with θ > `occupied_above` in each column, NaN if none.
+def height_image(panel: MapPanel, max_pixels: int = MAX_PIXELS, max_queries: int = MAX_QUERIES) -> MapImage:
+    """Returns the height (m) of the highest occupied cell in each column, NaN if none.
 
     Queries layers from the top down, each only in the columns without a cell yet. Pixels grow if that could
     take more than `max_queries` queries.
@@ -137,7 +142,7 @@ def height_image(
             break
         points = columns[still_open]
         points[:, 2] = level
-        heights[still_open[_is_occupied(_query(panel, points), occupied_above)]] = level
+        heights[still_open[_is_occupied(_query(panel, points))]] = level
     return image._replace(image=heights.reshape(image.image.shape))
 
 
@@ -165,16 +170,16 @@ def highest_occupancy(probability: ArrayLike, low: ArrayLike, resolution: float)
     return MapImage(image, (x, y), resolution, (bottom, bottom + theta.shape[2] * resolution))
 
 
-def roof_above(panel: MapPanel, path: np.ndarray, occupied_above: float, headroom: float = 0.5) -> bool:
-    """Returns whether most of the path (S, 3) has an occupied cell more than `headroom` metres above it."""
-    levels = torch.arange(float(path[:, 2].min()) + headroom, panel.high[2], panel.resolution).double()
+def roof_above(panel: MapPanel, path: np.ndarray) -> bool:
+    """Returns whether most of the path (S, 3) has an occupied cell more than `HEADROOM` above it."""
+    levels = torch.arange(float(path[:, 2].min()) + HEADROOM, panel.high[2], panel.resolution).double()
     if len(levels) == 0:
         return False
     stops = torch.from_numpy(path)[torch.linspace(0, len(path) - 1, min(len(path), 200)).long()]
     points = stops[:, None].repeat(1, len(levels), 1)
     points[:, :, 2] = levels
-    occupied = _is_occupied(_query(panel, points.reshape(-1, 3)), occupied_above).reshape(len(stops), -1)
-    occupied &= points[:, :, 2] > stops[:, 2:] + headroom
+    occupied = _is_occupied(_query(panel, points.reshape(-1, 3))).reshape(len(stops), -1)
+    occupied &= points[:, :, 2] > stops[:, 2:] + HEADROOM
     return bool(occupied.any(1).double().mean() > 0.5)
 
 
@@ -220,8 +225,8 @@ def _is_unknown(theta: Tensor) -> Tensor:
     return (theta - 0.5).abs() < _UNKNOWN_BAND
 
 
-def _is_occupied(theta: Tensor, occupied_above: float) -> Tensor:
-    return (theta > occupied_above) & ~_is_unknown(theta)
+def _is_occupied(theta: Tensor) -> Tensor:
+    return (theta > OCCUPIED_ABOVE) & ~_is_unknown(theta)
 
 
 def _query(panel: MapPanel, points: Tensor) -> Tensor:
