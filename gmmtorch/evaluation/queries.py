@@ -98,6 +98,10 @@ class Queries:
         """Mask (M,) of the points with this label."""
         return self.labels == label
 
+    def split(self, values: Tensor) -> tuple[Tensor, Tensor]:
+        """The values of occupied and of free points, of values (M,)."""
+        return values[self.of(OCCUPIED)], values[self.of(FREE)]
+
 
 def test_beams(scans: Sequence[Scan], max_beams: int, seed: int) -> tuple[Tensor, Tensor]:
     """Origins and ends (B, D) of the return beams of the test scans.

@@ -16,7 +16,7 @@ from gmmtorch.cli.reporting.map_outputs import surfaces_of
 from gmmtorch.evaluation.calibration import reliability
 from gmmtorch.evaluation.held_out import Built, Outcome
 from gmmtorch.evaluation.metrics import separating_threshold
-from gmmtorch.evaluation.queries import FREE, OCCUPIED
+from gmmtorch.evaluation.queries import OCCUPIED
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.report.maps.accuracy_figures import auc_against_kept_figure, reliability_figure, roc_figure
@@ -84,9 +84,9 @@ def _scene(shown: Sequence[Built], points: Tensor, trajectory: Tensor, surfaces:
     """The maps of one resolution in space, beside the points and the surfaces of the `GaussianMap`."""
     maps = []
     for built in shown:
-        row, theta = built.row, built.theta
+        row = built.row
         # Thresholds of their own, because maps differ in calibration.
-        least = separating_threshold(theta[built.asked.of(OCCUPIED)], theta[built.asked.of(FREE)])
+        least = separating_threshold(*built.asked.split(built.theta))
         n = "" if row["n_components"] is None else f"{row['n_components']:,} components, "
         title = f"{_label(built)}: {n}{byte_text(row['nbytes'])}, AUC {row['auc']:.3f}, θ ≥ {least:.2f}"
         maps.append(OccupancyPanel(title, built.answer, least))

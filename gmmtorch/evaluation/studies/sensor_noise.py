@@ -151,7 +151,7 @@ def _areas(built: GaussianMap, asked: dict[str, queries.Queries], resolution: fl
     row: Row = {}
     for field, ask in asked.items():
         theta = torch.as_tensor(built.occupancy(ask.points, resolution))
-        occupied, empty = theta[ask.of(queries.OCCUPIED)], theta[ask.of(queries.FREE)]
+        occupied, empty = ask.split(theta)
         row[field] = area = metrics.roc(occupied, empty).auc
         if field == "auc":
             row["auc_low"], row["auc_high"] = metrics.auc_interval(occupied, empty, area, seed)
