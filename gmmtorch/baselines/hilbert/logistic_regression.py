@@ -26,15 +26,6 @@ Covariance = Literal["diagonal", "mean_field", "full"]
 # -- stochastic gradients ---------------------------------------------------------------------------
 
 
-def penalised_loss(
-    design: Design, is_hit: Tensor, weights: Tensor, alpha: float = 0.0, l1_ratio: float = 0.0
-) -> Tensor:
-    """Σ ln(1 + exp(−y wᵀφ)) + α (ρ‖w‖₁ + ½(1 − ρ)‖w‖²), y = ±1: Ramos & Ott 2016, (6) with an elastic net."""
-    sign = torch.where(is_hit, -1.0, 1.0).double()
-    loss = torch.nn.functional.softplus(sign * design.dot(weights)).sum()
-    return loss + alpha * (l1_ratio * weights.abs().sum() + 0.5 * (1 - l1_ratio) * weights.square().sum())
-
-
 def logistic_regression(
     design: Design,
     is_hit: Tensor,
@@ -47,9 +38,12 @@ def logistic_regression(
     learning_rate: float,
     generator: torch.Generator,
 ) -> Tensor:
-    """Weights (F,), float64, that minimize `penalised_loss` by stochastic gradients from initial `weights`.
+    """Weights w (F,), float64, that minimize a loss by stochastic gradients from initial `weights` w₀.
 
-    The penalty applies to the change from the initial weights, so that an earlier map is not forgotten.
+        Σ ln(1 + exp(−y wᵀφ)) + α (ρ‖w − w₀‖₁ + ½(1 − ρ)‖w − w₀‖²),   y = ±1, ρ = l1_ratio
+
+    Ramos & Ott 2016, (6), with an elastic net. The penalty applies to the change from the initial weights, so
+    that an earlier map is not forgotten.
 
     Each batch makes one composite step of AdaGrad (Duchi, Hazan & Singer 2011). Every weight has its own
     step size, which features with few points need. Soft thresholds apply the L1 term exactly. The loss is
