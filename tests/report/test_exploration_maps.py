@@ -251,13 +251,8 @@ def test_cutaway_removes_ceilings_and_near_walls():
     inside = torch.tensor([[0.0, 0.1, 2.0]], dtype=torch.float64).expand(5, 3)
     from_front = Camera(0, 40)  # the viewer is at +x
 
-    def shown(seen_from: torch.Tensor | None, ceiling: float | None) -> list[bool]:
-        return cut_away(means, covariances, seen_from, ceiling, from_front)[0].tolist()
-
-    assert shown(inside, None) == [True, False, False, True, True]
-    assert shown(None, 3.0) == [True, False, True, True, True]
-    assert shown(None, None) == [True, False, True, True, True]
-    assert shown(inside, 1.0) == [True, *[False] * 4]
+    assert cut_away(means, covariances, inside, from_front)[0].tolist() == [True, False, False, True, True]
+    assert cut_away(means, covariances, None, from_front)[0].tolist() == [True, False, True, True, True]
     figure = mixture_scene_figure(means, covariances, seen_from=inside, camera=from_front, max_pixels=200)
     assert "3 of 5 components" in figure.get_suptitle()
 
@@ -272,7 +267,7 @@ def test_cutaway_removes_components_attached_to_removed_walls():
     flat, ball, bar = ([0.001, 0.2, 0.2], [0.02, 0.02, 0.02], [4.0, 0.01, 0.01])
     covariances = torch.diag_embed(torch.tensor([*[flat] * 20, ball, ball, bar], dtype=torch.float64))
     seen_from = torch.zeros(23, 3, dtype=torch.float64)
-    kept, ceiling = cut_away(means, covariances, seen_from, None, Camera(0, 40))
+    kept, ceiling = cut_away(means, covariances, seen_from, Camera(0, 40))
     assert kept.tolist() == [*[False] * 10, *[True] * 10, False, True, False]
     assert ceiling == math.inf  # nothing is overhead
 
@@ -285,7 +280,7 @@ def test_cutaway_cuts_level_ceilings_only():
     for lean, cut in ((0.0, 3.9), (0.5, math.inf)):
         slope = torch.stack([0 * x, 0 * x, lean * x], 1).repeat(2, 1)
         means = torch.cat([floor, roof]) + slope
-        kept, ceiling = cut_away(means, covariances, seen_from + slope, None, Camera())
+        kept, ceiling = cut_away(means, covariances, seen_from + slope, Camera())
         assert kept.tolist() == [*[True] * 40, *[False] * 40]
         assert ceiling == pytest.approx(cut)
 
@@ -310,7 +305,7 @@ def test_scene_figure_accepts_any_number_of_components(k):
     figure = mixture_scene_figure(means, covariances, trajectories=flights(2, 20), max_pixels=300)
     figure.canvas.draw()
     assert any(axes.get_ylabel() == "height z [m]" for axes in figure.axes)
-    named = mixture_scene_figure(means, covariances, ceiling=10.0, title="mine", max_pixels=300)
+    named = mixture_scene_figure(means, covariances, title="mine", max_pixels=300)
     assert named.get_suptitle() == "mine"
 
 

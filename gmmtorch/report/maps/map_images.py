@@ -114,7 +114,7 @@ def slice_image(
     """
     image = _pixels(panel, max_pixels)
     theta = _query(panel, _centres(image, panel, height)).reshape(image.image.shape)
-    theta[_is_unknown(theta)] = torch.nan
+    theta[is_unknown(theta)] = torch.nan
     image = image._replace(image=theta)
     factor = 1 if shown_pixels is None else round(max(theta.shape) / max(shown_pixels, 1))
     return _reduced(image, factor) if factor > 1 else image
@@ -165,7 +165,7 @@ def highest_occupancy(probability: ArrayLike, low: ArrayLike, resolution: float)
             "with at least one layer of cells, and (3,)."
         )
     x, y, bottom = corner.tolist()
-    highest = torch.where(_is_unknown(theta), -1.0, theta).amax(2)
+    highest = torch.where(is_unknown(theta), -1.0, theta).amax(2)
     image = torch.where(highest < 0, 0.5, highest)
     return MapImage(image, (x, y), resolution, (bottom, bottom + theta.shape[2] * resolution))
 
@@ -221,12 +221,13 @@ def _reduced(image: MapImage, factor: int) -> MapImage:
     )
 
 
-def _is_unknown(theta: Tensor) -> Tensor:
+def is_unknown(theta: Tensor) -> Tensor:
+    """Returns the mask of probabilities that are as good as ½."""
     return (theta - 0.5).abs() < _UNKNOWN_BAND
 
 
 def _is_occupied(theta: Tensor) -> Tensor:
-    return (theta > OCCUPIED_ABOVE) & ~_is_unknown(theta)
+    return (theta > OCCUPIED_ABOVE) & ~is_unknown(theta)
 
 
 def _query(panel: MapPanel, points: Tensor) -> Tensor:

@@ -165,9 +165,10 @@ def first_viewpoints(components: Components) -> Tensor:
 
 
 def cut_away(
-    mean: Tensor, covariance: Tensor, seen_from: Tensor | None, ceiling: float | None, camera: Camera
+    mean: Tensor, covariance: Tensor, seen_from: Tensor | None, camera: Camera
 ) -> tuple[Tensor, float]:
-    """Returns which components to draw (K,), and the height (m) above which to cut these off.
+    """Returns which components to draw (K,), and the height (m) above which to cut these off: a share of the
+    total height, or ∞ if the observed ceiling is not level.
 
     Leaves out components with means above that height, flat components that were observed from the side that
     faces away from the viewer, and components attached to such surfaces. A component is attached if most of
@@ -177,22 +178,19 @@ def cut_away(
         mean: (K, 3), metres.
         covariance: (K, 3, 3), m².
         seen_from: (K, 3), a sensor origin that observed each; if None, only the height counts.
-        ceiling: the height (m); if None, a share of the total height, or ∞ if the observed ceiling is not
-            level.
         camera: the viewer.
     """
     if len(mean) == 0:
         return torch.ones(0, dtype=torch.bool), math.inf
     if seen_from is None:
-        top = _share_of_height(mean, _CUT) if ceiling is None else ceiling
+        top = _share_of_height(mean, _CUT)
         return mean[:, 2] <= top, top
     deviations, directions = principal_axes(covariance)
     flat = deviations[:, 0] ** 2 < _FLAT * deviations[:, 1] ** 2
     normal, longest = directions[:, :, 0], directions[:, :, 2]
     side = normal * ((seen_from - mean) * normal).sum(1, keepdim=True).sign()
     hides = flat & (side @ camera.axes[2] < _BACK_FACE)
-    if ceiling is None:
-        ceiling = _level_ceiling(mean, mean[flat & (side[:, 2] < _OVERHEAD), 2])
+    ceiling = _level_ceiling(mean, mean[flat & (side[:, 2] < _OVERHEAD), 2])
     end = N_SIGMA * longest * deviations[:, 2:]
     kept = (mean[:, 2] <= ceiling) & ~hides
     if bool(flat.any()):

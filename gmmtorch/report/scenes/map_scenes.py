@@ -15,7 +15,8 @@ from torch import Tensor
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.evidence import Thresholds
 from gmmtorch.report import style
-from gmmtorch.report.maps.map_regions import Corners, robust_bounds
+from gmmtorch.report.maps.map_images import is_unknown
+from gmmtorch.report.maps.map_regions import Corners, inside, robust_bounds
 from gmmtorch.report.scenes.ellipsoids import (
     cut_away,
     first_viewpoints,
@@ -40,7 +41,6 @@ _SHARE = 0.97  # of the points, along each axis, that are shown
 _OUTSIDE = 1.0  # metres by which an ellipsoid may exceed the box
 _MAX_POINTS = 300_000
 _MAX_CELLS = 2_000_000
-_UNKNOWN_BAND = 0.02  # around θ = ½
 _REACH = 2  # cells around a measured point that are asked
 _POINT_PIXELS = 1.3  # radius of a point
 _PATH_PIXELS = 2.5  # radius of the sensor's path
@@ -94,11 +94,10 @@ def map_scene_figure(
     if components is not None:
         surfaces = _surfaces(components, scale, hidden, box)
         shown.append((f"surfaces of the map: {count_text(len(components), 'component')}", surfaces))
-    centres, side = cells_near(points[_inside(points, box)], resolution)
+    centres, side = cells_near(points[inside(points, box)], resolution)
     for one in maps:
         theta = one.occupancy(centres).cpu()
-        is_unknown = (theta - 0.5).abs() < _UNKNOWN_BAND
-        occupied = centres[(theta >= one.occupied_from) & ~is_unknown]
+        occupied = centres[(theta >= one.occupied_from) & ~is_unknown(theta)]
         shown.append((one.title, _spots(occupied, _FILL * side, scale, hidden, box)))
     path = [path_balls(trajectory.double(), _PATH_PIXELS / canvas.scale, _PATH)] if len(trajectory) else []
     figure, panels = _sheet(len(shown), canvas)
@@ -151,7 +150,7 @@ class _Hidden:
             components.covariances.double().cpu(),
         )
         seen_from = first_viewpoints(components).double().cpu()
-        self.kept, self.top = cut_away(self._means, self._covariances, seen_from, None, SOUTH_WEST)
+        self.kept, self.top = cut_away(self._means, self._covariances, seen_from, SOUTH_WEST)
 
     def __call__(self, places: Tensor) -> Tensor:
         """Whether each place (M, 3) is left out."""
@@ -180,7 +179,7 @@ def _surfaces(components: Components, scale: Normalize, hidden: _Hidden, box: Co
 def _spots(places: Tensor, radius: float, scale: Normalize, hidden: _Hidden, box: Corners) -> Ellipsoids:
     """Balls at the places (M, 3) in the box that are not hidden, coloured by height."""
     places = places.double().cpu()
-    places = places[_inside(places, box)]
+    places = places[inside(places, box)]
     places = places[~hidden(places)]
     return balls(places, radius, height_colours(places[:, 2], scale))
 
@@ -190,9 +189,4 @@ def _lie_inside(components: Components, box: Corners) -> Tensor:
     means, (deviations, directions) = components.means, principal_axes(components.covariances)
     end = N_SIGMA * directions[:, :, 2] * deviations[:, 2:]
     wide = tuple(x - _OUTSIDE for x in box[0]), tuple(x + _OUTSIDE for x in box[1])
-    return _inside(means, box) & _inside(means + end, wide) & _inside(means - end, wide)
-
-
-def _inside(places: Tensor, box: Corners) -> Tensor:
-    low, high = (places.new_tensor(corner) for corner in box)
-    return ((places >= low) & (places <= high)).all(1)
+    return inside(means, box) & inside(means + end, wide) & inside(means - end, wide)

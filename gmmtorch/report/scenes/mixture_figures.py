@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.report import style
-from gmmtorch.report.maps.map_regions import robust_bounds
+from gmmtorch.report.maps.map_regions import inside, robust_bounds
 from gmmtorch.report.scenes.ellipsoids import (
     checked_components,
     checked_rows,
@@ -153,17 +153,15 @@ def _draw_in_space(
 ) -> None:
     """Draws the components and points inside the box; with `seen_from`, without the
     components that hide the inside, and without points, which would stand where these were."""
-    low, high = (torch.tensor(corner, dtype=torch.float64) for corner in box)
-    inside = ((mean >= low) & (mean <= high)).all(1)
-    cloud, top = torch.from_numpy(points), np.inf
+    shown, cloud, top = inside(mean, box), torch.from_numpy(points), np.inf
     if seen_from is None:
         style.label_axes(axes, "in space")
-        cloud = cloud[((cloud >= low) & (cloud <= high)).all(1)]
+        cloud = cloud[inside(cloud, box)]
     else:
         style.label_axes(axes, "in space, ceilings and near walls left out")
-        kept, top = cut_away(mean, covariance, seen_from, None, SOUTH_WEST)
-        inside, cloud = inside & kept, cloud[:0]
-    components = Ellipsoids(mean[inside], covariance[inside], height_colours(mean[inside, 2], scale), top)
+        kept, top = cut_away(mean, covariance, seen_from, SOUTH_WEST)
+        shown, cloud = shown & kept, cloud[:0]
+    components = Ellipsoids(mean[shown], covariance[shown], height_colours(mean[shown, 2], scale), top)
     grey = torch.tensor(to_rgb(_POINT), dtype=torch.float64)
     dots = balls(cloud, _POINT_PIXELS / canvas.scale, grey)
     draw_scene(axes, [components, dots], *box, SOUTH_WEST, canvas)
