@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import fields
+from functools import partial
 from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
-from gmmtorch.mapping.codec.map_file import FileSize, MapSettings, number_after
+from gmmtorch.mapping.codec.map_file import MapSettings, file_size, number_after
 from gmmtorch.mapping.codec.quantization import numbered
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.depth_frame import DepthFrame, as_scans
-from gmmtorch.mapping.learning.forgetting import Doubts, Forgetting
+from gmmtorch.mapping.learning.forgetting import Doubts, joined
 from gmmtorch.mapping.learning.rules import LearningRule, WindowedRule, read_rule, rule_facts
 from gmmtorch.mapping.learning.windows import absorb, learn_window
 from gmmtorch.mapping.query import Query
@@ -125,15 +126,15 @@ class MapState(nn.Module):
         self, scans: Iterable[Scan | DepthFrame], rule: LearningRule, weight: float = 1.0
     ) -> Components:
         """All components, with those of scans, or of frames with points that each stand for `weight`."""
-        known, forgetting = self._final(), Forgetting(rule, self._doubts)
+        known = self._final()
         if isinstance(rule, WindowedRule):
             generator = torch.Generator().manual_seed(hash((self._random_state, self._n_windows)) % 2**63)
             window = as_scans(scans)
-            learned = forgetting.joined(known, learn_window(window, rule, generator), window)
+            new = learn_window(window, rule, generator)
+            learned, self._next_doubts = joined(known, new, window, rule, self._doubts)
         else:
-            size = FileSize(rule, self.settings, self._next_number)
-            learned = absorb(known, scans, rule, size, weight, forgetting)
-        self._next_doubts = forgetting.doubts
+            size = partial(file_size, rule=rule, settings=self.settings, next_number=self._next_number)
+            learned, self._next_doubts = absorb(known, scans, rule, size, weight, self._doubts)
         return numbered(learned, self.robot, self._next_number)
 
     def _add(self, scan: Scan) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +108,7 @@ def _tile(
     """The file of a tile, and its row of the index."""
     found = canonical(components)
     if tile_bytes is not None:
-        size = map_file.FileSize(_RULE, settings, 0)
+        size = partial(map_file.file_size, rule=_RULE, settings=settings, next_number=0)
         found = compact_to_bytes(found, tile_bytes, _RULE.max_origins, _RULE.mean_origins, size)
         found = canonical(found if settings.codec == "float" else quantized(found))
     data = map_file.to_bytes(found, _RULE, settings, 0)

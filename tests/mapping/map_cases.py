@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import Any
 
@@ -14,6 +14,7 @@ from torch import Tensor
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule, LearningRule, WindowedRule
+from gmmtorch.mapping.learning.windows import absorb
 from gmmtorch.scan import Scan
 
 FINE = IncrementalRule(noise=0.01, length=0.1, cell=0.05, window=2)
@@ -41,6 +42,11 @@ def built(scans: list[Scan], learning: LearningRule | None = None, **options: An
     for scan in scans:
         made.insert(scan)
     return made
+
+
+def absorbed(components: Components, scans: Sequence[Scan], rule: IncrementalRule) -> Components:
+    """The components with scans added."""
+    return absorb(components, scans, rule)[0]
 
 
 def given_parts(dim: int = 2, k: int = 4, seed: int = 0) -> dict[str, Tensor]:
@@ -84,11 +90,6 @@ def sightings(made: Components) -> list[dict[tuple[float, ...], float]]:
         assert place not in table[k]
         table[k][place] = count
     return table
-
-
-def each_value(table: Mapping[str, Sequence[Any]]) -> list[tuple[str, Any]]:
-    """(name, value) for each value of each name, as parameters of a test."""
-    return [(name, value) for name, values in table.items() for value in values]
 
 
 def names(ids: Tensor) -> set[tuple[int, ...]]:

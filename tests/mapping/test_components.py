@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from mapping.map_cases import assert_same_components, each_value, given_parts, sightings
+from invalid_values import each_value
+from mapping.map_cases import assert_same_components, given_parts, sightings
 from mapping.random_components import counts_add_up, normal_components
 from occupancy.protocol_contract import dims, lattice, wall_scan
 from scipy.stats import multivariate_normal

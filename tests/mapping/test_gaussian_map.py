@@ -9,12 +9,12 @@ import re
 import numpy as np
 import pytest
 import torch
+from invalid_values import each_value
 from mapping.map_cases import (
     FINE,
     assert_same_components,
     built,
     drive,
-    each_value,
     given_parts,
     sightings,
 )

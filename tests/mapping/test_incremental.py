@@ -10,6 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mapping.map_cases import absorbed
 from mapping.random_components import counts_add_up
 from occupancy.protocol_contract import WALL, dims, open_scan, points, wall_scan
 from torch import Tensor
@@ -41,7 +42,7 @@ def drive(n: int, dim: int) -> list[Scan]:
 
 
 def grown(scans: list[Scan], rule: IncrementalRule = RULE) -> Components:
-    return absorb(Components.empty(scans[0].dim), scans, rule).checked()
+    return absorbed(Components.empty(scans[0].dim), scans, rule).checked()
 
 
 def occupancy(components: Components, x: Tensor, resolution: float = 0.125) -> Tensor:
@@ -79,7 +80,7 @@ def test_old_components_keep_their_ids_and_new_ones_have_none():
     assert bool((first.ids[:, 1] == UNNUMBERED).all())
     numbered = replace(first, ids=torch.stack([torch.zeros(len(first)), torch.arange(len(first))], 1).long())
     there = Scan(scans[2].points + 50, scans[2].origin + 50)
-    second = absorb(numbered, [there], replace(RULE, max_cost=0.0))
+    second = absorbed(numbered, [there], replace(RULE, max_cost=0.0))
     assert torch.equal(second.ids[: len(first)], numbered.ids)
     assert bool((second.ids[len(first) :, 1] == UNNUMBERED).all())
     assert torch.equal(second.means[: len(first)], first.means)
@@ -93,7 +94,7 @@ NOVEL = replace(RULE, novelty=NoveltyRule(resolution=0.125, threshold=0.5, dista
 @dims
 def test_repeated_scans_add_few_components(dim):
     once = grown([wall_scan(dim, seed) for seed in range(2)], NOVEL)
-    again = absorb(once, [wall_scan(dim, seed) for seed in range(2, 6)], NOVEL)
+    again = absorbed(once, [wall_scan(dim, seed) for seed in range(2, 6)], NOVEL)
     without = grown([wall_scan(dim, seed) for seed in range(6)], replace(RULE, window=1))
     assert len(again) - len(once) < 0.5 * (len(without) - len(once))
     assert float(again.support.sum()) < float(without.support.sum())
@@ -104,7 +105,7 @@ def test_scans_of_new_space_add_components(dim):
     once = grown([wall_scan(dim)], NOVEL)
     beyond = wall_scan(dim, 1)
     beyond = Scan(beyond.points + 8.0, beyond.origin + 8.0)
-    both = absorb(once, [beyond], NOVEL)
+    both = absorbed(once, [beyond], NOVEL)
     assert float(both.support.sum() - once.support.sum()) == pytest.approx(len(beyond.points))
     x = points([2.0, WALL], dim)
     torch.testing.assert_close(occupancy(both, x + 8.0), occupancy(once, x), rtol=0, atol=0.1)
@@ -115,7 +116,7 @@ def test_explained_novel_points_are_counted_instead_of_learned():
     rule = replace(NOVEL, novelty=NoveltyRule(resolution=0.125, threshold=0.0, distance=0.3, explained=1e9))
     once = grown([wall_scan(3)], rule)
     scan = wall_scan(3, 1)
-    twice = absorb(once, [scan], rule)
+    twice = absorbed(once, [scan], rule)
     assert len(twice) == len(once)
     assert torch.equal(twice.means, once.means)
     gained = float(twice.support.sum() - once.support.sum())
@@ -132,7 +133,7 @@ def test_only_beams_that_contribute_free_space_ask_where_components_were_seen_fr
     rule = replace(known, threshold=float(bits.median()))
     by_their_end = int(((bits >= rule.threshold) & (way < rule.threshold)).sum())
     gained = {
-        asked: absorb(once, [away], replace(NOVEL, novelty=replace(rule, distance_for=asked)))
+        asked: absorbed(once, [away], replace(NOVEL, novelty=replace(rule, distance_for=asked)))
         .support[: len(once)]
         .sum()
         - once.support.sum()
@@ -148,7 +149,7 @@ def test_only_beams_that_contribute_free_space_ask_where_components_were_seen_fr
 
 def absorb_depth(components, frames, intrinsics, rule, pixel_stride=4, max_range=torch.inf):
     scans = (DepthFrame.of(*frame, intrinsics, pixel_stride, max_range) for frame in frames)
-    return absorb(components, scans, rule, weight=float(pixel_stride**2))
+    return absorb(components, scans, rule, weight=float(pixel_stride**2))[0]
 
 
 def depth_frames(n: int = 3) -> list[tuple[Tensor, Tensor]]:

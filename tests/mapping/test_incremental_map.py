@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from mapping.map_cases import FINE, assert_same_components, built, drive, names, open_drive
-from occupancy.protocol_contract import dims, empty_scan, lattice, open_scan, shifted, wall_scan
+from occupancy.protocol_contract import dims, empty_scan, lattice, shifted, wall_scan
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.gaussian_map import GaussianMap
@@ -178,29 +178,6 @@ def test_empty_scans_fill_windows_and_add_no_components(dim, learning):
     for scan in (first, empty_scan(dim), empty_scan(dim), second, empty_scan(dim), empty_scan(dim)):
         made.insert(scan)
     assert_same_components(made.components(), built([first, second], learning, window=1).components())
-
-
-@dims
-def test_no_return_beams_alone_give_only_free_space(dim):
-    made = built([open_scan(dim)] * 3, TIGHT, cutoff=5.0)
-    assert bool(made.components().max_range.all())
-    assert made.n_components == 9
-    theta = made.occupancy(lattice(dim))
-    assert float(theta.max()) == 0.5
-    assert float(theta.min()) < 0.3
-
-
-@dims
-def test_a_map_is_the_same_far_from_the_world_origin(dim):
-    matrix = shifted(dim, (524_288.0, -262_144.0, 1024.0))
-    near, far = (
-        built([scan.transformed(matrix) if move else scan for scan in open_drive(5, dim)], TIGHT)
-        for move in (False, True)
-    )
-    shift = matrix[:dim, dim]
-    torch.testing.assert_close(far.means - shift, near.means, rtol=0, atol=1e-6)
-    expected = near.occupancy(lattice(dim))
-    torch.testing.assert_close(far.occupancy(lattice(dim) + shift), expected, rtol=0, atol=1e-4)
 
 
 # -- files -----------------------------------------------------------------------------------------------

@@ -11,7 +11,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mapping.map_cases import FINE, assert_same_components, built, each_value, open_drive
+from invalid_values import each_value
+from mapping.map_cases import FINE, assert_same_components, built, open_drive
 from mapping.random_components import random_components
 from occupancy.protocol_contract import lattice, wall_scan
 from torch import Tensor
@@ -93,7 +94,7 @@ def test_file_size_equals_the_length_of_the_written_file(dim, k, n_known, seed, 
     components = random_components(dim, k=k, seed=seed)
     components.ids[n_known:, 1] = UNNUMBERED
     rule, map_settings = IncrementalRule(), storage.MapSettings(0.1, "point", codec, 3, QueryOptions())
-    size = storage.FileSize(rule, map_settings, next_number=40)(components)
+    size = storage.file_size(components, rule, map_settings, next_number=40)
     written = storage.to_bytes(numbered(components, 3, 40), rule, map_settings, 40)
     assert size == len(written) + 48  # room for settings that change
 

@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from mapping.map_cases import absorbed
 from mapping.random_components import normal_components
 from occupancy.exact_dda import voxels_left
 from occupancy.protocol_contract import dims, empty_scan, open_scan, wall_scan
@@ -13,7 +14,6 @@ from occupancy.protocol_contract import dims, empty_scan, open_scan, wall_scan
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.novelty import entropy_reduction, novel_beams
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule
-from gmmtorch.mapping.learning.windows import absorb
 from gmmtorch.occupancy.forms.point import point_evidence
 from gmmtorch.scan import Scan
 
@@ -63,7 +63,7 @@ def test_entropy_reduction_equals_an_exact_walk(dim, seed):
 @dims
 def test_beams_through_learned_space_are_not_novel(dim):
     scans = [wall_scan(dim, seed) for seed in range(3)]
-    learned = absorb(Components.empty(dim), scans, LEARNING)
+    learned = absorbed(Components.empty(dim), scans, LEARNING)
     again = wall_scan(dim, 9)
     assert float(novel_beams(learned, again, RULE).double().mean()) < 0.25
     elsewhere = again.transformed(_turn(dim))
@@ -81,12 +81,12 @@ def _turn(dim: int) -> torch.Tensor:
 def test_every_beam_is_novel_to_an_empty_map(dim):
     assert bool(novel_beams(Components.empty(dim), wall_scan(dim), RULE).all())
     assert novel_beams(Components.empty(dim), empty_scan(dim), RULE).shape == (0,)
-    known = absorb(Components.empty(dim), [wall_scan(dim)], LEARNING)
+    known = absorbed(Components.empty(dim), [wall_scan(dim)], LEARNING)
     assert novel_beams(known, empty_scan(dim), RULE).shape == (0,)
 
 
 def test_one_unobserved_cell_makes_a_beam_novel():
-    known = absorb(Components.empty(2), [wall_scan(2, seed) for seed in range(3)], LEARNING)
+    known = absorbed(Components.empty(2), [wall_scan(2, seed) for seed in range(3)], LEARNING)
     inside = wall_scan(2, 5).select(torch.arange(241) == 120)
     never = NoveltyRule(resolution=0.125, threshold=1e6)
     assert novel_beams(known, inside, never).tolist() == [False]
@@ -99,7 +99,7 @@ def test_one_unobserved_cell_makes_a_beam_novel():
 @dims
 def test_no_return_beams_reduce_the_entropy_of_free_space(dim):
     open_ = open_scan(dim)
-    learned = absorb(Components.empty(dim), [open_, open_, open_], LEARNING)
+    learned = absorbed(Components.empty(dim), [open_, open_, open_], LEARNING)
     assert bool(learned.max_range.all())
     bits, _ = entropy_reduction(learned, open_, RULE)
     assert bool((bits > 0).all())
@@ -110,8 +110,8 @@ def test_novelty_is_the_same_far_from_the_world_origin():
     shift = torch.tensor([512_000.0, -256_000.0, 1024.0], dtype=torch.float64)
     scans = [wall_scan(3, seed) for seed in range(2)]
     moved = [Scan(scan.points + shift, scan.origin + shift) for scan in scans]
-    near = absorb(Components.empty(3), scans[:1], LEARNING)
-    far = absorb(Components.empty(3), moved[:1], LEARNING)
+    near = absorbed(Components.empty(3), scans[:1], LEARNING)
+    far = absorbed(Components.empty(3), moved[:1], LEARNING)
     here, _ = entropy_reduction(near, scans[1], RULE)
     there, _ = entropy_reduction(far, moved[1], RULE)
     torch.testing.assert_close(here, there, rtol=1e-4, atol=1e-4)

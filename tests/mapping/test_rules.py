@@ -7,7 +7,7 @@ import math
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mapping.map_cases import each_value
+from invalid_values import each_value
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule, read_rule, rule_facts

@@ -10,6 +10,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from invalid_values import each_value
 from sharing.message_examples import examples, numbers, places, sealed, views
 
 from gmmtorch.errors import InvalidArgumentError
@@ -74,26 +75,22 @@ def test_a_view_takes_few_bytes():
     assert len(encode_views(replace(views(0), removed=Intervals.span(5, 500_000)))[0]) <= 13
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("ids", torch.tensor([[0, 1], [0, 1]])),
-        ("ids", torch.tensor([[0, -1], [0, 1]])),
-        ("ids", torch.tensor([[0, 1 << 60], [0, 1]])),
-        ("ids", torch.tensor([[0.0, 1.0], [0.0, 2.0]])),
-        ("ids", torch.tensor([[1024, 1], [0, 1]])),
-        ("removed", Intervals.span(-5, 5)),
-        ("removed", Intervals.span(5, (1 << 62) + 1)),
-        ("poses", torch.full((2, 4), math.nan)),
-        ("poses", torch.full((2, 4), 1e9)),
-        ("poses", torch.full((2, 4), 1.01 * FARTHEST)),
-        ("poses", torch.zeros(2, 3)),
-        ("values", torch.tensor([1.0, 7e4])),
-        ("values", torch.tensor([1.0, math.nan])),
-        ("stamps", torch.tensor([1.0, math.inf])),
-        ("stamps", torch.zeros(3)),
+INVALID_VIEWS = {
+    "ids": [
+        torch.tensor([[0, 1], [0, 1]]),
+        torch.tensor([[0, -1], [0, 1]]),
+        torch.tensor([[0, 1 << 60], [0, 1]]),
+        torch.tensor([[0.0, 1.0], [0.0, 2.0]]),
+        torch.tensor([[1024, 1], [0, 1]]),
     ],
-)
+    "removed": [Intervals.span(-5, 5), Intervals.span(5, (1 << 62) + 1)],
+    "poses": [*(torch.full((2, 4), x) for x in (math.nan, 1e9, 1.01 * FARTHEST)), torch.zeros(2, 3)],
+    "values": [torch.tensor([1.0, 7e4]), torch.tensor([1.0, math.nan])],
+    "stamps": [torch.tensor([1.0, math.inf]), torch.zeros(3)],
+}
+
+
+@pytest.mark.parametrize(("name", "value"), each_value(INVALID_VIEWS))
 def test_invalid_views_are_refused(name, value):
     with pytest.raises(InvalidArgumentError, match=name):
         encode_views(replace(views(2, 2), **{name: value}))

@@ -10,6 +10,7 @@ import pytest
 import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from invalid_values import each_value
 from mapping.random_components import random_components
 from sharing.message_examples import codecs, frame_of_components, numbers, places
 
@@ -101,20 +102,16 @@ def with_one(components: Components, name: str, value: float) -> Components:
     return replace(components, **{name: changed})
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("means", 1e300),
-        ("means", -2 * FARTHEST),
-        ("origins", 2 * FARTHEST),
-        ("covariances", 1e300),
-        ("covariances", 2.0**41),
-        ("support", 2 * MOST_POINTS),
-        ("support", math.nan),
-        ("ids", -1),
-        ("ids", 1 << 60),
-    ],
-)
+INVALID_COMPONENTS = {
+    "means": [1e300, -2 * FARTHEST],
+    "origins": [2 * FARTHEST],
+    "covariances": [1e300, 2.0**41],
+    "support": [2 * MOST_POINTS, math.nan],
+    "ids": [-1, 1 << 60],
+}
+
+
+@pytest.mark.parametrize(("name", "value"), each_value(INVALID_COMPONENTS))
 @codecs
 def test_invalid_components_are_refused_before_sending(name, value, codec):
     one = random_components(3, k=3, n_origins=1, max_sightings=1)
@@ -262,23 +259,20 @@ def test_points_take_12_bytes_a_bit_and_a_header():
     assert 41 + 12 * (n + 1) + math.ceil((n + 1) / 8) > MAX_BYTES  # one more would not fit
 
 
-@pytest.mark.parametrize(
-    "changed",
-    [
-        {"sender": 65536},
-        {"frame": -1},
-        {"frame": 1 << 32},
-        {"ends": torch.full((4, 3), math.nan)},
-        {"ends": torch.full((4, 3), math.inf)},
-        {"ends": torch.full((4, 3), 1e39, dtype=torch.float64)},
-        {"ends": torch.full((4, 3), 1.1 * FARTHEST, dtype=torch.float64)},
-        {"origin": torch.tensor([0.0, 0.0, -1.1 * FARTHEST])},
-        {"ends": torch.zeros(4, 2)},
-        {"origin": torch.tensor([0.0, math.inf, 0.0])},
-        {"is_hit": torch.ones(3, dtype=torch.bool)},
+INVALID_POINTS = {
+    "sender": [65536],
+    "frame": [-1, 1 << 32],
+    "ends": [
+        *(torch.full((4, 3), x, dtype=torch.float64) for x in (math.nan, math.inf, 1e39, 1.1 * FARTHEST)),
+        torch.zeros(4, 2),
     ],
-)
-def test_invalid_points_are_refused(changed):
+    "origin": [torch.tensor([0.0, 0.0, -1.1 * FARTHEST]), torch.tensor([0.0, math.inf, 0.0])],
+    "is_hit": [torch.ones(3, dtype=torch.bool)],
+}
+
+
+@pytest.mark.parametrize(("name", "value"), each_value(INVALID_POINTS))
+def test_invalid_points_are_refused(name, value):
     sound = {
         "sender": 0,
         "frame": 0,
@@ -287,5 +281,5 @@ def test_invalid_points_are_refused(changed):
         "is_hit": torch.ones(4, dtype=torch.bool),
     }
     assert len(encode_points(**sound)) == 1
-    with pytest.raises(InvalidArgumentError, match=next(iter(changed))):
-        encode_points(**{**sound, **changed})
+    with pytest.raises(InvalidArgumentError, match=name):
+        encode_points(**{**sound, name: value})

@@ -10,6 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from invalid_values import each_value
 from scipy import stats
 
 from gmmtorch.errors import InvalidArgumentError
@@ -282,20 +283,18 @@ def test_traffic_counts_each_broadcast_once_by_sender_and_kind(sent, conditions)
 
 # -- invalid input ---------------------------------------------------------------------------------------
 
-BAD_CONDITIONS = [
-    ("latency", [-0.1, math.nan, math.inf, "1", None, True]),
-    ("jitter", [-0.1, math.nan, math.inf, "1", None]),
-    ("bandwidth", [0.0, -1.0, math.inf, math.nan, "fast"]),
-    ("loss", [1.0, -0.1, math.nan, None, "high"]),
-    ("duplication", [1.1, -0.1, math.nan, None, "x"]),
-    ("reach", [0.0, -1.0, math.inf, math.nan, "far"]),
-    ("partitions", [3, None]),
-]
+BAD_CONDITIONS = {
+    "latency": [-0.1, math.nan, math.inf, "1", None, True],
+    "jitter": [-0.1, math.nan, math.inf, "1", None],
+    "bandwidth": [0.0, -1.0, math.inf, math.nan, "fast"],
+    "loss": [1.0, -0.1, math.nan, None, "high"],
+    "duplication": [1.1, -0.1, math.nan, None, "x"],
+    "reach": [0.0, -1.0, math.inf, math.nan, "far"],
+    "partitions": [3, None],
+}
 
 
-@pytest.mark.parametrize(
-    ("field", "value"), [(field, value) for field, values in BAD_CONDITIONS for value in values]
-)
+@pytest.mark.parametrize(("field", "value"), each_value(BAD_CONDITIONS))
 def test_invalid_conditions_are_named(field, value):
     with pytest.raises(InvalidArgumentError, match=rf"^{field}={value!r} must be "):
         LinkConditions(**{field: value})

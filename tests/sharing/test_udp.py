@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 
 import pytest
-from sharing.transport_cases import KEY, heard, until
+from sharing.transport_cases import KEY, heard, hostile_frames, until
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.sharing.transport.security import Sealer
@@ -170,18 +170,10 @@ def test_an_independent_implementation_of_the_format_takes_part(opening):
 
 def test_foreign_datagrams_are_counted_and_ignored(opening, raw):
     a, b = team(opening, 2, key=KEY)
-    rng, stranger = random.Random(0), Sealer(0, TeamKey.generate())
     a.peers = [*a.peers, raw.getsockname()]
     a.send(0, [b"one"], 0.0, "maps")
     frame = raw.recv(2000)
-    hostile = {
-        "foreign": [b"", b"hello", b"\x11" + rng.randbytes(1199)],
-        "oversized": [rng.randbytes(1232), bytes(60000)],
-        "version": [b"\xf3" + rng.randbytes(99)],
-        "malformed": [frame[:30], b"\xf1"],
-        "wrong_key": [frame[:-1], frame[:-1] + b"?", stranger.seal(b"x"), Sealer(0).seal(b"x")],
-        "replayed": [frame, frame, frame],
-    }
+    hostile = hostile_frames(frame, sender=0)
     for datagrams in hostile.values():
         for datagram in datagrams:
             raw.sendto(datagram, b.address)
@@ -190,6 +182,20 @@ def test_foreign_datagrams_are_counted_and_ignored(opening, raw):
     assert {reason: n for reason, n in b.refused.items() if n} == {r: len(d) for r, d in hostile.items()}
     sizes = [len(datagram) for datagrams in hostile.values() for datagram in datagrams]
     assert b.received == Traffic(2 + len(sizes), 2 * 34 + sum(sizes))
+
+
+def test_forged_frames_take_no_memory(opening, raw):
+    a, b = team(opening, 2, key=KEY, max_waiting=10)
+    rng = random.Random(1)
+    for i in range(3000):
+        raw.sendto(b"\xf1" + rng.randbytes(rng.randrange(1300)), b.address)
+        if i % 50 == 0:
+            until(lambda i=i: b.received.datagrams + b.n_overflowed > i)
+    until(lambda: b.received.datagrams == 3000)
+    a.send(0, [b"x"], 0.0, "maps")
+    assert heard(b, 1) == [(0, b"x")]
+    assert len(b._opener._sessions) == 1
+    assert sum(b.refused.values()) == 3000
 
 
 def test_a_full_queue_keeps_the_newest_datagrams(opening):

@@ -12,14 +12,14 @@ from contextlib import ExitStack
 
 import pytest
 from sharing.schedules import components
-from sharing.transport_cases import KEY, heard, until
+from sharing.transport_cases import KEY, heard, hostile_frames, until
 from sharing.zenoh_cases import Opening, endpoint, greet, wait_until_connected, zenoh
 
 from gmmtorch.errors import GmmTorchError
 from gmmtorch.sharing.radio import Radio
 from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.sharing.transport.security import Sealer
-from gmmtorch.sharing.transport.simulated_network import Network, Traffic, Transport
+from gmmtorch.sharing.transport.simulated_network import Traffic, Transport
 from gmmtorch.sharing.transport.zenoh_transport import ZenohTransport
 
 
@@ -66,8 +66,8 @@ def test_all_others_receive_each_datagram_once_and_in_order(opening, key, protoc
 
 
 @pytest.mark.parametrize("key", [KEY, None])
-def test_statistics_equal_the_measured_traffic(opening, stranger, key):
-    """Against a plain session that listens, and against `Network` with the same input."""
+def test_sent_counts_each_frame_once(opening, stranger, key):
+    """Against a plain session that listens."""
     where = endpoint()
     a = opening(0, listen=[where], key=key)
     sizes: list[int] = []
@@ -76,21 +76,11 @@ def test_statistics_equal_the_measured_traffic(opening, stranger, key):
     a.send(0, [bytes(1000)], 0.0, "greetings")
     until(lambda: sizes[-1] == 1000 + a.overhead)
     before, n_before = a.sent, len(sizes)
-    network, rng = Network(2), random.Random(0)
-    for turn in range(20):
-        datagrams = [rng.randbytes(rng.randrange(1201)) for _ in range(rng.randrange(4))]
-        kind = rng.choice(["maps", "plans"])
-        a.send(0, datagrams, float(turn), kind)
-        network.send(0, datagrams, float(turn), kind)
-    for kind in ("maps", "plans"):
-        assert a.traffic(0, kind) == a.traffic(kind=kind) == network.traffic(0, kind)
-    assert a.traffic(1) == Traffic()
-    n = network.traffic().datagrams
-    assert a.overhead == (31 if key else 15)
-    until(lambda: len(sizes) == n_before + n)
-    measured = sum(sizes[n_before:])
-    assert measured == network.traffic().bytes + a.overhead * n
-    assert a.sent == Traffic(before.datagrams + n, before.bytes + measured)
+    datagrams = [bytes(n) for n in (0, 7, 1200, 300)]
+    a.send(0, datagrams, 1.0, "maps")
+    until(lambda: len(sizes) == n_before + 4)
+    assert sizes[n_before:] == [len(datagram) + a.overhead for datagram in datagrams]
+    assert a.sent == Traffic(before.datagrams + 4, before.bytes + sum(sizes[n_before:]))
     assert (a.received, a.failures) == (Traffic(), {})
 
 
@@ -167,12 +157,7 @@ def test_hostile_frames_are_counted_and_the_team_continues(opening, stranger):
     until(lambda: b.send(1, [b"one"], 0.0, "maps") or len(frames) > 0)
     b.send(1, [b"two"], 0.0, "maps")
     until(lambda: (1, b"two") in a.deliver(0, 0.0))
-    hostile = {
-        "foreign": [b"", b"hello"],
-        "oversized": [bytes(60000)],
-        "wrong_key": [frames[0][:-1] + b"?", Sealer(5).seal(b"x")],
-        "replayed": [frames[0]] * 2,
-    }
+    hostile = hostile_frames(frames[0], sender=5)
     before = a.received
     waits = {"congestion_control": zenoh.CongestionControl.BLOCK}
     for number, payloads in enumerate(hostile.values()):

@@ -62,24 +62,17 @@ def to_bytes(components: Components, rule: LearningRule, settings: MapSettings, 
     return _container(torch.frombuffer(bytearray(encode(components)), dtype=torch.uint8), facts)
 
 
-@dataclass(frozen=True)
-class FileSize:
-    """Computes the file size of components before they are numbered, without writing the file."""
-
-    rule: LearningRule
-    settings: MapSettings
-    next_number: int
-
-    def __call__(self, components: Components) -> int:
-        """Bytes of the file, plus room for settings that change while the map is built."""
-        n_new = int((components.ids[:, 1] < 0).sum())
-        facts = _facts(self.rule, self.settings, number_after(components.ids, self.next_number + n_new))
-        if self.settings.codec == "float":
-            data = pack_tensors(vars(components), FILE_KIND, FILE_VERSION, **facts)
-        else:
-            values = quantize_numbered(components, self.settings.robot, self.next_number)
-            data = _container(torch.zeros(batch_bytes(values), dtype=torch.uint8), facts)
-        return len(data) + _ROOM_FOR_SETTINGS
+def file_size(components: Components, rule: LearningRule, settings: MapSettings, next_number: int) -> int:
+    """Bytes of the file of components before they are numbered, without writing it; and room for settings
+    that change while the map is built."""
+    n_new = int((components.ids[:, 1] < 0).sum())
+    facts = _facts(rule, settings, number_after(components.ids, next_number + n_new))
+    if settings.codec == "float":
+        data = pack_tensors(vars(components), FILE_KIND, FILE_VERSION, **facts)
+    else:
+        values = quantize_numbered(components, settings.robot, next_number)
+        data = _container(torch.zeros(batch_bytes(values), dtype=torch.uint8), facts)
+    return len(data) + _ROOM_FOR_SETTINGS
 
 
 def number_after(ids: Tensor, next_number: int) -> int:

@@ -81,58 +81,64 @@ class Doubts:
         return table[number[len(self.ids) :]]
 
 
-class Forgetting:
-    """Adds components to those of a map, and drops what is gone. One object serves one call of a rule.
+def joined(
+    known: Components,
+    learned: Components,
+    window: Sequence[Scan | DepthFrame],
+    rule: LearningRule,
+    doubts: Doubts,
+) -> tuple[Components, Doubts]:
+    """The components of a map and those learned from a window of S scans, without those that are gone; and
+    the doubts after the window.
+
+    Components without a number are not in doubt: their test begins with the next window.
 
     Args:
         rule: its noise must be set if a scan has a return.
-        doubts: before the first window. Attribute `doubts`: after the last one; components without a number
-            are not in it, so that their test begins with the next window.
+        doubts: before the window.
+
+    Raises `InvalidArgumentError` for a half-life if a scan has no time.
     """
+    if rule.forget == FORGET_OFF:
+        return Components.concatenate([known, learned]), doubts
+    if rule.forget == CONTRADICTION:
+        both = Components.concatenate([known, learned])
+        return _confirmed(both, as_scans(window), rule.noise or 0.0, doubts)
+    aged, doubts = _aged(known, getattr(window[-1], "time", None), float(rule.forget), doubts)
+    return Components.concatenate([aged, learned]), doubts
 
-    def __init__(self, rule: LearningRule, doubts: Doubts) -> None:
-        self._forget, self._noise = rule.forget, rule.noise or 0.0
-        self.doubts = doubts
 
-    def joined(
-        self, known: Components, learned: Components, window: Sequence[Scan | DepthFrame]
-    ) -> Components:
-        """The components of a map and those learned from a window of S scans, without those that are gone.
+def _confirmed(
+    components: Components, scans: Sequence[Scan], noise: float, doubts: Doubts
+) -> tuple[Components, Doubts]:
+    """The components that these scans do not contradict."""
+    log_odds = doubts.of(components.ids)
+    surfaces = (~components.max_range).nonzero().squeeze(1)
+    found = gone_log_odds(components.selected(surfaces), scans, noise, log_odds[surfaces])
+    log_odds = log_odds.index_copy(0, surfaces, found)
+    kept = (log_odds < math.log(_CERTAIN)).nonzero().squeeze(1)
+    doubted = kept[(log_odds[kept] > 0) & (components.ids[kept, 1] >= 0)]
+    doubts = Doubts(components.ids[doubted].cpu(), log_odds[doubted].cpu())
+    return components if len(kept) == len(components) else components.selected(kept), doubts
 
-        Raises `InvalidArgumentError` for a half-life if a scan has no time.
-        """
-        if self._forget == FORGET_OFF:
-            return Components.concatenate([known, learned])
-        if self._forget == CONTRADICTION:
-            return self._confirmed(Components.concatenate([known, learned]), as_scans(window))
-        return Components.concatenate([self._aged(known, window), learned])
 
-    def _confirmed(self, components: Components, scans: Sequence[Scan]) -> Components:
-        """The components that these scans do not contradict."""
-        log_odds = self.doubts.of(components.ids)
-        surfaces = (~components.max_range).nonzero().squeeze(1)
-        found = gone_log_odds(components.selected(surfaces), scans, self._noise, log_odds[surfaces])
-        log_odds = log_odds.index_copy(0, surfaces, found)
-        kept = (log_odds < math.log(_CERTAIN)).nonzero().squeeze(1)
-        doubted = kept[(log_odds[kept] > 0) & (components.ids[kept, 1] >= 0)]
-        self.doubts = Doubts(components.ids[doubted].cpu(), log_odds[doubted].cpu())
-        return components if len(kept) == len(components) else components.selected(kept)
-
-    def _aged(self, components: Components, window: Sequence[Scan | DepthFrame]) -> Components:
-        """The components with their counts at the time of the last scan of the window."""
-        time, before = getattr(window[-1], "time", None), self.doubts.time
-        if time is None:
-            raise InvalidArgumentError(
-                f"forget={self._forget} is a half-life in seconds, but a scan has no time: give "
-                "Scan(points, origin, time=seconds), or forget='contradiction'."
-            )
-        self.doubts = replace(self.doubts, time=time if before is None else max(time, before))
-        if before is None or time <= before:  # a clock that goes back does not add evidence
-            return components
-        left = 2.0 ** ((before - time) / float(self._forget))
-        kept = (components.support * left >= _LEAST_SUPPORT).nonzero().squeeze(1)
-        aged = components.selected(kept)
-        return replace(aged, support=aged.support * left, seen_count=aged.seen_count * left)
+def _aged(
+    components: Components, time: float | None, half_life: float, doubts: Doubts
+) -> tuple[Components, Doubts]:
+    """The components with their counts at the time (s) of the last scan of the window."""
+    if time is None:
+        raise InvalidArgumentError(
+            f"forget={half_life:g} is a half-life in seconds, but a scan has no time: give "
+            "Scan(points, origin, time=seconds), or forget='contradiction'."
+        )
+    before = doubts.time
+    doubts = replace(doubts, time=time if before is None else max(time, before))
+    if before is None or time <= before:  # a clock that goes back does not add evidence
+        return components, doubts
+    left = 2.0 ** ((before - time) / half_life)
+    kept = (components.support * left >= _LEAST_SUPPORT).nonzero().squeeze(1)
+    aged = components.selected(kept)
+    return replace(aged, support=aged.support * left, seen_count=aged.seen_count * left), doubts
 
 
 def gone_log_odds(components: Components, scans: Sequence[Scan], noise: float, log_odds: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.association import count_explained
 from gmmtorch.mapping.learning.depth_frame import DepthFrame, as_scans
 from gmmtorch.mapping.learning.fitting import SurfaceFit, fit_frames, fit_window
-from gmmtorch.mapping.learning.forgetting import Doubts, Forgetting
+from gmmtorch.mapping.learning.forgetting import Doubts, joined
 from gmmtorch.mapping.learning.merging import Size, compact, compact_to_bytes, estimated_bytes
 from gmmtorch.mapping.learning.novelty import novel_beams
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
@@ -32,9 +32,9 @@ def absorb(
     rule: IncrementalRule,
     size: Size = estimated_bytes,
     weight: float = 1.0,
-    forgetting: Forgetting | None = None,
-) -> Components:
-    """The components of a map with scans added, merged until they meet the budget.
+    doubts: Doubts | None = None,
+) -> tuple[Components, Doubts]:
+    """The components of a map with scans added, merged until they meet the budget; and the doubts after them.
 
     Every `rule.window` scans are learned together; scans are taken from the iterable window by window.
     Nothing is random: the same scans in the same order give the same map. Components that are new or
@@ -46,16 +46,15 @@ def absorb(
         rule: if it is not complete, it is fitted to all scans, which are then read at once.
         size: number of bytes of given components, for `rule.max_bytes`.
         weight: number of measured points for which each point of the scans stands.
-        forgetting: drops what is gone, as `rule.forget` says; None: a new one.
+        doubts: of `forgetting`, before these scans; None: none.
     """
     if None in (rule.noise, rule.length, rule.cell, rule.window):
         scans = as_scans(scans)
         rule = rule.fitted(scans)
-    forgetting = Forgetting(rule, Doubts.none()) if forgetting is None else forgetting
-    left = iter(scans)
+    doubts, left = doubts or Doubts.none(), iter(scans)
     while window := list(islice(left, rule.window)):
-        components = _absorb_window(components, window, rule, size, weight, forgetting)
-    return components
+        components, doubts = _absorb_window(components, window, rule, size, weight, doubts)
+    return components, doubts
 
 
 def _absorb_window(
@@ -64,8 +63,8 @@ def _absorb_window(
     rule: IncrementalRule,
     size: Size,
     weight: float,
-    forgetting: Forgetting,
-) -> Components:
+    doubts: Doubts,
+) -> tuple[Components, Doubts]:
     frames = [frame for frame in window if isinstance(frame, DepthFrame)]
     if rule.novelty is None and len(frames) == len(window):
         learned = fit_frames(frames, surface_fit(rule, components.dim), all_origins(weight))
@@ -74,8 +73,8 @@ def _absorb_window(
         if rule.novelty is not None:
             components, scans = _explain(components, scans, rule.novelty, weight)
         learned = _learned(scans, rule, weight)
-    joined = forgetting.joined(components, learned, window)
-    return _within_budget(joined, rule, size) if len(learned) else joined
+    components, doubts = joined(components, learned, window, rule, doubts)
+    return _within_budget(components, rule, size) if len(learned) else components, doubts
 
 
 def _learned(scans: Sequence[Scan], rule: IncrementalRule, weight: float) -> Components:

@@ -166,16 +166,12 @@ class Counters:
 
     def drop(self, records: Iterable[CountersMessage]) -> None:
         """Remove records that were added."""
-        by_author: dict[int, list[CountersMessage]] = {}
-        for record in records:
-            by_author.setdefault(author_of(record.key), []).append(record)
-        for author, dropped in by_author.items():
-            left = self._records[author]
-            for record in dropped:
-                del left[record.key]
-            if left:
-                stale = np.unique(np.concatenate([record.components for record in dropped]))
-                self._largest[author] = _recomputed(self._largest[author], stale, list(left.values()))
+        dropped = {record.key: author_of(record.key) for record in records}
+        for key, author in dropped.items():
+            del self._records[author][key]
+        for author in set(dropped.values()):
+            if left := self._records[author]:
+                self._largest[author] = _largest_of(left.values())
             else:
                 del self._records[author], self._largest[author]
 
@@ -213,14 +209,10 @@ def _raised(row: _Row, keys: Ints, steps: Ints) -> _Row:
     return np.insert(known_keys, at, new), np.insert(raised, at, value)
 
 
-def _recomputed(row: _Row, stale: Ints, records: list[CountersMessage]) -> _Row:
-    """The row, with the counters of stale keys taken from these records."""
-    place, is_known = _places(row[0], stale)
-    kept = np.delete(row[0], place[is_known]), np.delete(row[1], place[is_known])
-    keys = np.concatenate([record.components for record in records])
-    steps = np.concatenate([record.steps for record in records])
-    is_stale = _places(stale, keys)[1]
-    order = np.lexsort((steps[is_stale], keys[is_stale]))
-    keys, steps = keys[is_stale][order], steps[is_stale][order]
+def _largest_of(records: Iterable[CountersMessage]) -> _Row:
+    """The largest counter of each component in these records, at least one."""
+    keys, steps = (np.concatenate(x) for x in zip(*((r.components, r.steps) for r in records), strict=True))
+    order = np.lexsort((steps, keys))
+    keys, steps = keys[order], steps[order]
     is_largest = np.append(np.diff(keys) != 0, True)[: len(keys)]
-    return _raised(kept, keys[is_largest], steps[is_largest])
+    return keys[is_largest], steps[is_largest]
