@@ -7,7 +7,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from gmmtorch.cli import app, common
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import InvalidArgumentError, check_choice
 from gmmtorch.report.progress import ProgressBars
 
 _OF_SPACE = ("map_server", "octomap", "ply", "pcd", "mesh", "distance_field")
@@ -61,8 +61,7 @@ def _format(config: DictConfig) -> str:
                 f"format={'|'.join(known)}."
             )
         return _OF_ENDINGS[ending]
-    if config.format not in known:
-        raise InvalidArgumentError(f"format={config.format!r} is not one of {', '.join(known)}.")
+    check_choice("format", config.format, known)
     return str(config.format)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from gmmtorch.cli import common
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import InvalidArgumentError, check_choice
 from gmmtorch.sharing.transport.frames import FramedTransport
 from gmmtorch.sharing.transport.security import TeamKey
 from gmmtorch.sharing.transport.team_key import KEY_VARIABLE
@@ -50,8 +50,7 @@ def open_link(config: DictConfig, robot: int, is_alone: bool = False) -> FramedT
 
 
 def _opened(config: DictConfig, robot: int, is_alone: bool) -> FramedTransport:
-    if config.transport not in TRANSPORTS:
-        raise InvalidArgumentError(f"transport={config.transport!r} is not one of {', '.join(TRANSPORTS)}.")
+    check_choice("transport", config.transport, TRANSPORTS)
     link = common.as_options(config.link)
     key = team_key(link.pop("key_file"))
     if config.transport == "zenoh":

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from omegaconf import DictConfig, OmegaConf
 
 from gmmtorch.cli import common
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import InvalidArgumentError, check_choice
 from gmmtorch.evaluation.events import Event, ignore
 from gmmtorch.exploration.mission.options import THESIS, TeamOptions
 from gmmtorch.exploration.mission.results import PLANNING
@@ -46,8 +46,7 @@ NAMES = {
 
 def variants_of(config: DictConfig) -> list[dict[str, Any]]:
     """The variants of a study. Raises `InvalidArgumentError` for options that a variant cannot set."""
-    if config.study.name != "trials":
-        raise InvalidArgumentError(f"study.name={config.study.name!r} is not one of trials.")
+    check_choice("study.name", config.study.name, ("trials",))
     variants: list[dict[str, Any]] = list(common.as_options(config.study)["variants"])
     known = {"team", *PLANNING, *THESIS, *config.network}
     for variant in variants:

@@ -24,7 +24,7 @@ import torch
 from sklearn.exceptions import ConvergenceWarning
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import InvalidArgumentError, check_choice
 from gmmtorch.evaluation import metrics, queries
 from gmmtorch.evaluation.events import Event, Row, ignore
 from gmmtorch.evaluation.studies.study_options import SensorModelStudy
@@ -60,8 +60,7 @@ class _Cloud:
 
 def sensor_model(study: SensorModelStudy) -> SensorModel:
     """The sensor model that the study names. Raises `InvalidArgumentError` for an unknown name or field."""
-    if study.sensor not in SENSORS:
-        raise InvalidArgumentError(f"sensor={study.sensor!r} is not one of {', '.join(SENSORS)}.")
+    check_choice("sensor", study.sensor, SENSORS)
     model = SENSORS[study.sensor]
     known = {item.name for item in fields(model)}
     if unknown := set(study.sensor_options) - known:

@@ -219,10 +219,10 @@ def map_variants_figures(rows: style.Rows) -> dict[str, Figure]:
             at = {"xycoords": ("axes fraction", "data"), "va": "center", "fontsize": style.TICK_SIZE}
             axes.annotate(text, (1.02, place), annotation_clip=False, **at)
         title = f"cells of {style.metres(resolution)}, {own[0]['variant']}: AUC {own[0]['auc']:.4f}"
-        style.label_axes(axes, title.replace("_", " "), "difference of AUC, 95 % interval", "")
+        style.label_axes(axes, style.label_of(title), "difference of AUC, 95 % interval", "")
         axes.margins(y=0.08)
         style.draw_grid(axes)
-    grid[0][0].set_yticks(range(len(variants)), [name.replace("_", " ") for name in variants])
+    grid[0][0].set_yticks(range(len(variants)), [style.label_of(name) for name in variants])
     grid[0][0].invert_yaxis()
     style.figure_title(figure, f"Variants of a map: {rows[0]['dataset']}")
     return {"map_variants": figure}
