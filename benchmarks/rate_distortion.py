@@ -36,7 +36,6 @@ from gmmtorch import GaussianMap, IncrementalRule
 from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.evaluation.codecs.point_bytes import compressed
 from gmmtorch.evaluation.codecs.point_codecs import (
-    BEST_LEVEL,
     DepthImage,
     Draco,
     Octree,
@@ -175,7 +174,7 @@ def measure_mixtures(task: Task) -> Rows:
         data = [b"".join(frame) for frame in datagrams]
         found = row(task._replace(codec=codec), data, frames, points, scores)
         if codec == "ours":
-            found["nbytes_zstd"] = statistics.mean(len(compressed(d, BEST_LEVEL)) for d in data)
+            found["nbytes_zstd"] = statistics.mean(len(compressed(d)) for d in data)
         rows.append(found)
     return rows
 

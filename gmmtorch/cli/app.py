@@ -21,12 +21,14 @@ from typing import Any
 
 import hydra
 from hydra._internal.utils import get_args_parser
+from hydra.errors import HydraException
 from omegaconf import DictConfig
 
 from gmmtorch.cli import common
 from gmmtorch.cli.options import command_options, schema
 from gmmtorch.cli.reporting.sweep_table import ERROR_FILE
 from gmmtorch.errors import GmmTorchError
+from gmmtorch.evaluation.processes import end_with_parent
 
 _FULL_ERROR = "HYDRA_FULL_ERROR"
 """Environment variable with which Hydra raises its errors."""
@@ -94,13 +96,15 @@ def _any_help() -> Iterator[None]:
 
 
 @contextmanager
-def stop_requests() -> Iterator[Callable[[], bool]]:
-    """Yields whether Ctrl-C was pressed, or the process was asked to end. A second Ctrl-C interrupts at
-    once."""
+def stop_requests(by_force: bool = True) -> Iterator[Callable[[], bool]]:
+    """Yields whether Ctrl-C was pressed, or the process was asked to end.
+
+    by_force: a second request interrupts at once.
+    """
     requests: list[int] = []
 
     def request(number: int, frame: Any) -> None:
-        if requests:
+        if requests and by_force:
             raise KeyboardInterrupt
         requests.append(number)
 
@@ -119,7 +123,6 @@ def _interrupt() -> None:
 
 def _hydra_main(name: str, run: Callable[[DictConfig], Any]) -> None:
     """Run a command by Hydra, with our own help, completion and errors of options."""
-    from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
     if "--version" in sys.argv[1:]:
@@ -188,8 +191,6 @@ def _with_memory(run: Callable[[DictConfig], Any], config: DictConfig) -> Any:
 
 def _guarded(run: Callable[[DictConfig], Any], config: DictConfig) -> Any:
     """The result of a command; an error ends the command, or only its job of a sweep."""
-    from gmmtorch.evaluation.processes import end_with_parent
-
     end_with_parent()  # a job of a sweep in its own process ends if the sweep's process ends
     if not common.is_job_of_sweep():
         try:

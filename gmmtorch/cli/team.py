@@ -14,19 +14,17 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from gmmtorch.cli import app, common
-from gmmtorch.cli.from_options import links, missions
-from gmmtorch.cli.reporting.outputs import Outputs, terse
-from gmmtorch.cli.reporting.team_listener import listener
+from gmmtorch.cli.reporting.robot_report import Outputs, print_refusals, terse
 from gmmtorch.cli.robot import TEAM_VARIABLE, check_options
 from gmmtorch.cli.view import open_live_view, serve
-
-if TYPE_CHECKING:
-    from gmmtorch.report.progress import ProgressBars
+from gmmtorch.errors import GmmTorchError, InvalidArgumentError
+from gmmtorch.report.progress import ProgressBars
 
 _COMMAND = (sys.executable, "-m", "gmmtorch.cli.robot")
 _PATIENCE = 30.0
@@ -59,8 +57,6 @@ class RobotProcess:
 
     def is_running(self) -> bool:
         """Whether it still runs. Raises `GmmTorchError` if it failed."""
-        from gmmtorch.errors import GmmTorchError
-
         status = self._process.poll()
         if status in (None, 0):
             return status is None
@@ -79,8 +75,6 @@ class RobotProcess:
 
     def row(self) -> dict[str, Any]:
         """Its row of results.json, once it has ended. Raises `GmmTorchError` if there is none."""
-        from gmmtorch.errors import GmmTorchError
-
         try:
             row: dict[str, Any] = json.loads((self.folder / "results.json").read_text("utf-8"))["rows"][0]
         except (OSError, ValueError, LookupError) as error:
@@ -136,8 +130,7 @@ def main() -> None:
 
 def run(config: DictConfig) -> None:
     """Runs a team until all its robots have ended."""
-    from gmmtorch.cli.reporting.robot_report import print_refusals
-    from gmmtorch.report.progress import ProgressBars
+    from gmmtorch.cli.reporting.team_listener import listener
 
     config.clock = config.clock or "wall"
     check_options(config)
@@ -157,7 +150,7 @@ def run(config: DictConfig) -> None:
     common.print_table(rows, TABLE.split(), f"{len(rows)} robots: {_COMPARED[summary['same_map']]}")
     print_refusals(rows)
     outputs.check()
-    common.print_files(folder, folder / "results.json")
+    common.print_files(folder)
     if config.report.tensorboard:
         print(f"browse    tensorboard --logdir {folder}")
     if view is not None:
@@ -166,6 +159,7 @@ def run(config: DictConfig) -> None:
 
 def _prepare(config: DictConfig, bars: ProgressBars) -> None:
     """Computes the world's properties once for all robots, and raises errors of the options once."""
+    from gmmtorch.cli.from_options import missions
     from gmmtorch.exploration.mission.team_setup import start_poses
 
     if config.source == "world":
@@ -194,10 +188,6 @@ def _started(
 
 def _given_options() -> list[str]:
     """The options of this run, as they were given, that all its robots get."""
-    from hydra.core.hydra_config import HydraConfig
-
-    from gmmtorch.errors import InvalidArgumentError
-
     given = list(HydraConfig.get().overrides.task)
     for item in given:
         if item.split("=")[0] in _OWN:
@@ -209,6 +199,8 @@ def _given_options() -> list[str]:
 
 def _addresses(config: DictConfig) -> list[list[str]]:
     """The options of each robot that say where it listens, and where it sends to; of a view, too."""
+    from gmmtorch.cli.from_options import links
+
     n = config.team.size + (1 if config.view else 0)
     if config.transport == "zenoh":
         free = links.free_addresses(n, socket.SOCK_STREAM)

@@ -13,12 +13,9 @@ from typing import TYPE_CHECKING
 from omegaconf import DictConfig
 
 from gmmtorch.cli import app, common
-from gmmtorch.cli.from_options import maps
-from gmmtorch.cli.reporting import map_outputs
+from gmmtorch.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from gmmtorch.live.live_view import LiveView
     from gmmtorch.live.map_viewer import MapViewer
 
@@ -57,7 +54,8 @@ def _assigned(name: str, value: str) -> str:
 
 def run(config: DictConfig) -> None:
     """Run the command. Without `html` it serves the page until it is interrupted."""
-    from gmmtorch.errors import InvalidArgumentError
+    from gmmtorch.cli.from_options import maps
+    from gmmtorch.cli.reporting import map_outputs
     from gmmtorch.live.map_page import write_page
     from gmmtorch.live.map_viewer import MapViewer
 
@@ -67,7 +65,7 @@ def run(config: DictConfig) -> None:
     common.use_runtime(config.runtime)
     path = Path(config.path).expanduser()
     shown = maps.open_map(path, config.runtime, config.bounds)
-    trajectories = _trajectories(config, path, shown.dim or 3)
+    trajectories = map_outputs.trajectories(path, config.trajectory, shown.dim or 3)
     look = {"shape": config.shape, "colour": config.colour}
     if config.html:
         written = write_page(config.html, shown, trajectories, **look)
@@ -97,18 +95,6 @@ def serve(viewer: MapViewer | LiveView) -> None:
         threading.Event().wait()
     finally:
         viewer.stop()
-
-
-def _trajectories(config: DictConfig, path: Path, dim: int) -> list[Tensor]:
-    """The sensor positions (S, D) in `trajectory`, or in the files next to the map: one of each recording."""
-    from gmmtorch.errors import MissingDataError
-
-    if config.trajectory is not None:
-        file = Path(config.trajectory).expanduser()
-        if not file.is_file():
-            raise MissingDataError(f"trajectory={file} does not exist; give a TUM or KITTI file, or null.")
-        return [map_outputs.positions(file, dim)]
-    return map_outputs.trajectories(path if path.is_dir() else path.parent, dim)
 
 
 if __name__ == "__main__":

@@ -8,19 +8,18 @@ points are occupied, while most of real space is free. Scores of two tests with 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.queries import OCCUPIED
 from gmmtorch.occupancy.evidence import CellClass, classify
 
-Binning = Literal["width", "count"]
 N_BINS = 15
-"""Number of equal-width bins of the expected calibration error, as in Guo et al. 2017."""
+"""Number of equal-width bins, as in Guo et al. 2017."""
 
 PRIORS = (0.1, 0.5, 1.0, 2.0, 5.0)
 VARIANCE_THRESHOLDS = (0.25, 0.2, 0.15, 0.1, 0.06, 0.03)
@@ -50,54 +49,17 @@ class Reliability(NamedTuple):
         return np.abs(self.observed - self.predicted)
 
 
-def reliability(
-    theta: Tensor, labels: Tensor, n_bins: int = N_BINS, binning: Binning = "width"
-) -> Reliability:
+def reliability(theta: Tensor, labels: Tensor) -> Reliability:
     """Reliability curve of probabilities (M,) of points with labels (M,), 1 occupied and 0 free.
 
-    Bins have equal widths ("width") or equal numbers of points ("count"). Equal θ are always in one bin, so
-    ties reduce the number of bins. A bin contains its upper edge; the first bin also contains its lower edge.
+    Bins have equal widths. A bin contains its upper edge; the first bin also contains its lower edge.
     """
     truth, p = _checked(theta, labels)
-    member = _bins(p, n_bins, binning)
+    member = np.searchsorted(np.linspace(0, 1, N_BINS + 1)[1:-1], p)
     count = np.bincount(member)
     kept = count > 0
     sums = [np.bincount(member, weights)[kept] for weights in (p, truth)]
     return Reliability(sums[0] / count[kept], sums[1] / count[kept], count[kept])
-
-
-class BrierParts(NamedTuple):
-    """brier = reliability − resolution + uncertainty + within (Murphy 1973; Stephenson et al. 2008).
-
-    reliability: mean squared difference of observed and predicted share; 0 is calibrated.
-    resolution: variance of the bins' observed shares about the overall share; larger is better.
-    uncertainty: variance of the labels; ¼ for a balanced test.
-    within: variance of θ inside the bins, minus twice its covariance with the labels there.
-    """
-
-    brier: float
-    reliability: float
-    resolution: float
-    uncertainty: float
-    within: float
-
-
-def brier_parts(
-    theta: Tensor, labels: Tensor, n_bins: int = N_BINS, binning: Binning = "width"
-) -> BrierParts:
-    """Decomposition by bins of the Brier score of probabilities (M,) of points with labels (M,)."""
-    truth, p = _checked(theta, labels)
-    member = _bins(p, n_bins, binning)
-    count = np.maximum(np.bincount(member), 1)  # avoids 0/0; the mean of an empty bin is never used
-    predicted, observed = (np.bincount(member, values)[member] / count[member] for values in (p, truth))
-    spread, explained = p - predicted, truth - observed
-    return BrierParts(
-        brier=float(np.mean((p - truth) ** 2)),
-        reliability=float(np.mean((predicted - observed) ** 2)),
-        resolution=float(np.mean((observed - truth.mean()) ** 2)),
-        uncertainty=float(truth.mean() * (1 - truth.mean())),
-        within=float(np.mean(spread**2) - 2 * np.mean(spread * explained)),
-    )
 
 
 def log_loss_bits(theta: Tensor, labels: Tensor) -> float:
@@ -153,7 +115,7 @@ def prior_and_dead_band(
             "prior": float(prior),
             "ece": curve.expected_error,
             "mce": curve.maximum_error,
-            "brier": brier_parts(theta, labels).brier,
+            "brier": float((theta.double() - labels.double().cpu()).square().mean()),
             "log_loss_bits": log_loss_bits(theta, labels),
             "accuracy": accuracy(theta, labels),
         }
@@ -187,13 +149,3 @@ def _checked(theta: Tensor, labels: Tensor) -> tuple[np.ndarray, np.ndarray]:
     if not ((p >= 0) & (p <= 1)).all():
         raise InvalidArgumentError("theta has values outside [0, 1], or NaN; give probabilities.")
     return truth, p
-
-
-def _bins(p: np.ndarray, n_bins: int, binning: Binning) -> np.ndarray:
-    """Bin index (M,) of each probability; a bin contains its upper edge."""
-    check_whole("n_bins", n_bins, 1)
-    if binning not in get_args(Binning):
-        raise InvalidArgumentError(f"binning={binning!r} is not one of {', '.join(get_args(Binning))}.")
-    share = np.linspace(0, 1, n_bins + 1)[1:-1]
-    edges = share if binning == "width" else np.quantile(p, share)
-    return np.searchsorted(edges, p)

@@ -16,7 +16,7 @@ from gmmtorch.evaluation import calibration, metrics, queries
 from gmmtorch.evaluation.events import Event, OnRows, Row, ignore
 from gmmtorch.evaluation.methods import Form, MapFactory
 from gmmtorch.evaluation.protocol_options import Protocol
-from gmmtorch.evaluation.queries import FREE, OCCUPIED, UNKNOWN, Queries
+from gmmtorch.evaluation.queries import UNKNOWN, Queries
 from gmmtorch.files import check_writable
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.occupancy.protocol import OccupancyMap
@@ -174,7 +174,7 @@ def _score(
     begin = time.perf_counter()
     theta = answer(asked.points).cpu()
     seconds = time.perf_counter() - begin
-    occupied, free = theta[asked.of(OCCUPIED)], theta[asked.of(FREE)]
+    occupied, free = asked.split(theta)
     known = asked.labels != UNKNOWN
     curve = metrics.roc(occupied, free)
     low, high = metrics.auc_interval(occupied, free, curve.auc, seed)

@@ -15,6 +15,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.paired_statistics import Interval
 
 _BINS = 4096
+_N_RESAMPLES = 1000
 CALLED_FREE, CALLED_OCCUPIED = 0.2, 0.65
 """In `unknown_scores`, cells with θ below the first value are free, and above the second are occupied."""
 
@@ -57,10 +58,8 @@ def _roc_curve(occupied: Tensor, free: Tensor) -> tuple[np.ndarray, np.ndarray, 
     return false_positive, true_positive, thresholds
 
 
-def auc_interval(
-    occupied: Tensor, free: Tensor, auc: float, seed: int, n_resamples: int = 1000, level: float = 0.95
-) -> tuple[float, float]:
-    """Bootstrap interval of an AUC: occupied and free points are resampled with replacement.
+def auc_interval(occupied: Tensor, free: Tensor, auc: float, seed: int) -> tuple[float, float]:
+    """Bootstrap interval (95 %) of an AUC: occupied and free points are resampled with replacement.
 
     Resamples the counts of 4096 quantile bins, which are multinomial. The replicates are shifted so that
     their mean is the exact AUC.
@@ -73,17 +72,16 @@ def auc_interval(
         for x in (free, occupied)
     ]
     below, above = (
-        generator.multinomial(counts.sum(), counts / counts.sum(), n_resamples) / counts.sum()
+        generator.multinomial(counts.sum(), counts / counts.sum(), _N_RESAMPLES) / counts.sum()
         for counts in share
     )
     replicates = (above * (np.cumsum(below, 1) - below / 2)).sum(1)
-    tail = (1 - level) / 2
-    low, high = np.quantile(replicates - replicates.mean(), [tail, 1 - tail]) + auc
+    low, high = np.quantile(replicates - replicates.mean(), [0.025, 0.975]) + auc
     return max(0.0, float(low)), min(1.0, float(high))
 
 
-def auc_gain(before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor], level: float = 0.95) -> Interval:
-    """Difference of the AUCs of two classifiers of the same points, with its interval.
+def auc_gain(before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> Interval:
+    """Difference of the AUCs of two classifiers of the same points, with its 95 % interval.
 
     Each argument has the probabilities of occupied (P,) and free (Q,) points. The variance is that of
     DeLong, DeLong & Clarke-Pearson (1988): of the differences of the points' shares of the AUC.
@@ -92,7 +90,7 @@ def auc_gain(before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor], level:
     up, down = other_occupied - occupied, other_free - free
     mean = float(up.mean())
     variance = float(up.var() / len(up) + down.var() / len(down))
-    half = NormalDist().inv_cdf((1 + level) / 2) * math.sqrt(variance)
+    half = NormalDist().inv_cdf(0.975) * math.sqrt(variance)
     return Interval(mean, mean - half, mean + half)
 
 

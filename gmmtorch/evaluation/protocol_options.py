@@ -16,19 +16,6 @@ Removal = Literal["beams", "scans"]
 FreePoints = Literal["uniform", "near_surface", "clear"]
 
 
-def check_share(share: float) -> None:
-    """Raises unless the share lies in (0, 1]."""
-    if not 0 < share <= 1:
-        raise InvalidArgumentError(f"kept={share} must be a share in (0, 1].")
-
-
-def check_noise(noise: Sequence[float]) -> tuple[float, float]:
-    """Standard deviations (m, rad) as floats; raises unless they are two finite numbers ≥ 0."""
-    if len(noise) != 2 or not all(math.isfinite(x) and x >= 0 for x in noise):
-        raise InvalidArgumentError(f"pose_noise={list(noise)} must be two numbers ≥ 0: metres and radians.")
-    return float(noise[0]), float(noise[1])
-
-
 def check_test_every(test_every: int) -> None:
     """Raises unless at least one scan of each `test_every` scans is left for training."""
     if test_every < 2:
@@ -78,10 +65,14 @@ class Protocol:
         for value in self.resolution:
             check_resolution(value)
         for share in self.kept:
-            check_share(share)
+            if not 0 < share <= 1:
+                raise InvalidArgumentError(f"kept={share} must be a share in (0, 1].")
         check_choice("removal", self.removal, get_args(Removal))
         check_test_every(self.test_every)
-        check_noise(self.pose_noise)
+        if len(self.pose_noise) != 2 or not all(math.isfinite(x) and x >= 0 for x in self.pose_noise):
+            raise InvalidArgumentError(
+                f"pose_noise={list(self.pose_noise)} must be two numbers ≥ 0: metres and radians."
+            )
         check_choice("free", self.free, get_args(FreePoints))
         check_whole("max_beams", self.max_beams, 1)
 

@@ -7,20 +7,13 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_choice
-from gmmtorch.evaluation.protocol_options import (
-    FreePoints,
-    Removal,
-    check_noise,
-    check_share,
-    check_test_every,
-)
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.evaluation.protocol_options import FreePoints, Removal
 from gmmtorch.files import write_bytes
 from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 from gmmtorch.scan import Scan
@@ -28,7 +21,6 @@ from gmmtorch.scan import Scan
 
 def split_indices(n_scans: int, test_every: int) -> tuple[list[int], list[int]]:
     """Indices of training and test scans: 0, n, 2n, … are held out."""
-    check_test_every(test_every)
     if n_scans < 2:
         raise InvalidArgumentError(
             f"The data set has {n_scans} scans; at least 2 are needed: one for training and one for the test."
@@ -43,8 +35,6 @@ def keep_share(scans: Sequence[Scan], share: float, removal: Removal, seed: int)
 
     With the same seed, a smaller share is a subset of a larger one.
     """
-    check_share(share)
-    check_choice("removal", removal, get_args(Removal))
     if share == 1:
         return list(scans)
     generator = torch.Generator().manual_seed(seed)
@@ -60,7 +50,7 @@ def pose_perturbations(scans: Sequence[Scan], noise: Sequence[float], seed: int)
     `noise`: standard deviations of the translation along each axis (m) and of the rotation about each
     axis (rad).
     """
-    shift, angle = check_noise(noise)
+    shift, angle = noise
     generator = torch.Generator().manual_seed(seed)
     motions = []
     for scan in scans:
@@ -77,7 +67,7 @@ def pose_perturbations(scans: Sequence[Scan], noise: Sequence[float], seed: int)
 
 def perturb_poses(scans: Sequence[Scan], noise: Sequence[float], seed: int) -> list[Scan]:
     """Each scan moved by its motion of `pose_perturbations`; unchanged if both deviations are zero."""
-    if check_noise(noise) == (0, 0):
+    if not any(noise):
         return list(scans)
     motions = pose_perturbations(scans, noise, seed)
     return [scan.transformed(motion) for scan, motion in zip(scans, motions, strict=True)]
@@ -107,6 +97,10 @@ class Queries:
     def of(self, label: int) -> Tensor:
         """Mask (M,) of the points with this label."""
         return self.labels == label
+
+    def split(self, values: Tensor) -> tuple[Tensor, Tensor]:
+        """The values of occupied and of free points, of values (M,)."""
+        return values[self.of(OCCUPIED)], values[self.of(FREE)]
 
 
 def test_beams(scans: Sequence[Scan], max_beams: int, seed: int) -> tuple[Tensor, Tensor]:
@@ -138,7 +132,6 @@ def hit_and_free(origins: Tensor, ends: Tensor, free: FreePoints, resolution: fl
     sensor; this measures how thick a map's surfaces are. "clear": uniform, but points within one cell of the
     hit are left out, because a cell can contain both.
     """
-    check_choice("free", free, get_args(FreePoints))
     generator = torch.Generator().manual_seed(seed)
     uniform = torch.rand(ends.shape[0], generator=generator, dtype=torch.float64)
     if free == "near_surface":

@@ -17,11 +17,15 @@ import torch
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
-from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.errors import InvalidArgumentError, check_choice, check_whole
 from gmmtorch.linalg import check_rigid
 
 Alignment = Literal["none", "first", "rigid"]
 ALIGNMENTS: tuple[Alignment, ...] = ("none", "first", "rigid")
+UNSCORED = {
+    f"{error}{kind}": None for error in ("ate", "rpe") for kind in ("", "_median", "_max", "_degrees")
+}
+"""The fields of `PoseErrors.scores` of both errors, for poses without a truth."""
 _DEGENERATE = 1e-9  # of the largest singular value: below, positions lie on a line
 
 
@@ -75,14 +79,13 @@ def aligned(estimate: ArrayLike, truth: ArrayLike, align: Alignment = "rigid") -
     Raises `InvalidArgumentError` for poses of other shapes, for poses that are not rigid, and for `rigid` if
     the positions lie on a line (in 2D, in a point), so that they determine no rotation.
     """
+    check_choice("align", align, ALIGNMENTS)
     given, true = _checked(estimate, truth, 1)
     if align == "none":
         return given
     if align == "first":
         return true[0] @ torch.linalg.solve(given[0], given)
-    if align == "rigid":
-        return _umeyama(given[:, :-1, -1], true[:, :-1, -1]) @ given
-    raise InvalidArgumentError(f"align={align!r} is not one of {', '.join(ALIGNMENTS)}.")
+    return _umeyama(given[:, :-1, -1], true[:, :-1, -1]) @ given
 
 
 def _umeyama(positions: Tensor, true: Tensor) -> Tensor:

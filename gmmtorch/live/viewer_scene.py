@@ -193,7 +193,7 @@ def _open_height(components: Components, solid: Solid) -> float:
         return math.inf
     chosen = components.selected(solid.rows.to(components.means.device))
     seen_from = first_viewpoints(chosen).cpu()
-    return cut_away(chosen.means.cpu(), chosen.covariances.cpu(), seen_from, None, SOUTH_WEST)[1]
+    return cut_away(chosen.means.cpu(), chosen.covariances.cpu(), seen_from, SOUTH_WEST)[1]
 
 
 def occupancy_slice(shown: GaussianMap, resolution: float, height: float, view: Frame) -> Slice:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal
@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
@@ -169,7 +170,7 @@ def log_axis(axes: Axes, name: str, values: Iterable[float]) -> None:
     else:
         axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10], min_n_ticks=3))
         axis.set_minor_locator(NullLocator())
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}"))
+    tick_text(axis, lambda value: f"{value:,.10g}")
     axis.set_minor_formatter(NullFormatter())
 
 
@@ -177,6 +178,11 @@ def _n_ticks(steps: Sequence[float], low: float, high: float) -> int:
     """Counts the products of a step and a power of ten between low and high."""
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     return sum(low <= step * 10.0**decade <= high for decade in decades for step in steps)
+
+
+def tick_text(axis: Axis, text: Callable[[float], str]) -> None:
+    """Labels the major ticks of an axis with the text of their values."""
+    axis.set_major_formatter(FuncFormatter(lambda value, _: text(value)))
 
 
 def colour(index: int) -> str:

@@ -22,8 +22,8 @@ from gmmtorch.scan import ArrayLike
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MAX_POINTS = 50_000
-"""Default limit of points per cloud and vertices per mesh: browsers still turn these smoothly."""
+_MAX_POINTS = 50_000
+"""Limit of points per cloud and vertices per mesh: browsers still turn these smoothly. More are thinned."""
 
 _MIN_VERTICES, _MAX_VERTICES = 12, 162  # of an ellipsoid
 
@@ -36,16 +36,12 @@ class Board:
 
     Args:
         directory: folder of the event file; created if missing.
-        max_points: limit of points per cloud and vertices per mesh; larger ones are thinned evenly.
     """
 
-    def __init__(self, directory: str | Path, max_points: int = MAX_POINTS) -> None:
+    def __init__(self, directory: str | Path) -> None:
         from torch.utils.tensorboard import SummaryWriter
 
-        if max_points < 1:
-            raise InvalidArgumentError(f"max_points={max_points} must be at least 1.")
         self.directory = Path(directory)
-        self.max_points = max_points
         self._writer = SummaryWriter(str(self.directory))
         self._first: dict[tuple[str, str], tuple[float, int, float] | None] = {}
         """Value, step and time of a tag's first value; None once the tag is a curve."""
@@ -84,7 +80,7 @@ class Board:
         self._writer.add_text("results", "\n".join(f"| {' | '.join(line)} |" for line in lines))
         self._first = {}
 
-    def curve(self, tag: str, labels: ArrayLike, probabilities: ArrayLike, step: int = 0) -> None:
+    def curve(self, tag: str, labels: ArrayLike, probabilities: ArrayLike) -> None:
         """Writes the precision-recall curve of probabilities (M,) for labels (M,), 1 occupied and 0 free,
         and a figure of the ROC curve (tag/roc) if both labels occur."""
         truth, theta = as_array(labels) > 0.5, as_array(probabilities)
@@ -94,7 +90,7 @@ class Board:
             )
         if len(truth) == 0:
             return
-        self._writer.add_pr_curve(tag, truth, theta, step)
+        self._writer.add_pr_curve(tag, truth, theta, 0)
         if truth.all() or not truth.any():
             return
         from sklearn.metrics import roc_auc_score, roc_curve
@@ -104,9 +100,9 @@ class Board:
         false_rate, true_rate, _ = roc_curve(truth, theta)
         name = tag.rsplit("/", 1)[-1]
         curves = {name: (false_rate, true_rate, float(roc_auc_score(truth, theta)))}
-        self.figure(f"{tag}/roc", roc_figure(curves), step)
+        self.figure(f"{tag}/roc", roc_figure(curves))
 
-    def figure(self, tag: str, figure: Figure, step: int = 0) -> None:
+    def figure(self, tag: str, figure: Figure) -> None:
         """Writes a figure as an image."""
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -114,14 +110,14 @@ class Board:
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
         pixels = np.asarray(canvas.buffer_rgba())[..., :3].copy()
-        self._writer.add_image(tag, pixels, step, dataformats="HWC")
+        self._writer.add_image(tag, pixels, 0, dataformats="HWC")
 
     def cloud(self, tag: str, points: ArrayLike, colors: ArrayLike | None = None, step: int = 0) -> None:
         """Writes points (N, D), metres, with colours (N, 3) from 0 to 255; writes nothing for no points."""
         cloud = torch.as_tensor(points).detach().cpu()
         if cloud.ndim != 2 or cloud.shape[1] not in (2, 3):
             raise InvalidArgumentError(f"points has shape {tuple(cloud.shape)}; expected (N, 2) or (N, 3).")
-        kept = torch.from_numpy(even_sample(len(cloud), self.max_points))
+        kept = torch.from_numpy(even_sample(len(cloud), _MAX_POINTS))
         colour = None
         if colors is not None:
             colour = torch.as_tensor(colors).detach().cpu()
@@ -141,17 +137,15 @@ class Board:
             hues = [torch.tensor(to_rgb(colour(i))).expand(len(path), 3) for i, path in enumerate(paths)]
             self.cloud(tag, torch.cat(paths), 255 * torch.cat(hues), step)
 
-    def ellipsoids(
-        self, tag: str, means: ArrayLike, covariances: ArrayLike, n_sigma: float = 2.0, step: int = 0
-    ) -> None:
-        """Writes ellipsoids of components (K, D), (K, D, D), coloured by height, as finely as the limit of
+    def ellipsoids(self, tag: str, means: ArrayLike, covariances: ArrayLike, step: int = 0) -> None:
+        """Writes 2σ ellipsoids of components (K, D), (K, D, D), coloured by height, as finely as the limit of
         vertices permits; writes nothing for no components."""
         mean, covariance = (value.cpu() for value in checked_components(means, covariances))
         if len(mean) == 0:
             return
-        n_vertices = min(max(self.max_points // len(mean), _MIN_VERTICES), _MAX_VERTICES)
-        kept = torch.from_numpy(even_sample(len(mean), max(1, self.max_points // n_vertices)))
-        mesh = ellipsoid_mesh(mean[kept], covariance[kept], n_sigma, n_vertices)
+        n_vertices = min(max(_MAX_POINTS // len(mean), _MIN_VERTICES), _MAX_VERTICES)
+        kept = torch.from_numpy(even_sample(len(mean), max(1, _MAX_POINTS // n_vertices)))
+        mesh = ellipsoid_mesh(mean[kept], covariance[kept], n_vertices)
         self._add_mesh(tag, mesh.vertices, mesh.colors, mesh.faces, step)
 
     def hparams(self, config_flat: Mapping[str, Any], metrics: Mapping[str, Any]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 import json
 import logging
 import os
@@ -20,7 +21,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
 
-from gmmtorch.cli import common, export, fit, localize, map, occupancy, ros, view
+from gmmtorch.cli import common, explore, export, fit, localize, map, occupancy, robot, ros, team, view
 from gmmtorch.cli.options import schema
 
 CHECKOUT = Path(__file__).resolve().parents[2]
@@ -29,6 +30,9 @@ COMMANDS = {
     "occupancy": occupancy,
     "fit": fit,
     "export": export,
+    "explore": explore,
+    "robot": robot,
+    "team": team,
     "map": map,
     "localize": localize,
     "view": view,
@@ -46,6 +50,15 @@ def composed(command: str, *overrides: str) -> DictConfig:
     schema.register()
     with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
         return compose(command, overrides=list(overrides))
+
+
+def room_mesh(path: Path) -> Path:
+    """Writes a mesh: the six walls of an empty room of 7 by 6 by 3 metres, two triangles each."""
+    corners = [f"v {x} {y} {z}" for x, y, z in itertools.product((0.0, 7.0), (0.0, 6.0), (0.0, 3.0))]
+    walls = [(1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4)]
+    faces = [f"f {a} {b} {c}\nf {a} {c} {d}" for a, b, c, d in walls]
+    path.write_text("\n".join([*corners, *faces, ""]))
+    return path
 
 
 @dataclass

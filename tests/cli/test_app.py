@@ -11,23 +11,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from command_runs import COMMANDS as MODULES
-from command_runs import QUIET, Finished, refused, run_here, succeeded
+from command_runs import COMMANDS, QUIET, Finished, refused, run_here, succeeded
 from omegaconf import DictConfig
 
 import gmmtorch
-from gmmtorch.cli import common, explore, map, occupancy, robot, team
+from gmmtorch.cli import common, occupancy
 from gmmtorch.cli.options import command_options, schema
 from gmmtorch.errors import InvalidArgumentError
-
-COMMANDS = ["occupancy", "fit", "export", "explore", "robot", "team", "map", "localize", "view", "ros"]
 
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., Finished]:
-    for name, module in {"explore": explore, "robot": robot, "team": team, "map": map}.items():
-        monkeypatch.setitem(MODULES, name, module)
-
     def run_command(command: str, *options: str) -> Finished:
         return run_here(monkeypatch, command, tmp_path / "run", *options)
 
@@ -220,3 +214,7 @@ def test_a_sweep_prints_one_table_with_its_failed_jobs(monkeypatch, tmp_path):
     assert table[3].endswith("seed=2 fails.")
     assert table[4].endswith("ZeroDivisionError: a mistake")
     assert "Traceback" in (folder / "2" / "error.txt").read_text()
+    job = Finished(0, "", "", folder / "0")
+    assert job.results()["seed"] == 1
+    assert ".hydra/overrides.yaml" in job.files()
+    assert not (tmp_path / "run" / "results.json").exists()

@@ -27,7 +27,6 @@ from command_runs import (
 import gmmtorch
 from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 
 Run = Callable[..., Finished]
@@ -39,6 +38,7 @@ FIT_FIELDS = {
     "dataset", "method", "n_points", "n_components", "seconds", "n_iterations", "log_likelihood", "psnr2_db",
     "nbytes",
 }  # fmt: skip
+STRATEGIES = ["experiment=strategies", "method=[em,hierarchical,scikit_learn]", "max_points=150"]
 CARMEN_LOG = "FLASER 3 1.0 2.0 1.5 {x} 0 0 {x} 0 0 0.1 host 0.1\n"
 
 
@@ -67,7 +67,7 @@ def occupancy_run(tmp_path_factory: pytest.TempPathFactory) -> Finished:
 
 @pytest.fixture(scope="module")
 def fit_run(tmp_path_factory: pytest.TempPathFactory) -> Finished:
-    return whole("fit", tmp_path_factory.mktemp("fit") / "run", "method=[em,scikit_learn]")
+    return whole("fit", tmp_path_factory.mktemp("fit") / "run", *STRATEGIES)
 
 
 @pytest.fixture(params=["occupancy", "fit"])
@@ -86,7 +86,7 @@ def test_results_have_the_documented_fields(whole_run):
     extra = {"magnify": 0, "scene": False} if command == "occupancy" else {}
     assert results["config"]["report"] == {"progress": True, "figures": True, "tensorboard": True, **extra}
     fields = OCCUPANCY_FIELDS if command == "occupancy" else FIT_FIELDS
-    assert len(results["rows"]) == 2
+    assert [row["method"] for row in results["rows"]] == results["config"]["method"]
     for row in results["rows"]:
         assert fields <= row.keys()
         assert all(isinstance(value, str | int | float | bool | None) for value in row.values())
@@ -103,8 +103,9 @@ def test_run_directory_contains_results_figures_events_and_configuration(whole_r
     files = done.files()
     assert {"results.json", ".hydra/config.yaml", ".hydra/overrides.yaml", ".hydra/hydra.yaml"} <= files
     of_occupancy = "auc_against_kept map_0.1m mixture reliability_0.1m roc_0.1m"
-    of_fit = "comparison convergence mixture_em mixture_scikit_learn"
-    expected = {f"{name}.png" for name in (of_occupancy if command == "occupancy" else of_fit).split()}
+    methods = [row["method"] for row in done.results()["rows"]]
+    of_fit = ["comparison", "convergence", *(f"mixture_{method}" for method in methods)]
+    expected = {f"{name}.png" for name in (of_occupancy.split() if command == "occupancy" else of_fit)}
     assert {name for name in files if name.endswith(".png")} == expected
     for name in expected:
         assert (done.folder / name).read_bytes().startswith(b"\x89PNG")
@@ -150,6 +151,7 @@ def test_event_files_contain_scalars_figures_and_hyperparameters(occupancy_run, 
 
 def test_fitted_mixtures_are_saved(fit_run):
     for row in fit_run.results()["rows"]:
+        assert {"held_out_psnr2_db", "n_components_used"} <= row.keys()
         path = fit_run.folder / f"{row['method']}.safetensors"
         assert path.stat().st_size == row["nbytes"]
         assert GaussianMixture.load(path).means_.shape == (row["n_components"], 3)
@@ -158,8 +160,8 @@ def test_fitted_mixtures_are_saved(fit_run):
 @pytest.mark.slow
 def test_the_script_gives_the_same_results_in_another_process(whole_run, tmp_path):
     command, done = whole_run
-    methods = ["method=[em,scikit_learn]"] if command == "fit" else []
-    other = succeeded(run_script(command, tmp_path / "run", *TINY[command], *QUIET, *methods))
+    more = STRATEGIES if command == "fit" else []
+    other = succeeded(run_script(command, tmp_path / "run", *TINY[command], *more, *QUIET))
     again, results = timeless(other.results()), timeless(done.results())
     assert again["rows"] == results["rows"]
     for config in (again["config"], results["config"]):
@@ -170,21 +172,19 @@ def test_the_script_gives_the_same_results_in_another_process(whole_run, tmp_pat
 # -- options --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("command", ["occupancy", "fit"])
-def test_rows_depend_only_on_the_seed_and_reports_only_on_their_options(command, run):
-    first, again, other = (
-        succeeded(run(command, f"seed={seed}", *more, name=name))
-        for name, seed, more in (("a", 1, []), ("b", 1, ["report.tensorboard=true"]), ("c", 2, []))
-    )
-    assert timeless(first.results())["rows"] == timeless(again.results())["rows"]
-    assert timeless(first.results())["rows"] != timeless(other.results())["rows"]
-    assert not [name for name in first.files() if name.endswith(".png") or "tfevents" in name]
+def test_rows_depend_only_on_the_seed_and_reports_only_on_their_options(whole_run, run):
+    command, done = whole_run
+    more = STRATEGIES if command == "fit" else []
+    only = "method=[em,scikit_learn]" if command == "fit" else "report.tensorboard=true"
+    score = "log_likelihood" if command == "fit" else "auc"
+    again, other = (succeeded(run(command, *more, only, f"seed={seed}", name=str(seed))) for seed in (0, 1))
+    first = {row["method"]: row for row in timeless(done.results())["rows"]}
+    for row, other_row in zip(timeless(again.results())["rows"], other.results()["rows"], strict=True):
+        assert row == first[row["method"]]
+        assert row[score] != other_row[score]
+    assert again.stderr == ""
     assert not [name for name in again.files() if name.endswith(".png")]
-    assert [name for name in again.files() if "tfevents" in name]
-
-
-def test_standard_error_is_empty_without_progress(run):
-    assert succeeded(run("occupancy")).stderr == ""
+    assert any("tfevents" in name for name in again.files()) == (command == "occupancy")
 
 
 def test_every_share_resolution_and_method_has_a_row_and_a_saved_map(run, tmp_path):
@@ -218,48 +218,6 @@ def test_a_carmen_log_can_be_mapped(monkeypatch, tmp_path):
     options = [*QUIET, "map.n_samples=20000", "dataset=carmen", f"dataset.path={log}"]
     done = succeeded(run_here(monkeypatch, "occupancy", tmp_path / "run", *options))
     assert {row["dataset"] for row in done.results()["rows"]} == {"own"}
-
-
-@pytest.mark.parametrize(
-    ("name", "more", "expected"),
-    [
-        (
-            "per_scan",
-            "map.min_points=4",
-            {"window": 1, "max_origins": 1, "min_points": 4, "dtype": "float64"},
-        ),
-        ("windowed", "map.max_cells=500", {"window": 20, "max_origins": 8, "max_cells": 500}),
-        ("incremental", "map.window=3 map.n_components=30", {"window": 3, "n_components": 30}),
-        ("incremental", "map.novelty={threshold:2}", {"novelty": NoveltyRule(threshold=2)}),
-    ],
-)
-def test_the_map_has_the_options_of_its_group(name, more, expected, run, tmp_path):
-    options = ["map.noise=0.02", "map.prior=0.5", "map.sampling=plain", "runtime.dtype=float64", "seed=7"]
-    options += ["map.cutoff=4", "map.hit_length=2", "map.codec=float", *more.split()]
-    succeeded(
-        run(
-            "occupancy",
-            "method=[monte_carlo]",
-            f"map={name}",
-            f"evaluation.save_map={tmp_path / 'maps'}",
-            *options,
-        )
-    )
-    made = GaussianMap.load(tmp_path / "maps" / "monte_carlo_1_0.1.safetensors")
-    assert made.learning.noise == 0.02
-    assert {option: getattr(made.learning, option) for option in expected} == expected
-    how = made.query_options
-    assert (how.n_samples, how.sampling, how.prior, how.random_state) == (20_000, "plain", 0.5, 7)
-    assert (how.cutoff, how.hit_length, made.codec) == (4, 2, "float")
-
-
-def test_a_sweep_writes_a_folder_for_each_job(run, tmp_path):
-    done = succeeded(run("occupancy", "-m", "seed=0,1", f"hydra.sweep.dir={tmp_path / 'sweep'}"))
-    for number in (0, 1):
-        job = Finished(0, "", "", tmp_path / "sweep" / str(number))
-        assert job.results()["seed"] == number
-        assert ".hydra/overrides.yaml" in job.files()
-    assert not (done.folder / "results.json").exists()
 
 
 # -- experiments ----------------------------------------------------------------------------------
@@ -344,23 +302,8 @@ def test_component_count_study(run):
 
 
 def test_the_number_of_components_can_be_automatic(run):
-    counts = [
-        succeeded(run("fit", "mixture.n_components=null", f"mixture.noise={noise}")).results()["rows"][0]
-        for noise in (0.01, 10.0)
-    ]
-    assert [row["n_components"] for row in counts] == [pytest.approx(15, abs=14), 1]
-
-
-def test_every_method_has_a_row_and_a_figure(run):
-    done = succeeded(
-        run("fit", "experiment=strategies", "max_points=150", "mixture.n_components=3", "report.figures=true")
-    )
-    results = done.results()
-    methods = results["config"]["method"]
-    assert [row["method"] for row in results["rows"]] == methods
-    assert FIT_FIELDS | {"held_out_psnr2_db", "n_components_used"} <= results["rows"][0].keys()
-    pictures = {name for name in done.files() if name.endswith(".png")}
-    assert pictures == {"comparison.png", "convergence.png", *(f"mixture_{m}.png" for m in methods)}
+    done = succeeded(run("fit", "mixture.n_components=null", "mixture.noise=10"))
+    assert done.results()["rows"][0]["n_components"] == 1
 
 
 def test_a_mesh_can_be_fitted(monkeypatch, tmp_path):
@@ -379,30 +322,23 @@ def test_a_mesh_can_be_fitted(monkeypatch, tmp_path):
     ("options", "words"),
     [
         ("method=[octree]", "method='octree' known monte_carlo occupancy_grid occupancy_log_odds"),
-        ("evaluation.resolution=[-0.1]", "evaluation.resolution=-0.1"),
         ("evaluation.resolution=[1e-9]", "resolution=1e-09 fits"),
         ("evaluation.kept=[0]", "evaluation.kept=0.0 share"),
-        ("evaluation.test_every=1", "evaluation.test_every=1"),
         ("evaluation.pose_noise=[0.1]", "evaluation.pose_noise=[0.1]"),
         ("map.noise=0", "map.noise=0.0"),
-        ("map.cutoff=0", "map.cutoff=0"),
         ("map.codec=zip", "codec='zip' quantized float"),
         ("map.max_bytes=10 method=[point]", "max_bytes=10"),
         ("map.novelty={resolutoin:1}", "map.novelty resolutoin threshold"),
         ("map.novelty={threshold:-1}", "map.novelty.threshold=-1"),
-        ("map=per_scan map.min_points=0", "map.min_points=0"),
         ("report.magnify=-1", "report.magnify=-1"),
         ("dataset.stride=0", "stride=0"),
         ("dataset.n_scans=1", "1 scans at least 2"),
         ("dataset.max_range=0.01", "no return beams dataset.max_range"),
-        ("runtime.threads=0", "runtime.threads=0"),
         ("runtime.device=foo", "runtime.device=foo cpu"),
-        ("runtime.device=meta", "runtime.device=meta"),
         ("runtime.dtype=float16", "dtype='float16' float32 float64"),
         ("runtime.memory_limit=1000 method=[occupancy_grid]", "1,000"),
         ("seed=-1", "seed=-1"),
         ("evaluation.save_map=/dev/null/maps", "/dev/null/maps"),
-        ("evaluation.save_queries=/dev/null/queries.npz", "/dev/null"),
     ],
 )
 def test_an_invalid_map_option_gives_a_one_line_error(options, words, run):
@@ -416,14 +352,9 @@ def test_an_invalid_map_option_gives_a_one_line_error(options, words, run):
         ("method=[kmeans]", "method='kmeans' em scikit_learn"),
         ("method=[]", "method"),
         ("scans=[99]", "scans=[99] 0 39"),
-        ("test_share=1", "test_share=1.0"),
         ("max_points=0", "max_points=0"),
         ("mixture.n_components=9999", "n_components=9999"),
         ("mixture.n_components=null method=[scikit_learn]", "mixture.n_components=null scikit_learn"),
-        ("mixture.n_components=null mixture.noise=0", "noise=0"),
-        ("mixture.init_params=sorted", "init_params='sorted' kmeans"),
-        ("runtime.dtype=float16", "dtype='float16'"),
-        ("seed=-1", "-1"),
         ("experiment=fig2_1_initialization study.n_seeds=0", "study.n_seeds=0"),
         ("experiment=fig2_1_initialization study.n_components=[999]", "n_components=999 200"),
         ("+method_options.em.branching=2", "method_options.em.branching warm_start"),
@@ -459,21 +390,6 @@ def test_a_damaged_file_is_named(monkeypatch, tmp_path):
     log.write_bytes(b"\x1f\x8b broken")
     options = [*QUIET, "dataset=carmen", f"dataset.path={log}"]
     assert str(log) in refused(run_here(monkeypatch, "occupancy", tmp_path / "run", *options))
-
-
-@pytest.mark.parametrize(
-    ("option", "words"),
-    [
-        ("evaluation.test_every=often", "evaluation.test_every=often could not be converted to Integer"),
-        ("map.noise=loud", "map.noise=loud could not be converted to Float"),
-        ("dataset.stride=two", "dataset.stride=two could not be converted to Integer"),
-        ("evaluation.kept=0.5", "evaluation.kept=0.5 list"),
-    ],
-)
-def test_wrong_types_give_a_one_line_error(option, words, monkeypatch, tmp_path):
-    line = refused(run_here(monkeypatch, "occupancy", tmp_path / "run", *QUIET, option))
-    assert all(word in line for word in words.split()), line
-    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.slow

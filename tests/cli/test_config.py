@@ -22,6 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 from gmmtorch import datasets
 from gmmtorch.cli import common, export, localize
 from gmmtorch.cli.from_options import maps, missions
+from gmmtorch.cli.from_options.scans import fit_options, open_dataset
 from gmmtorch.cli.options import schema
 from gmmtorch.cli.studies import fit_studies, occupancy_studies
 from gmmtorch.errors import InvalidArgumentError, MissingDataError
@@ -31,7 +32,7 @@ from gmmtorch.exploration.mission.options import FRAMEWORKS, THESIS, TeamOptions
 from gmmtorch.exploration.mission.trials import WorldOptions
 from gmmtorch.exploration.planning.planners import PLANNERS
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
+from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
 from gmmtorch.simulation.worlds.tunnels import tunnels
 from gmmtorch.simulation.worlds.warehouse import warehouse
 
@@ -75,21 +76,20 @@ def plain(node: DictConfig) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("dataset", choices("dataset"))
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_data_set_composes_and_its_reader_takes_its_options(command, dataset, tmp_path):
-    config = composed(command, f"dataset={dataset}").dataset
+def test_every_data_set_composes_and_its_reader_takes_its_options(dataset, tmp_path):
+    config = composed("fit", f"dataset={dataset}").dataset
     source = datasets._SOURCES[dataset]
     assert (config.name, config.get("stride", 1)) == (dataset, 1)
     assert (config.no_return_range, config.max_range) == (source.no_return_range, source.max_range)
     if "path" not in list(config):  # `in` is False for a missing value
-        assert len(common.open_dataset(config)) > 1
+        assert len(open_dataset(config)) > 1
         return
     assert OmegaConf.is_missing(config, "path")
     with pytest.raises(InvalidArgumentError, match=r"dataset\.path is not set"):
-        common.open_dataset(config)
+        open_dataset(config)
     config.path = str(tmp_path / "nowhere")
     with pytest.raises(MissingDataError, match=r"nowhere does not exist; looked for"):
-        common.open_dataset(config)
+        open_dataset(config)
 
 
 @pytest.mark.parametrize(("command", "name"), EXPERIMENTS)
@@ -207,14 +207,9 @@ def test_results_go_to_a_folder_in_outputs(command):
     [
         "evaluation.test_every=often",
         "evaluation.kept=0.5",
-        "evaluation.resolution=[fine]",
         "map.noise=loud",
-        "dataset.stride=two",
         "method=monte_carlo",
-        "runtime.threads=many",
         "evaluation.tests_every=3",
-        "map.windw=3",
-        "dataset.n_scan=3",
         "map=nonsense",
     ],
 )
@@ -282,6 +277,26 @@ def test_a_map_of_the_options_has_the_default_rule_and_answers(name):
     assert made.codec == GaussianMap().codec
 
 
+@pytest.mark.parametrize(
+    ("name", "more", "expected"),
+    [
+        ("per_scan", "map.min_points=4", {"window": 1, "min_points": 4, "dtype": "float64"}),
+        ("windowed", "map.max_cells=500", {"window": 20, "max_origins": 8, "max_cells": 500}),
+        ("incremental", "map.window=3 map.n_components=30", {"window": 3, "n_components": 30}),
+        ("incremental", "map.novelty={threshold:2}", {"novelty": NoveltyRule(threshold=2)}),
+    ],
+)
+def test_the_map_has_the_options_of_its_group(name, more, expected):
+    options = ["map.noise=0.02", "map.prior=0.5", "map.sampling=plain", "runtime.dtype=float64", "seed=7"]
+    options += ["map.cutoff=4", "map.hit_length=2", "map.codec=float", "map.n_samples=1000"]
+    made = maps.map_factory(composed("occupancy", f"map={name}", *more.split(), *options))()
+    assert made.learning.noise == 0.02
+    assert {option: getattr(made.learning, option) for option in expected} == expected
+    how = made.query_options
+    assert (how.n_samples, how.sampling, how.prior, how.random_state) == (1000, "plain", 0.5, 7)
+    assert (how.cutoff, how.hit_length, made.codec) == (4, 2, "float")
+
+
 def test_an_exploration_of_the_options_is_the_default_one(tmp_path):
     trial = missions.trial_of(composed("explore"), tmp_path)
     assert trial.team == TeamOptions()
@@ -291,8 +306,8 @@ def test_an_exploration_of_the_options_is_the_default_one(tmp_path):
 def test_a_fit_of_the_options_is_the_default_one():
     from gmmtorch.evaluation.protocol_options import FitOptions, Protocol
 
-    assert common.fit_options(composed("fit")) == FitOptions()
-    assert occupancy_studies.protocol_of(composed("occupancy")) == Protocol()
+    assert fit_options(composed("fit")) == FitOptions()
+    assert maps.protocol_of(composed("occupancy")) == Protocol()
 
 
 def test_robots_and_teams_have_the_options_of_an_exploration():

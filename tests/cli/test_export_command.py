@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from command_runs import Finished, as_it_was, refused, run_here, run_script, succeeded
+from command_runs import Finished, as_it_was, refused, run_here, succeeded
 from export.map_examples import read_map_image
 
 from gmmtorch.baselines.occupancy_grid import LogOdds, OccupancyGrid
@@ -306,15 +306,3 @@ def test_an_empty_map_needs_bounds(run, tmp_path):
     assert "is an empty map; give bounds" in done.stderr
     succeeded(run("path=empty.safetensors", "output=a.yaml", "bounds=[0,0,1,1]"))
     assert bool((read_map_image(tmp_path / "a.yaml").probability - 0.5).abs().max() <= 1 / 255)
-
-
-# -- the command itself ---------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_the_script_of_the_checkout_runs(files, tmp_path):
-    done = succeeded(
-        run_script("export", tmp_path, f"path={files / 'map_2.safetensors'}", "format=npz", "output=m.npz")
-    )
-    assert (tmp_path.parent / "m.npz").is_file()
-    assert not done.files()

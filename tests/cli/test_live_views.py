@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 import signal
 import sys
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_runs import COMMANDS, QUIET, Finished, refused, run_here, succeeded
+from command_runs import QUIET, Finished, refused, room_mesh, run_here, succeeded
 
 from gmmtorch.cli import explore, robot, team
 from gmmtorch.cli import map as map_command
@@ -54,8 +53,6 @@ class Watched:
         monkeypatch.setattr(LiveView, "_draw", noted)
         for command in (map_command, explore, robot, team):
             monkeypatch.setattr(command, "serve", self._serve)
-        for name, command in (("explore", explore), ("robot", robot), ("team", team)):
-            monkeypatch.setitem(COMMANDS, name, command)
 
     def _serve(self, view: LiveView) -> None:
         self.clients[0].received(b"/components", b"/paths/0")
@@ -76,10 +73,7 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> Watched:
 def in_room(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., Finished]:
     """Runs a command of exploration in an empty room, for a few seconds."""
     monkeypatch.setenv("GMMTORCH_CACHE", str(tmp_path / "cache"))
-    mesh = tmp_path / "room.obj"
-    corners = [f"v {x} {y} {z}" for x, y, z in itertools.product((0, 7), (0, 6), (0, 3))]
-    walls = [(1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4)]
-    mesh.write_text("\n".join([*corners, *(f"f {a} {b} {c}\nf {a} {c} {d}" for a, b, c, d in walls), ""]))
+    mesh = room_mesh(tmp_path / "room.obj")
     small = ["team.size=2", "sensor.width=48", "sensor.height=36", "duration=2", "evaluation.every=1"]
 
     def run(command: str, *options: str) -> Finished:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from command_runs import QUIET, Finished, refused, run_here, run_script, succeeded
+from command_runs import QUIET, Finished, refused, run_here, succeeded
 
 from gmmtorch.cli.localize import overrides
 from gmmtorch.datasets import Dataset, load
@@ -122,9 +122,3 @@ def test_errors_are_one_line(run, monkeypatch, tmp_path, saved):
     assert "distance=-1" in refused(run("distance=-1"))
     (tmp_path / "late.tum").write_text("1000 0 0 0 0 0 0 1\n1001 0 0 0 0 0 0 1\n")
     assert "has no pose at the time of a scan" in refused(run(f"truth={tmp_path / 'late.tum'}"))
-
-
-@pytest.mark.slow
-def test_the_script_of_the_checkout_runs(saved, tmp_path):
-    options = [f"map={saved}", "dataset=synthetic_building_2d", "dataset.n_scans=3", "pose=dataset"]
-    assert "trajectory" in succeeded(run_script("localize", tmp_path / "run", *options, *QUIET)).stdout

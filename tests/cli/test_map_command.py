@@ -16,41 +16,43 @@ from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.map_builder import MapBuilder
 
 Run = Callable[..., Finished]
-SMALL = ["dataset=synthetic_building_2d", "dataset.n_scans=10", "map.window=4"]
+SMALL = ["dataset=synthetic_building_2d", "dataset.n_scans=10", "map.window=4", "resolution=0.2"]
 
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
-    def run_command(*options: str, folder: str = "run") -> Finished:
-        return run_here(monkeypatch, "map", tmp_path / folder, *SMALL, *options)
+    def run_command(*options: str) -> Finished:
+        return run_here(monkeypatch, "map", tmp_path / "run", *SMALL, *QUIET, *options)
 
     return run_command
 
 
-def test_a_run_writes_the_map_its_trajectory_exports_and_results(run):
-    done = succeeded(run(*QUIET, "export=[map_server,cloud]", "resolution=0.2"))
-    row = done.results()["rows"][0]
-    built = GaussianMap.load(done.folder / "map.safetensors")
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    """A run with everything that it writes."""
+    options = [*SMALL, "report.progress=false", "export=[map_server,cloud]"]
+    with pytest.MonkeyPatch.context() as patch:
+        return succeeded(run_here(patch, "map", tmp_path_factory.mktemp("map") / "run", *options))
+
+
+def test_a_run_writes_the_map_its_trajectory_pictures_exports_and_results(whole):
+    row = whole.results()["rows"][0]
+    built = GaussianMap.load(whole.folder / "map.safetensors")
     assert (row["n_scans"], row["n_skipped"], row["n_components"]) == (10, 0, built.n_components)
-    assert row["nbytes"] == (done.folder / "map.safetensors").stat().st_size
+    assert row["nbytes"] == (whole.folder / "map.safetensors").stat().st_size
     assert built.resolution == 0.2
-    trajectory = np.loadtxt(done.folder / "trajectory.tum")
+    trajectory = np.loadtxt(whole.folder / "trajectory.tum")
     assert trajectory.shape == (10, 8)
     steps = np.linalg.norm(np.diff(trajectory[:, 1:4], axis=0), axis=1)
     assert row["metres"] == pytest.approx(steps.sum(), rel=1e-6)
-    assert {"navigation.yaml", "navigation.pgm", "cloud.ply"} <= done.files()
-    assert "checkpoint.safetensors" not in done.files()
-    assert "navigation.pgm" in done.stdout
+    files = whole.files()
+    assert {"navigation.yaml", "navigation.pgm", "cloud.ply", "above.png", "components.png"} <= files
+    assert any(name.startswith("tensorboard/events") for name in files)
+    assert "checkpoint.safetensors" not in files
+    assert "navigation.pgm" in whole.stdout
 
 
-def test_pictures_and_tensorboard(run):
-    done = succeeded(run("report.progress=false"))
-    assert {"above.png", "components.png"} <= done.files()
-    assert any(name.startswith("tensorboard/events") for name in done.files())
-
-
-def test_a_stopped_run_continues_to_the_same_map(run, monkeypatch):
-    whole = succeeded(run(*QUIET, folder="whole"))
+def test_a_stopped_run_continues_to_the_same_map(run, whole, monkeypatch):
     insert, inserted = MapBuilder._insert, []
 
     def stop_at_six(self: MapBuilder, index: int) -> None:
@@ -61,16 +63,16 @@ def test_a_stopped_run_continues_to_the_same_map(run, monkeypatch):
 
     monkeypatch.setattr(MapBuilder, "_insert", stop_at_six)
     handlers = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)
-    stopped = run(*QUIET)
+    stopped = run()
     assert stopped.status == 130
     assert "stopped after scan 6 of 10" in stopped.stderr
     assert "checkpoint.safetensors" in stopped.files()
     assert "map.safetensors" not in stopped.files()
     assert (signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)) == handlers
-    other = run(*QUIET, "seed=5")
+    other = run("seed=5")
     assert other.status == 1
     assert "is of another run: it has seed=0, this run has seed=5" in other.stderr
-    again = succeeded(run(*QUIET))
+    again = succeeded(run())
     assert "continues after scan 6" in again.stdout
     assert inserted == list(range(10))
     for name in ("map.safetensors", "trajectory.tum"):
@@ -78,9 +80,9 @@ def test_a_stopped_run_continues_to_the_same_map(run, monkeypatch):
 
 
 def test_a_wrong_export_is_refused_before_any_work(run):
-    error = refused(run(*QUIET, "export=[mesch]"))
+    error = refused(run("export=[mesch]"))
     assert "'mesch' is not one of map_server" in error
-    assert "resolution=0" in refused(run(*QUIET, "resolution=0"))
+    assert "resolution=0" in refused(run("resolution=0"))
 
 
 def test_scans_of_a_bag_that_cannot_be_used_are_counted_and_printed(monkeypatch, tmp_path):

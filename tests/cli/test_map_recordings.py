@@ -14,10 +14,10 @@ import pytest
 import torch
 from command_runs import QUIET, Finished, refused, run_here, succeeded
 
-from gmmtorch.cli.recordings import map_recordings
-from gmmtorch.cli.recordings.inputs import find_recordings
-from gmmtorch.cli.recordings.tasks import run_tasks
 from gmmtorch.cli.reporting import map_outputs
+from gmmtorch.cli.runs import map_recordings
+from gmmtorch.cli.runs.inputs import find_recordings
+from gmmtorch.cli.runs.tasks import run_tasks
 from gmmtorch.datasets import load
 from gmmtorch.errors import MissingDataError
 from gmmtorch.mapping.components import Components
@@ -46,10 +46,8 @@ def write_log(path: Path, first: float) -> None:
     path.write_text("\n".join(lines) + "\n")
 
 
-@pytest.fixture
-def logs(tmp_path: Path) -> Path:
+def write_logs(folder: Path) -> Path:
     """A folder with three recordings."""
-    folder = tmp_path / "logs"
     folder.mkdir()
     for number in range(3):
         write_log(folder / f"drive{number}.log", 1.0 + 3 * number)
@@ -57,27 +55,46 @@ def logs(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
+def logs(tmp_path: Path) -> Path:
+    """Recordings that a test may change."""
+    return write_logs(tmp_path / "logs")
+
+
+def inputs(*paths: str | Path) -> str:
+    return "inputs=[{}]".format(",".join(f'"{path}"' for path in paths))
+
+
+@pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
-    def run_command(inputs: object, *options: str, folder: str = "run") -> Finished:
-        given = ",".join(f'"{path}"' for path in ([inputs] if isinstance(inputs, str | Path) else inputs))  # type: ignore[attr-defined]
-        return run_here(monkeypatch, "map", tmp_path / folder, *OPTIONS, f"inputs=[{given}]", *options)
+    def run_command(paths: str | Path | list[Path], *options: str, folder: str = "run") -> Finished:
+        given = inputs(*(paths if isinstance(paths, list) else [paths]))
+        return run_here(monkeypatch, "map", tmp_path / folder, *OPTIONS, given, *options)
 
     return run_command
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    """A run of the three recordings with everything that it writes."""
+    folder = tmp_path_factory.mktemp("whole")
+    options = [inputs(write_logs(folder / "logs") / "*.log"), "export=[map_server]"]
+    options += ["report.figures=true", "report.tensorboard=true"]
+    with pytest.MonkeyPatch.context() as patch:
+        return succeeded(run_here(patch, "map", folder / "run", *OPTIONS, *options))
 
 
 def tiles(done: Finished) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in (done.folder / "tiles").iterdir()}
 
 
-def test_recordings_are_mapped_and_merged_into_the_map_of_all(run, logs, generator):
-    done = succeeded(run(logs / "*.log", "export=[map_server]"))
-    *rows, merged = done.results()["rows"]
+def test_recordings_are_mapped_and_merged_into_the_map_of_all(whole, generator):
+    *rows, merged = whole.results()["rows"]
     assert [row["dataset"] for row in rows] == ["drive0", "drive1", "drive2"]
     assert [row["n_scans"] for row in rows] == [N_SCANS] * 3
-    tiled = TiledMap(done.folder / "tiles")
+    tiled = TiledMap(whole.folder / "tiles")
     assert merged["n_components"] == tiled.n_components == sum(row["n_components"] for row in rows)
     assert merged["n_tiles"] == len(tiled.index) > 1
-    assert merged["nbytes"] == sum(map(len, tiles(done).values()))
+    assert merged["nbytes"] == sum(map(len, tiles(whole).values()))
     assert (merged["n_recordings"], merged["n_failed"], merged["n_scans"]) == (3, 0, 3 * N_SCANS)
     points = torch.tensor([[6.0, 3.0], [12.0, 3.0], [20.0, 3.0]])  # free, a wall, unknown
     theta = torch.as_tensor(tiled.occupancy(points))
@@ -87,23 +104,22 @@ def test_recordings_are_mapped_and_merged_into_the_map_of_all(run, logs, generat
     parts = []
     for number in range(3):
         built = GaussianMap(window=3)
-        for scan in load("carmen", logs / f"drive{number}.log"):
+        for scan in load("carmen", whole.folder.parent / "logs" / f"drive{number}.log"):
             built.insert(scan)
         parts.append(built.components())
-    whole = GaussianMap.of(Components.concatenate(parts), codec="quantized")
+    together = GaussianMap.of(Components.concatenate(parts), codec="quantized")
     points = torch.rand(200, 2, generator=generator, dtype=torch.float64) * torch.tensor([14, 8])
-    torch.testing.assert_close(tiled.occupancy(points), whole.occupancy(points), rtol=0, atol=1e-9)
-    assert {"navigation.pgm", "navigation.yaml"} <= done.files()
-    assert sum(name.endswith("trajectory.tum") for name in done.files()) == 3
+    torch.testing.assert_close(tiled.occupancy(points), together.occupancy(points), rtol=0, atol=1e-9)
+    assert {"navigation.pgm", "navigation.yaml"} <= whole.files()
+    assert sum(name.endswith("trajectory.tum") for name in whole.files()) == 3
 
 
-def test_a_run_has_the_pictures_of_its_map_and_the_paths_of_its_recordings(run, logs):
-    done = succeeded(run(logs / "*.log", "report.figures=true", "report.tensorboard=true"))
-    assert {"above.png", "components.png"} <= done.files()
-    assert any(name.startswith("tensorboard/events") for name in done.files())
-    merged = done.results()["rows"][-1]
+def test_a_run_has_the_pictures_of_its_map_and_the_paths_of_its_recordings(whole):
+    assert {"above.png", "components.png"} <= whole.files()
+    assert any(name.startswith("tensorboard/events") for name in whole.files())
+    merged = whole.results()["rows"][-1]
     assert merged["metres"] == pytest.approx(3 * 0.3 * (N_SCANS - 1), rel=0.01)
-    paths = map_outputs.trajectories(done.folder, 2)
+    paths = map_outputs.trajectories(whole.folder, None, 2)
     assert [tuple(path.shape) for path in paths] == [(N_SCANS, 2)] * 3
     (first, last) = paths[0][0], paths[2][-1]
     torch.testing.assert_close(first, torch.tensor([1.0, 2.0], dtype=torch.float64))
@@ -118,8 +134,7 @@ def test_a_map_larger_than_the_memory_limit_is_written_without_pictures(run, log
     assert len(TiledMap(done.folder / "tiles").index) > 1
 
 
-def test_exports_open_only_the_tiles_in_the_bounds(run, logs, monkeypatch, tmp_path):
-    done = succeeded(run(logs / "*.log"))
+def test_exports_open_only_the_tiles_in_the_bounds(whole, monkeypatch, tmp_path):
     opened: list[int] = []
     read = TiledMap.components
 
@@ -129,9 +144,9 @@ def test_exports_open_only_the_tiles_in_the_bounds(run, logs, monkeypatch, tmp_p
 
     monkeypatch.setattr(TiledMap, "components", count)
     output = tmp_path / "part.yaml"
-    quiet = [f"path={done.folder}", f"output={output}", "report.progress=false"]
+    quiet = [f"path={whole.folder}", f"output={output}", "report.progress=false"]
     succeeded(run_here(monkeypatch, "export", tmp_path, *quiet, "bounds=[0.5,0.5,0.9,0.9]"))
-    n_tiles = len(TiledMap(done.folder / "tiles").index)
+    n_tiles = len(TiledMap(whole.folder / "tiles").index)
     assert 0 < len(opened) < n_tiles
     opened.clear()
     succeeded(run_here(monkeypatch, "export", tmp_path, *quiet))
@@ -143,15 +158,13 @@ def test_exports_open_only_the_tiles_in_the_bounds(run, logs, monkeypatch, tmp_p
     assert "components in 2D" in succeeded(run_here(monkeypatch, "export", tmp_path, *csv)).stdout
 
 
-def test_the_order_of_the_inputs_does_not_change_the_tiles(run, logs):
-    paths = [logs / f"drive{number}.log" for number in range(3)]
-    one = succeeded(run(paths, folder="one"))
-    other = succeeded(run([*paths[::-1], logs / "*1.log"], folder="other"))  # one of them twice
-    assert tiles(one) == tiles(other)
+def test_the_order_of_the_inputs_does_not_change_the_tiles(run, logs, whole):
+    paths = [logs / f"drive{number}.log" for number in (2, 1, 0)]
+    other = succeeded(run([*paths, logs / "*1.log"]))  # one of them twice
+    assert tiles(other) == tiles(whole)
 
 
-def test_a_stopped_run_keeps_finished_recordings(run, logs, monkeypatch):
-    whole = succeeded(run(logs / "*.log", folder="whole"))
+def test_a_stopped_run_keeps_finished_recordings(run, logs, whole, monkeypatch):
     mapped, seen = map_recordings.map_recording, []
 
     def stop_at_second(*arguments: object) -> object:
@@ -177,8 +190,7 @@ def test_a_stopped_run_keeps_finished_recordings(run, logs, monkeypatch):
     assert "recording.json is damaged" in run(logs / "*.log").stderr
 
 
-def test_a_failed_recording_is_reported_and_ends_no_other(run, logs):
-    whole = succeeded(run(logs / "*.log", folder="whole"))
+def test_a_failed_recording_is_reported_and_ends_no_other(run, logs, whole):
     good = (logs / "drive1.log").read_text()
     (logs / "drive1.log").write_text("no scans\n")
     done = run(logs / "*.log")
@@ -203,7 +215,7 @@ def test_a_run_without_any_map_fails(run, logs):
     assert not (done.folder / "tiles").exists()
 
 
-def test_urls_are_read_by_fsspec(run, logs, monkeypatch):
+def test_urls_are_read_by_fsspec(run, logs, whole, monkeypatch):
     fsspec = pytest.importorskip("fsspec")
     memory = fsspec.filesystem("memory")
     for path in logs.iterdir():
@@ -211,7 +223,7 @@ def test_urls_are_read_by_fsspec(run, logs, monkeypatch):
     try:
         remote = succeeded(run("memory://drives/*.log", folder="remote"))
         assert [row["dataset"] for row in remote.results()["rows"][:3]] == ["drive0", "drive1", "drive2"]
-        assert tiles(remote) == tiles(succeeded(run(logs / "*.log", folder="local")))
+        assert tiles(remote) == tiles(whole)
         assert "matches no file" in refused(run("memory://drives/*.bag", folder="none"))
     finally:
         memory.rm("/drives", recursive=True)
@@ -273,11 +285,10 @@ def test_a_task_runs_again_if_its_worker_is_killed(tmp_path):
 
 
 @pytest.mark.slow
-def test_workers_of_ray_give_the_same_tiles(run, logs):
+def test_workers_of_ray_give_the_same_tiles(run, logs, whole):
     pytest.importorskip("ray")
-    here = succeeded(run(logs / "*.log", folder="here"))
-    there = succeeded(run(logs / "*.log", "workers=2", folder="there"))
-    assert tiles(there) == tiles(here)
+    there = succeeded(run(logs / "*.log", "workers=2"))
+    assert tiles(there) == tiles(whole)
     workers = {row["worker"] for row in there.results()["rows"][:3]}
     assert not any(worker.endswith(f":{os.getpid()}") for worker in workers)
 

@@ -77,7 +77,9 @@ def test_auc_against_sparsity_in_2d(run):
 
 def test_maps_in_2d_with_magnified_regions(run):
     done = succeeded(run("fig3_5_maps_2d", "report.figures=true"))
-    assert {"map_0.5m.png", "map_0.5m_region_1.png", "map_0.5m_region_2.png"} <= set(done.files())
+    assert "map_0.5m.png" in done.files()
+    first, second = ((done.folder / f"map_0.5m_region_{number}.png").read_bytes() for number in (1, 2))
+    assert first != second
 
 
 def test_auc_against_sparsity_in_3d(run):
@@ -175,27 +177,13 @@ def test_variance_threshold_of_a_data_set_in_2d(run):
     assert {row["dataset"] for row in done.results()["rows"]} == {"synthetic_building_2d"}
 
 
-@pytest.mark.parametrize("name", ["pose_correction"])
-def test_no_figures_are_written_without_report_figures(name, run):
-    done = succeeded(run(name, "seed=3"))
-    assert not [file for file in done.files() if file.endswith(".png") or "tfevents" in file]
-    results = done.results()
-    assert (results["command"], results["seed"]) == ("occupancy", 3)
-    assert results["config"]["study"]["name"] == name.removeprefix("tab3_1_")
-
-
 @pytest.mark.parametrize(
     ("name", "options", "words"),
     [
         ("fig3_3_approximation_error", "study.dims=[4]", "study.dims=4 2 3"),
-        ("fig3_3_approximation_error", "study.n_rays=[64,0]", "study.n_rays=0"),
         ("fig3_3_approximation_error", "study.tolerance=[]", "study.tolerance=[] empty"),
-        ("fig3_3_approximation_error", "study.tolerance=[2]", "tolerance=2"),
         ("fig3_3_approximation_error", "study.name=errors", "study.name='errors' auc_memory pose_correction"),
         ("tab3_1_auc_memory", "study.forms=[octree]", "method='octree' flux"),
-        ("tab3_1_auc_memory", "study.n_components=[5,0]", "n_components=0"),
-        ("tab3_1_auc_memory", "study.bgk_points=[0]", "max_points=0"),
-        ("tab3_1_auc_memory", "study.others=[octree]", "method='octree' occupancy_grid"),
         (
             "tab3_1_auc_memory",
             "study.forms=[] study.bgk_points=[] study.others=[]",
@@ -203,14 +191,10 @@ def test_no_figures_are_written_without_report_figures(name, run):
         ),
         ("pose_correction", "map=incremental", "map=per_scan"),
         ("pose_correction", "study.methods=[]", "study.methods=[] point flux"),
-        ("pose_correction", "study.methods=[occupancy_grid]", "method='occupancy_grid' point"),
         ("fig3_8_variance_threshold", "study.method=[bgk]", "method='bgk' point"),
-        ("fig3_8_variance_threshold", "study.hit_length=[-1]", "hit_length=-1"),
         ("pruning", "study.variants.support.prune=weight", "map.prune='weight' density"),
         ("pruning", "+study.variants.support.novel=1", "study.variants.support.novel map=incremental"),
         ("pruning", "study.variants.support=1", "study.variants={support: prune: support"),
-        ("fig3_8_variance_threshold", "study.n_components=[]", "study.n_components=[] empty"),
-        ("fig3_8_variance_threshold", "study.variance_threshold=[-1]", "threshold=-1"),
         ("fig3_8_variance_threshold", "study.thin_width=0", "study.thin_width=0"),
     ],
 )

@@ -13,8 +13,7 @@ import pytest
 from command_runs import Disk, as_it_was, composed
 
 from gmmtorch.cli import common
-from gmmtorch.cli.reporting.outputs import Outputs, terse
-from gmmtorch.cli.reporting.robot_report import RobotReport, print_refusals
+from gmmtorch.cli.reporting.robot_report import Outputs, RobotReport, print_refusals, terse
 from gmmtorch.errors import OutputError
 from gmmtorch.files import write_bytes
 

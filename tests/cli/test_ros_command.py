@@ -24,8 +24,9 @@ pytest.importorskip("cyclonedds", reason="needs the extra [ros]: cyclonedds")
 from exploration.replays import content
 from mapping.random_components import random_components
 
-from gmmtorch.cli import common, ros
+from gmmtorch.cli import common
 from gmmtorch.cli.from_options import links
+from gmmtorch.cli.from_options.robots import shared_map
 from gmmtorch.datasets.base import Ranges
 from gmmtorch.datasets.recordings.ros.bag_reader import Topic
 from gmmtorch.datasets.recordings.ros.bag_topics import LASER as LASERS
@@ -75,7 +76,7 @@ def test_a_robot_that_starts_again_keeps_its_frame(monkeypatch, tmp_path, dim):
     made = [random_components(dim, k=3, seed=seed) for seed in range(2)]
     for number, components in enumerate(made):
         with ExitStack() as stack:
-            shared = ros._shared_map(config, stack)
+            shared = shared_map(config, stack)
             assert shared is not None
             shared.replica.add(components)
             shared.exchange(0.0)

@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_runs import COMMANDS, QUIET, Disk, Finished, refused, run_here, succeeded
+from command_runs import QUIET, Disk, Finished, refused, room_mesh, run_here, succeeded
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 from sharing.test_publish import everything
-from test_robot_command import LOG, SMALL, room
+from test_robot_command import LOG, SMALL
 
 from gmmtorch.cli import team
-from gmmtorch.cli.robot import facts_of
+from gmmtorch.cli.from_options.robots import facts_of
 from gmmtorch.cli.team import RobotProcess
 from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.sharing.store import Store
@@ -29,7 +29,6 @@ Run = Callable[..., Finished]
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
-    monkeypatch.setitem(COMMANDS, "team", team)
     monkeypatch.delenv(KEY_VARIABLE, raising=False)
 
     def run_command(*options: str) -> Finished:
@@ -43,9 +42,8 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
 
 @pytest.mark.slow
 def test_a_team_holds_the_map_of_one_replica_with_all_records(tmp_path, monkeypatch):
-    monkeypatch.setitem(COMMANDS, "team", team)
     monkeypatch.delenv(KEY_VARIABLE, raising=False)
-    options = ["world=mesh", f"world.path={room(tmp_path / 'room.obj')}", *SMALL, "team.size=2"]
+    options = ["world=mesh", f"world.path={room_mesh(tmp_path / 'room.obj')}", *SMALL, "team.size=2"]
     options += ["duration=4", "speed=2", "settle=12", "evaluation.every=2", "network.announce=0.5"]
     done = succeeded(run_here(monkeypatch, "team", tmp_path / "run", *options))
     assert done.results()["config"]["clock"] == "wall"
@@ -258,7 +256,6 @@ def test_a_signal_ends_all_robots(before, name, run, robots, monkeypatch):
         ("clock=lockstep", "clock=lockstep clock=wall speed=2"),
         ("speed=0", "speed=0.0"),
         ("settle=-1", "settle=-1.0"),
-        ("team.size=0", "team.size=0"),
         ("team.size=40", "team.size=40"),
         ("runtime.device=meta", "runtime.device=meta"),
     ],
@@ -266,7 +263,8 @@ def test_a_signal_ends_all_robots(before, name, run, robots, monkeypatch):
 def test_bad_values_are_named_before_a_robot_is_started(options, words, run, robots, tmp_path, monkeypatch):
     if "settle" in options:
         monkeypatch.setattr(team, "_prepare", None)  # nor is the world opened
-    line = refused(run("world=mesh", f"world.path={room(tmp_path / 'room.obj')}", *SMALL, *options.split()))
+    world = ["world=mesh", f"world.path={room_mesh(tmp_path / 'room.obj')}"]
+    line = refused(run(*world, *SMALL, *options.split()))
     for word in words.split():
         assert word in line
     assert not robots

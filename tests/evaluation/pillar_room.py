@@ -1,8 +1,10 @@
-"""A room with a round pillar and a range sensor that circles it, in closed form."""
+"""A room with a round pillar and a range sensor that circles it, in closed form; and rows without times."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -53,3 +55,8 @@ def room_scan(number: int, n_beams: int = 90, dim: int = 2, noise: float = 0.01,
 def room_scans(n_scans: int, n_beams: int = 90, dim: int = 2, seed: int = 0) -> list[Scan]:
     """Scans from positions along the circle."""
     return [room_scan(number, n_beams, dim, seed=seed) for number in range(n_scans)]
+
+
+def timeless(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows of a result without times."""
+    return [{k: v for k, v in row.items() if not k.endswith("seconds")} for row in rows]

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from pillar_room import timeless
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.studies.approximation_error import map_rows, run, sweep_rows
@@ -95,9 +96,6 @@ def test_monte_carlo_and_flux_converge_on_a_grid(rows):
 
 
 def test_rows_depend_only_on_the_seed_and_progress_is_complete(rows):
-    def timeless(given: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        return [{k: v for k, v in row.items() if k != "seconds"} for row in given]
-
     events: list[tuple[str, int, int | None]] = []
     seen: list[int] = []
     again = run(SMALL, 0, lambda *event: events.append(event), lambda rows: seen.append(len(rows)))

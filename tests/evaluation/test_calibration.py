@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from sklearn.calibration import calibration_curve
-from sklearn.metrics import brier_score_loss, log_loss
+from sklearn.metrics import log_loss
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.calibration import (
+    N_BINS,
     accuracy,
-    brier_parts,
     log_loss_bits,
     prior_and_dead_band,
     reliability,
@@ -34,12 +33,10 @@ def drawn(n: int = 5000, seed: int = 0, bend: float = 1.0) -> tuple[torch.Tensor
     return torch.from_numpy(theta), torch.from_numpy(labels)
 
 
-@pytest.mark.parametrize("n_bins", [1, 2, 10, 15])
-@pytest.mark.parametrize(("binning", "strategy"), [("width", "uniform"), ("count", "quantile")])
-def test_reliability_matches_scikit_learn(n_bins, binning, strategy):
+def test_reliability_matches_scikit_learn():
     theta, labels = drawn()
-    curve = reliability(theta, labels, n_bins, binning)
-    observed, predicted = calibration_curve(labels, theta, n_bins=n_bins, strategy=strategy)
+    curve = reliability(theta, labels)
+    observed, predicted = calibration_curve(labels, theta, n_bins=N_BINS)
     np.testing.assert_allclose(curve.observed, observed, atol=1e-12)
     np.testing.assert_allclose(curve.predicted, predicted, atol=1e-12)
     assert curve.n_points.sum() == len(theta)
@@ -48,12 +45,12 @@ def test_reliability_matches_scikit_learn(n_bins, binning, strategy):
 def test_calibration_errors_match_a_loop_over_bins():
     theta, labels = drawn(700, bend=2.0)
     gaps, sizes = [], []
-    for low, high in zip(np.linspace(0, 1, 11)[:-1], np.linspace(0, 1, 11)[1:], strict=True):
+    for low, high in itertools.pairwise(np.linspace(0, 1, N_BINS + 1)):
         inside = [i for i, p in enumerate(theta.tolist()) if low < p <= high or (low == 0 and p == 0)]
         if inside:
             gaps.append(abs(float(theta[inside].mean()) - float(labels[inside].double().mean())))
             sizes.append(len(inside))
-    curve = reliability(theta, labels, 10)
+    curve = reliability(theta, labels)
     assert curve.expected_error == pytest.approx(np.average(gaps, weights=sizes), abs=1e-12)
     assert curve.maximum_error == pytest.approx(max(gaps), abs=1e-12)
     assert curve.n_points.tolist() == sizes
@@ -67,28 +64,8 @@ def test_expected_error_matches_a_known_miscalibration():
     assert reliability(theta, labels).expected_error == pytest.approx(expected, abs=0.005)
 
 
-def test_count_bins_have_equally_many_points():
-    theta = torch.rand(1000, generator=torch.Generator().manual_seed(0))
-    assert set(reliability(theta, theta > 0.5, 10, "count").n_points.tolist()) == {100}
-
-
-@pytest.mark.parametrize("binning", ["width", "count"])
-@given(st.integers(1, 20), st.integers(1, 60), st.integers(0, 1000))
-def test_brier_parts_sum_to_the_brier_score(binning, n_bins, n, seed):
-    rng = np.random.default_rng(seed)
-    theta = torch.from_numpy(rng.choice([rng.random(n), rng.integers(0, 5, n) / 4], axis=0))
-    labels = torch.from_numpy(rng.integers(2, size=n))
-    parts = brier_parts(theta, labels, n_bins, binning)
-    assert parts.brier == pytest.approx(float(((theta - labels) ** 2).mean()), abs=1e-12)
-    total = parts.reliability - parts.resolution + parts.uncertainty + parts.within
-    assert total == pytest.approx(parts.brier, abs=1e-12)
-    assert min(parts.reliability, parts.resolution, parts.uncertainty) >= 0
-    assert parts.resolution <= parts.uncertainty + 1e-12
-
-
-def test_brier_and_log_loss_match_scikit_learn():
+def test_log_loss_matches_scikit_learn():
     theta, labels = drawn()
-    assert brier_parts(theta, labels).brier == pytest.approx(brier_score_loss(labels, theta), abs=1e-12)
     assert log_loss_bits(theta, labels) == pytest.approx(log_loss(labels, theta) / math.log(2), rel=1e-9)
 
 
@@ -103,7 +80,7 @@ def test_scores_contain_ece_log_loss_and_accuracy():
     theta, labels = drawn()
     found = scores(theta.float(), labels)
     assert list(found) == ["ece", "log_loss_bits", "accuracy"]
-    assert found["ece"] == pytest.approx(reliability(theta, labels, 15).expected_error, abs=1e-4)
+    assert found["ece"] == pytest.approx(reliability(theta, labels).expected_error, abs=1e-4)
     assert found["accuracy"] == accuracy(theta, labels)
     assert all(type(value) is float for value in found.values())
 
@@ -150,15 +127,7 @@ def test_accuracy_decided_is_none_if_nothing_is_decided():
         ([[0.5]], [[1]], "must be \\(M,\\)"),
     ],
 )
-@pytest.mark.parametrize("score", [reliability, brier_parts, log_loss_bits, accuracy])
+@pytest.mark.parametrize("score", [reliability, log_loss_bits, accuracy])
 def test_invalid_probabilities_and_labels_raise(score, theta, labels, says):
     with pytest.raises(InvalidArgumentError, match=says):
         score(torch.tensor(theta), torch.tensor(labels))
-
-
-def test_invalid_bins_raise():
-    theta, labels = drawn(10)
-    with pytest.raises(InvalidArgumentError, match="n_bins=0"):
-        reliability(theta, labels, 0)
-    with pytest.raises(InvalidArgumentError, match="binning='wide' is not one of width, count"):
-        reliability(theta, labels, 5, "wide")

@@ -7,7 +7,7 @@ import math
 
 import pytest
 import torch
-from evaluation.pillar_room import room_scans
+from evaluation.pillar_room import room_scans, timeless
 from sklearn.cluster import MeanShift
 
 from gmmtorch.datasets import load
@@ -58,10 +58,6 @@ def rows(data, scans) -> list[Row]:
 
 def of(rows: list[Row], rule: str) -> list[Row]:
     return [row for row in rows if row["rule"] == rule]
-
-
-def timeless(rows: list[Row]) -> list[Row]:
-    return [{k: v for k, v in row.items() if not k.endswith("seconds")} for row in rows]
 
 
 def test_every_rule_has_a_row_per_setting(rows):

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import torch
+from pillar_room import timeless
 from sklearn.mixture import GaussianMixture as ScikitLearnMixture
 from torch import Tensor
 
@@ -66,10 +67,6 @@ def everything() -> All:
         lambda rows: counts.append(len(rows)),
     )
     return All(outcome, events, counts)
-
-
-def timeless(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    return [{k: v for k, v in row.items() if not k.endswith("seconds")} for row in rows]
 
 
 def test_rows_have_every_documented_field_with_its_type(everything):
@@ -222,36 +219,23 @@ def test_own_options_apply_only_to_their_estimator():
 # -- invalid input --------------------------------------------------------------------------------
 
 
-def test_an_unknown_method_raises_and_lists_the_known_ones():
-    with pytest.raises(
-        InvalidArgumentError, match=r"method='kmeans' is not known; known are em, .*scikit_learn"
-    ):
-        fit("em", "kmeans")
+@pytest.mark.parametrize(
+    ("methods", "options", "message"),
+    [
+        (["em", "kmeans"], {}, "method='kmeans' is not known; known are em, .*scikit_learn"),
+        ([], {}, "method is empty"),
+        (["em"], {"test_share": 1.0}, r"test_share=1.0 must be a share in \[0, 1\)"),
+        (["em"], {"test_share": math.nan}, "test_share=nan"),
+        (["em"], {"points": torch.empty(0, 3)}, "have no points"),
+        (["scikit_learn"], {"init_params": "random_points"}, "init_params='random_points'.*only kmeans"),
+        (["scikit_learn_bayesian"], {"init_params": "random_points"}, "only kmeans"),
+    ],
+)
+def test_what_cannot_be_compared_raises(methods, options, message):
+    with pytest.raises(InvalidArgumentError, match=message):
+        fit(*methods, **options)
 
 
-def test_an_empty_list_of_methods_raises():
-    with pytest.raises(InvalidArgumentError, match="method is empty"):
-        fit()
-
-
-@pytest.mark.parametrize("test_share", [1.0, -0.1, 2.0, math.nan])
-def test_an_invalid_test_share_raises(test_share):
-    with pytest.raises(InvalidArgumentError, match=r"test_share=.* must be a share in \[0, 1\)"):
-        fit("em", test_share=test_share)
-
-
-def test_a_cloud_without_points_raises():
-    with pytest.raises(InvalidArgumentError, match="have no points"):
-        fit("em", points=torch.empty(0, 3))
-
-
-@pytest.mark.parametrize("method", ["scikit_learn", "scikit_learn_bayesian"])
-def test_scikit_learn_supports_only_the_kmeans_start(method):
-    with pytest.raises(InvalidArgumentError, match=r"init_params='random_points'.*only kmeans"):
-        fit(method, init_params="random_points")
-
-
-@pytest.mark.parametrize("method", ESTIMATORS)
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -263,9 +247,10 @@ def test_scikit_learn_supports_only_the_kmeans_start(method):
         ({"seed": -1}, "-1"),
     ],
 )
-def test_invalid_options_raise_for_every_method(method, options, message):
-    with pytest.raises(InvalidArgumentError, match=message):
-        fit(method, **options)
+def test_invalid_options_raise_for_every_method(options, message):
+    for method in ESTIMATORS:
+        with pytest.raises(InvalidArgumentError, match=message):
+            fit(method, **options)
 
 
 def test_unknown_own_options_raise():

@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from pillar_room import room_scans
+from pillar_room import room_scans, timeless
 
 from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.datasets import load
@@ -66,11 +65,6 @@ def outcome() -> Outcome:
 @pytest.fixture(scope="module")
 def plain_rows(outcome) -> list[dict[str, Any]]:
     return outcome.rows
-
-
-def timeless(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The rows without times."""
-    return [{k: v for k, v in row.items() if not k.endswith("seconds")} for row in rows]
 
 
 def test_rows_have_every_documented_field_with_its_type(plain_rows):
@@ -171,20 +165,12 @@ def test_unknown_points_add_four_fields_and_keep_the_auc(plain_rows, tmp_path):
     grids = [row for row in rows if row["method"] == "occupancy_grid"]
     # No training beam observes the unknown points, so a grid answers exactly ½.
     assert all(row["unknown_called_free"] == row["unknown_called_occupied"] == 0 for row in grids)
-    check_saved_maps(tmp_path)
-    check_progress(events)
-
-
-def check_saved_maps(tmp_path: Path) -> None:
     assert {path.name for path in (tmp_path / "maps").iterdir()} == {
         f"{method}_{kept}_{resolution}.safetensors"
         for method in small_methods()
         for kept in ("1", "0.3")
         for resolution in ("0.2", "0.1")
     }
-
-
-def check_progress(events: list[tuple[str, int, int | None]]) -> None:
     stages = {stage for stage, _, _ in events}
     assert any("mixture" in stage and "30%" in stage for stage in stages)
     for stage in stages:
@@ -196,24 +182,14 @@ def check_progress(events: list[tuple[str, int, int | None]]) -> None:
 # -- invalid input --------------------------------------------------------------------------------
 
 
-def test_choose_keeps_the_order_of_the_names():
-    assert list(choose(["monte_carlo", "occupancy_grid"], methods(small_map))) == [
-        "monte_carlo",
-        "occupancy_grid",
-    ]
-
-
-@pytest.mark.parametrize("names", [["octree"], ["monte_carlo", "octree"]])
-def test_an_unknown_method_raises_and_lists_the_known_ones(names):
-    known = methods(small_map)
+def test_chosen_methods_are_known_and_keep_their_order():
+    known, names = methods(small_map), ["monte_carlo", "occupancy_grid"]
+    assert list(choose(names, known)) == names
     with pytest.raises(InvalidArgumentError, match="method='octree' is not known") as caught:
-        choose(names, known)
+        choose(["monte_carlo", "octree"], known)
     assert all(name in str(caught.value) for name in known)
-
-
-def test_an_empty_list_of_methods_raises():
     with pytest.raises(InvalidArgumentError, match=r"method is empty.*monte_carlo"):
-        choose([], methods(small_map))
+        choose([], known)
 
 
 def test_a_data_set_with_one_scan_raises():
@@ -233,12 +209,9 @@ def test_held_out_scans_without_returns_raise():
     ("options", "message"),
     [
         ({"resolution": (0.1, -0.1)}, "resolution=-0.1"),
-        ({"resolution": (0.0,)}, "resolution=0"),
-        ({"resolution": (float("nan"),)}, "resolution=nan"),
         ({"resolution": ()}, r"resolution=\[\] is empty"),
         ({"kept": ()}, r"kept=\[\] is empty"),
         ({"max_beams": 0}, "max_beams=0"),
-        ({"kept": (2.0,)}, "kept=2"),
         ({"kept": (1.0, 2.0)}, "kept=2"),
         ({"kept": (0.0,)}, "kept=0"),
         ({"test_every": 1}, "test_every=1"),
@@ -246,6 +219,7 @@ def test_held_out_scans_without_returns_raise():
         ({"free": "behind"}, "free='behind'"),
         ({"pose_noise": (0.1,)}, "pose_noise="),
         ({"pose_noise": (-1.0, 0.0)}, "pose_noise="),
+        ({"pose_noise": (0.0, float("inf"))}, "pose_noise="),
     ],
 )
 def test_an_invalid_protocol_raises_when_it_is_made(options, message):

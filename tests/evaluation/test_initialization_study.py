@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
+from pillar_room import timeless
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.events import ignore
@@ -30,10 +30,6 @@ def data(generator) -> FitData:
 
 def rows_of(data: FitData, study: InitializationStudy = SMALL, seed: int = 0) -> list[Row]:
     return run(data, study, EM, seed, ignore, lambda rows: None)
-
-
-def timeless(rows: list[Row]) -> list[dict[str, Any]]:
-    return [{k: v for k, v in row.items() if not k.endswith("seconds")} for row in rows]
 
 
 def test_a_row_for_each_initialization_number_and_seed(data):

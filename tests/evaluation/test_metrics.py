@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.metrics import (
+    auc_gain,
     auc_interval,
     brier,
     psnr2,
@@ -84,10 +85,10 @@ def test_roc_of_one_class_raises(n_occupied, n_free):
 # -- its bootstrap interval -----------------------------------------------------------------------
 
 
-def interval(occupied: Tensor, free: Tensor, seed: int = 0, **options: float) -> tuple[float, float, float]:
+def interval(occupied: Tensor, free: Tensor, seed: int = 0) -> tuple[float, float, float]:
     """Lower end, AUC, upper end."""
     auc = roc(occupied, free).auc
-    low, high = auc_interval(occupied, free, auc, seed, **options)
+    low, high = auc_interval(occupied, free, auc, seed)
     return low, auc, high
 
 
@@ -116,17 +117,42 @@ def test_interval_width_matches_delong():
     assert (low + high) / 2 == pytest.approx(auc, abs=0.2 * sigma)
 
 
-def test_interval_depends_only_on_the_seed_and_widens_with_the_level():
+def test_interval_depends_only_on_the_seed():
     occupied, free = scores(200, 0.7, 0), scores(200, 0.0, 1)
     assert interval(occupied, free, seed=1) == interval(occupied, free, seed=1)
     assert interval(occupied, free, seed=1) != interval(occupied, free, seed=2)
-    narrow, wide = (interval(occupied, free, level=level) for level in (0.5, 0.99))
-    assert wide[0] < narrow[0] < narrow[1] < narrow[2] < wide[2]
 
 
 def test_interval_of_equal_scores_is_a_point():
     half = torch.full((30,), 0.5)
     assert interval(half, half) == (0.5, 0.5, 0.5)
+
+
+# -- the gain of another classifier ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("levels", [None, 10])
+def test_auc_gain_matches_scikit_learn_and_a_bootstrap(levels):
+    rng = np.random.default_rng(3)
+    before = scores(400, 0.8, 0, levels), scores(600, -0.2, 1, levels)
+    changes = (torch.from_numpy(rng.normal(0.05, 0.2, len(x))) for x in before)
+    occupied, free = ((x + change).clamp(0, 1) for x, change in zip(before, changes, strict=True))
+    found = auc_gain(before, (occupied, free))
+
+    def area(occupied: Tensor, free: Tensor) -> float:
+        return float(roc_auc_score(*labelled(occupied, free)))
+
+    assert found.mean == pytest.approx(area(occupied, free) - area(*before), abs=1e-12)
+    gains = []
+    for _ in range(300):
+        rows, columns = rng.integers(0, 400, 400), rng.integers(0, 600, 600)
+        gains.append(area(occupied[rows], free[columns]) - area(before[0][rows], before[1][columns]))
+    assert found.high - found.low == pytest.approx(2 * 1.96 * np.std(gains), rel=0.15)
+
+
+def test_auc_gain_of_equal_answers_is_exactly_zero():
+    same = scores(50, 0.8, 0), scores(60, -0.2, 1)
+    assert auc_gain(same, same) == (0.0, 0.0, 0.0)
 
 
 # -- the other scores -----------------------------------------------------------------------------

@@ -5,18 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from shown import read
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams import plugin_data_pb2
 from tensorboard.util.tensor_util import make_ndarray
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.report import tensorboard_writer
 from gmmtorch.report.maps.accuracy_figures import roc_figure
 from gmmtorch.report.tensorboard_writer import Board
-
-
-def read(directory) -> EventAccumulator:
-    events = EventAccumulator(str(directory), size_guidance={"scalars": 0, "images": 0, "tensors": 0})
-    return events.Reload()
 
 
 def tensor(events: EventAccumulator, tag: str) -> np.ndarray:
@@ -40,7 +37,7 @@ def test_board_writes_figures_and_precision_recall_curves(tmp_path):
     labels = torch.tensor([0, 1, 1, 0, 1])
     with Board(tmp_path) as board:
         board.figure("maps", roc_figure({}))
-        board.curve("grid", labels, torch.tensor([0.1, 0.9, 0.8, 0.6, 0.4]), step=2)
+        board.curve("grid", labels, torch.tensor([0.1, 0.9, 0.8, 0.6, 0.4]))
         board.curve("one_class", torch.ones(3), torch.rand(3))
         board.curve("none", torch.empty(0), torch.empty(0))
     events = read(tmp_path)
@@ -56,11 +53,12 @@ def test_board_writes_figures_and_precision_recall_curves(tmp_path):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_clouds_are_thinned_deterministically(tmp_path, dim):
+def test_clouds_are_thinned_deterministically(tmp_path, dim, monkeypatch):
+    monkeypatch.setattr(tensorboard_writer, "_MAX_POINTS", 10)
     points = torch.arange(100 * dim, dtype=torch.float64).reshape(100, dim)
     colors = torch.full((100, 3), 300)
     for name in ("a", "b"):
-        with Board(tmp_path / name, max_points=10) as board:
+        with Board(tmp_path / name) as board:
             board.cloud("scan", points, colors)
             board.cloud("one", points[:1])
             board.cloud("empty", points[:0])
@@ -76,8 +74,9 @@ def test_clouds_are_thinned_deterministically(tmp_path, dim):
 
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize(("k", "n_vertices"), [(3, 3 * 162), (20, 20 * 25), (200, 41 * 12), (0, None)])
-def test_ellipsoids_use_as_many_vertices_as_the_limit_permits(tmp_path, dim, k, n_vertices):
-    with Board(tmp_path, max_points=500) as board:
+def test_ellipsoids_use_as_many_vertices_as_the_limit_permits(tmp_path, dim, k, n_vertices, monkeypatch):
+    monkeypatch.setattr(tensorboard_writer, "_MAX_POINTS", 500)
+    with Board(tmp_path) as board:
         board.ellipsoids("mixture", torch.zeros(k, dim), torch.eye(dim).expand(k, dim, dim))
     events = read(tmp_path)
     if n_vertices is None:
@@ -106,8 +105,6 @@ def test_hparams_are_written_to_the_same_run(tmp_path):
 
 
 def test_board_errors_name_the_argument(tmp_path):
-    with pytest.raises(InvalidArgumentError, match="max_points=0"):
-        Board(tmp_path, max_points=0)
     with Board(tmp_path) as board:
         with pytest.raises(InvalidArgumentError, match="points has shape"):
             board.cloud("bad", torch.zeros(3))

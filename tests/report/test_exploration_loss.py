@@ -9,6 +9,7 @@ import pytest
 from exploration_rows import OBSERVABLE_BITS, networks, trial
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
+from shown import texts
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.paired_statistics import mean_band
@@ -17,10 +18,6 @@ from gmmtorch.report.exploration.trial_groups import by_variant
 from gmmtorch.report.style import PALETTE
 
 CUT = {"begin": 60.0, "end": 120.0, "groups": [[0], [1, 2]]}
-
-
-def texts(axes: Axes) -> str:
-    return "\n".join(text.get_text() for text in axes.texts)
 
 
 def line(axes: Axes, index: int, n_points: int) -> np.ndarray:

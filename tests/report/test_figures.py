@@ -26,7 +26,7 @@ def mixture(k: int, dim: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 @pytest.mark.parametrize(("n", "k"), [(200, 5), (5, 0), (0, 3)])
 def test_mixture_figure_states_the_numbers_drawn(dim, n, k):
     points = torch.randn(n, dim, generator=torch.Generator().manual_seed(1))
-    figure = mixture_figure(points, *mixture(k, dim), origins=torch.zeros(1, dim))
+    figure = mixture_figure(points, *mixture(k, dim))
     title = figure.get_suptitle()
     points_said = f", {n} point{'s' * (n != 1)}" if n else ""
     assert title == f"Gaussian mixture: {k} component{'s' * (k != 1)}{points_said}"

@@ -25,7 +25,7 @@ def grown(n_frames: int) -> list[GrowthFrame]:
 
 
 def test_unknown_space_shrinks_and_the_last_frame_is_held(tmp_path):
-    written = save_growth(tmp_path / "map.gif", grown(3), resolution=0.3, period=0.1, hold=2.0)
+    written = save_growth(tmp_path / "map.gif", grown(3), resolution=0.3, period=0.1)
     unknown = np.array([int(style.UNKNOWN[k : k + 2], 16) for k in (1, 3, 5)])
     path_colour = np.array([int(style.PALETTE[1][k : k + 2], 16) for k in (1, 3, 5)])
     durations, shares = [], []
@@ -37,7 +37,7 @@ def test_unknown_space_shrinks_and_the_last_frame_is_held(tmp_path):
             pixels = np.asarray(picture.convert("RGB")).astype(int)
             shares.append((np.abs(pixels - unknown).max(-1) < 8).mean())
             assert (np.abs(pixels - path_colour).max(-1) < 16).sum() > 30  # the robot
-    assert durations == [100, 100, 2000]
+    assert durations == [100, 100, 4000]
     assert shares[0] > shares[1] > shares[2] > 0.01
 
 

@@ -15,7 +15,7 @@ from gmmtorch.report.scenes.map_scenes import OccupancyPanel, cells_near, map_sc
 
 def test_cells_near_points_are_those_of_a_search(generator):
     points = torch.randn(30, 3, generator=generator, dtype=torch.float64)
-    centres, side = cells_near(points, 0.25, reach=2)
+    centres, side = cells_near(points, 0.25)
     expected = {
         tuple(cell + np.array(offset))
         for cell in np.floor(points.numpy() / 0.25).astype(int)

@@ -107,10 +107,10 @@ def test_height_image_gives_the_highest_occupied_cell():
         return torch.where(occupied, 0.9, 0.1)
 
     panel = MapPanel("steps", occupancy, 1.0, (0.0, 0.0, 0.0), (3.0, 1.0, 4.0))
-    found = height_image(panel, 0.5)
+    found = height_image(panel)
     np.testing.assert_allclose(found.image, [[0.5], [np.nan], [1.5]])
     assert found.resolution == 1.0
-    assert height_image(panel, 0.5, max_queries=4).image.numel() < found.image.numel()
+    assert height_image(panel, max_queries=4).image.numel() < found.image.numel()
 
 
 @pytest.mark.parametrize("roof", [2.0, 100.0])
@@ -120,10 +120,9 @@ def test_map_figure_leaves_out_a_roof(roof):
 
     panel = MapPanel("room", occupancy, 0.5, (0.0, 0.0, -1.0), (4.0, 4.0, 3.0))
     path = torch.tensor([[1.0, 1.0, 1.0], [3.0, 3.0, 1.0]], dtype=torch.float64)
-    assert roof_above(panel, path.numpy(), 0.5) == (roof == 2.0)
+    assert roof_above(panel, path.numpy()) == (roof == 2.0)
     titles = [axes.get_title() for axes in map_figure([panel], [path]).axes]
     assert any("below z = 1.5 m" in title for title in titles) == (roof == 2.0)
-    assert not any("below" in axes.get_title() for axes in map_figure([panel], [path], ceiling=50.0).axes)
 
 
 def test_robust_bounds_ignore_stray_points():

@@ -92,7 +92,7 @@ def test_cells_figure_draws_the_cells_of_each_mask(generator):
 def test_closest_look_contains_the_most_thin_points():
     thin = torch.tensor([[x, 9.0, 1.0] for x in torch.linspace(8.2, 9.8, 50)] + [[1.0, 1.0, 1.0]])
     hits = torch.cat([thin, torch.tensor([[9.0, 9.0, 3.0]])]).double()
-    low, high = map_study_figures.closest_look(thin.double(), hits, side=4.0)
+    low, high = map_study_figures.closest_look(thin.double(), hits)
     assert low[:2] == (8.0, 8.0)
     assert high[:2] == (12.0, 12.0)
     assert low[2] == pytest.approx(0.8, abs=0.02)

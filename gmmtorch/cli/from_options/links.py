@@ -5,15 +5,17 @@ from __future__ import annotations
 import os
 import socket
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from omegaconf import DictConfig
 
 from gmmtorch.cli import common
-
-if TYPE_CHECKING:
-    from gmmtorch.sharing.transport.frames import FramedTransport
-    from gmmtorch.sharing.transport.security import TeamKey
+from gmmtorch.errors import InvalidArgumentError, check_choice
+from gmmtorch.sharing.transport.frames import FramedTransport
+from gmmtorch.sharing.transport.security import TeamKey
+from gmmtorch.sharing.transport.team_key import KEY_VARIABLE
+from gmmtorch.sharing.transport.udp import UdpTransport
+from gmmtorch.sharing.transport.zenoh_transport import ZenohTransport
 
 TRANSPORTS = ("udp", "zenoh")
 _NAMES = {"key": "link.key_file", "insecure": "link.insecure"}
@@ -48,10 +50,7 @@ def open_link(config: DictConfig, robot: int, is_alone: bool = False) -> FramedT
 
 
 def _opened(config: DictConfig, robot: int, is_alone: bool) -> FramedTransport:
-    from gmmtorch.errors import InvalidArgumentError
-
-    if config.transport not in TRANSPORTS:
-        raise InvalidArgumentError(f"transport={config.transport!r} is not one of {', '.join(TRANSPORTS)}.")
+    check_choice("transport", config.transport, TRANSPORTS)
     link = common.as_options(config.link)
     key = team_key(link.pop("key_file"))
     if config.transport == "zenoh":
@@ -68,8 +67,6 @@ def _opened(config: DictConfig, robot: int, is_alone: bool) -> FramedTransport:
 
 
 def _zenoh(robot: int, link: dict[str, Any], key: TeamKey | None) -> FramedTransport:
-    from gmmtorch.sharing.transport.zenoh_transport import ZenohTransport
-
     return ZenohTransport(
         robot,
         link["team"],
@@ -83,8 +80,6 @@ def _zenoh(robot: int, link: dict[str, Any], key: TeamKey | None) -> FramedTrans
 
 
 def _udp(robot: int, link: dict[str, Any], key: TeamKey | None) -> FramedTransport:
-    from gmmtorch.sharing.transport.udp import UdpTransport
-
     insecure = link["insecure"]
     if link["group"] is not None:
         group = address("link.group", link["group"], least_port=1)
@@ -98,9 +93,6 @@ def _udp(robot: int, link: dict[str, Any], key: TeamKey | None) -> FramedTranspo
 
 def team_key(path: str | None) -> TeamKey | None:
     """The team's key, from a file or else from the environment; None without either."""
-    from gmmtorch.sharing.transport.security import TeamKey
-    from gmmtorch.sharing.transport.team_key import KEY_VARIABLE
-
     if path is not None:
         return TeamKey.from_file(Path(path))
     return TeamKey.from_environment() if KEY_VARIABLE in os.environ else None
@@ -108,8 +100,6 @@ def team_key(path: str | None) -> TeamKey | None:
 
 def address(name: str, text: str, least_port: int = 0) -> tuple[str, int]:
     """The address of a text host:port. Port 0 means any free port."""
-    from gmmtorch.errors import InvalidArgumentError
-
     host, colon, port = str(text).rpartition(":")
     if (
         not colon

@@ -1,21 +1,25 @@
-"""Maps from the options: `GaussianMap` from `map.*`, and every method of a run."""
+"""Maps from the options: `GaussianMap` from `map.*`, every method of a run, and the test of their maps."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from omegaconf import DictConfig
 
 from gmmtorch.cli import common
 from gmmtorch.cli.options.structured import build
-
-if TYPE_CHECKING:
-    from gmmtorch.evaluation.methods import MapFactory
-    from gmmtorch.mapping.gaussian_map import GaussianMap
-    from gmmtorch.mapping.learning.rules import LearningRule
+from gmmtorch.errors import InvalidArgumentError, check_choice
+from gmmtorch.evaluation import methods
+from gmmtorch.evaluation.methods import MapFactory
+from gmmtorch.evaluation.protocol_options import Protocol
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping.learning.rules import SOFTMAX_DTYPES, IncrementalRule, LearningRule, WindowedRule
+from gmmtorch.mapping.query_options import QueryOptions
+from gmmtorch.mapping.tile_index import INDEX
+from gmmtorch.mapping.tiles import TiledMap
 
 
 def limits(config: DictConfig) -> dict[str, Any]:
@@ -30,16 +34,17 @@ def limits(config: DictConfig) -> dict[str, Any]:
 
 def known_methods(config: DictConfig) -> dict[str, MapFactory]:
     """Every method by name."""
-    from gmmtorch.evaluation import methods
-
     options = common.as_options(config.method_options)
     return methods.methods(map_factory(config), options, **limits(config))
 
 
+def protocol_of(config: DictConfig) -> Protocol:
+    """The held-out test from `evaluation.*`."""
+    return build(Protocol, common.as_options(config.evaluation), "evaluation")
+
+
 def check_factories(factories: Mapping[str, MapFactory], resolution: float) -> None:
     """Make an empty map with each factory, so that an invalid option fails before any map is built."""
-    from gmmtorch.errors import InvalidArgumentError
-
     for name, factory in factories.items():
         try:
             factory(resolution)
@@ -59,11 +64,6 @@ def open_map(
             that give evidence in the box. None: all.
         resolution: side (m) of the largest cells that will be asked; None: that of the map.
     """
-    from gmmtorch.errors import InvalidArgumentError
-    from gmmtorch.mapping.gaussian_map import GaussianMap
-    from gmmtorch.mapping.tile_index import INDEX
-    from gmmtorch.mapping.tiles import TiledMap
-
     folders = [folder for folder in (path / "tiles", path) if (folder / INDEX).exists()]
     if (path / "map.safetensors").exists() or not folders:
         file = path / "map.safetensors" if path.is_dir() else path
@@ -82,11 +82,6 @@ def open_map(
 def map_factory(config: DictConfig, resolution: float = 0.1, **changes: Any) -> Callable[[], GaussianMap]:
     """A factory of empty maps with the options `map.*`; `changes` replaces some of them. `resolution`: of
     queries without one (m)."""
-    from gmmtorch.errors import check_choice
-    from gmmtorch.mapping.gaussian_map import GaussianMap
-    from gmmtorch.mapping.learning.rules import SOFTMAX_DTYPES
-    from gmmtorch.mapping.query_options import QueryOptions
-
     dtype = config.runtime.dtype
     check_choice("runtime.dtype", dtype, SOFTMAX_DTYPES)  # an incremental map does not use it
     options = {**common.as_options(config.map), **changes}
@@ -103,8 +98,6 @@ def map_factory(config: DictConfig, resolution: float = 0.1, **changes: Any) -> 
 
 def _rule(options: dict[str, Any], dtype: str) -> LearningRule:
     """The learning rule of the options `map.*`."""
-    from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
-
     if options["name"] == "incremental":
         return build(IncrementalRule, options, "map")
     return build(WindowedRule, options, "map", dtype=dtype)

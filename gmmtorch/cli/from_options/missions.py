@@ -6,17 +6,24 @@ import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from omegaconf import DictConfig, OmegaConf
 
 from gmmtorch.cli import common
-
-if TYPE_CHECKING:
-    from gmmtorch.evaluation.events import Event
-    from gmmtorch.exploration.mission.options import TeamOptions
-    from gmmtorch.exploration.mission.trials import Trial, WorldOptions
-    from gmmtorch.exploration.world.world import World
+from gmmtorch.errors import InvalidArgumentError, check_choice
+from gmmtorch.evaluation.events import Event, ignore
+from gmmtorch.exploration.mission.options import THESIS, TeamOptions
+from gmmtorch.exploration.mission.results import PLANNING
+from gmmtorch.exploration.mission.trials import Trial, WorldOptions
+from gmmtorch.exploration.planning.primitives import Dynamics
+from gmmtorch.exploration.robot.gmm_mapper import FrameRule
+from gmmtorch.exploration.robot.robot_state import StoppingRule
+from gmmtorch.exploration.world.scoring import BeliefRule
+from gmmtorch.exploration.world.world import World
+from gmmtorch.mapping.learning.rules import NoveltyRule
+from gmmtorch.sharing.transport.link_conditions import LinkConditions
+from gmmtorch.simulation.sensors.depth_camera import DepthCamera
 
 T = TypeVar("T")
 OF_ROBOTS = {"announce": "announce_every", "budget": "budget"}
@@ -39,12 +46,7 @@ NAMES = {
 
 def variants_of(config: DictConfig) -> list[dict[str, Any]]:
     """The variants of a study. Raises `InvalidArgumentError` for options that a variant cannot set."""
-    from gmmtorch.errors import InvalidArgumentError
-    from gmmtorch.exploration.mission.options import THESIS
-    from gmmtorch.exploration.mission.results import PLANNING
-
-    if config.study.name != "trials":
-        raise InvalidArgumentError(f"study.name={config.study.name!r} is not one of trials.")
+    check_choice("study.name", config.study.name, ("trials",))
     variants: list[dict[str, Any]] = list(common.as_options(config.study)["variants"])
     known = {"team", *PLANNING, *THESIS, *config.network}
     for variant in variants:
@@ -71,8 +73,6 @@ def trial_of(
 ) -> Trial:
     """A trial of the mission that the options describe, with the changes of a variant, and a folder in
     `folder`."""
-    from gmmtorch.exploration.mission.trials import Trial
-
     seed = config.seed if seed is None else seed
     chosen = {"team": config.team.name, "planner": config.planner.name} if variant is None else variant
     about = "_".join(f"{key}-{_short(value)}" for key, value in chosen.items())
@@ -87,9 +87,6 @@ def _short(value: Any) -> str:
 
 def world_options(config: DictConfig) -> WorldOptions:
     """The world that the options describe."""
-    from gmmtorch.errors import InvalidArgumentError
-    from gmmtorch.exploration.mission.trials import WorldOptions
-
     if OmegaConf.is_missing(config.world, "path"):
         raise InvalidArgumentError(
             "world=mesh needs world.path=FILE: a triangle mesh (PLY, OBJ, STL) in metres, z up."
@@ -103,8 +100,6 @@ def world_options(config: DictConfig) -> WorldOptions:
 
 def open_world(world: WorldOptions, team: TeamOptions, on_event: Event | None = None) -> World:
     """The world for this team; errors name options."""
-    from gmmtorch.evaluation.events import ignore
-
     names = {name: f"world.{name}" for name in ("path", "bounds", "size", "seed")}
     with common.naming({**NAMES, **names}):
         return world.open(team, on_event or ignore)
@@ -112,14 +107,6 @@ def open_world(world: WorldOptions, team: TeamOptions, on_event: Event | None = 
 
 def team_options(config: DictConfig, seed: int, variant: dict[str, Any]) -> TeamOptions:
     """The team that the options describe, with the changes of a variant."""
-    from gmmtorch.exploration.mission.options import THESIS, TeamOptions
-    from gmmtorch.exploration.planning.primitives import Dynamics
-    from gmmtorch.exploration.robot.gmm_mapper import FrameRule
-    from gmmtorch.exploration.robot.robot_state import StoppingRule
-    from gmmtorch.exploration.world.scoring import BeliefRule
-    from gmmtorch.mapping.learning.rules import NoveltyRule
-    from gmmtorch.simulation.sensors.depth_camera import DepthCamera
-
     sensor, mapping = common.as_options(config.sensor), common.as_options(config.map)
     mapping |= {name: variant[name] for name in mapping if name in variant and name in THESIS}
     rate, window = sensor.pop("rate"), mapping.pop("window")
@@ -165,8 +152,6 @@ def team_options(config: DictConfig, seed: int, variant: dict[str, Any]) -> Team
 
 def _check_thesis(given: dict[str, Any], options: TeamOptions) -> None:
     """Raises `InvalidArgumentError` if the options `given` of team=gmm_thesis are not those of the thesis."""
-    from gmmtorch.errors import InvalidArgumentError
-
     for name, value in options.learning.items():
         if given[name] != value:
             raise InvalidArgumentError(
@@ -189,8 +174,6 @@ def _of(group: str, make: Callable[..., T], options: dict[str, Any], **others: A
 
 def _network(config: DictConfig, variant: dict[str, Any]) -> dict[str, Any]:
     """The fields of `TeamOptions` for the network; errors name options."""
-    from gmmtorch.sharing.transport.link_conditions import LinkConditions
-
     given = {key: value for key, value in common.as_options(config.network).items() if key not in OF_ROBOTS}
     names = {key: f"study.variants: {key}" if key in variant else f"network.{key}" for key in given}
     given |= {key: variant[key] for key in given if key in variant}
@@ -203,8 +186,6 @@ def _network(config: DictConfig, variant: dict[str, Any]) -> dict[str, Any]:
 
 def _poses(start: Any) -> tuple[tuple[float, ...], ...]:
     """Start poses as tuples. Raises `InvalidArgumentError` unless each has four numbers."""
-    from gmmtorch.errors import InvalidArgumentError
-
     try:
         poses = tuple(tuple(float(x) for x in pose) for pose in start)
     except (TypeError, ValueError):
@@ -217,8 +198,6 @@ def _poses(start: Any) -> tuple[tuple[float, ...], ...]:
 
 
 def _three(name: str, values: list[int]) -> tuple[int, int, int]:
-    from gmmtorch.errors import InvalidArgumentError
-
     if len(values) != 3:
         raise InvalidArgumentError(f"{name}={values} must have three entries: cells along x, y and z.")
     return values[0], values[1], values[2]

@@ -13,10 +13,8 @@ from hydra.core.config_store import ConfigStore
 from gmmtorch.cli.options import (
     dataset_schema,
     exploration_schema,
-    fit_schema,
     map_schema,
     robot_schema,
-    ros_schema,
 )
 from gmmtorch.cli.options.structured import read_dataclass, schema_of
 from gmmtorch.evaluation.protocol_options import FitOptions, Protocol
@@ -56,20 +54,20 @@ def _map_schema(rule: type) -> type:
 
 def _sensor_schema() -> type:
     """Options of a live sensor."""
-    return schema_of(ros_schema.SensorOptions, read_dataclass("live.mapper.live_scans", "LiveOptions"))
+    return schema_of(robot_schema.SensorOptions, read_dataclass("live.mapper.live_scans", "LiveOptions"))
 
 
 def _commands() -> dict[str, type]:
     """The options of each command."""
     mixture = schema_of(FitOptions, PruneOptions, without=("dtype", "compiled"))
     return {
-        "fit": schema_of(fit_schema.Fit, mixture=mixture),
+        "fit": schema_of(map_schema.Fit, mixture=mixture),
         "map": map_schema.Map,
         "localize": map_schema.Localize,
         "occupancy": schema_of(map_schema.Occupancy, evaluation=schema_of(Protocol)),
         "export": map_schema.Export,
         "view": map_schema.View,
-        "ros": schema_of(ros_schema.Ros, sensor=_sensor_schema()),
+        "ros": schema_of(robot_schema.Ros, sensor=_sensor_schema()),
         "explore": exploration_schema.Explore,
         "robot": robot_schema.Robot,
     }

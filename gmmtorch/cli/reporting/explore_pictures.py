@@ -4,21 +4,40 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import torch
 from omegaconf import DictConfig
+from torch import Tensor
 
 from gmmtorch.cli import common
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from gmmtorch.exploration.mission.mission import Mission
-    from gmmtorch.exploration.mission.results import Snapshot
-    from gmmtorch.exploration.world.world import World
-    from gmmtorch.mapping.components import Components
-    from gmmtorch.report.exploration.mission_maps import TeamSnapshot
-    from gmmtorch.report.maps.map_images import MapImage
+from gmmtorch.cli.reporting.map_outputs import surfaces_of
+from gmmtorch.exploration.mission.mission import Mission
+from gmmtorch.exploration.mission.options import THESIS
+from gmmtorch.exploration.mission.results import NETWORK, Snapshot, Snapshots, differing, variant_of
+from gmmtorch.exploration.mission.trials import TRAJECTORIES, save_trajectories
+from gmmtorch.exploration.world.world import World
+from gmmtorch.files import write_bytes
+from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.report.exploration.mission_bars import (
+    deviations_figure,
+    profile_figure,
+    summary_bars,
+)
+from gmmtorch.report.exploration.mission_curves import (
+    bandwidth_figure,
+    entropy_figure,
+    planner_comparison_figure,
+)
+from gmmtorch.report.exploration.mission_maps import TeamSnapshot, team_map_figure, trajectories_figure
+from gmmtorch.report.exploration.mission_summary import study_summary, write_exploration_board
+from gmmtorch.report.exploration.network_figures import loss_figure
+from gmmtorch.report.maps.map_images import MapImage, highest_occupancy
+from gmmtorch.report.scenes.ellipsoids import first_viewpoints
+from gmmtorch.report.scenes.scene import mixture_scene_figure
+from gmmtorch.report.tensorboard_writer import Board
 
 _HALF_BAND = 0.6  # metres above and below the first robot's start that maps from above show
 
@@ -33,9 +52,6 @@ class MissionRecorder:
     """
 
     def __init__(self, config: DictConfig, folder: Path, world: World) -> None:
-        from gmmtorch.exploration.mission.results import Snapshots
-        from gmmtorch.report.tensorboard_writer import Board
-
         self._config, self._folder, self._world = config, folder, world
         self._board = Board(folder / "tensorboard") if config.report.tensorboard else None
         self._components: Components | None = None  # at the mission's end
@@ -59,16 +75,13 @@ class MissionRecorder:
 
         The mixture is that of the mission's end, as in the row; robots may have exchanged more since then.
         """
-        import torch
-
-        from gmmtorch.exploration.mission.trials import TRAJECTORIES, save_trajectories
-
         paths = [torch.stack(path) for path in mission.trajectories]
 
         save_trajectories(mission, self._folder / TRAJECTORIES)
         components = self._components
         if components is not None and len(components):
-            _save_mixture(components, self._world.resolution, self._folder / "map.safetensors")
+            made = GaussianMap.of(components, resolution=self._world.resolution, codec="quantized")
+            made.save(self._folder / "map.safetensors")
         figures = self._figures(mission, row, paths, components)
         common.save_figures(self._config, figures, self._folder)
         if self._board is not None:
@@ -123,8 +136,6 @@ class MissionRecorder:
 
     def _snapshot(self, mission: Mission, snapshot: Snapshot, paths: list[Tensor]) -> TeamSnapshot:
         """A snapshot for the picture of the team's map, with the components in the band of heights."""
-        from gmmtorch.report.exploration.mission_maps import TeamSnapshot
-
         shown: dict[str, Any] = {}
         if "means" in snapshot.content:
             low, high = _band(mission)
@@ -142,12 +153,6 @@ class MissionRecorder:
     def _figures(
         self, mission: Mission, row: dict[str, Any], paths: list[Tensor], components: Components | None
     ) -> dict[str, Any]:
-        from gmmtorch.report.exploration.mission_bars import profile_figure, stage_means
-        from gmmtorch.report.exploration.mission_curves import bandwidth_figure, entropy_figure
-        from gmmtorch.report.exploration.mission_maps import team_map_figure, trajectories_figure
-        from gmmtorch.report.scenes.ellipsoids import first_viewpoints
-        from gmmtorch.report.scenes.scene import mixture_scene_figure
-
         if not (self._config.report.figures or self._config.report.tensorboard):
             return {}
         figures = {
@@ -157,7 +162,7 @@ class MissionRecorder:
                 [self._snapshot(mission, snapshot, paths) for snapshot in self.snapshots.chosen()],
                 belief=mission.score.union.rule,
             ),
-            "profile": profile_figure(*stage_means([row])),
+            "profile": profile_figure([row]),
         }
         if row["bytes_sent"]:
             figures["bandwidth"] = bandwidth_figure([row], draco_error=mission.options.frame.noise)
@@ -178,44 +183,27 @@ def save_comparison(config: DictConfig, rows: list[dict[str, Any]], folder: Path
     If teams ran on several networks, one picture compares these, and all others show the first network. If
     they learned in several ways, one picture compares these, and all others show the first way.
     """
-    from gmmtorch.exploration.mission.options import THESIS
-    from gmmtorch.exploration.mission.results import NETWORK, differing
-    from gmmtorch.files import write_bytes
-    from gmmtorch.report.exploration.mission_bars import (
-        deviations_figure,
-        profile_figure,
-        stage_means,
-        summary_bars,
-    )
-    from gmmtorch.report.exploration.mission_curves import (
-        bandwidth_figure,
-        entropy_figure,
-        planner_comparison_figure,
-    )
-    from gmmtorch.report.exploration.mission_summary import study_summary, write_exploration_board
-    from gmmtorch.report.exploration.network_figures import loss_figure
-    from gmmtorch.report.tensorboard_writer import Board
-
     write_bytes(folder / "summary.md", study_summary(rows).encode())
     on_first, on_several = _by_first(rows, NETWORK)
     shown, _ = _by_first(on_first, THESIS)
-    figures: dict[str, Any] = {"profile": profile_figure(*stage_means(shown))}
-    if on_several:
-        figures["loss"] = loss_figure(on_several)
-    if len(shown) < len(on_first):
-        figures["deviations"] = deviations_figure(on_first)
-    if len({row["framework"] for row in rows}) > 1:
-        figures |= {
-            "entropy": entropy_figure(shown),
-            "bandwidth": bandwidth_figure(shown),
-            "summary": summary_bars(shown),
-        }
-    elif len(shown) == len(rows) or differing(on_first, without=[*NETWORK, *THESIS]):
-        figures["planners"] = planner_comparison_figure(on_first)
-    common.save_figures(config, figures, folder)
-    if config.report.tensorboard:
-        with Board(folder / "tensorboard") as board:
-            write_exploration_board(board, rows, figures)
+
+    def figures() -> dict[str, Any]:
+        found: dict[str, Any] = {"profile": profile_figure(shown)}
+        if on_several:
+            found["loss"] = loss_figure(on_several)
+        if len(shown) < len(on_first):
+            found["deviations"] = deviations_figure(on_first)
+        if len({row["framework"] for row in rows}) > 1:
+            found |= {
+                "entropy": entropy_figure(shown),
+                "bandwidth": bandwidth_figure(shown),
+                "summary": summary_bars(shown),
+            }
+        elif len(shown) == len(rows) or differing(on_first, without=[*NETWORK, *THESIS]):
+            found["planners"] = planner_comparison_figure(on_first)
+        return found
+
+    common.show(config, folder, figures, lambda board: write_exploration_board(board, rows))
 
 
 def _by_first(
@@ -223,8 +211,6 @@ def _by_first(
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """The rows of each framework with the first values of `fields`; and all rows of the frameworks that have
     several."""
-    from gmmtorch.exploration.mission.results import variant_of
-
     values: dict[str, dict[Any, None]] = {}  # as an ordered set
     for row in rows:
         values.setdefault(row["framework"], {})[variant_of(row, tuple(fields))] = None
@@ -234,16 +220,8 @@ def _by_first(
 
 def _surfaces(components: Components | None) -> Components | None:
     """The components of surfaces; None if there are none."""
-    if components is None or not bool((~components.max_range).any()):
-        return None
-    return components.selected((~components.max_range).nonzero().squeeze(1))
-
-
-def _save_mixture(components: Components, resolution: float, path: Path) -> None:
-    """Saves the mixture as a map that the other commands read."""
-    from gmmtorch.mapping.gaussian_map import GaussianMap
-
-    GaussianMap.of(components, resolution=resolution, codec="quantized").save(path)
+    found = None if components is None else surfaces_of(components)
+    return found if found is not None and len(found) else None
 
 
 def _band(mission: Mission) -> tuple[float, float]:
@@ -260,8 +238,6 @@ def _layers(mission: Mission) -> tuple[int, int]:
 
 
 def _view(mission: Mission, probability: Any) -> MapImage:
-    from gmmtorch.report.maps.map_images import highest_occupancy
-
     low = mission.world.box.low.clone()
     low[2] += _layers(mission)[0]
     return highest_occupancy(probability, low.double() * mission.world.resolution, mission.world.resolution)
@@ -269,8 +245,6 @@ def _view(mission: Mission, probability: Any) -> MapImage:
 
 def _team_view(mission: Mission) -> MapImage:
     """The team's map from above, in the band of heights."""
-    from gmmtorch.occupancy.voxels.boxes import Box
-
     box, (first, last) = mission.world.box, _layers(mission)
     low, high = box.low.clone(), box.high.clone()
     low[2], high[2] = box.low[2] + first, box.low[2] + last
@@ -288,8 +262,6 @@ def _world_view(mission: Mission) -> MapImage:
 
 def _coverage(mission: Mission) -> Any:
     """The number of robots that saw each column (nx, ny) in the band."""
-    import torch
-
     first, last = _layers(mission)
     seen = mission.score.seen_by.cpu().view(mission.world.box.shape)[:, :, first:last]
     bits = torch.zeros(seen.shape[:2], dtype=torch.int64)

@@ -1,25 +1,32 @@
-"""The files of gmmtorch-localize: trajectories, scores, a picture and TensorBoard."""
+"""The poses that gmmtorch-localize is given, and its files: trajectories, scores, a picture, TensorBoard."""
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
-from omegaconf import DictConfig
+import numpy as np
+import torch
+from omegaconf import DictConfig, ListConfig
+from torch import Tensor
 
 from gmmtorch.cli import common
 from gmmtorch.cli.reporting import map_outputs
+from gmmtorch.datasets import Dataset
+from gmmtorch.datasets.recordings.trajectory import in_plane, pose_matrix, read_trajectory, to_nanoseconds
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.evaluation.events import Row
+from gmmtorch.evaluation.trajectories import UNSCORED, absolute_trajectory_error, relative_pose_error
+from gmmtorch.export.trajectory_files import write_pose_table, write_tum
+from gmmtorch.localization.scan_locations import ScanLocation, clock_faults, scan_times
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.report.maps.map_figures import map_figure
+from gmmtorch.report.tensorboard_writer import Board
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from gmmtorch.datasets import Dataset
-    from gmmtorch.evaluation.events import Row
-    from gmmtorch.localization.scan_locations import ScanLocation
-    from gmmtorch.mapping.gaussian_map import GaussianMap
-
+_FORMS = {2: "[x,y,yaw]", 3: "[x,y,z,yaw] or [x,y,z,qx,qy,qz,qw]"}
 FOUND, ALL = "trajectory.tum", "trajectory.csv"
 _SHOWN = 3  # reasons of lost scans that are printed
 
@@ -31,14 +38,35 @@ class Truth(NamedTuple):
     known: Tensor
 
 
+def first_pose(config: DictConfig, dataset: Dataset, dim: int) -> Tensor | None:
+    """The first pose (D+1, D+1), map ← sensor, of the option `pose`; None: unknown."""
+    given = config.pose
+    if given is None or given == "dataset":
+        known = None if given is None else dataset.pose(0)
+        if given is not None and known is None:
+            raise InvalidArgumentError(
+                f"pose=dataset, but {dataset.name} has no poses; give pose={_FORMS[dim]}."
+            )
+        return known
+    numbers = list(given) if isinstance(given, ListConfig) else []
+    try:
+        values = np.array([float(value) for value in numbers])
+        if len(values) not in {2: (3,), 3: (4, 7)}[dim]:
+            raise ValueError
+        position = np.zeros(3)
+        position[:dim] = values[:dim]
+        yaw = values[dim]
+        spin = values[3:] if len(values) == 7 else np.array([0, 0, math.sin(yaw / 2), math.cos(yaw / 2)])
+        matrix = pose_matrix(position, spin)
+    except (TypeError, ValueError) as error:
+        raise InvalidArgumentError(
+            f"pose={given} is not a pose in a {dim}D map; give {_FORMS[dim]} (m, rad), dataset or null."
+        ) from error
+    return torch.from_numpy(matrix if dim == 3 else in_plane(matrix[None])[0])
+
+
 def true_poses(config: DictConfig, dataset: Dataset, dim: int) -> Truth | None:
     """The poses of the option `truth`. Raises `InvalidArgumentError` if no scan has one."""
-    import torch
-
-    from gmmtorch.datasets.recordings.trajectory import in_plane, read_trajectory, to_nanoseconds
-    from gmmtorch.errors import InvalidArgumentError
-    from gmmtorch.localization.scan_locations import scan_times
-
     if config.truth in (None, "none"):
         return None
     if config.truth == "dataset":
@@ -67,10 +95,6 @@ def result_row(
     config: DictConfig, dataset: Dataset, located: Sequence[ScanLocation], truth: Truth | None
 ) -> Row:
     """The row of results.json. `messages`: what the user must know, one sentence each."""
-    import torch
-
-    from gmmtorch.localization.scan_locations import clock_faults, scan_times
-
     found = [scan for scan in located if scan.location.found]
     dim = located[0].location.pose.shape[0] - 1 if located else 3
     deviations = [float(s.location.covariance[:dim, :dim].trace().sqrt()) for s in found]
@@ -95,13 +119,7 @@ def result_row(
 
 def _scores(config: DictConfig, found: Sequence[ScanLocation], truth: Truth | None) -> dict[str, Any]:
     """ATE and RPE of the found scans whose true pose is known; None where they cannot be computed."""
-    import torch
-
-    from gmmtorch.errors import InvalidArgumentError
-    from gmmtorch.evaluation.trajectories import absolute_trajectory_error, relative_pose_error
-
-    names = [f"{kind}{part}" for kind in ("ate", "rpe") for part in ("", "_median", "_max", "_degrees")]
-    scores: dict[str, Any] = dict.fromkeys(names)
+    scores: dict[str, Any] = dict(UNSCORED)
     used = [scan for scan in found if truth is not None and bool(truth.known[scan.number])]
     scores["n_scored"] = len(used)
     if truth is None or not used:
@@ -159,10 +177,6 @@ def write(
     folder: Path,
 ) -> None:
     """Write both trajectories, the picture and TensorBoard's events."""
-    import torch
-
-    from gmmtorch.export.trajectory_files import write_pose_table, write_tum
-
     found = [scan for scan in located if scan.location.found]
     blank = torch.zeros(0, (built.dim or 3) + 1, (built.dim or 3) + 1)
     poses = torch.stack([scan.location.pose for scan in found]) if found else blank
@@ -181,48 +195,32 @@ def write(
             torch.stack([scan.location.covariance for scan in located]),
             columns,
         )
-    if config.report.figures or config.report.tensorboard:
-        _draw(config, built, located, truth, row, folder)
+
+    def write_board(board: Board) -> None:
+        for scan in located:
+            board.scalars(_scalars(scan, truth), "localize", step=scan.number)
+        board.hparams(common.chosen_options(config), {"found": row["n_found"] / max(row["n_scans"], 1)})
+
+    common.show(config, folder, lambda: {"path": _figure(built, located, truth, row)}, write_board)
 
 
-def _draw(
-    config: DictConfig,
-    built: GaussianMap,
-    located: Sequence[ScanLocation],
-    truth: Truth | None,
-    row: Row,
-    folder: Path,
-) -> None:
-    from gmmtorch.report.maps.map_figures import map_figure
-
+def _figure(built: GaussianMap, located: Sequence[ScanLocation], truth: Truth | None, row: Row) -> Any:
+    """The map with the path of the scans that were found, the true path, and places of lost scans."""
     path, lost, true = _positions(located, truth)
     shown = [positions for positions in (path, true) if positions is not None and len(positions)]
     title = f"{row['dataset']}: {row['n_found']:,} of {row['n_scans']:,} scans found"
     title += f", ATE {row['ate']:.3f} m" if row["ate"] is not None else ""
-    figure = map_figure(
+    return map_figure(
         [map_outputs.map_panel(built, shown or [built.components().means[:0].double()])],
         [path] if len(path) else [],
         truth=true,
         lost=lost if len(lost) else None,
         title=title,
-        occupied_above=map_outputs.OCCUPIED_ABOVE,
     )
-    common.save_figures(config, {"path": figure}, folder)
-    if not config.report.tensorboard:
-        return
-    from gmmtorch.report.tensorboard_writer import Board
-
-    with Board(folder / "tensorboard") as board:
-        for scan in located:
-            board.scalars(_scalars(scan, truth), "localize", step=scan.number)
-        board.figure("path", figure)
-        board.hparams(common.chosen_options(config), {"found": row["n_found"] / max(row["n_scans"], 1)})
 
 
 def _scalars(scan: ScanLocation, truth: Truth | None) -> dict[str, float]:
     """Numbers of a scan for TensorBoard."""
-    from gmmtorch.evaluation.trajectories import absolute_trajectory_error
-
     location, dim = scan.location, scan.location.pose.shape[0] - 1
     numbers = {
         "found": float(location.found),
@@ -239,8 +237,6 @@ def _scalars(scan: ScanLocation, truth: Truth | None) -> dict[str, float]:
 def _positions(located: Sequence[ScanLocation], truth: Truth | None) -> tuple[Tensor, Tensor, Tensor | None]:
     """Positions (S, D) of the found scans, of the lost ones, and the true ones. A lost scan is shown at its
     true position, or without one at the last that was found."""
-    import torch
-
     dim = located[0].location.pose.shape[0] - 1 if located else 3
     path, lost = [], []
     for scan in located:

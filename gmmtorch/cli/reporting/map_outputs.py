@@ -3,26 +3,36 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import torch
 from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
 
-from gmmtorch.cli import common, export
+import gmmtorch
+from gmmtorch.cli import common
 from gmmtorch.cli.options import map_schema
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from gmmtorch.datasets import Dataset
-    from gmmtorch.evaluation.events import Event, Row
-    from gmmtorch.live.live_moments import BuildMoments
-    from gmmtorch.localization.odometry.odometry import Trajectory
-    from gmmtorch.mapping.components import Components
-    from gmmtorch.mapping.gaussian_map import GaussianMap
-    from gmmtorch.mapping.map_builder import MapBuilder
-    from gmmtorch.report.maps.map_images import MapPanel
+from gmmtorch.cli.reporting import exported_files
+from gmmtorch.datasets import Dataset
+from gmmtorch.datasets.recordings.trajectory import read_trajectory
+from gmmtorch.errors import GmmTorchError, InvalidArgumentError, MissingDataError, check_number
+from gmmtorch.evaluation.events import Event, Row
+from gmmtorch.export import trajectory_files
+from gmmtorch.localization.odometry.odometry import Trajectory
+from gmmtorch.localization.scan_locations import scan_times
+from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping.map_builder import MapBuilder
+from gmmtorch.report.maps.map_figures import map_figure
+from gmmtorch.report.maps.map_images import MapPanel
+from gmmtorch.report.maps.map_regions import robust_bounds
+from gmmtorch.report.scenes.ellipsoids import first_viewpoints
+from gmmtorch.report.scenes.mixture_figures import mixture_figure
+from gmmtorch.report.scenes.scene import mixture_scene_figure
+from gmmtorch.report.table import byte_text
+from gmmtorch.report.tensorboard_writer import Board
 
 EXPORTS = {
     "map_server": ("map_server", "navigation.yaml"),
@@ -35,20 +45,68 @@ EXPORTS = {
 
 _MESH_CELLS = 0.5  # sides of a mesh's cells, relative to the resolution of the map
 _MOST_CELLS = 1600  # along a side of a picture
-OCCUPIED_ABOVE = 0.4
-"""Of pictures: grazing beams count more misses than hits in a surface cell, so ½ would hide thin surfaces."""
 _STANDING = 1.0  # m of a path, below which bytes a metre say nothing
 
 
 def check_exports(config: DictConfig) -> None:
     """Raises `InvalidArgumentError` for an unknown export."""
-    from gmmtorch.errors import InvalidArgumentError
-
     for name in config.export:
         if name not in EXPORTS:
             raise InvalidArgumentError(
                 f"export={list(config.export)}: {name!r} is not one of {', '.join(EXPORTS)}."
             )
+
+
+def run_facts(config: DictConfig, source: str) -> dict[str, Any]:
+    """What the map of a run depends on; source: the group of options of its scans."""
+    return {
+        "version": gmmtorch.__version__,
+        source: common.as_options(config[source]),
+        "map": common.as_options(config.map),
+        "seed": config.seed,
+        "dtype": config.runtime.dtype,
+    }
+
+
+class Checkpoint:
+    """The file in a run directory from which a run that was stopped or killed goes on.
+
+    If the file exists, the map continues from it. Raises `InvalidArgumentError` if it is of another run.
+
+    Args:
+        source: see `run_facts`.
+        clock: the time (s) by which `checkpoint_seconds` pass.
+
+    Attributes:
+        is_continued: whether the file existed.
+    """
+
+    def __init__(
+        self, config: DictConfig, builder: MapBuilder, source: str, clock: Callable[[], float]
+    ) -> None:
+        check_number("checkpoint_seconds", config.checkpoint_seconds)
+        self._builder, self._clock, self._period = builder, clock, config.checkpoint_seconds
+        self._facts = run_facts(config, source)
+        self._path = common.run_dir() / "checkpoint.safetensors"
+        self.is_continued = self._path.exists()
+        if self.is_continued:
+            builder.load(self._path, self._facts)
+            print(f"continues after scan {builder.record.n_read} of {self._path}", flush=True)
+        self._saved = clock()
+
+    def save_when_due(self) -> None:
+        """Writes the file if enough time has passed since the last one."""
+        if self._clock() - self._saved >= self._period:
+            self.save()
+
+    def save(self) -> None:
+        """Writes the file."""
+        self._builder.save(self._path, self._facts)
+        self._saved = self._clock()
+
+    def remove(self) -> None:
+        """Deletes the file of a finished run."""
+        self._path.unlink(missing_ok=True)
 
 
 TRAJECTORY, POSE_TABLE = "trajectory.tum", "trajectory.csv"
@@ -58,19 +116,12 @@ RECORDINGS = "recordings"
 
 def write_trajectory(builder: MapBuilder, folder: Path) -> Tensor:
     """Write the trajectory as TUM; returns the sensor positions (S, D)."""
-    from gmmtorch.export.trajectory_files import write_tum
-
-    write_tum(folder / TRAJECTORY, builder.times, builder.poses)
+    trajectory_files.write_tum(folder / TRAJECTORY, builder.times, builder.poses)
     return builder.poses[:, :-1, -1]
 
 
 def write_pose_table(dataset: Dataset, estimated: Trajectory, folder: Path) -> None:
     """Write the estimated poses of all scans with their covariances, if the method gives some."""
-    import torch
-
-    from gmmtorch.export import trajectory_files
-    from gmmtorch.localization.scan_locations import scan_times
-
     if bool(estimated.covariances.isnan().any()):
         return
     dim = estimated.poses.shape[1] - 1
@@ -90,34 +141,36 @@ def write_pose_table(dataset: Dataset, estimated: Trajectory, folder: Path) -> N
     )
 
 
-def trajectories(folder: Path, dim: int) -> list[Tensor]:
-    """The sensor positions (S, D) of each recording in a run directory."""
+def trajectories(run: Path, given: str | None, dim: int) -> list[Tensor]:
+    """The sensor positions (S, D) of each recording of a map: in the file `given`, or next to the map.
+
+    run: the run directory, or a file in it. Raises `MissingDataError` if the file `given` does not exist.
+    """
+    if given is not None:
+        file = Path(given).expanduser()
+        if not file.is_file():
+            raise MissingDataError(f"trajectory={file} does not exist; give a TUM or KITTI file, or null.")
+        return [positions(file, dim)]
+    folder = run if run.is_dir() else run.parent
     files = [folder / TRAJECTORY, *sorted(folder.glob(f"{RECORDINGS}/*/{TRAJECTORY}"))]
     return [positions(file, dim) for file in files if file.is_file()]
 
 
 def positions(trajectory: Path, dim: int) -> Tensor:
     """The sensor positions (S, D) of a trajectory file. Raises `DataError` if it is damaged."""
-    import torch
-
-    from gmmtorch.datasets.recordings.trajectory import read_trajectory
-
     return torch.from_numpy(read_trajectory(trajectory).matrices[:, :dim, 3])
 
 
-def moments_of(builder: MapBuilder) -> BuildMoments:
-    """What the live view shows of a map that is built."""
-    from gmmtorch.live.live_moments import BuildMoments
-
-    return BuildMoments(builder, lambda: builder.progress().nbytes)
+def print_skipped(skipped: Mapping[str, int]) -> None:
+    """Print the numbers of scans that were left out, by the reason."""
+    for reason, count in skipped.items():
+        print(f"skipped   {count} scans: {reason}")
 
 
 def write_exports(
     config: DictConfig, source: GaussianMap, folder: Path, on_event: Event
 ) -> tuple[list[str], list[str]]:
     """Write the exports that the options name; returns messages, and the errors of those that failed."""
-    from gmmtorch.errors import GmmTorchError
-
     messages, errors = [], []
     for name in config.export:
         form, file = EXPORTS[name]
@@ -131,12 +184,18 @@ def write_exports(
         }
         merged: Any = OmegaConf.merge(OmegaConf.structured(map_schema.Export), options)
         try:
-            written = export.write_space(merged, source, on_event)
+            written = exported_files.write_space(merged, source, on_event)
         except GmmTorchError as error:
             errors.append(f"{name}: {error}")
             continue
         messages.append("export    " + written.replace("\n", "\n          "))
     return messages, errors
+
+
+def check_exported(config: DictConfig, errors: Sequence[str]) -> None:
+    """Raises `GmmTorchError` if an export of the options has failed."""
+    if errors:
+        raise GmmTorchError(f"not all of export={list(config.export)} was written: {' '.join(errors)}")
 
 
 def result_row(name: str, builder: MapBuilder, config: DictConfig, odometry: Row | None = None) -> Row:
@@ -175,36 +234,21 @@ def draw(
 
     trajectories: sensor positions (S, D) of each recording. row: of results.json.
     """
-    if not (config.report.figures or config.report.tensorboard):
-        return
-    figures = _figures(built, trajectories, row)
-    common.save_figures(config, figures, folder)
-    if not config.report.tensorboard:
-        return
-    from gmmtorch.report.tensorboard_writer import Board
 
-    components = built.components()
-    with Board(folder / "tensorboard") as board:
+    def write(board: Board) -> None:
         for entry in row.get("history", ()):
             board.scalars(entry, "map", step=entry["n_read"])
-        for name, figure in figures.items():
-            board.figure(name, figure)
-        surface = ~components.max_range
-        board.ellipsoids("components", components.means[surface], components.covariances[surface])
+        surfaces = surfaces_of(built.components())
+        board.ellipsoids("components", surfaces.means, surfaces.covariances)
         board.paths("trajectory", trajectories)
-        board.hparams(
-            common.chosen_options(config), {f"{key}": row[key] for key in ("n_components", "nbytes")}
-        )
+        board.hparams(common.chosen_options(config), {key: row[key] for key in ("n_components", "nbytes")})
+
+    common.show(config, folder, lambda: _figures(built, trajectories, row), write)
 
 
 def map_panel(built: GaussianMap, trajectories: Sequence[Tensor]) -> MapPanel:
     """The region of a map around its surfaces and the sensor positions (S, D), for pictures."""
-    import torch
-
-    from gmmtorch.report.maps.map_images import MapPanel
-    from gmmtorch.report.maps.map_regions import robust_bounds
-
-    low, high = robust_bounds(_surfaces(built).means.cpu(), torch.cat(list(trajectories)))
+    low, high = robust_bounds(_shown(built).means.cpu(), torch.cat(list(trajectories)))
     side = max(b - a for a, b in zip(low[:2], high[:2], strict=True))
     resolution = built.resolution * max(1, math.ceil(side / (_MOST_CELLS * built.resolution)))
 
@@ -214,26 +258,25 @@ def map_panel(built: GaussianMap, trajectories: Sequence[Tensor]) -> MapPanel:
     return MapPanel("occupancy", answer, resolution, low, high)
 
 
-def _surfaces(built: GaussianMap) -> Components:
-    """The surface components; all components if there are none."""
+def surfaces_of(components: Components) -> Components:
+    """The components of surfaces, without those of free space."""
+    return components.selected((~components.max_range).nonzero().squeeze(1))
+
+
+def _shown(built: GaussianMap) -> Components:
+    """The components of surfaces; all components if there are none."""
     components = built.components()
-    surfaces = components.selected((~components.max_range).nonzero().squeeze(1))
+    surfaces = surfaces_of(components)
     return surfaces if len(surfaces) else components
 
 
 def _figures(built: GaussianMap, trajectories: Sequence[Tensor], row: Row) -> dict[str, Any]:
     """The map from above, and its components: in 3D in space."""
-    from gmmtorch.report.maps.map_figures import map_figure
-    from gmmtorch.report.scenes.ellipsoids import first_viewpoints
-    from gmmtorch.report.scenes.mixture_figures import mixture_figure
-    from gmmtorch.report.scenes.scene import mixture_scene_figure
-    from gmmtorch.report.table import byte_text
-
-    surfaces = _surfaces(built)
+    surfaces = _shown(built)
     title = f"{row['dataset']}: {row['n_components']:,} components, {byte_text(row['nbytes'])}"
     title += f", {row['metres']:,.0f} m travelled" if row["metres"] >= _STANDING else ""
     panel = map_panel(built, trajectories)
-    figures = {"above": map_figure([panel], trajectories, title=title, occupied_above=OCCUPIED_ABOVE)}
+    figures = {"above": map_figure([panel], trajectories, title=title)}
     shown = surfaces.means.cpu(), surfaces.covariances.cpu()
     if surfaces.dim == 3:
         seen_from = first_viewpoints(surfaces).cpu()

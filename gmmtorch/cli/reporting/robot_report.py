@@ -1,11 +1,13 @@
-"""How a robot's process shows its robot: a status line, scalars in TensorBoard, and curves for its row."""
+"""What the process of a robot shows: a status line and scalars; and how it writes files to a failing disk."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Protocol
@@ -13,10 +15,10 @@ from typing import TYPE_CHECKING, Any, Protocol
 from omegaconf import DictConfig
 
 from gmmtorch.cli import common
+from gmmtorch.errors import OutputError
 
 if TYPE_CHECKING:
     from gmmtorch.exploration.mission.robot_view import RobotView
-
 
 _PERIOD = 1.0
 """Seconds of the robot's time between two updates of the displays."""
@@ -190,3 +192,57 @@ def print_refusals(rows: Sequence[dict[str, Any]]) -> None:
             reasons = ", ".join(f"{n:,} {reason}" for reason, n in counts.items())
             remedy = _COMPARE_KEYS if "wrong_key" in counts else ""
             print(f"robot {row['robot']} refused {sum(counts.values()):,} frames: {reasons}{remedy}")
+
+
+# -- files ----------------------------------------------------------------------------------------
+
+
+class Outputs:
+    """Writes the files of a run's folder; a failed file does not prevent the next ones."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._missing: dict[str, list[str]] = {}
+        """Names of missing files by the reason."""
+
+    def written(self, name: str, write: Callable[[Path], object]) -> Path | None:
+        """Call `write` with the path of the file or folder `name`; returns the path, or None if it fails."""
+        path = self.folder / name
+        try:
+            write(path)
+        except OSError as error:
+            cause = error.__cause__ if isinstance(error.__cause__, OSError) else error
+            self._missing.setdefault(cause.strerror or str(cause), []).append(name)
+            return None
+        return path
+
+    def check(self) -> None:
+        """Raises `OutputError` with the names of the missing files and the reasons."""
+        if self._missing:
+            missing = "; ".join(f"{', '.join(names)} ({why})" for why, names in self._missing.items())
+            raise OutputError(
+                f"hydra.run.dir={self.folder} does not contain all results: {missing}. Free space there, or "
+                "give another folder."
+            )
+
+
+@contextmanager
+def terse() -> Iterator[None]:
+    """Suppresses Python's call stacks for a disk that fails; `Outputs` reports the failure in one line.
+
+    Python would print a call stack for each log record that cannot be written, and for TensorBoard's writer
+    thread.
+    """
+    raising, hook = logging.raiseExceptions, threading.excepthook
+
+    def report(ended: threading.ExceptHookArgs) -> None:
+        if not (
+            type(ended.thread).__module__.startswith("tensorboard.") and issubclass(ended.exc_type, OSError)
+        ):
+            hook(ended)
+
+    logging.raiseExceptions, threading.excepthook = False, report
+    try:
+        yield
+    finally:
+        logging.raiseExceptions, threading.excepthook = raising, hook

@@ -5,17 +5,20 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import torch
 from omegaconf import DictConfig, OmegaConf
 
 from gmmtorch.cli.from_options import links, maps, missions
-
-if TYPE_CHECKING:
-    from gmmtorch.exploration.robot.agent import Agent
-    from gmmtorch.live.live_moments import AgentMoments, ReplayMoments
-    from gmmtorch.live.live_view import LiveView
-    from gmmtorch.sharing.transport.frames import FramedTransport
+from gmmtorch.exploration.mission.driver import WallClock
+from gmmtorch.exploration.mission.replay import ReplayMission
+from gmmtorch.exploration.mission.team_setup import make_agent, start_poses
+from gmmtorch.exploration.robot.agent import Agent
+from gmmtorch.live.live_moments import RECEIVED, AgentMoments, ReplayMoments
+from gmmtorch.live.live_view import LiveView
+from gmmtorch.sharing.replica.replica import Replica
+from gmmtorch.sharing.transport.frames import FramedTransport
 
 
 def listener(
@@ -27,9 +30,6 @@ def listener(
     """
     if view is None:
         return lambda is_last: None
-    from gmmtorch.exploration.mission.driver import WallClock
-    from gmmtorch.live.live_moments import RECEIVED
-
     number = config.team.size
     own: Any = OmegaConf.merge(config, OmegaConf.from_dotlist(list(link)))
     transport = links.open_link(own, number)
@@ -58,11 +58,6 @@ def _of_world(
     config: DictConfig, number: int, transport: FramedTransport, traffic: _Traffic
 ) -> tuple[Callable[[float], object], AgentMoments]:
     """A listener that maps what it hears as the robots do."""
-    import torch
-
-    from gmmtorch.exploration.mission.team_setup import make_agent, start_poses
-    from gmmtorch.live.live_moments import AgentMoments
-
     options = missions.team_options(config, config.seed, {})
     world = missions.open_world(missions.world_options(config), options)
     agent: Agent = make_agent(number, start_poses(world, options)[0], world, options, transport)
@@ -80,10 +75,6 @@ def _of_log(
     config: DictConfig, number: int, transport: FramedTransport, traffic: _Traffic
 ) -> tuple[Callable[[float], object], ReplayMoments]:
     """A listener that holds the team's map."""
-    from gmmtorch.exploration.mission.replay import ReplayMission
-    from gmmtorch.live.live_moments import ReplayMoments
-    from gmmtorch.sharing.replica.replica import Replica
-
     make_map = maps.map_factory(missions.log_map_options(config))
     mission = ReplayMission(Replica(number), [], transport, make_map, announce_every=config.network.announce)
     return mission.exchange, ReplayMoments(mission, traffic)

@@ -2,32 +2,37 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping
+from typing import Any
 
 from omegaconf import DictConfig
 
 from gmmtorch.cli import common
-from gmmtorch.cli.from_options.fit_data import fit_data, fit_data_of, selected_scans
+from gmmtorch.cli.from_options.scans import fit_data, fit_data_of, fit_options, selected_scans
 from gmmtorch.cli.options.structured import build
+from gmmtorch.cli.reporting import fit_outputs
 from gmmtorch.cli.studies.study import Found, Study
+from gmmtorch.evaluation.events import Event, OnRows, Row
+from gmmtorch.evaluation.fits.fit_comparison import means
+from gmmtorch.evaluation.studies import component_count, initialization_study, sensor_noise
+from gmmtorch.evaluation.studies.study_options import (
+    ComponentCountStudy,
+    InitializationStudy,
+    SensorModelStudy,
+)
+from gmmtorch.report.studies.fit_study_figures import (
+    component_count_figures,
+    initialization_figures,
+    sensor_model_figures,
+)
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from typing import Any
-
-    from gmmtorch.evaluation.events import Event, OnRows, Row
-
-    Figures = Callable[[list[Row]], dict[str, Any]]
+Figures = Callable[[list[Row]], Mapping[str, Any]]
 
 
 def _initialization(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
-    from gmmtorch.evaluation.studies import initialization_study
-    from gmmtorch.evaluation.studies.study_options import InitializationStudy
-    from gmmtorch.report.studies.fit_study_figures import initialization_figures
-
     study = build(InitializationStudy, common.as_options(config.study), "study")
     data = fit_data(config, device, on_event)
-    rows = initialization_study.run(data, study, common.fit_options(config), config.seed, on_event, on_rows)
+    rows = initialization_study.run(data, study, fit_options(config), config.seed, on_event, on_rows)
     return _found(
         rows,
         initialization_figures,
@@ -38,10 +43,6 @@ def _initialization(config: DictConfig, device: str, on_event: Event, on_rows: O
 
 def _sensor_model(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
     """Fields of a fit that this study does not measure are None."""
-    from gmmtorch.evaluation.studies import sensor_noise
-    from gmmtorch.evaluation.studies.study_options import SensorModelStudy
-    from gmmtorch.report.studies.fit_study_figures import sensor_model_figures
-
     study = build(SensorModelStudy, common.as_options(config.study), "study")
     with common.naming({name: f"study.{name}" for name in ("sensor", "sensor_options")}):
         sensor_noise.sensor_model(study)  # an invalid option fails before the scans are read
@@ -65,14 +66,10 @@ def _sensor_model(config: DictConfig, device: str, on_event: Event, on_rows: OnR
 
 
 def _component_count(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
-    from gmmtorch.evaluation.studies import component_count
-    from gmmtorch.evaluation.studies.study_options import ComponentCountStudy
-    from gmmtorch.report.studies.fit_study_figures import component_count_figures
-
     study = build(ComponentCountStudy, common.as_options(config.study), "study")
     dataset, scans = selected_scans(config, device, on_event)
     data = fit_data_of(config, dataset, component_count.middle(scans, study.window))
-    options = common.fit_options(config)
+    options = fit_options(config)
     rows = component_count.run(data, scans, study, options, config.seed, on_event, on_rows)
     return _found(
         rows,
@@ -84,18 +81,16 @@ def _component_count(config: DictConfig, device: str, on_event: Event, on_rows: 
 
 def _found(rows: list[Row], figures: Figures, line: str, columns: str) -> Found:
     """The table shows means over the seeds for each value of the field `line` and number of components."""
-    from gmmtorch.evaluation.fits.fit_comparison import means
-
     table = means(rows, (line, "n_components"))
     return Found(
         rows,
-        lambda: figures(rows),
+        figures,
         f"{line} n_components n_seeds {columns}",
-        common.headline(rows),
+        fit_outputs.headline(rows),
         shown=table,
         line=line,
         step="n_components",
-        scores={"best_log_likelihood": max(common.log_likelihood(row) for row in table)},
+        scores={"best_log_likelihood": max(fit_outputs.log_likelihood(row) for row in table)},
     )
 
 

@@ -2,68 +2,67 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 from omegaconf import DictConfig
 
 from gmmtorch.cli import common
 from gmmtorch.cli.from_options import maps
+from gmmtorch.cli.from_options.scans import all_scans
 from gmmtorch.cli.options.structured import build
 from gmmtorch.cli.studies.study import Found, Study
-
-if TYPE_CHECKING:
-    from gmmtorch.evaluation.events import Event, OnRows
-    from gmmtorch.evaluation.protocol_options import Protocol
-
-
-def protocol_of(config: DictConfig) -> Protocol:
-    """The held-out test from `evaluation.*`."""
-    from gmmtorch.evaluation.protocol_options import Protocol
-
-    return build(Protocol, common.as_options(config.evaluation), "evaluation")
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.evaluation.events import Event, OnRows, Row
+from gmmtorch.evaluation.methods import Form, baseline, choose
+from gmmtorch.evaluation.studies import (
+    approximation_error,
+    auc_memory,
+    map_variants,
+    pose_correction,
+    variance_threshold,
+)
+from gmmtorch.evaluation.studies.auc_memory import Sized
+from gmmtorch.evaluation.studies.railing import BOUNDS, Railing
+from gmmtorch.evaluation.studies.study_options import (
+    ApproximationErrorStudy,
+    AucMemoryStudy,
+    MapVariantsStudy,
+    PoseCorrectionStudy,
+    VarianceThresholdStudy,
+)
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping.query_options import METHODS
+from gmmtorch.report.studies import approximation_error_figures
+from gmmtorch.report.studies import map_study_figures as report
 
 
 def _auc_memory(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
     """Our map and the BGK map at each of their sizes, and `study.others` at their only size."""
-    from gmmtorch.evaluation import methods
-    from gmmtorch.evaluation.studies import auc_memory
-    from gmmtorch.evaluation.studies.auc_memory import Sized
-    from gmmtorch.evaluation.studies.study_options import AucMemoryStudy
-    from gmmtorch.report.studies.map_study_figures import auc_memory_figures
-
-    protocol = protocol_of(config)
+    protocol = maps.protocol_of(config)
     study = build(AucMemoryStudy, common.as_options(config.study), "study")
     sized = [
-        Sized(form, n, methods.Form(maps.map_factory(config, n_components=n), form))
+        Sized(form, n, Form(maps.map_factory(config, n_components=n), form))
         for form in study.forms
         for n in study.n_components
     ]
     limits = maps.limits(config)
-    sized += [
-        Sized("bgk_points", n, methods.baseline("bgk_points", limits, max_points=n)) for n in study.bgk_points
-    ]
+    sized += [Sized("bgk_points", n, baseline("bgk_points", limits, max_points=n)) for n in study.bgk_points]
     if study.others:
-        others = methods.choose(study.others, maps.known_methods(config))
+        others = choose(study.others, maps.known_methods(config))
         sized += [Sized(name, None, factory) for name, factory in others.items()]
     for one in sized:
         maps.check_factories({one.method: one.factory}, protocol.resolution[0])
-    name, scans = common.all_scans(config, device, on_event)
+    name, scans = all_scans(config, device, on_event)
     rows = auc_memory.run(name, scans, sized, protocol, config.seed, on_event, on_rows)
     table = "method size resolution auc auc_low auc_high brier nbytes build_seconds query_seconds"
-    return Found(rows, lambda: auc_memory_figures(rows), table, f"{name}: {len(scans)} scans")
+    return Found(rows, report.auc_memory_figures, table, f"{name}: {len(scans)} scans")
 
 
 def _variance_threshold(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
     """Thin structures with several forms, sizes, cells, priors, hit lengths and thresholds."""
-    from gmmtorch.evaluation.studies import variance_threshold
-    from gmmtorch.evaluation.studies.railing import BOUNDS, Railing
-    from gmmtorch.evaluation.studies.study_options import VarianceThresholdStudy
-    from gmmtorch.mapping.gaussian_map import GaussianMap
-    from gmmtorch.report.studies import map_study_figures as report
-
     study = build(VarianceThresholdStudy, common.as_options(config.study), "study")
     if study.railing is None:
-        (name, scans), is_thin = common.all_scans(config, device, on_event), None
+        (name, scans), is_thin = all_scans(config, device, on_event), None
     else:
         railing = Railing(study.railing)
         name, scans, is_thin = "railing", railing.scans(study.railing_scans, config.seed), railing.holds
@@ -73,8 +72,8 @@ def _variance_threshold(config: DictConfig, device: str, on_event: Event, on_row
 
     found = variance_threshold.run(name, scans, new_map, study, config.seed, on_event, on_rows, is_thin)
 
-    def figures() -> dict[str, object]:
-        drawn: dict[str, object] = dict(report.variance_threshold_figures(found.rows))
+    def figures(rows: list[Row]) -> dict[str, Any]:
+        drawn: dict[str, Any] = dict(report.variance_threshold_figures(rows))
         cells = variance_threshold.cells_by_setting(found, study)
         if found.hits.shape[1] == 3 and cells:
             thin = found.thin if len(found.thin) else found.hits
@@ -96,46 +95,35 @@ def _variance_threshold(config: DictConfig, device: str, on_event: Event, on_row
 
 def _approximation_error(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
     """Every form of evidence against the exact angular form; needs no data set."""
-    from gmmtorch.evaluation.studies import approximation_error
-    from gmmtorch.evaluation.studies.study_options import ApproximationErrorStudy
-    from gmmtorch.report.studies import approximation_error_figures as report
-
     study = build(ApproximationErrorStudy, common.as_options(config.study), "study")
     rows = approximation_error.run(study, config.seed, on_event, on_rows)
     swept = [row for row in rows if row["study"] == "sweep"]
     table = "method dim hits_max hits_p99 hits_median misses_max misses_p99 misses_median probability_max"
     return Found(
-        rows, lambda: report.figures(rows), table, "errors per ray of random single components", swept
+        rows,
+        approximation_error_figures.figures,
+        table,
+        "errors per ray of random single components",
+        swept,
     )
 
 
 def _pose_correction(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
     """Maps from perturbed poses, before and after the correction of the poses."""
-    from gmmtorch.evaluation.studies import pose_correction
-    from gmmtorch.evaluation.studies.study_options import PoseCorrectionStudy
-    from gmmtorch.report.studies.map_study_figures import pose_correction_figures
-
-    protocol = protocol_of(config)
+    protocol = maps.protocol_of(config)
     study = build(PoseCorrectionStudy, common.as_options(config.study), "study")
     new_map = maps.map_factory(config)
-    name, scans = common.all_scans(config, device, on_event)
+    name, scans = all_scans(config, device, on_event)
     rows = pose_correction.evaluate_correction(
         name, scans, new_map, protocol, study.methods, config.seed, on_event, on_rows
     )
     table = "method resolution auc auc_corrected auc_clean n_components nbytes"
-    return Found(rows, lambda: pose_correction_figures(rows), table, f"{name}: {len(scans)} scans")
+    return Found(rows, report.pose_correction_figures, table, f"{name}: {len(scans)} scans")
 
 
 def _map_variants(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
     """Maps with changed options, such as pruning."""
-    from gmmtorch.errors import InvalidArgumentError
-    from gmmtorch.evaluation.methods import Form
-    from gmmtorch.evaluation.studies import map_variants
-    from gmmtorch.evaluation.studies.study_options import MapVariantsStudy
-    from gmmtorch.mapping.query_options import METHODS
-    from gmmtorch.report.studies.map_study_figures import map_variants_figures
-
-    protocol = protocol_of(config)
+    protocol = maps.protocol_of(config)
     study = build(MapVariantsStudy, common.as_options(config.study), "study")
     form = next((method for method in config.method if method in METHODS), "point")
     variants = {}
@@ -145,14 +133,18 @@ def _map_variants(config: DictConfig, device: str, on_event: Event, on_rows: OnR
                 f"study.variants.{name}.{min(unknown)} is not an option of map={config.map.name}."
             )
         variants[name] = Form(maps.map_factory(config, **changes), form)
-    name, scans = common.all_scans(config, device, on_event)
+    name, scans = all_scans(config, device, on_event)
     rows = map_variants.run(name, scans, variants, protocol, config.seed, on_event, on_rows)
     table = (
         "variant resolution n_components n_free_components nbytes auc auc_gain auc_gain_low auc_gain_high "
         "held_out_log_likelihood build_seconds"
     )
     return Found(
-        rows, lambda: map_variants_figures(rows), table, f"{name}: {len(scans)} scans", line="variant"
+        rows,
+        report.map_variants_figures,
+        table,
+        f"{name}: {len(scans)} scans",
+        line="variant",
     )
 
 

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from omegaconf import DictConfig
 
 from gmmtorch.cli import common
-
-if TYPE_CHECKING:
-    from gmmtorch.evaluation.events import Event, OnRows, Row
+from gmmtorch.errors import check_choice
+from gmmtorch.evaluation.events import Event, OnRows, Row
+from gmmtorch.report.tensorboard_writer import Board
 
 
 class Found(NamedTuple):
@@ -24,7 +24,7 @@ class Found(NamedTuple):
 
     Attributes:
         rows: of results.json.
-        figures: returns the figures by file name.
+        figures: makes the figures of the rows, by file name.
         table: columns of the printed table. about: its title. shown: its rows; None: all rows.
         line: the field that names the curve of a row in TensorBoard.
         step: the field with the step of a row in TensorBoard; None: the row's index.
@@ -32,7 +32,7 @@ class Found(NamedTuple):
     """
 
     rows: list[Row]
-    figures: Callable[[], dict[str, Any]]
+    figures: Callable[[list[Row]], Mapping[str, Any]]
     table: str
     about: str
     shown: list[Row] | None = None
@@ -41,7 +41,7 @@ class Found(NamedTuple):
     scores: Mapping[str, float] = {}
 
 
-Study = Callable[[DictConfig, str, "Event", "OnRows"], Found]
+Study = Callable[[DictConfig, str, Event, OnRows], Found]
 """(config, device, on_event, on_rows) → the results."""
 
 
@@ -57,36 +57,23 @@ def run(
 
     Writes results.json after each row, then the figures as PNG and in TensorBoard, and prints the table.
     """
-    from gmmtorch.errors import check_choice
-
     check_choice("study.name", config.study.name, studies)
 
-    def write(rows: list[Row]) -> None:
+    def on_rows(rows: list[Row]) -> None:
         common.write_results(command, config, rows, folder)
 
-    found = studies[config.study.name](config, device, on_event, write)
-    write(found.rows)
+    found = studies[config.study.name](config, device, on_event, on_rows)
+    on_rows(found.rows)
     shown = found.rows if found.shown is None else found.shown
-    if config.report.figures or config.report.tensorboard:
-        figures = found.figures()
-        common.save_figures(config, figures, folder)
-        if config.report.tensorboard:
-            _write_board(config, found, shown, figures, folder / "tensorboard")
-    common.print_table(shown, found.table.split(), found.about)
-    return found.rows
 
-
-def _write_board(
-    config: DictConfig, found: Found, shown: list[Row], figures: dict[str, Any], folder: Path
-) -> None:
-    from gmmtorch.report.tensorboard_writer import Board
-
-    step = found.step
-    rows = shown if step is None else sorted(shown, key=lambda row: row[step])
-    with Board(folder) as board:
+    def write(board: Board) -> None:
+        step = found.step
+        rows = shown if step is None else sorted(shown, key=lambda row: row[step])
         for index, row in enumerate(rows):
             board.scalars(row, str(row[found.line]), step=index if step is None else int(row[step]))
-        for name, figure in figures.items():
-            board.figure(f"figures/{name}", figure)
         if found.scores:
             board.hparams(common.chosen_options(config), dict(found.scores))
+
+    common.show(config, folder, lambda: found.figures(found.rows), write)
+    common.print_table(shown, found.table.split(), found.about)
+    return found.rows

@@ -16,6 +16,7 @@ from gmmtorch.optional_packages import needs_extra
 
 MOST_BITS = 21
 """Bits of a cell index along an axis; three axes fit into 63 bits."""
+_LEVEL = 22  # the strongest of zstd
 _LARGEST_OUTPUT = 1 << 26  # bytes that zstd may decompress to
 
 
@@ -131,11 +132,11 @@ def ungrouped(data: bytes, n: int) -> Ints:
     return numbers
 
 
-def compressed(data: bytes, level: int) -> bytes:
+def compressed(data: bytes) -> bytes:
     """The bytes as a zstd frame without magic number, length and checksum."""
     zstd = library("zstandard")
     parameters = zstd.ZstdCompressionParameters.from_level(
-        level,
+        _LEVEL,
         source_size=len(data),
         format=zstd.FORMAT_ZSTD1_MAGICLESS,
         write_content_size=False,

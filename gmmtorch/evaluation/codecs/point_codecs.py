@@ -39,10 +39,8 @@ FARTHEST = 2.0**14
 """Largest coordinate (m) of `RawPoints`; beyond it the spacing of float32 exceeds a millimetre."""
 POINT_CODECS = ("raw", "quantized", "octree", "draco")
 """Names that `point_codec` accepts."""
-BEST_LEVEL = 22
-"""The strongest level of zstd."""
 _DRACO_BITS = 30
-_DRACO_LEVEL = 10
+_DRACO_LEVEL = 10  # the strongest
 _DEEPEST = (1 << 16) - 1
 
 
@@ -93,7 +91,6 @@ class QuantizedPoints:
     """
 
     resolution: float
-    level: int = BEST_LEVEL
     name: ClassVar[str] = "quantized"
 
     def __post_init__(self) -> None:
@@ -103,7 +100,7 @@ class QuantizedPoints:
         corner, codes, _ = morton_codes(points, self.resolution)
         codes = np.sort(codes)
         steps = codes - np.concatenate([np.zeros(1, np.int64), codes])[:-1]
-        return header(corner, len(codes)) + compressed(grouped(steps), self.level)
+        return header(corner, len(codes)) + compressed(grouped(steps))
 
     def decode(self, data: bytes) -> Tensor:
         corner, n, rest = read_header(data)
@@ -122,7 +119,6 @@ class Octree:
     """
 
     resolution: float
-    level: int = BEST_LEVEL
     name: ClassVar[str] = "octree"
 
     def __post_init__(self) -> None:
@@ -137,7 +133,7 @@ class Octree:
             levels.append(np.bitwise_or.reduceat(np.left_shift(1, nodes & 7), starts).astype(np.uint8))
             nodes = parents[starts]
         occupancy = b"".join(level.tobytes() for level in reversed(levels))
-        return header(corner, 1 + depth if len(codes) else 0) + compressed(occupancy, self.level)
+        return header(corner, 1 + depth if len(codes) else 0) + compressed(occupancy)
 
     def decode(self, data: bytes) -> Tensor:
         corner, levels, rest = read_header(data)
@@ -165,7 +161,6 @@ class Draco:
     """
 
     error: float
-    level: int = _DRACO_LEVEL
     name: ClassVar[str] = "draco"
 
     def __post_init__(self) -> None:
@@ -182,7 +177,7 @@ class Draco:
         encoded: bytes = library("DracoPy").encode(
             (rows - corner).astype(np.float32),  # the only type that Draco accepts
             quantization_bits=bits,
-            compression_level=self.level,
+            compression_level=_DRACO_LEVEL,
             quantization_range=step * ((1 << bits) - 1),
             quantization_origin=np.zeros(3),
         )
@@ -210,7 +205,6 @@ class DepthImage:
     Depths below half a step are lost.
     """
 
-    level: int = BEST_LEVEL
     step: float = 0.001
     name: ClassVar[str] = "depth_image"
 
@@ -236,7 +230,7 @@ class DepthImage:
         wrapped = (change + (1 << 15)) % (1 << 16) - (1 << 15)
         planes = zigzag(wrapped).astype(">u2").view(np.uint8).reshape(-1, 2).T
         body = np.packbits(present).tobytes() + planes.tobytes()
-        return header(np.array([*image.shape, 0]), 0) + compressed(body, self.level)
+        return header(np.array([*image.shape, 0]), 0) + compressed(body)
 
     def decode(self, data: bytes) -> Tensor:
         """Decode to depths (H, W), metres, float64. Raises `DataError` for invalid bytes."""

@@ -45,41 +45,8 @@ NO_LIKELIHOODS = frozenset({"variational", "sliced_wasserstein", "scikit_learn_b
 """Methods whose lower bound does not bound the mean log-likelihood, so it is not comparable with others."""
 
 
-def fit(
-    method: str,
-    points: Tensor,
-    options: FitOptions,
-    seed: int,
-    on_event: Event,
-    origins: Tensor | None = None,
-    **own: Any,
-) -> MixtureEstimator:
-    """Fit the estimator of that name to points (N, D).
-
-    Args:
-        options: an estimator takes the options that its constructor has.
-        origins: (S, D) sensor origins, for the estimators that take them.
-        own: options of this estimator only.
-
-    Raises `InvalidArgumentError` for an unknown method or option.
-    """
-    if method not in ESTIMATORS:
-        raise InvalidArgumentError(
-            f"method={method!r} is not known; known are {', '.join(sorted(ESTIMATORS))}."
-        )
-    if issubclass(ESTIMATORS[method], MixtureEstimator):
-        return _fit_ours(method, points, options, seed, on_event, origins, own)
-    return _fit_scikit_learn(method, points, options, seed, on_event, own)
-
-
 def _fit_ours(
-    method: str,
-    points: Tensor,
-    options: FitOptions,
-    seed: int,
-    on_event: Event,
-    origins: Tensor | None,
-    own: dict[str, Any],
+    method: str, data: FitData, options: FitOptions, seed: int, on_event: Event, own: Mapping[str, Any]
 ) -> MixtureEstimator:
     mixture: Any = ESTIMATORS[method](**_arguments(method, options, seed, own))
     on_event(method, 0, options.max_iter)
@@ -88,17 +55,17 @@ def _fit_ours(
         on_event(method, min(iteration, options.max_iter), options.max_iter)
 
     known = inspect.signature(mixture.fit).parameters
-    given = {"on_iteration": on_iteration, "origins": origins}
+    given = {"on_iteration": on_iteration, "origins": None if data.views is None else data.views.origins}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the row contains `converged`
-        mixture.fit(points, **{name: value for name, value in given.items() if name in known})
+        mixture.fit(data.train, **{name: value for name, value in given.items() if name in known})
     on_event(method, options.max_iter, options.max_iter)
     fitted: MixtureEstimator = mixture
     return fitted
 
 
 def _fit_scikit_learn(
-    method: str, points: Tensor, options: FitOptions, seed: int, on_event: Event, own: dict[str, Any]
+    method: str, data: FitData, options: FitOptions, seed: int, on_event: Event, own: Mapping[str, Any]
 ) -> MixtureEstimator:
     """Fit from scikit-learn's own k-means start; returns the result as our mixture."""
     if options.init_params not in ("auto", "kmeans"):
@@ -112,7 +79,7 @@ def _fit_scikit_learn(
     fitted = ESTIMATORS[method](**arguments)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        fitted.fit(points.cpu().numpy())
+        fitted.fit(data.train.cpu().numpy())
     on_event(method, 1, 1)
     return GaussianMixture.from_parameters(
         fitted.weights_,
@@ -123,7 +90,7 @@ def _fit_scikit_learn(
     )
 
 
-def _arguments(method: str, options: FitOptions, seed: int, own: dict[str, Any]) -> dict[str, Any]:
+def _arguments(method: str, options: FitOptions, seed: int, own: Mapping[str, Any]) -> dict[str, Any]:
     """Arguments of the estimator's constructor: the options that it has, the seed, and its own options."""
     estimator = ESTIMATORS[method]
     known = inspect.signature(estimator).parameters
@@ -188,9 +155,9 @@ def compare(
 ) -> FitOutcome:
     """Fit the training points by each method, and score the mixtures on training and test points.
 
-    `own` contains, by method, options that only its estimator takes. `pruning` removes components; None
-    removes none. Raises `InvalidArgumentError` for an
-    unknown method or an invalid option.
+    An estimator takes the options that its constructor has, and its options in `own`, which are by method.
+    `pruning` removes components; None removes none. Raises `InvalidArgumentError` for an unknown method or
+    an invalid option.
     """
     own = own or {}
     known = ", ".join(sorted(ESTIMATORS))
@@ -221,12 +188,13 @@ def _fit_and_prune(
     own: Mapping[str, Any],
     pruning: PruneOptions | None,
 ) -> MixtureEstimator:
-    pruning, views = pruning or PruneOptions(), data.views
-    if method == "hierarchical":
-        own = {**tree_options(pruning, data.train, views), **own}
-    origins = None if views is None else views.origins
-    mixture = fit(method, data.train, options, seed, on_event, origins, **own)
-    return mixture if method == "hierarchical" else pruned(mixture, pruning, data.train, views)
+    pruning = pruning or PruneOptions()
+    is_tree = method == "hierarchical"
+    if is_tree:
+        own = {**tree_options(pruning, data.train, data.views), **own}
+    fit = _fit_ours if issubclass(ESTIMATORS[method], MixtureEstimator) else _fit_scikit_learn
+    mixture = fit(method, data, options, seed, on_event, own)
+    return mixture if is_tree else pruned(mixture, pruning, data.train, data.views)
 
 
 def row_of(data: FitData, method: str, mixture: MixtureEstimator, seconds: float, seed: int) -> Row:

@@ -23,18 +23,17 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
-import torch
 from sklearn.cluster import MeanShift
 from sklearn.exceptions import ConvergenceWarning
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation import held_out, queries
+from gmmtorch.evaluation import held_out
 from gmmtorch.evaluation.events import Event, OnRows, Row, ignore
 from gmmtorch.evaluation.fits.fit_comparison import FitData, row_of
 from gmmtorch.evaluation.methods import MapFactory
 from gmmtorch.evaluation.protocol_options import FitOptions, Protocol
-from gmmtorch.evaluation.studies.map_variants import surface_score
+from gmmtorch.evaluation.studies.map_variants import held_out_points, surface_score
 from gmmtorch.evaluation.studies.study_options import ComponentCountStudy
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import WindowedRule
@@ -47,8 +46,6 @@ from gmmtorch.scan import Scan
 RULES = ("fixed", "flat_pieces", "bic", "mean_shift", "hierarchical", "map_fixed", "map_flat_pieces")
 
 T = TypeVar("T")
-
-_SCORED_POINTS = 5000  # held-out points for the likelihood of a map
 
 
 def middle(scans: Sequence[Scan], window: int) -> Sequence[Scan]:
@@ -235,8 +232,7 @@ def map_rows(
     factories = {f"{name} {setting:g}": factory(learning) for name, setting, learning in cases}
     protocol = Protocol(study.test_every, resolution=(study.resolution,), max_beams=study.max_beams)
     outcome = held_out.evaluate(dataset, scans, factories, protocol, seed, on_event)
-    test = torch.cat([scans[i].points for i in queries.split_indices(len(scans), study.test_every)[1]])
-    test = test[:: max(1, len(test) // _SCORED_POINTS)]
+    test = held_out_points(scans, study.test_every)
     return [
         {
             "dataset": dataset,

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import torch
+from torch import Tensor
 
 from gmmtorch.evaluation import held_out, queries
 from gmmtorch.evaluation.events import Event, OnRows, Row, ignore
@@ -20,7 +21,7 @@ from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 from gmmtorch.scan import Scan
 
-_SCORED_POINTS = 5000  # held-out points for the likelihood of a map
+_SCORED_POINTS = 5000
 
 
 def run(
@@ -38,8 +39,7 @@ def run(
     `auc_gain_low`, `auc_gain_high`: the AUC minus that of the first variant, with its 95 % interval;
     `held_out_log_likelihood`, of held-out returns under the components of surfaces, nats per point.
     """
-    ends = torch.cat([scans[i].points for i in queries.split_indices(len(scans), protocol.test_every)[1]])
-    ends = ends[:: max(1, len(ends) // _SCORED_POINTS)].double()
+    ends = held_out_points(scans, protocol.test_every)
     rows: list[Row] = []
     first: dict[float, Built] = {}
     for variant, factory in variants.items():
@@ -47,7 +47,7 @@ def run(
         for built in outcome.shown:
             assert isinstance(built.map, GaussianMap)
             base = first.setdefault(built.row["resolution"], built)
-            gain = auc_gain(_by_label(base), _by_label(built))
+            gain = auc_gain(base.asked.split(base.theta), built.asked.split(built.theta))
             rows.append(
                 {
                     **built.row,
@@ -63,15 +63,16 @@ def run(
     return rows
 
 
-def surface_score(built: GaussianMap, points: torch.Tensor) -> float:
+def held_out_points(scans: Sequence[Scan], test_every: int) -> Tensor:
+    """About 5000 points (N, D) of the held-out scans."""
+    points = torch.cat([scans[i].points for i in queries.split_indices(len(scans), test_every)[1]])
+    return points[:: max(1, len(points) // _SCORED_POINTS)].double()
+
+
+def surface_score(built: GaussianMap, points: Tensor) -> float:
     """Mean log-likelihood (nats) of points (N, D) under the surfaces of a map, before the codec rounds them,
     weighted by their support.
     """
     hits = ~built.max_range
     weight, means, covariances = built.support[hits], built.means[hits], built.covariances[hits]
     return GaussianMixture.from_parameters(weight / weight.sum(), means, covariances).score(points)
-
-
-def _by_label(built: Built) -> tuple[torch.Tensor, torch.Tensor]:
-    """Probabilities of the occupied and of the free test points."""
-    return built.theta[built.asked.of(queries.OCCUPIED)], built.theta[built.asked.of(queries.FREE)]

@@ -15,7 +15,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation import metrics, queries
 from gmmtorch.evaluation.events import Event, OnRows, Row, ignore
 from gmmtorch.evaluation.protocol_options import Protocol
-from gmmtorch.evaluation.queries import FREE, OCCUPIED, Queries
+from gmmtorch.evaluation.queries import Queries
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.scan import Scan
 
@@ -134,5 +134,5 @@ def _aucs(
     for method in methods:
         for resolution, ask in asked.items():
             theta = torch.as_tensor(built.occupancy(ask.points, resolution, method)).cpu()
-            found[method, resolution] = metrics.roc(theta[ask.of(OCCUPIED)], theta[ask.of(FREE)]).auc
+            found[method, resolution] = metrics.roc(*ask.split(theta)).auc
     return found

@@ -24,7 +24,7 @@ import torch
 from sklearn.exceptions import ConvergenceWarning
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import InvalidArgumentError, check_choice
 from gmmtorch.evaluation import metrics, queries
 from gmmtorch.evaluation.events import Event, Row, ignore
 from gmmtorch.evaluation.studies.study_options import SensorModelStudy
@@ -60,8 +60,7 @@ class _Cloud:
 
 def sensor_model(study: SensorModelStudy) -> SensorModel:
     """The sensor model that the study names. Raises `InvalidArgumentError` for an unknown name or field."""
-    if study.sensor not in SENSORS:
-        raise InvalidArgumentError(f"sensor={study.sensor!r} is not one of {', '.join(SENSORS)}.")
+    check_choice("sensor", study.sensor, SENSORS)
     model = SENSORS[study.sensor]
     known = {item.name for item in fields(model)}
     if unknown := set(study.sensor_options) - known:
@@ -151,7 +150,7 @@ def _areas(built: GaussianMap, asked: dict[str, queries.Queries], resolution: fl
     row: Row = {}
     for field, ask in asked.items():
         theta = torch.as_tensor(built.occupancy(ask.points, resolution))
-        occupied, empty = theta[ask.of(queries.OCCUPIED)], theta[ask.of(queries.FREE)]
+        occupied, empty = ask.split(theta)
         row[field] = area = metrics.roc(occupied, empty).auc
         if field == "auc":
             row["auc_low"], row["auc_high"] = metrics.auc_interval(occupied, empty, area, seed)

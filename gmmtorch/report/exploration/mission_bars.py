@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.container import BarContainer
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.paired_statistics import Interval, mean_band
@@ -26,7 +26,6 @@ from gmmtorch.report.exploration.trial_groups import (
     seeds_note,
     short_name,
 )
-from gmmtorch.report.style import Rows
 from gmmtorch.report.table import byte_text
 
 
@@ -49,7 +48,7 @@ _MEASURES = (
 )
 
 
-def summary_bars(rows: Rows) -> Figure:
+def summary_bars(rows: style.Rows) -> Figure:
     """Draws bytes sent, t90, AUC and coverage per metre of each framework, and below them the differences.
 
     Above: a dot per seed, and the mean with its 95 % interval. If a seed has no value (it never reached t90),
@@ -89,7 +88,7 @@ def summary_bars(rows: Rows) -> Figure:
     return figure
 
 
-def deviations_figure(rows: Rows) -> Figure:
+def deviations_figure(rows: style.Rows) -> Figure:
     """Draws, for each variant, its mean difference to the first one, over common seeds with the paired 95 %
     interval: entropy removed (ratio), t90 (t50 unless all missions reach t90), AUC, and bytes sent (ratio).
 
@@ -127,7 +126,7 @@ def deviations_figure(rows: Rows) -> Figure:
         if measure.field == "bytes_sent":
             axes.set_xscale("log")
             axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-            axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}×"))
+            style.tick_text(axes.xaxis, lambda value: f"{value:g}×")
             axes.xaxis.set_minor_formatter(NullFormatter())
         kind = "ratio" if measure.by_ratio else f"difference{f' [{measure.unit}]' if measure.unit else ''}"
         style.label_axes(axes, measure.title, kind, "")
@@ -138,41 +137,22 @@ def deviations_figure(rows: Rows) -> Figure:
     return figure
 
 
-def stage_means(rows: Rows) -> tuple[dict[str, dict[str, float]], dict[str, float]]:
-    """Returns the mean wall seconds of each stage, and the mean simulated seconds, by framework: the
-    arguments of `profile_figure`. Rows are explore rows with `stage_seconds`."""
-    stages, simulated = {}, {}
-    for framework, trials in by_framework(rows).items():
-        names = dict.fromkeys(name for row in trials for name in row["stage_seconds"])
-        stages[framework] = {
-            name: float(np.mean([row["stage_seconds"].get(name, 0.0) for row in trials])) for name in names
-        }
-        simulated[framework] = float(np.mean([row["times"][-1] for row in trials]))
-    return stages, simulated
-
-
-def profile_figure(
-    stages: Mapping[str, Mapping[str, float]],
-    simulated_seconds: Mapping[str, float] | float,
-) -> Figure:
+def profile_figure(rows: style.Rows) -> Figure:
     """Draws the milliseconds of computing per simulated second by stage, one bar per framework.
 
     The end of a bar gives the ratio of simulated to computing time.
 
     Args:
-        stages: by framework: wall seconds of each stage of a mission, for all robots together.
-        simulated_seconds: duration of the missions, by framework or one for all.
+        rows: explore rows with `stage_seconds`.
 
     Raises:
-        InvalidArgumentError: no framework, negative times, or a duration that is not positive.
+        InvalidArgumentError: no row.
     """
-    if not stages:
-        raise InvalidArgumentError("stages is empty; give the wall seconds of one framework at least.")
-    costs = {f: _milliseconds(f, times, simulated_seconds) for f, times in stages.items()}
+    costs = {framework: _milliseconds(trials) for framework, trials in by_framework(rows).items()}
     names = list(dict.fromkeys(stage for cost in costs.values() for stage in cost))
     sizes = {style.label_of(n): np.array([cost.get(n, 0.0) for cost in costs.values()]) for n in names}
     hues = [style.colour(index + 3) for index in range(len(names))]
-    figure = style.new_figure(9.6, 1.9 + 0.62 * len(stages))
+    figure = style.new_figure(9.6, 1.9 + 0.62 * len(costs))
     axes = figure.subplots()
     totals = style.stacked_bars(axes, sizes, hues)
     longest = float(totals.max(initial=0.0)) or 1.0
@@ -191,7 +171,7 @@ def profile_figure(
     return figure
 
 
-def _by_seed(trials: Rows, measure: _Measure) -> dict[Any, float | None]:
+def _by_seed(trials: style.Rows, measure: _Measure) -> dict[Any, float | None]:
     """Returns the value of each seed; None if there is none, or none to take a ratio of."""
     values: dict[Any, float | None] = {}
     for row in trials:
@@ -242,7 +222,7 @@ def _draw_differences(
 
 def _log_ticks(axes: Axes, text: Callable[[float], str]) -> None:
     axes.set_yscale("log")
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: text(value)))
+    style.tick_text(axes.yaxis, text)
 
 
 def _name_places(axes: Axes, names: Sequence[str]) -> None:
@@ -250,12 +230,10 @@ def _name_places(axes: Axes, names: Sequence[str]) -> None:
     axes.set_xlim(-0.6, len(names) - 0.4)
 
 
-def _milliseconds(
-    framework: str, stages: Mapping[str, float], simulated_seconds: Mapping[str, float] | float
-) -> dict[str, float]:
-    length = simulated_seconds[framework] if isinstance(simulated_seconds, Mapping) else simulated_seconds
-    if not length > 0 or any(not seconds >= 0 for seconds in stages.values()):
-        raise InvalidArgumentError(
-            f"{framework}: simulated_seconds={length} must be above zero, and no stage below: {dict(stages)}."
-        )
-    return {name: 1000 * seconds / length for name, seconds in stages.items()}
+def _milliseconds(trials: style.Rows) -> dict[str, float]:
+    """Returns the computing time of each stage per simulated second."""
+    seconds = sum(row["times"][-1] for row in trials)
+    names = dict.fromkeys(name for row in trials for name in row["stage_seconds"])
+    return {
+        name: 1000 * sum(row["stage_seconds"].get(name, 0.0) for row in trials) / seconds for name in names
+    }

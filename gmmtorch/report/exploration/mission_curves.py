@@ -9,7 +9,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.paired_statistics import time_to_share
@@ -32,7 +31,6 @@ from gmmtorch.report.exploration.trial_groups import (
     seeds_note,
 )
 from gmmtorch.report.labels import LineEnd, label_ends
-from gmmtorch.report.style import Rows
 from gmmtorch.report.table import byte_text, ratio_text
 
 _MILESTONES = (("t50", 0.5, "o"), ("t90", 0.9, "s"))
@@ -47,7 +45,7 @@ _BYTE_LINES = (
 )
 
 
-def entropy_figure(rows: Rows) -> Figure:
+def entropy_figure(rows: style.Rows) -> Figure:
     """Draws the share of the observable entropy that remains in the team's union of maps (Fig 4.4).
 
     There is a line for each framework: the mean over seeds in its 95 % band. Marks show the mean t50 and
@@ -77,7 +75,7 @@ def entropy_figure(rows: Rows) -> Figure:
     return _finished(figure, axes, ends, rows, handles, title)
 
 
-def planner_comparison_figure(rows: Rows) -> Figure:
+def planner_comparison_figure(rows: style.Rows) -> Figure:
     """Draws the share of the observable entropy that remains, one line per variant of the planner.
 
     Variants differ in any option; a label lists those in which they do. Lines are means over seeds in 95 %
@@ -99,7 +97,7 @@ def planner_comparison_figure(rows: Rows) -> Figure:
     return _finished(figure, axes, ends, rows, handles, title)
 
 
-def bandwidth_figure(rows: Rows, draco_error: float = 0.03) -> Figure:
+def bandwidth_figure(rows: style.Rows, draco_error: float = 0.03) -> Figure:
     """Draws the cumulative bytes that the team shared over time, on a logarithmic axis (Fig 4.5).
 
     Lines are what E0, E1 and the thesis's E0 sent, and the novel points of the frames that E0 learned from in
@@ -165,7 +163,7 @@ def _entropy_axes(reference: float | None, whose: str) -> tuple[Figure, Axes, li
     return figure, axes, handles
 
 
-def _draw_trials(axes: Axes, name: str, trials: Rows, look: dict[str, Any]) -> LineEnd:
+def _draw_trials(axes: Axes, name: str, trials: style.Rows, look: dict[str, Any]) -> LineEnd:
     """Draws the mean of trials with marks at their milestones, and returns the label of the line."""
     curves = curves_of(trials, [percent_left(row) for row in trials])
     curves.draw(axes, **look)
@@ -182,7 +180,12 @@ def _draw_trials(axes: Axes, name: str, trials: Rows, look: dict[str, Any]) -> L
 
 
 def _finished(
-    figure: Figure, axes: Axes, ends: Sequence[LineEnd], rows: Rows, handles: Sequence[Line2D], title: str
+    figure: Figure,
+    axes: Axes,
+    ends: Sequence[LineEnd],
+    rows: style.Rows,
+    handles: Sequence[Line2D],
+    title: str,
 ) -> Figure:
     """Sets limits and grid, and draws the labels of the lines, legend and title."""
     axes.set_xlim(0, max(float(row["times"][-1]) for row in rows) or 1.0)
@@ -195,7 +198,7 @@ def _finished(
     return figure
 
 
-def _reference(rows: Rows) -> float | None:
+def _reference(rows: style.Rows) -> float | None:
     """Returns the stated reference reduction as a share of the observable entropy, or None if rows disagree;
     without a stated one, the mean reduction."""
     stated = {float(row["reference_bits"]) / observable(row) for row in rows if row.get("reference_bits")}
@@ -204,7 +207,7 @@ def _reference(rows: Rows) -> float | None:
     return stated.pop() if len(stated) == 1 else None
 
 
-def _mean_reduction(rows: Rows) -> float:
+def _mean_reduction(rows: style.Rows) -> float:
     return float(np.mean([row["entropy_reduction_bits"] / observable(row) for row in rows]))
 
 
@@ -222,4 +225,4 @@ def _byte_axis(axes: Axes, curves: Sequence[Curves]) -> None:
     low, high = lowest / 1.3, 1.3 * highest
     style.log_axis(axes, "y", (low, high))
     axes.set_ylim(low, high)
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: byte_text(value, 2).replace(".0 ", " ")))
+    style.tick_text(axes.yaxis, lambda value: byte_text(value, 2).replace(".0 ", " "))

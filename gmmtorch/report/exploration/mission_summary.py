@@ -5,16 +5,12 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from gmmtorch.exploration.mission.results import NETWORK, differing
 from gmmtorch.report.exploration.trial_groups import by_variant, check_rows, named_fields, paired_difference
 from gmmtorch.report.style import Rows
 from gmmtorch.report.tensorboard_writer import Board
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 
 _EMPTY = "\N{EN DASH}"
 _MAX_ALL_PAIRS = 3  # variants that are all compared with each other; more are compared with the first only
@@ -138,8 +134,8 @@ _SERIES = (
 )
 
 
-def write_exploration_board(board: Board, rows: Rows, figures: Mapping[str, Figure]) -> None:
-    """Writes trials and figures to one TensorBoard run.
+def write_exploration_board(board: Board, rows: Rows) -> None:
+    """Writes trials to one TensorBoard run.
 
     Tags name the framework, the options in which rows differ, and the seed. Each trial has its entropy (bits,
     and as a share of the observable), the entropies of its robots, cumulative bytes and the share of missing
@@ -148,15 +144,12 @@ def write_exploration_board(board: Board, rows: Rows, figures: Mapping[str, Figu
     Args:
         board: the run; the caller closes it.
         rows: explore rows of `results.json`.
-        figures: by name.
     """
     fields = differing(rows, without=["framework"])
     for row in rows:
         tag = f"{row['framework']}/{_variant(row, named_fields(row, rows[0], fields))}seed_{row['seed']}"
         _write_series(board, row, tag)
         board.scalars(row, tag, step=int(row["times"][-1]))
-    for name, figure in figures.items():
-        board.figure(f"figures/{name}", figure)
 
 
 def _variant(row: Mapping[str, Any], fields: Sequence[str]) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
+from matplotlib.ticker import MaxNLocator, NullLocator
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.paired_statistics import Band
@@ -27,7 +27,6 @@ from gmmtorch.report.exploration.trial_groups import (
     seeds_note,
 )
 from gmmtorch.report.labels import LineEnd, label_ends
-from gmmtorch.report.style import PALETTE, Rows
 from gmmtorch.report.table import byte_text, ratio_text
 
 _MAX_COLUMNS = 5
@@ -37,7 +36,7 @@ _PERCENT_TICKS = (0.0, 0.1, 1.0, 10.0, 100.0)
 _SERIES = ("entropy_bits", "wire_bytes_over_time", "missing_share")
 
 
-def loss_figure(rows: Rows) -> Figure:
+def loss_figure(rows: style.Rows) -> Figure:
     """Draws remaining entropy and bytes with headers over simulated time, and below them one panel per
     variant with the share of all records that the robot with the most gaps is missing.
 
@@ -81,7 +80,7 @@ def loss_figure(rows: Rows) -> Figure:
     left.set_ylim(0, max(100.0, left.dataLim.y1) * 1.015)
     style.label_axes(sent, "bytes sent, with headers", TIME, "cumulative bytes")
     sent.set_ylim(0, max(sent.dataLim.y1, 1.0) * 1.03)
-    sent.yaxis.set_major_formatter(FuncFormatter(lambda value, _: byte_text(value, digits=2)))
+    style.tick_text(sent.yaxis, lambda value: byte_text(value, digits=2))
     for axes in (left, sent, *multiples):
         axes.set_xlim(0, last)
         style.draw_grid(axes)
@@ -92,7 +91,7 @@ def loss_figure(rows: Rows) -> Figure:
     return figure
 
 
-def _check(rows: Rows) -> None:
+def _check(rows: style.Rows) -> None:
     check_rows(rows)
     for row in rows:
         missing = [name for name in _SERIES if not row.get(name)]
@@ -119,7 +118,7 @@ def _panels(n: int, window: float) -> tuple[Figure, Axes, Axes, list[Axes]]:
     return figure, left, sent, list(places[:n])
 
 
-def _draw_missing(axes: Axes, trials: Rows, window: float, look: Mapping[str, Any]) -> None:
+def _draw_missing(axes: Axes, trials: style.Rows, window: float, look: Mapping[str, Any]) -> None:
     curves = curves_of(trials, [_percent_missing(row, window) for row in trials])
     mean, low, high = curves.band
     # Student's interval may exceed the bounds of a share.
@@ -141,14 +140,14 @@ def _percent_missing(row: Mapping[str, Any], window: float) -> np.ndarray:
     return 100 * np.array([np.median(share[a:b]) for a, b in zip(first, end, strict=True)])
 
 
-def _ratio_note(trials: Rows, field: str) -> str:
+def _ratio_note(trials: style.Rows, field: str) -> str:
     """Returns the mean ratio to lossless missions, if every seed has one and these trials have faults."""
     ratios = known(trials, field)
     has_faults = any(row.get("loss") or row.get("partitions") for row in trials)
     return f", {ratio_text(float(np.mean(ratios)))}" if has_faults and len(ratios) == len(trials) else ""
 
 
-def _map_texts(trials: Rows) -> list[str]:
+def _map_texts(trials: style.Rows) -> list[str]:
     notes = []
     if len(differ := known(trials, "map_disagreement")) == len(trials):
         notes.append(f"{100 * np.mean(differ):.2g} % of cells differ")
@@ -157,7 +156,7 @@ def _map_texts(trials: Rows) -> list[str]:
     return notes
 
 
-def _shade(axes: Axes, rows: Rows, name: str = "") -> None:
+def _shade(axes: Axes, rows: style.Rows, name: str = "") -> None:
     """Shades the times at which robots are cut off."""
     spans = {(float(cut["begin"]), float(cut["end"])) for row in rows for cut in row.get("partitions") or []}
     for begin, end in sorted(spans):
@@ -176,21 +175,21 @@ def _shade(axes: Axes, rows: Rows, name: str = "") -> None:
 
 
 _HUES = {
-    "components": PALETTE[0],
-    "counts": PALETTE[5],
-    "supersessions": PALETTE[4],
-    "corrections": PALETTE[1],
+    "components": style.PALETTE[0],
+    "counts": style.PALETTE[5],
+    "supersessions": style.PALETTE[4],
+    "corrections": style.PALETTE[1],
     "frames": "#8a6d3b",
-    "points": PALETTE[6],
-    "views": PALETTE[2],
-    "plans": PALETTE[3],
+    "points": style.PALETTE[6],
+    "views": style.PALETTE[2],
+    "plans": style.PALETTE[3],
     "announcements": "#9a9a9a",
 }
 """Colours of the kinds of datagrams, in the order of the bars."""
 _MAX_LABELS = 10
 
 
-def team_run_figure(rows: Rows) -> Figure:
+def team_run_figure(rows: style.Rows) -> Figure:
     """Draws the map of each robot over time (left), and the bytes it sent by kind, each datagram once
     (right).
 
@@ -213,14 +212,14 @@ def team_run_figure(rows: Rows) -> Figure:
     return figure
 
 
-def _title(rows: Rows) -> str:
+def _title(rows: style.Rows) -> str:
     if len(rows) == 1:
         return f"Robot {rows[0]['robot']}"
     same = len({row["digest"] for row in rows}) == 1
     return f"{len(rows)} robots with {'the same map' if same else 'different maps'}"
 
 
-def _draw_maps(axes: Axes, rows: Rows) -> None:
+def _draw_maps(axes: Axes, rows: style.Rows) -> None:
     explores = all(row.get("entropy_bits") and row.get("observable_bits") for row in rows)
     ends = []
     for index, row in enumerate(rows):
@@ -236,7 +235,7 @@ def _draw_maps(axes: Axes, rows: Rows) -> None:
         label_ends(axes, ends)
 
 
-def _draw_bytes(axes: Axes, rows: Rows) -> None:
+def _draw_bytes(axes: Axes, rows: style.Rows) -> None:
     sizes = {kind: np.array([row["bytes_by_kind"].get(kind, 0.0) for row in rows]) for kind in _HUES}
     sizes = {kind: size for kind, size in sizes.items() if size.any()}
     totals = style.stacked_bars(axes, sizes, [_HUES[kind] for kind in sizes])
@@ -248,4 +247,4 @@ def _draw_bytes(axes: Axes, rows: Rows) -> None:
         label.set_color(style.colour(index))
     axes.set_xlim(0, 1.2 * max(float(totals.max(initial=0.0)), 1.0))
     axes.xaxis.set_major_locator(MaxNLocator(4))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: byte_text(value)))
+    style.tick_text(axes.xaxis, byte_text)

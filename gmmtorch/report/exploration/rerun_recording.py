@@ -16,7 +16,8 @@ from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.files import write_atomically
 from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.optional_packages import needs_extra
-from gmmtorch.report.scenes.ellipsoids import N_SIGMA, checked_components, height_colours, principal_axes
+from gmmtorch.report.scenes.ellipsoids import checked_components, height_colours, principal_axes
+from gmmtorch.report.scenes.scene_renderer import N_SIGMA
 from gmmtorch.report.style import as_array, colour
 from gmmtorch.scan import ArrayLike
 

@@ -13,7 +13,6 @@ from gmmtorch.evaluation.paired_statistics import Band, Interval, mean_band, on_
 from gmmtorch.exploration.mission.options import THESIS
 from gmmtorch.exploration.mission.results import NETWORK, differing, variant_of
 from gmmtorch.report import style
-from gmmtorch.report.style import Rows
 from gmmtorch.report.table import byte_text, count_text
 from gmmtorch.scan import ArrayLike
 
@@ -51,7 +50,7 @@ def framework_colour(framework: str) -> str:
     return _COLOURS.get(framework, style.PALETTE[-1])
 
 
-def by_framework(rows: Rows) -> dict[str, list[Mapping[str, Any]]]:
+def by_framework(rows: style.Rows) -> dict[str, list[Mapping[str, Any]]]:
     """Groups rows by framework: E0, E1, E2, E0 of the thesis, then others in order of occurrence.
 
     Raises `InvalidArgumentError` if there is no row.
@@ -63,13 +62,13 @@ def by_framework(rows: Rows) -> dict[str, list[Mapping[str, Any]]]:
     return {name: [row for row in rows if row["framework"] == name] for name in order}
 
 
-def check_rows(rows: Rows) -> None:
+def check_rows(rows: style.Rows) -> None:
     """Raises `InvalidArgumentError` if there is no row."""
     if not rows:
         raise InvalidArgumentError("rows is empty; give the rows of one trial at least.")
 
 
-def by_variant(rows: Rows, otherwise: str = "planner") -> dict[str, list[Mapping[str, Any]]]:
+def by_variant(rows: style.Rows, otherwise: str = "planner") -> dict[str, list[Mapping[str, Any]]]:
     """Groups rows by the options in which they differ, in order of occurrence; the names list these options.
 
     If rows differ in none, the name is the value of the field `otherwise`. A variant whose name would be
@@ -152,7 +151,7 @@ class Curves(NamedTuple):
             axes.fill_between(self.times, low, high, **area)
 
 
-def curves_of(rows: Rows, values: Sequence[Any]) -> Curves:
+def curves_of(rows: style.Rows, values: Sequence[Any]) -> Curves:
     """Returns mean and 95 % band of one series (T,) per row, at the times that all rows cover."""
     times, curves = on_common_times([row["times"] for row in rows], values)
     return Curves(times, mean_band(curves), len(curves))
@@ -176,12 +175,12 @@ def percent_left(row: Mapping[str, Any], entropy_bits: ArrayLike | None = None) 
     return 100 * bits / observable(row)
 
 
-def known(rows: Rows, field: str) -> list[float]:
+def known(rows: style.Rows, field: str) -> list[float]:
     """Returns the values of a field in the rows that have one."""
     return [float(row[field]) for row in rows if row.get(field) is not None]
 
 
-def milestone_text(rows: Rows, field: str) -> str:
+def milestone_text(rows: style.Rows, field: str) -> str:
     """Returns the mean of a milestone such as t90 (s), or in how many rows it was reached if not in all."""
     times = known(rows, field)
     if len(times) < len(rows):
@@ -206,7 +205,7 @@ def paired_difference(
     return paired_interval(*complete.T)
 
 
-def seeds_note(rows: Rows, confidence: str = "95 % confidence band") -> str:
+def seeds_note(rows: style.Rows, confidence: str = "95 % confidence band") -> str:
     """Returns what lines and bands show: mean of 5 seeds with 95 % confidence band; or one mission of E0,
     seed 0."""
     sizes = sorted({len(group) for group in _same_but_seed(rows)})
@@ -218,7 +217,7 @@ def seeds_note(rows: Rows, confidence: str = "95 % confidence band") -> str:
     return f"one mission {which}" + (f", seed {seeds.pop()}" if len(seeds) == 1 else "")
 
 
-def about(rows: Rows) -> str:
+def about(rows: style.Rows) -> str:
     """Returns the world and the number of robots that all rows share."""
     worlds = {str(row.get("world", "")) for row in rows}
     numbers = {int(row["n_robots"]) for row in rows}
@@ -227,7 +226,7 @@ def about(rows: Rows) -> str:
     return ", ".join(parts)
 
 
-def _same_but_seed(rows: Rows) -> list[list[Mapping[str, Any]]]:
+def _same_but_seed(rows: style.Rows) -> list[list[Mapping[str, Any]]]:
     groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
     for row in rows:
         groups.setdefault((row.get("world"), *variant_of(row)), []).append(row)

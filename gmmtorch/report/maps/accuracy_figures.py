@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.ticker import MaxNLocator
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.calibration import Reliability
@@ -72,7 +72,7 @@ def reliability_figure(
     style.draw_grid(upper)
     style.label_axes(lower, "", "predicted occupancy probability θ", "share of points")
     lower.set_ylim(bottom=0)
-    lower.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0%}"))
+    style.tick_text(lower.yaxis, lambda value: f"{value:.0%}")
     style.draw_grid(lower, "y")
     style.legend_below(figure, max_columns=3)
     style.figure_title(figure, title)

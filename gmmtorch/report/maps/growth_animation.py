@@ -30,6 +30,7 @@ _WIDTH, _DPI = 6.4, 100  # inches, and pixels per inch
 _COMPONENT, _PATH = style.PALETTE[0], style.PALETTE[1]
 _BEAM_STRIDE = 3  # of the beams of the newest scan that are drawn
 _QUALITY = 72  # of WebP
+_LAST_FRAME = 4000  # milliseconds
 
 
 class GrowthFrame(NamedTuple):
@@ -51,7 +52,6 @@ def save_growth(
     *,
     resolution: float,
     period: float = 0.15,
-    hold: float = 4.0,
 ) -> Path:
     """Writes frames as an animated WebP or GIF that repeats, and returns its path.
 
@@ -59,7 +59,7 @@ def save_growth(
         path: file name that ends in .webp or .gif.
         frames: the map as it grows; the last one is the finished map.
         resolution: side (m) of the cells of occupancy.
-        period, hold: seconds of a frame, and of the last one.
+        period: seconds of a frame; the last one is shown for four seconds.
 
     Raises:
         InvalidArgumentError: another suffix, no frame, or a map in 3D.
@@ -74,7 +74,7 @@ def save_growth(
     means = solid.means[~solid.max_range].cpu()
     box = robust_bounds(means, last.path, share=0.995, margin=0.8)
     pictures = [_picture(frame, last.n_scans, box, resolution) for frame in frames]
-    durations = [round(1000 * period)] * (len(pictures) - 1) + [round(1000 * hold)]
+    durations = [round(1000 * period)] * (len(pictures) - 1) + [_LAST_FRAME]
 
     def write(temporary: Path) -> None:
         first, *others = pictures

@@ -20,8 +20,10 @@ from matplotlib.patches import Patch
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.report import style
 from gmmtorch.report.maps.map_images import (
+    HEADROOM,
     MAX_PIXELS,
     MAX_QUERIES,
+    OCCUPIED_ABOVE,
     MapPanel,
     height_image,
     roof_above,
@@ -32,7 +34,6 @@ from gmmtorch.scan import ArrayLike
 _MAX_COLUMNS = 4
 _GREYS = [(0.0, "#ffffff"), (0.3, "#dedede"), (0.5, "#9c9c9c"), (0.67, "#404040"), (1.0, "#000000")]
 _NONE = "#f1f1f1"  # a column without an occupied cell
-_HEADROOM = 0.5  # metres above the sensor at which a roof is cut off
 _PATH, _START, _END = style.PALETTE[1], style.PALETTE[2], style.PALETTE[0]
 _TRUE, _LOST = style.PALETTE[5], style.PALETTE[3]
 
@@ -44,15 +45,14 @@ def map_figure(
     truth: ArrayLike | None = None,
     lost: ArrayLike | None = None,
     title: str | None = None,
-    ceiling: float | None = None,
-    occupied_above: float = 0.5,
     max_pixels: int = MAX_PIXELS,
     max_queries: int = MAX_QUERIES,
 ) -> Figure:
     """Draws one panel per map: occupied dark, free light, unknown (θ within 0.02 of ½) blue-grey.
 
     In 3D, draws a horizontal slice of each map, and below it the height of the highest occupied cells. The
-    slice is at the median height of the trajectories, or without one in the middle of the region.
+    slice is at the median height of the trajectories, or without one in the middle of the region. If most of
+    the trajectories lies under a roof, the view from above leaves out what is half a metre above them.
 
     Args:
         panels: one or more maps, all 2D or all 3D.
@@ -60,9 +60,6 @@ def map_figure(
         truth: true positions (S, D), drawn beside the trajectories.
         lost: positions (S, D) near which a scan was not localised.
         title: title of the figure.
-        ceiling: height (m) above which cells are left out of the view from above; if None, half a metre above
-            the trajectories if most of them lies under a roof, else no limit.
-        occupied_above: probability above which a cell counts as occupied in the view from above.
         max_pixels: pixels along each side of a picture; larger regions are sampled more coarsely.
         max_queries: largest number of queries for one view from above.
 
@@ -96,8 +93,8 @@ def map_figure(
     if dim == 3:
         views = [band[1] for band in bands]
         # One ceiling for all: panels that are cut at different heights cannot be compared.
-        top = min(_ceiling(panel, flown, ceiling, occupied_above) for panel in panels)
-        _draw_heights(figure, views, panels, paths, top, occupied_above, shown_pixels, max_queries)
+        top = min(_ceiling(panel, flown) for panel in panels)
+        _draw_heights(figure, views, panels, paths, top, shown_pixels, max_queries)
     for axes in bands[-1][:, len(panels) - (n_bands - 1) * n_columns :].flat:
         axes.set_visible(False)
     for axes in np.concatenate([band[-1] for band in bands]):
@@ -135,13 +132,12 @@ def _draw_heights(
     panels: Sequence[MapPanel],
     paths: list[np.ndarray],
     top: float,
-    occupied_above: float,
     shown_pixels: int,
     max_queries: int,
 ) -> None:
     """Draws the views from above, of the cells below z = `top` (m), with a colour bar for each band."""
     cut = [_below(panel, top) for panel in panels]
-    images = [height_image(panel, occupied_above, shown_pixels, max_queries) for panel in cut]
+    images = [height_image(panel, shown_pixels, max_queries) for panel in cut]
     known = torch.cat([image.image[image.image.isfinite()] for image in images])
     colours = matplotlib.colormaps[style.HEIGHTS].with_extremes(bad=_NONE)
     heights = ScalarMappable(style.height_scale(known), colours)
@@ -149,7 +145,7 @@ def _draw_heights(
         image.draw(axes, heights.to_rgba(np.ma.masked_invalid(image.image.numpy())))
         _draw_paths(axes, panel, paths)
         below = f" below z = {style.metres(panel.high[2])}" if panel.high[2] < whole.high[2] else ""
-        style.label_axes(axes, f"highest cell with θ > {occupied_above:g}{below}")
+        style.label_axes(axes, f"highest cell with θ > {OCCUPIED_ABOVE:g}{below}")
     for band in bands:
         style.colour_bar(figure, heights, band.tolist(), "height z [m]", extend="both")
 
@@ -202,12 +198,10 @@ def _legend_beside(truth: ArrayLike | None, lost: ArrayLike | None) -> list[Arti
     return [line for line, given in ((true, truth), (mark, lost)) if given is not None]
 
 
-def _ceiling(panel: MapPanel, path: np.ndarray | None, given: float | None, occupied_above: float) -> float:
-    if given is not None:
-        return float(given)
-    if path is None or not roof_above(panel, path, occupied_above, _HEADROOM):
+def _ceiling(panel: MapPanel, path: np.ndarray | None) -> float:
+    if path is None or not roof_above(panel, path):
         return math.inf
-    return float(np.median(path[:, 2])) + _HEADROOM
+    return float(np.median(path[:, 2])) + HEADROOM
 
 
 def _below(panel: MapPanel, ceiling: float) -> MapPanel:

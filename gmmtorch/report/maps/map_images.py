@@ -24,6 +24,13 @@ MAX_PIXELS = 2000
 MAX_QUERIES = 4_000_000
 """Largest number of cells queried for one image of heights."""
 
+OCCUPIED_ABOVE = 0.4
+"""Occupied cells of views from above: grazing beams count more misses than hits in a surface cell, so ½ would
+hide thin surfaces."""
+
+HEADROOM = 0.5
+"""Metres above a path at which a roof begins."""
+
 _BATCH = 1 << 18  # queries at a time
 _UNKNOWN_BAND = 0.02  # around θ = ½: the tails of a component are no evidence
 _TOLERANCE = 1e-3  # of a cell: float32 corners on a boundary between cells count as exact
@@ -107,16 +114,14 @@ def slice_image(
     """
     image = _pixels(panel, max_pixels)
     theta = _query(panel, _centres(image, panel, height)).reshape(image.image.shape)
-    theta[_is_unknown(theta)] = torch.nan
+    theta[is_unknown(theta)] = torch.nan
     image = image._replace(image=theta)
     factor = 1 if shown_pixels is None else round(max(theta.shape) / max(shown_pixels, 1))
     return _reduced(image, factor) if factor > 1 else image
 
 
-def height_image(
-    panel: MapPanel, occupied_above: float, max_pixels: int = MAX_PIXELS, max_queries: int = MAX_QUERIES
-) -> MapImage:
-    """Returns the height (m) of the highest known cell with θ > `occupied_above` in each column, NaN if none.
+def height_image(panel: MapPanel, max_pixels: int = MAX_PIXELS, max_queries: int = MAX_QUERIES) -> MapImage:
+    """Returns the height (m) of the highest occupied cell in each column, NaN if none.
 
     Queries layers from the top down, each only in the columns without a cell yet. Pixels grow if that could
     take more than `max_queries` queries.
@@ -137,59 +142,44 @@ def height_image(
             break
         points = columns[still_open]
         points[:, 2] = level
-        heights[still_open[_is_occupied(_query(panel, points), occupied_above)]] = level
+        heights[still_open[_is_occupied(_query(panel, points))]] = level
     return image._replace(image=heights.reshape(image.image.shape))
 
 
-def highest_occupancy(
-    probability: ArrayLike,
-    low: ArrayLike,
-    resolution: float,
-    band: tuple[float, float] = (-math.inf, math.inf),
-) -> MapImage:
-    """Returns the highest occupancy of the known cells in each column within a band; ½ where none is known.
+def highest_occupancy(probability: ArrayLike, low: ArrayLike, resolution: float) -> MapImage:
+    """Returns the highest occupancy of the known cells in each column; ½ where none is known.
 
     Args:
         probability: occupancy (nx, ny, nz) of the cells; within 0.02 of ½ is unknown. Truth values are
             accepted.
         low: corner (3,) of the lowest cell, world metres.
         resolution: side (m) of a cell.
-        band: lowest and highest z (m) of the centres of cells that count.
 
     Raises:
-        InvalidArgumentError: shapes disagree, or the band contains no layer of cells.
+        InvalidArgumentError: shapes disagree, or there is no layer of cells.
     """
     theta, corner = torch.as_tensor(probability).detach().cpu().double(), as_array(low)
-    side = check_resolution(resolution)
-    if theta.ndim != 3 or corner.shape != (3,):
+    if theta.ndim != 3 or corner.shape != (3,) or theta.shape[2] == 0:
         raise InvalidArgumentError(
-            f"probability has shape {tuple(theta.shape)} and low {corner.shape}; expected (nx, ny, nz), (3,)."
+            f"probability has shape {tuple(theta.shape)} and low {corner.shape}; expected (nx, ny, nz) "
+            "with at least one layer of cells, and (3,)."
         )
-    heights = corner[2] + (torch.arange(theta.shape[2]) + 0.5) * side
-    within = (heights >= band[0]) & (heights <= band[1])
-    if not bool(within.any()):
-        raise InvalidArgumentError(
-            f"band={band} contains no layer of cells between {heights.min():g} and {heights.max():g} m."
-            if len(heights)
-            else "probability has no layer of cells."
-        )
-    layers = theta[:, :, within]
-    highest = torch.where(_is_unknown(layers), -1.0, layers).amax(2)
-    shown = (float(heights[within][0]) - side / 2, float(heights[within][-1]) + side / 2)
+    x, y, bottom = corner.tolist()
+    highest = torch.where(is_unknown(theta), -1.0, theta).amax(2)
     image = torch.where(highest < 0, 0.5, highest)
-    return MapImage(image, (float(corner[0]), float(corner[1])), side, shown)
+    return MapImage(image, (x, y), resolution, (bottom, bottom + theta.shape[2] * resolution))
 
 
-def roof_above(panel: MapPanel, path: np.ndarray, occupied_above: float, headroom: float = 0.5) -> bool:
-    """Returns whether most of the path (S, 3) has an occupied cell more than `headroom` metres above it."""
-    levels = torch.arange(float(path[:, 2].min()) + headroom, panel.high[2], panel.resolution).double()
+def roof_above(panel: MapPanel, path: np.ndarray) -> bool:
+    """Returns whether most of the path (S, 3) has an occupied cell more than `HEADROOM` above it."""
+    levels = torch.arange(float(path[:, 2].min()) + HEADROOM, panel.high[2], panel.resolution).double()
     if len(levels) == 0:
         return False
     stops = torch.from_numpy(path)[torch.linspace(0, len(path) - 1, min(len(path), 200)).long()]
     points = stops[:, None].repeat(1, len(levels), 1)
     points[:, :, 2] = levels
-    occupied = _is_occupied(_query(panel, points.reshape(-1, 3)), occupied_above).reshape(len(stops), -1)
-    occupied &= points[:, :, 2] > stops[:, 2:] + headroom
+    occupied = _is_occupied(_query(panel, points.reshape(-1, 3))).reshape(len(stops), -1)
+    occupied &= points[:, :, 2] > stops[:, 2:] + HEADROOM
     return bool(occupied.any(1).double().mean() > 0.5)
 
 
@@ -231,12 +221,13 @@ def _reduced(image: MapImage, factor: int) -> MapImage:
     )
 
 
-def _is_unknown(theta: Tensor) -> Tensor:
+def is_unknown(theta: Tensor) -> Tensor:
+    """Returns the mask of probabilities that are as good as ½."""
     return (theta - 0.5).abs() < _UNKNOWN_BAND
 
 
-def _is_occupied(theta: Tensor, occupied_above: float) -> Tensor:
-    return (theta > occupied_above) & ~_is_unknown(theta)
+def _is_occupied(theta: Tensor) -> Tensor:
+    return (theta > OCCUPIED_ABOVE) & ~is_unknown(theta)
 
 
 def _query(panel: MapPanel, points: Tensor) -> Tensor:

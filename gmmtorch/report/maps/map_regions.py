@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -60,6 +62,12 @@ def robust_bounds(
         return (-1.0,) * cloud.shape[1], (1.0,) * cloud.shape[1]
     pad = max(margin, 1e-3)
     return corner_of(np.min(corners, (0, 1)) - pad), corner_of(np.max(corners, (0, 1)) + pad)
+
+
+def inside(points: Tensor, box: tuple[Sequence[float], Sequence[float]]) -> Tensor:
+    """Returns the mask (N,) of the points (N, D) in a box between two corners (D,)."""
+    low, high = (points.new_tensor(corner) for corner in box)
+    return ((points >= low) & (points <= high)).all(1)
 
 
 def corner_of(value: ArrayLike) -> tuple[float, ...]:

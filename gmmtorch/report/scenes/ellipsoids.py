@@ -15,11 +15,8 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.mapping.components import Components
 from gmmtorch.report import style
-from gmmtorch.report.scenes.scene_renderer import Camera
+from gmmtorch.report.scenes.scene_renderer import N_SIGMA, Camera
 from gmmtorch.scan import ArrayLike
-
-N_SIGMA = 2.0
-"""Size in standard deviations at which components are drawn."""
 
 _THINNESS = 0.1  # thickness of an embedded 2D ellipse, as a share of its minor axis
 _LIGHTER = 0.25  # share of white in height colours, because shading darkens them
@@ -100,30 +97,23 @@ def height_colours(heights: Tensor, scale: Normalize | None = None) -> Tensor:
     return torch.from_numpy(height_colour_map()(shares)[:, :3].copy())
 
 
-def ellipsoid_mesh(
-    means: ArrayLike, covariances: ArrayLike, n_sigma: float = N_SIGMA, n_vertices: int = 162
-) -> EllipsoidMesh:
-    """Returns the surfaces (x − μ)ᵀ Σ⁻¹ (x − μ) = n_sigma² of K components, in order, coloured by height.
+def ellipsoid_mesh(means: ArrayLike, covariances: ArrayLike, n_vertices: int = 162) -> EllipsoidMesh:
+    """Returns the surfaces (x − μ)ᵀ Σ⁻¹ (x − μ) = 4 of K components, in order, coloured by height.
 
     Args:
         means: (K, D), metres; 2D components become thin 3D ones at z = 0.
         covariances: (K, D, D), m²; a singular one gives a flat ellipsoid.
-        n_sigma: size in standard deviations.
         n_vertices: vertices per ellipsoid, 4 or more; each then has 2·n_vertices − 4 faces.
 
     Raises:
-        InvalidArgumentError: shapes disagree, values are not finite, n_sigma ≤ 0, or too few vertices.
+        InvalidArgumentError: shapes disagree, values are not finite, or too few vertices.
     """
     mean, covariance = checked_components(means, covariances)
-    if not (math.isfinite(n_sigma) and n_sigma > 0):
-        raise InvalidArgumentError(
-            f"n_sigma={n_sigma} must be above zero; 2 contains 86 % of a 2D component."
-        )
     if mean.shape[1] == 2:
         mean, covariance = _embedded(mean, covariance)
     sphere, triangles = (part.to(mean.device) for part in unit_sphere(n_vertices))
     deviations, directions = principal_axes(covariance)
-    vertices = mean[:, None] + n_sigma * sphere @ (directions * deviations[:, None, :]).mT
+    vertices = mean[:, None] + N_SIGMA * sphere @ (directions * deviations[:, None, :]).mT
     offsets = torch.arange(len(mean), device=mean.device)[:, None, None] * n_vertices
     colors = height_colours(mean[:, 2]).mul(255).to(torch.uint8).to(mean.device)
     return EllipsoidMesh(
@@ -175,9 +165,10 @@ def first_viewpoints(components: Components) -> Tensor:
 
 
 def cut_away(
-    mean: Tensor, covariance: Tensor, seen_from: Tensor | None, ceiling: float | None, camera: Camera
+    mean: Tensor, covariance: Tensor, seen_from: Tensor | None, camera: Camera
 ) -> tuple[Tensor, float]:
-    """Returns which components to draw (K,), and the height (m) above which to cut these off.
+    """Returns which components to draw (K,), and the height (m) above which to cut these off: a share of the
+    total height, or ∞ if the observed ceiling is not level.
 
     Leaves out components with means above that height, flat components that were observed from the side that
     faces away from the viewer, and components attached to such surfaces. A component is attached if most of
@@ -187,22 +178,19 @@ def cut_away(
         mean: (K, 3), metres.
         covariance: (K, 3, 3), m².
         seen_from: (K, 3), a sensor origin that observed each; if None, only the height counts.
-        ceiling: the height (m); if None, a share of the total height, or ∞ if the observed ceiling is not
-            level.
         camera: the viewer.
     """
     if len(mean) == 0:
         return torch.ones(0, dtype=torch.bool), math.inf
     if seen_from is None:
-        top = _share_of_height(mean, _CUT) if ceiling is None else ceiling
+        top = _share_of_height(mean, _CUT)
         return mean[:, 2] <= top, top
     deviations, directions = principal_axes(covariance)
     flat = deviations[:, 0] ** 2 < _FLAT * deviations[:, 1] ** 2
     normal, longest = directions[:, :, 0], directions[:, :, 2]
     side = normal * ((seen_from - mean) * normal).sum(1, keepdim=True).sign()
     hides = flat & (side @ camera.axes[2] < _BACK_FACE)
-    if ceiling is None:
-        ceiling = _level_ceiling(mean, mean[flat & (side[:, 2] < _OVERHEAD), 2])
+    ceiling = _level_ceiling(mean, mean[flat & (side[:, 2] < _OVERHEAD), 2])
     end = N_SIGMA * longest * deviations[:, 2:]
     kept = (mean[:, 2] <= ceiling) & ~hides
     if bool(flat.any()):

@@ -15,9 +15,9 @@ from torch import Tensor
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.evidence import Thresholds
 from gmmtorch.report import style
-from gmmtorch.report.maps.map_regions import Corners, robust_bounds
+from gmmtorch.report.maps.map_images import is_unknown
+from gmmtorch.report.maps.map_regions import Corners, inside, robust_bounds
 from gmmtorch.report.scenes.ellipsoids import (
-    N_SIGMA,
     cut_away,
     first_viewpoints,
     height_colours,
@@ -32,7 +32,7 @@ from gmmtorch.report.scenes.scene import (
     height_bar,
     path_balls,
 )
-from gmmtorch.report.scenes.scene_renderer import Camera, Canvas
+from gmmtorch.report.scenes.scene_renderer import N_SIGMA, Canvas
 from gmmtorch.report.table import byte_text, count_text
 
 _SIDE = 6.6  # inches, width of a panel
@@ -41,7 +41,6 @@ _SHARE = 0.97  # of the points, along each axis, that are shown
 _OUTSIDE = 1.0  # metres by which an ellipsoid may exceed the box
 _MAX_POINTS = 300_000
 _MAX_CELLS = 2_000_000
-_UNKNOWN_BAND = 0.02  # around θ = ½
 _REACH = 2  # cells around a measured point that are asked
 _POINT_PIXELS = 1.3  # radius of a point
 _PATH_PIXELS = 2.5  # radius of the sensor's path
@@ -69,7 +68,6 @@ def map_scene_figure(
     components: Components | None = None,
     *,
     title: str = "",
-    camera: Camera = SOUTH_WEST,
 ) -> Figure:
     """Draws 3D maps side by side in space, coloured by height (thesis Fig 3.6b and Fig 3.7).
 
@@ -84,29 +82,27 @@ def map_scene_figure(
         resolution: side (m) of the cells; a multiple if more than two million cells would be asked.
         components: surfaces of the map; None: the panel of the components is left out.
         title: of the figure.
-        camera: the viewer.
     """
-    hidden = _Hidden(components, camera)
+    hidden = _Hidden(components)
     cloud = points[style.even_sample(len(points), _MAX_POINTS)].double().cpu()
     cloud = cloud[~hidden(cloud)]
     box = low, high = robust_bounds(cloud, trajectory, _SHARE, margin=0.3)
     scale = style.height_scale(cloud[:, 2])
-    canvas = canvas_around(low, high, camera, int(_SIDE * style.SAVED_DPI))
+    canvas = canvas_around(low, high, SOUTH_WEST, int(_SIDE * style.SAVED_DPI))
     size = f"{count_text(len(points), 'point')}, {byte_text(_POINT_BYTES * len(points))}"
     shown = [(f"measured: {size}", _spots(cloud, _POINT_PIXELS / canvas.scale, scale, hidden, box))]
     if components is not None:
         surfaces = _surfaces(components, scale, hidden, box)
         shown.append((f"surfaces of the map: {count_text(len(components), 'component')}", surfaces))
-    centres, side = cells_near(points[_inside(points, box)], resolution)
+    centres, side = cells_near(points[inside(points, box)], resolution)
     for one in maps:
         theta = one.occupancy(centres).cpu()
-        is_unknown = (theta - 0.5).abs() < _UNKNOWN_BAND
-        occupied = centres[(theta >= one.occupied_from) & ~is_unknown]
+        occupied = centres[(theta >= one.occupied_from) & ~is_unknown(theta)]
         shown.append((one.title, _spots(occupied, _FILL * side, scale, hidden, box)))
     path = [path_balls(trajectory.double(), _PATH_PIXELS / canvas.scale, _PATH)] if len(trajectory) else []
     figure, panels = _sheet(len(shown), canvas)
     for axes, (name, part) in zip(panels, shown, strict=False):
-        draw_scene(axes, [part, *path], low, high, camera, canvas)
+        draw_scene(axes, [part, *path], low, high, SOUTH_WEST, canvas)
         axes.set_title(name, fontsize=style.TITLE_SIZE)
     height_bar(figure, panels, scale)
     style.figure_title(figure, title)
@@ -125,14 +121,14 @@ def _sheet(n_panels: int, canvas: Canvas) -> tuple[Figure, list[Axes]]:
     return figure, panels
 
 
-def cells_near(points: Tensor, resolution: float, reach: int = _REACH) -> tuple[Tensor, float]:
-    """Returns the centres (M, 3) of the cells at most `reach` cells from a point along each axis, and their
+def cells_near(points: Tensor, resolution: float) -> tuple[Tensor, float]:
+    """Returns the centres (M, 3) of the cells at most two cells from a point along each axis, and their
     side (m): `resolution`, doubled until there are no more than two million cells."""
     while True:
         cells = torch.unique((points.double() / resolution).floor(), dim=0)
         for axis in range(3):
-            step = torch.zeros(2 * reach + 1, 3, dtype=torch.float64)
-            step[:, axis] = torch.arange(-reach, reach + 1)
+            step = torch.zeros(2 * _REACH + 1, 3, dtype=torch.float64)
+            step[:, axis] = torch.arange(-_REACH, _REACH + 1)
             cells = torch.unique((cells[:, None] + step).flatten(0, 1), dim=0)
             if len(cells) > _MAX_CELLS:
                 break
@@ -145,7 +141,7 @@ class _Hidden:
     """What is left out because it hides the inside: what lies above `top` (m), and what belongs to components
     that `cut_away` leaves out; `kept` (K,) marks the others."""
 
-    def __init__(self, components: Components | None, camera: Camera) -> None:
+    def __init__(self, components: Components | None) -> None:
         self.kept, self.top = torch.ones(0, dtype=torch.bool), math.inf
         if components is None or len(components) == 0:
             return
@@ -154,7 +150,7 @@ class _Hidden:
             components.covariances.double().cpu(),
         )
         seen_from = first_viewpoints(components).double().cpu()
-        self.kept, self.top = cut_away(self._means, self._covariances, seen_from, None, camera)
+        self.kept, self.top = cut_away(self._means, self._covariances, seen_from, SOUTH_WEST)
 
     def __call__(self, places: Tensor) -> Tensor:
         """Whether each place (M, 3) is left out."""
@@ -183,7 +179,7 @@ def _surfaces(components: Components, scale: Normalize, hidden: _Hidden, box: Co
 def _spots(places: Tensor, radius: float, scale: Normalize, hidden: _Hidden, box: Corners) -> Ellipsoids:
     """Balls at the places (M, 3) in the box that are not hidden, coloured by height."""
     places = places.double().cpu()
-    places = places[_inside(places, box)]
+    places = places[inside(places, box)]
     places = places[~hidden(places)]
     return balls(places, radius, height_colours(places[:, 2], scale))
 
@@ -193,9 +189,4 @@ def _lie_inside(components: Components, box: Corners) -> Tensor:
     means, (deviations, directions) = components.means, principal_axes(components.covariances)
     end = N_SIGMA * directions[:, :, 2] * deviations[:, 2:]
     wide = tuple(x - _OUTSIDE for x in box[0]), tuple(x + _OUTSIDE for x in box[1])
-    return _inside(means, box) & _inside(means + end, wide) & _inside(means - end, wide)
-
-
-def _inside(places: Tensor, box: Corners) -> Tensor:
-    low, high = (places.new_tensor(corner) for corner in box)
-    return ((places >= low) & (places <= high)).all(1)
+    return inside(means, box) & inside(means + end, wide) & inside(means - end, wide)

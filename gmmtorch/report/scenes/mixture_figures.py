@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.report import style
-from gmmtorch.report.maps.map_regions import robust_bounds
+from gmmtorch.report.maps.map_regions import inside, robust_bounds
 from gmmtorch.report.scenes.ellipsoids import (
     checked_components,
     checked_rows,
@@ -42,7 +42,7 @@ MAX_ELLIPSOIDS = 3_000
 
 _PANEL_WIDTH = 6.6  # inches, of each view of a 3D mixture
 _MARGIN = 0.04  # of the longest side of what is shown
-_POINT, _ELLIPSE, _ORIGIN = "#8a8a8a", style.PALETTE[0], style.PALETTE[1]
+_POINT, _ELLIPSE = "#8a8a8a", style.PALETTE[0]
 _POINT_PIXELS = 1.2  # radius of a point in the view in space
 
 Corner = Sequence[float]
@@ -53,7 +53,6 @@ def mixture_figure(
     means: ArrayLike,
     covariances: ArrayLike,
     weights: ArrayLike,
-    origins: ArrayLike | None = None,
     *,
     seen_from: ArrayLike | None = None,
     title: str = "Gaussian mixture",
@@ -69,7 +68,6 @@ def mixture_figure(
         means: (K, D), metres.
         covariances: (K, D, D), m².
         weights: (K,), on any positive scale.
-        origins: (S, D), sensor positions to mark, if given.
         seen_from: (K, 3), a sensor origin that observed each component: the view in space then leaves out
             ceilings and near walls, so that rooms are open. If None, it shows all components.
         title: title of the figure; the numbers of components and points are added.
@@ -86,20 +84,17 @@ def mixture_figure(
             f"weights has shape {weight.shape}; expected ({len(mean)},), one per component."
         )
     places = checked_rows("seen_from", seen_from, mean)
-    marks = np.empty((0, dim)) if origins is None else style.as_array(origins).reshape(-1, dim)
     limit = max_components or (MAX_ELLIPSES if dim == 2 else MAX_ELLIPSOIDS)
     shown = torch.from_numpy(np.sort(np.argsort(-weight, kind="stable")[:limit]))
     mean, covariance = mean[shown], covariance[shown]
-    low, high = robust_bounds(cloud if len(cloud) else mean, marks, margin=0.0)
+    low, high = robust_bounds(cloud if len(cloud) else mean, margin=0.0)
     margin = max(_MARGIN * max(b - a for a, b in zip(low, high, strict=True)), 0.05)
     box = [a - margin for a in low], [b + margin for b in high]
     cloud_shown = cloud[style.even_sample(len(cloud), MAX_POINTS)]
     if dim == 2:
-        figure = _flat_figure(cloud_shown, mean, covariance, marks, box)
+        figure = _flat_figure(cloud_shown, mean, covariance, box)
     else:
-        figure = _solid_figure(
-            cloud_shown, mean, covariance, None if places is None else places[shown], marks, box
-        )
+        figure = _solid_figure(cloud_shown, mean, covariance, None if places is None else places[shown], box)
     count = count_text(len(weight), "component")
     if len(shown) < len(weight):
         count = f"{len(shown):,} largest of {count}"
@@ -108,18 +103,16 @@ def mixture_figure(
     return figure
 
 
-def _flat_figure(
-    points: np.ndarray, mean: Tensor, covariance: Tensor, marks: np.ndarray, box: tuple[Corner, Corner]
-) -> Figure:
+def _flat_figure(points: np.ndarray, mean: Tensor, covariance: Tensor, box: tuple[Corner, Corner]) -> Figure:
     (x0, y0), (x1, y1) = box
     shape = float(np.clip((y1 - y0) / (x1 - x0), 0.25, 4.0))
     width = 8.2 / max(1.0, shape**0.5)
     figure = style.new_figure(max(width + 0.8, 6.4), width * shape + 1.5)
     axes = figure.subplots()
     colours = np.tile(to_rgb(_ELLIPSE), (len(mean), 1))
-    _draw_from_above(axes, points, ellipse_outlines(mean, covariance), colours, marks, box)
+    _draw_from_above(axes, points, ellipse_outlines(mean, covariance), colours, box)
     style.label_axes(axes, "", "x [m]", "y [m]")
-    _mixture_legend(figure, "2σ ellipses", len(points) > 0, len(marks) > 0)
+    _mixture_legend(figure, "2σ ellipses", len(points) > 0)
     return figure
 
 
@@ -128,7 +121,6 @@ def _solid_figure(
     mean: Tensor,
     covariance: Tensor,
     seen_from: Tensor | None,
-    marks: np.ndarray,
     box: tuple[Corner, Corner],
 ) -> Figure:
     low, high = box
@@ -138,14 +130,14 @@ def _solid_figure(
     figure = style.new_figure(2 * _PANEL_WIDTH + 1.0, float(np.clip(_PANEL_WIDTH * tall, 4.0, 7.0)) + 1.4)
     space, plan = figure.subplots(1, 2)
     scale = Normalize(low[2], high[2], clip=True)
-    _draw_in_space(space, points, mean, covariance, seen_from, marks, box, canvas, scale)
+    _draw_in_space(space, points, mean, covariance, seen_from, box, canvas, scale)
     order = torch.argsort(mean[:, 2], stable=True)  # higher components cover lower ones
     mean, covariance = mean[order], covariance[order]
     outlines = ellipse_outlines(mean[:, :2], covariance[:, :2, :2])
-    _draw_from_above(plan, points, outlines, height_colours(mean[:, 2], scale).numpy(), marks, box)
+    _draw_from_above(plan, points, outlines, height_colours(mean[:, 2], scale).numpy(), box)
     style.label_axes(plan, "from above", "x [m]", "y [m]")
     height_bar(figure, plan, scale)
-    _mixture_legend(figure, "2σ ellipsoids", len(points) > 0, len(marks) > 0)
+    _mixture_legend(figure, "2σ ellipsoids", len(points) > 0)
     return figure
 
 
@@ -155,29 +147,24 @@ def _draw_in_space(
     mean: Tensor,
     covariance: Tensor,
     seen_from: Tensor | None,
-    marks: np.ndarray,
     box: tuple[Corner, Corner],
     canvas: Canvas,
     scale: Normalize,
 ) -> None:
-    """Draws the components and points inside the box, and the sensor positions; with `seen_from`, without the
+    """Draws the components and points inside the box; with `seen_from`, without the
     components that hide the inside, and without points, which would stand where these were."""
-    low, high = (torch.tensor(corner, dtype=torch.float64) for corner in box)
-    inside = ((mean >= low) & (mean <= high)).all(1)
-    cloud, top = torch.from_numpy(points), np.inf
+    shown, cloud, top = inside(mean, box), torch.from_numpy(points), np.inf
     if seen_from is None:
         style.label_axes(axes, "in space")
-        cloud = cloud[((cloud >= low) & (cloud <= high)).all(1)]
+        cloud = cloud[inside(cloud, box)]
     else:
         style.label_axes(axes, "in space, ceilings and near walls left out")
-        kept, top = cut_away(mean, covariance, seen_from, None, SOUTH_WEST)
-        inside, cloud = inside & kept, cloud[:0]
-    components = Ellipsoids(mean[inside], covariance[inside], height_colours(mean[inside, 2], scale), top)
+        kept, top = cut_away(mean, covariance, seen_from, SOUTH_WEST)
+        shown, cloud = shown & kept, cloud[:0]
+    components = Ellipsoids(mean[shown], covariance[shown], height_colours(mean[shown, 2], scale), top)
     grey = torch.tensor(to_rgb(_POINT), dtype=torch.float64)
     dots = balls(cloud, _POINT_PIXELS / canvas.scale, grey)
     draw_scene(axes, [components, dots], *box, SOUTH_WEST, canvas)
-    flat = SOUTH_WEST.project(torch.from_numpy(marks)).numpy()
-    axes.plot(flat[:, 0], flat[:, 1], "^", color=_ORIGIN, markeredgecolor="white", markersize=6, zorder=10)
 
 
 def _draw_from_above(
@@ -185,10 +172,9 @@ def _draw_from_above(
     points: np.ndarray,
     outlines: np.ndarray,
     colours: np.ndarray,
-    marks: np.ndarray,
     box: tuple[Corner, Corner],
 ) -> None:
-    """Draws points, ellipses (K, C, 2) with colours (K, 3), and sensor positions in the x-y plane."""
+    """Draws points, and ellipses (K, C, 2) with colours (K, 3), in the x-y plane."""
     size = float(np.clip(12000 / max(len(points), 1), 1.0, 14))
     axes.scatter(points[:, 0], points[:, 1], s=size, color=_POINT, linewidths=0, rasterized=True)
     opacity = _opacity(outlines)[:, None]
@@ -199,16 +185,6 @@ def _draw_from_above(
         linewidths=1.2 if len(outlines) < 500 else 0.6,
     )
     axes.add_collection(patches, autolim=False)
-    size = 8 if len(marks) < 20 else 5
-    axes.plot(
-        marks[:, 0],
-        marks[:, 1],
-        "^",
-        color=_ORIGIN,
-        markeredgecolor="white",
-        markersize=size,
-        markeredgewidth=0.5,
-    )
     low, high = box
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
 
@@ -221,16 +197,9 @@ def _opacity(outlines: np.ndarray) -> np.ndarray:
     return np.clip(0.5 * np.sqrt(typical / np.maximum(area, 1e-300)), 0.04, 0.5)
 
 
-def _mixture_legend(figure: Figure, shapes: str, with_points: bool, with_origins: bool) -> None:
+def _mixture_legend(figure: Figure, shapes: str, with_points: bool) -> None:
     """Draws the legend with marks large enough to see."""
-    entries: list[tuple[str, str, Literal["full", "none"], int, str]] = []
-    if with_points:
-        entries.append((_POINT, "o", "full", 5, "points"))
-    entries.append((_ELLIPSE, "o", "none", 10, shapes))
-    if with_origins:
-        entries.append((_ORIGIN, "^", "full", 8, "sensor positions"))
-    handles = [
-        Line2D([], [], linestyle="", color=hue, marker=mark, fillstyle=fill, markersize=size, label=label)
-        for hue, mark, fill, size, label in entries
-    ]
+    look: dict[str, Any] = {"linestyle": "", "marker": "o"}
+    handles = [Line2D([], [], color=_POINT, markersize=5, label="points", **look)] if with_points else []
+    handles.append(Line2D([], [], color=_ELLIPSE, fillstyle="none", markersize=10, label=shapes, **look))
     style.legend_below(figure, handles)

@@ -19,7 +19,6 @@ from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.report import style
 from gmmtorch.report.maps.map_regions import robust_bounds
 from gmmtorch.report.scenes.ellipsoids import (
-    N_SIGMA,
     checked_components,
     checked_rows,
     cut_away,
@@ -27,7 +26,7 @@ from gmmtorch.report.scenes.ellipsoids import (
     height_colours,
 )
 from gmmtorch.report.scenes.paths import path_handles, smooth_path
-from gmmtorch.report.scenes.scene_renderer import Camera, Canvas, render
+from gmmtorch.report.scenes.scene_renderer import N_SIGMA, Camera, Canvas, render
 from gmmtorch.report.table import count_text
 from gmmtorch.scan import ArrayLike
 
@@ -110,7 +109,6 @@ def draw_scene(
         torch.cat(colours),
         camera,
         canvas,
-        N_SIGMA,
         tops=torch.cat(tops),
     )
     _draw_floor(axes, np.asarray(low), np.asarray(high), camera, n_ticks)
@@ -135,24 +133,21 @@ def mixture_scene_figure(
     seen_from: ArrayLike | None = None,
     trajectories: Sequence[ArrayLike] = (),
     traveller: str = "robot",
-    ceiling: float | None = None,
     camera: Camera = SOUTH_WEST,
     title: str | None = None,
     max_pixels: int = int(_WIDTH * style.SAVED_DPI),
 ) -> Figure:
     """Draws the 2σ ellipsoids of a 3D mixture in space, coloured by height, and the paths of robots.
 
-    Leaves out what hides the inside: components above the ceiling, flat components that were observed from
+    Leaves out what hides the inside: components of a level ceiling, flat components that were observed from
     the side that faces away from the viewer, and components attached to these.
 
     Args:
         means: (K, 3), metres.
         covariances: (K, 3, 3), m².
-        seen_from: (K, 3), a sensor origin that observed each component.
+        seen_from: (K, 3), a sensor origin that observed each component; if None, the top is left out.
         trajectories: poses (T, ≥ 3) of each robot, world metres.
         traveller: what each path is of, for the legend.
-        ceiling: height (m) above which nothing is drawn; if None, below the top if `seen_from` is None or
-            most surfaces overhead are near the top, else none.
         camera: the viewer; by default in the south-west, 45° up.
         title: title of the figure; by default the number of components.
         max_pixels: width of the picture.
@@ -164,7 +159,7 @@ def mixture_scene_figure(
     if mean.shape[1] != 3:
         raise InvalidArgumentError(f"means has shape {tuple(mean.shape)}; a scene needs (K, 3).")
     places = checked_rows("seen_from", seen_from, mean)
-    kept, top = cut_away(mean, covariance, places, ceiling, camera)
+    kept, top = cut_away(mean, covariance, places, camera)
     paths = [torch.from_numpy(smooth_path(path)) for path in trajectories if len(path)]
     flown = torch.cat([path[:, :3] for path in paths]) if paths else mean[:0]
     low, high = robust_bounds(mean, flown, _SHARE, margin=0.3)

@@ -12,7 +12,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError
+N_SIGMA = 2.0
+"""Size in standard deviations at which components are drawn."""
 
 _CHUNK = 1 << 19  # fragments at a time
 _MIN_RADIUS = 0.72  # pixels: a ball of this radius contains the centre of a pixel wherever it is
@@ -74,11 +75,10 @@ def render(
     colours: Tensor,
     camera: Camera,
     canvas: Canvas,
-    n_sigma: float = 2.0,
     smoothing: int = 2,
     tops: Tensor | None = None,
 ) -> Rendered:
-    """Renders the surfaces (x − μ)ᵀ Σ⁻¹ (x − μ) = n_sigma² of K ellipsoids with shading.
+    """Renders the surfaces (x − μ)ᵀ Σ⁻¹ (x − μ) = 4 of K ellipsoids with shading.
 
     In camera coordinates x = (d, z), d in the picture plane, the conditional Gaussian of z given d gives the
     surface in closed form: z = μ_z + cᵀd + √(v (n² − dᵀS⁻¹d)), c = S⁻¹Σ_dz, v = Σ_zz − cᵀΣ_dz. Σ is never
@@ -91,19 +91,13 @@ def render(
         colours: (K, 3), in [0, 1].
         camera: the viewer.
         canvas: the picture plane.
-        n_sigma: size of the ellipsoids in standard deviations.
         smoothing: rays per pixel along each axis.
         tops: (K,), heights (m) above which the ellipsoids are cut off; none if None.
-
-    Raises:
-        InvalidArgumentError: n_sigma or smoothing is not positive.
     """
-    if not n_sigma > 0 or smoothing < 1:
-        raise InvalidArgumentError(f"n_sigma={n_sigma} and smoothing={smoothing} must be above zero.")
     rows, columns = canvas.shape
     fine = canvas._replace(scale=canvas.scale * smoothing)
     height, width = rows * smoothing, columns * smoothing
-    shapes = _Shapes.of(means, covariances, camera, fine, n_sigma)
+    shapes = _Shapes.of(means, covariances, camera, fine)
     if tops is not None:
         shapes = shapes.cut_off(tops, camera, fine)
     depth, owner = _nearest(shapes, height, width)
@@ -126,39 +120,36 @@ class _Shapes(NamedTuple):
 
     table: (K, 9): centre x, y, z (z relative to the mean depth), inverse of the outline's matrix (xx, xy,
     yy), slope c (x, y) and conditional variance v of the depth; first, last: (K, 2) range of pixels of
-    each, within the picture; square: n²; middle: mean depth, metres; limits: (K,), the largest value of up
+    each, within the picture; middle: mean depth, metres; limits: (K,), the largest value of up
     · (y, z).
     """
 
     table: Tensor
     first: Tensor
     last: Tensor
-    square: float
     middle: float
     limits: Tensor | None = None
     up: tuple[float, float] = (0.0, 1.0)
 
     @classmethod
-    def of(
-        cls, means: Tensor, covariances: Tensor, camera: Camera, canvas: Canvas, n_sigma: float
-    ) -> _Shapes:
+    def of(cls, means: Tensor, covariances: Tensor, camera: Camera, canvas: Canvas) -> _Shapes:
         axes, scale = camera.axes, canvas.scale
         placed = camera.project(means)
         middle = float(placed[:, 2].mean()) if len(placed) else 0.0
         centre = (placed - torch.tensor([canvas.left, canvas.bottom, middle], dtype=torch.float64)) * scale
         spread = axes @ covariances.double() @ axes.T * scale**2
-        outline = spread[:, :2, :2] + (_MIN_RADIUS / n_sigma) ** 2 * torch.eye(2, dtype=torch.float64)
+        outline = spread[:, :2, :2] + (_MIN_RADIUS / N_SIGMA) ** 2 * torch.eye(2, dtype=torch.float64)
         inverse = torch.linalg.inv(outline)
         slope = (inverse @ spread[:, :2, 2:])[..., 0]
         variance = (spread[:, 2, 2] - (slope * spread[:, :2, 2]).sum(1)).clamp_min(0)
         unique = inverse.flatten(1)[:, [0, 1, 3]]
-        half = n_sigma * outline.diagonal(dim1=1, dim2=2).sqrt()
+        half = N_SIGMA * outline.diagonal(dim1=1, dim2=2).sqrt()
         height, width = canvas.shape
         limit = torch.tensor([width, height])
         first = (centre[:, :2] - half).floor().clamp_min(0).long()
         last = torch.minimum((centre[:, :2] + half).ceil(), limit).long()
         table = torch.cat([centre, unique, slope, variance[:, None]], 1).float()
-        return cls(table, first, torch.maximum(first, last), n_sigma**2, middle)
+        return cls(table, first, torch.maximum(first, last), middle)
 
     def cut_off(self, tops: Tensor, camera: Camera, canvas: Canvas) -> _Shapes:
         """Adds a largest height (m) for each. The height is z₀ + u_y y + u_z z in pixels."""
@@ -171,7 +162,7 @@ class _Shapes(NamedTuple):
         columns `rows` of the ellipsoid of each pixel."""
         cx, cy, cz, xx, xy, yy, sx, sy, variance = rows
         dx, dy = x + 0.5 - cx, y + 0.5 - cy
-        left = self.square - (xx * dx * dx + 2 * xy * dx * dy + yy * dy * dy)
+        left = N_SIGMA**2 - (xx * dx * dx + 2 * xy * dx * dy + yy * dy * dy)
         return left, cz + sx * dx + sy * dy + (variance * left.clamp_min(0)).sqrt()
 
     def normals(self, visible: Tensor, x: Tensor, y: Tensor) -> Tensor:

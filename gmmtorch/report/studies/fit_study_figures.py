@@ -13,7 +13,6 @@ from matplotlib.ticker import NullLocator
 
 from gmmtorch.report import style
 from gmmtorch.report.labels import Label, place_labels
-from gmmtorch.report.style import Rows
 
 _AXES = {"n_components": "components", "nbytes": "map size [bytes]"}
 _LABELS = {
@@ -125,7 +124,7 @@ _QUALITY = (
 )
 
 
-def initialization_figures(rows: Rows) -> dict[str, Figure]:
+def initialization_figures(rows: style.Rows) -> dict[str, Figure]:
     """Draws `initialization`: initialization time, iterations, total time and PSNR2, as in Fig 2.1; and
     `initialization_quality`: the gain over the first initialization in both terms of PSNR2, and in PSNR2 and
     log-likelihood of held-out points.
@@ -147,7 +146,7 @@ _SENSOR_PANELS = (
 )
 
 
-def sensor_model_figures(rows: Rows) -> dict[str, Figure]:
+def sensor_model_figures(rows: style.Rows) -> dict[str, Figure]:
     """Draws `sensor_model`: log-likelihood, thickness and AUC of each variant against the bytes of its map.
 
     Args:

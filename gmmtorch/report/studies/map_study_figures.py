@@ -7,17 +7,16 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import torch
-from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator
+from matplotlib.ticker import LogLocator
 from torch import Tensor
 
 from gmmtorch.report import style
 from gmmtorch.report.labels import Label, place_labels
-from gmmtorch.report.maps.map_regions import Corners, busiest_regions
-from gmmtorch.report.scenes.ellipsoids import height_colour_map, height_colours
-from gmmtorch.report.scenes.scene import balls, canvas_around, draw_scene
+from gmmtorch.report.maps.map_regions import Corners, busiest_regions, inside
+from gmmtorch.report.scenes.ellipsoids import height_colours
+from gmmtorch.report.scenes.scene import balls, canvas_around, draw_scene, height_bar
 from gmmtorch.report.scenes.scene_renderer import Camera
 from gmmtorch.report.table import byte_text
 
@@ -49,7 +48,7 @@ def auc_memory_figures(rows: style.Rows) -> dict[str, Figure]:
             ]
         axes.set_xscale("log")
         axes.xaxis.set_major_locator(LogLocator())
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: byte_text(value, digits=1)))
+        style.tick_text(axes.xaxis, lambda value: byte_text(value, digits=1))
         style.label_axes(axes, f"cells of {style.metres(resolution)}", "map size", "")
         style.draw_grid(axes)
     grid[0][0].set_ylabel("area under the ROC curve", fontsize=style.LABEL_SIZE)
@@ -141,12 +140,10 @@ def _length(length: object) -> str:
     return "hits as counts" if length is None else f"hit_length={length}"
 
 
-def closest_look(thin: Tensor, hits: Tensor, side: float = 4.0) -> Corners:
-    """Returns the corners of a box around the most thin points: `side` × `side` metres, as high as its
-    hits."""
-    (low, high), *_ = busiest_regions(thin[:, :2], 1, side)
-    inside = ((hits[:, :2] >= torch.tensor(low)) & (hits[:, :2] <= torch.tensor(high))).all(1)
-    heights = np.quantile(hits[inside, 2].numpy(), [0.005, 0.995])
+def closest_look(thin: Tensor, hits: Tensor) -> Corners:
+    """Returns the corners of a box around the most thin points: 4 m × 4 m, as high as its hits."""
+    (low, high), *_ = busiest_regions(thin[:, :2], 1, 4.0)
+    heights = np.quantile(hits[inside(hits[:, :2], (low, high)), 2].numpy(), [0.005, 0.995])
     return (*low, float(heights[0]) - 0.2), (*high, float(heights[1]) + 0.2)
 
 
@@ -168,7 +165,6 @@ def cells_figure(
         resolution: side (m) of the cells; larger if the box has more than 400,000 of them.
     """
     corners = torch.tensor([low, high], dtype=torch.float64)
-    inside = hits[((hits >= corners[0]) & (hits <= corners[1])).all(1)]
     size = resolution * max(1.0, (math.prod((corners[1] - corners[0]) / resolution) / _MAX_CELLS) ** (1 / 3))
     steps = [
         torch.arange(math.floor(a / size), math.ceil(b / size), dtype=torch.float64) * size + size / 2
@@ -182,14 +178,19 @@ def cells_figure(
     grid = figure.subplots(len(maps), n_columns, squeeze=False)
     canvas = canvas_around(low, high, _CAMERA, int(_SIDE * style.SAVED_DPI))
     for row, (n_components, masks) in zip(grid, drawn.items(), strict=True):
-        shown = [(inside, _POINT_PIXELS / canvas.scale, f"{n_components:,} components:\nheld-out points")]
+        shown = [
+            (
+                hits[inside(hits, (low, high))],
+                _POINT_PIXELS / canvas.scale,
+                f"{n_components:,} components:\nheld-out points",
+            )
+        ]
         shown += [(centres[mask], size / 2, title) for title, mask in masks.items()]
         for axes, (places, radius, title) in zip(row, shown, strict=True):
             part = balls(places, radius, height_colours(places[:, 2], scale))
             draw_scene(axes, [part], low, high, _CAMERA, canvas, n_ticks=3)
             axes.set_title(title, fontsize=style.TITLE_SIZE)
-    colours = ScalarMappable(scale, height_colour_map())
-    style.colour_bar(figure, colours, grid.ravel().tolist(), "height z [m]", shrink=0.6)
+    height_bar(figure, grid.ravel().tolist(), scale)
     style.figure_title(figure, f"Cells of {style.metres(size)} with the dead band of a variance threshold")
     return figure
 
@@ -218,10 +219,10 @@ def map_variants_figures(rows: style.Rows) -> dict[str, Figure]:
             at = {"xycoords": ("axes fraction", "data"), "va": "center", "fontsize": style.TICK_SIZE}
             axes.annotate(text, (1.02, place), annotation_clip=False, **at)
         title = f"cells of {style.metres(resolution)}, {own[0]['variant']}: AUC {own[0]['auc']:.4f}"
-        style.label_axes(axes, title.replace("_", " "), "difference of AUC, 95 % interval", "")
+        style.label_axes(axes, style.label_of(title), "difference of AUC, 95 % interval", "")
         axes.margins(y=0.08)
         style.draw_grid(axes)
-    grid[0][0].set_yticks(range(len(variants)), [name.replace("_", " ") for name in variants])
+    grid[0][0].set_yticks(range(len(variants)), [style.label_of(name) for name in variants])
     grid[0][0].invert_yaxis()
     style.figure_title(figure, f"Variants of a map: {rows[0]['dataset']}")
     return {"map_variants": figure}

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.report import style
@@ -68,23 +68,22 @@ class _Curve(NamedTuple):
         return np.where(quality > self.quality[-1], math.inf, needed)
 
 
-def leads(rows: style.Rows, quality: str, left_out: Sequence[str] = (), ours: str = OURS) -> Lead:
-    """Returns the range of sizes in which `ours` needs no more bytes than every other codec.
+def leads(rows: style.Rows, quality: str, left_out: Sequence[str] = ()) -> Lead:
+    """Returns the range of sizes in which ours needs no more bytes than every other codec.
 
     Args:
         rows: of one data set: codec, nbytes, and `quality`; higher is better, ∞ is lossless.
         quality: field of the rows.
         left_out: codecs to ignore, in addition to `MIXTURES`.
-        ours: the codec in question.
 
-    Raises `InvalidArgumentError` if `ours` or all other codecs have no rows.
+    Raises `InvalidArgumentError` if ours or all other codecs have no rows.
     """
-    ignored = (ours, *MIXTURES, *left_out)
+    ignored = (*MIXTURES, *left_out)
     other_names = dict.fromkeys(row["codec"] for row in rows if row["codec"] not in ignored)
-    own = _curve(rows, ours, quality)
+    own = _curve(rows, OURS, quality)
     others = {name: _curve(rows, name, quality) for name in other_names}
     if not len(own.quality) or not others:
-        raise InvalidArgumentError(f"rows contain nothing of {ours!r}, or of no other codec.")
+        raise InvalidArgumentError(f"rows contain nothing of {OURS!r}, or of no other codec.")
     rate = np.linspace(own.log_bytes[0], own.log_bytes[-1], _N_SIZES)
     reached = np.interp(rate, own.log_bytes, own.quality)
     needed = np.stack([curve.bytes_for(reached) for curve in others.values()])
@@ -185,5 +184,5 @@ def _scale(axes: Axes, values: Sequence[float]) -> None:
     axes.set_xscale("log")
     axes.set_xlim(min(values) / 1.4, max(values) * 1.6)
     axes.xaxis.set_major_locator(LogLocator())
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: byte_text(value, digits=1)))
+    style.tick_text(axes.xaxis, lambda value: byte_text(value, digits=1))
     axes.xaxis.set_minor_formatter(NullFormatter())

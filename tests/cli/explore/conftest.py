@@ -2,39 +2,24 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from cli.command_runs import (
-    COMMANDS,
-    Finished,
-    succeeded,
-)
-from cli.explore.explore_cases import ROOM, Run, run_in
-
-from gmmtorch.cli import explore, export
+from cli.command_runs import Finished, room_mesh, succeeded
+from cli.explore.explore_cases import Run, run_in
 
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A mesh: the six walls of an empty room, two triangles each."""
-    path = tmp_path_factory.mktemp("mesh") / "room.obj"
-    corners = [f"v {x} {y} {z}" for x, y, z in itertools.product(*((0.0, side) for side in ROOM))]
-    walls = [(1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4)]
-    faces = [f"f {a} {b} {c}\nf {a} {c} {d}" for a, b, c, d in walls]
-    path.write_text("\n".join([*corners, *faces, ""]))
-    return path
+    return room_mesh(tmp_path_factory.mktemp("mesh") / "room.obj")
 
 
 @pytest.fixture(scope="module", autouse=True)
-def with_these_commands(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """The commands of this file, with a cache of worlds of their own."""
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A cache of worlds of their own."""
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setitem(COMMANDS, "explore", explore)
-        monkeypatch.setitem(COMMANDS, "export", export)
         monkeypatch.setenv("GMMTORCH_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
 

@@ -22,7 +22,6 @@ FIELDS = {
 
 
 SMALL = ["team.size=2", "sensor.width=48", "sensor.height=36", "runtime.workers=1"]
-ROOM = (7.0, 6.0, 3.0)
 
 
 def run_in(monkeypatch: pytest.MonkeyPatch, folder: Path, room: Path, *options: str) -> Finished:

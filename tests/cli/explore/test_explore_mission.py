@@ -12,7 +12,6 @@ from cli.command_runs import (
     Finished,
     run_here,
     succeeded,
-    timeless,
 )
 from cli.explore.explore_cases import FIELDS
 
@@ -150,29 +149,18 @@ def test_the_command_prints_a_table_and_progress(mission):
 # -- options ---------------------------------------------------------------------------------------
 
 
-def test_equal_runs_give_equal_rows_and_another_seed_gives_others(run):
-    first, again, other = (
-        succeeded(run(f"seed={seed}", name=name)) for seed, name in ((1, "a"), (1, "b"), (2, "c"))
-    )
-    assert timeless(first.results()) == timeless(again.results())
-    assert timeless(first.results())["rows"] != timeless(other.results())["rows"]
-    assert first.stderr == ""
-    assert not [name for name in first.files() if name.endswith(".png") or "tfevents" in name]
-
-
-@pytest.mark.parametrize("team", ["grid_shared", "grid_isolated"])
-def test_teams_of_grids_leave_no_mixture(team, run):
-    done = succeeded(run(f"team={team}", "planner=frontier"))
+def test_teams_of_grids_leave_no_mixture(run):
+    done = succeeded(run("team=grid_isolated", "planner=frontier"))
     (row,) = done.results()["rows"]
-    assert (row["framework"], row["planner"], row["n_components"]) == (team, "frontier", None)
+    assert (row["framework"], row["planner"], row["n_components"]) == ("grid_isolated", "frontier", None)
     assert "map.safetensors" not in done.files()
 
 
 def test_options_reach_the_mission(run):
     options = ["information=fsmi", "coordination=myopic", "network.loss=0.5", "world.resolution=0.25"]
-    cut = {"begin": 1.0, "end": 3.0, "groups": [[0], [1]]}
+    cut = {"begin": 1.0, "end": 9.0, "groups": [[0], [1]]}  # until after the mission
     options += ["network.jitter=0.02", "network.duplication=0.5", "network.reach=15", "network.delay=0.1"]
-    options += ["network.partitions=[{begin: 1, end: 3, groups: [[0], [1]]}]", "duration=4"]
+    options += ["network.partitions=[{begin: 1, end: 9, groups: [[0], [1]]}]", "duration=4"]
     options += ["network.announce=1.5", "network.budget=2000"]
     options += ["evaluation.codecs=[octree]", "team.start=[[2,3,1.5,0],[5,3,1.5,3]]", "planner.prior=0.5"]
     done = succeeded(run(*options))
@@ -187,16 +175,9 @@ def test_options_reach_the_mission(run):
     with np.load(done.folder / "trajectories.npz") as kept:
         assert kept["robot_0"][0].tolist() == [2, 3, 1.5, 0]
         assert kept["robot_1"][0].tolist() == [5, 3, 1.5, 3]
-
-
-def test_the_map_is_that_of_the_end_of_the_mission(run):
-    cut = "network.partitions=[{begin: 0, end: 4, groups: [[0], [1]]}]"  # until after the mission
-    done = succeeded(run(cut))
-    (row,) = done.results()["rows"]
     assert row["missing_share"][-1] > 0
     assert row["converged_after"] > 0
-    made = GaussianMap.load(done.folder / "map.safetensors")
-    assert len(made.components()) == row["n_components"]
+    assert len(GaussianMap.load(done.folder / "map.safetensors").components()) == row["n_components"]
 
 
 def test_jobs_of_a_sweep_have_folders_and_are_not_run_again_in_them(run, steps, tmp_path):

@@ -10,19 +10,23 @@ import time
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 
 from gmmtorch.cli import common
 from gmmtorch.cli.from_options import maps
-from gmmtorch.cli.recordings.inputs import find_recordings, local_copy
-from gmmtorch.cli.recordings.tasks import Outcome, run_tasks
+from gmmtorch.cli.from_options.scans import open_with_trajectory
 from gmmtorch.cli.reporting import map_outputs
-
-if TYPE_CHECKING:
-    from gmmtorch.evaluation.events import Row
-    from gmmtorch.report.progress import ProgressBars
+from gmmtorch.cli.runs.inputs import find_recordings, local_copy
+from gmmtorch.cli.runs.tasks import Outcome, run_tasks
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MemoryLimitError
+from gmmtorch.evaluation.events import Row
+from gmmtorch.files import write_bytes, write_json
+from gmmtorch.mapping.map_builder import MapBuilder, check_same_run, resident_bytes
+from gmmtorch.mapping.tile_merging import merge, tile_files
+from gmmtorch.mapping.tiles import TiledMap
+from gmmtorch.report.progress import ProgressBars
 
 _STAGE = "recordings"
 _DONE = "recording.json"  # written last: it says that a recording is complete
@@ -40,9 +44,6 @@ class Mapped(NamedTuple):
 
 def run(config: DictConfig) -> None:
     """Run the command. Recordings that an earlier run in this folder has finished are kept."""
-    from gmmtorch.errors import GmmTorchError, InvalidArgumentError
-    from gmmtorch.report.progress import ProgressBars
-
     begin, folder = time.monotonic(), common.run_dir()
     if config.view:
         raise InvalidArgumentError(
@@ -68,35 +69,22 @@ def run(config: DictConfig) -> None:
         exported, errors = _show(config, finished, rows[-1], folder, bars) if finished else ([], [])
     if finished:
         common.print_table(rows[-1:], TABLE.split(), f"{len(found)} recordings")
-        print(f"\nmap       {folder / 'tiles'}")
-        print(*exported, sep="\n", end="\n" if exported else "")
-    common.print_files(folder, folder / "results.json")
+        print("", f"map       {folder / 'tiles'}", *exported, sep="\n")
+    common.print_files(folder)
     if failed:
         reasons = " ".join(f"{row['input']}: {row['error'].splitlines()[-1]}" for row in failed)
         raise GmmTorchError(
             f"{len(failed)} of {len(found)} recordings could not be mapped. {reasons} The same options with "
             f"hydra.run.dir={folder} try them again."
         )
-    if errors:
-        raise GmmTorchError(f"not all of export={list(config.export)} was written: {' '.join(errors)}")
+    map_outputs.check_exported(config, errors)
 
 
 def _facts(config: DictConfig, address: str) -> dict[str, Any]:
     """What the map of a recording depends on."""
-    import gmmtorch
-
-    dataset = OmegaConf.to_container(config.dataset, resolve=False)
-    assert isinstance(dataset, dict)
-    return {
-        "input": address,
-        "version": gmmtorch.__version__,
-        "dataset": {key: value for key, value in dataset.items() if key != "path"},
-        "map": common.as_options(config.map),
-        "seed": config.seed,
-        "dtype": config.runtime.dtype,
-        "resolution": config.resolution,
-        "tile": config.tile,
-    }
+    facts = map_outputs.run_facts(config, "dataset")
+    del facts["dataset"]["path"]
+    return {"input": address, **facts, "resolution": config.resolution, "tile": config.tile}
 
 
 def _map_all(
@@ -120,9 +108,6 @@ def _map_all(
 
 def _finished(folder: Path, facts: dict[str, Any]) -> Row | None:
     """The row of a recording that is finished. Raises an error if it was mapped with other options."""
-    from gmmtorch.errors import DataError
-    from gmmtorch.mapping.map_builder import check_same_run
-
     path = folder / _DONE
     if not path.exists():
         return None
@@ -139,8 +124,6 @@ def _finished(folder: Path, facts: dict[str, Any]) -> Row | None:
 
 def _keep(outcome: Outcome, facts: dict[str, Any], folder: Path) -> Row:
     """Writes the files of a recording, and returns its row."""
-    from gmmtorch.files import write_bytes, write_json
-
     mapped = outcome.result
     if mapped is None:
         mapped = Mapped({}, {}, outcome.error)
@@ -154,8 +137,6 @@ def _keep(outcome: Outcome, facts: dict[str, Any], folder: Path) -> Row:
 
 def map_recording(facts: dict[str, Any], options: dict[str, Any]) -> Mapped:
     """The map of one recording in tiles, its trajectory and its row. Runs in a worker; raises nothing."""
-    from gmmtorch.errors import GmmTorchError
-
     config = OmegaConf.create({**facts, **options})
     config.runtime.dtype = facts["dtype"]
     try:
@@ -168,13 +149,10 @@ def map_recording(facts: dict[str, Any], options: dict[str, Any]) -> Mapped:
 
 
 def _mapped(config: DictConfig, path: Path) -> Mapped:
-    from gmmtorch.mapping.map_builder import MapBuilder
-    from gmmtorch.mapping.tile_merging import tile_files
-
     begin = time.process_time()
     device = common.use_runtime(config.runtime)
     config.dataset.path = str(path)
-    dataset, poses, odometry = common.open_with_trajectory(config.dataset)
+    dataset, poses, odometry = open_with_trajectory(config.dataset)
     builder = MapBuilder(dataset, maps.map_factory(config, resolution=config.resolution)(), device)
     for _ in builder.insert_all():
         pass
@@ -194,10 +172,6 @@ def _merge(
     config: DictConfig, places: Sequence[Path], rows: Sequence[Row], folder: Path, bars: ProgressBars
 ) -> Row:
     """Merges the finished recordings into tiles/; returns the row of the merged map."""
-    from gmmtorch.mapping.map_builder import resident_bytes
-    from gmmtorch.mapping.tile_merging import merge
-    from gmmtorch.mapping.tiles import TiledMap
-
     begin, memory = time.process_time(), [resident_bytes()]
 
     def note(stage: str, n_done: int, n_total: int | None) -> None:
@@ -231,9 +205,6 @@ def _show(
 
     A map that does not fit into `runtime.memory_limit` has no pictures.
     """
-    from gmmtorch.errors import MemoryLimitError
-    from gmmtorch.mapping.tiles import TiledMap
-
     tiled = TiledMap(folder / "tiles", config.runtime.device, memory_limit=config.runtime.memory_limit)
     try:
         built = tiled.open()

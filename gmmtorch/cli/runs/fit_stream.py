@@ -3,83 +3,62 @@
 from __future__ import annotations
 
 import os
-import sys
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
 
 from gmmtorch.cli import common
-from gmmtorch.cli.from_options.fit_data import fit_data
-
-if TYPE_CHECKING:
-    from gmmtorch.evaluation.fits.streamed_fit import Split, Streamed
-    from gmmtorch.mixture.streaming.checkpoints import Checkpoint
-
-
-def _is_worker() -> bool:
-    """Whether torchrun started this process with a rank above 0; only rank 0 writes files."""
-    return int(os.environ.get("WORLD_SIZE", "1")) > 1 and os.environ.get("RANK", "0") != "0"
-
-
-@contextmanager
-def quiet_worker() -> Iterator[None]:
-    """Sends the files and messages that Hydra writes in a worker to a temporary folder."""
-    if not _is_worker():
-        yield
-        return
-    with tempfile.TemporaryDirectory(prefix="gmmtorch-") as folder:
-        quiet = ["hydra.output_subdir=null", "hydra/job_logging=disabled", "hydra/hydra_logging=disabled"]
-        sys.argv += [f"hydra.run.dir={folder}", f"hydra.sweep.dir={folder}", *quiet]
-        yield
+from gmmtorch.cli.from_options.scans import fit_data, fit_options
+from gmmtorch.cli.reporting import fit_outputs
+from gmmtorch.datasets.point_files.point_chunks import open_points
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.evaluation.events import Event, Row
+from gmmtorch.evaluation.fits.fit_comparison import FitOutcome
+from gmmtorch.evaluation.fits.streamed_fit import Split, fit_streamed, split_data, split_source
+from gmmtorch.mixture.streaming.checkpoints import Checkpoint
+from gmmtorch.mixture.streaming.distributed import is_launched, joined
+from gmmtorch.report.progress import ProgressBars
 
 
 def is_wanted(config: DictConfig) -> bool:
     """Whether the options or torchrun request a streamed fit."""
-    from gmmtorch.mixture.streaming.distributed import is_launched
-
     return config.points is not None or config.checkpoint is not None or config.resume or is_launched()
 
 
-def run(config: DictConfig, folder: Path) -> Streamed | None:
-    """Run a streamed fit, write its row and save its mixture. Returns None in workers."""
-    from gmmtorch.evaluation.fits.streamed_fit import fit_streamed
-    from gmmtorch.mixture.streaming.distributed import joined
-    from gmmtorch.report.progress import ProgressBars
+def run(config: DictConfig, columns: Sequence[str], folder: Path) -> Row | None:
+    """Run a streamed fit, save and draw its mixture, and print its row; returns the row, or None in workers.
 
+    columns: of the printed table.
+    """
     device = common.set_up(config)
     if device == "cuda":
         device = f"cuda:{os.environ.get('LOCAL_RANK', '0')}"
     _check(config)
-    options = common.fit_options(config)
-    checkpoint = _checkpoint(config)
     with (
         joined(device, config.stream.timeout) as processes,
         ProgressBars(enabled=config.report.progress and processes.rank == 0) as bars,
     ):
-        split = _split(config, device, bars)
-        streamed = fit_streamed(
-            split,
-            options,
+        row, mixture, sample = fit_streamed(
+            _split(config, device, bars),
+            fit_options(config),
             config.seed,
             device=device,
             processes=processes,
-            checkpoint=checkpoint,
+            checkpoint=_checkpoint(config),
             on_event=bars,
         )
     if processes.rank != 0:
         return None
-    streamed.mixture.save(folder / "em.safetensors")
-    common.write_results("fit", config, [streamed.row], folder)
-    return streamed
+    mixture.save(folder / "em.safetensors")
+    common.write_results("fit", config, [row], folder)
+    outcome = FitOutcome([row], {"em": mixture}, {"em": mixture.lower_bounds_})
+    fit_outputs.draw(config, sample.train, outcome, folder)
+    common.print_table([row], columns, fit_outputs.headline([row]))
+    return row
 
 
 def _check(config: DictConfig) -> None:
-    from gmmtorch.errors import InvalidArgumentError
-
     if list(config.method) != ["em"]:
         raise InvalidArgumentError(
             f"method={list(config.method)}: a streamed fit, or a fit by several processes, needs method=[em]."
@@ -115,8 +94,6 @@ def _check(config: DictConfig) -> None:
 
 
 def _checkpoint(config: DictConfig) -> Checkpoint | None:
-    from gmmtorch.mixture.streaming.checkpoints import Checkpoint
-
     if config.checkpoint is None:
         return None
     stream = config.stream
@@ -124,10 +101,7 @@ def _checkpoint(config: DictConfig) -> Checkpoint | None:
     return Checkpoint(path, stream.checkpoint_every, stream.checkpoint_seconds, config.resume)
 
 
-def _split(config: DictConfig, device: str, on_event: Any) -> Split:
-    from gmmtorch.datasets.point_files.point_chunks import open_points
-    from gmmtorch.evaluation.fits.streamed_fit import split_data, split_source
-
+def _split(config: DictConfig, device: str, on_event: Event) -> Split:
     stream = config.stream
     if config.points is None:
         return split_data(fit_data(config, device, on_event), stream.chunk_points)

@@ -1,0 +1,157 @@
+"""Data sets and their scans from the options `dataset.*`, and the points that gmmtorch-fit learns from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
+
+from gmmtorch import datasets
+from gmmtorch.cli import common
+from gmmtorch.cli.options.structured import build
+from gmmtorch.datasets import Dataset
+from gmmtorch.datasets.recordings.reposed import Reposed
+from gmmtorch.errors import DataError, InvalidArgumentError, check_choice
+from gmmtorch.evaluation.events import Event, Row
+from gmmtorch.evaluation.fits.fit_comparison import FitData, split
+from gmmtorch.evaluation.fits.fit_pruning import Views
+from gmmtorch.evaluation.protocol_options import FitOptions
+from gmmtorch.evaluation.trajectories import UNSCORED, absolute_trajectory_error, relative_pose_error
+from gmmtorch.localization.odometry.odometry import Trajectory
+from gmmtorch.localization.odometry.recorded_poses import with_odometry
+from gmmtorch.scan import Scan
+
+_WITHOUT_POSES = ("scan_folder", "rosbag")  # data sets that `dataset.poses=standing` reads without poses
+
+
+class OpenedDataset(NamedTuple):
+    """A data set; with `dataset.odometry`, also its trajectory, and the facts of it for results.json."""
+
+    dataset: Dataset
+    trajectory: Trajectory | None
+    odometry: Row | None
+
+
+def open_dataset(config: DictConfig) -> Dataset:
+    """The data set that the options `dataset.*` describe."""
+    return open_with_trajectory(config).dataset
+
+
+def open_with_trajectory(config: DictConfig) -> OpenedDataset:
+    """The data set of the options `dataset.*`, with the trajectory that `dataset.odometry` gives."""
+    options = {
+        str(key): config[key]
+        for key in config
+        # If a path is missing, the reader raises an error that describes the files it needs.
+        if not OmegaConf.is_missing(config, key) and config[key] is not None
+    }
+    method, name = options.pop("odometry", "none"), options.pop("name")
+    motion = options.pop("motion", "constant")
+    check_choice("dataset.odometry", method, ("none", "auto", "kiss_icp", "mixture"))
+    try:
+        found = datasets.load(name, options.pop("path", None), **options)
+        if method == "none" or (method == "auto" and found.pose(0) is not None):
+            return OpenedDataset(found, None, None)
+        has_truth = options.get("poses") != "standing"
+    except DataError:
+        if method == "none" or name not in _WITHOUT_POSES:
+            raise
+        found = datasets.load(name, config.path, **{**options, "poses": "standing"})
+        has_truth = False
+    return _with_odometry(found, "mixture" if method == "auto" else method, motion, has_truth)
+
+
+def _with_odometry(source: Dataset, method: str, motion: str, has_truth: bool) -> OpenedDataset:
+    """The data set with estimated poses. Prints the errors against its own poses, if it has some."""
+    with common.naming({"odometry": "dataset.odometry", "motion": "dataset.motion"}):
+        posed, trajectory = with_odometry(source, method, motion=motion)
+    facts: Row = {
+        "method": method,
+        "n_lost": int((~trajectory.found).sum()),
+        "n_closures": trajectory.n_closures,
+        **_trajectory_scores(posed, trajectory, has_truth and motion == "constant"),
+    }
+    text = f"odometry  {len(posed)} poses estimated, {facts['n_lost']} scans lost, "
+    text += f"{trajectory.n_closures} loop closures"
+    if facts["ate"] is not None:
+        text += f"; ATE {facts['ate']:.3f} m, RPE {facts['rpe']:.3f} m against the poses of the data set"
+    print(text)
+    return OpenedDataset(posed, trajectory, facts)
+
+
+def _trajectory_scores(posed: Reposed, trajectory: Trajectory, has_truth: bool) -> Row:
+    """ATE and RPE against the data set's own poses; None where they cannot be computed."""
+    scores: Row = {"align": None, **UNSCORED}
+    if not has_truth or len(posed) < 3:
+        return scores
+    true = torch.stack([posed.own_pose(index) for index in range(len(posed))])
+    scores |= relative_pose_error(trajectory.poses, true).scores("rpe")
+    try:
+        ate = absolute_trajectory_error(trajectory.poses, true, "rigid").scores("ate")
+        return scores | ate | {"align": "rigid"}
+    except InvalidArgumentError:  # positions on a line determine no rotation
+        ate = absolute_trajectory_error(trajectory.poses, true, "first").scores("ate")
+        return scores | ate | {"align": "first"}
+
+
+def all_scans(config: DictConfig, device: str, on_event: Event) -> tuple[str, list[Scan]]:
+    """The name and all scans of the data set `dataset.*`, on the device."""
+    dataset = open_dataset(config.dataset)
+    return dataset.name, read_scans(dataset, range(len(dataset)), device, on_event)
+
+
+def read_scans(dataset: Dataset, indices: Sequence[int], device: str, on_event: Event) -> list[Scan]:
+    """The scans with these indices, on the device."""
+    scans = []
+    on_event("reading scans", 0, len(indices))
+    for done, index in enumerate(indices, 1):
+        scans.append(dataset[index].to(device))
+        on_event("reading scans", done, len(indices))
+    return scans
+
+
+def fit_options(config: DictConfig) -> FitOptions:
+    """The options of a fit from `mixture.*` and `runtime.*`."""
+    runtime, mixture = config.runtime, common.as_options(config.mixture)
+    return build(FitOptions, mixture, "mixture", dtype=runtime.dtype, compiled=runtime.compile)
+
+
+def fit_data(config: DictConfig, device: str, on_event: Event) -> FitData:
+    """The points of the selected scans: at most `max_points`, split by `test_share`."""
+    return fit_data_of(config, *selected_scans(config, device, on_event))
+
+
+def fit_data_of(config: DictConfig, name: str, scans: Sequence[Scan]) -> FitData:
+    """The same for given scans of the data set with this name."""
+    points = torch.cat([scan.points for scan in scans])
+    sizes = torch.tensor([len(scan.points) for scan in scans], device=points.device)
+    views = Views(torch.repeat_interleave(sizes), torch.stack([scan.origin.double() for scan in scans]))
+    chosen = _subset(points, config.max_points, config.seed)
+    views = views._replace(scan=views.scan[chosen])
+    return split(name, points[chosen], config.test_share, config.seed, views)
+
+
+def selected_scans(config: DictConfig, device: str, on_event: Event) -> tuple[str, list[Scan]]:
+    """The data set's name, and its scans with the indices `scans`; all scans for null."""
+    dataset = open_dataset(config.dataset)
+    indices = list(range(len(dataset))) if config.scans is None else list(config.scans)
+    for index in indices:
+        if not -len(dataset) <= index < len(dataset):
+            raise InvalidArgumentError(f"scans={indices}: {dataset.name} has scans 0 to {len(dataset) - 1}.")
+    if not indices:
+        raise InvalidArgumentError("scans is empty; give at least one index, or null for all.")
+    return dataset.name, read_scans(dataset, indices, device, on_event)
+
+
+def _subset(points: Tensor, max_points: int | None, seed: int) -> Tensor | slice:
+    """Indices of a random subset of `max_points` of the points (N, D), in their order; all if there are
+    fewer."""
+    if max_points is None or points.shape[0] <= max_points:
+        return slice(None)
+    if max_points < 1:
+        raise InvalidArgumentError(f"max_points={max_points} must be at least 1, or null.")
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randperm(points.shape[0], generator=generator)[:max_points].sort().values.to(points.device)

@@ -1,0 +1,258 @@
+"""Files in the formats of other programs: poses, components, and the space of a map."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import torch
+from omegaconf import DictConfig
+from torch import Tensor
+
+from gmmtorch.baselines.occupancy_grid import OccupancyGrid
+from gmmtorch.cli.from_options import maps
+from gmmtorch.datasets.recordings.trajectory import read_trajectory
+from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
+from gmmtorch.evaluation.events import Event
+from gmmtorch.export import distance_field, floor_and_ceiling, map_server, mixture_formats
+from gmmtorch.export.mesh import surface_mesh
+from gmmtorch.export.mesh_formats import write_mesh
+from gmmtorch.export.octomap import write_octomap
+from gmmtorch.export.point_cloud import CellCloud, write_pcd, write_ply
+from gmmtorch.export.trajectory_files import write_kitti
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mixture import GaussianMixture
+from gmmtorch.occupancy.evidence import Thresholds
+from gmmtorch.occupancy.grid import VoxelGrid, check_resolution, rasterize
+
+_EXTENT = 3.0  # standard deviations around each component that the cells cover
+
+
+def write_poses(path: Path, output: Path) -> str:
+    """Write the poses of a trajectory file as KITTI rows; returns a message."""
+    if not path.is_file():
+        raise MissingDataError(f"path={path} does not exist; format=kitti needs a trajectory file.")
+    matrices = read_trajectory(path).matrices
+    write_kitti(output, matrices)
+    return f"{_size(output)}: {len(matrices):,} poses"
+
+
+# -- components -----------------------------------------------------------------------------------
+
+
+def write_components(config: DictConfig) -> str:
+    """Write weights, means and covariances; returns a message."""
+    mixture = mixture_formats.checked(_components(config))
+    output = Path(config.output)
+    if config.format == "csv":
+        mixture_formats.write_gira_csv(output, mixture)
+    elif config.format == "npz":
+        mixture_formats.write_npz(output, mixture)
+    else:
+        GaussianMixture.from_parameters(*mixture[:3]).save(output)
+    k, dim = mixture.means.shape
+    return f"{_size(output)}: {k:,} components in {dim}D"
+
+
+def _components(config: DictConfig) -> mixture_formats.PlainMixture:
+    """The mixture in a file of any supported format; the surface components of a map."""
+    path, n_points = Path(config.path), config.n_points
+    if path.suffix == ".csv":
+        return mixture_formats.read_gira_csv(path, n_points)
+    if path.suffix == ".npz":
+        return mixture_formats.read_npz(path)
+    try:
+        found = maps.open_map(path, config.runtime, config.bounds).components()
+        surface = ~found.max_range
+        return mixture_formats.PlainMixture.of_support(
+            found.means[surface], found.covariances[surface], found.support[surface]
+        )
+    except DataError as error:
+        no_map = error
+    try:
+        mixture = GaussianMixture.load(path)
+    except DataError as error:
+        raise DataError(f"{path} contains no components to export. {no_map} {error}") from error
+    support = None if n_points is None else mixture.weights * n_points
+    return mixture_formats.PlainMixture(mixture.weights, mixture.means, mixture.covariances, support)
+
+
+# -- space ----------------------------------------------------------------------------------------
+
+
+Source = GaussianMap | OccupancyGrid
+
+
+def open_source(config: DictConfig) -> Source:
+    """The map in a file or folder. Raises `DataError` with the errors of all readers if it has no map."""
+    path = Path(config.path)
+    try:
+        return maps.open_map(path, config.runtime, config.bounds, config.resolution)
+    except DataError as error:
+        no_map = error
+    try:
+        return OccupancyGrid.load(path)
+    except DataError as error:
+        raise DataError(f"{path} is not a map that can be exported. {no_map} {error}") from error
+
+
+def write_space(config: DictConfig, source: Source, on_event: Event) -> str:
+    """Write the space of a map: probabilities of cells, distances or surfaces; returns a message."""
+    output, rule = Path(config.output), Thresholds(config.free_thresh, config.occupied_thresh)
+    space = _Space(config, source)
+    if config.format == "map_server":
+        about = space.choose_band()
+        grid, theta = space.dense(on_event)
+        if grid.dim == 3:
+            grid, theta = map_server.highest_in_band(grid, theta)  # `dense` returns only the band
+        written = map_server.write_map_server(output, grid, theta, rule)
+        return "\n".join(map(_size, written)) + f": {_cells(grid)}{about}"
+    if config.format == "distance_field":
+        grid, theta = space.dense(on_event)
+        distance_field.write_distance_field(output, grid, distance_field.distance_field(grid, theta, rule))
+        return f"{_size(output)}: {_cells(grid)}"
+    if config.format == "mesh":
+        if not isinstance(source, GaussianMap):
+            raise InvalidArgumentError(
+                f"format=mesh needs a GaussianMap; {config.path} is an occupancy grid."
+            )
+        on_event("mesh", 0, None)
+        side = space.resolution
+        mesh = surface_mesh(source.components(), side, memory_limit=config.runtime.memory_limit)
+        if space.is_limited:
+            mesh = mesh.inside(*space.box())
+        write_mesh(output, mesh)
+        return f"{_size(output)}: {len(mesh.faces):,} triangles, cells of {side:g} m"
+    cells = space.cloud(on_event)
+    if config.format == "octomap":
+        write_octomap(output, cells, rule)
+    else:
+        cells = cells.above(rule.occupied)
+        write = write_ply if config.format == "ply" else write_pcd
+        write(output, cells)
+    return f"{_size(output)}: {len(cells):,} cells of {cells.resolution:g} m"
+
+
+class _Space:
+    """The part of a map that the options export.
+
+    Attributes:
+        resolution: side (m) of the cells. band: lowest and highest z (m); None: all heights.
+
+    Raises `InvalidArgumentError` if a grid has another resolution than the options.
+    """
+
+    def __init__(self, config: DictConfig, source: Source) -> None:
+        self._config, self._source, self.resolution = config, source, source.resolution
+        if config.resolution is not None:
+            self.resolution = check_resolution(config.resolution)
+        if isinstance(source, OccupancyGrid) and self.resolution != source.resolution:
+            raise InvalidArgumentError(
+                f"resolution={self.resolution} m, but the cells of {config.path} are {source.resolution} m; "
+                "remove it."
+            )
+        self.band: tuple[float, float] | None = None
+        if config.z_min is not None or config.z_max is not None:
+            low, high = config.z_min, config.z_max
+            self.band = -math.inf if low is None else low, math.inf if high is None else high
+
+    @property
+    def is_limited(self) -> bool:
+        """Whether the options give a box or a band of heights."""
+        return self._config.bounds is not None or self.band is not None
+
+    def choose_band(self) -> str:
+        """Chooses the heights between floor and ceiling if the options give none for 3D; returns a note."""
+        source, side, levels = self._source, self.resolution, None
+        if self.is_limited:
+            return ""
+        if isinstance(source, GaussianMap):
+            found = source.components()
+            if found.dim == 3 and len(found):
+                levels = floor_and_ceiling.of_components(found, side)
+        elif (evidence := source.evidence()).dim == 3 and evidence.n_blocks:
+            levels = floor_and_ceiling.of_grid(source, self._config.occupied_thresh)
+        if levels is None:
+            return ""
+        self.band = levels.band(side)
+        return f"\nz_min={self.band[0]:.2f} z_max={self.band[1]:.2f} (m) were chosen: {levels.about()}"
+
+    def cloud(self, on_event: Event) -> CellCloud:
+        """The observed cells with their probabilities; all cells of the box for a `GaussianMap`."""
+        if isinstance(self._source, GaussianMap) or self.is_limited:
+            return CellCloud.of_grid(*self.dense(on_event))
+        observed = CellCloud.of_blocks(self._source.evidence())
+        # By the grid's rule: counts or log-odds.
+        theta = torch.as_tensor(self._source.occupancy(observed.centers))
+        return CellCloud(observed.centers, theta, observed.resolution)
+
+    def dense(self, on_event: Event) -> tuple[VoxelGrid, Tensor]:
+        """All cells of the box within the height band, and their probabilities, with the grid's shape."""
+        source, resolution = self._source, self.resolution
+        low, high = self.box()
+        # If the box ends on a plane between cells, the cells behind the plane are left out.
+        high = [max(a, b - 1e-6 * resolution) for a, b in zip(low, high, strict=True)]
+        grid = VoxelGrid.covering(low, high, resolution, self._config.runtime.memory_limit)
+        if not isinstance(source, GaussianMap):
+            return grid, rasterize(lambda points: torch.as_tensor(source.occupancy(points)), grid, on_event)
+        method = self._config.method or source.method
+        if method == "point":
+            return grid, rasterize(
+                lambda points: torch.as_tensor(source.occupancy(points, resolution, method)), grid, on_event
+            )
+        on_event(f"evidence by {method}", 0, None)  # of all cells together
+        return grid, source.evidence(grid, method).probability(source.query_options.prior)
+
+    def box(self) -> tuple[list[float], list[float]]:
+        """Lowest and highest corner (m): `bounds`, or the extent of the map; limited to the height band."""
+        low, high = self._extent()
+        dim, bounds = len(low), self._config.bounds
+        if bounds is not None:
+            if len(bounds) != 2 * dim:
+                raise InvalidArgumentError(
+                    f"bounds={list(bounds)} must be {2 * dim} numbers in {dim}D: the lowest corner, then the "
+                    "highest."
+                )
+            low, high = list(bounds[:dim]), list(bounds[dim:])
+            if not all(a < b for a, b in zip(low, high, strict=True)):
+                raise InvalidArgumentError(
+                    f"bounds={list(bounds)}: the lowest corner {low} must be below the highest {high} along "
+                    "every axis."
+                )
+        elif not all(map(math.isfinite, low)):
+            raise DataError(f"{self._config.path} is an empty map; give bounds to export it.")
+        if self.band is not None:
+            bottom, top = self.band
+            if dim == 2:
+                raise InvalidArgumentError(f"z_min={bottom}, z_max={top}: a 2D map has no heights.")
+            heights = f"{low[2]:.3g} to {high[2]:.3g} m"
+            low[2], high[2] = max(low[2], bottom), min(high[2], top)
+            if low[2] > high[2]:
+                raise InvalidArgumentError(
+                    f"z_min={bottom}, z_max={top} is outside the map, which extends from {heights}."
+                )
+        return low, high
+
+    def _extent(self) -> tuple[list[float], list[float]]:
+        """Lowest and highest corner (m) of the map; infinite if it is empty."""
+        if isinstance(self._source, OccupancyGrid):
+            blocks = self._source.evidence()
+            if blocks.n_blocks == 0:
+                return [math.inf] * blocks.dim, [-math.inf] * blocks.dim
+            low, high = blocks.bounds()
+        else:
+            found = self._source.components()
+            if not len(found):
+                return [math.inf] * found.dim, [-math.inf] * found.dim
+            extent = _EXTENT * found.covariances.diagonal(dim1=1, dim2=2).sqrt()
+            points = torch.cat([found.means - extent, found.means + extent, found.origins])
+            low, high = points.amin(0), points.amax(0)
+        return low.tolist(), high.tolist()
+
+
+def _cells(grid: VoxelGrid) -> str:
+    return f"{' × '.join(map(str, grid.shape))} cells of {grid.resolution:g} m"
+
+
+def _size(path: Path) -> str:
+    return f"{path}  {path.stat().st_size:,} bytes"

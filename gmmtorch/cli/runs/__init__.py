@@ -1,0 +1,1 @@
+"""What commands do that is too large for their own file."""
