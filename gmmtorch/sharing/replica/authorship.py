@@ -30,11 +30,13 @@ from gmmtorch.sharing.messages.record_messages import (
 )
 from gmmtorch.sharing.replica.anti_entropy import Packet
 from gmmtorch.sharing.replica.component_table import fingerprints, most_viewpoints
+from gmmtorch.sharing.replica.materialized_view import latest
 from gmmtorch.sharing.replica.record_keys import (
     MOST_RECORDS,
     Intervals,
     Ints,
     author_of,
+    authors,
     first_key,
     ids_of,
     keys_of_author,
@@ -49,6 +51,21 @@ _MOST_OUTDATED = 64
 _MOST_SHORT = 16
 """Records of counters shorter than half of `RECORD_BYTES` before they are merged."""
 _MOST_POINTS = 2.0**40
+_MOST_RUNS = 128
+"""Intervals of keys in a correction of a map; components of further ones are written again."""
+
+
+class MovedMap(NamedTuple):
+    """How corrected poses have moved a map of K components.
+
+    before: the components where they would be without corrections. scans (K,): the number of the scan, or of
+    the window of scans, of each; −1: of none. motions: of each scan, from number 0 on, (D+1, D+1), from
+    `before` to the map; exactly the identity for those that were not corrected.
+    """
+
+    before: Components
+    scans: Tensor
+    motions: Sequence[Tensor]
 
 
 class Published(NamedTuple):
@@ -112,12 +129,15 @@ class Author:
         superseded = self._supersede((old & self._records.held) - self._records.dead, written)
         return Published(keys, written | superseded, packets)
 
-    def publish_map(self, components: Components, whole: bool, max_bytes: int) -> Published:
+    def publish_map(
+        self, components: Components, whole: bool, max_bytes: int, moved: MovedMap | None = None
+    ) -> Published:
         """Write what is new in a map, and supersede what it no longer has. Components are compared by
         content.
 
         whole: whether the map continues those of earlier incarnations, whose records are superseded, too,
         if the map lacks them.
+        moved: components that were published where they were before are corrected.
         """
         table, own = self._records.table, self._own_components()
         published = self._published & set(own)
@@ -126,17 +146,52 @@ class Author:
         available: dict[bytes, list[int]] = {}
         for key, print_ in zip(candidates, table.fingerprints(candidates), strict=True):
             available.setdefault(print_, []).append(key)
-        kept, rows = set(), []
-        for row, print_ in enumerate(fingerprints(quantized(components))):
-            if available.get(print_):
-                kept.add(available[print_].pop())  # of equal ones, those that this author published first
-            else:
-                rows.append(row)
-        gone = set(candidates if whole else published) - kept
-        new = components.selected(torch.tensor(rows, dtype=torch.int64))
+        keys, runs = np.full(len(components), -1), {}
+        if moved is not None:
+            _match(available, moved.before, keys)
+            runs = self._runs(keys, moved)
+        _match(available, components, keys)
+        gone = set(candidates if whole else published) - set(keys.tolist())
+        rows = np.flatnonzero(keys < 0)
+        new = components.selected(torch.from_numpy(rows))
         made = self.publish(new, Intervals.of(np.array(sorted(gone), np.int64)), max_bytes)
-        self._published = kept | set(made.keys.tolist())
-        return made
+        self._published = {*keys[keys >= 0].tolist(), *made.keys.tolist()}
+        corrected = [] if moved is None else self._correct_map(runs, moved.motions)
+        return made._replace(written=Intervals.union([made.written, *corrected]))
+
+    def _runs(self, keys: Ints, moved: MovedMap) -> dict[int, Intervals]:
+        """Of the components (K,) with these keys, −1 for those without one, the keys of each corrected scan.
+
+        The intervals also contain keys of dead records, so that they are few. Keys beyond `_MOST_RUNS`
+        intervals become −1: their components are written again.
+        """
+        live, scans = np.array(self._own_components(), np.int64), moved.scans.cpu().numpy()
+        corrections = self._corrections()
+        found = {}
+        for scan, motion in enumerate(moved.motions):
+            rows = np.flatnonzero((scans == scan) & (keys >= 0))
+            if scan in corrections or (len(rows) and not _is_identity(motion)):
+                runs = _covering(keys[rows], live)
+                found[scan] = Intervals(runs.edges[: 2 * _MOST_RUNS])
+                keys[rows[~found[scan].contains(keys[rows])]] = -1
+        return found
+
+    def _correct_map(self, runs: Mapping[int, Intervals], motions: Sequence[Tensor]) -> list[Intervals]:
+        """Write the corrections of scans that have changed; returns the new records."""
+        live, before = Intervals.of(np.array(self._own_components(), np.int64)), self._corrections()
+        written = []
+        for scan, moved in runs.items():
+            record = before.get(scan)
+            is_same = record is not None and torch.equal(record.pose, pose_of(motions[scan]))
+            if record is None or not is_same or record.moved & live != moved & live:
+                written.append(self.correct(scan, motions[scan], moved))
+        return written
+
+    def _corrections(self) -> dict[int, CorrectionMessage]:
+        """The corrections of this robot that move a component, by scan."""
+        mine = Intervals.of(np.array(self._own_components(), np.int64))
+        records = latest(self._records.of(CorrectionMessage))
+        return {r.scan: r for r in records if r.key in self._keys_of_robot and r.moved & mine}
 
     def _own_components(self) -> list[int]:
         """The keys, rising, of this robot's components that count."""
@@ -296,3 +351,27 @@ class Author:
             )
         self._n += n
         return self._first + self._n - n
+
+
+def _match(available: Mapping[bytes, list[int]], components: Components, keys: Ints) -> None:
+    """Take a key with the content of each component (K,) that has none, −1, as far as there are some."""
+    prints = fingerprints(quantized(components))
+    for row in np.flatnonzero(keys < 0).tolist():
+        if available.get(prints[row]):
+            keys[row] = available[prints[row]].pop()  # of equal ones, those that this author published first
+
+
+def _covering(keys: Ints, live: Ints) -> Intervals:
+    """The least number of intervals that contain keys (J,), and no other one of the live keys (K,), rising.
+
+    An interval has keys of one author, all of which were given.
+    """
+    inside = np.isin(live, keys)
+    joins = np.zeros(len(live), np.bool_)  # with the live key before it
+    joins[1:] = inside[1:] & inside[:-1] & (authors(live[1:]) == authors(live[:-1]))
+    begins, ends = inside & ~joins, inside & ~np.append(joins[1:], False)
+    return Intervals(np.stack([live[begins], live[ends] + 1], 1).reshape(-1))
+
+
+def _is_identity(motion: Tensor) -> bool:
+    return torch.equal(motion, torch.eye(len(motion), dtype=motion.dtype))
