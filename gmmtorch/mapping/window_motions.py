@@ -84,13 +84,9 @@ class WindowMotions:
         self.motions = after
         return lambda origins: motions[find(origins)]
 
-    def of(self, components: Components) -> Tensor:
-        """The window (K,) of each component of the map; −1 for components that no scan here has seen."""
-        return _members(components, self._finder())[0]
-
     def as_inserted(self, target: GaussianMap) -> tuple[Components, Tensor]:
-        """The components of a map without an unfinished window where they were learned, not rounded, and the
-        window (K,) of each."""
+        """The components of a map, not rounded, where they would be if no window had moved, and the window
+        (K,) of each; −1 for those that no scan here has seen."""
         components = Components(**{field.name: getattr(target, field.name) for field in fields(Components)})
         identity = torch.eye(components.dim + 1, dtype=torch.float64)
         back = [one if _is_identity(one) else torch.linalg.inv(one) for one in self.motions]

@@ -13,7 +13,7 @@ from gmmtorch.mapping.window_motions import MotionAt, WindowMotions
 from gmmtorch.scan import Scan
 from gmmtorch.sharing.frame_joiner import FrameJoiner
 from gmmtorch.sharing.radio import Radio, RecordStore
-from gmmtorch.sharing.replica.authorship import MovedMap
+from gmmtorch.sharing.replica.moved_map import MovedMap
 from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.sharing.transport.simulated_network import Transport
 

@@ -103,8 +103,9 @@ class LoopCloser:
         last, self._last = self._last, found
         if last is None or not _agree(poses, last, found):
             return None
-        self.closures += [found] if self.closures and self.closures[-1] is last else [last, found]
-        if not _is_noticed(poses, last) and not _is_noticed(poses, found):
+        new_ones = [found] if self.closures and self.closures[-1] is last else [last, found]
+        self.closures += new_ones
+        if not any(_is_noticed(poses, closure) for closure in new_ones):
             return None
         return optimised(poses, edges.joined(_edges(self.closures)), with_covariances=False).poses
 

@@ -31,12 +31,12 @@ from gmmtorch.sharing.messages.record_messages import (
 from gmmtorch.sharing.replica.anti_entropy import Packet
 from gmmtorch.sharing.replica.component_table import fingerprints, most_viewpoints
 from gmmtorch.sharing.replica.materialized_view import latest
+from gmmtorch.sharing.replica.moved_map import MovedMap
 from gmmtorch.sharing.replica.record_keys import (
     MOST_RECORDS,
     Intervals,
     Ints,
     author_of,
-    authors,
     first_key,
     ids_of,
     keys_of_author,
@@ -51,21 +51,6 @@ _MOST_OUTDATED = 64
 _MOST_SHORT = 16
 """Records of counters shorter than half of `RECORD_BYTES` before they are merged."""
 _MOST_POINTS = 2.0**40
-_MOST_RUNS = 128
-"""Intervals of keys in a correction of a map; components of further ones are written again."""
-
-
-class MovedMap(NamedTuple):
-    """How corrected poses have moved a map of K components.
-
-    before: the components where they would be without corrections. scans (K,): the number of the scan, or of
-    the window of scans, of each; −1: of none. motions: of each scan, from number 0 on, (D+1, D+1), from
-    `before` to the map; exactly the identity for those that were not corrected.
-    """
-
-    before: Components
-    scans: Tensor
-    motions: Sequence[Tensor]
 
 
 class Published(NamedTuple):
@@ -149,7 +134,7 @@ class Author:
         keys, runs = np.full(len(components), -1), {}
         if moved is not None:
             _match(available, moved.before, keys)
-            runs = self._runs(keys, moved)
+            runs = moved.corrected(keys, np.array(own, np.int64), self._corrections())
         _match(available, components, keys)
         gone = set(candidates if whole else published) - set(keys.tolist())
         rows = np.flatnonzero(keys < 0)
@@ -158,23 +143,6 @@ class Author:
         self._published = {*keys[keys >= 0].tolist(), *made.keys.tolist()}
         corrected = [] if moved is None else self._correct_map(runs, moved.motions)
         return made._replace(written=Intervals.union([made.written, *corrected]))
-
-    def _runs(self, keys: Ints, moved: MovedMap) -> dict[int, Intervals]:
-        """Of the components (K,) with these keys, −1 for those without one, the keys of each corrected scan.
-
-        The intervals also contain keys of dead records, so that they are few. Keys beyond `_MOST_RUNS`
-        intervals become −1: their components are written again.
-        """
-        live, scans = np.array(self._own_components(), np.int64), moved.scans.cpu().numpy()
-        corrections = self._corrections()
-        found = {}
-        for scan, motion in enumerate(moved.motions):
-            rows = np.flatnonzero((scans == scan) & (keys >= 0))
-            if scan in corrections or (len(rows) and not _is_identity(motion)):
-                runs = _covering(keys[rows], live)
-                found[scan] = Intervals(runs.edges[: 2 * _MOST_RUNS])
-                keys[rows[~found[scan].contains(keys[rows])]] = -1
-        return found
 
     def _correct_map(self, runs: Mapping[int, Intervals], motions: Sequence[Tensor]) -> list[Intervals]:
         """Write the corrections of scans that have changed; returns the new records."""
@@ -359,19 +327,3 @@ def _match(available: Mapping[bytes, list[int]], components: Components, keys: I
     for row in np.flatnonzero(keys < 0).tolist():
         if available.get(prints[row]):
             keys[row] = available[prints[row]].pop()  # of equal ones, those that this author published first
-
-
-def _covering(keys: Ints, live: Ints) -> Intervals:
-    """The least number of intervals that contain keys (J,), and no other one of the live keys (K,), rising.
-
-    An interval has keys of one author, all of which were given.
-    """
-    inside = np.isin(live, keys)
-    joins = np.zeros(len(live), np.bool_)  # with the live key before it
-    joins[1:] = inside[1:] & inside[:-1] & (authors(live[1:]) == authors(live[:-1]))
-    begins, ends = inside & ~joins, inside & ~np.append(joins[1:], False)
-    return Intervals(np.stack([live[begins], live[ends] + 1], 1).reshape(-1))
-
-
-def _is_identity(motion: Tensor) -> bool:
-    return torch.equal(motion, torch.eye(len(motion), dtype=motion.dtype))

@@ -27,8 +27,9 @@ from gmmtorch.sharing.messages.record_messages import (
     encode_announcements,
 )
 from gmmtorch.sharing.replica.anti_entropy import Backlog, packets
-from gmmtorch.sharing.replica.authorship import Author, MovedMap, Published
+from gmmtorch.sharing.replica.authorship import Author, Published
 from gmmtorch.sharing.replica.materialized_view import Changes
+from gmmtorch.sharing.replica.moved_map import MovedMap
 from gmmtorch.sharing.replica.record_keys import (
     LARGEST_INCARNATION,
     LARGEST_ROBOT,

@@ -84,7 +84,7 @@ def test_poses_and_the_transform_to_odometry_are_published(node, known, monkeypa
     scans = LiveScans(sensor, node.transforms, Ranges(), LiveOptions(frame="odom", max_latency=None))
     sent: dict[str, list[Any]] = {"pose": [], "/tf": [], "/diagnostics": []}
     monkeypatch.setattr(
-        node, "publisher", lambda topic, _: lambda message, stamp: sent[topic].append(message)
+        node, "publisher", lambda topic, _: lambda message, stamp=None: sent[topic].append(message)
     )
     localizer = LiveLocalizer(node, scans, known)
     from gmmtorch.export.message_fields import transform_fields

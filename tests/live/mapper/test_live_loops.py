@@ -16,7 +16,7 @@ from torch import Tensor
 pytest.importorskip("rosbags", reason="needs the extra [ros]: rosbags")
 pytest.importorskip("cyclonedds", reason="needs the extra [ros]: cyclonedds")
 
-from looping_robot import BACK, DriftingOdometry, lap, off_the_walls
+from localization.looping_robot import BACK, DriftingOdometry, lap, off_the_walls
 
 from gmmtorch.datasets.base import Ranges
 from gmmtorch.datasets.recordings.ros.bag_reader import Topic
