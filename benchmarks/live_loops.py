@@ -1,6 +1,6 @@
 """Loops that are closed while a map is built: the error of the poses, the time, and what a team receives.
 
-    OMP_NUM_THREADS=1 python benchmarks/live_loops.py --data FOLDER [--names intel] [--most 500]
+    OMP_NUM_THREADS=1 python benchmarks/live_loops.py --data FOLDER [--names intel] [--most 450]
 
 FOLDER holds laser2d/. Scans go through odometry into a map, one by one, as in gmmtorch-ros with
 sensor.poses=mixture; the windows of the map are published to a replica. Writes a table of BENCHMARKS.md.

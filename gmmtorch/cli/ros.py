@@ -248,7 +248,8 @@ class _Checkpoint:
         from gmmtorch.errors import check_number
 
         check_number("checkpoint_seconds", config.checkpoint_seconds)
-        self._builder, self._path, self._period = mapper.builder, path, config.checkpoint_seconds
+        self._mapper, self._builder, self._path = mapper, mapper.builder, path
+        self._period, self._n_corrections = config.checkpoint_seconds, 0
         self._facts: dict[str, Any] = {
             "version": gmmtorch.__version__,
             "sensor": common.as_options(config.sensor),
@@ -263,10 +264,11 @@ class _Checkpoint:
         self._saved = time.monotonic()
 
     def save_when_due(self) -> None:
-        """Writes the file if enough time has passed since the last one."""
-        if time.monotonic() - self._saved >= self._period:
+        """Writes the file if enough time has passed since the last one, or if a loop was closed since."""
+        n_corrections = self._mapper.n_corrections
+        if n_corrections > self._n_corrections or time.monotonic() - self._saved >= self._period:
             self._builder.save(self._path, self._facts)
-            self._saved = time.monotonic()
+            self._saved, self._n_corrections = time.monotonic(), n_corrections
 
 
 def _until_stopped(

@@ -39,6 +39,9 @@ class LiveMapper:
         publisher: publishes the map; None: it is not published.
         period: seconds between two publications, at least.
         shared: the robot's map in the map of its team; None: it is not shared.
+
+    Attributes:
+        n_corrections: how often closed loops have moved the map.
     """
 
     def __init__(
@@ -53,6 +56,7 @@ class LiveMapper:
     ) -> None:
         self.builder = MapBuilder(scans, target, device)
         self.shared = shared
+        self.n_corrections = 0
         self.diagnostics = Diagnostics(node, scans)
         self._node, self._scans, self._publisher, self._period = node, scans, publisher, period
         self._poses = PosePublisher(node, scans.world_frame) if scans.has_odometry else None
@@ -120,7 +124,10 @@ class LiveMapper:
         """Moves the map if a loop was closed."""
         corrected = self._scans.corrected_poses()
         motion_at = None if corrected is None else self.builder.correct(*corrected)
-        if motion_at is not None and self.shared is not None:
+        if motion_at is None:
+            return
+        self.n_corrections += 1
+        if self.shared is not None:
             self.shared.correct(motion_at)
             self._share()
 

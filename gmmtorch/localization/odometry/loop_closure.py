@@ -86,16 +86,18 @@ class LoopCloser:
         self.closures: list[_Closure] = []
         self._last: _Closure | None = None  # the last one, which may wait for another one that agrees
 
+    @staticmethod
+    def is_due(n: int) -> bool:
+        """Whether the newest of n keyframes is searched for."""
+        return n > _APART and n % _SPACING == 1
+
     def corrected(self, keyframes: Sequence[Keyframe], edges: Edges) -> Tensor | None:
         """Corrected poses (K, D+1, D+1) of K keyframes if the newest one closes a loop, otherwise None.
 
         edges: of odometry, between successive keyframes.
         """
-        new = len(keyframes) - 1
-        if new < _APART or new % _SPACING:
-            return None
         poses = torch.stack([frame.pose for frame in keyframes])
-        pairs = _candidates(poses, [new])
+        pairs = _candidates(poses, [len(keyframes) - 1])
         places = list(enumerate(keyframes))
         found = _closure(poses, places, *pairs[0], self._least_explained, self._rule) if pairs else None
         if found is None:

@@ -149,7 +149,8 @@ class Odometry:
         Every third keyframe is searched for, in the nearest older place, which takes about as long as
         `add`. Two successive closures must agree. The first pose stays.
         """
-        if not self._frames or self._frames[-1] != len(self._poses) - 1:
+        is_keyframe = bool(self._frames) and self._frames[-1] == len(self._poses) - 1
+        if not is_keyframe or not self._loops.is_due(len(self._frames)):
             return False
         rows = torch.tensor(self._frames)
         chain = self._all_edges().at(rows[1:] - 1)

@@ -133,6 +133,7 @@ def driven(tmp_path_factory) -> Lap:
 
 def test_the_map_moves_to_the_corrected_poses(driven):
     assert driven.closed_at >= BACK
+    assert driven.mapper.n_corrections > 0
     off = driven.mapper.builder.poses[:, :2, 2] - driven.true[:, :2, 2]
     assert float(off.norm(dim=1).max()) < NEAR
     assert float(surfaces(driven.mapper.builder.map.components()).quantile(0.95)) < NEAR
