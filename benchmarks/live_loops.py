@@ -1,8 +1,8 @@
 """Loops that are closed while a map is built: the error of the poses, the time, and what a team receives.
 
-    OMP_NUM_THREADS=1 python benchmarks/live_loops.py --data FOLDER [--names intel] [--most 450]
+    OMP_NUM_THREADS=1 python benchmarks/live_loops.py --data FOLDER [--names intel hall] [--most 450]
 
-FOLDER holds laser2d/. Scans go through odometry into a map, one by one, as in gmmtorch-ros with
+FOLDER holds laser2d/ and hall/. Scans go through odometry into a map, one by one, as in gmmtorch-ros with
 sensor.poses=mixture; the windows of the map are published to a replica. Writes a table of BENCHMARKS.md.
 Errors are those of all poses at the end, with the first pose at the truth. Seconds are CPU time. One thread.
 """
@@ -101,7 +101,7 @@ def measured(data: Path, name: str, most: int | None) -> dict[str, object]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--names", nargs="+", default=["intel"])
+    parser.add_argument("--names", nargs="+", default=["intel", "hall"])
     parser.add_argument("--most", type=int)
     options = parser.parse_args()
     torch.set_num_threads(1)
