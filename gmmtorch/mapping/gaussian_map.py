@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Unpack
@@ -220,10 +220,18 @@ class GaussianMap(MapState):
         `ids` (J, 2): robot and sequence number of the components; None: all. Ids that the map does not
         contain are ignored. Nothing is fitted again. An unfinished window is learned first.
         """
-        components = self._with_pending()
-        matrix = as_tensor(transform, "transform", torch.float64, components.means.device)
-        check_rigid(matrix, components.dim)
-        self._commit(components.transformed(matrix, components.has_id(ids)))
+
+        def moved(components: Components) -> Components:
+            matrix = as_tensor(transform, "transform", torch.float64, components.means.device)
+            check_rigid(matrix, components.dim)
+            return components.transformed(matrix, components.has_id(ids))
+
+        self.revise(moved)
+
+    def revise(self, change: Callable[[Components], Components]) -> None:
+        """Replaces all components by the result of `change` for them, not rounded. An unfinished window is
+        learned first."""
+        self._commit(change(self._with_pending()))
 
     @property
     def n_components(self) -> int:

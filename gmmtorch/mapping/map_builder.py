@@ -17,6 +17,7 @@ from gmmtorch.datasets.base import Dataset
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
 from gmmtorch.files import joined_tensors, pack_tensors, read_tensors, split_tensors, write_bytes
 from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping.window_motions import MotionAt, WindowMotions
 from gmmtorch.scan import Scan
 
 _KIND, _VERSION = "gmmtorch.map_builder", 1
@@ -79,11 +80,13 @@ class MapBuilder:
         times: (S,) their times in seconds, float64; their indices if the data set states none.
         skipped: number of scans left out, by the reason.
         record: counts and the history of the run.
+        windows: the windows of the map, and how `correct` has moved them.
     """
 
     def __init__(self, dataset: Dataset, target: GaussianMap, device: str | torch.device = "cpu") -> None:
         self.map = target
         self.record = BuildRecord()
+        self.windows = WindowMotions()
         self._dataset = dataset
         self._device = device
         self._poses: list[Tensor] = []
@@ -131,6 +134,19 @@ class MapBuilder:
         self.record.seconds += time.monotonic() - begin
         self._add_row()
 
+    def correct(self, poses: Tensor, first: int) -> MotionAt | None:
+        """Moves the map, window by window, to corrected poses (N, D+1, D+1) of the scans of the data set from
+        number `first` on, up to the last one in the map or further.
+
+        Returns the motion of the scans, or None if no window moves; see `WindowMotions.correct`.
+        """
+        rows = [row for row, index in enumerate(self.record.indices) if index >= first]
+        if not rows:
+            return None
+        corrected = poses[[self.record.indices[row] - first for row in rows]]
+        self._poses[rows[0] :] = list(corrected)
+        return self.windows.correct(self.map, corrected)
+
     def progress(self) -> BuildProgress:
         """The present state."""
         record = self.record
@@ -155,6 +171,8 @@ class MapBuilder:
         if scan is not None and scan.n_beams > 0:
             self.map.insert(scan)
             self._note(index, scan)
+            if self.map.n_pending == 0:
+                self.windows.end()
         found = {why: n - before.get(why, 0) for why, n in self._dataset.skipped.items()}
         found = {why: n for why, n in found.items() if n}
         if scan is None or (scan.n_beams == 0 and not found):
@@ -171,6 +189,7 @@ class MapBuilder:
         if self._poses:
             record.metres += float((pose[:-1, -1] - self._poses[-1][:-1, -1]).norm())
         self._poses.append(pose)
+        self.windows.add(pose)
         record.indices.append(index)
         record.n_points += scan.points.shape[0]
 
@@ -198,7 +217,12 @@ class MapBuilder:
             path: the file.
             run: the settings of the run, in JSON types; `load` compares them.
         """
-        state = {"map": dict(self.map.state_dict()), "poses": self.poses, "record": vars(self.record)}
+        state = {
+            "map": dict(self.map.state_dict()),
+            "poses": self.poses,
+            "record": vars(self.record),
+            "windows": self.windows.state(),
+        }
         tree, tensors = split_tensors(state)
         write_bytes(path, pack_tensors(tensors, _KIND, _VERSION, tree=tree, run=dict(run)))
 
@@ -217,13 +241,15 @@ class MapBuilder:
             record, poses = BuildRecord(**state["record"]), state["poses"]
             if len(record.indices) != len(poses) or not self._dataset.can_continue(record.n_read):
                 raise ValueError("its counts disagree")
+            windows = WindowMotions.restored(state["windows"]) if "windows" in state else WindowMotions()
+            windows.end()  # poses of later scans are corrected without those of the earlier run
             self.map.load_state_dict(state["map"])
             self.map.to(self._device)
         except GmmTorchError:
             raise
         except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise DataError(f"{path} is damaged: {error!r}; delete it to start again.") from error
-        self.record, self._poses = record, list(poses.double())
+        self.record, self._poses, self.windows = record, list(poses.double()), windows
 
 
 def check_same_run(path: str | Path, stored: Mapping[str, Any], run: Mapping[str, Any]) -> None:

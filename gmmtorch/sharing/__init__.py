@@ -11,9 +11,16 @@ from gmmtorch.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from gmmtorch.sharing.frame_joiner import FrameJoiner as FrameJoiner
+    from gmmtorch.sharing.replica.moved_map import MovedMap as MovedMap
     from gmmtorch.sharing.replica.replica import Replica as Replica
     from gmmtorch.sharing.store import Store as Store
 
 __getattr__, __dir__, __all__ = lazy_names(
-    __name__, {"FrameJoiner": "frame_joiner", "Replica": "replica.replica", "Store": "store"}
+    __name__,
+    {
+        "FrameJoiner": "frame_joiner",
+        "MovedMap": "replica.moved_map",
+        "Replica": "replica.replica",
+        "Store": "store",
+    },
 )

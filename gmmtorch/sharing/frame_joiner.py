@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -86,6 +87,14 @@ class FrameJoiner:
         if len(self._places) > self._most:
             self._places, self._spacing = self._places[::2], 2 * self._spacing
             self._waiting = self._waiting[::2]
+
+    def correct(self, motion_at: Callable[[Tensor], Tensor]) -> None:
+        """Move the remembered scans, when the poses of the robot's scans were corrected.
+
+        motion_at: the motions (N, D+1, D+1) of scans with origins (N, D), after ← before.
+        """
+        self._places, self._waiting = (_moved(some, motion_at) for some in (self._places, self._waiting))
+        self._last = None
 
     def search(self) -> bool:
         """Search for one scan, the newest that was not searched for, in the first of `other_frames`.
@@ -171,6 +180,16 @@ def _refined(own: Components, theirs: Components, estimate: _Estimate) -> Tensor
         return estimate.transform
     found = register(own, theirs, estimate.transform, coarsest=_COARSEST)
     return found.transform if found.reliable and _agree(found.transform, estimate) else estimate.transform
+
+
+def _moved(places: Sequence[_Place], motion_at: Callable[[Tensor], Tensor]) -> list[_Place]:
+    if not places:
+        return []
+    motions = motion_at(torch.stack([place.origin for place in places]))
+    return [
+        _Place(motion[:-1, :-1] @ place.origin + motion[:-1, -1], place.points @ motion[:-1, :-1].T)
+        for place, motion in zip(places, motions, strict=True)
+    ]
 
 
 def _shifted(pose: Tensor, shift: Tensor) -> Tensor:

@@ -8,9 +8,12 @@ import time
 import torch
 
 from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping.window_motions import MotionAt, WindowMotions
 from gmmtorch.scan import Scan
 from gmmtorch.sharing.frame_joiner import FrameJoiner
 from gmmtorch.sharing.radio import Radio, RecordStore
+from gmmtorch.sharing.replica.moved_map import MovedMap
 from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.sharing.transport.simulated_network import Transport
 
@@ -56,6 +59,21 @@ class SharedMap:
         """Remembers a scan that the robot has mapped, for the search for its place."""
         if self._joiner is not None:
             self._joiner.add(scan)
+
+    def publish(self, own: GaussianMap, windows: WindowMotions) -> None:
+        """Makes the robot's records those of its map, which has no unfinished window.
+
+        What was published before its window moved gets a correction, one record for each window.
+        """
+        moved = None
+        if windows.moved or self.replica.is_corrected:
+            moved = MovedMap(*windows.as_inserted(own), windows.motions)
+        self.replica.publish(own.components(), whole=True, moved=moved)
+
+    def correct(self, motion_at: MotionAt) -> None:
+        """Moves the scans that are remembered for the search for the robot's place."""
+        if self._joiner is not None:
+            self._joiner.correct(motion_at)
 
     def exchange(self, now: float) -> None:
         """Listens, answers and announces."""

@@ -41,6 +41,21 @@ def first_part(scans) -> list[bytes]:
     return robot_with(0, scans[: 2 * N_SCANS // 3]).datagrams()
 
 
+def test_remembered_scans_follow_corrected_poses(scans, first_part):
+    truth, drift = motion(30.0, -7.0, 2.0), motion(4.0, -2.0, 0.5)
+    theirs = [scan.transformed(truth) for scan in scans[N_SCANS // 2 :]]
+    one = robot_with(1, theirs)
+    joiner = FrameJoiner(one)
+    for scan in theirs:
+        joiner.add(scan.transformed(drift))
+    joiner.correct(lambda origins: torch.linalg.inv(drift).expand(len(origins), 3, 3))
+    for datagram in first_part:
+        one.receive(datagram)
+    assert any(joiner.search() for _ in range(20))
+    back = one.placement.transform @ truth
+    assert torch.allclose(back, torch.eye(3).double(), atol=0.05)
+
+
 def test_two_parts_of_a_building_are_laid_over_each_other(scans, first_part):
     truth = motion(30.0, -7.0, 2.0)  # robot 1's frame ← the building's
     theirs = [scan.transformed(truth) for scan in scans[N_SCANS // 2 :]]

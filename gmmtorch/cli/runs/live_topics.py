@@ -82,6 +82,7 @@ def build_map(config: DictConfig, node: Node, device: str, shared: SharedMap | N
     checkpoint = map_outputs.Checkpoint(config, mapper.builder, "sensor", time.monotonic)
     if checkpoint.is_continued:
         scans.continue_in(mapper.builder.map)
+    n_saved_corrections = 0
 
     def team() -> str:
         if shared is None:
@@ -92,10 +93,15 @@ def build_map(config: DictConfig, node: Node, device: str, shared: SharedMap | N
         return f", {shared.replica.n_components:,} of the team{shared.radio.warnings(n_conflicts)}"
 
     def after_scan() -> None:
+        nonlocal n_saved_corrections
         now = mapper.builder.progress()
         bars("mapping", now.n_read, None)
         bars.note("mapping", f"{now.n_components:,} components, {scans.n_dropped:,} dropped{team()}")
-        checkpoint.save_when_due()
+        if mapper.n_corrections > n_saved_corrections:  # teammates know the poses of closed loops already
+            checkpoint.save()
+            n_saved_corrections = mapper.n_corrections
+        else:
+            checkpoint.save_when_due()
         if view is not None:
             moments.note()
             if mapper.builder.map.n_pending == 0:

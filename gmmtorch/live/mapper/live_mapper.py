@@ -26,10 +26,11 @@ _PATIENCE = 3.0  # s that a due publication waits for the end of a window
 class LiveMapper:
     """Inserts the scans of a live topic into a map with a `MapBuilder`, and publishes the map.
 
-    Poses of odometry are published, too.
+    Poses of odometry are published, too. When odometry closes a loop, the windows of the map move with the
+    corrected poses of their scans.
 
-    With `shared`, teammates receive the components of complete windows, and their components are published
-    together with the robot's own.
+    With `shared`, teammates receive the components of complete windows and their corrections, and their
+    components are published together with the robot's own.
 
     Args:
         node: receives the messages of `scans`.
@@ -38,6 +39,9 @@ class LiveMapper:
         publisher: publishes the map; None: it is not published.
         period: seconds between two publications, at least.
         shared: the robot's map in the map of its team; None: it is not shared.
+
+    Attributes:
+        n_corrections: how often closed loops have moved the map.
     """
 
     def __init__(
@@ -52,6 +56,7 @@ class LiveMapper:
     ) -> None:
         self.builder = MapBuilder(scans, target, device)
         self.shared = shared
+        self.n_corrections = 0
         self.diagnostics = Diagnostics(node, scans)
         self._node, self._scans, self._publisher, self._period = node, scans, publisher, period
         self._poses = PosePublisher(node, scans.world_frame) if scans.has_odometry else None
@@ -102,6 +107,7 @@ class LiveMapper:
         return GaussianMap.of(components, codec=codec, **options)
 
     def _insert(self) -> bool:
+        self._correct()
         for _ in self.builder.insert_all():
             newest = self._scans.newest
             if newest is not None:
@@ -114,11 +120,22 @@ class LiveMapper:
             self._share()
         return True
 
+    def _correct(self) -> None:
+        """Moves the map if a loop was closed."""
+        corrected = self._scans.corrected_poses()
+        motion_at = None if corrected is None else self.builder.correct(*corrected)
+        if motion_at is None:
+            return
+        self.n_corrections += 1
+        if self.shared is not None:
+            self.shared.correct(motion_at)
+            self._share()
+
     def _share(self) -> None:
         """Makes the robot's records those of its map. After a restart this withdraws what the checkpoint
         lacks."""
         if self.shared is not None:
-            self.shared.replica.publish(self.builder.map.components(), whole=True)
+            self.shared.publish(self.builder.map, self.builder.windows)
 
     def _publish_when_due(self) -> None:
         if self._publication is not None and self._publication.done():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from array import array
 from collections import Counter, deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +22,7 @@ from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree, frame
 from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, in_plane, in_space
 from gmmtorch.errors import DataError, check_choice, check_number
 from gmmtorch.localization.location import Location, composed
+from gmmtorch.localization.odometry.odometry import Odometry
 from gmmtorch.localization.odometry.recorded_poses import METHODS, odometry_of
 from gmmtorch.localization.tracker import Tracker
 from gmmtorch.mapping.gaussian_map import GaussianMap
@@ -42,6 +43,7 @@ class LiveOptions:
     poses: tf; standing for a sensor that does not move; mixture or kiss_icp for odometry from the scans.
     frame: the fixed frame of TF, such as odom; None: the root of the sensor's tree. Of odometry: the name of
         its frame; None: odom.
+    loops: whether odometry by mixtures closes loops, which moves earlier poses and the present one.
     max_gap: longest time (s) between two poses that are interpolated.
     clock: header, stamps of the messages; or received, times of receipt.
     deskew: each point with a time gets the pose of its own time.
@@ -52,6 +54,7 @@ class LiveOptions:
 
     poses: str = "tf"
     frame: str | None = None
+    loops: bool = True
     max_gap: float = 2.0
     clock: str = "header"
     deskew: bool = True
@@ -117,6 +120,9 @@ class LiveScans(Dataset):
         self._odometry = odometry_of(options.poses) if options.poses in METHODS else None
         self._start: Location | None = None  # of odometry in the map of an earlier run
         self._tracker: Tracker | None = None  # of the map of an earlier run
+        self._posed: list[int] = []  # numbers of the scans in odometry, which also has those left out
+        self._n_added = 0  # scans of odometry
+        self._is_corrected = False
         self._is_flat: bool | None = None
         self._last_stamp: int | None = None
         self._n_posed = 0
@@ -308,6 +314,7 @@ class LiveScans(Dataset):
             scan, matrix = scan.transformed(location.pose), in_space(location.pose.numpy()[None])[0]
         self.newest = LiveScan(scan, matrix, item.stamp, item.frame, location)
         self._stamps.append(item.stamp / NANOSECONDS)
+        self._posed.append(self._n_added - 1)
         return True
 
     def _located(self, scan: Scan, stamp: int) -> Location:
@@ -320,7 +327,20 @@ class LiveScans(Dataset):
                 return first
             self._start, self._tracker = first, None
         location = self._odometry.add(points, stamp / NANOSECONDS)
+        self._n_added += 1
+        if isinstance(self._odometry, Odometry) and self._options.loops and self._odometry.close_loops():
+            self._is_corrected = True
+            location = replace(location, pose=self._odometry.poses[-1])
         return location if self._start is None else composed(self._start, location)
+
+    def corrected_poses(self) -> tuple[Tensor, int] | None:
+        """Poses (N, D+1, D+1) of the scans of this run, and the number of the first of them, if odometry has
+        closed a loop since the last call; otherwise None."""
+        if not self._is_corrected or not isinstance(self._odometry, Odometry):
+            return None
+        self._is_corrected = False
+        poses = self._odometry.poses[self._posed]
+        return (poses if self._start is None else self._start.pose @ poses), self._first
 
     @property
     def has_odometry(self) -> bool:

@@ -1,16 +1,20 @@
-"""Loop closures: pairs of keyframes that saw one place at different times, with the motion between them."""
+"""Loop closures: pairs of keyframes that saw one place at different times, with the motion between them.
+
+`closed` finds those of a complete trajectory, `LoopCloser` those of a sensor that moves on.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from gmmtorch.localization.location import Location
 from gmmtorch.localization.odometry.local_map import Expectation, Keyframe, LocalMap
-from gmmtorch.localization.odometry.pose_graph import Edges, optimised
+from gmmtorch.localization.odometry.pose_graph import Edges, logarithm, optimised
 from gmmtorch.mapping.learning.rules import WindowedRule
 
 _ROUNDS = 3  # of closing and correcting: corrected poses bring more places together
@@ -26,6 +30,17 @@ _SYSTEMATIC = {  # deviations (m, rad) of errors that the points do not show, su
     3: torch.tensor([0.01, 0.01, 0.01, 0.001, 0.001, 0.001]).double(),
 }
 _ANGLE = math.radians(10)  # of the heading of a closure
+_AGREE = 0.3, math.radians(3)  # metres and radians: two closures agree
+_NOTICED = 0.03, math.radians(0.3)  # metres and radians: a closure changes the poses
+
+
+class _Closure(NamedTuple):
+    """Numbers of two poses, the motion source ← target between them, and its information."""
+
+    source: int
+    target: int
+    motion: Tensor
+    information: Tensor
 
 
 def closed(
@@ -43,36 +58,106 @@ def closed(
     """
     tried: set[tuple[int, int]] = set()
     for _ in range(_ROUNDS):
-        pairs = [pair for pair in _candidates(poses, [at for at, _ in places]) if pair not in tried]
+        pairs = [pair for pair in _candidates(poses[[at for at, _ in places]]) if pair not in tried]
         found = [edge for pair in pairs if (edge := _closure(poses, places, *pair, least_explained, rule))]
         tried.update(pairs)
         if not found:
             break
-        source, target, motions, information = zip(*found, strict=True)
-        edges = edges.joined(
-            Edges(
-                torch.tensor(source),
-                torch.tensor(target),
-                torch.stack(motions),
-                torch.stack(information),
-                torch.ones(len(found), dtype=torch.bool),
-            )
-        )
-        poses = optimised(poses, edges).poses
+        edges = edges.joined(_edges(found))
+        poses = optimised(poses, edges, with_covariances=False).poses
     return edges
 
 
-def _candidates(poses: Tensor, numbers: list[int]) -> list[tuple[int, int]]:
-    """Pairs (old, new) of rows of keyframes that may be at one place: for each new one, the nearest."""
-    at = poses[numbers][:, :-1, -1]
+class LoopCloser:
+    """Closes the loops of a sensor that moves on: every third keyframe is searched for in one old place.
+
+    A closure counts when the next one agrees with it, within 0.3 m and 3°, so that one wrong closure moves
+    nothing. The pose graph has the keyframes only.
+
+    Args:
+        least_explained, rule: as for `LocalMap`.
+
+    Attributes:
+        closures: of the graph, by rows of the keyframes.
+    """
+
+    def __init__(self, least_explained: float, rule: WindowedRule) -> None:
+        self._least_explained, self._rule = least_explained, rule
+        self.closures: list[_Closure] = []
+        self._last: _Closure | None = None  # the last one, which may wait for another one that agrees
+
+    @staticmethod
+    def is_due(n: int) -> bool:
+        """Whether the newest of n keyframes is searched for."""
+        return n > _APART and n % _SPACING == 1
+
+    def corrected(self, keyframes: Sequence[Keyframe], edges: Edges) -> Tensor | None:
+        """Corrected poses (K, D+1, D+1) of K keyframes if the newest one closes a loop, otherwise None.
+
+        edges: of odometry, between successive keyframes.
+        """
+        poses = torch.stack([frame.pose for frame in keyframes])
+        pairs = _candidates(poses, [len(keyframes) - 1])
+        places = list(enumerate(keyframes))
+        found = _closure(poses, places, *pairs[0], self._least_explained, self._rule) if pairs else None
+        if found is None:
+            return None
+        last, self._last = self._last, found
+        if last is None or not _agree(poses, last, found):
+            return None
+        new_ones = [found] if self.closures and self.closures[-1] is last else [last, found]
+        self.closures += new_ones
+        if not any(_is_noticed(poses, closure) for closure in new_ones):
+            return None
+        return optimised(poses, edges.joined(_edges(self.closures)), with_covariances=False).poses
+
+
+def _agree(poses: Tensor, last: _Closure, now: _Closure) -> bool:
+    """Whether the last closure, moved along the poses to the ends of the new one, gives its motion."""
+    before = torch.linalg.solve(poses[now.source], poses[last.source])
+    after = torch.linalg.solve(poses[last.target], poses[now.target])
+    return not _is_beyond(torch.linalg.solve(now.motion, before @ last.motion @ after), _AGREE)
+
+
+def _is_noticed(poses: Tensor, closure: _Closure) -> bool:
+    """Whether the poses disagree with a closure."""
+    between = torch.linalg.solve(poses[closure.source], poses[closure.target])
+    return _is_beyond(torch.linalg.solve(closure.motion, between), _NOTICED)
+
+
+def _is_beyond(motion: Tensor, limits: tuple[float, float]) -> bool:
+    """Whether a motion (D+1, D+1) is longer than a shift (m) or turns by more than an angle (rad)."""
+    dim = len(motion) - 1
+    step = logarithm(motion[None])[0]
+    return bool(step[:dim].norm() > limits[0]) or bool(step[dim:].norm() > limits[1])
+
+
+def _edges(closures: Sequence[_Closure]) -> Edges:
+    source, target, motions, information = zip(*closures, strict=True)
+    is_closure = torch.ones(len(closures), dtype=torch.bool)
+    return Edges(
+        torch.tensor(source), torch.tensor(target), torch.stack(motions), torch.stack(information), is_closure
+    )
+
+
+def _candidates(poses: Tensor, rows: Sequence[int] | None = None) -> list[tuple[int, int]]:
+    """Pairs (old, new) of rows of keyframes that may be at one place: for each new one, the nearest.
+
+    poses: (K, D+1, D+1) of the keyframes. rows: new ones; None: every third.
+    """
+    at = poses[:, :-1, -1]
     path = torch.cat([torch.zeros(1), (at[1:] - at[:-1]).norm(dim=1)]).cumsum(0)
-    gap = torch.cdist(at, at)
-    reach = (_REACH + _DRIFT * (path[:, None] - path)).clamp_max(_FARTHEST)
     order = torch.arange(len(at))
-    allowed = (order[:, None] - order >= _APART) & (gap <= reach)
+    new = order if rows is None else torch.tensor(rows)
+    gap = torch.cdist(at[new], at)
+    reach = (_REACH + _DRIFT * (path[new, None] - path)).clamp_max(_FARTHEST)
+    allowed = (new[:, None] - order >= _APART) & (gap <= reach)
     nearest = torch.where(allowed, gap, torch.inf).argmin(1)
+    step = _SPACING if rows is None else 1
     return [
-        (int(nearest[new]), new) for new in range(0, len(at), _SPACING) if bool(allowed[new, nearest[new]])
+        (int(nearest[row]), int(new[row]))
+        for row in range(0, len(new), step)
+        if bool(allowed[row, nearest[row]])
     ]
 
 
@@ -83,8 +168,8 @@ def _closure(
     new: int,
     least_explained: float,
     rule: WindowedRule,
-) -> tuple[int, int, Tensor, Tensor] | None:
-    """Pose numbers, motion and information of the edge between two keyframes, if they see one place."""
+) -> _Closure | None:
+    """The closure between two rows of keyframes, if they see one place."""
     around = range(max(old - _NEIGHBOURS, 0), min(old + _NEIGHBOURS + 1, len(places)))
     order = [row for row in around if row != old] + [old]  # the last one is the centre of a local map
     local = LocalMap(
@@ -96,7 +181,7 @@ def _closure(
     if not location.found or location.explained < _MOST_EXPLAINED:
         return None
     motion = torch.linalg.solve(poses[source], location.pose)
-    return source, target, motion, information_of(location)
+    return _Closure(source, target, motion, information_of(location))
 
 
 def information_of(location: Location) -> Tensor:

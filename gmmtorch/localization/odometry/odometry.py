@@ -13,7 +13,7 @@ from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
 from gmmtorch.linalg import check_rigid
 from gmmtorch.localization.location import Location
 from gmmtorch.localization.odometry.local_map import LOST, Expectation, Keyframe, LocalMap, nowhere
-from gmmtorch.localization.odometry.loop_closure import closed, information_of
+from gmmtorch.localization.odometry.loop_closure import LoopCloser, closed, information_of
 from gmmtorch.localization.odometry.pose_graph import Edges, optimised
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import WindowedRule
@@ -107,6 +107,7 @@ class Odometry:
         self._explained = 0.95  # share of the points: few places explain less
         self._stamp: float | None = None
         self._seconds: float | None = None
+        self._loops = LoopCloser(least_explained, rule)
 
     def add(self, points: ArrayLike, stamp: float | None = None, motion: ArrayLike | None = None) -> Location:
         """The pose of the next scan in the frame of the first one; if it is not `found`, the best guess.
@@ -135,6 +136,38 @@ class Odometry:
             location = self._located(scan, measured, ratio)
         self._remember(scan, location)
         return location
+
+    @property
+    def poses(self) -> Tensor:
+        """Poses (N, D+1, D+1) of all scans so far, with the corrections of `close_loops`."""
+        return torch.stack(self._poses)
+
+    def close_loops(self) -> bool:
+        """Searches for the newest scan in an older place, if it is a keyframe and there is one near; returns
+        whether `poses` were corrected. For mapping while the sensor moves: call it after each `add`.
+
+        Every third keyframe is searched for, in the nearest older place, which takes about as long as
+        `add`. Two successive closures must agree. The first pose stays.
+        """
+        is_keyframe = bool(self._frames) and self._frames[-1] == len(self._poses) - 1
+        if not is_keyframe or not self._loops.is_due(len(self._frames)):
+            return False
+        rows = torch.tensor(self._frames)
+        chain = self._all_edges().at(rows[1:] - 1)
+        row = torch.arange(len(chain.source))
+        found = self._loops.corrected(self.keyframes, chain._replace(source=row, target=row + 1))
+        if found is None:
+            return False
+        # Other scans hang on the last keyframe before them.
+        motions = found @ torch.linalg.inv(self.poses[rows])
+        last = torch.searchsorted(rows, torch.arange(len(self._poses)), right=True) - 1
+        self._poses = list((motions[last.clamp_min(0)] @ self.poses).unbind(0))
+        self.keyframes = [
+            frame._replace(pose=pose) for frame, pose in zip(self.keyframes, found, strict=True)
+        ]
+        recent = self.keyframes[-(self.n_keyframes or 1) :]
+        self._local = LocalMap(recent, self.least_explained, self.rule, self.n_points)
+        return True
 
     def trajectory(self, loops: bool = True) -> Trajectory:
         """The poses of all scans so far; with `loops`, corrected by loop closures."""

@@ -45,11 +45,14 @@ class Edges(NamedTuple):
     def joined(self, others: Edges) -> Edges:
         return Edges(*(torch.cat(pair) for pair in zip(self, others, strict=True)))
 
+    def at(self, rows: Tensor) -> Edges:
+        return Edges(*(value[rows] for value in self))
+
 
 class OptimisedPoses(NamedTuple):
     """Poses (N, D+1, D+1), world ← sensor; covariances (N, F, F) of a shift (m) and a turn (rad) in the
-    frame of the sensor, zero for the first pose; weight (E,) of each edge, near 0 for a rejected closure; and
-    whether the last step was small.
+    frame of the sensor, zero for the first pose, NaN if they were not asked for; weight (E,) of each edge,
+    near 0 for a rejected closure; and whether the last step was small.
     """
 
     poses: Tensor
@@ -58,10 +61,13 @@ class OptimisedPoses(NamedTuple):
     converged: bool
 
 
-def optimised(poses: Tensor, edges: Edges, scale: float = 3.0) -> OptimisedPoses:
+def optimised(
+    poses: Tensor, edges: Edges, scale: float = 3.0, with_covariances: bool = True
+) -> OptimisedPoses:
     """The poses (N, D+1, D+1) that agree best with the edges, from a first guess; the first one stays.
 
-    scale: deviations c at which a closure loses most of its weight.
+    scale: deviations c at which a closure loses most of its weight. with_covariances: their time is
+    proportional to N².
 
     Raises `InvalidArgumentError` if an edge names a pose that does not exist, or if the edges do not connect
     all poses.
@@ -80,8 +86,10 @@ def optimised(poses: Tensor, edges: Edges, scale: float = 3.0) -> OptimisedPoses
             break
         wide *= _NARROWING
     weights = _weights(poses, edges, scale)
-    hessian, _ = _normal_equations(poses, edges, weights)
     converged = float(step.abs().max()) < _SETTLED
+    if not with_covariances:
+        return OptimisedPoses(poses, torch.full((n, free, free), torch.nan).to(poses), weights, converged)
+    hessian, _ = _normal_equations(poses, edges, weights)
     return OptimisedPoses(poses, _marginals(hessian, n, free), weights, converged)
 
 

@@ -29,6 +29,8 @@ from gmmtorch.sharing.messages.record_messages import (
 )
 from gmmtorch.sharing.replica.anti_entropy import Packet
 from gmmtorch.sharing.replica.component_table import fingerprints, most_viewpoints
+from gmmtorch.sharing.replica.materialized_view import latest
+from gmmtorch.sharing.replica.moved_map import MovedMap
 from gmmtorch.sharing.replica.record_keys import (
     MOST_RECORDS,
     Intervals,
@@ -111,12 +113,15 @@ class Author:
         superseded = self._supersede((old & self._records.held) - self._records.dead, written)
         return Published(keys, written | superseded, packets)
 
-    def publish_map(self, components: Components, whole: bool, max_bytes: int) -> Published:
+    def publish_map(
+        self, components: Components, whole: bool, max_bytes: int, moved: MovedMap | None = None
+    ) -> Published:
         """Write what is new in a map, and supersede what it no longer has. Components are compared by
         content.
 
         whole: whether the map continues those of earlier incarnations, whose records are superseded, too,
         if the map lacks them.
+        moved: components that were published where they were before are corrected.
         """
         table, own = self._records.table, self._own_components()
         published = self._published & set(own)
@@ -125,17 +130,35 @@ class Author:
         available: dict[bytes, list[int]] = {}
         for key, print_ in zip(candidates, table.fingerprints(candidates), strict=True):
             available.setdefault(print_, []).append(key)
-        kept, rows = set(), []
-        for row, print_ in enumerate(fingerprints(quantized(components))):
-            if available.get(print_):
-                kept.add(available[print_].pop())  # of equal ones, those that this author published first
-            else:
-                rows.append(row)
-        gone = set(candidates if whole else published) - kept
-        new = components.selected(torch.tensor(rows, dtype=torch.int64))
+        keys, runs = np.full(len(components), -1), {}
+        if moved is not None:
+            _match(available, moved.before, keys)
+            runs = moved.corrected(keys, np.array(own, np.int64), self._corrections())
+        _match(available, components, keys)
+        gone = set(candidates if whole else published) - set(keys.tolist())
+        rows = np.flatnonzero(keys < 0)
+        new = components.selected(torch.from_numpy(rows))
         made = self.publish(new, Intervals.of(np.array(sorted(gone), np.int64)), max_bytes)
-        self._published = kept | set(made.keys.tolist())
-        return made
+        self._published = {*keys[keys >= 0].tolist(), *made.keys.tolist()}
+        corrected = [] if moved is None else self._correct_map(runs, moved.motions)
+        return made._replace(written=Intervals.union([made.written, *corrected]))
+
+    def _correct_map(self, runs: Mapping[int, Intervals], motions: Sequence[Tensor]) -> list[Intervals]:
+        """Write the corrections of scans that have changed; returns the new records."""
+        live, before = Intervals.of(np.array(self._own_components(), np.int64)), self._corrections()
+        written = []
+        for scan, moved in runs.items():
+            record = before.get(scan)
+            is_same = record is not None and torch.equal(record.pose, pose_of(motions[scan]))
+            if record is None or not is_same or record.moved & live != moved & live:
+                written.append(self.correct(scan, motions[scan], moved))
+        return written
+
+    def _corrections(self) -> dict[int, CorrectionMessage]:
+        """The corrections of this robot that move a component, by scan."""
+        mine = Intervals.of(np.array(self._own_components(), np.int64))
+        records = latest(self._records.of(CorrectionMessage))
+        return {r.scan: r for r in records if r.key in self._keys_of_robot and r.moved & mine}
 
     def _own_components(self) -> list[int]:
         """The keys, rising, of this robot's components that count."""
@@ -295,3 +318,11 @@ class Author:
             )
         self._n += n
         return self._first + self._n - n
+
+
+def _match(available: Mapping[bytes, list[int]], components: Components, keys: Ints) -> None:
+    """Take a key with the content of each component (K,) that has none, −1, as far as there are some."""
+    prints = fingerprints(quantized(components))
+    for row in np.flatnonzero(keys < 0).tolist():
+        if available.get(prints[row]):
+            keys[row] = available[prints[row]].pop()  # of equal ones, those that this author published first

@@ -19,6 +19,7 @@ from gmmtorch.sharing.messages.envelope import MAX_BYTES
 from gmmtorch.sharing.messages.message_registry import ComponentsMessage, Message, decode
 from gmmtorch.sharing.messages.record_messages import (
     AnnouncementMessage,
+    CorrectionMessage,
     FrameMessage,
     RecordMessage,
     SupersessionMessage,
@@ -28,6 +29,7 @@ from gmmtorch.sharing.messages.record_messages import (
 from gmmtorch.sharing.replica.anti_entropy import Backlog, packets
 from gmmtorch.sharing.replica.authorship import Author, Published
 from gmmtorch.sharing.replica.materialized_view import Changes, Placement, robot_of_frame
+from gmmtorch.sharing.replica.moved_map import MovedMap
 from gmmtorch.sharing.replica.record_keys import (
     LARGEST_INCARNATION,
     LARGEST_ROBOT,
@@ -122,7 +124,7 @@ class Replica:
         old = Intervals.empty() if supersedes is None else Intervals.of(_keys("supersedes", supersedes))
         return self._due(self._author.publish(self._checked(new), old, self._max_bytes))
 
-    def publish(self, components: Components, *, whole: bool) -> Tensor:
+    def publish(self, components: Components, *, whole: bool, moved: MovedMap | None = None) -> Tensor:
         """Make this robot's records equal to the components of its own map; returns the ids (K, 2) of new
         ones.
 
@@ -130,10 +132,15 @@ class Replica:
         written again; those published by this replica and no longer in the map are superseded. whole: also
         supersede what was published before a restart and is not in the map. Components given to `add`
         directly are not affected.
+
+        moved: how corrected poses have moved the map. A component that was published where it was before is
+        corrected, as by `correct`, and not written again.
         """
         if not len(components) and not self.n_components:
             return ids_of(np.zeros(0, np.int64))
-        made = self._author.publish_map(self._checked(components), whole, self._max_bytes)
+        if moved is not None:
+            moved = moved._replace(before=self._checked(moved.before))
+        made = self._author.publish_map(self._checked(components), whole, self._max_bytes, moved)
         return self._due(made._replace(keys=np.sort(made.keys)))
 
     def count(self, gains: Mapping[tuple[int, int], float]) -> None:
@@ -313,6 +320,11 @@ class Replica:
     def placement(self) -> Placement:
         """Where the frame is in which this robot adds components."""
         return self._records.frames.place(self._own)
+
+    @property
+    def is_corrected(self) -> bool:
+        """Whether this robot has corrected a scan, also before a restart."""
+        return any(robot_of(record.key) == self.robot for record in self._records.of(CorrectionMessage))
 
     @property
     def earlier_frames(self) -> list[int]:
