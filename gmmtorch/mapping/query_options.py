@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, TypedDict, get_args
 
-from gmmtorch.errors import InvalidArgumentError, check_prior, check_whole
+from gmmtorch.errors import InvalidArgumentError, check_choice, check_prior, check_whole
 from gmmtorch.mapping.learning.rules import LearningRule
 
 Method = Literal["point", "flux", "cone", "monte_carlo"]
@@ -62,14 +62,12 @@ class QueryOptions:
             and (isinstance(length, str) or not 0 < length < float("inf"))
         ):
             raise InvalidArgumentError(f"hit_length={length} must be metres above zero, auto, or null.")
-        if self.sampling not in SAMPLINGS:
-            raise InvalidArgumentError(f"sampling={self.sampling!r} is not one of {', '.join(SAMPLINGS)}.")
+        check_choice("sampling", self.sampling, SAMPLINGS)
 
 
 def check_method(method: str) -> None:
     """Raises `InvalidArgumentError` unless `method` is one of `METHODS`."""
-    if method not in METHODS:
-        raise InvalidArgumentError(f"method={method!r} is not one of {', '.join(METHODS)}.")
+    check_choice("method", method, METHODS)
 
 
 class MapOptions(TypedDict, total=False):

@@ -1,4 +1,4 @@
-"""The test whether the hull of a cone can give evidence near a point, see `occupancy.index.hulls`."""
+"""The test whether the hull of a cone can give evidence near a point, see `occupancy.cone_index`."""
 
 from __future__ import annotations
 
