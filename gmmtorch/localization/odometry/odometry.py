@@ -56,8 +56,8 @@ class Odometry:
             location = odometry.add(points)
         poses = odometry.trajectory().poses
 
-    The pose of a scan is the one that best explains its points by one mixture of the last keyframes, weighed
-    with its distance from the prediction. The search climbs from the best of a lattice of starts and, in 3D,
+    The pose of a scan is the one that best explains its points by one mixture of the last keyframes and is
+    not far from the prediction. The search climbs from the best of a lattice of starts and, in 3D,
     from where the mixture of the scan is registered. The prediction continues the last motion. `trajectory`
     finds the places that were seen twice and corrects all poses by a pose graph
     (`localization.odometry.pose_graph`).
