@@ -12,7 +12,8 @@ from gmmtorch.localization.rigid_motions import generators
 UNSEEN = 10.0
 """Metres of standard deviation of a direction that no surface fixes."""
 
-_CORRELATED = 10.0  # points that share one error: that of their component (measured on a hall and an office)
+CORRELATED = 10.0
+"""Points that share one error, that of their component (measured on a hall and an office)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +44,7 @@ def pose_covariance(information: Tensor, rows: Tensor) -> tuple[Tensor, float]:
     scale = information.new_ones(len(information))
     scale[dim:] = 1 / rows.norm(dim=1).median().clamp_min(1e-3)
     values, axes = torch.linalg.eigh(information * scale[:, None] * scale)
-    variances = _CORRELATED / values.clamp_min(_CORRELATED / UNSEEN**2)
+    variances = CORRELATED / values.clamp_min(CORRELATED / UNSEEN**2)
     inner = axes @ (variances[:, None] * axes.mT)
     return inner * scale[:, None] * scale, float(variances.max().sqrt())
 

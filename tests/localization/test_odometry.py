@@ -102,6 +102,44 @@ def test_a_room_with_equal_sides_leaves_the_heading_in_doubt():
     assert heading == pytest.approx(math.pi / 2, abs=0.02)  # 45° lies between; 0.8 rad is nearer to this one
 
 
+def wall(draw: torch.Generator, n: int, reach: float, period: float) -> Tensor:
+    """Points (N, 3) of a wall 3 m ahead, with a pillar every `period` metres."""
+    x, height = torch.rand(2, n, generator=draw).double()
+    x, height = reach * (2 * x - 1), 2 * height - 1
+    is_pillar = (x / period - (x / period).round()).abs() < 0.15
+    return torch.stack([x, 3 - 0.2 * is_pillar, height], 1) + 0.01 * torch.randn(n, 3, generator=draw)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_first_search_in_3d_reaches_past_the_nearest_maximum(seed):
+    # One pillar is missing, which the pose 1 m to the side explains almost as well.
+    draw = torch.Generator().manual_seed(seed)
+    before, after = wall(draw, 4000, 8, 1), wall(draw, 1000, 3, 1)
+    before, after = (points[(points[:, 0].abs() > 0.2) | (points[:, 1] > 2.9)] for points in (before, after))
+    local = LocalMap([Odometry()._scan(before)], 0.5, _RULE)
+    predicted = torch.eye(4).double()
+    predicted[0, 3] = 0.75
+    location = local.locate(Odometry()._scan(after), Expectation(predicted[None], 0.3, 0.2, 0.95))
+    assert location.found
+    assert float(location.pose[:3, 3].norm()) < 0.05
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_a_box_that_moved_does_not_outweigh_the_expected_motion(seed):
+    # Along a wall with a pillar every 2 m, a box of 2 % of the points moves by 2 m. People hide the wall, so
+    # that the search is wide.
+    draw = torch.Generator().manual_seed(seed)
+    before, after = wall(draw, 3000, 8, 2)[:, :2], wall(draw, 1000, 5, 2)[:, :2]
+    for points, place in ((before, 1), (after, -1)):
+        points[(points[:, 0] - place).abs() < 0.1, 1] -= 0.3
+    after[:300, 1] = 3 - 0.3 * torch.rand(300, generator=draw)
+    local = LocalMap([Odometry()._scan(before)], 0.5, _RULE)
+    expected = Expectation(torch.eye(3).double()[None], 0.3, 0.2, 0.95)
+    location = local.locate(Odometry()._scan(after), expected)
+    assert location.found
+    assert float(location.pose[:2, 2].norm()) < 0.05
+
+
 def test_a_motion_beyond_the_bounds_is_not_found():
     scans, _ = sensor_scans("synthetic_building_2d", 2)
     free, bound = Odometry(), Odometry(max_step=0.05, max_turn=0.01)

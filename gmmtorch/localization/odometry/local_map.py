@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.localization.location import Location, pose_covariance
+from gmmtorch.localization.location import CORRELATED, Location, pose_covariance
 from gmmtorch.localization.odometry.free_space import FreeSpace, View
 from gmmtorch.localization.odometry.pose_graph import logarithm
 from gmmtorch.localization.registration.alignment import Alignment, AlignmentTarget, align, seen_normals
@@ -24,23 +24,21 @@ from gmmtorch.scan import Scan
 
 _BLURS = {2: (0.2, 0.08, 0.03), 3: (0.25, 0.1, 0.04)}  # metres
 _STEPS = 15  # of a level
-_SPACING = 0.25  # metres between the starts of a search in 2D
+_SPACING = {2: 0.25, 3: 0.5}  # metres between the starts of the first search
 _COARSE = {2: 0.5, 3: 1.0}  # metres of blur, and between the starts, of the last search
 _TURNED = {
     2: 0.5,
     3: 0.2,
 }  # radians between the headings of neighbouring starts, for each metre between their places
-_NEAR = 0.5  # metres, and half as many radians, of the deviations of the first search in 2D
+_NEAR = 0.5  # metres, and half as many radians, of the deviations of the first search
 _FARTHEST = 3.0  # metres of a search
 _NEVER = 1e4  # nats of a pose that is farther from the expected poses than the sensor moves
 _AT_ONCE = 256  # starts
-_SORTED = 400  # best starts, of which
-_CLIMBED = {2: 64, 3: 48}  # different ones are climbed
+_SORTED = {2: 400, 3: 64}  # best starts, of which
+_CLIMBED = {2: 64, 3: 24}  # different ones are climbed
 _SPREAD = 0.75  # spacings between them
 _COARSE_POINTS = 400  # of the scan on all levels but the last one
 _RANKED = 200  # points of the scan that rank the starts
-# Points that share one error: with 10, the prediction outweighed the surfaces where a corridor begins.
-_CORRELATED = 3.0
 _LOOSEST = 0.3  # metres of standard deviation
 LOST = 1.0, math.radians(20)  # deviations (m, rad) of a pose that no scan confirms
 _APART = 0.3  # metres, and radians: poses are different
@@ -129,14 +127,12 @@ class LocalMap:
         self, scan: Keyframe, expected: Expectation
     ) -> Iterator[tuple[Tensor, list[AlignmentTarget]]]:
         """Starts, and the levels they climb; the cheapest search first."""
-        if self.dim == 2:
-            near = expected._replace(
-                distance=min(expected.distance, _NEAR), angle=min(expected.angle, _NEAR / 2)
-            )
-            yield self._lattice(scan, near, self._targets[0], _SPACING), self._targets
-        else:
+        near = expected._replace(distance=min(expected.distance, _NEAR), angle=min(expected.angle, _NEAR / 2))
+        starts = self._lattice(scan, near, self._targets[0], _SPACING[self.dim])
+        if self.dim == 3:
             registered = register(scan.mixture, self._components, expected.poses).transform
-            yield torch.cat([registered[None], expected.poses]), self._targets
+            starts = torch.cat([registered[None], starts])
+        yield starts, self._targets
         coarse = self._target(_COARSE[self.dim])
         wide = expected._replace(distance=_FARTHEST / 2, angle=math.pi / 2)
         starts = self._lattice(scan, wide, coarse, coarse.blur)
@@ -162,11 +158,11 @@ class LocalMap:
         starts = torch.cat([expected.poses, poses.flatten(0, 2)])
         points = scan.points[:_RANKED]
         score = torch.cat([target.sums(points, self._motions(part)).score for part in starts.split(_AT_ONCE)])
-        total = score / _CORRELATED - self._unlikely(starts, expected)
-        best = total.argsort(descending=True, stable=True)[:_SORTED]
+        total = score / CORRELATED - self._unlikely(starts, expected)
+        best = total.argsort(descending=True, stable=True)[: _SORTED[self.dim]]
         view = self._space.view(points, starts[best])
         against = _CONTRADICTED * (view.in_free_space + view.looked_through) - _UNKNOWN * view.unknown
-        total = total[best] - against * len(points) / _CORRELATED
+        total = total[best] - against * len(points) / CORRELATED
         starts = starts[best[total.argsort(descending=True, stable=True)]]
         starts = starts[distinct(self._motions(starts), _SPREAD * spacing, _SPREAD * turn)]
         return torch.cat([expected.poses, starts[: _CLIMBED[self.dim]]])
@@ -195,16 +191,16 @@ class LocalMap:
         mean = (
             found.score + _INSIDE * found.explained + _UNKNOWN * view.unknown - _CONTRADICTED * contradicted
         )
-        return mean * len(points) / _CORRELATED - self._unlikely(poses, expected), view
+        return mean * len(points) / CORRELATED - self._unlikely(poses, expected), view
 
     def _unlikely(self, poses: Tensor, expected: Expectation) -> Tensor:
-        """Half the square deviation (B,) of poses from the nearest expected one, with a long tail."""
+        """Half the square deviation (B,) of poses from the nearest expected one."""
         shift = torch.cdist(poses[:, :-1, -1], expected.poses[:, :-1, -1])
         chord = torch.linalg.matrix_norm(poses[:, None, :-1, :-1] - expected.poses[:, :-1, :-1])
         turned = 2 * (chord / math.sqrt(8)).clamp_max(1).asin()
         is_near = (shift <= expected.max_step) & (turned <= expected.max_turn)
         square = (shift / expected.distance).square() + (turned / expected.angle).square()
-        return torch.log1p(square.amin(1) / 2) + torch.where(is_near.any(1), 0.0, _NEVER)
+        return square.amin(1) / 2 + torch.where(is_near.any(1), 0.0, _NEVER)
 
     def _judged(
         self, points: Tensor, found: Alignment, total: Tensor, view: View, expected: Expectation

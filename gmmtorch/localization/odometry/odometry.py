@@ -56,10 +56,11 @@ class Odometry:
             location = odometry.add(points)
         poses = odometry.trajectory().poses
 
-    A scan becomes a small mixture. It is registered with the mixtures of the last keyframes (in 2D, the best
-    of a lattice of starts), then the pose that best explains its points is found from there. The
-    prediction continues the last motion. `trajectory` finds the places that were seen twice and corrects
-    all poses by a pose graph (`localization.odometry.pose_graph`).
+    The pose of a scan is the one that best explains its points by one mixture of the last keyframes and is
+    not far from the prediction. The search climbs from the best of a lattice of starts and, in 3D,
+    from where the mixture of the scan is registered. The prediction continues the last motion. `trajectory`
+    finds the places that were seen twice and corrects all poses by a pose graph
+    (`localization.odometry.pose_graph`).
 
     Args:
         n_keyframes: in the local map. None: 10, or 80 for a sensor with a narrow field of view, such as a
