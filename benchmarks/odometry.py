@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 
 import torch
-from tables import hardware, markdown, publish
+from tables import OUTPUTS, hardware, markdown, publish
 
 import gmmtorch as gt
 from gmmtorch.datasets import Dataset
@@ -140,7 +140,7 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", default=METHODS)
     parser.add_argument("--most", type=int)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--runs", type=Path, default=Path("odometry_runs.jsonl"))
+    parser.add_argument("--runs", type=Path, default=OUTPUTS / "odometry_runs.jsonl")
     options = parser.parse_args()
     torch.set_num_threads(1)
     for name in options.names:
