@@ -16,7 +16,7 @@ def load_open3d(failure: str) -> Any:
     except (ImportError, OSError) as error:
         raise GmmTorchError(
             f"{failure}, because Open3D does not load: {error}. On Debian or Ubuntu install libusb-1.0-0 "
-            "libgl1 libegl1 libx11-6 libudev1 libgomp1 (scripts/setup.sh does this)."
+            "libgl1 libegl1 libx11-6 libudev1 libgomp1 libidn2-0 (scripts/setup.sh does this)."
         ) from error
     return open3d
 

@@ -5,7 +5,7 @@ cd "$(dirname "$0")/.."
 
 PYTHON="${PYTHON:-python3}"
 STAMP=.venv/.gmmtorch-setup
-PACKAGES="libusb-1.0-0 libgl1 libegl1 libx11-6 libudev1 libgomp1"
+PACKAGES="libusb-1.0-0 libgl1 libegl1 libx11-6 libudev1 libgomp1 libidn2-0"
 
 if ! "$PYTHON" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2])'; then
   echo "setup: $("$PYTHON" --version) is too old; set PYTHON to a Python of 3.11 or newer." >&2

@@ -61,6 +61,8 @@ class BagReader:
         self.path = _bag_file(path)
         self._is_ros1 = self.path.suffix == ".bag"
         with self._errors():
+            for file in sorted(self.path.glob("*.db3")) if self.path.is_dir() else [self.path]:
+                _check_length(file)
             self._reader: Any = reader_class(self._is_ros1)(_bounded(self.path))
             self._reader.open()
             self._connections = [
@@ -150,6 +152,21 @@ def _bag_file(path: Path) -> Path:
     if path.is_file() and path.stat().st_size == 0:
         raise DataError(f"{path} is empty; record or copy it again.")
     return path
+
+
+def _check_length(path: Path) -> None:
+    """Raise `EOFError` if a SQLite file is shorter than its header states.
+
+    Some versions of SQLite notice that only when they read a page that is missing.
+    """
+    with path.open("rb") as file:
+        header = file.read(100)
+    if not header.startswith(b"SQLite format 3\0") or header[24:28] != header[92:96]:
+        return  # another format, or a header without a valid number of pages
+    page = int.from_bytes(header[16:18], "big")
+    expected = (65536 if page == 1 else page) * int.from_bytes(header[28:32], "big")
+    if path.stat().st_size < expected:
+        raise EOFError(f"it has {path.stat().st_size:,} of {expected:,} bytes")
 
 
 class _BoundedFile(io.BufferedReader):
