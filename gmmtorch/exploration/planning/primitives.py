@@ -183,13 +183,11 @@ class Primitives:
 
 def _moved(paths: Tensor, states: Tensor) -> Tensor:
     """Move paths (..., S, 7) that begin at the origin with yaw 0 to the poses of states (..., 7)."""
-    pose = states[..., None, :]
-    cos, sin = pose[..., 3].cos(), pose[..., 3].sin()
-    moved = paths.clone()
-    moved[..., 0] = pose[..., 0] + cos * paths[..., 0] - sin * paths[..., 1]
-    moved[..., 1] = pose[..., 1] + sin * paths[..., 0] + cos * paths[..., 1]
-    moved[..., 2:4] += pose[..., 2:4]
-    return moved
+    x, y, z, yaw = states[..., None, :4].unbind(-1)
+    along, across, up, turn, *velocities = paths.unbind(-1)
+    cos, sin = yaw.cos(), yaw.sin()
+    place = [x + cos * along - sin * across, y + sin * along + cos * across, up + z, turn + yaw]
+    return torch.stack(torch.broadcast_tensors(*place, *velocities), -1)
 
 
 def _integrated(states: Tensor, commands: Tensor, dynamics: Dynamics, n_steps: int) -> Tensor:

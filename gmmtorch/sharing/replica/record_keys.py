@@ -252,7 +252,8 @@ def keys_of(ids: Tensor) -> Ints:
             f"sequences from 0 to {most[1]}."
         )
     keys = rows[:, 0] << SEQUENCE_BITS | rows[:, 1]
-    if len(np.unique(keys)) != len(keys):
+    is_rising = bool((keys[1:] > keys[:-1]).all())  # nearly always, and much faster than sorting
+    if not is_rising and len(np.unique(keys)) != len(keys):
         raise DataError("Two records have the same id.")
     return keys
 
