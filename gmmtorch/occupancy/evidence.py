@@ -155,7 +155,7 @@ class Evidence:
         origins, ends, weights, is_hit = checked_rays(
             origins, ends, weights, is_hit, self.grid.dim, self.misses.device
         )
-        size = chunk_elements(self.misses.device) // 2  # rays whose positions fit a core's cache
+        size = chunk_elements(self.misses.device)
         for begin in range(0, len(ends), size):
             part = slice(begin, begin + size)
             starts, stops = self.grid.to_units(origins[part]), self.grid.to_units(ends[part])
