@@ -276,7 +276,8 @@ RUNS = {
     "odometry": Run(f"{ODOMETRY} --seeds 0 1 2 --names courtyard && "
                     f"{ODOMETRY} --seeds 0 --names street && "
                     f"{ODOMETRY} --seeds 0 1 --names hall && "
-                    f"{ODOMETRY} --seeds 0 --names intel freiburg-101 aces",
+                    f"{ODOMETRY} --seeds 0 1 --names intel && "
+                    f"{ODOMETRY} --seeds 0 --names freiburg-101 aces",
                     of_table(RESULTS, "odometry", 3, FLOWN)),
     "fig3_4": Run(OCCUPANCY + "experiment=fig3_4_auc_sparsity_2d " + INTEL, [
         Claim(FIGURES, "1 cm Monte Carlo has # […] with all beams, # […] with 70 % removed and # […] with",
