@@ -1,4 +1,4 @@
-"""C++ of a vector of eight numbers on a CPU, and of one on CUDA: `vec`, `mask`, `whole`, exp, Mills' ratio."""
+"""C++ of a vector of eight numbers on a CPU, or of one: `vec`, `mask`, `whole`, exp, Mills' ratio."""
 
 from __future__ import annotations
 
