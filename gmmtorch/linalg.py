@@ -128,6 +128,22 @@ def check_rigid(transform: Tensor, dim: int, name: str = "transform") -> tuple[T
     return matrix[:dim, :dim], matrix[:dim, dim]
 
 
+# -- devices ---------------------------------------------------------------------------------------
+
+
+def on_cpu(*tensors: Tensor) -> tuple[Tensor, ...]:
+    """The tensors on the CPU, without gradients. Python waits once for their device, not for each tensor."""
+    tensors = tuple(tensor.detach() for tensor in tensors)
+    if all(tensor.device.type == "cpu" for tensor in tensors):
+        return tensors
+    sizes = [tensor.numel() * tensor.element_size() for tensor in tensors]
+    # Wide types come first: a tensor must begin at a multiple of the size of its entries.
+    order = sorted(range(len(tensors)), key=lambda i: -tensors[i].element_size())
+    data = torch.cat([tensors[i].flatten().view(torch.uint8) for i in order]).cpu()
+    parts = dict(zip(order, data.split([sizes[i] for i in order]), strict=True))
+    return tuple(parts[i].view(tensor.dtype).view(tensor.shape) for i, tensor in enumerate(tensors))
+
+
 # -- sorting: NumPy's vectorised sorts on the CPU, torch's elsewhere ------------------------------
 
 
@@ -152,23 +168,13 @@ def largest_indices(scores: Tensor, k: int) -> Tensor:
     return taken.nonzero()[:, 1].view(-1, k)
 
 
-def count_distinct(keys: Tensor) -> int:
-    """Number of distinct keys (N,)."""
-    if keys.numel() == 0:
-        return 0
-    if _by_hash(keys):
-        return len(distinct_keys(keys, numbered=False)[0])
-    ordered = torch.from_numpy(np.sort(keys.numpy())) if keys.device.type == "cpu" else keys.sort().values
-    return 1 + int((ordered[1:] != ordered[:-1]).sum())
-
-
 def dense_ranks(keys: Tensor) -> tuple[Tensor, int]:
     """Rank of each key (N,) among the distinct keys, from 0, and the number of distinct keys."""
     if keys.device.type != "cpu":
         unique, number = torch.unique(keys, return_inverse=True)
         return number, unique.numel()
     if _by_hash(keys):
-        distinct, place = distinct_keys(keys, numbered=True)
+        distinct, place = distinct_keys(keys)
         rank = torch.empty_like(distinct)
         rank[argsort(distinct)] = torch.arange(len(distinct))
         return rank[place], len(distinct)

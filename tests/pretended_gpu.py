@@ -59,9 +59,6 @@ class GPUTensor(Tensor):
     def __repr__(self, **options: Any) -> str:
         return f"GPUTensor({self.held})"
 
-    def tolist(self) -> Any:
-        return self.held.tolist()
-
     def numpy(self, *args: Any, **options: Any) -> Any:
         raise TypeError("can't convert cuda:0 device type tensor to numpy; use Tensor.cpu() first.")
 
@@ -146,6 +143,10 @@ class _Dispatch(TorchDispatchMode):
 class _Functions(TorchFunctionMode):
     """Data become tensors on the CPU and move; tensors move by `_Move`, which has a gradient."""
 
+    def __init__(self, gpu: PretendedGPU) -> None:
+        super().__init__()
+        self.gpu = gpu
+
     def __torch_function__(self, func, types, args=(), kwargs=None):  # type: ignore[no-untyped-def]
         kwargs = dict(kwargs or {})
         if func in (torch.tensor, torch.as_tensor):
@@ -160,9 +161,14 @@ class _Functions(TorchFunctionMode):
             index = args[1] if isinstance(args[1], tuple) else (args[1],)
             index = tuple(torch.tensor(part) if isinstance(part, list) else part for part in index)
             return func(args[0], index, *args[2:])
+        if func is Tensor.tolist and isinstance(args[0], GPUTensor):
+            self.gpu.waits["tolist"] += 1
+            return args[0].held.tolist()
         if func in (Tensor.to, Tensor.cuda, Tensor.cpu):
             rest = list(args[1:]) if func is Tensor.to else ["cuda" if func is Tensor.cuda else "cpu"]
-            return _move(args[0], rest, kwargs)
+            moved = _move(args[0], rest, kwargs)
+            self.gpu.waits["to cpu"] += isinstance(args[0], GPUTensor) and not isinstance(moved, GPUTensor)
+            return moved
         return func(*args, **kwargs)
 
 
@@ -212,5 +218,5 @@ def pretended_gpu() -> Iterator[PretendedGPU]:
         for name, value in (("is_available", True), ("device_count", 1), ("_lazy_init", None)):
             stack.enter_context(mock.patch.object(torch.cuda, name, lambda value=value: value))
         stack.enter_context(_Dispatch(gpu))
-        stack.enter_context(_Functions())
+        stack.enter_context(_Functions(gpu))
         yield gpu

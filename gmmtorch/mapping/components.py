@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.linalg import argsort, check_symmetric, safe_cholesky
+from gmmtorch.linalg import argsort, check_symmetric, on_cpu, safe_cholesky
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.scan import check_positions, extent
 
@@ -136,11 +136,13 @@ class Components:
         """The components on a device."""
         if self.means.device == torch.device(device):
             return self
+        if torch.device(device).type == "cpu":
+            return self.on_cpu()
         return Components(**{name: value.to(device) for name, value in vars(self).items()})
 
     def on_cpu(self) -> Components:
         """The components on the CPU, without gradients."""
-        return Components(**{name: value.detach().cpu() for name, value in vars(self).items()})
+        return Components(*on_cpu(*vars(self).values()))
 
     def cones(self) -> Cones:
         """One cone for each viewpoint: the argument of the evidence functions."""

@@ -115,7 +115,7 @@ class GaussianMap(MapState):
         scans = f"{self.n_pending} pending scan{'s' if self.n_pending != 1 else ''}"
         if self.dim is None:
             return f"GaussianMap(empty, {type(self.learning).__name__})"
-        known = self._learned or self._final()
+        known = self._learned[0] if self._learned else self._final()
         if self.n_pending and self._learned is None:
             size = f"{len(known)} components and {scans} not learned yet in {self.dim}D"
         else:
@@ -196,10 +196,10 @@ class GaussianMap(MapState):
         first = frame_of(0)
         self._prepare(3, first.depth.device, "depth images are")
         if self.n_pending:
-            self._commit(self._with_pending())
+            self._commit(*self._upcoming())
         self.learning = self.learning.fitted([first])
         taken = (frame_of(index).to(self._device) for index in range(len(frames)))
-        self._commit(self._absorbed(taken, self.learning, float(pixel_stride**2)))
+        self._commit(*self._absorbed(taken, self.learning, float(pixel_stride**2)))
 
     def finish(self) -> None:
         """Learns from the scans of the unfinished window now instead of at the first query. Changes no

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
-from gmmtorch.mapping.codec.map_file import MapSettings, file_size, number_after
-from gmmtorch.mapping.codec.quantization import numbered
+from gmmtorch.mapping.codec.map_file import MapSettings, file_size
+from gmmtorch.mapping.codec.quantization import number_after, numbered
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.depth_frame import DepthFrame, as_scans
 from gmmtorch.mapping.learning.forgetting import Doubts, joined
@@ -70,7 +70,7 @@ class MapState(nn.Module):
         self._n_windows = 0
         self._next_number = 0  # of the next new component
         self._doubts = self._next_doubts = Doubts.none()  # of the final components; after the pending scans
-        self._learned: Components | None = None  # what follows from the buffers and the pending scans
+        self._learned: tuple[Components, int] | None = None  # what follows from buffers and pending scans
         self._rounded: Components | None = None
         self._query: Query | None = None
 
@@ -117,15 +117,20 @@ class MapState(nn.Module):
 
     def _with_pending(self) -> Components:
         """All components, not rounded."""
+        return self._upcoming()[0]
+
+    def _upcoming(self) -> tuple[Components, int]:
+        """All components, not rounded, and the number of the next new one after them."""
+        if not self._pending:
+            return self._final(), self._next_number
         if self._learned is None:
-            rule = self.learning.fitted(self._pending)
-            self._learned = self._absorbed(self._pending, rule) if self._pending else self._final()
+            self._learned = self._absorbed(self._pending, self.learning.fitted(self._pending))
         return self._learned
 
     def _absorbed(
         self, scans: Iterable[Scan | DepthFrame], rule: LearningRule, weight: float = 1.0
-    ) -> Components:
-        """All components, with those of scans, or of frames with points that each stand for `weight`."""
+    ) -> tuple[Components, int]:
+        """`_upcoming`, with the components of scans, or of frames whose points each stand for `weight`."""
         known = self._final()
         if isinstance(rule, WindowedRule):
             generator = torch.Generator().manual_seed(hash((self._random_state, self._n_windows)) % 2**63)
@@ -147,11 +152,11 @@ class MapState(nn.Module):
         if len(self._pending) < (self.learning.fitted(self._pending).window or _LONGEST_WINDOW):
             return
         try:
-            learned = self._with_pending()
+            learned = self._upcoming()
         except GmmTorchError:
             self._pending.pop()
             raise
-        self._commit(learned)
+        self._commit(*learned)
 
     def _prepare(self, dim: int, device: torch.device, what: str) -> None:
         """Gives an empty map its dimension. Raises if the map has another one."""
@@ -160,13 +165,16 @@ class MapState(nn.Module):
         elif dim != self.dim:
             raise InvalidArgumentError(f"{what} {dim}-dimensional, but the map is {self.dim}-dimensional.")
 
-    def _commit(self, components: Components) -> None:
-        """Replaces all components, those of the unfinished window included."""
+    def _commit(self, components: Components, next_number: int | None = None) -> None:
+        """Replaces all components, those of the unfinished window included.
+
+        `next_number`: of the next new component; None: the one after all ids.
+        """
         self.learning = self.learning.fitted(self._pending)
         self._doubts = self._next_doubts
         self._n_windows += bool(self._pending)
         self._pending = []
-        self._next_number = number_after(components.ids, self._next_number)
+        self._next_number = next_number or number_after(components.ids, self._next_number)
         self._set(components)
 
     def _set(self, components: Components) -> None:

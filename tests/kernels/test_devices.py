@@ -15,6 +15,7 @@ import gmmtorch.kernels
 from gmmtorch.kernels import kernels
 from gmmtorch.kernels.compiler import FusedKernel, compiler_failure
 from gmmtorch.kernels.rays.ray_traversal import traverse
+from gmmtorch.linalg import on_cpu
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.grouping import Rows, group_rows, truncated_expectation
 from gmmtorch.occupancy.cones import Cones
@@ -139,10 +140,40 @@ def test_the_pretended_gpu_refuses_what_a_gpu_refuses():
             x + torch.ones(3)
         with pytest.raises(TypeError, match="cpu"):
             x.numpy()
-        assert gpu.waits.total() == 0
+        assert gpu.waits == {"tolist": 1}
         assert float(x.sum()) == 3.0
         assert x.cpu().numpy().sum() == 3.0
-        assert gpu.waits.total() >= 1
+        assert gpu.waits == {"tolist": 1, "_local_scalar_dense": 1, "to cpu": 1}
+
+
+def test_one_wait_brings_tensors_of_any_type_to_the_cpu():
+    made = [torch.tensor([True, False, True]), torch.arange(5), torch.ones(2, 0), torch.rand(3, 2).T]
+    made += [torch.rand(2, dtype=torch.float64), torch.tensor(7, dtype=torch.int32)]
+    with pretended_gpu() as gpu:
+        found = on_cpu(*(tensor.to("cuda") for tensor in made))
+        assert gpu.waits == {"to cpu": 1}
+    for one, other in zip(found, made, strict=True):
+        assert one.dtype == other.dtype
+        assert torch.equal(one, other)
+
+
+def test_a_gpu_waits_eight_times_for_a_scan_that_is_inserted():
+    points, origin = cloud(20_000).double(), torch.tensor([2.0, 2.0, 1.0], dtype=torch.float64)
+
+    def inserted(scan):
+        made = gt.GaussianMap(gt.IncrementalRule(noise=0.01, length=0.5, cell=0.05, window=1))
+        made.insert(scan)
+        return made.components()
+
+    with kernels("torch"):
+        expected = inserted(gt.Scan(points, origin))
+    with pretended_gpu() as gpu:
+        scan = gt.Scan(points.to("cuda"), origin.to("cuda"))
+        gpu.waits.clear()
+        found = inserted(scan)
+        assert gpu.waits.total() == 8
+    for name, values in vars(expected).items():
+        torch.testing.assert_close(getattr(found, name).held, values)
 
 
 @pytest.mark.parametrize(

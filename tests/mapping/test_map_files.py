@@ -95,7 +95,7 @@ def test_file_size_equals_the_length_of_the_written_file(dim, k, n_known, seed, 
     components.ids[n_known:, 1] = UNNUMBERED
     rule, map_settings = IncrementalRule(), storage.MapSettings(0.1, "point", codec, 3, QueryOptions())
     size = storage.file_size(components, rule, map_settings, next_number=40)
-    written = storage.to_bytes(numbered(components, 3, 40), rule, map_settings, 40)
+    written = storage.to_bytes(numbered(components, 3, 40)[0], rule, map_settings, 40)
     assert size == len(written) + 48  # room for settings that change
 
 

@@ -23,7 +23,7 @@ _KERNEL = FusedKernel(
             place[at] = found;
             distinct[found++] = key;
         }
-        if (number) number[i] = place[at];
+        number[i] = place[at];
     }
     *n_distinct = found;
     """,
@@ -31,16 +31,15 @@ _KERNEL = FusedKernel(
 )
 
 
-def distinct_keys(keys: Tensor, numbered: bool) -> tuple[Tensor, Tensor | None]:
-    """The distinct keys (C,) of `keys` (N,), int64, in the order of their first occurrence.
-
-    With `numbered`, also the index (N,) of each key among them.
+def distinct_keys(keys: Tensor) -> tuple[Tensor, Tensor]:
+    """The distinct keys (C,) of `keys` (N,), int64, in the order of their first occurrence; and the index
+    (N,) of each key among them.
     """
     keys, n = keys.contiguous(), keys.shape[0]
     n_places = 1 << (2 * n).bit_length()
     place = torch.full((n_places,), -1, dtype=torch.int64)
     distinct = torch.empty_like(keys)
-    number = torch.empty_like(keys) if numbered else None
+    number = torch.empty_like(keys)
     n_distinct = torch.zeros(1, dtype=torch.int64)
     _KERNEL(1, keys, n, place, n_places, distinct, number, n_distinct, device=keys.device)
     return distinct[: int(n_distinct)], number

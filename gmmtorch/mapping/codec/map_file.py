@@ -22,7 +22,7 @@ from gmmtorch.errors import (
 )
 from gmmtorch.files import pack_tensors, read_tensors, require, unpack_tensors
 from gmmtorch.mapping.codec.component_batch import batch_bytes, decode, encode
-from gmmtorch.mapping.codec.quantization import quantize_numbered
+from gmmtorch.mapping.codec.quantization import number_after, quantize_numbered
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import LearningRule, changed_options, rule_facts
 from gmmtorch.mapping.query_options import QueryOptions, check_method
@@ -73,11 +73,6 @@ def file_size(components: Components, rule: LearningRule, settings: MapSettings,
         values = quantize_numbered(components, settings.robot, next_number)
         data = _container(torch.zeros(batch_bytes(values), dtype=torch.uint8), facts)
     return len(data) + _ROOM_FOR_SETTINGS
-
-
-def number_after(ids: Tensor, next_number: int) -> int:
-    """The sequence number of the next new component, after components with these ids (K, 2) exist."""
-    return max(next_number, int(ids[:, 1].max()) + 1 if len(ids) else 0)
 
 
 def from_file(path: str | Path) -> tuple[Components, dict[str, Any]]:

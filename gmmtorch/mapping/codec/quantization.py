@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.linalg import argsort
+from gmmtorch.linalg import argsort, on_cpu
 from gmmtorch.mapping.codec import lattice
 from gmmtorch.mapping.codec.bitstream import Ints, fewest_bits
 from gmmtorch.mapping.codec.lattice import PER_OCTAVE, Lattice
@@ -114,17 +114,17 @@ def quantize(components: Components) -> Quantized:
     viewpoint are dropped. Raises `InvalidArgumentError` for values that are too large to be stored, see
     `lattice` and `LARGEST_COUNT`.
     """
-    c = components
-    places = lattice.nearest(c.means.double().cpu(), c.covariances.double().cpu())
-    count = _support_steps(c.support.double().cpu())
-    seen_by, seen_from, seen_count = c.seen_by.cpu(), c.seen_from.cpu(), c.seen_count.double().cpu()
+    c = components.on_cpu()
+    places = lattice.nearest(c.means.double(), c.covariances.double())
+    count = _support_steps(c.support.double())
+    seen_by, seen_from, seen_count = c.seen_by, c.seen_from, c.seen_count.double()
     by, seen, counts = seen_by.numpy(), seen_from.numpy(), seen_count.numpy()
     largest = _largest(seen_count, seen_by, len(c)).numpy()
     kept = np.flatnonzero((counts > 0) | (largest[by] == 0))
     kept = kept[np.argsort(by[kept], kind="stable")]
     by, seen, counts = by[kept], seen[kept], counts[kept]
 
-    steps = _origin_steps(c.origins.double().cpu()).numpy()
+    steps = _origin_steps(c.origins.double()).numpy()
     distinct, place = _first_uses(steps)
     used, seen = np.unique(place[seen], return_inverse=True)
     origins = steps[distinct[used]]
@@ -135,8 +135,8 @@ def quantize(components: Components) -> Quantized:
     return Quantized(
         places=places,
         count=count,
-        max_range=c.max_range.cpu(),
-        ids=c.ids.cpu(),
+        max_range=c.max_range,
+        ids=c.ids,
         origins=torch.from_numpy(origins),
         n_viewpoints=torch.from_numpy(np.bincount(by[kept], minlength=len(c))),
         seen_from=seen_from,
@@ -213,34 +213,48 @@ def spatial_order(components: Components) -> Tensor:
 
     Use it before components are numbered: ids take few bits only if they are consecutive.
     """
-    places = lattice.nearest(components.means.double().cpu(), components.covariances.double().cpu())
-    return order_of(places).to(components.means.device)
+    return _order(*on_cpu(components.means, components.covariances)).to(components.means.device)
 
 
-def numbered(components: Components, robot: int, first: int) -> Components:
-    """Components with ids for those that have none: (robot, first), (robot, first + 1), …
+def _order(means: Tensor, covariances: Tensor) -> Tensor:
+    return order_of(lattice.nearest(means.double(), covariances.double()))
+
+
+def numbered(components: Components, robot: int, first: int) -> tuple[Components, int]:
+    """Components with ids for those that have none: (robot, first), (robot, first + 1), …; and the number
+    after all of them.
 
     New components come last, in their spatial order.
     """
-    ids, order = _numbering(components.ids, spatial_order(components), robot, first)
-    return replace(components.rearranged(order), ids=ids)
+    ids, *shapes = on_cpu(components.ids, components.means, components.covariances)
+    ids, order = _numbering(ids, _order(*shapes), robot, first)
+    device = components.ids.device
+    arranged = replace(components.rearranged(order.to(device)), ids=ids.to(device))
+    return arranged, number_after(ids, first)
+
+
+def number_after(ids: Tensor, next_number: int) -> int:
+    """The sequence number of the next new component, after components with these ids (K, 2) exist."""
+    return max(next_number, int(ids[:, 1].max()) + 1 if len(ids) else 0)
 
 
 def quantize_numbered(components: Components, robot: int, first: int) -> Quantized:
-    """The same as `quantize(numbered(components, robot, first))`, rounding every component once."""
+    """The same as `quantize(numbered(components, robot, first)[0])`, rounding every component once."""
     values = quantize(components)
     ids, order = _numbering(values.ids, order_of(values.places), robot, first)
     return replace(values.reordered(order), ids=ids)
 
 
 def _numbering(ids: Tensor, by_place: Tensor, robot: int, first: int) -> tuple[Tensor, Tensor]:
-    """Ids (K, 2) after numbering, and the order (K,) of the components: numbered ones, then new ones."""
+    """Ids (K, 2) after numbering, and the order (K,) of the components: numbered ones, then new ones. On the
+    CPU.
+    """
     is_new = ids[:, 1] < 0
     rank = torch.zeros_like(ids[:, 0])
-    rank[by_place] = torch.arange(len(ids), device=ids.device)
+    rank[by_place] = torch.arange(len(ids))
     order = argsort(torch.where(is_new, len(ids) + rank, 0))
     ids = ids[order].clone()
-    numbers = first + torch.arange(int(is_new.sum()), device=ids.device)
+    numbers = first + torch.arange(int(is_new.sum()))
     ids[len(ids) - len(numbers) :] = torch.stack([torch.full_like(numbers, robot), numbers], 1)
     return ids, order
 

@@ -129,7 +129,7 @@ def _components(
     found: em.Parameters, assigned: AssignedViewpoints, origins: Tensor, max_range: bool
 ) -> Components:
     """The components that keep a viewpoint; not numbered."""
-    kept, support, seen_by, seen_from, seen_count = assigned
+    kept, support, seen_by, seen_from, seen_count = (part.to(origins.device) for part in assigned)
     ids = torch.zeros(support.shape[0], 2, dtype=torch.int64, device=origins.device)
     ids[:, 1] = UNNUMBERED
     return Components(

@@ -14,12 +14,13 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.linalg import on_cpu
 from gmmtorch.mapping.components import Components
 
 
 class AssignedViewpoints(NamedTuple):
     """kept (K′,): rows of the components that keep at least one viewpoint; their support (K′,); and
-    seen_by, seen_from, seen_count (E,) of their viewpoints, as in `Components`."""
+    seen_by, seen_from, seen_count (E,) of their viewpoints, as in `Components`. On the CPU."""
 
     kept: Tensor
     support: Tensor
@@ -42,6 +43,7 @@ def all_origins(weight: float = 1.0) -> AssignViewpoints:
     """
 
     def assign(counts: Tensor, weights: Tensor, n_points: float) -> AssignedViewpoints:
+        counts, weights = on_cpu(counts, weights)
         kept = (counts.sum(1) > 0).nonzero().squeeze(1)
         counts, support = counts[kept], weights[kept]
         support = support * (n_points * weight / support.sum())
@@ -60,11 +62,12 @@ def sampled_origins(max_origins: int, generator: torch.Generator) -> AssignViewp
     """
 
     def assign(counts: Tensor, weights: Tensor, n_points: float) -> AssignedViewpoints:
+        counts, weights = on_cpu(counts, weights)
         support = weights * n_points
         n_kept = min(max_origins, counts.shape[1])
         if n_kept < counts.shape[1]:
             race = torch.empty(counts.shape, dtype=torch.float64).exponential_(generator=generator)
-            key = torch.where(counts > 0, race.to(counts.device) / counts.clamp_min(1), float("inf"))
+            key = torch.where(counts > 0, race / counts.clamp_min(1), float("inf"))
             drawn = key.topk(n_kept, dim=1, largest=False).indices
             counts = torch.zeros_like(counts).scatter_(1, drawn, counts.gather(1, drawn))
         share = counts * (support / counts.sum(1).clamp_min(1e-12))[:, None]
@@ -105,28 +108,36 @@ def limit_origins(components: Components, max_origins: int, mean_origins: float 
     check_whole("max_origins", max_origins, 1)
     if mean_origins is not None and not 1 <= mean_origins < math.inf:
         raise InvalidArgumentError(f"mean_origins={mean_origins} must be at least 1.")
-    kept = _kept_viewpoints(components, max_origins, mean_origins)
+    kept, all_used = _kept_viewpoints(components, max_origins, mean_origins)
     by, count, seen_from = components.seen_by, components.seen_count, components.seen_from
     if kept is not None:
         by, count, seen_from = by[kept], count[kept], seen_from[kept]
     total = count.new_zeros(len(components)).index_add_(0, by, count)
     share = components.support / total.clamp_min(torch.finfo(total.dtype).tiny)
     limited = replace(components, seen_by=by, seen_from=seen_from, seen_count=count * share[by])
-    return limited.with_used_origins()
+    return limited if all_used else limited.with_used_origins()
 
 
-def _kept_viewpoints(components: Components, max_origins: int, mean_origins: float | None) -> Tensor | None:
-    """The viewpoints (E′,) that `limit_origins` keeps, in rising order; None: all."""
+def _kept_viewpoints(
+    components: Components, max_origins: int, mean_origins: float | None
+) -> tuple[Tensor | None, bool]:
+    """The viewpoints (E′,) that `limit_origins` keeps, in rising order, None: all; and whether it is known
+    that every origin then has one.
+    """
     by, count = components.seen_by, components.seen_count
     n, rows = len(components), torch.arange(components.seen_by.shape[0], device=components.seen_by.device)
     limit = n * max_origins if mean_origins is None else int(n * mean_origins)
     left = count > 0
     if n == 0:
-        return None
+        return None, False
+    n_origins = components.origins.shape[0]
     per_component = by.new_zeros(n).index_add_(0, by, left.long())
-    n_left, most = torch.stack([left.sum(), per_component.max()]).tolist()
+    used = by.new_zeros(n_origins).index_fill_(0, components.seen_from, 1)
+    n_left, most, n_used = torch.stack([left.sum(), per_component.max(), used.sum()]).tolist()
     if n_left <= limit and most <= max_origins:
-        return None if n_left == len(rows) else left.nonzero().squeeze(1)
+        if n_left == len(rows):
+            return None, n_used == n_origins
+        return left.nonzero().squeeze(1), False
     worth, position = count.sqrt(), components.origins[components.seen_from]
     nearest = torch.ones_like(count)  # distance to the nearest kept origin of the same component
     gain = torch.full_like(count, -1.0)  # √count · distance at which a viewpoint was chosen
@@ -145,4 +156,4 @@ def _kept_viewpoints(components: Components, max_origins: int, mean_origins: flo
         nearest = distance if step == 0 else torch.minimum(nearest, distance)
     kept = torch.zeros_like(left)
     kept[gain.argsort(descending=True, stable=True)[:limit]] = True
-    return (kept & (gain >= 0)).nonzero().squeeze(1)
+    return (kept & (gain >= 0)).nonzero().squeeze(1), False

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.mixtures.cell_moments import KEY_BITS, cell_moments
-from gmmtorch.linalg import count_distinct, dense_ranks
+from gmmtorch.linalg import dense_ranks
 from gmmtorch.mixture.em.exact import quadratic_features
 
 _MAX_CELLS_ALONG = (1 << KEY_BITS) - 2  # along the longest side
@@ -45,18 +45,22 @@ def pool_into_cells(points: Tensor, max_cells: int, finest: float, weight: Tenso
     if n <= max_cells:
         return Cells(quadratic_features(points), weight, torch.arange(n, device=points.device))
     low = points.amin(0)
-    extent = float((points.amax(0) - low).max())
-    side = max(finest, extent / _MAX_CELLS_ALONG) or 1.0  # equal points share one cell
+    extent = (points.amax(0) - low).max()
+    side = (extent / _MAX_CELLS_ALONG).clamp_min(finest)
+    side = torch.where(side > 0, side, 1.0)  # equal points share one cell
 
     def pooled(thirds: int) -> tuple[Tensor, Tensor] | None:
         """Sums and members of cells of side · 2^(thirds/3); None if there are too many cells."""
         factor = 2 ** (-thirds / 3)
         if points.device.type == "cpu" and is_fused(points, weight):
-            return cell_moments(points, weight, low, side, factor, max_cells)
+            return cell_moments(points, weight, low, float(side), factor, max_cells)
         return _sums_by_key(points, weight, _pack(((points - low) / side * factor).long()), max_cells)
 
-    last = 3 * math.ceil(math.log2(extent / side + 2))  # gives one cell
-    sums, member = pooled(0) or coarsest_allowed(pooled, last)[1]
+    found = pooled(0)
+    if found is None:
+        one_cell = 3 * math.ceil(math.log2(float(extent / side) + 2))
+        found = coarsest_allowed(pooled, one_cell)[1]
+    sums, member = found
     return Cells(sums / sums[:, :1], sums[:, 0].clone(), member)
 
 
@@ -79,9 +83,9 @@ def _sums_by_key(
     points: Tensor, weight: Tensor, keys: Tensor, max_cells: int
 ) -> tuple[Tensor, Tensor] | None:
     """The twin of `kernels.mixtures.cell_moments`: sums (C, F) over equal keys, and each point's cell."""
-    if count_distinct(keys) > max_cells:
-        return None
     member, n_cells = dense_ranks(keys)
+    if n_cells > max_cells:
+        return None
     sums = points.new_zeros(n_cells, quadratic_features(points[:1]).shape[1])
     for part, cell, p in zip(*(t.split(_CHUNK_POINTS) for t in (points, member, weight)), strict=True):
         sums.index_add_(0, cell, quadratic_features(part) * p[:, None])

@@ -63,13 +63,18 @@ def shift_features(features: Tensor, offset: Tensor) -> Tensor:
 
 def natural_parameters(parameters: Parameters) -> Tensor:
     """W (K, F) such that φ(x)·W_k = log π_k + log N(x | μ_k, Σ_k)."""
-    weights, means, covariances = parameters
-    dim = means.shape[1]
+    dim, covariances = parameters.means.shape[1], parameters.covariances
     if m_step.is_fused_on(dim, *parameters):
         found, failed = m_step.fused_natural_parameters(*parameters)
         if not bool(failed):
             return found
-    factors = safe_cholesky(covariances)
+    return _natural_parameters(parameters, safe_cholesky(covariances))
+
+
+def _natural_parameters(parameters: Parameters, factors: Tensor) -> Tensor:
+    """The same, with the Cholesky factors (K, D, D) of the covariances."""
+    weights, means, _ = parameters
+    dim = means.shape[1]
     whiten = inverse_factor(factors)
     precision = whiten @ whiten.transpose(-2, -1)
     linear = (precision @ means[:, :, None]).squeeze(-1)
@@ -88,9 +93,12 @@ def unchecked_expectation(
     """`expectation` that does not wait for the device: the log-likelihood is NaN where the natural parameters
     need the checks of `natural_parameters`.
     """
-    if not m_step.is_fused_on(parameters.means.shape[1], *parameters):
-        return expectation(features, sample_weight, natural_parameters(parameters), softmax_dtype)
-    natural, failed = m_step.fused_natural_parameters(*parameters)
+    if m_step.is_fused_on(parameters.means.shape[1], *parameters):
+        natural, failed = m_step.fused_natural_parameters(*parameters)
+    else:
+        factors, info = torch.linalg.cholesky_ex(parameters.covariances)
+        natural = _natural_parameters(parameters, factors)
+        failed = (info != 0).any() | ~torch.isfinite(natural).all()
     statistics, value = expectation(features, sample_weight, natural, softmax_dtype)
     return statistics, value.masked_fill(failed, math.nan)
 

@@ -16,6 +16,7 @@ from gmmtorch.mixture.em import exact
 from gmmtorch.mixture.em.covariance_types import constrain
 from gmmtorch.mixture.em.exact import Parameters
 
+_STEPS_AHEAD = 8  # on a GPU, where to wait for a bound takes about as long as a step
 State = TypeVar("State")  # what an iteration improves: `Parameters`, or a posterior
 
 Step = Callable[[State], tuple[State, float]]
@@ -86,25 +87,54 @@ def natural_step(
     digits to cancellation uses the direct form instead.
     """
     rows = in_spatial_order(features, sample_weight)
-    total = float(sample_weight.sum())
+    total = sample_weight.sum()
 
     def gather(parameters: Parameters) -> tuple[Tensor, Tensor]:
         return exact.expectation(*rows, exact.natural_parameters(parameters), softmax_dtype)
 
     if points is not None:
         direct = functools.partial(exact.direct_step, points, sample_weight, reg_covar=reg_covar)
-        return guarded_step(gather, direct, reg_covar, total, covariance_type)
+        return guarded_step(gather, direct, reg_covar, float(total), covariance_type)
 
-    def maximized(parameters: Parameters, statistics: Tensor, value: Tensor) -> tuple[Parameters, float]:
+    def maximized(parameters: Parameters, statistics: Tensor, value: Tensor) -> tuple[Parameters, Tensor]:
         new = of_type(exact.maximization(statistics, reg_covar, parameters), covariance_type)
-        return new, float(value) / total
+        return new, value / total
 
-    def step(parameters: Parameters) -> tuple[Parameters, float]:
-        unchecked = exact.unchecked_expectation(*rows, parameters, softmax_dtype)
-        new, bound = maximized(parameters, *unchecked)
-        return maximized(parameters, *gather(parameters)) if math.isnan(bound) else (new, bound)
+    def step(parameters: Parameters) -> tuple[Parameters, Tensor]:
+        return maximized(parameters, *exact.unchecked_expectation(*rows, parameters, softmax_dtype))
 
-    return step
+    def checked_step(parameters: Parameters) -> tuple[Parameters, float]:
+        new, bound = maximized(parameters, *gather(parameters))
+        return new, float(bound)
+
+    return _ahead(step, checked_step, 1 if features.device.type == "cpu" else _STEPS_AHEAD)
+
+
+def _ahead(
+    step: Callable[[Parameters], tuple[Parameters, Tensor]], checked: Step[Parameters], n_ahead: int
+) -> Step[Parameters]:
+    """Steps of which `n_ahead` run before their bounds are read: Python then waits once for all of them.
+
+    A step whose bound is NaN is taken again by `checked`. Steps beyond the last one asked for are lost.
+    """
+    ready: list[tuple[Parameters, Parameters, float]] = []  # from, to, bound: the next step last
+
+    def take(parameters: Parameters) -> tuple[Parameters, float]:
+        if not ready or ready[-1][0] is not parameters:
+            states, bounds = [parameters], []
+            for _ in range(n_ahead):
+                state, unread = step(states[-1])
+                states.append(state)
+                bounds.append(unread)
+            read = torch.stack(bounds).tolist()
+            ready[:] = reversed(list(zip(states, states[1:], read, strict=False)))
+        _, new, bound = ready.pop()
+        if math.isnan(bound):
+            ready.clear()
+            return checked(parameters)
+        return new, bound
+
+    return take
 
 
 def guarded_step(

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels.mixtures.piece_cuts import CutRule, is_fused_on, piece_cuts
-from gmmtorch.linalg import unpack_symmetric
+from gmmtorch.linalg import on_cpu, unpack_symmetric
 from gmmtorch.mixture.em.exact import quadratic_features
 
 _MAX_LEVELS = 64
@@ -103,7 +103,8 @@ def partition(
     n, dim = points.shape
     features = quadratic_features(points) if features is None else features
     if points.device.type != "cpu" and n <= _MOST_ON_CPU:
-        found = partition(points.cpu(), weight.cpu(), rule, features.cpu())
+        points_cpu, weight_cpu, features_cpu = on_cpu(points, weight, features)
+        found = partition(points_cpu, weight_cpu, rule, features_cpu)
         return found._replace(labels=found.labels.to(points.device))
     if is_fused_on(points, weight, features):
         return Partition(*piece_cuts(points, weight, features, _cut_rule(rule)))
