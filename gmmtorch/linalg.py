@@ -139,7 +139,7 @@ def on_cpu(*tensors: Tensor) -> tuple[Tensor, ...]:
     sizes = [tensor.numel() * tensor.element_size() for tensor in tensors]
     # Wide types come first: a tensor must begin at a multiple of the size of its entries.
     order = sorted(range(len(tensors)), key=lambda i: -tensors[i].element_size())
-    data = torch.cat([tensors[i].flatten().view(torch.uint8) for i in order]).cpu()
+    data = torch.cat([tensors[i].contiguous().view(-1).view(torch.uint8) for i in order]).cpu()
     parts = dict(zip(order, data.split([sizes[i] for i in order]), strict=True))
     return tuple(parts[i].view(tensor.dtype).view(tensor.shape) for i, tensor in enumerate(tensors))
 

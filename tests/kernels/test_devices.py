@@ -148,7 +148,7 @@ def test_the_pretended_gpu_refuses_what_a_gpu_refuses():
 
 def test_one_wait_brings_tensors_of_any_type_to_the_cpu():
     made = [torch.tensor([True, False, True]), torch.arange(5), torch.ones(2, 0), torch.rand(3, 2).T]
-    made += [torch.rand(2, dtype=torch.float64), torch.tensor(7, dtype=torch.int32)]
+    made += [torch.rand(2, 3, dtype=torch.float64)[:, 0], torch.tensor(7, dtype=torch.int32)]
     with pretended_gpu() as gpu:
         found = on_cpu(*(tensor.to("cuda") for tensor in made))
         assert gpu.waits == {"to cpu": 1}

@@ -125,7 +125,7 @@ def _kept_viewpoints(
     that every origin then has one.
     """
     by, count = components.seen_by, components.seen_count
-    n, rows = len(components), torch.arange(components.seen_by.shape[0], device=components.seen_by.device)
+    n, n_rows = len(components), components.seen_by.shape[0]
     limit = n * max_origins if mean_origins is None else int(n * mean_origins)
     left = count > 0
     if n == 0:
@@ -135,25 +135,24 @@ def _kept_viewpoints(
     used = by.new_zeros(n_origins).index_fill_(0, components.seen_from, 1)
     n_left, most, n_used = torch.stack([left.sum(), per_component.max(), used.sum()]).tolist()
     if n_left <= limit and most <= max_origins:
-        if n_left == len(rows):
+        if n_left == n_rows:
             return None, n_used == n_origins
         return left.nonzero().squeeze(1), False
     worth, position = count.sqrt(), components.origins[components.seen_from]
     nearest = torch.ones_like(count)  # distance to the nearest kept origin of the same component
-    gain = torch.full_like(count, -1.0)  # √count · distance at which a viewpoint was chosen
-    for step in range(max_origins):
-        score = torch.where(left, worth * nearest, -1.0)
+    # A component without a viewpoint that is left chooses one more row at the end, which does not count.
+    rows, left = torch.arange(n_rows, device=by.device), torch.cat([left, left.new_zeros(1)])
+    gain = count.new_full((n_rows + 1,), -1.0)  # √count · distance at which a viewpoint was chosen
+    nowhere = position.new_full((1, components.dim), torch.inf)
+    for step in range(min(max_origins, most)):
+        score = torch.where(left[:-1], worth * nearest, -1.0)
         largest = score.new_full((n,), -1.0).scatter_reduce_(0, by, score, "amax")
-        best = left & (score == largest[by])
-        first = rows.new_full((n,), len(rows)).scatter_reduce_(0, by[best], rows[best], "amin")
-        chosen = first[first < len(rows)]
-        if len(chosen) == 0:
-            break
-        gain[chosen] = torch.inf if step == 0 else score[chosen]
-        left = left.index_fill(0, chosen, False)
-        place = position.new_full((n, components.dim), torch.inf).index_copy_(0, by[chosen], position[chosen])
-        distance = (position - place[by]).norm(dim=1)
+        best = torch.where(left[:-1] & (score == largest[by]), rows, n_rows)
+        chosen = rows.new_full((n,), n_rows).scatter_reduce_(0, by, best, "amin")
+        gain.scatter_(0, chosen, torch.inf if step == 0 else torch.cat([score, score[:1]])[chosen])
+        left.index_fill_(0, chosen, False)
+        distance = (position - torch.cat([position, nowhere])[chosen][by]).norm(dim=1)
         nearest = distance if step == 0 else torch.minimum(nearest, distance)
-    kept = torch.zeros_like(left)
+    gain, kept = gain[:-1], torch.zeros_like(left[:-1])
     kept[gain.argsort(descending=True, stable=True)[:limit]] = True
     return (kept & (gain >= 0)).nonzero().squeeze(1), False
