@@ -187,9 +187,13 @@ def _draw_group(
     values = np.array([value for value in by_seed.values() if value is not None])
     spread = place + np.linspace(-0.12, 0.12, len(values)) if len(values) > 1 else [place] * len(values)
     axes.plot(spread, values, "o", color=hue, alpha=0.45, markersize=5, markeredgewidth=0)
+    if not len(values):
+        axes.text(place, 0.5, "none", ha="center", color=hue, transform=axes.get_xaxis_transform())
+        return
     if len(values) < n_trials:
-        text = f"{len(values)} of {n_trials}" if len(values) else "none"
-        axes.text(place, 0.5, text, ha="center", color=hue, transform=axes.get_xaxis_transform())
+        text, look = f"{len(values)} of {n_trials}", {"ha": "center", "color": hue}
+        axes.annotate(text, (place, values.max()), (0, 6), textcoords="offset points", **look)
+        axes.margins(y=0.14)  # room for the text above the highest dot
         return
     _draw_interval(axes, place, Interval(*(float(part[0]) for part in mean_band(values[:, None]))), hue)
 
