@@ -54,6 +54,7 @@ _TOP = {
 }
 """Files of the repository's root, and the pages of the site that show them."""
 _FIELD = re.compile(r"([a-z_]\w*(?:, [a-z_]\w*)*(?: \([^)]*\))?(?: bool)?): (.+)")
+_ANY = re.compile(r"\(\*args(: \S+)?, \*\*kwargs(: \S+)?\)")
 
 
 def _links(app: Any, name: str, source: list[str]) -> None:
@@ -93,10 +94,11 @@ def _skip(app: Any, what: str, name: str, item: Any, skip: bool, options: Any) -
 
 def _signature(app: Any, what: str, name: str, item: Any, options: Any, text: str, returned: str) -> Any:
     """Shows the arguments of `__init__` if `__new__` accepts any; none of protocols, which have none."""
-    if what == "class" and text == "(*args: Any, **kwargs: Any)":
-        text = stringify_signature(signature(item.__init__, bound_method=True), unqualified_typehints=True)
-        return ("" if "**kwargs" in text else text), returned
-    return None
+    if what != "class" or not _ANY.fullmatch(text or ""):
+        return None
+    own = signature(item.__init__, bound_method=True)
+    text = stringify_signature(own, show_return_annotation=False, unqualified_typehints=True)
+    return ("" if "**kwargs" in text else text), returned
 
 
 def _alternatives(app: Any, page: Any) -> None:
