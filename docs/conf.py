@@ -117,6 +117,15 @@ def _linked_pictures(app: Any, page: str, template: str, context: Any, doctree: 
     context["body"] = re.sub(picture, r'<a class="picture" href="\2">\1</a>', context.get("body", ""))
 
 
+def _broken_names(app: Any, page: str, template: str, context: Any, doctree: Any) -> None:
+    """Lets names in tables break after their marks, such as dots, and not within a word."""
+
+    def broken(cell: re.Match[str]) -> str:
+        return re.sub(r"(?<=[a-z][._/=,])(?=[a-z][^<>]*</span>)(?!py<)", "<wbr>", cell[0])
+
+    context["body"] = re.sub(r"<td\b.*?</td>", broken, context.get("body", ""), flags=re.DOTALL)
+
+
 def _equation(display: str) -> Any:
     """Writes a formula as MathML."""
 
@@ -137,3 +146,4 @@ def setup(app: Any) -> None:
     app.connect("autodoc-process-signature", _signature)
     app.connect("doctree-read", _alternatives)
     app.connect("html-page-context", _linked_pictures)
+    app.connect("html-page-context", _broken_names)

@@ -237,6 +237,7 @@ def test_summary_draws_no_mean_if_a_seed_has_no_value():
     assert box.y1 < above.bbox.y1
     assert [len(line.get_ydata()) for line in above.lines if line.get_marker() == "o"] == [2, 3]
     assert len(beneath.lines) == 1  # the line at zero
+    assert "none" in texts(beneath)
 
 
 def test_profile_is_in_milliseconds_per_simulated_second():
