@@ -118,12 +118,15 @@ def _linked_pictures(app: Any, page: str, template: str, context: Any, doctree: 
 
 
 def _broken_names(app: Any, page: str, template: str, context: Any, doctree: Any) -> None:
-    """Lets names in tables break after their marks, such as dots, and not within a word."""
+    """Lets long names in tables break after their marks, such as dots, and not within a word."""
 
-    def broken(cell: re.Match[str]) -> str:
-        return re.sub(r"(?<=[a-z][._/=,])(?=[a-z][^<>]*</span>)(?!py<)", "<wbr>", cell[0])
+    def broken(name: re.Match[str]) -> str:
+        return re.sub(r"(?<=[a-z][._/=,])(?=[a-z])(?!py<)", "<wbr>", name[0])
 
-    context["body"] = re.sub(r"<td\b.*?</td>", broken, context.get("body", ""), flags=re.DOTALL)
+    def in_cell(cell: re.Match[str]) -> str:
+        return re.sub(r'class="pre">[^<]{15,}<', broken, cell[0])
+
+    context["body"] = re.sub(r"<td\b.*?</td>", in_cell, context.get("body", ""), flags=re.DOTALL)
 
 
 def _equation(display: str) -> Any:

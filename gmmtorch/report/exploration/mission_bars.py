@@ -191,8 +191,8 @@ def _draw_group(
         _say_none(axes, place, hue)
         return
     if len(values) < n_trials:
-        text, look = f"{len(values)} of {n_trials}", {"ha": "center", "color": hue}
-        axes.annotate(text, (place, values.max()), (0, 6), textcoords="offset points", **look)
+        look: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "color": hue}
+        axes.annotate(f"{len(values)} of {n_trials}", (place, values.max()), (0, 6), **look)
         axes.margins(y=0.14)  # room for the text above the highest dot
         return
     _draw_interval(axes, place, Interval(*(float(part[0]) for part in mean_band(values[:, None]))), hue)
