@@ -7,8 +7,9 @@ import re
 from importlib.metadata import version as installed
 from typing import Any
 
-from docutils.nodes import SkipNode
+from docutils.nodes import SkipNode, image, section
 from latex2mathml.converter import convert
+from sphinx.util.inspect import signature, stringify_signature
 
 project = "gmmtorch"
 author = "The gmmtorch developers"
@@ -23,7 +24,7 @@ html_theme = "furo"
 html_math_renderer = "mathml"  # browsers draw it without a script from the network
 html_title = f"gmmtorch {release}"
 html_static_path = ["style"]
-html_css_files = ["wide_formulas.css"]
+html_css_files = ["site.css"]
 html_copy_source = False
 suppress_warnings = ["ref.python"]  # words of Literal types that are also names of attributes
 
@@ -53,6 +54,7 @@ _TOP = {
 }
 """Files of the repository's root, and the pages of the site that show them."""
 _FIELD = re.compile(r"([a-z_]\w*(?:, [a-z_]\w*)*(?: \([^)]*\))?(?: bool)?): (.+)")
+_ANY = re.compile(r"\(\*args(: \S+)?, \*\*kwargs(: \S+)?\)")
 
 
 def _links(app: Any, name: str, source: list[str]) -> None:
@@ -90,6 +92,43 @@ def _skip(app: Any, what: str, name: str, item: Any, skip: bool, options: Any) -
     return skip or name.endswith(("_request", "_metadata_routing"))
 
 
+def _signature(app: Any, what: str, name: str, item: Any, options: Any, text: str, returned: str) -> Any:
+    """Shows the arguments of `__init__` if `__new__` accepts any; none of protocols, which have none."""
+    if what != "class" or not _ANY.fullmatch(text or ""):
+        return None
+    own = signature(item.__init__, bound_method=True)
+    text = stringify_signature(own, show_return_annotation=False, unqualified_typehints=True)
+    return ("" if "**kwargs" in text else text), returned
+
+
+def _alternatives(app: Any, page: Any) -> None:
+    """Gives pictures that the code of a tutorial draws a text; the prose below each describes it."""
+    for picture in page.findall(image):
+        if "alt" not in picture:
+            around = picture.parent
+            while not isinstance(around, section):
+                around = around.parent
+            picture["alt"] = f"Picture drawn by the code of the section {around[0].astext()}"
+
+
+def _linked_pictures(app: Any, page: str, template: str, context: Any, doctree: Any) -> None:
+    """Links each picture to its file, so that a click shows it at full size."""
+    picture = r'(<img\b[^>]*\bsrc="([^"]*_images/[^"]*)"[^>]*>)'
+    context["body"] = re.sub(picture, r'<a class="picture" href="\2">\1</a>', context.get("body", ""))
+
+
+def _broken_names(app: Any, page: str, template: str, context: Any, doctree: Any) -> None:
+    """Lets long names in tables break after their marks, such as dots, and not within a word."""
+
+    def broken(name: re.Match[str]) -> str:
+        return re.sub(r"(?<=[a-z][._/=,])(?=[a-z])(?!py<)", "<wbr>", name[0])
+
+    def in_cell(cell: re.Match[str]) -> str:
+        return re.sub(r'class="pre">[^<]{15,}<', broken, cell[0])
+
+    context["body"] = re.sub(r"<td\b.*?</td>", in_cell, context.get("body", ""), flags=re.DOTALL)
+
+
 def _equation(display: str) -> Any:
     """Writes a formula as MathML."""
 
@@ -107,3 +146,7 @@ def setup(app: Any) -> None:
     app.connect("include-read", _included_links)
     app.connect("autodoc-process-docstring", _docstring, priority=400)  # before napoleon
     app.connect("autodoc-skip-member", _skip)
+    app.connect("autodoc-process-signature", _signature)
+    app.connect("doctree-read", _alternatives)
+    app.connect("html-page-context", _linked_pictures)
+    app.connect("html-page-context", _broken_names)

@@ -9,9 +9,10 @@ import numpy as np
 
 import gmmtorch as gt
 
-# A scan needs the points (N, 3) and the position of the sensor (3,), both in metres in the world frame.
+# A scan: points (N, 3) and the position of the sensor (3,), metres in the world frame.
 rng = np.random.default_rng(0)
-wall = np.column_stack([np.full(5000, 4.0), rng.uniform(-3, 3, 5000), rng.uniform(0, 2.5, 5000)])
+y, z = rng.uniform(-3, 3, 5000), rng.uniform(0, 2.5, 5000)
+wall = np.column_stack([np.full(5000, 4.0), y, z])
 wall += rng.normal(scale=0.01, size=wall.shape)
 sensor = np.array([0.0, 0.0, 1.0])
 

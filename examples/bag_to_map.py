@@ -28,8 +28,10 @@ else:
 builder = MapBuilder(gt.datasets.load("rosbag", bag), gt.GaussianMap())
 for now in builder.insert_all():
     print(f"\r{now.n_read} of {now.n_total} scans, {now.metres:.1f} m", end="")
-print(f"\n{builder.map.n_components:,} components, {builder.map.nbytes:,} bytes; skipped: {builder.skipped}")
+print(f"\n{builder.map.n_components:,} components, {builder.map.nbytes:,} bytes")
+print(f"skipped: {builder.skipped}")
 
 builder.map.save(output / "building.safetensors")
 if builder.map.dim == 3:
-    print(write_mesh(output / "building.ply", surface_mesh(builder.map.components(), 0.1)))
+    mesh = surface_mesh(builder.map.components(), 0.1)
+    print(write_mesh(output / "building.ply", mesh))

@@ -1,4 +1,4 @@
-"""A planner checks a path against a map: distance to surfaces, collision probability, and its gradient.
+"""A planner checks a path against a map: distances, collision probability, gradient.
 
 python examples/collision_checks.py
 """
@@ -16,11 +16,12 @@ for scan in scans:
     m.insert(scan)
 
 start, goal = scans[0].origin, scans[5].origin
-path = torch.lerp(start, goal, torch.linspace(0, 1, 50, dtype=torch.float64)[:, None]).requires_grad_()
+share = torch.linspace(0, 1, 50, dtype=torch.float64)[:, None]
+path = torch.lerp(start, goal, share).requires_grad_()
 
 gap = clearance(m, path)  # (50,), metres to the nearest surface
 risk = collision_probability(m, path.detach(), RADIUS)  # (50,)
 gap.min().backward()
 nearest = int(gap.argmin())
-print(f"smallest clearance {gap.min():.2f} m, largest collision probability {risk.max():.3f}")
+print(f"clearance {gap.min():.2f} m at least, collision probability {risk.max():.3f} at most")
 print(f"at point {nearest}, move along {path.grad[nearest].tolist()} to gain clearance")

@@ -1,4 +1,4 @@
-"""A mixture map and an occupancy grid learn from the same scans and are tested on a scan that neither saw.
+"""A mixture map and an occupancy grid of the same scans, tested on one that neither saw.
 
 python examples/compare_with_grid.py
 """
@@ -19,8 +19,9 @@ for scan in scans:
     for m in maps.values():
         m.insert(scan)
 
-# Each beam of the test scan gives an occupied point, its end, and a free point on the way there.
-along = torch.rand(len(test.points), 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+# Each beam of the test scan gives an occupied point, its end, and a free one before it.
+generator = torch.Generator().manual_seed(0)
+along = torch.rand(len(test.points), 1, generator=generator, dtype=torch.float64)
 points = torch.cat([test.points, test.origin + along * (test.points - test.origin)])
 labels = torch.cat([torch.ones(len(test.points)), torch.zeros(len(test.points))])
 for name, m in maps.items():

@@ -1,7 +1,7 @@
 """A planner finds a path through a map: Dijkstra on a grid of clearances, then gradient steps.
 
 python examples/plan_path.py                     # a simulated building
-python examples/plan_path.py map.safetensors     # your own map, between the two farthest sensor positions
+python examples/plan_path.py map.safetensors     # your map, between its two farthest sensors
 """
 
 import sys

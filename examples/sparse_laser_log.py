@@ -1,4 +1,4 @@
-"""A laser log of which only every tenth beam is kept becomes a 2D map, and an image for ROS's map_server.
+"""Every tenth beam of a laser log becomes a 2D map, and an image for ROS's map_server.
 
 python examples/sparse_laser_log.py                    # a simulated building
 python examples/sparse_laser_log.py intel.log.gz       # a CARMEN log
@@ -26,7 +26,8 @@ for scan in scans:
 ends = torch.cat(ends)
 print(f"{len(ends):,} beams, {m.n_components:,} components, {m.nbytes:,} bytes")
 
-grid = gt.VoxelGrid.covering(low=ends.amin(0).tolist(), high=ends.amax(0).tolist(), resolution=0.1)
+low, high = ends.amin(0).tolist(), ends.amax(0).tolist()
+grid = gt.VoxelGrid.covering(low=low, high=high, resolution=0.1)
 occupancy = m.evidence(grid).probability()
 output = Path("outputs/examples/laser.yaml")
 output.parent.mkdir(parents=True, exist_ok=True)

@@ -35,7 +35,6 @@ while replica_0.digest() != replica_1.digest() and time.monotonic() < until:
             replica.receive(datagram)
 
 for number, (replica, transport) in enumerate(robots):
-    print(
-        f"robot {number} holds {replica.map().n_components:,} components, digest {replica.digest().hex()[:8]}"
-    )
+    digest = replica.digest().hex()[:8]
+    print(f"robot {number} holds {replica.map().n_components:,} components, digest {digest}")
     transport.close()

@@ -32,6 +32,9 @@ def test_the_site_builds_without_a_warning_and_is_whole(tmp_path, capsys):
     pages = {path: path.read_text("utf-8") for path in site.rglob("*.html")}
     assert len(pages) > 30
     assert not unnamed(pages[site / "api.html"])
+    assert {"n_components", "reg_covar"} <= set(
+        arguments(pages[site / "api.html"], "gmmtorch.GaussianMixture")
+    )
     assert not broken_links(pages)
     assert not {
         address for page in pages.values() for address in LOADED.findall(page) if urlsplit(address).netloc
@@ -43,6 +46,14 @@ def unnamed(api: str) -> list[str]:
     """Public names that the reference lacks."""
     documented = {name.rpartition(".")[2] for name in re.findall(r'id="(gmmtorch[\w.]+)"', api)}
     return [f"{name}.{item}" for name in MODULES for item in names(name) if item not in documented]
+
+
+def arguments(api: str, name: str) -> list[str]:
+    """The arguments that the reference lists for a class."""
+    (heading,) = re.findall(rf'id="{re.escape(name)}">(.*?)</dt>', api, re.DOTALL)
+    return re.findall(
+        r'class="n"><span class="pre">(\w+)</span></span><span class="p"><span class="pre">:', heading
+    )
 
 
 def names(module: str) -> list[str]:

@@ -136,7 +136,7 @@ class GaussianMap(MapState):
         """A map of given components.
 
         Args:
-            means (K, D), covariances (K, D, D), support (K,): the components; metres, points.
+            means, covariances, support: (K, D), (K, D, D), (K,) of the components; metres, points.
             origins: (K, D), one sensor origin for each component; or for each component a list of
                 (origin (D,), count), whose counts are scaled to add up to its support.
             max_range: (K,) True for components of no-return beams. None: no component is.

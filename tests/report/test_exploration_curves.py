@@ -82,6 +82,17 @@ def test_a_single_trial_has_lines_of_its_robots_and_no_band():
         assert any(np.allclose(line, 100 * np.array(bits) / OBSERVABLE_BITS) for line in drawn)
 
 
+@pytest.mark.parametrize(("distance", "drawn"), [(1.0, 0), (3.0, 3)])
+def test_maps_of_robots_are_drawn_and_named_only_if_they_differ_visibly(distance, drawn):
+    row = trial("gmm_shared", 0)
+    others = np.array(row["entropy_bits"]) + distance / 100 * OBSERVABLE_BITS
+    row["entropy_bits_per_robot"] = [others.tolist()] * 3
+    figure = entropy_figure([row])
+    assert len(lines(figure.axes[0], framework_colour("gmm_shared"), len(row["times"]))) == 1 + drawn
+    said = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert ("map of one robot" in said) is bool(drawn)
+
+
 def test_bandwidth_labels_give_total_and_ratio_to_e0():
     row = trial("gmm_shared", 0)
     final = {"bytes_over_time": 50e3, "raw_points_bytes_over_time": 2e6, "octree_bytes_over_time": 150e3}
@@ -217,10 +228,16 @@ def test_deviations_are_drawn_as_paired_differences():
 def test_summary_draws_no_mean_if_a_seed_has_no_value():
     rows = [trial(framework, seed) for framework in ("gmm_shared", "grid_shared") for seed in range(3)]
     rows[0]["t90"] = None
-    above, beneath = (summary_bars(rows).axes[i] for i in (1, 5))
-    assert "2 of 3" in texts(above)
+    figure = summary_bars(rows)
+    above, beneath = (figure.axes[i] for i in (1, 5))
+    figure.draw_without_rendering()
+    (note,) = (text for text in above.texts if text.get_text() == "2 of 3")
+    box, dots = note.get_window_extent(), above.lines[0].get_xydata()
+    assert box.y0 > above.transData.transform(dots)[:, 1].max()
+    assert box.y1 < above.bbox.y1
     assert [len(line.get_ydata()) for line in above.lines if line.get_marker() == "o"] == [2, 3]
     assert len(beneath.lines) == 1  # the line at zero
+    assert "none" in texts(beneath)
 
 
 def test_profile_is_in_milliseconds_per_simulated_second():

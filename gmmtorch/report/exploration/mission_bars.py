@@ -54,7 +54,7 @@ def summary_bars(rows: style.Rows) -> Figure:
     Above: a dot per seed, and the mean with its 95 % interval. If a seed has no value (it never reached t90),
     text says how many have one, because a mean of these would be biased. Below: the mean difference of two
     frameworks over their common seeds with its paired 95 % interval, and a line at zero; for bytes, the
-    geometric mean of the ratio, and a line at one. Empty if a seed has no value. With more than three
+    geometric mean of the ratio, and a line at one. "none" if a seed has no value. With more than three
     frameworks, only the first is compared with the others.
 
     Args:
@@ -187,9 +187,13 @@ def _draw_group(
     values = np.array([value for value in by_seed.values() if value is not None])
     spread = place + np.linspace(-0.12, 0.12, len(values)) if len(values) > 1 else [place] * len(values)
     axes.plot(spread, values, "o", color=hue, alpha=0.45, markersize=5, markeredgewidth=0)
+    if not len(values):
+        _say_none(axes, place, hue)
+        return
     if len(values) < n_trials:
-        text = f"{len(values)} of {n_trials}" if len(values) else "none"
-        axes.text(place, 0.5, text, ha="center", color=hue, transform=axes.get_xaxis_transform())
+        look: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "color": hue}
+        axes.annotate(f"{len(values)} of {n_trials}", (place, values.max()), (0, 6), **look)
+        axes.margins(y=0.14)  # room for the text above the highest dot
         return
     _draw_interval(axes, place, Interval(*(float(part[0]) for part in mean_band(values[:, None]))), hue)
 
@@ -210,14 +214,23 @@ def _draw_differences(
     axes.axhline(1 if measure.by_ratio else 0, color="#777777", linewidth=1)
     for place, (first, second) in enumerate(pairs):
         interval = paired_difference(values[first], values[second], by_ratio=measure.by_ratio)
-        if interval is not None:
+        if interval is None:
+            _say_none(axes, place, "#333333")
+        else:
             _draw_interval(axes, place, interval, hue="#333333")
     if measure.by_ratio:
         _log_ticks(axes, lambda value: f"{value:g}×")
+    if len(axes.lines) == 1:  # no difference: the scale has no meaning
+        axes.set_yticks([])
     sign = "/" if measure.by_ratio else "\N{MINUS SIGN}"
     _name_places(axes, [f"{short_name(a)} {sign} {short_name(b)}" for a, b in pairs])
     kind = "ratio" if measure.by_ratio else "difference"
     style.label_axes(axes, "", "", f"{kind} [{measure.unit}]" if measure.unit else kind)
+
+
+def _say_none(axes: Axes, place: float, hue: str) -> None:
+    """Writes that there is no value, in the middle of the axes."""
+    axes.text(place, 0.5, "none", ha="center", color=hue, transform=axes.get_xaxis_transform())
 
 
 def _log_ticks(axes: Axes, text: Callable[[float], str]) -> None:

@@ -35,6 +35,7 @@ from gmmtorch.report.table import byte_text, ratio_text
 
 _MILESTONES = (("t50", 0.5, "o"), ("t90", 0.9, "s"))
 _SIZE = (9.6, 5.4)  # inches
+_DISTINCT = 2.0  # percent; a line closer to the team's line touches it
 _BYTE_LINES = (
     ("gmm_shared", "bytes_over_time", "E0, as sent", framework_colour("gmm_shared"), "-"),
     ("grid_shared", "bytes_over_time", "E1, as sent", framework_colour("grid_shared"), "-"),
@@ -50,7 +51,7 @@ def entropy_figure(rows: style.Rows) -> Figure:
 
     There is a line for each framework: the mean over seeds in its 95 % band. Marks show the mean t50 and
     t90 if every seed has one; dotted lines show the levels at which they are taken. A framework with one
-    trial has no band, but thin lines for the maps of its robots.
+    trial has no band, but thin lines for the maps of its robots, unless all are within 2 % of the team's.
 
     Args:
         rows: explore rows of `results.json`.
@@ -61,15 +62,13 @@ def entropy_figure(rows: style.Rows) -> Figure:
     groups = by_framework(rows)
     whose = "E1's final reduction" if "grid_shared" in groups else "the final reduction"
     figure, axes, handles = _entropy_axes(_reference(groups.get("grid_shared", rows)), whose)
-    ends = []
+    ends, robots_drawn = [], False
     for framework, trials in groups.items():
         hue = framework_colour(framework)
         ends.append(_draw_trials(axes, framework_name(framework), trials, {"color": hue}))
         if len(trials) == 1:
-            for bits in trials[0].get("entropy_bits_per_robot") or []:
-                look: dict[str, Any] = {"color": hue, "linewidth": 0.8, "alpha": 0.7, "zorder": 2}
-                axes.plot(trials[0]["times"], percent_left(trials[0], bits), **look)
-    if any(len(trials) == 1 for trials in groups.values()):
+            robots_drawn |= _draw_robots(axes, trials[0], hue)
+    if robots_drawn:
         handles.append(Line2D([], [], color=style.EDGE, linewidth=0.8, label="map of one robot"))
     title = f"Entropy of the team's map: {about(rows)}\n{seeds_note(rows)}"
     return _finished(figure, axes, ends, rows, handles, title)
@@ -177,6 +176,15 @@ def _draw_trials(axes: Axes, name: str, trials: style.Rows, look: dict[str, Any]
             )
     notes = ", ".join(milestone_text(trials, field) for field, *_ in _MILESTONES)
     return LineEnd(float(curves.band.mean[-1]), f"{name}\n{notes}", look["color"])
+
+
+def _draw_robots(axes: Axes, row: Mapping[str, Any], hue: str) -> bool:
+    """Draws the maps of a trial's robots, and returns True; draws nothing if no line would be distinct."""
+    shares = [percent_left(row, bits) for bits in row.get("entropy_bits_per_robot") or []]
+    distinct = any(np.abs(share - percent_left(row)).max() > _DISTINCT for share in shares)
+    for share in shares if distinct else []:
+        axes.plot(row["times"], share, color=hue, linewidth=0.8, alpha=0.7, zorder=2)
+    return distinct
 
 
 def _finished(
