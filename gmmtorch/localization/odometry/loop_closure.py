@@ -145,6 +145,8 @@ def _candidates(poses: Tensor, rows: Sequence[int] | None = None) -> list[tuple[
 
     poses: (K, D+1, D+1) of the keyframes. rows: new ones; None: every third.
     """
+    if not len(poses):
+        return []
     at = poses[:, :-1, -1]
     path = torch.cat([torch.zeros(1), (at[1:] - at[:-1]).norm(dim=1)]).cumsum(0)
     order = torch.arange(len(at))
