@@ -14,6 +14,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from gmmtorch.datasets import load
+from gmmtorch.datasets.recordings.ros.gyroscope import Gyroscope
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.localization import with_odometry
 from gmmtorch.localization.odometry.odometry import Odometry
@@ -68,6 +69,8 @@ def test_turns_of_a_mounted_imu_are_those_of_the_motion(tmp_path, suffix, stride
     with BagWriter(path) as bag:
         static = {("base", "imu"): matrix(MOUNT_IMU, 0.3), ("base", "lidar"): matrix(MOUNT_LIDAR, -1.0)}
         bag.transforms(0.0, static, static=True)
+        for parent in ("odom", "map"):  # what is above both does not matter
+            bag.transforms(1.0, {(parent, "base"): np.eye(4)})
         write_imu(bag, times, np.array([rate(lambda t: tumble(t) * MOUNT_IMU, time) for time in times]))
         for time in STAMPS:
             bag.cloud("/points", float(time), "lidar", POINTS)
@@ -76,6 +79,17 @@ def test_turns_of_a_mounted_imu_are_those_of_the_motion(tmp_path, suffix, stride
     expected = [np.eye(3)] + [(a.inv() * b).as_matrix() for a, b in itertools.pairwise(poses)]
     assert turns.dtype == torch.float64
     np.testing.assert_allclose(turns.numpy(), expected, atol=2e-5)
+
+
+@pytest.mark.parametrize("n", [2, 3, 4, 5, 8, 101])
+def test_any_number_of_messages_is_joined(n):
+    rng = np.random.default_rng(n)
+    times, rates = np.arange(n) * 10_000_000, rng.normal(scale=5, size=(n, 3))
+    expected = Rotation.identity()
+    for mean in (rates[:-1] + rates[1:]) / 2:
+        expected = expected * Rotation.from_rotvec(0.01 * mean)
+    turns = Gyroscope("a", "imu", 0, times, rates).turns(times[[0, -1]])
+    np.testing.assert_allclose(turns, [np.eye(3), expected.as_matrix()], atol=1e-12)
 
 
 def test_a_sensor_that_turns_on_the_body_has_its_own_rotation(tmp_path):

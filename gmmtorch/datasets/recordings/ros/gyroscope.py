@@ -10,7 +10,6 @@ import logging
 from array import array
 from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,9 +18,6 @@ from gmmtorch.datasets.recordings.ros.bag_topics import IMU_TYPE, choose_imu
 from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree, frame_name, stamp_of
 from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, strictly_increasing
 from gmmtorch.errors import DataError, InvalidArgumentError
-
-if TYPE_CHECKING:
-    from scipy.spatial.transform import Rotation
 
 MAX_GAP = 0.2
 """Longest time (s) between two messages over which rates are interpolated. If the rate changes by 10 rad/s²,
@@ -57,7 +53,8 @@ class Gyroscope:
         seconds, rise = np.diff(self.times) / NANOSECONDS, np.diff(self.rates, axis=0)
         is_gap = seconds > MAX_GAP
         means = np.where(is_gap[:, None], 0, self.rates[:-1] + rise / 2)
-        starts = _products(Rotation.from_rotvec(means * seconds[:, None]))
+        steps = Rotation.from_rotvec(means * seconds[:, None]).as_quat()
+        starts = Rotation.from_quat(_products(np.concatenate([[[0.0, 0.0, 0.0, 1.0]], steps])))
         at = (np.searchsorted(self.times, stamps, side="right") - 1).clip(0, len(seconds) - 1)
         since = ((stamps - self.times[at]) / NANOSECONDS).clip(0, seconds[at])
         rates = self.rates[at] + rise[at] * (since / seconds[at] / 2)[:, None]
@@ -71,17 +68,22 @@ class Gyroscope:
         return turns
 
 
-def _products(steps: Rotation) -> Rotation:
-    """Rotations I, q₀, q₀q₁, q₀q₁q₂, … (N + 1) of steps q (N): products of 2, 4, 8, … neighbours."""
+def _products(quaternions: np.ndarray) -> np.ndarray:
+    """Products q₀, q₀q₁, q₀q₁q₂, … (N, 4) of unit quaternions (N, 4), with arrays of N/2, N/4, … pairs."""
+    if len(quaternions) < 2:
+        return quaternions
+    found = quaternions.copy()
+    found[1::2] = _products(_product(quaternions[:-1:2], quaternions[1::2]))
+    if len(found) > 2:
+        found[2::2] = _product(found[1:-1:2], quaternions[2::2])
+    return found
+
+
+def _product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
-    quaternions = np.concatenate([[[0.0, 0.0, 0.0, 1.0]], steps.as_quat()])
-    reach = 1
-    while reach < len(quaternions):
-        left, right = Rotation.from_quat(quaternions[:-reach]), Rotation.from_quat(quaternions[reach:])
-        quaternions[reach:] = (left * right).as_quat()
-        reach *= 2
-    return Rotation.from_quat(quaternions)
+    found: np.ndarray = (Rotation.from_quat(first) * Rotation.from_quat(second)).as_quat()
+    return found
 
 
 def read_gyroscope(reader: BagReader, topic: str | None, clock: str) -> Gyroscope:
@@ -122,7 +124,7 @@ def read_gyroscope(reader: BagReader, topic: str | None, clock: str) -> Gyroscop
             "Choose another dataset.imu_topic",
         )
     if len(frames) > 1:
-        counts = ", ".join(f"{frame or '(unnamed)'} ({n} messages)" for frame, n in frames.most_common())
+        counts = ", ".join(f"{frame or '(unnamed)'} ({n} messages)" for frame, n in frames.most_common(5))
         raise _unusable(f"{where} has several IMUs, with frames {counts}", "Write each to a topic of its own")
     samples = np.array(rates).reshape(-1, 3)[kept]
     return Gyroscope(where, next(iter(frames)), faults.total(), np.array(times, np.int64)[kept], samples)
