@@ -40,10 +40,11 @@ def run(config: DictConfig) -> None:
     from gmmtorch.cli.reporting import localization_outputs
     from gmmtorch.evaluation.trajectories import ALIGNMENTS
     from gmmtorch.localization import Tracker
+    from gmmtorch.localization.odometry.recorded_poses import MOTIONS
 
     if not config.map.path:
         raise InvalidArgumentError("map is not set; give map=FILE, a map file or a run directory.")
-    check_choice("motion", config.motion, ("constant", "dataset"))
+    check_choice("motion", config.motion, MOTIONS)
     check_choice("align", config.align, ALIGNMENTS)
     common.use_runtime(config.runtime)
     folder = common.run_dir()
@@ -81,7 +82,8 @@ def _locate(config: DictConfig, dataset: Dataset, tracker: Tracker, bars: Progre
             f"{dataset[0].dim}D; give a map of scans of the same kind."
         )
     located = []
-    for scan in locate_scans(dataset, tracker, config.motion == "dataset"):
+    turns = dataset.turns() if config.motion == "imu" else None
+    for scan in locate_scans(dataset, tracker, config.motion == "dataset", turns):
         located.append(scan)
         bars(_STAGE, len(located), len(dataset))
         n_found = sum(one.location.found for one in located)

@@ -141,6 +141,16 @@ class Dataset(Sequence[Scan]):
         times = self._known_times()
         return None if times is None else times[:: self.stride]
 
+    def turns(self) -> Tensor:
+        """Rotations (N, D, D) of the sensor since the scan before, before ← now, float64, by an IMU.
+
+        The first is the identity; unknown ones are NaN. Raises `InvalidArgumentError` without an IMU.
+        """
+        raise InvalidArgumentError(
+            f"motion=imu cannot be used: it needs the IMU of a ROS bag, and the scans of {self.name} are not "
+            "read from one, or have estimated poses. Predict with motion=constant or motion=dataset."
+        )
+
     @property
     def skipped(self) -> dict[str, int]:
         """Reason → number of scans that are left out for it, returned without points because their

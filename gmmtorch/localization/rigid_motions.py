@@ -13,6 +13,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike, as_tensor
+from gmmtorch.linalg import check_rigid
+
 _SMALL_TURN = 1e-8  # rad²
 _TURNED = math.radians(10)  # between the headings of neighbouring starts, for each metre between their places
 
@@ -54,6 +57,59 @@ def turns(angles: Tensor) -> Tensor:
     first = torch.where(is_small, 1 - square / 6, angle.sin() / angle)
     second = torch.where(is_small, 0.5 - square / 24, 2 * (0.5 * angle).sin().square() / angle.square())
     return torch.eye(dim).to(angles) + first * skew + second * skew @ skew
+
+
+def logarithm(motions: Tensor) -> Tensor:
+    """A shift and a turn (E, F) of motions (E, D+1, D+1): the translation, and the rotation's vector."""
+    dim = motions.shape[1] - 1
+    rotation = motions[:, :dim, :dim]
+    if dim == 2:
+        turn = torch.atan2(rotation[:, 1, 0], rotation[:, 0, 0])[:, None]
+        return torch.cat([motions[:, :2, 2], turn], 1)
+    from scipy.spatial.transform import Rotation
+
+    turn = torch.from_numpy(Rotation.from_matrix(rotation.detach().numpy()).as_rotvec())
+    return torch.cat([motions[:, :3, 3], turn.to(motions)], 1)
+
+
+def measured_motion(motion: ArrayLike, dim: int, device: torch.device) -> Tensor:
+    """A motion (D+1, D+1), or its rotation (D, D) alone, float64. Raises `InvalidArgumentError`."""
+    matrix = as_tensor(motion, "motion", torch.float64, device).detach().clone()
+    is_rotation = tuple(matrix.shape) == (dim, dim)
+    check_rigid(_with_rotation(matrix) if is_rotation else matrix, dim, "motion")
+    return matrix
+
+
+def continued(rotation: Tensor, last: Tensor | None, ratio: float = 1.0) -> Tensor:
+    """The motion (D+1, D+1) with a measured rotation (D, D) at the velocity of the last one, if it is known.
+
+    The velocity v in the frame of the sensor stays, and takes effect while the sensor turns by ω: the
+    translation is t = J(ω) v with J(ω) = ∫₀¹ exp(s [ω]) ds. `ratio`: how many times longer than the last
+    motion this one takes.
+    """
+    found = _with_rotation(rotation)
+    if last is not None:
+        dim = len(rotation)
+        now, before = (_mean_rotation(turn) for turn in (rotation, last[:dim, :dim]))
+        found[:dim, dim] = ratio * now @ torch.linalg.solve(before, last[:dim, dim])
+    return found
+
+
+def _with_rotation(rotation: Tensor) -> Tensor:
+    """The motion (D+1, D+1) with this rotation (D, D) and no translation."""
+    return (
+        torch.nn.functional.pad(rotation, (0, 1, 0, 1)) + torch.eye(len(rotation) + 1).to(rotation)[-1].diag()
+    )
+
+
+def _mean_rotation(rotation: Tensor) -> Tensor:
+    """J(ω) (D, D) of a rotation (D, D) by ω: a block of exp [[ω] I; 0 0]."""
+    dim = len(rotation)
+    turn = logarithm(_with_rotation(rotation).cpu()[None])[0, dim:]
+    block = torch.zeros(2 * dim, 2 * dim).double()
+    block[:dim, :dim] = torch.tensordot(turn, generators(dim), 1)
+    block[:dim, dim:] = torch.eye(dim)
+    return torch.linalg.matrix_exp(block)[:dim, dim:].to(rotation)
 
 
 def differences(some: Motions, others: Motions, distance: float, angle: float) -> Tensor:

@@ -29,7 +29,9 @@ class ScanLocation(NamedTuple):
     seconds: float
 
 
-def locate_scans(dataset: Dataset, tracker: Tracker, use_motion: bool = False) -> Iterator[ScanLocation]:
+def locate_scans(
+    dataset: Dataset, tracker: Tracker, use_motion: bool = False, turns: Tensor | None = None
+) -> Iterator[ScanLocation]:
     """Localises every scan in order. A scan that cannot be read is not found, and its doubt is the reason.
 
     Args:
@@ -37,6 +39,8 @@ def locate_scans(dataset: Dataset, tracker: Tracker, use_motion: bool = False) -
         tracker: with the first pose, if it is known.
         use_motion: predict each pose with the motion between the poses of the data set, such as an
             odometry's. False: the sensor moves as between the last two scans.
+        turns: rotations (N, D, D) of the sensor since the scan before, as `Dataset.turns` returns them, which
+            predict the headings instead; NaN where they are unknown.
 
     Raises `InvalidArgumentError` if scans and map have different dimensions.
     """
@@ -55,6 +59,8 @@ def locate_scans(dataset: Dataset, tracker: Tracker, use_motion: bool = False) -
         motion = None
         if use_motion and pose is not None and before is not None:
             motion = torch.linalg.solve(before.double(), pose.double())
+        if turns is not None and index and bool(turns[index].isfinite().all()):
+            motion = turns[index]
         begin = time.process_time()
         location = tracker.locate(points, motion)
         seconds = time.process_time() - begin

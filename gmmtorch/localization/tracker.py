@@ -20,7 +20,15 @@ from gmmtorch.localization.registration.alignment import (
     merged_below,
     seen_normals,
 )
-from gmmtorch.localization.rigid_motions import Motions, around, best_distinct, differences, everywhere
+from gmmtorch.localization.rigid_motions import (
+    Motions,
+    around,
+    best_distinct,
+    continued,
+    differences,
+    everywhere,
+    measured_motion,
+)
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.surfaces import Surfaces, surface_mixture
@@ -131,8 +139,9 @@ class Tracker:
 
         Args:
             points: (N, D) returns in the frame of the sensor, metres.
-            motion: (D+1, D+1) of the sensor since the last scan, last ← now, such as an odometry's. None: the
-                sensor moves as between the last two scans.
+            motion: (D+1, D+1) of the sensor since the last scan, last ← now, such as an odometry's; or its
+                rotation (D, D) alone, such as that of an IMU: the velocity in the frame of the sensor
+                continues. None: the sensor moves as between the last two scans.
 
         Raises `InvalidArgumentError` for another shape, NaN, or a motion that is not rigid.
         """
@@ -141,7 +150,9 @@ class Tracker:
             shape = tuple(rows.shape)
             raise InvalidArgumentError(f"points has shape {shape}; expected (N, {self.dim}), metres.")
         check_positions("points", rows)
-        measured = None if motion is None else _rigid(motion, "motion", self._center)
+        measured = None if motion is None else measured_motion(motion, self.dim, self._center.device)
+        if measured is not None and len(measured) == self.dim:
+            measured = continued(measured, self._motion)
         predicted = self._predicted(measured)
         rows = self._thinned(rows[rows.norm(dim=1) > _NEAREST])
         best: Location | None = None

@@ -13,6 +13,7 @@ from command_runs import QUIET, Finished, refused, run_here, succeeded
 from gmmtorch.cli.localize import overrides
 from gmmtorch.datasets import Dataset, load
 from gmmtorch.datasets.recordings.trajectory import read_trajectory
+from gmmtorch.export.bag import BagWriter
 from gmmtorch.export.trajectory_files import write_tum
 from gmmtorch.mapping.gaussian_map import GaussianMap
 
@@ -80,6 +81,33 @@ def test_the_pose_may_be_given_and_the_truth_a_file(run, scans, tmp_path):
     assert done.results()["rows"][0]["ate"] < 0.05
 
 
+def test_the_imu_of_a_bag_without_poses_predicts_the_headings(monkeypatch, tmp_path, saved):
+    pytest.importorskip("rosbags")
+    near = load("synthetic_building_2d", n_scans=240)
+    poses = torch.stack([near.pose(number) for number in range(8)])
+    steps = torch.linalg.solve(poses[:-1], poses[1:])
+    rates = torch.atan2(steps[:, 1, 0], steps[:, 0, 0])  # a scan a second
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        for number, pose in enumerate(poses):
+            points = (near[number].points - pose[:2, 2]) @ pose[:2, :2]
+            bag.cloud("/points", number + 1.0, "lidar", torch.nn.functional.pad(points, (0, 1)))
+        for time in np.arange(0.95, 8.1, 0.1):
+            velocity = {"x": 0.0, "y": 0.0, "z": float(rates[min(max(int(time) - 1, 0), 6)])}
+            fields = {"header": {"frame_id": "lidar"}, "angular_velocity": velocity}
+            bag.message("/imu", "sensor_msgs/msg/Imu", time, fields)
+    write_tum(tmp_path / "truth.tum", torch.arange(8).double() + 1, poses)
+    x, y, yaw = poses[0, 0, 2], poses[0, 1, 2], torch.atan2(poses[0, 1, 0], poses[0, 0, 0])
+    options = [f"map={saved}", "dataset=rosbag", f"dataset.path={tmp_path / 'a.mcap'}"]
+    options += ["dataset.poses=standing", f"pose=[{x:.3f},{y:.3f},{yaw:.3f}]", "motion=imu"]
+    options += [f"truth={tmp_path / 'truth.tum'}", *QUIET]
+    done = succeeded(run_here(monkeypatch, "localize", tmp_path / "run", *options))
+    row = done.results()["rows"][0]
+    assert row["n_found"] >= 6  # the map has few scans
+    assert row["ate"] < 0.05
+    other = run_here(monkeypatch, "localize", tmp_path / "other", *options, "dataset.imu_topic=/imu/raw")
+    assert "dataset.imu_topic=/imu/raw of type sensor_msgs/Imu with messages, only /imu (" in refused(other)
+
+
 def test_a_wrong_first_pose_is_recovered_from(run):
     done = succeeded(run("pose=[500,500,0]", "motion=dataset", "truth=dataset", *QUIET))
     row = done.results()["rows"][0]
@@ -117,6 +145,7 @@ def test_errors_are_one_line(run, monkeypatch, tmp_path, saved):
     assert "pose=[1, 2] is not a pose in a 2D map; give [x,y,yaw]" in refused(run("pose=[1,2]"))
     assert "pose=here is not a pose" in refused(run("pose=here"))
     assert "motion='wheels' is not one of constant, dataset" in refused(run("motion=wheels"))
+    assert "motion=imu cannot be used: it needs the IMU of a ROS bag" in refused(run("motion=imu"))
     assert "align='scale' is not one of" in refused(run("align=scale"))
     assert "truth=none.tum does not exist" in refused(run("truth=none.tum"))
     assert "distance=-1" in refused(run("distance=-1"))

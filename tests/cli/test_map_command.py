@@ -167,3 +167,7 @@ def test_odometry_auto_keeps_given_poses_and_mixture_is_scored_by_them(monkeypat
     assert 0 < odometry["ate"] < 0.05
     assert 0 < odometry["rpe"] < 0.05
     assert odometry["rpe_degrees"] < 1
+    imu = ["dataset.odometry=mixture", "dataset.motion=imu"]
+    text = refused(run_here(monkeypatch, "map", tmp_path / "imu", *options, *imu))
+    assert "dataset.motion=imu cannot be used: it needs the IMU of a ROS bag" in text
+    assert "Predict with dataset.motion=constant or dataset.motion=dataset." in text

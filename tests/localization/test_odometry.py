@@ -203,6 +203,13 @@ def test_one_scan_has_the_first_pose():
     assert found.covariances.abs().max() == 0
 
 
+def test_scans_with_too_few_points_have_a_trajectory_that_is_not_found():
+    odometry = Odometry()
+    for _ in range(3):
+        odometry.add(torch.rand(2, 3))
+    assert odometry.trajectory().found.tolist() == [True, False, False]
+
+
 def test_a_clock_that_jumps_does_not_scale_the_motion():
     odometry = Odometry()
     ratios = [odometry._clock(stamp) for stamp in (0.0, 1.0, 3.0, 2.0, 3.0, math.nan, 5.0, 1e9, None)]

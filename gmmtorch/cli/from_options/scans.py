@@ -72,7 +72,7 @@ def _with_odometry(source: Dataset, method: str, motion: str, has_truth: bool) -
         "method": method,
         "n_lost": int((~trajectory.found).sum()),
         "n_closures": trajectory.n_closures,
-        **_trajectory_scores(posed, trajectory, has_truth and motion == "constant"),
+        **_trajectory_scores(posed, trajectory, has_truth and motion != "dataset"),
     }
     text = f"odometry  {len(posed)} poses estimated, {facts['n_lost']} scans lost, "
     text += f"{trajectory.n_closures} loop closures"

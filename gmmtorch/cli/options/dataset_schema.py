@@ -19,7 +19,7 @@ class FileDataset:
     odometry: none, the poses of the data set; auto, mixture if it has none; mixture or kiss_icp, poses are
         estimated from the scans.
     motion: prediction of odometry=mixture. constant: the motion continues; dataset: as between the poses of
-        the data set, such as those of wheels.
+        the data set, such as those of wheels; imu: by the IMU of a ROS bag.
     """
 
     name: str = MISSING
@@ -60,6 +60,7 @@ class RosbagDataset(FileDataset):
     deskew: each point with a time gets the pose of its own time.
     camera_info: topic of the camera parameters of depth images; null: the nearest by name.
     pixel_stride: every n-th pixel of every n-th row of depth images.
+    imu_topic: topic of the IMU of motion=imu; null: the only one.
     """
 
     topic: str | None = None
@@ -71,6 +72,7 @@ class RosbagDataset(FileDataset):
     deskew: bool = True
     camera_info: str | None = None
     pixel_stride: int = 1
+    imu_topic: str | None = None
 
 
 @dataclass

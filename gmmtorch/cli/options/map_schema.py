@@ -76,7 +76,8 @@ class Localize:
     pose: first pose, [x,y,yaw], [x,y,z,yaw] or [x,y,z,qx,qy,qz,qw] (m, rad); dataset; null: unknown.
     distance: metres along the ground by which the first pose may be off.
     angle: radians by which the heading of the first pose may be off.
-    motion: constant, or dataset: predict with the motion between the poses of the data set.
+    motion: constant; dataset: predict with the motion between the poses of the data set; imu: by the IMU of a
+        ROS bag.
     n_points: points of a scan that are used at most.
     least_explained: share of the points that must lie on surfaces of the map.
     truth: true poses, for scores: dataset, none, or a TUM or KITTI file.

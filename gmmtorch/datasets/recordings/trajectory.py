@@ -44,8 +44,7 @@ class Trajectory:
         If the clock jumps, the longest sequence of increasing times is kept. Of samples with equal times the
         last one counts.
         """
-        order = increasing(times)
-        kept = order[np.append(np.diff(times[order]) > 0, True)] if len(order) else order
+        kept = strictly_increasing(times)
         return Trajectory(times[kept], matrices[kept])
 
     def __len__(self) -> int:
@@ -101,6 +100,12 @@ def increasing(times: np.ndarray) -> np.ndarray:
     while before[chain[-1]] >= 0:
         chain.append(int(before[chain[-1]]))
     return np.array(chain[::-1])
+
+
+def strictly_increasing(times: np.ndarray) -> np.ndarray:
+    """Indices of `increasing(times)`; of equal times that of the last one."""
+    order = increasing(times)
+    return order[np.append(np.diff(times[order]) > 0, True)] if len(order) else order
 
 
 def pose_matrix(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:

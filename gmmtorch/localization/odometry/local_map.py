@@ -12,10 +12,9 @@ from torch import Tensor
 
 from gmmtorch.localization.location import CORRELATED, Location, pose_covariance
 from gmmtorch.localization.odometry.free_space import FreeSpace, View
-from gmmtorch.localization.odometry.pose_graph import logarithm
 from gmmtorch.localization.registration.alignment import Alignment, AlignmentTarget, align, seen_normals
 from gmmtorch.localization.registration.registration import register
-from gmmtorch.localization.rigid_motions import Motions, distinct, generators
+from gmmtorch.localization.rigid_motions import Motions, distinct, generators, logarithm
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import WindowedRule
 from gmmtorch.mapping.learning.windows import learn_window

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from gmmtorch.localization.location import Location
 from gmmtorch.localization.odometry.local_map import Expectation, Keyframe, LocalMap
-from gmmtorch.localization.odometry.pose_graph import Edges, logarithm, optimised
+from gmmtorch.localization.odometry.pose_graph import Edges, optimised
+from gmmtorch.localization.rigid_motions import logarithm
 from gmmtorch.mapping.learning.rules import WindowedRule
 
 _ROUNDS = 3  # of closing and correcting: corrected poses bring more places together
@@ -145,6 +146,8 @@ def _candidates(poses: Tensor, rows: Sequence[int] | None = None) -> list[tuple[
 
     poses: (K, D+1, D+1) of the keyframes. rows: new ones; None: every third.
     """
+    if not len(poses):
+        return []
     at = poses[:, :-1, -1]
     path = torch.cat([torch.zeros(1), (at[1:] - at[:-1]).norm(dim=1)]).cumsum(0)
     order = torch.arange(len(at))

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
-from gmmtorch.linalg import check_rigid
 from gmmtorch.localization.location import Location
 from gmmtorch.localization.odometry.local_map import LOST, Expectation, Keyframe, LocalMap, nowhere
 from gmmtorch.localization.odometry.loop_closure import LoopCloser, closed, information_of
 from gmmtorch.localization.odometry.pose_graph import Edges, optimised
+from gmmtorch.localization.rigid_motions import continued, measured_motion
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import WindowedRule
 from gmmtorch.mapping.learning.windows import learn_window
@@ -118,17 +118,15 @@ class Odometry:
                 left out.
             stamp: time (s). The predicted motion is scaled by the time since the last scan, if both are
                 known and the clock runs forward.
-            motion: (D+1, D+1) of the sensor since the last scan, last ← now, from wheels or an IMU. None: the
-                motion continues.
+            motion: (D+1, D+1) of the sensor since the last scan, last ← now, such as that of wheels; or its
+                rotation (D, D) alone, such as that of an IMU: the velocity in the frame of the sensor
+                continues. None: the motion continues.
 
         Raises `InvalidArgumentError` for another shape or dimension, or for a motion that is not rigid.
         """
         rows = self._checked(points)
         dim = rows.shape[1]
-        measured = None
-        if motion is not None:
-            measured = as_tensor(motion, "motion", torch.float64).detach()
-            check_rigid(measured, dim, "motion")
+        measured = None if motion is None else measured_motion(motion, dim, rows.device)
         scan = self._scan(rows)
         ratio = self._clock(stamp)
         if not self._poses:
@@ -218,12 +216,14 @@ class Odometry:
     def _located(self, scan: Keyframe, measured: Tensor | None, ratio: float) -> Location:
         last = self._poses[-1]
         dim = len(last) - 1
-        step = torch.eye(dim + 1).double()
-        if measured is not None:
+        step = rest = torch.eye(dim + 1).double()
+        if measured is not None and len(measured) == dim:
+            step, rest = continued(measured, self._motion, ratio), continued(measured, None)
+        elif measured is not None:
             step = measured
         elif self._motion is not None:
             step = _scaled(self._motion, ratio)
-        poses, bounds = torch.stack([last @ step, last]), (self.max_step, self.max_turn)
+        poses, bounds = torch.stack([last @ step, last @ rest]), (self.max_step, self.max_turn)
         expected = Expectation(poses, *self._surprise, self._explained, *bounds)
         if not len(scan.mixture) or self._local is None:
             doubt = "the scan has too few points" if not len(scan.mixture) else "no scan before had points"

@@ -21,7 +21,7 @@ from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.localization.rigid_motions import generators
+from gmmtorch.localization.rigid_motions import generators, logarithm
 
 _SETTLED = 1e-7  # metres and radians: a smaller step ends the optimisation
 _MOST_STEPS = 100
@@ -185,19 +185,6 @@ def _moved(poses: Tensor, steps: Tensor) -> Tensor:
     moved[:, :dim, :dim] = poses[:, :dim, :dim] @ torch.linalg.matrix_exp(turn)
     moved[:, :dim, dim] += (poses[:, :dim, :dim] @ steps[:, :dim, None])[:, :, 0]
     return moved
-
-
-def logarithm(motions: Tensor) -> Tensor:
-    """A shift and a turn (E, F) of motions (E, D+1, D+1): the translation, and the rotation's vector."""
-    dim = motions.shape[1] - 1
-    rotation = motions[:, :dim, :dim]
-    if dim == 2:
-        turn = torch.atan2(rotation[:, 1, 0], rotation[:, 0, 0])[:, None]
-        return torch.cat([motions[:, :2, 2], turn], 1)
-    from scipy.spatial.transform import Rotation
-
-    turn = torch.from_numpy(Rotation.from_matrix(rotation.detach().numpy()).as_rotvec())
-    return torch.cat([motions[:, :3, 3], turn.to(motions)], 1)
 
 
 def _adjoint(motions: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ from gmmtorch.localization.odometry.odometry import Odometry, Trajectory
 from gmmtorch.optional_packages import needs_extra
 
 METHODS = ("kiss_icp", "mixture")
-MOTIONS = ("constant", "dataset")
+MOTIONS = ("constant", "dataset", "imu")
 
 
 class PosedRecording(NamedTuple):
@@ -41,26 +42,31 @@ def with_odometry(
             closures and without covariances (NaN).
         on_scan: called with the number of scans done and of all.
         motion: prediction of each pose. constant: the motion continues; dataset: as between the poses of the
-            data set, such as those of wheel odometry (mixture only).
+            data set, such as those of wheel odometry; imu: with the rotation of a bag's IMU, while the
+            velocity continues. The last two are for mixture only.
 
-    Raises `InvalidArgumentError` for another method or motion, `DataError` if no scan can be read.
+    Raises `InvalidArgumentError` for another method or motion or without a usable IMU, `DataError` if no scan
+    can be read.
     """
     check_choice("odometry", method, METHODS)
     check_choice("motion", motion, MOTIONS)
-    if motion == "dataset" and method != "mixture":
+    if motion != "constant" and method != "mixture":
         raise InvalidArgumentError(
-            f"motion=dataset does not go with odometry={method}; use odometry=mixture."
+            f"motion={motion} does not go with odometry={method}; use odometry=mixture."
         )
+    turns = source.turns() if motion == "imu" else None
     odometry = odometry_of(method)
     known = torch.zeros(len(source), dtype=torch.bool)
     times = source.times
-    before: Tensor | None = None
+    before: int | None = None
     for index in range(len(source)):
         points = _sensor_points(source, index)
         if points is not None:
-            moved, before = _motion(source, index, before) if motion == "dataset" else (None, None)
-            odometry.add(points, None if times is None else float(times[index]), moved)
-            known[index] = True
+            predicted = None
+            if before is not None and motion != "constant":
+                predicted = _motion(source, turns, before, index)
+            odometry.add(points, None if times is None else float(times[index]), predicted)
+            known[index], before = True, index
         on_scan(index + 1, len(source))
     if not known.any():
         raise DataError(f"{source.name}: no scan of {len(source)} can be read, so none has a pose.")
@@ -70,12 +76,15 @@ def with_odometry(
     return PosedRecording(with_poses(source, poses, known), trajectory)
 
 
-def _motion(source: Dataset, index: int, before: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
-    """The motion of the sensor since the pose `before`, by the poses of the data set; and the pose now."""
-    now = source.pose(index)
-    if now is None:
-        return None, before
-    return None if before is None else torch.linalg.solve(before.double(), now.double()), now
+def _motion(source: Dataset, turns: Tensor | None, before: int, now: int) -> Tensor | None:
+    """The motion of the sensor between two scans, by the poses of the data set, or its rotation by `turns`
+    (N, D, D) since the scan before; None if it is unknown.
+    """
+    if turns is not None:
+        turn = functools.reduce(torch.matmul, turns[before + 1 : now + 1])
+        return turn if bool(turn.isfinite().all()) else None
+    first, last = source.pose(before), source.pose(now)
+    return None if first is None or last is None else torch.linalg.solve(first.double(), last.double())
 
 
 def _sensor_points(source: Dataset, index: int) -> Tensor | None:

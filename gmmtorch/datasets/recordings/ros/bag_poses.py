@@ -42,6 +42,7 @@ class BagSurvey:
     Attributes:
         heads: (time of recording in ns, first bytes) of each message of the sensor.
         tree: the transforms of TF.
+        max_gap: longest time in seconds between two of them that are interpolated.
 
     Raises `DataError` or `InvalidArgumentError` if the bag cannot have the poses that the options choose.
     """
@@ -56,7 +57,7 @@ class BagSurvey:
         max_gap: float,
     ) -> None:
         self._reader, self._topic = reader, topic
-        self._poses, self._frame, self._max_gap = poses, frame, max_gap
+        self._poses, self._frame, self.max_gap = poses, frame, max_gap
         self._extrinsic = mount_matrix(extrinsic)
         self._pose_topic = poses if poses in {t.name for t in reader.topics} else None
         self._file = None
@@ -125,7 +126,7 @@ class BagSurvey:
             stamps, poses = np.array(times, np.int64), np.array(matrices).reshape(-1, 4, 4)
             trajectory = Trajectory.from_samples(stamps, poses)
             mounts = {frame: self._mount(frame, where) if mount is None else mount for frame in frames}
-            return BodyPoses(trajectory, mounts, self._max_gap, f"topic {self._pose_topic}")
+            return BodyPoses(trajectory, mounts, self.max_gap, f"topic {self._pose_topic}")
         if len(frames) > 1:
             counts = ", ".join(f"{frame or '(unnamed)'} ({n} scans)" for frame, n in frames.most_common())
             raise InvalidArgumentError(
@@ -138,10 +139,10 @@ class BagSurvey:
         trajectory = read_trajectory(self._file, len(self.heads))
         if not trajectory.has_times:
             return PosesByIndex({r.stamp: trajectory.matrices[r.number] for r in records}, fixed)
-        return BodyPoses(trajectory, dict.fromkeys(frames, fixed), self._max_gap, str(self._file))
+        return BodyPoses(trajectory, dict.fromkeys(frames, fixed), self.max_gap, str(self._file))
 
     def _from_tf(self, frames: Counter[str], where: str) -> PoseSource:
-        source = TfPoses(self.tree, self._frame, self._max_gap, where)
+        source = TfPoses(self.tree, self._frame, self.max_gap, where)
         chains = [source.chain(frame) for frame in frames]
         chosen = self._poses is not None or self._frame is not None
         if not chosen and not any(self.tree.is_moving(chain) for chain in chains):

@@ -1,4 +1,4 @@
-"""Which topics of a bag are sensors, and the choice between them."""
+"""Which topics of a bag are sensors or an IMU, and the choice between them."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ POSE_TYPES = (
     "geometry_msgs/msg/TransformStamped",
 )
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"
+IMU_TYPE = "sensor_msgs/msg/Imu"
 _IMAGE, _COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")
 
@@ -133,6 +134,24 @@ def choose_camera_info(reader: BagReader, image: str, wanted: str | None) -> str
             f"type CameraInfo are {', '.join(infos) or 'none: record the one of the camera'}."
         )
     return best[0]
+
+
+def choose_imu(reader: BagReader, wanted: str | None) -> str:
+    """The topic `wanted`, or else the only one of an IMU. Raises `InvalidArgumentError`, which lists them."""
+    found = [topic for topic in reader.topics if topic.type == IMU_TYPE and topic.n_messages]
+    if wanted is None and len(found) > 1:
+        raise InvalidArgumentError(
+            f"{reader.path} has {len(found)} topics of an IMU: {listed(found)}. Choose one: "
+            f"dataset.imu_topic={found[0].name}."
+        )
+    chosen = [topic.name for topic in found if wanted in (None, topic.name)]
+    if not chosen:
+        what = "has no topic" if wanted is None else f"has no topic dataset.imu_topic={wanted}"
+        raise InvalidArgumentError(
+            f"motion=imu cannot be used: {reader.path} {what} of type sensor_msgs/Imu with messages, only "
+            f"{listed(found)}. Record one, or predict with motion=constant or motion=dataset."
+        )
+    return chosen[0]
 
 
 def nearest_names(names: list[str], topic: str) -> list[str]:

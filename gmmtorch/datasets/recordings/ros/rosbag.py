@@ -15,6 +15,7 @@ from gmmtorch.datasets.base import Dataset, Ranges, require_path
 from gmmtorch.datasets.recordings.ros import bag_topics, sensor_messages
 from gmmtorch.datasets.recordings.ros.bag_poses import BagSurvey, Record
 from gmmtorch.datasets.recordings.ros.bag_reader import BagReader, RawMessage
+from gmmtorch.datasets.recordings.ros.gyroscope import read_gyroscope, sensor_turns
 from gmmtorch.datasets.recordings.ros.scan_conversion import ScanConversion
 from gmmtorch.datasets.recordings.ros.sensor_messages import Reading
 from gmmtorch.datasets.recordings.ros.transform_tree import frame_name, stamp_of
@@ -40,6 +41,7 @@ def open_rosbag(
     deskew: bool = True,
     camera_info: str | None = None,
     pixel_stride: int = 1,
+    imu_topic: str | None = None,
 ) -> RosBag:
     """The scans of one topic of a bag; see docs/recordings.md.
 
@@ -56,6 +58,7 @@ def open_rosbag(
         deskew: whether points with times get the pose of their own time.
         camera_info: topic of the camera parameters of depth images.
         pixel_stride: every n-th pixel of every n-th row of depth images is used.
+        imu_topic: of the IMU of `RosBag.turns`; None: the only one.
     """
     source = "A bag of ROS 1 is a file; one of ROS 2 is a file or its folder."
     file = require_path(path, "file or folder", "a ROS bag (.bag, .mcap, .db3)", source)
@@ -70,7 +73,8 @@ def open_rosbag(
         intrinsics = sensor_messages.camera_matrix(reader.decode(next(reader.messages([info]))))
     survey = BagSurvey(reader, sensor.topic.name, poses, frame, extrinsic, max_gap)
     kind = DepthBag if sensor.is_camera else RosBag
-    return kind(reader, sensor, survey, ranges, stride, sensor_frame, clock, deskew, intrinsics, pixel_stride)
+    options = sensor_frame, clock, deskew, intrinsics, pixel_stride, imu_topic
+    return kind(reader, sensor, survey, ranges, stride, *options)
 
 
 class RosBag(Dataset):
@@ -96,9 +100,11 @@ class RosBag(Dataset):
         deskew: bool,
         intrinsics: Tensor | None,
         pixel_stride: int,
+        imu_topic: str | None,
     ) -> None:
         super().__init__(reader.path.stem, ranges, stride)
         self._reader, self._sensor, self._clock = reader, sensor, clock
+        self._imu_topic, self._tree, self._max_gap = imu_topic, survey.tree, survey.max_gap
         self.topic = sensor.topic.name
         self._where = f"{reader.path}, topic {self.topic}"
         self._stream: Iterator[RawMessage] | None = None
@@ -185,6 +191,23 @@ class RosBag(Dataset):
         if not empty:
             raise failures[0]
         return empty[0]
+
+    def turns(self) -> Tensor:
+        """Rotations (N, D, D) of the sensor since the scan before, from the gyroscope of the bag's IMU.
+
+        See `Dataset.turns`. TF states how the IMU is mounted. Where the IMU has no messages, rotations are
+        NaN, and a warning states how many. Raises `InvalidArgumentError`, with the remedy, if all are.
+        """
+        records, matrices = self._records[:: self.stride], self._matrices[:: self.stride]
+        gyroscope = read_gyroscope(self._reader, self._imu_topic, self._clock)
+        frames, stamps = [record.frame for record in records], np.array([record.stamp for record in records])
+        turns = sensor_turns(gyroscope, self._tree, frames, stamps, self._max_gap)
+        if self._is_flat:  # as the heading changes in the plane, also of a sensor on its head
+            motions = np.tile(np.eye(4), (len(turns) - 1, 1, 1))
+            motions[:, :3, :3] = turns[1:]
+            before, now = in_plane(matrices[:-1]), in_plane(matrices[:-1] @ motions)
+            turns = np.concatenate([np.eye(2)[None], (np.swapaxes(before, 1, 2) @ now)[:, :2, :2]])
+        return torch.from_numpy(turns)
 
     def _count(self) -> int:
         return len(self._records)

@@ -123,6 +123,31 @@ class TransformTree:
             matrices, known = step.matrices @ matrices, known & step.known
         return Poses(matrices, known)
 
+    def between(self, frame: str, other: str, times: np.ndarray, max_gap: float) -> Poses:
+        """Poses frame ← other of two frames at times (M,) in ns, from the nearest frame above both.
+
+        Raises `DataError` if there is no such frame.
+        """
+        ours, others = self._above(frame), self._above(other)
+        top = next((name for name in ours if name in others), None)
+        if top is None:
+            raise DataError(
+                f"TF has no transform between frame {frame or '(unnamed)'} and frame {other or '(unnamed)'}; "
+                f"all frames: {self.describe()}"
+            )
+        up = self.lookup(ours[: ours.index(top) + 1], times, max_gap)
+        down = self.lookup(others[: others.index(top) + 1], times, max_gap)
+        return Poses(np.linalg.inv(up.matrices) @ down.matrices, up.known & down.known)
+
+    def _above(self, frame: str) -> list[str]:
+        """A frame and those above it, as far as each has one parent."""
+        found = [frame]
+        while (
+            len(parents := self._parents.get(found[-1], ())) == 1 and (up := next(iter(parents))) not in found
+        ):
+            found.append(up)
+        return found
+
     def latest(self, chain: list[str]) -> int | None:
         """The time (ns) up to which all transforms of a chain are known; None if all are static."""
         edges = [self._edge(child) for child in chain[:-1] if child in self._samples]
