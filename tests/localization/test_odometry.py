@@ -130,7 +130,7 @@ def test_a_wider_search_does_not_replace_a_doubtful_pose_by_one_with_less_eviden
     local = LocalMap([Odometry()._scan(wall(torch.Generator().manual_seed(0), 400, 8, 2)[:, :2])], 0.5, _RULE)
     likely = Location(torch.eye(3).double(), torch.eye(3).double(), 0.9, ("a direction is open",))
     unlikely = replace(likely, pose=2 * likely.pose, doubts=())
-    results = iter([_Found(likely, 126.0, 0.0), _Found(unlikely, 91.0, 0.0)])
+    results = iter([_Found(likely, 126.0, 0.0, True), _Found(unlikely, 91.0, 0.0, True)])
     monkeypatch.setattr(LocalMap, "_searches", lambda *_: iter([(None, None)] * 2))
     monkeypatch.setattr(LocalMap, "_climbed", lambda *_: next(results))
     assert local.locate(None, Expectation(likely.pose[None], 0.3, 0.2, 0.95)) is likely
