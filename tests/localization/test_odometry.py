@@ -1,6 +1,7 @@
 """Odometry in simulated worlds whose poses are known, and on bad input."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,7 +11,8 @@ from gmmtorch.datasets import load
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.evaluation.trajectories import absolute_trajectory_error
 from gmmtorch.localization import Odometry, with_odometry
-from gmmtorch.localization.odometry.local_map import Expectation, LocalMap
+from gmmtorch.localization.location import Location
+from gmmtorch.localization.odometry.local_map import Expectation, LocalMap, _Found
 from gmmtorch.localization.odometry.odometry import _RULE, _scaled
 
 N_2D, N_3D = 14, 6
@@ -124,6 +126,16 @@ def test_the_first_search_in_3d_reaches_past_the_nearest_maximum(seed):
     assert float(location.pose[:3, 3].norm()) < 0.05
 
 
+def test_a_wider_search_does_not_replace_a_doubtful_pose_by_one_with_less_evidence(monkeypatch):
+    local = LocalMap([Odometry()._scan(wall(torch.Generator().manual_seed(0), 400, 8, 2)[:, :2])], 0.5, _RULE)
+    likely = Location(torch.eye(3).double(), torch.eye(3).double(), 0.9, ("a direction is open",))
+    unlikely = replace(likely, pose=2 * likely.pose, doubts=())
+    results = iter([_Found(likely, 126.0, 0.0, True), _Found(unlikely, 91.0, 0.0, True)])
+    monkeypatch.setattr(LocalMap, "_searches", lambda *_: iter([(None, None)] * 2))
+    monkeypatch.setattr(LocalMap, "_climbed", lambda *_: next(results))
+    assert local.locate(None, Expectation(likely.pose[None], 0.3, 0.2, 0.95)) is likely
+
+
 @pytest.mark.parametrize("seed", [0, 2])
 def test_a_box_that_moved_does_not_outweigh_the_expected_motion(seed):
     # Along a wall with a pillar every 2 m, a box of 2 % of the points moves by 2 m. People hide the wall, so
@@ -153,8 +165,8 @@ def test_a_motion_beyond_the_bounds_is_not_found():
 @pytest.mark.real_data
 @pytest.mark.parametrize(
     ("log", "first", "last"),
-    [("intel", 0, 2), ("intel", 54, 60), ("hall", 20, 24)],
-    ids=["a wall grows behind the sensor", "a corridor", "a turn by 135 degrees"],
+    [("intel", 0, 2), ("intel", 54, 60), ("intel", 884, 895), ("hall", 20, 24)],
+    ids=["a wall grows behind the sensor", "a corridor", "a corridor with doors", "a turn by 135 degrees"],
 )
 def test_steps_that_mislead_the_points_are_found_with_free_space(real_data, log, first, last):
     planar = real_data / f"laser2d/{log}.log.gz"

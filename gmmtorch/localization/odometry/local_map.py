@@ -23,6 +23,9 @@ from gmmtorch.scan import Scan
 
 _BLURS = {2: (0.2, 0.08, 0.03), 3: (0.25, 0.1, 0.04)}  # metres
 _STEPS = 15  # of a level
+_SLIDE = 1.0  # metres that the best pose is moved at most along its loosest direction, in
+_SLIDES = 16  # places, each of which climbs
+_SLIDE_STEPS = 3
 _SPACING = {2: 0.25, 3: 0.5}  # metres between the starts of the first search
 _COARSE = {2: 0.5, 3: 1.0}  # metres of blur, and between the starts, of the last search
 _TURNED = {
@@ -75,11 +78,15 @@ class Expectation(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """The result of one search, with its log-likelihood (nats) and the share of the points against it."""
+    """The result of one search, with the share of the points against it, and whether the points allow it: an
+    open direction or a second pose is no reason against it. total: its log-likelihood (nats); of a pose that
+    the points do not allow, only that of the motion.
+    """
 
     location: Location
     total: float
     contradicted: float
+    possible: bool
 
 
 class LocalMap:
@@ -114,7 +121,7 @@ class LocalMap:
         best: _Found | None = None
         for starts, targets in self._searches(scan, expected):
             tried = self._climbed(scan, expected, starts, targets)
-            if best is None or (tried.location.found, tried.total) > (best.location.found, best.total):
+            if best is None or (tried.possible, tried.total) > (best.possible, best.total):
                 best = tried
             supported = best.location.explained - best.contradicted
             if best.location.found and supported >= _USUAL * expected.explained:
@@ -172,15 +179,23 @@ class LocalMap:
         motions, kept = self._motions(starts), len(starts)
         for target in targets:
             points = scan.points[: self.n_points if target is targets[-1] else _COARSE_POINTS]
-            found = align(points, target, motions, _STEPS)
             kept = max(kept // 3, 3)
-            total, view = self._total(found, points, expected)
-            order = total.argsort(descending=True, stable=True)
-            order = order[distinct(found.motions.at(order), target.blur / 2, target.blur / 2)]
-            order = order[:kept]
-            found, total, view = found.at(order), total[order], view.at(order)
+            found = self._ranked(align(points, target, motions, _STEPS), points, expected, target.blur)[0]
+            found = found.at(torch.arange(min(kept, len(found.score))))
             motions = found.motions
-        return self._judged(points, found, total, view, expected)
+        # A climb has the points' score alone, which can rise along a wall while the sum of evidence falls.
+        slid = align(points, targets[-1], _slid(found, points), _SLIDE_STEPS)
+        both = Alignment(motions.joined(slid.motions), *map(torch.cat, zip(found[1:], slid[1:], strict=True)))
+        return self._judged(points, *self._ranked(both, points, expected, targets[-1].blur), expected)
+
+    def _ranked(
+        self, found: Alignment, points: Tensor, expected: Expectation, blur: float
+    ) -> tuple[Alignment, Tensor, View]:
+        """Different poses, best first, with their log-likelihoods and how they agree with free space."""
+        total, view = self._total(found, points, expected)
+        order = total.argsort(descending=True, stable=True)
+        order = order[distinct(found.motions.at(order), blur / 2, blur / 2)]
+        return found.at(order), total[order], view.at(order)
 
     def _total(self, found: Alignment, points: Tensor, expected: Expectation) -> tuple[Tensor, View]:
         """Log-likelihood of the points and of the motion (B,), nats; how the points agree with free space."""
@@ -221,6 +236,7 @@ class LocalMap:
             doubts.append(f"{contradicted:.0%} of the points contradict the free space of the last scans")
         if share < self.least_explained:
             doubts.append(f"only {share:.0%} of the points lie on surfaces of the last scans")
+        is_possible = not doubts
         if doubts:
             covariance = covariance + nowhere(self.dim)
         if loosest > _LOOSEST:
@@ -228,9 +244,9 @@ class LocalMap:
         if bool(rivals.any()):
             doubts.append("another pose explains the scan as well")
             covariance = covariance + _scatter(poses[best], poses[chosen])
-        return _Found(
-            Location(poses[best], covariance, share, tuple(doubts)), float(total[best]), contradicted
-        )
+        location = Location(poses[best], covariance, share, tuple(doubts))
+        likelihood = float(total[best]) if is_possible else -float(self._unlikely(poses, expected)[best])
+        return _Found(location, likelihood, contradicted, is_possible)
 
     def _motions(self, poses: Tensor) -> Motions:
         return Motions(poses[:, :-1, :-1], poses[:, :-1, -1] - self._center)
@@ -241,6 +257,16 @@ class LocalMap:
         poses[:, :-1, :-1] = left @ right
         poses[:, :-1, -1] = motions.translations + self._center
         return poses
+
+
+def _slid(found: Alignment, points: Tensor) -> Motions:
+    """Motions along the direction that the points fix least, on both sides of the first one."""
+    covariance, loosest = pose_covariance(found.information[0], points)
+    scale = torch.ones(len(covariance)).double()
+    scale[points.shape[1] :] = 1 / points.norm(dim=1).median().clamp_min(1e-3)
+    axis = torch.linalg.eigh(covariance / scale[:, None] / scale)[1][:, -1] * scale
+    steps = torch.linspace(-1, 1, _SLIDES).double() * min(2 * loosest, _SLIDE)
+    return found.motions.at(torch.zeros(_SLIDES, dtype=torch.int64)).moved(steps[:, None] * axis)
 
 
 def nowhere(dim: int) -> Tensor:
