@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import signal
@@ -15,7 +16,7 @@ from command_runs import COMMANDS, QUIET, Finished, refused, run_here, succeeded
 from omegaconf import DictConfig
 
 import gmmtorch
-from gmmtorch.cli import common, occupancy
+from gmmtorch.cli import common, map, occupancy
 from gmmtorch.cli.options import command_options, schema
 from gmmtorch.errors import InvalidArgumentError
 
@@ -95,6 +96,15 @@ def test_a_folder_that_cannot_be_written_is_a_one_line_error(run, tmp_path):
 
 
 # -- version, help, completion --------------------------------------------------------------------
+
+
+def test_characters_that_the_encoding_of_the_output_lacks_are_no_error(monkeypatch):
+    output = io.TextIOWrapper(io.BytesIO(), encoding="cp1252")
+    monkeypatch.setattr(sys, "stdout", output)
+    monkeypatch.setattr(sys, "argv", ["gmmtorch-map", "--help"])
+    map.main()
+    output.flush()
+    assert re.search(r"map.hit_length=1.0 +\? \(m\);", output.buffer.getvalue().decode("cp1252"))
 
 
 def test_the_version_is_that_of_the_package(run):
