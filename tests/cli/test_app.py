@@ -78,8 +78,13 @@ def test_a_typo_names_the_nearest_option_or_choice(command, options, words, run)
 
 
 @pytest.mark.parametrize("launcher", ["joblib", "ray"])
-def test_a_launcher_that_is_not_installed_names_its_extra(launcher, monkeypatch):
-    monkeypatch.setattr(command_options, "find_spec", lambda name: None)
+@pytest.mark.parametrize("has_other_plugins", [True, False])
+def test_a_launcher_that_is_not_installed_names_its_extra(launcher, has_other_plugins, monkeypatch):
+    def find_spec(name: str) -> None:
+        if not has_other_plugins:
+            raise ModuleNotFoundError("No module named 'hydra_plugins'")
+
+    monkeypatch.setattr(command_options, "find_spec", find_spec)
     overrides = [f"hydra/launcher={launcher}", "seed=0,1"]
     message = command_options.explained("occupancy", overrides, RuntimeError("not found"))
     assert f"hydra-{launcher}-launcher" in message
