@@ -1,6 +1,6 @@
 """Learning a mixture, beside scikit-learn, tgmm and torchgmm: seconds at equal quality.
 
-    pip install gmmtorch[benchmarks]
+    pip install 'gmmtorch[benchmarks]'
     python benchmarks/learning.py --data FOLDER [--threads 1] [--only CASE …] [--methods METHOD …]
 
 FOLDER holds hall/ and kinect/. All methods see the same clouds, drawn with other seeds than the

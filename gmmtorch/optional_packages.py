@@ -22,18 +22,19 @@ def load_open3d(failure: str) -> Any:
 
 
 @contextmanager
-def needs_extra(purpose: str, package: str, extra: str) -> Iterator[None]:
+def needs_extra(purpose: str, package: str, extra: str, note: str = "") -> Iterator[None]:
     """For imports: raises `GmmTorchError` if they fail, which names the extra of gmmtorch to install.
 
     Args:
         purpose: beginning of the message, as in "OctoMap needs".
+        note: end of the message, with a leading space.
     """
     try:
         yield
     except ImportError as error:
         raise GmmTorchError(
             f"{purpose} the package {package}, which does not load ({error}); install it: "
-            f"pip install 'gmmtorch[{extra}]'."
+            f"pip install 'gmmtorch[{extra}]'.{note}"
         ) from error
 
 

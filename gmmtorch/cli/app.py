@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import _thread
 import argparse
+import io
 import math
 import os
 import signal
@@ -43,12 +44,23 @@ def start(name: str, run: Callable[[DictConfig], Any]) -> None:
             becomes a one-line message and exit status 1.
     """
     schema.register()
+    _print_any_text()
     try:
         with interruptible(), _any_help():
             _hydra_main(name, run)
     except KeyboardInterrupt:
         print("gmmtorch: interrupted; all files that were written are complete.", file=sys.stderr)
         sys.exit(130)
+
+
+def _print_any_text() -> None:
+    """Characters that the encoding of the output lacks are printed as a question mark.
+
+    Without this they are errors: on Windows, output to a file or a pipe has a code page of 256 characters.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
 
 
 @contextmanager

@@ -15,6 +15,7 @@ from gmmtorch.cli import app, common
 from gmmtorch.cli.reporting.robot_report import Outputs, RobotReport, print_refusals, terse
 from gmmtorch.cli.view import open_live_view, serve
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, check_whole
+from gmmtorch.evaluation.processes import has_lost_parent
 
 if TYPE_CHECKING:
     from gmmtorch.exploration.mission.driver import Drivable
@@ -113,7 +114,7 @@ def _drive(config: DictConfig, mission: Drivable, view: RobotView, folder: Path)
         clock = WallClock(config.speed)
 
         def is_stopped() -> bool:
-            return is_asked() or team not in (None, str(os.getppid()))
+            return is_asked() or (team is not None and has_lost_parent(team))
 
         def on_step() -> None:
             view.check_id()

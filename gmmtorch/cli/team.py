@@ -102,7 +102,9 @@ def end_all(robots: Sequence[RobotProcess]) -> None:
 def _environment() -> dict[str, str]:
     """The environment of a robot, in which it imports the same packages as this process."""
     found = os.pathsep.join(path for path in sys.path if path)
-    return {**os.environ, "PYTHONPATH": found, TEAM_VARIABLE: str(os.getpid())}
+    # On Windows the output to a file would not be UTF-8.
+    own = {"PYTHONPATH": found, "PYTHONIOENCODING": "utf-8", TEAM_VARIABLE: str(os.getpid())}
+    return {**os.environ, **own}
 
 
 def _quoted(path: Path) -> str:

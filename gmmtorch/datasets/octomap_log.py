@@ -186,7 +186,8 @@ def _read_pose(file: io.BufferedIOBase, position: int, where: str) -> Tensor:
     if not abs(norm - 1) < _NORM_ERROR:
         raise DataError(f"{where}: the quaternion {quaternion} has length {norm:.3g} instead of 1.")
     pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = torch.from_numpy(Rotation.from_quat(quaternion, scalar_first=True).as_matrix())
+    w, *axis = quaternion  # SciPy has the scalar last
+    pose[:3, :3] = torch.from_numpy(Rotation.from_quat([*axis, w]).as_matrix())
     pose[:3, 3] = torch.tensor([x, y, z], dtype=torch.float64)
     return check_pose(pose, where)
 

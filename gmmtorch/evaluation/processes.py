@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import sys
 import threading
 import time
 from typing import Any
 
 _PERIOD = 0.5
 """Seconds between checks whether the parent process is alive."""
+
+
+def has_lost_parent(process: str) -> bool:
+    """Whether the process with this number, which started this one, has ended. Always false on Windows."""
+    # There os.getppid names the launcher of a virtual environment, and does not change when a parent ends.
+    return sys.platform != "win32" and str(os.getppid()) != process
 
 
 def end_with_parent() -> None:

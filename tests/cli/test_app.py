@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import signal
@@ -15,7 +16,7 @@ from command_runs import COMMANDS, QUIET, Finished, refused, run_here, succeeded
 from omegaconf import DictConfig
 
 import gmmtorch
-from gmmtorch.cli import common, occupancy
+from gmmtorch.cli import common, map, occupancy
 from gmmtorch.cli.options import command_options, schema
 from gmmtorch.errors import InvalidArgumentError
 
@@ -77,8 +78,13 @@ def test_a_typo_names_the_nearest_option_or_choice(command, options, words, run)
 
 
 @pytest.mark.parametrize("launcher", ["joblib", "ray"])
-def test_a_launcher_that_is_not_installed_names_its_extra(launcher, monkeypatch):
-    monkeypatch.setattr(command_options, "find_spec", lambda name: None)
+@pytest.mark.parametrize("has_other_plugins", [True, False])
+def test_a_launcher_that_is_not_installed_names_its_extra(launcher, has_other_plugins, monkeypatch):
+    def find_spec(name: str) -> None:
+        if not has_other_plugins:
+            raise ModuleNotFoundError("No module named 'hydra_plugins'")
+
+    monkeypatch.setattr(command_options, "find_spec", find_spec)
     overrides = [f"hydra/launcher={launcher}", "seed=0,1"]
     message = command_options.explained("occupancy", overrides, RuntimeError("not found"))
     assert f"hydra-{launcher}-launcher" in message
@@ -95,6 +101,15 @@ def test_a_folder_that_cannot_be_written_is_a_one_line_error(run, tmp_path):
 
 
 # -- version, help, completion --------------------------------------------------------------------
+
+
+def test_characters_that_the_encoding_of_the_output_lacks_are_no_error(monkeypatch):
+    output = io.TextIOWrapper(io.BytesIO(), encoding="cp1252")
+    monkeypatch.setattr(sys, "stdout", output)
+    monkeypatch.setattr(sys, "argv", ["gmmtorch-map", "--help"])
+    map.main()
+    output.flush()
+    assert re.search(r"map.hit_length=1.0 +\? \(m\);", output.buffer.getvalue().decode("cp1252"))
 
 
 def test_the_version_is_that_of_the_package(run):

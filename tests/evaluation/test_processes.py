@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
 import pytest
 
-from gmmtorch.evaluation.processes import end_with_parent
+from gmmtorch.evaluation.processes import end_with_parent, has_lost_parent
 
 _WORK = """
 work = "\\n".join([
@@ -52,3 +53,15 @@ def test_workers_end_when_their_parent_is_killed(program: str) -> None:
 
 def test_end_with_parent_leaves_other_processes_alone() -> None:
     end_with_parent()
+
+
+@pytest.mark.parametrize("platform", ["linux", "darwin"])
+def test_a_process_has_lost_its_parent_if_another_has_adopted_it(platform, monkeypatch):
+    monkeypatch.setattr(sys, "platform", platform)
+    assert not has_lost_parent(str(os.getppid()))
+    assert has_lost_parent(str(os.getpid()))
+
+
+def test_a_launcher_between_two_processes_of_windows_is_no_lost_parent(monkeypatch):
+    monkeypatch.setattr(sys, "platform", "win32")
+    assert not has_lost_parent(str(os.getpid()))

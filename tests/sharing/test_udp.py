@@ -119,8 +119,9 @@ def multicast() -> None:
 
 
 @pytest.mark.usefixtures("multicast")
-@pytest.mark.parametrize("key", [KEY, None])
-def test_multicast_sends_once_and_delivers_to_the_others_only(key):
+@pytest.mark.parametrize(("key", "binds_groups"), [(KEY, True), (None, True), (KEY, False)])
+def test_multicast_sends_once_and_delivers_to_the_others_only(key, binds_groups, monkeypatch):
+    monkeypatch.setattr("gmmtorch.sharing.transport.udp._BINDS_GROUPS", binds_groups)
     with ExitStack() as stack:
         a = stack.enter_context(UdpTransport.multicast(0, (GROUP, 0), key=key))
         group = a.address
@@ -205,6 +206,14 @@ def test_a_full_queue_keeps_the_newest_datagrams(opening):
     until(lambda: b.received.datagrams == 250)
     assert b.deliver(1, 0.0) == [(0, i.to_bytes(2, "little")) for i in range(150, 250)]
     assert b.n_dropped == 150
+
+
+def test_datagrams_arrive_without_the_calls_that_windows_lacks(opening, monkeypatch):
+    monkeypatch.setattr("gmmtorch.sharing.transport.udp._HAS_NOTES", False)
+    a, b = team(opening, 2, key=KEY)
+    a.send(0, [b"one", bytes(1000)], 0.0, "maps")
+    until(lambda: b.received.datagrams == 2)
+    assert b.deliver(1, 0.0) == [(0, b"one"), (0, bytes(1000))]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux counts what a socket has no room for")

@@ -200,6 +200,14 @@ def _tolerant(command: str, overrides: Sequence[str]) -> DictConfig:
 # -- mistakes -------------------------------------------------------------------------------------
 
 
+def _is_installed(module: str) -> bool:
+    """Whether a module of a package exists; the package itself may be missing."""
+    try:
+        return find_spec(module) is not None
+    except ModuleNotFoundError:  # of the package
+        return False
+
+
 def explained(command: str, overrides: Sequence[str], error: Exception) -> str:
     """What is wrong with these overrides, which Hydra has refused with an error, in one line."""
     parsed: list[Override] = []
@@ -213,7 +221,7 @@ def explained(command: str, overrides: Sequence[str], error: Exception) -> str:
             )
     for launcher in _LAUNCHERS:
         chosen = f"hydra/launcher={launcher}"
-        if chosen in overrides and find_spec(f"hydra_plugins.hydra_{launcher}_launcher") is None:
+        if chosen in overrides and not _is_installed(f"hydra_plugins.hydra_{launcher}_launcher"):
             return (
                 f"{chosen} needs the package hydra-{launcher}-launcher, which is not installed; install it: "
                 "pip install 'gmmtorch[sweep]'."

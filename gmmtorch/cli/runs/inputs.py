@@ -50,7 +50,8 @@ def _remote(pattern: str) -> list[str]:
 
 def _name(address: str) -> str:
     """The last part of an address, and the start of its hash, because two folders can have equal names."""
-    stem = re.sub(r"[^\w.-]+", "_", address.rstrip("/").split("/")[-1])[:_LONGEST_NAME].strip(".")
+    last = address.rstrip("/").split("/")[-1] if "://" in address else Path(address).name
+    stem = re.sub(r"[^\w.-]+", "_", last)[:_LONGEST_NAME].strip(".")
     return f"{stem or 'recording'}-{hashlib.sha256(address.encode()).hexdigest()[:8]}"
 
 

@@ -118,7 +118,7 @@ def _calibration(path: Path) -> np.ndarray:
             f"{path} is missing; it states the Velodyne's pose on the camera. If poses.txt has poses of the "
             f"Velodyne, write the line '{_CALIBRATION}'."
         )
-    for line in path.read_text(errors="replace").splitlines():
+    for line in path.read_text("utf-8", errors="replace").splitlines():
         name, _, numbers = line.partition(":")
         if name.strip() in ("Tr", "Tr_velo_cam", "Tr_velo_to_cam"):
             try:

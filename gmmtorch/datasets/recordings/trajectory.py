@@ -153,7 +153,9 @@ def read_trajectory(path: str | Path, n_scans: int | None = None) -> Trajectory:
 
 def read_rows(path: Path) -> np.ndarray:
     """The numbers of a text file, one row a line; # begins a comment. Raises `DataError`."""
-    lines = [line for line in path.read_text(errors="replace").splitlines() if line.split("#")[0].strip()]
+    lines = [
+        line for line in path.read_text("utf-8", errors="replace").splitlines() if line.split("#")[0].strip()
+    ]
     if not lines:
         raise DataError(f"{path} contains no row of numbers.")
     try:

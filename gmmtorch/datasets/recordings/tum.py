@@ -113,7 +113,7 @@ def _listed(path: Path) -> tuple[np.ndarray, list[Path]]:
     if not path.is_file():
         raise DataError(f"{path} is missing; it lists a time and a file for each depth image.")
     times, files = [], []
-    for number, line in enumerate(path.read_text(errors="replace").splitlines(), 1):
+    for number, line in enumerate(path.read_text("utf-8", errors="replace").splitlines(), 1):
         words = line.split("#")[0].split()
         if not words:
             continue

@@ -179,7 +179,7 @@ def kept_row(trial: Trial, **more: Any) -> dict[str, Any] | None:
         return None
     path = trial.folder / ROW
     try:
-        kept = json.loads(path.read_text())
+        kept = json.loads(path.read_text("utf-8"))
         row: dict[str, Any] = kept["row"]
         is_same = kept["facts"] == {**trial.facts(), **more}
     except (ValueError, KeyError, TypeError) as error:

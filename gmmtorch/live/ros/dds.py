@@ -17,6 +17,10 @@ from gmmtorch.optional_packages import needs_extra
 
 LOOPBACK = "127.0.0.1"
 MAX_DOMAIN = 232
+_NO_WHEELS = (
+    " On Linux for ARM (aarch64) and for Python 3.14 this does not install cyclonedds, which has no wheels "
+    "there: choose middleware=zenoh, or build cyclonedds from its source."
+)
 _PARTICIPANTS = 60  # processes with a node on one machine, at most
 _TOPIC_PREFIX = "rt"
 _MOST_SAMPLES = 1000
@@ -43,7 +47,7 @@ class DdsMiddleware:
     def __init__(
         self, types: MessageTypes, domain: int, interface: str = LOOPBACK, peers: Sequence[str] = ()
     ) -> None:
-        with needs_extra("middleware=dds needs", "cyclonedds", "ros"):
+        with needs_extra("middleware=dds needs", "cyclonedds", "ros", note=_NO_WHEELS):
             from cyclonedds.builtin import (
                 BuiltinDataReader,
                 BuiltinTopicDcpsPublication,

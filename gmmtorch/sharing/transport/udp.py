@@ -25,6 +25,8 @@ _LARGEST_READ = 1 << 16
 _SO_RXQ_OVFL = 40  # of Linux; Python has no name for it
 _IP_MULTICAST_ALL = 49  # of Linux; Python has no name for it
 _PAUSE = 0.01  # seconds, after the socket has failed
+_HAS_NOTES = hasattr(socket.socket, "recvmsg_into")  # not on Windows
+_BINDS_GROUPS = sys.platform != "win32"  # there a socket must be bound to an address of the machine
 
 
 class UdpTransport(FramedTransport):
@@ -119,7 +121,10 @@ class UdpTransport(FramedTransport):
                 f"group={group[0]!r} must be a multicast address, such as 239.71.77.7."
             )
         _check_key("interface", (interface, 0), key, insecure)
-        return cls(robot, lambda: multicast_socket(group, interface, ttl), key, max_waiting)
+        transport = cls(robot, lambda: multicast_socket(group, interface, ttl), key, max_waiting)
+        transport.address = (group[0], transport.address[1])
+        transport._peers = [transport.address]
+        return transport
 
     @property
     def peers(self) -> list[Address]:
@@ -164,7 +169,7 @@ class UdpTransport(FramedTransport):
         """Read all frames that the socket has."""
         while not self._closing.is_set():
             try:
-                size, notes, _, source = self._socket.recvmsg_into([buffer], socket.CMSG_SPACE(4))
+                size, notes, source = self._received(buffer)
             except BlockingIOError:
                 return
             except OSError as error:
@@ -173,6 +178,14 @@ class UdpTransport(FramedTransport):
                 return
             self._count_overflow(notes)
             self._take(bytes(buffer[:size]), f"{source[0]}:{source[1]}")
+
+    def _received(self, buffer: memoryview) -> tuple[int, list[tuple[int, int, bytes]], Address]:
+        """Number of bytes of the next frame, notes of the system, and the sender. Raises `OSError`."""
+        if not _HAS_NOTES:
+            size, source = self._socket.recvfrom_into(buffer)
+            return size, [], source
+        size, notes, _, source = self._socket.recvmsg_into([buffer], socket.CMSG_SPACE(4))
+        return size, notes, source
 
     def _count_overflow(self, notes: list[tuple[int, int, bytes]]) -> None:
         """Read how many datagrams the system has had no room for so far, which Linux reports with each
@@ -204,7 +217,7 @@ def multicast_socket(group: Address, interface: str, ttl: int) -> socket.socket:
         bound.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
     elif hasattr(socket, "SO_REUSEPORT"):  # BSD shares a port only with this option
         bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
-    _bound(bound, "group", group)
+    _bound(bound, "group", group if _BINDS_GROUPS else ("", group[1]))
     try:
         card = socket.inet_aton(interface)
         bound.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, socket.inet_aton(group[0]) + card)
