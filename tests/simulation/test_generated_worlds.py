@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.ndimage import label
 
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.voxelize import occupied_cells
 from gmmtorch.simulation.worlds.furniture import UNIT_CUBE, copies
@@ -132,6 +132,13 @@ def interior(seed: int, spacing: float = 0.5) -> tuple[torch.Tensor, torch.Tenso
             position[:, 2] += side * torch.where(hit, distance + 1e-3, 1e3)
         odd &= crossings % 2 == 1
     return odd.view([len(axis) for axis in axes]), points[odd], mesh.clearance(points[odd])
+
+
+def test_a_mine_names_the_version_of_open3d_that_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh = pytest.importorskip("open3d").t.geometry.TriangleMesh
+    monkeypatch.delattr(mesh, "create_isosurfaces")
+    with pytest.raises(GmmTorchError, match=r"needs Open3D 0\.19"):
+        tunnels(0, (40.0, 40.0, 7.0))
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import check_whole
+from gmmtorch.errors import GmmTorchError, check_whole
 from gmmtorch.optional_packages import load_open3d
 from gmmtorch.simulation.worlds.floor_plan import checked_size, uniform
 from gmmtorch.simulation.worlds.mesh_world import have_area
@@ -154,6 +154,11 @@ def _noise(shape: torch.Size, wavelength: float, generator: torch.Generator) -> 
 def _surface(field: Tensor) -> Tensor:
     """Triangles (T, 3, 3) of the zero surface of the field, by Open3D's dual contouring."""
     open3d = load_open3d("A mine cannot be built")
+    if not hasattr(open3d.t.geometry.TriangleMesh, "create_isosurfaces"):
+        raise GmmTorchError(
+            f"A mine (world=tunnels) needs Open3D 0.19; {open3d.__version__} is installed: "
+            "pip install 'open3d>=0.19'."
+        )
     volume = open3d.core.Tensor(field.permute(2, 1, 0).contiguous().numpy())
     mesh = open3d.t.geometry.TriangleMesh.create_isosurfaces(volume)
     corners = torch.from_numpy(mesh.vertex.positions.numpy()).double()
