@@ -1,7 +1,6 @@
 """Odometry in simulated worlds whose poses are known, and on bad input."""
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -11,8 +10,7 @@ from gmmtorch.datasets import load
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.evaluation.trajectories import absolute_trajectory_error
 from gmmtorch.localization import Odometry, with_odometry
-from gmmtorch.localization.location import Location
-from gmmtorch.localization.odometry.local_map import Expectation, LocalMap, _Found
+from gmmtorch.localization.odometry.local_map import Expectation, LocalMap
 from gmmtorch.localization.odometry.odometry import _RULE, _scaled
 
 N_2D, N_3D = 14, 6
@@ -124,16 +122,6 @@ def test_the_first_search_in_3d_reaches_past_the_nearest_maximum(seed):
     location = local.locate(Odometry()._scan(after), Expectation(predicted[None], 0.3, 0.2, 0.95))
     assert location.found
     assert float(location.pose[:3, 3].norm()) < 0.05
-
-
-def test_a_wider_search_does_not_replace_a_doubtful_pose_by_one_with_less_evidence(monkeypatch):
-    local = LocalMap([Odometry()._scan(wall(torch.Generator().manual_seed(0), 400, 8, 2)[:, :2])], 0.5, _RULE)
-    likely = Location(torch.eye(3).double(), torch.eye(3).double(), 0.9, ("a direction is open",))
-    unlikely = replace(likely, pose=2 * likely.pose, doubts=())
-    results = iter([_Found(likely, 126.0, 0.0, True), _Found(unlikely, 91.0, 0.0, True)])
-    monkeypatch.setattr(LocalMap, "_searches", lambda *_: iter([(None, None)] * 2))
-    monkeypatch.setattr(LocalMap, "_climbed", lambda *_: next(results))
-    assert local.locate(None, Expectation(likely.pose[None], 0.3, 0.2, 0.95)) is likely
 
 
 @pytest.mark.parametrize("seed", [0, 2])

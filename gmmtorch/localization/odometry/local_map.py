@@ -78,15 +78,11 @@ class Expectation(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """The result of one search, with the share of the points against it, and whether the points allow it: an
-    open direction or a second pose is no reason against it. total: its log-likelihood (nats); of a pose that
-    the points do not allow, only that of the motion.
-    """
+    """The result of one search, with its log-likelihood (nats) and the share of the points against it."""
 
     location: Location
     total: float
     contradicted: float
-    possible: bool
 
 
 class LocalMap:
@@ -121,7 +117,7 @@ class LocalMap:
         best: _Found | None = None
         for starts, targets in self._searches(scan, expected):
             tried = self._climbed(scan, expected, starts, targets)
-            if best is None or (tried.possible, tried.total) > (best.possible, best.total):
+            if best is None or (tried.location.found, tried.total) > (best.location.found, best.total):
                 best = tried
             supported = best.location.explained - best.contradicted
             if best.location.found and supported >= _USUAL * expected.explained:
@@ -236,7 +232,6 @@ class LocalMap:
             doubts.append(f"{contradicted:.0%} of the points contradict the free space of the last scans")
         if share < self.least_explained:
             doubts.append(f"only {share:.0%} of the points lie on surfaces of the last scans")
-        is_possible = not doubts
         if doubts:
             covariance = covariance + nowhere(self.dim)
         if loosest > _LOOSEST:
@@ -244,9 +239,9 @@ class LocalMap:
         if bool(rivals.any()):
             doubts.append("another pose explains the scan as well")
             covariance = covariance + _scatter(poses[best], poses[chosen])
-        location = Location(poses[best], covariance, share, tuple(doubts))
-        likelihood = float(total[best]) if is_possible else -float(self._unlikely(poses, expected)[best])
-        return _Found(location, likelihood, contradicted, is_possible)
+        return _Found(
+            Location(poses[best], covariance, share, tuple(doubts)), float(total[best]), contradicted
+        )
 
     def _motions(self, poses: Tensor) -> Motions:
         return Motions(poses[:, :-1, :-1], poses[:, :-1, -1] - self._center)
