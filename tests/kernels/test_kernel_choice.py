@@ -117,7 +117,7 @@ from gmmtorch.kernels.mixtures.distinct_keys import distinct_keys
 logging.basicConfig(level=logging.INFO)
 from gmmtorch.kernels import use_kernels
 use_kernels("fused")
-distinct_keys(torch.arange(5), False)"""
+distinct_keys(torch.arange(5))"""
     command, environment = [sys.executable, "-c", code], {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
     options = {"env": environment, "capture_output": True, "text": True, "check": True}
     first, second = (subprocess.run(command, **options) for _ in range(2))

@@ -23,9 +23,6 @@ from gmmtorch.scan import Scan
 
 _BLURS = {2: (0.2, 0.08, 0.03), 3: (0.25, 0.1, 0.04)}  # metres
 _STEPS = 15  # of a level
-_SLIDE = 1.0  # metres that the best pose is moved at most along its loosest direction, in
-_SLIDES = 16  # places, each of which climbs
-_SLIDE_STEPS = 3
 _SPACING = {2: 0.25, 3: 0.5}  # metres between the starts of the first search
 _COARSE = {2: 0.5, 3: 1.0}  # metres of blur, and between the starts, of the last search
 _TURNED = {
@@ -175,23 +172,15 @@ class LocalMap:
         motions, kept = self._motions(starts), len(starts)
         for target in targets:
             points = scan.points[: self.n_points if target is targets[-1] else _COARSE_POINTS]
+            found = align(points, target, motions, _STEPS)
             kept = max(kept // 3, 3)
-            found = self._ranked(align(points, target, motions, _STEPS), points, expected, target.blur)[0]
-            found = found.at(torch.arange(min(kept, len(found.score))))
+            total, view = self._total(found, points, expected)
+            order = total.argsort(descending=True, stable=True)
+            order = order[distinct(found.motions.at(order), target.blur / 2, target.blur / 2)]
+            order = order[:kept]
+            found, total, view = found.at(order), total[order], view.at(order)
             motions = found.motions
-        # A climb has the points' score alone, which can rise along a wall while the sum of evidence falls.
-        slid = align(points, targets[-1], _slid(found, points), _SLIDE_STEPS)
-        both = Alignment(motions.joined(slid.motions), *map(torch.cat, zip(found[1:], slid[1:], strict=True)))
-        return self._judged(points, *self._ranked(both, points, expected, targets[-1].blur), expected)
-
-    def _ranked(
-        self, found: Alignment, points: Tensor, expected: Expectation, blur: float
-    ) -> tuple[Alignment, Tensor, View]:
-        """Different poses, best first, with their log-likelihoods and how they agree with free space."""
-        total, view = self._total(found, points, expected)
-        order = total.argsort(descending=True, stable=True)
-        order = order[distinct(found.motions.at(order), blur / 2, blur / 2)]
-        return found.at(order), total[order], view.at(order)
+        return self._judged(points, found, total, view, expected)
 
     def _total(self, found: Alignment, points: Tensor, expected: Expectation) -> tuple[Tensor, View]:
         """Log-likelihood of the points and of the motion (B,), nats; how the points agree with free space."""
@@ -252,16 +241,6 @@ class LocalMap:
         poses[:, :-1, :-1] = left @ right
         poses[:, :-1, -1] = motions.translations + self._center
         return poses
-
-
-def _slid(found: Alignment, points: Tensor) -> Motions:
-    """Motions along the direction that the points fix least, on both sides of the first one."""
-    covariance, loosest = pose_covariance(found.information[0], points)
-    scale = torch.ones(len(covariance)).double()
-    scale[points.shape[1] :] = 1 / points.norm(dim=1).median().clamp_min(1e-3)
-    axis = torch.linalg.eigh(covariance / scale[:, None] / scale)[1][:, -1] * scale
-    steps = torch.linspace(-1, 1, _SLIDES).double() * min(2 * loosest, _SLIDE)
-    return found.motions.at(torch.zeros(_SLIDES, dtype=torch.int64)).moved(steps[:, None] * axis)
 
 
 def nowhere(dim: int) -> Tensor:
