@@ -97,9 +97,9 @@ def continued(rotation: Tensor, last: Tensor | None, ratio: float = 1.0) -> Tens
 
 def _with_rotation(rotation: Tensor) -> Tensor:
     """The motion (D+1, D+1) with this rotation (D, D) and no translation."""
-    return (
-        torch.nn.functional.pad(rotation, (0, 1, 0, 1)) + torch.eye(len(rotation) + 1).to(rotation)[-1].diag()
-    )
+    motion = torch.eye(len(rotation) + 1).to(rotation)
+    motion[:-1, :-1] = rotation
+    return motion
 
 
 def _mean_rotation(rotation: Tensor) -> Tensor:

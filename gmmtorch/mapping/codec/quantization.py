@@ -217,6 +217,7 @@ def spatial_order(components: Components) -> Tensor:
 
 
 def _order(means: Tensor, covariances: Tensor) -> Tensor:
+    """`spatial_order` of means (K, D) and covariances (K, D, D) on the CPU."""
     return order_of(lattice.nearest(means.double(), covariances.double()))
 
 

@@ -72,7 +72,7 @@ def natural_parameters(parameters: Parameters) -> Tensor:
 
 
 def _natural_parameters(parameters: Parameters, factors: Tensor) -> Tensor:
-    """The same, with the Cholesky factors (K, D, D) of the covariances."""
+    """`natural_parameters`, from the lower Cholesky factors (K, D, D) of the covariances."""
     weights, means, _ = parameters
     dim = means.shape[1]
     whiten = inverse_factor(factors)

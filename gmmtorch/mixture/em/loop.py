@@ -16,7 +16,7 @@ from gmmtorch.mixture.em import exact
 from gmmtorch.mixture.em.covariance_types import constrain
 from gmmtorch.mixture.em.exact import Parameters
 
-_STEPS_AHEAD = 8  # on a GPU, where to wait for a bound takes about as long as a step
+_STEPS_AHEAD = 8  # on a GPU: steps between two waits for their bounds
 State = TypeVar("State")  # what an iteration improves: `Parameters`, or a posterior
 
 Step = Callable[[State], tuple[State, float]]

@@ -122,6 +122,7 @@ class UdpTransport(FramedTransport):
             )
         _check_key("interface", (interface, 0), key, insecure)
         transport = cls(robot, lambda: multicast_socket(group, interface, ttl), key, max_waiting)
+        # The socket's own address is not the group's where it cannot be bound to one.
         transport.address = (group[0], transport.address[1])
         transport._peers = [transport.address]
         return transport
