@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from cli.robot.robot_cases import LOG, SMALL
 from command_runs import QUIET, Disk, Finished, refused, room_mesh, run_here, succeeded
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 from sharing.test_publish import everything
-from test_robot_command import LOG, SMALL
 
 from gmmtorch.cli import team
 from gmmtorch.cli.from_options.robots import facts_of

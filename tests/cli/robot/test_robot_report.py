@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_runs import Disk, as_it_was, composed
+from cli.command_runs import Disk, as_it_was, composed
 
 from gmmtorch.cli import common
 from gmmtorch.cli.reporting.robot_report import Outputs, RobotReport, print_refusals, terse

@@ -1,4 +1,4 @@
-"""gmmtorch-robot: what a robot writes, alone and in a team, killed and restarted; and bad input."""
+"""gmmtorch-robot: what a robot writes, alone and in a team, killed and restarted."""
 
 from __future__ import annotations
 
@@ -6,72 +6,41 @@ import contextlib
 import os
 import shutil
 import signal
-import socket
 import sqlite3
 import subprocess
 import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from command_runs import (
+from cli.command_runs import (
     CHECKOUT,
     QUIET,
     Disk,
     Finished,
-    as_it_was,
-    composed,
     environment,
     refused,
     room_mesh,
-    run_here,
     succeeded,
 )
+from cli.robot.robot_cases import LOG, SMALL
 from exploration.replays import content
 
 from gmmtorch.cli import robot
 from gmmtorch.cli.from_options import links
-from gmmtorch.cli.from_options.robots import facts_of
 from gmmtorch.exploration.mission.replay import ReplayMission
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.sharing.messages.message_registry import encode_plan
 from gmmtorch.sharing.replica.replica import Replica
-from gmmtorch.sharing.store import Store
 from gmmtorch.sharing.transport.frames import FramedTransport
 from gmmtorch.sharing.transport.security import TeamKey
-from gmmtorch.sharing.transport.team_key import KEY_VARIABLE
 from gmmtorch.sharing.transport.udp import UdpTransport
-
-Run = Callable[..., Finished]
-
-SMALL = ["sensor.width=48", "sensor.height=36", "runtime.cache=false"]
-LOG = [
-    "source=log",
-    "dataset@log.dataset=synthetic_building_2d",
-    "log.dataset.n_scans=12",
-    "log.dataset.stride=2",
-]
-LOG += ["map@log.map=windowed", "log.map.window=3", "settle=0"]
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
-    """Runs a robot in this process, at a free address, without figures unless told otherwise."""
-    monkeypatch.delenv(KEY_VARIABLE, raising=False)
-
-    def run_command(*options: str, name: str = "run") -> Finished:
-        chosen = {option.split("=")[0] for option in options}
-        defaults = [*QUIET, "link.listen=127.0.0.1:0", "team.size=1"]
-        kept = [option for option in defaults if option.split("=")[0] not in chosen]
-        return run_here(monkeypatch, "robot", tmp_path / name, *kept, *options)
-
-    return run_command
 
 
 @contextmanager
@@ -354,136 +323,3 @@ def test_a_killed_robot_continues_and_its_teammate_catches_up(run, tmp_path):
         return content(GaussianMap.load(tmp_path / path).components())
 
     assert content(late.replica.components()) == said(row["own_map_path"]) == said(unharmed["own_map_path"])
-
-
-# -- bad input ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ("clock=lockstep", "clock=lockstep clock=wall speed=2"),
-        ("source=radio", "source='radio' world, log"),
-        ("clock=sun", "clock='sun' wall"),
-        ("transport=pigeon", "transport='pigeon' udp, zenoh"),
-        ("id=2 team.size=2", "id=2 team.size=2"),
-        ("source=log", "source=log dataset@log.dataset=carmen"),
-        ("source=log dataset@log.dataset=carmen log.dataset.path=/no/log", "log.dataset.path=/no/log"),
-        ("link.listen=7400", "link.listen='7400' 127.0.0.1:7447"),
-        ("link.listen=127.0.0.1:70000", "link.listen='127.0.0.1:70000'"),
-        ("link.peers=[127.0.0.1]", "link.peers='127.0.0.1'"),
-        ("link.listen=0.0.0.0:0", "link.listen='0.0.0.0' link.key_file link.insecure=True"),
-        ("link.group=239.71.77.7:7400 link.interface=10.1.2.3", "link.interface='10.1.2.3' link.key_file"),
-        ("link.group=10.0.0.1:7400", "link.group='10.0.0.1' multicast"),
-        ("link.group=239.71.77.7:7400 link.ttl=256", "link.ttl=256"),
-        ("link.group=239.71.77.7:0", "link.group='239.71.77.7:0'"),
-        ("link.peers=[10.0.0.2:7400]", "link.peers= link.listen= 0.0.0.0"),
-        ("link.listen=198.51.100.7:0 link.insecure=true", "link.listen=198.51.100.7:0 0.0.0.0"),
-        ("link.key_file=/nowhere/team.key", "/nowhere/team.key openssl"),
-        ("transport=zenoh", "link.listen_endpoints=[] link.connect_endpoints=[]"),
-        ("transport=zenoh link.scouting=true", "link.scouting=True link.key_file link.insecure=True"),
-        (
-            "transport=zenoh link.listen_endpoints=[tcp/10.0.0.3:7447]",
-            "link.listen_endpoints='tcp/10.0.0.3:7447'",
-        ),
-    ],
-)
-def test_a_bad_value_is_named_in_one_line(options, words, run):
-    line = refused(run(*options.split()))
-    for word in words.split():
-        assert word in line
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ("speed=0", "speed=0.0"),
-        ("settle=inf", "settle=inf"),
-        ("log.rate=0", "log.rate=0.0"),
-    ],
-)
-def test_paces_are_checked_before_anything_is_opened(options, words, run, monkeypatch):
-    monkeypatch.setattr(links, "open_link", None)
-    assert words in refused(run(*LOG, options))
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ("log.every=0", "log.every=0"),
-        ("log.map.prior=-1", "log.map.prior=-1.0"),
-        ("log.part=odd", "log.part='odd'"),
-        ("log.start=here", "log.start='here'"),
-        ("journal.sync=never", "journal.sync='never'"),
-    ],
-)
-def test_a_bad_value_for_a_log_is_named_in_one_line(options, words, run):
-    line = refused(run(*LOG, *options.split()))
-    for word in words.split():
-        assert word in line
-
-
-@pytest.mark.parametrize(
-    ("option", "host", "remedy"),
-    [
-        ("link.listen", "127.0.0.1", "give another port, or 0 for any that is free."),
-        ("link.group", "239.71.77.7", "give another port."),
-    ],
-)
-def test_a_port_in_use_is_named_with_the_remedy(option, host, remedy, run):
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
-        taken.bind(("", 0))
-        where = f"{option}={host}:{taken.getsockname()[1]}"
-        line = refused(run(*LOG, where))
-    assert f"{where} " in line
-    assert "another process has that port" in line
-    assert remedy in line
-
-
-def test_a_robot_without_peers_is_warned_of(run):
-    said = succeeded(run(*LOG, "team.size=2", "log.rate=50")).stdout
-    assert "link.peers=[]: robot 0 sends to no other robot" in said
-
-
-def test_a_store_of_another_log_is_rejected(run, tmp_path):
-    kept = f"journal.folder={tmp_path / 'kept'}"
-    said = f"{kept} holds no robot_0.sqlite: the map starts empty."
-    assert said in succeeded(run(*LOG, "log.rate=50", kept)).stdout
-    assert "every" in refused(run(*LOG, "log.rate=50", kept, "log.every=2", name="other"))
-    again = succeeded(run(*LOG, "log.rate=40", kept, name="again"))  # the rate may change
-    assert said not in again.stdout
-
-
-def test_a_store_of_another_world_is_rejected(run, tmp_path):
-    kept = f"journal.folder={tmp_path / 'kept'}"
-    succeeded(run(*LOG, "log.rate=50", kept))
-    line = refused(run(kept, name="flying"))
-    assert f"{kept.split('=')[0]}=" in line
-    assert "source" in line
-
-
-def test_a_store_in_use_is_named_by_its_option(run, tmp_path):
-    with Store(tmp_path / "robot_0.sqlite", 0, {}):
-        line = refused(run(*LOG, f"journal.folder={tmp_path}"))
-    assert "journal.folder=" in line
-    assert "runs already" in line
-    assert "path=" not in line
-
-
-def facts(*options: str) -> dict[str, object]:
-    return facts_of(composed("robot", *options))
-
-
-def test_facts_that_identify_a_world(tmp_path):
-    with as_it_was():
-        warehouse = facts()
-        for other in ("world=tunnels", "world.seed=1", "world.size=[20,20,8]"):
-            assert facts(other) != warehouse, other
-        for same in ("seed=3", "world.resolution=0.4", "team.size=2", "sensor.max_range=4", "planner=random"):
-            assert facts(same) == warehouse, same
-        one, moved = room_mesh(tmp_path / "one.obj"), room_mesh(tmp_path / "moved.obj")
-        meshes = [facts("world=mesh", f"world.path={path}") for path in (one, moved)]
-        assert meshes[0] == meshes[1]
-        one.write_text(one.read_text().replace("7.0", "7.5"))
-        assert facts("world=mesh", f"world.path={one}") != meshes[0]
-        assert facts("world=mesh") != meshes[0]
