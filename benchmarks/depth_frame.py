@@ -101,7 +101,7 @@ def main() -> None:
     header = ["", "ms a frame, median", "log-likelihood a pixel", "AUC of the map"]
     height, width = frames[0][0].shape
     sizes = f"{len(frames)} frames of {width} × {height}, {N_COMPONENTS} components each"
-    publish("depth", f"{sizes}; {RESOLUTION} m. {hardware()}\n\n{markdown(header, rows)}")
+    publish("depth", f"{sizes}; {RESOLUTION} m. {hardware(options.device)}\n\n{markdown(header, rows)}")
 
 
 if __name__ == "__main__":

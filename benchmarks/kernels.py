@@ -218,7 +218,7 @@ def main() -> None:
             work_on_maps = map_work(options.data, options.points, options.device)
             rows += [compared(work, options.repeats, options.device) for work in work_on_maps]
         header = ["work", "", "tensor operations", "fused", "times faster"]
-        publish("kernels", f"{options.rays:,} rays. {hardware()}\n\n{markdown(header, rows)}")
+        publish("kernels", f"{options.rays:,} rays. {hardware(options.device)}\n\n{markdown(header, rows)}")
         publish("operations", operations_table(options.device))
 
 

@@ -68,7 +68,8 @@ def main() -> None:
             ]
         )
     header = ["rule", "pixels used", "frames/s", "AUC", "components", "bytes"]
-    note = f"{len(frames)} frames of 640 × 480; at most {arguments.max_bytes:,} bytes. {hardware()}"
+    machine = hardware(arguments.device)
+    note = f"{len(frames)} frames of 640 × 480; at most {arguments.max_bytes:,} bytes. {machine}"
     publish("map-building", f"{note}\n\n{markdown(header, rows)}")
 
 

@@ -86,28 +86,30 @@ def room(n: int) -> Tensor:
     return (points + 0.01 * torch.randn(n, 3, generator=generator)).double()
 
 
-def rays(resolution: float) -> Work:
-    """300,000 rays of about 5 m, counted in a dense grid of 20 × 20 × 4 m."""
+def rays(resolution: float, device: str, n: int = 300_000) -> Work:
+    """n rays of about 5 m, counted in a dense grid of 20 × 20 × 4 m."""
     extent = torch.tensor([20.0, 20.0, 4.0], dtype=torch.float64)
-    starts = uniform(300_000, 3) * extent
-    steps = 3 * torch.randn(300_000, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    starts = uniform(n, 3) * extent
+    steps = 3 * torch.randn(n, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     ends = (starts + steps).clamp(torch.full_like(extent, 1e-6), extent - 1e-6)
     grid = gt.VoxelGrid((0.0, 0.0, 0.0), resolution, tuple(round(float(x) / resolution) for x in extent))
-    return lambda: gt.Evidence.empty(grid).add_rays(starts, ends)
+    starts, ends = starts.to(device), ends.to(device)
+    return lambda: gt.Evidence.empty(grid, device).add_rays(starts, ends)
 
 
-def exact_em() -> Work:
-    """Five iterations of exact EM on 100,000 points with 1,000 components."""
-    points = room(100_000)
+def exact_em(device: str, n: int = 100_000) -> Work:
+    """Five iterations of exact EM on n points with 1,000 components."""
+    points = room(n)
     start = {
-        "means_init": points[::100].numpy(),
+        "means_init": points[:: n // 1000].numpy(),
         "precisions_init": 25.0 * torch.eye(3).repeat(1000, 1, 1).numpy(),
     }
+    points = points.to(device)
     return lambda: gt.GaussianMixture(1000, algorithm="exact", max_iter=5, tol=0.0, **start).fit(points)
 
 
-def em(n: int, k: int) -> Work:
-    points = room(n)
+def em(n: int, k: int, device: str) -> Work:
+    points = room(n).to(device)
     return lambda: gt.GaussianMixture(k, tol=2e-3, reg_covar=1e-5, random_state=0).fit(points)
 
 
@@ -116,9 +118,15 @@ def frames(data: Path) -> tuple[list[tuple[Tensor, Tensor]], Tensor]:
     return [dataset.image(i) for i in range(len(dataset)) if i % 5], dataset.intrinsics
 
 
-def built(data: Path, stride: int, **rule: float) -> gt.GaussianMap:
+def prepare(data: Path) -> None:
+    """Read the frames."""
+    FRAMES[0][:], intrinsics = frames(data)
+    FRAMES[1].copy_(intrinsics)
+
+
+def built(images: list[tuple[Tensor, Tensor]], stride: int, **rule: float) -> gt.GaussianMap:
     made = gt.GaussianMap(gt.IncrementalRule(max_bytes=8000, **rule), **MAP)
-    made.insert_depth(*FRAMES, stride)
+    made.insert_depth(images, FRAMES[1], stride)
     made.finish()
     return made
 
@@ -126,9 +134,14 @@ def built(data: Path, stride: int, **rule: float) -> gt.GaussianMap:
 FRAMES: tuple[list[tuple[Tensor, Tensor]], Tensor] = ([], torch.eye(3))
 
 
-def queries(data: Path, name: str) -> Work:
+def frames_to_map(device: str, stride: int, **rule: float) -> Work:
+    images = [(depth.to(device), pose) for depth, pose in FRAMES[0]]
+    return lambda: built(images, stride, **rule)
+
+
+def queries(data: Path, name: str, device: str, n: int = 20_000) -> Work:
     if name == "kinect":
-        made, resolution = built(data, 4), 0.05
+        made, resolution = built(FRAMES[0], 4), 0.05
     else:
         made, resolution = gt.GaussianMap(gt.IncrementalRule(max_bytes=26_000), **MAP), 0.2
         for number, scan in enumerate(gt.datasets.load("scan_folder", data / name)):
@@ -136,22 +149,25 @@ def queries(data: Path, name: str) -> Work:
                 made.insert(scan)
         made.finish()
     low, high = made.means.amin(0), made.means.amax(0)
-    points = low + (high - low) * uniform(20_000, 3)
+    points = (low + (high - low) * uniform(n, 3)).to(device)
+    made = made if device == "cpu" else made.to(device)
     made.occupancy(points[:100], resolution)  # makes the spatial index
     return lambda: made.occupancy(points, resolution)
 
 
-def flux(data: Path) -> Work:
-    made = built(data, 4)
+def flux(device: str) -> Work:
+    made = built(FRAMES[0], 4)
     low, high = made.means.quantile(0.02, 0), made.means.quantile(0.98, 0)
     shape = tuple(((high - low) / 0.1).ceil().long().tolist())
     grid = gt.VoxelGrid(tuple(low.tolist()), 0.1, shape)
+    made = made if device == "cpu" else made.to(device)
     return lambda: made.evidence(grid, "flux")
 
 
-def frame() -> Work:
+def frame(device: str) -> Work:
     """A cloud of 20,000 points becomes a map of its own, as a frame inserted into a map does."""
     scan = gt.Scan(room(20_000), torch.tensor([4.0, 3.0, 1.5], dtype=torch.float64))
+    scan = scan if device == "cpu" else scan.to(device)
 
     def insert() -> None:
         made = gt.GaussianMap(gt.IncrementalRule(noise=0.01, length=0.5, cell=0.05, window=1), **MAP)
@@ -161,7 +177,7 @@ def frame() -> Work:
     return insert
 
 
-def registration(data: Path) -> Work:
+def registration(data: Path, device: str) -> Work:
     try:
         from gmmtorch import register
     except ImportError:
@@ -172,26 +188,37 @@ def registration(data: Path) -> Work:
         part = gt.GaussianMap(gt.IncrementalRule(noise=0.02, length=0.6, cell=0.05, window=1))
         part.insert(scans[place])
         part.finish()
-        made.append(part)
+        made.append(part if device == "cpu" else part.to(device))
     start = torch.eye(4, dtype=torch.float64)
     start[:3, 3] = torch.tensor([0.4, -0.3, 0.1], dtype=torch.float64)
     return lambda: register(made[1], made[0], start)
 
 
-def works(data: Path) -> dict[str, Callable[[], Work]]:
+def works(data: Path, device: str = "cpu") -> dict[str, Callable[[], Work]]:
     return {
-        "rays through 0.2 m, counted, dense": lambda: rays(0.2),
-        "rays through 0.05 m, counted, dense": lambda: rays(0.05),
-        "exact EM, 100,000 points, K = 1,000, five iterations": exact_em,
-        "EM, 20,000 points, K = 1,000": lambda: em(20_000, 1000),
-        "EM, 1,000,000 points, K = 2,000": lambda: em(1_000_000, 2000),
-        "112 frames to a map, default rule": lambda: lambda: built(data, 4),
-        "112 frames to a map, fast rule, every pixel": lambda: lambda: built(data, 1, **FAST),
-        "a frame of 20,000 points inserted": frame,
-        "20,000 point queries, kinect in 8 kB": lambda: queries(data, "kinect"),
-        "20,000 point queries, hall in 26 kB": lambda: queries(data, "hall"),
-        "flux, kinect in 8 kB, cells of 0.1 m": lambda: flux(data),
-        "registration of two scans of hall": lambda: registration(data),
+        "rays through 0.2 m, counted, dense": lambda: rays(0.2, device),
+        "rays through 0.05 m, counted, dense": lambda: rays(0.05, device),
+        "exact EM, 100,000 points, K = 1,000, five iterations": lambda: exact_em(device),
+        "EM, 20,000 points, K = 1,000": lambda: em(20_000, 1000, device),
+        "EM, 1,000,000 points, K = 2,000": lambda: em(1_000_000, 2000, device),
+        "112 frames to a map, default rule": lambda: frames_to_map(device, 4),
+        "112 frames to a map, fast rule, every pixel": lambda: frames_to_map(device, 1, **FAST),
+        "a frame of 20,000 points inserted": lambda: frame(device),
+        "20,000 point queries, kinect in 8 kB": lambda: queries(data, "kinect", device),
+        "20,000 point queries, hall in 26 kB": lambda: queries(data, "hall", device),
+        "flux, kinect in 8 kB, cells of 0.1 m": lambda: flux(device),
+        "registration of two scans of hall": lambda: registration(data, device),
+    }
+
+
+def large_works(data: Path, device: str) -> dict[str, Callable[[], Work]]:
+    """Work that fills a GPU."""
+    return {
+        "10,000,000 rays through 0.05 m, counted, dense": lambda: rays(0.05, device, 10_000_000),
+        "exact EM, 1,000,000 points, K = 1,000, five iterations": lambda: exact_em(device, 1_000_000),
+        "EM, 10,000,000 points, K = 10,000": lambda: em(10_000_000, 10_000, device),
+        "1,000,000 point queries, kinect in 8 kB": lambda: queries(data, "kinect", device, 1_000_000),
+        "1,000,000 point queries, hall in 26 kB": lambda: queries(data, "hall", device, 1_000_000),
     }
 
 
@@ -201,8 +228,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", help="parts of names")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    FRAMES[0][:], intrinsics = frames(options.data)
-    FRAMES[1].copy_(intrinsics)
+    prepare(options.data)
     found = {}
     for name, prepared in works(options.data).items():
         if options.only and not any(part in name for part in options.only):

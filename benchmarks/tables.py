@@ -21,16 +21,17 @@ PAGE = ROOT / "BENCHMARKS.md"
 OUTPUTS = Path(os.environ.get("GMMTORCH_TABLES") or ROOT / "outputs")
 
 
-def hardware() -> str:
-    """The machine and the versions, in a line."""
+def hardware(device: str = "cpu") -> str:
+    """The machine and the versions, in a line; with the GPU, if `device` is one."""
     model = platform.processor() or platform.machine()
     cpu_info = Path("/proc/cpuinfo")
     if cpu_info.exists():
         lines = cpu_info.read_text().splitlines()
         names = [line.split(":")[1].strip() for line in lines if "model name" in line]
         model = names[0] if names else model
+    gpu = "" if device == "cpu" else f"{torch.cuda.get_device_name(device)}; "
     return (
-        f"{model}, {os.cpu_count()} cores, {torch.get_num_threads()} thread(s) used; "
+        f"{gpu}{model}, {os.cpu_count()} cores, {torch.get_num_threads()} thread(s) used; "
         f"torch {torch.__version__}, scikit-learn {sklearn.__version__}, "
         f"numpy {numpy.__version__}, Python {platform.python_version()}"
     )

@@ -14,6 +14,7 @@ from contextlib import ExitStack, contextmanager
 from typing import Any
 from unittest import mock
 
+import pytest
 import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
@@ -210,7 +211,12 @@ class PretendedGPU:
 
 @contextmanager
 def pretended_gpu() -> Iterator[PretendedGPU]:
-    """Tensors of the device "cuda" exist while the block runs."""
+    """Tensors of the device "cuda" exist while the block runs.
+
+    Skips the test where there is a real GPU: the tables that are kept for it would meet pretended tensors.
+    """
+    if torch.cuda.is_available():
+        pytest.skip("a real GPU is there")
     gpu = PretendedGPU()
     with ExitStack() as stack:
         # A wrapper cannot be an inference tensor.

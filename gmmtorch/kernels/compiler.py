@@ -35,7 +35,10 @@ _TYPES = {"int64": "int64", "double": "float64", "float": "float32", "bool": "bo
 _PACKED = {"int64": "q", "double": "d", "float": "f4x", "bool": "?7x"}
 """Formats of `struct` that place each argument of a CPU in eight bytes."""
 _POINTERS = {"int64": "int64_t", "int32": "int32_t", "uint8": "uint8_t"}
-_LEAST_ITEMS = 1 << 10  # of a thread
+_LEAST_ITEMS = 1 << 10  # of a thread of a CPU
+_BLOCK = 64
+"""Items of a block on CUDA. Few, because many kernels have some thousand items, each with much work: they
+spread over all multiprocessors."""
 _lock = threading.RLock()
 
 _PRELUDE = """
@@ -95,9 +98,7 @@ class FusedKernel:
         if device not in self._loaded:
             self.load(device)
         if device.type == "cuda":
-            wp = _warp()
-            stream = wp.stream_from_torch(torch.cuda.current_stream(device))
-            wp.launch(self._kernels["cuda"], dim=n_items, inputs=values, device=str(device), stream=stream)
+            self._cuda_launch_of_thread(device)(n_items, values)
             return
         launch = self._launch_of_thread()
         self._packed.pack_into(launch.block, 0, *values)
@@ -137,6 +138,13 @@ class FusedKernel:
             launch = self._threads.launch = _CpuLaunch(self._kernels["cpu"], self._packed.size)
         return launch
 
+    def _cuda_launch_of_thread(self, device: torch.device) -> _CudaLaunch:
+        """The same on a GPU."""
+        launches: dict[torch.device, _CudaLaunch] = self._threads.__dict__.setdefault("on_gpu", {})
+        if device not in launches:
+            launches[device] = _CudaLaunch(self._kernels["cuda"], device, len(self._parameters))
+        return launches[device]
+
     def load(self, device: torch.device) -> None:
         """Compile the kernel for a device, or load it from the cache; nothing if that is done.
 
@@ -148,7 +156,7 @@ class FusedKernel:
             if device in self._loaded:
                 return
             wp = _warp()
-            module, block = self.defined(device.type).module, 1 if device.type == "cpu" else None
+            module, block = self.defined(device.type).module, 1 if device.type == "cpu" else _BLOCK
             if not (Path(wp.config.kernel_cache_dir) / module.get_module_identifier(block)).is_dir():
                 _announce(str(device), wp.config.kernel_cache_dir)
             begin = time.perf_counter()
@@ -177,7 +185,7 @@ class FusedKernel:
                 if part == "stub":
                     scope["body"] = wp.func_native(_PRELUDE + native)(scope["body"])
             module = wp.get_module(scope["__name__"])
-            wp.set_module_options({"fuse_fp": not self._rounds_each}, module)
+            wp.set_module_options({"fuse_fp": not self._rounds_each, "block_dim": _BLOCK}, module)
             self._kernels[kind] = wp.kernel(
                 scope[self.name], enable_backward=False, module=module, grid_stride=False
             )
@@ -248,6 +256,30 @@ class _CpuLaunch:
     def __call__(self, begin: int, stop: int, block: ctypes.Array[ctypes.c_char]) -> None:
         self._launch.set_params_from_ctypes([begin, stop, ctypes.addressof(block)])
         self._launch.launch()
+
+
+class _CudaLaunch:
+    """A launch of a kernel on a GPU that can be repeated: (n_items, values of the arguments)."""
+
+    def __init__(self, kernel: Any, device: torch.device, n_values: int) -> None:
+        self._device = device
+        self._streams: dict[int, Any] = {}
+        self._launch = _warp().launch(
+            kernel, 1, inputs=[0] * n_values, device=str(device), block_dim=_BLOCK, record_cmd=True
+        )
+
+    def __call__(self, n_items: int, values: list[float]) -> None:
+        for place, value in zip(self._launch.params[1:], values, strict=True):
+            place.value = value
+        self._launch.set_dim(n_items)
+        self._launch.launch(self._current_stream())
+
+    def _current_stream(self) -> Any:
+        """The stream of torch, as Warp's: an object is made for each only once."""
+        stream = torch.cuda.current_stream(self._device)
+        if stream.cuda_stream not in self._streams:
+            self._streams[stream.cuda_stream] = _warp().stream_from_torch(stream)
+        return self._streams[stream.cuda_stream]
 
 
 @functools.cache

@@ -10,6 +10,8 @@ from gmmtorch.kernels import chunks, kernels
 from gmmtorch.kernels.mixtures import e_step
 from gmmtorch.mixture.em.exact import quadratic_features
 
+pytestmark = pytest.mark.cpu_only
+
 FULL = "CUDA out of memory. Tried to allocate 2.50 GiB. GPU 0 has a total capacity of 4.00 GiB of which ..."
 
 

@@ -1,4 +1,4 @@
-"""The main paths on a pretended GPU: they mix no devices, and give the results of the CPU."""
+"""The main paths on a pretended GPU and on a real one: they mix no devices, and give the CPU's results."""
 
 from __future__ import annotations
 
@@ -26,6 +26,8 @@ from gmmtorch.occupancy.grid import VoxelGrid
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
+
+pytestmark = pytest.mark.cpu_only
 
 
 def cloud(n: int = 4000) -> torch.Tensor:
@@ -110,18 +112,18 @@ def truncated_e_step(device):
     return found.statistics, found.owner
 
 
-@pytest.mark.parametrize(
-    "work",
-    [
-        add_rays,
-        add_sparse_rays,
-        cast_rays,
-        ask_points,
-        grid_flux,
-        fit_mixture,
-        pytest.param(build_and_ask_a_map, marks=pytest.mark.slow),
-    ],
-)
+WORK = [
+    add_rays,
+    add_sparse_rays,
+    cast_rays,
+    ask_points,
+    grid_flux,
+    fit_mixture,
+    pytest.param(build_and_ask_a_map, marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize("work", WORK)
 def test_results_of_the_pretended_gpu_are_those_of_the_cpu(work):
     with kernels("torch"):
         expected = work("cpu")
@@ -130,6 +132,19 @@ def test_results_of_the_pretended_gpu_are_those_of_the_cpu(work):
         assert all(isinstance(part, GPUTensor) for part in found)
     for one, other in zip(found, expected, strict=True):
         torch.testing.assert_close(one.held, other, rtol=1e-5, atol=1e-5, check_dtype=False)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("choice", ["torch", "fused"])
+@pytest.mark.parametrize("work", [*WORK, list_visits, exact_grid_flux, truncated_e_step])
+def test_results_of_a_gpu_are_those_of_the_cpu(work, choice):
+    with kernels("torch"):
+        expected = work("cpu")
+    with kernels(choice):
+        found = work("cuda")
+    assert {part.device.type for part in found} == {"cuda"}
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one.cpu(), other, rtol=1e-5, atol=1e-5, check_dtype=False)
 
 
 def test_the_pretended_gpu_refuses_what_a_gpu_refuses():

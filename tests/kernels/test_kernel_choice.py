@@ -14,6 +14,8 @@ import torch
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.kernels import choice, compiler, kernels, use_kernels
 
+pytestmark = pytest.mark.cpu_only
+
 ONE = torch.ones(1)
 
 

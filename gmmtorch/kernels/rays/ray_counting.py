@@ -19,9 +19,6 @@ from gmmtorch.kernels.rays.ray_traversal import CHUNK_VISITS, grid_arguments, ro
 from gmmtorch.kernels.rays.ray_walk import PARAMETERS, walk, walk_lanes
 from gmmtorch.kernels.simd import CPU_LANES
 
-_WAITING = 256
-
-
 _WAITING = 256  # visits
 
 

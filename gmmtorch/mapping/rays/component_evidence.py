@@ -76,7 +76,6 @@ def component_evidence(
     return sum_evidence(
         _drawn(components, seen[chosen], box, each, shell, hits_per_ray, thinned)
         for chosen, each in ((~is_empty, density), (is_empty, of_empty))
-        if bool(chosen.any())
     )
 
 

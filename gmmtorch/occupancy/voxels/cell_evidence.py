@@ -42,7 +42,8 @@ def sum_evidence(parts: Iterable[CellEvidence]) -> CellEvidence:
 
     Raises `InvalidArgumentError` if the cells span too large a box for 64-bit indices.
     """
-    parts = [part for part in parts if len(part.cells)]
+    given = list(parts)
+    parts = [part for part in given if len(part.cells)] or given[:1]
     if not parts:
         return CellEvidence.empty()
     if len(parts) == 1:

@@ -59,6 +59,7 @@ def test_evidence_of_points_with_gradients_comes_from_the_twin():
     assert torch.autograd.grad(found.misses.sum(), points)[0].abs().sum() > 0
 
 
+@pytest.mark.cpu_only
 def test_the_mills_ratio_of_the_kernels_equals_the_error_function():
     x = torch.cat([torch.linspace(0, 12, 2001), torch.logspace(1, 5, 200)]).double()
     t = (x - 3.5) / (x + 3.5)

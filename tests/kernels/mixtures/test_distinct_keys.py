@@ -9,6 +9,8 @@ from gmmtorch.kernels import kernels
 from gmmtorch.kernels.mixtures.distinct_keys import distinct_keys
 from gmmtorch.linalg import dense_ranks
 
+pytestmark = pytest.mark.cpu_only
+
 
 @pytest.mark.parametrize("kind", ["few", "many", "equal", "extreme", "strided"])
 def test_hashed_ranks_equal_the_sorted_ones(kind):

@@ -57,12 +57,14 @@ def test_fused_most_likely_component_is_that_of_the_twin(kind):
         assert e_step.most_likely(features[:0], natural).tolist() == []
 
 
+@pytest.mark.cpu_only
 def test_the_first_of_equal_components_is_the_most_likely():
     features = quadratic_features(torch.rand(20, 3, dtype=torch.float64))
     with kernels("fused"):
         assert set(e_step.most_likely(features, natural_parameters(mixture(41, 3, "equal"))).tolist()) == {0}
 
 
+@pytest.mark.cpu_only
 def test_threads_share_the_rows():
     features = quadratic_features(4 * torch.rand(1000, 3, dtype=torch.float64))
     natural, before = natural_parameters(mixture(20, 3, "any")), torch.get_num_threads()
@@ -84,6 +86,7 @@ def test_gradients_come_from_the_twin():
         assert not e_step._is_fused(features, natural)
 
 
+@pytest.mark.cpu_only
 def test_rows_in_spatial_order_are_the_same_rows():
     generator = torch.Generator().manual_seed(0)
     features = quadratic_features(torch.rand(3000, 3, generator=generator, dtype=torch.float64))

@@ -17,6 +17,8 @@ from gmmtorch.kernels import kernels
 from gmmtorch.mapping.codec import lattice
 from gmmtorch.mapping.codec.lattice import Lattice
 
+pytestmark = pytest.mark.cpu_only
+
 
 def rounded_by_both(means: Tensor, covariances: Tensor) -> Lattice:
     """The lattice points of the fused kernel, after a comparison with those of the twin."""

@@ -12,6 +12,8 @@ from gmmtorch.kernels import kernels
 from gmmtorch.mixture.em.exact import quadratic_features
 from gmmtorch.mixture.em.partition import FlatnessRule, Partition, partition
 
+pytestmark = pytest.mark.cpu_only
+
 
 def cells(n: int, dim: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
     """Cells of several surfaces and a few outliers: means, weights and mean features."""

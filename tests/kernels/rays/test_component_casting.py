@@ -15,19 +15,22 @@ from gmmtorch.mapping.rays.component_evidence import component_evidence
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 
-EVERYTHING = Box(torch.tensor([-4096] * 3), torch.tensor([4096] * 3))
 OPTIONS = {
     "plain": {},
     "thinned": {"thinned": True, "shell": 0.5, "hits_per_ray": 8},
     "empty apart": {"thinned": True, "shell": 0.5, "empty_rays_per_cell": 2.0, "empty_cutoff": 1.5},
     "few": {"rays_per_cell": 0.1, "least": 1, "most": 3, "cutoff": 1.0, "thinned": True},
 }
-BOXES = {
-    "everything": EVERYTHING,
-    "slab": Box(torch.tensor([-5, -100, -100]), torch.tensor([3, 100, 100])),
-    "cell": Box(torch.tensor([0, 0, 0]), torch.tensor([1, 1, 1])),
-    "far": Box(torch.tensor([900, 900, 900]), torch.tensor([999, 999, 999])),
+CORNERS = {
+    "everything": ([-4096] * 3, [4096] * 3),
+    "slab": ([-5, -100, -100], [3, 100, 100]),
+    "cell": ([0, 0, 0], [1, 1, 1]),
+    "far": ([900, 900, 900], [999, 999, 999]),
 }
+
+
+def box_of(name: str) -> Box:
+    return Box(*(torch.tensor(corner) for corner in CORNERS[name]))
 
 
 def cases() -> dict[str, Components]:
@@ -60,10 +63,10 @@ def in_order(evidence: CellEvidence) -> CellEvidence:
 
 
 @pytest.mark.parametrize("kind", OPTIONS)
-@pytest.mark.parametrize("box", BOXES)
+@pytest.mark.parametrize("box", CORNERS)
 @pytest.mark.parametrize("case", cases())
 def test_fused_casting_equals_the_twin_up_to_rounding(case, box, kind):
-    one, other = both(cases()[case], BOXES[box], **OPTIONS[kind])
+    one, other = both(cases()[case], box_of(box), **OPTIONS[kind])
     assert torch.equal(one.cells, other.cells)
     torch.testing.assert_close(other.hits, one.hits, rtol=1e-6, atol=0)
     torch.testing.assert_close(other.misses, one.misses, rtol=1e-6, atol=0)
@@ -72,9 +75,10 @@ def test_fused_casting_equals_the_twin_up_to_rounding(case, box, kind):
 def test_evidence_of_a_part_of_the_world_is_that_part_of_all_evidence():
     with kernels("fused"):
         components, options = cases()["random"], OPTIONS["thinned"]
-        whole = component_evidence(components, 0.2, EVERYTHING, **options)
-        part = component_evidence(components, 0.2, BOXES["slab"], **options)
-    inside = ((whole.cells >= BOXES["slab"].low) & (whole.cells < BOXES["slab"].high)).all(1)
+        whole = component_evidence(components, 0.2, box_of("everything"), **options)
+        slab = box_of("slab")
+        part = component_evidence(components, 0.2, slab, **options)
+    inside = ((whole.cells >= slab.low) & (whole.cells < slab.high)).all(1)
     assert torch.equal(whole.cells[inside], part.cells)
     # Viewpoints whose points cannot be in the slab draw fewer of them, which changes the sums' rounding.
     torch.testing.assert_close(whole.misses[inside], part.misses, rtol=1e-6, atol=0)
@@ -84,8 +88,8 @@ def test_covariances_without_a_factor_are_repaired_as_by_the_twin():
     some = random_components(3, 4)
     flat = some.covariances.clone()
     flat[1] = torch.diag(torch.tensor([0.04, 0.04, 0.0], dtype=torch.float64))
-    one, other = both(replace(some, covariances=flat), EVERYTHING)
+    one, other = both(replace(some, covariances=flat), box_of("everything"))
     assert torch.equal(one.misses, other.misses)
     flat[1, 0, 0] = torch.nan
     with kernels("fused"), pytest.raises(NumericalError, match=r"covariances\["):
-        component_evidence(replace(some, covariances=flat), 0.2, EVERYTHING)
+        component_evidence(replace(some, covariances=flat), 0.2, box_of("everything"))

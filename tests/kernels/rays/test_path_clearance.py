@@ -12,7 +12,10 @@ from gmmtorch.exploration.planning.coordination import PeerTrajectories
 from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
 from gmmtorch.kernels.compiler import compiler_failure
 
-pytestmark = pytest.mark.skipif(compiler_failure() is not None, reason="the kernel compiler does not work")
+pytestmark = [
+    pytest.mark.cpu_only,
+    pytest.mark.skipif(compiler_failure() is not None, reason="the kernel compiler does not work"),
+]
 
 LIBRARY = Primitives(Dynamics())
 CELL = 0.2
