@@ -1,9 +1,10 @@
 """E-step of exact EM (2.3): responsibilities of all components, summed over rows into sufficient statistics.
 
-The fused kernel runs on the CPU. It works on eight rows at a time, in float64, and skips responsibilities
-below e⁻³⁷ of the row's largest term: a far component costs its log-density and nothing more. Statistics
-differ from the twin's with float64 exponentials by at most 10⁻¹² of their largest entry. On a GPU the twin
-runs: it is two matrix products.
+The fused kernels compute in float64 and skip responsibilities below e⁻³⁷ of the row's largest term: a far
+component costs its log-density and nothing more. Statistics differ from the twin's with float64 exponentials
+by at most 10⁻¹² of their largest entry. On a CPU one kernel works on eight rows at a time. On a GPU the first
+kernel sums over the components of each row, and the second over the rows of each component; no block of
+N × K numbers is written to memory.
 """
 
 from __future__ import annotations
@@ -21,6 +22,10 @@ SKIPPED = 37.0
 
 _FEW_ROWS = 2048  # in fewer rows, their order matters little
 _PARTS = 64  # most parts of the rows; each has its own sums, so that threads write apart
+_GPU_THREADS = (
+    1 << 18
+)  # as many as a large GPU holds at a time; each sums one component over a part of the rows
+_GPU_ROWS = 32  # least rows of a part
 
 PRODUCTS = """
         vec a = x[0] * w[0], b = x[0] * w[WIDTH], c = x[0] * w[2 * WIDTH], d = x[0] * w[3 * WIDTH];
@@ -85,6 +90,47 @@ _LIKELIEST = """
         for (int l = 0; l < lane_rows; ++l) likeliest[row + l] = (int64_t)get(first, l);
     }
 """
+_NORMS_ON_GPU = """
+    double x[WIDTH];
+    for (int f = 0; f < WIDTH; ++f) x[f] = features[item * WIDTH + f];
+    auto logit = [&](int64_t k) {
+        const double* w = natural + k * WIDTH;
+        double sum = x[0] * w[0];
+        for (int f = 1; f < WIDTH; ++f) sum = fma(x[f], w[f], sum);
+        return sum;
+    };
+    double peak = -1e300, norm = 0.0;
+    int64_t first = 0;
+    for (int64_t k = 0; k < n_components; ++k) {
+        const double value = logit(k);
+        if (value > peak) peak = value, first = k;
+    }
+    if (likeliest) {
+        likeliest[item] = first;
+        return;
+    }
+    for (int64_t k = 0; k < n_components; ++k) {
+        const double under = logit(k) - peak;
+        if (under > -SKIPPED) norm += exp(under);
+    }
+    norms[item] = peak + log(norm);
+"""
+_SUMS_ON_GPU = """
+    const int64_t part = item / n_components, k = item % n_components;
+    const int64_t begin = n_rows * part / n_parts, stop = n_rows * (part + 1) / n_parts;
+    double w[WIDTH], sum[WIDTH];
+    for (int f = 0; f < WIDTH; ++f) w[f] = natural[k * WIDTH + f], sum[f] = 0.0;
+    for (int64_t row = begin; row < stop; ++row) {
+        const double* x = features + row * WIDTH;  // the same for all threads of a warp, but for part
+        double under = x[0] * w[0];
+        for (int f = 1; f < WIDTH; ++f) under = fma(x[f], w[f], under);
+        under -= norms[row];
+        if (!(under > -SKIPPED)) continue;
+        const double gamma = exp(under) * weight[row];
+        for (int f = 0; f < WIDTH; ++f) sum[f] = fma(gamma, x[f], sum[f]);
+    }
+    for (int f = 0; f < WIDTH; ++f) partial[item * WIDTH + f] = sum[f];
+"""
 _STORED = """
         logits[k] = a, logits[k + 1] = b, logits[k + 2] = c, logits[k + 3] = d;
         a = a > b ? a : b;
@@ -122,6 +168,15 @@ _EXPECTATION = {
     for dim in (1, 2, 3)
 }
 _MOST_LIKELY = {dim: _kernel("most_likely", _LIKELIEST, "int64* likeliest", dim) for dim in (1, 2, 3)}
+_NORMS = {
+    dim: _kernel("row_norms", _NORMS_ON_GPU, "double* norms, int64* likeliest", dim) for dim in (1, 2, 3)
+}
+_SHARES = {
+    dim: _kernel(
+        "component_sums", _SUMS_ON_GPU, "const double* weight, const double* norms, double* partial", dim
+    )
+    for dim in (1, 2, 3)
+}
 _DIMENSIONS = {1 + dim + dim * (dim + 1) // 2: dim for dim in _EXPECTATION}
 
 
@@ -137,17 +192,23 @@ def expectation(
         features: φ (N, F). sample_weight: p (N,). natural: W (K, F).
     """
     if _is_fused(features, sample_weight, natural):
-        return _fused(features, sample_weight, natural)
+        on_cpu = features.device.type == "cpu"
+        return (_fused if on_cpu else _fused_on_gpu)(features, sample_weight, natural)
     return _batched(features, sample_weight, natural, softmax_dtype)
 
 
 def most_likely(features: Tensor, natural: Tensor) -> Tensor:
     """The component (N,) with the largest L_nk for each row of features (N, F); natural: W (K, F)."""
     if _is_fused(features, natural):
-        likeliest = torch.empty(features.shape[0], dtype=torch.int64)
+        n, dim, device = features.shape[0], _DIMENSIONS[features.shape[1]], features.device
+        likeliest = torch.empty(n, dtype=torch.int64, device=device)
+        if device.type != "cpu":
+            given = features.contiguous(), n, natural.contiguous(), natural.shape[0], 1
+            _NORMS[dim](n, *given, None, likeliest, device=device)
+            return likeliest
         n_parts = _n_parts(features)
-        given = features.contiguous(), features.shape[0], *_by_four(natural), n_parts
-        _MOST_LIKELY[_DIMENSIONS[features.shape[1]]](n_parts, *given, likeliest, device=features.device)
+        given = features.contiguous(), n, *_by_four(natural), n_parts
+        _MOST_LIKELY[dim](n_parts, *given, likeliest, device=device)
         return likeliest
     transposed = natural.T.contiguous()
     rows = max(64, chunk_elements(features.device) // transposed.shape[1])
@@ -167,7 +228,8 @@ def in_spatial_order(features: Tensor, sample_weight: Tensor) -> tuple[Tensor, T
     places = features[:, 1 : 1 + dim].contiguous()
     low, high = places.amin(0), places.amax(0)
     cell = ((places - low) * (31.99 / (high - low).max().clamp_min(1e-300))).long().clamp_(0, 31)
-    bits = torch.tensor([sum((n >> b & 1) << (b * dim) for b in range(5)) for n in range(32)])
+    spread = [sum((n >> b & 1) << (b * dim) for b in range(5)) for n in range(32)]
+    bits = torch.tensor(spread, device=places.device)
     keys = sum((bits[cell[:, axis]] << axis for axis in range(dim)), torch.zeros_like(cell[:, 0]))
     order = keys.short().argsort(stable=True)
     return features.index_select(0, order), sample_weight.index_select(0, order)
@@ -175,7 +237,7 @@ def in_spatial_order(features: Tensor, sample_weight: Tensor) -> tuple[Tensor, T
 
 def _is_fused(*tensors: Tensor) -> bool:
     features = tensors[0]
-    fits = features.device.type == "cpu" and features.shape[1] in _DIMENSIONS
+    fits = features.shape[1] in _DIMENSIONS
     return fits and all(t.dtype == torch.float64 for t in tensors) and is_fused(*tensors)
 
 
@@ -207,6 +269,18 @@ def _fused(features: Tensor, weight: Tensor, natural: Tensor) -> tuple[Tensor, T
     rows = features.contiguous(), n, padded, k, n_parts
     _EXPECTATION[_DIMENSIONS[width]](n_parts, *rows, *arguments, device=features.device)
     return partial.sum((0, 3))[: natural.shape[0]], torch.dot(weight, peaks + norms.log())
+
+
+def _fused_on_gpu(features: Tensor, weight: Tensor, natural: Tensor) -> tuple[Tensor, Tensor]:
+    (n, width), k = features.shape, natural.shape[0]
+    dim, device = _DIMENSIONS[width], features.device
+    n_parts = max(1, min(_GPU_THREADS // k, n // _GPU_ROWS))
+    rows = features.contiguous(), n, natural.contiguous(), k, n_parts
+    norms = torch.empty_like(weight, memory_format=torch.contiguous_format)
+    partial = features.new_empty(n_parts, k, width)
+    _NORMS[dim](n, *rows, norms, None, device=device)
+    _SHARES[dim](n_parts * k, *rows, weight.contiguous(), norms, partial, device=device)
+    return partial.sum(0), torch.dot(weight, norms)
 
 
 def _batched(

@@ -57,7 +57,6 @@ def test_fused_most_likely_component_is_that_of_the_twin(kind):
         assert e_step.most_likely(features[:0], natural).tolist() == []
 
 
-@pytest.mark.cpu_only
 def test_the_first_of_equal_components_is_the_most_likely():
     features = quadratic_features(torch.rand(20, 3, dtype=torch.float64))
     with kernels("fused"):
@@ -86,7 +85,6 @@ def test_gradients_come_from_the_twin():
         assert not e_step._is_fused(features, natural)
 
 
-@pytest.mark.cpu_only
 def test_rows_in_spatial_order_are_the_same_rows():
     generator = torch.Generator().manual_seed(0)
     features = quadratic_features(torch.rand(3000, 3, generator=generator, dtype=torch.float64))
