@@ -155,11 +155,11 @@ def queries(data: Path, name: str, device: str, n: int = 20_000) -> Work:
     return lambda: made.occupancy(points, resolution)
 
 
-def flux(device: str) -> Work:
+def flux(device: str, side: float = 0.1) -> Work:
     made = built(FRAMES[0], 4)
     low, high = made.means.quantile(0.02, 0), made.means.quantile(0.98, 0)
-    shape = tuple(((high - low) / 0.1).ceil().long().tolist())
-    grid = gt.VoxelGrid(tuple(low.tolist()), 0.1, shape)
+    shape = tuple(((high - low) / side).ceil().long().tolist())
+    grid = gt.VoxelGrid(tuple(low.tolist()), side, shape)
     made = made if device == "cpu" else made.to(device)
     return lambda: made.evidence(grid, "flux")
 
@@ -217,6 +217,7 @@ def large_works(data: Path, device: str) -> dict[str, Callable[[], Work]]:
         "10,000,000 rays through 0.05 m, counted, dense": lambda: rays(0.05, device, 10_000_000),
         "exact EM, 1,000,000 points, K = 1,000, five iterations": lambda: exact_em(device, 1_000_000),
         "EM, 10,000,000 points, K = 10,000": lambda: em(10_000_000, 10_000, device),
+        "flux, kinect in 8 kB, cells of 0.03 m": lambda: flux(device, 0.03),
         "1,000,000 point queries, kinect in 8 kB": lambda: queries(data, "kinect", device, 1_000_000),
         "1,000,000 point queries, hall in 26 kB": lambda: queries(data, "hall", device, 1_000_000),
     }

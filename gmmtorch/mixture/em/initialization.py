@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gmmtorch.linalg import argsort
 from gmmtorch.mixture.em.cells import pool_into_cells
 from gmmtorch.mixture.em.exact import (
     Parameters,
@@ -34,9 +35,14 @@ Initialization = Callable[[Tensor, Tensor, int, float, torch.Generator], Paramet
 
 def distinct_points(points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Distinct rows in lexicographic order, and the sum of the weights of each."""
-    unique, inverse = np.unique(points.detach().cpu().numpy(), axis=0, return_inverse=True)
-    sums = np.bincount(inverse.reshape(-1), weights=weight.detach().cpu().numpy(), minlength=unique.shape[0])
-    return torch.from_numpy(unique).to(points.device), torch.from_numpy(sums).to(points.device)
+    order = argsort(points[:, -1].contiguous())
+    for column in reversed(points[:, :-1].unbind(1)):
+        order = order[argsort(column[order])]
+    rows = points[order]
+    is_new = torch.ones_like(order, dtype=torch.bool)
+    is_new[1:] = (rows[1:] != rows[:-1]).any(1)
+    number, distinct = is_new.cumsum(0) - 1, rows[is_new]
+    return distinct, weight.new_zeros(len(distinct)).index_add_(0, number, weight[order])
 
 
 def from_kmeans(
