@@ -139,7 +139,7 @@ def frames_to_map(device: str, stride: int, **rule: float) -> Work:
     return lambda: built(images, stride, **rule)
 
 
-def queries(data: Path, name: str, device: str, n: int = 20_000) -> Work:
+def queries(data: Path, name: str, device: str, n: int = 20_000, method: str = "point") -> Work:
     if name == "kinect":
         made, resolution = built(FRAMES[0], 4), 0.05
     else:
@@ -151,8 +151,8 @@ def queries(data: Path, name: str, device: str, n: int = 20_000) -> Work:
     low, high = made.means.amin(0), made.means.amax(0)
     points = (low + (high - low) * uniform(n, 3)).to(device)
     made = made if device == "cpu" else made.to(device)
-    made.occupancy(points[:100], resolution)  # makes the spatial index
-    return lambda: made.occupancy(points, resolution)
+    made.occupancy(points[:100], resolution, method=method)  # makes the spatial index
+    return lambda: made.occupancy(points, resolution, method=method)
 
 
 def flux(device: str, side: float = 0.1) -> Work:
@@ -206,6 +206,7 @@ def works(data: Path, device: str = "cpu") -> dict[str, Callable[[], Work]]:
         "a frame of 20,000 points inserted": lambda: frame(device),
         "20,000 point queries, kinect in 8 kB": lambda: queries(data, "kinect", device),
         "20,000 point queries, hall in 26 kB": lambda: queries(data, "hall", device),
+        "20,000 queries by flux, hall in 26 kB": lambda: queries(data, "hall", device, method="flux"),
         "flux, kinect in 8 kB, cells of 0.1 m": lambda: flux(device),
         "registration of two scans of hall": lambda: registration(data, device),
     }

@@ -12,7 +12,7 @@ from gmmtorch.occupancy.cone_index import ConeIndex
 from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.evidence import Evidence, occupancy_probability
 from gmmtorch.occupancy.forms.cone.cone_evidence import cone_evidence
-from gmmtorch.occupancy.forms.flux.box_flux import box_flux, flux_evidence
+from gmmtorch.occupancy.forms.flux.box_flux import cell_flux, flux_evidence
 from gmmtorch.occupancy.forms.monte_carlo import sample_rays
 from gmmtorch.occupancy.forms.point import PointEvidence, PointForm
 from gmmtorch.occupancy.grid import VoxelGrid
@@ -88,7 +88,12 @@ class Query:
             return PointEvidence(*self._lattice(resolution).at_points(points))
         finite = torch.isfinite(points).all(1)
         cells, cell = torch.unique(torch.floor(points[finite] / resolution), dim=0, return_inverse=True)
-        found = self._in_boxes(cells * resolution, (cells + 1) * resolution, resolution, method)
+        low, high = cells * resolution, (cells + 1) * resolution
+        if method == "flux":
+            pairs = self._index(resolution).candidates(low, high)
+            found = PointEvidence(*cell_flux(self.cones, cells, resolution, pairs, self.cutoff))
+        else:
+            found = self._in_boxes(low, high, resolution)
         place = finite.nonzero().squeeze(1)
         return PointEvidence(*(zeros.index_copy(0, place, values[cell]) for values in found))
 
@@ -113,7 +118,7 @@ class Query:
             if method == "point":
                 parts.append(self._form(grid.resolution)(centers))
             else:
-                parts.append(self._in_boxes(centers - half, centers + half, grid.resolution, method))
+                parts.append(self._in_boxes(centers - half, centers + half, grid.resolution))
         hits, misses = (torch.cat(values).view(grid.shape) for values in zip(*parts, strict=True))
         return Evidence(grid, hits, misses)
 
@@ -124,12 +129,15 @@ class Query:
             )
         return self._forms[resolution]
 
-    def _in_boxes(self, low: Tensor, high: Tensor, resolution: float, method: str) -> PointEvidence:
+    def _index(self, resolution: float) -> ConeIndex:
         if resolution not in self._indices:
             self._indices[resolution] = ConeIndex(self.cones, resolution, self.cutoff)
-        pairs = self._indices[resolution].candidates(low, high)
-        form = box_flux if method == "flux" else cone_evidence
-        return PointEvidence(*form(self.cones, low, high, pairs, cutoff=self.cutoff))
+        return self._indices[resolution]
+
+    def _in_boxes(self, low: Tensor, high: Tensor, resolution: float) -> PointEvidence:
+        """Evidence of the thesis's cones."""
+        pairs = self._index(resolution).candidates(low, high)
+        return PointEvidence(*cone_evidence(self.cones, low, high, pairs, cutoff=self.cutoff))
 
     def _lattice(self, resolution: float) -> SparseEvidence:
         """Monte Carlo evidence of the whole map on the world's lattice of this resolution."""

@@ -141,7 +141,7 @@ _BODY = """
             for (int l = 0; l < LANES; ++l) {
                 const double value = get(sum, l);
                 if (value == 0.0) continue;
-                int64_t flat = 0, left = cell[l];
+                int64_t flat = target ? target[item] : 0, left = cell[l];
                 for (int b = 2; b >= 0; --b) {
                     flat += (corner[b] + left % box[b]) * stride[b];
                     left /= box[b];
@@ -155,8 +155,9 @@ _BODY = """
 _KERNEL = FusedKernel(
     "cell_mass",
     "const double* cones, const double* counts, const int64* cone, const int64* first, const int64* number,"
-    " int64 dim, double place0, double place1, double place2, double side, int64 stride0, int64 stride1,"
-    " int64 stride2, double cutoff, double limit0, double limit1, double limit2, double limit3, double* hits",
+    " const int64* target, int64 dim, double place0, double place1, double place2, double side,"
+    " int64 stride0, int64 stride1, int64 stride2, double cutoff,"
+    " double limit0, double limit1, double limit2, double limit3, double* hits",
     SIMD + with_panels(_BODY, "cell"),
     shares=True,
 )
@@ -170,20 +171,21 @@ def add_cell_mass(
     grid: tuple[tuple[float, ...], float, tuple[int, ...]],
     cutoff: float,
     limits: tuple[float, ...],
+    target: Tensor | None = None,
 ) -> None:
     """Add the mass of components in boxes of cells, times their counts, to the hits of the cells.
 
     Args:
-        hits: (cells,) float64, row-major.
+        hits: (cells,) float64, row-major; or (M,), of any cells, if `target` is given.
         cones, counts: as in `face_flux.add_row_flux`.
         boxes: cone (R,) and first, number (R, D) of `culling.BallRows`.
-        grid, limits: as in `face_flux.add_row_flux`.
+        grid, limits, target: as in `face_flux.add_row_flux`.
     """
     cone, first, number = (part.contiguous() for part in boxes)
     origin, side, shape = grid
     dim = len(shape)
     pad = 3 - dim
-    strides = [math.prod(shape[a + 1 :]) for a in range(dim)]
+    strides = [math.prod(shape[a + 1 :]) if target is None else 0 for a in range(dim)]
     _KERNEL(
         len(cone),
         cones.contiguous(),
@@ -191,6 +193,7 @@ def add_cell_mass(
         cone,
         first,
         number,
+        target,
         dim,
         *origin,
         *[0.0] * pad,

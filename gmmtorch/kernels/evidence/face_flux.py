@@ -77,7 +77,7 @@ _BODY = """
     const int64_t n0 = number[2 * item], n1 = number[2 * item + 1], n_faces = n0 * n1;
     const double height = place0 + (double)plane[item] * side - origin[axis0];
     const double strength = (forward[item] ? height : -height) * area * c[15];
-    const int64_t cell0 = (forward[item] ? plane[item] - 1 : plane[item]) * stride0;
+    const int64_t cell0 = target ? target[item] : (forward[item] ? plane[item] - 1 : plane[item]) * stride0;
     RULES
     double edge[2][3], edge_length[2], turned[2];
     for (int b = 0; b < 2; ++b) {
@@ -197,10 +197,11 @@ _BODY = """
 _KERNEL = FusedKernel(
     "face_flux",
     "const double* cones, const double* counts, const int64* cone, const int64* plane, const bool* forward,"
-    " const int64* first, const int64* number, int64 dim, int64 axis0, int64 axis1, int64 axis2,"
-    " double place0, double place1, double place2, double side, double area, int64 stride0, int64 stride1,"
-    " int64 stride2, double cutoff, double limit0, double limit1, double limit2, double limit3,"
-    " double* misses",
+    " const int64* first, const int64* number, const int64* target,"
+    " int64 dim, int64 axis0, int64 axis1, int64 axis2,"
+    " double place0, double place1, double place2, double side, double area,"
+    " int64 stride0, int64 stride1, int64 stride2, double cutoff,"
+    " double limit0, double limit1, double limit2, double limit3, double* misses",
     SIMD + with_panels(_BODY, "face"),
     shares=True,
 )
@@ -215,17 +216,19 @@ def add_row_flux(
     grid: tuple[tuple[float, ...], float, tuple[int, ...]],
     cutoff: float,
     limits: tuple[float, ...],
+    target: Tensor | None = None,
 ) -> None:
     """Add the flux through rows of faces perpendicular to `axis` to the cells that the rays leave.
 
     Args:
-        misses: (cells,) float64, row-major.
+        misses: (cells,) float64, row-major; or (M,), of any cells, if `target` is given.
         cones: (C, 16) float64: whitening W (3 × 3), sensor origin, W(μ − s), and 1/√det 2πΣ; zeros for the
             third coordinate in the plane. See `whitened_rows`.
         counts: (C,) float64.
         rows: cone, plane, forward (R,) and first, number (R, D − 1) of `culling.FaceRows`.
         grid: its origin (m), the side of its cells (m), and their number along each axis.
         limits: largest variation of a panel for Gauss-Legendre rules of 1, 2, 3 and 4 nodes.
+        target: (R,) where in `misses` the flux of each row is added.
     """
     cone, plane, forward, first, number = rows
     origin, side, shape = grid
@@ -234,7 +237,7 @@ def add_row_flux(
         first = torch.cat([first, torch.zeros_like(first)], 1)
         number = torch.cat([number, torch.ones_like(number)], 1)
     axes = [axis, *(a for a in range(dim) if a != axis)]
-    strides = [math.prod(shape[a + 1 :]) for a in axes]
+    strides = [math.prod(shape[a + 1 :]) if target is None else 0 for a in axes]
     pad = 3 - dim
     _KERNEL(
         len(cone),
@@ -245,6 +248,7 @@ def add_row_flux(
         forward.contiguous(),
         first.contiguous(),
         number.contiguous(),
+        target,
         dim,
         *axes,
         *[-1] * pad,

@@ -8,7 +8,8 @@ from kernels.cones_for_kernels import cones_of
 
 from gmmtorch.kernels import kernels
 from gmmtorch.occupancy.cones import Cones
-from gmmtorch.occupancy.forms.flux.box_flux import flux_evidence
+from gmmtorch.occupancy.culling import candidate_pairs
+from gmmtorch.occupancy.forms.flux.box_flux import cell_flux, flux_evidence
 from gmmtorch.occupancy.grid import VoxelGrid
 
 
@@ -37,3 +38,20 @@ def test_a_looser_tolerance_stays_within_itself():
         loose, exact = (flux_evidence(cones, grid, 4.0, tolerance=t) for t in (1e-3, 1e-6))
     assert 0 < float((loose.misses - exact.misses).abs().max()) < 1e-3
     assert 0 < float((loose.hits - exact.hits).abs().max()) < 1e-3
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("kind", ["any", "flat", "around"])
+def test_fused_flux_of_listed_cells_equals_that_of_boxes(dim, kind):
+    cones = cones_of(dim, kind, 12, thin=0.03)
+    cones.origins[:2] = torch.tensor([0.5, 1.0, -1.5][:dim])
+    cones = Cones(*cones[:3], torch.ones(12), cones.max_range)
+    cells = torch.cartesian_prod(*[torch.arange(-6, 7)] * dim)[::5].flip(0).double()
+    found = []
+    for choice in ("torch", "fused"):
+        with kernels(choice):
+            pairs = candidate_pairs(cones, cells * 0.5, (cells + 1) * 0.5, 7.0)
+            found.append(cell_flux(cones, cells, 0.5, pairs, 7.0, tolerance=1e-6))
+    for one, other in zip(*found, strict=True):
+        assert one.count_nonzero() > 10
+        torch.testing.assert_close(other, one, rtol=1e-5, atol=1e-5)

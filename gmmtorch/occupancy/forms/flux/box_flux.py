@@ -6,6 +6,7 @@ flux out of its faces, and its hits are the mass of the Gaussian in it. No sampl
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -244,6 +245,45 @@ def box_flux(
         box, cone = box[returned], cone[returned]
         mass = box_mass(white.take(cone), low[box].T, high[box].T, cutoff, tolerance, dtype)
         hits = hits.index_add(0, box, mass * counts[cone])
+    return hits, misses
+
+
+def cell_flux(
+    cones: Cones,
+    cells: Tensor,
+    resolution: float,
+    pairs: Iterable[Pairs],
+    cutoff: float = CUTOFF,
+    *,
+    tolerance: float = TOLERANCE,
+) -> tuple[Tensor, Tensor]:
+    """Hits (M,) and misses (M,) of cells of the world's lattice: `box_flux` with a fused form.
+
+    Args:
+        cells: (M, D) whole numbers: cell c is the cube [c, c + 1) times the resolution.
+        pairs, cutoff, tolerance: as in `box_flux`.
+    """
+    cones, cells = cones.checked(), cells.double()
+    white, counts = WhitenedCones.of(cones), cones.counts.double()
+    if not is_fused(*white, counts, cells):
+        low, high = cells * resolution, (cells + 1) * resolution
+        return box_flux(cones, low, high, pairs, cutoff, tolerance=tolerance)
+    table = whitened_rows(white.matrix, white.origin, white.toward, white.log_norm)
+    place, limits = ((0.0,) * cones.dim, resolution, (1,) * cones.dim), variation_limits(tolerance)
+    hits, misses = cells.new_zeros(2, len(cells))
+    for cell, cone in pairs:
+        first, sensor = cells[cell].long(), cones.origins.double()[cone] / resolution
+        for axis, forward in itertools.product(range(cones.dim), (False, True)):
+            plane = first[:, axis] + forward
+            is_crossed = plane > sensor[:, axis] if forward else plane < sensor[:, axis]
+            rows = is_crossed.nonzero().squeeze(1)
+            others = torch.cat([first[rows, :axis], first[rows, axis + 1 :]], 1)
+            direction = torch.full_like(rows, forward, dtype=torch.bool)
+            faces = FaceRows(cone[rows], plane[rows], direction, others, torch.ones_like(others))
+            add_row_flux(misses, table, counts, faces, axis, place, cutoff, limits, cell[rows])
+        rows = (~cones.max_range[cone]).nonzero().squeeze(1)
+        boxes = cone[rows], first[rows], torch.ones_like(first[rows])
+        add_cell_mass(hits, table, counts, boxes, place, cutoff, limits, cell[rows])
     return hits, misses
 
 
