@@ -23,5 +23,6 @@ gap = clearance(m, path)  # (50,), metres to the nearest surface
 risk = collision_probability(m, path.detach(), RADIUS)  # (50,)
 gap.min().backward()
 nearest = int(gap.argmin())
-print(f"clearance {gap.min():.2f} m at least, collision probability {risk.max():.3f} at most")
+print(f"clearance {gap.min():.2f} m at least, ", end="")
+print(f"collision probability {risk.max():.3f} at most")
 print(f"at point {nearest}, move along {path.grad[nearest].tolist()} to gain clearance")

@@ -15,7 +15,7 @@ ROOM = np.array([[-3.0, -2.0, 0.0], [3.0, 2.0, 2.5]])  # two opposite corners, m
 
 
 def camera_pose(yaw: float) -> np.ndarray:
-    """The pose (4, 4), world ← camera: x right, y down, z forward; 1.2 m above the floor."""
+    """The pose (4, 4), world ← camera (x right, y down, z forward), at 1.2 m height."""
     forward = np.array([np.cos(yaw), np.sin(yaw), 0.0])
     down = np.array([0.0, 0.0, -1.0])
     pose = np.eye(4)

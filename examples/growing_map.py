@@ -1,7 +1,7 @@
 """A laser log becomes a moving picture of the map that grows.
 
-python examples/growing_map.py                     # a simulated building
-python examples/growing_map.py intel.log.gz        # a CARMEN log of your own; 910 scans take two minutes
+python examples/growing_map.py               # a simulated building
+python examples/growing_map.py intel.log.gz  # your CARMEN log; 910 scans take two minutes
 """
 
 import sys
@@ -29,8 +29,10 @@ for now in builder.insert_all():
         hits = scans[builder.record.indices[-1]].points
         copy = gt.GaussianMap.of(builder.map.components(), codec="quantized")
         frames.append(GrowthFrame(now.n_read, copy, builder.poses[:, :2, 2], hits))
-        print(f"\r{now.n_read} of {now.n_total} scans, {copy.n_components:,} components", end="")
+        size = f"{copy.n_components:,} components"
+        print(f"\r{now.n_read} of {now.n_total} scans, {size}", end="")
 
-Path("outputs/examples").mkdir(parents=True, exist_ok=True)
-picture = save_growth("outputs/examples/growing_map.webp", frames, resolution=0.05, period=0.3)
+picture = Path("outputs/examples/growing_map.webp")
+picture.parent.mkdir(parents=True, exist_ok=True)
+save_growth(picture, frames, resolution=0.05, period=0.3)
 print(f"\n{picture}: {len(frames)} frames, {picture.stat().st_size:,} bytes")

@@ -1,7 +1,7 @@
-"""A planner finds a path through a map: Dijkstra on a grid of clearances, then gradient steps.
+"""A planner finds a path through a map: a grid of clearances, then gradient steps.
 
-python examples/plan_path.py                     # a simulated building
-python examples/plan_path.py map.safetensors     # your map, between its two farthest sensors
+python examples/plan_path.py                   # a simulated building
+python examples/plan_path.py map.safetensors   # your map: its two farthest sensors
 """
 
 import sys
@@ -19,7 +19,8 @@ from gmmtorch.mapping import Body
 from gmmtorch.mapping.clearance import clearance
 
 STEP = 0.25  # metres between the places that the search visits
-BODY = Body([[0.15, 0.0, 0.0], [-0.15, 0.0, 0.0]], [0.2, 0.2])  # two balls: 0.7 m long, 0.4 m wide
+# Two balls: 0.7 m long, 0.4 m wide.
+BODY = Body([[0.15, 0.0, 0.0], [-0.15, 0.0, 0.0]], [0.2, 0.2])
 DEVIATIONS = 2.0  # an ellipsoid of 2 deviations is an obstacle
 DENSITY = 5.0  # returns per m³; ellipsoids with fewer are stray returns
 
@@ -57,7 +58,8 @@ for dx, dy in ((1, 0), (0, 1), (1, 1), (1, -1)):
     rows.append(a)
     columns.append(b)
     costs.append(length * (1 + 0.5 / (torch.minimum(room[a], room[b]) + 0.1)))
-edges = coo_array((torch.cat(costs), (torch.cat(rows), torch.cat(columns))), shape=(len(places),) * 2)
+ends = torch.cat(rows), torch.cat(columns)
+edges = coo_array((torch.cat(costs), ends), shape=(len(places), len(places)))
 
 
 def nearest_free(place: torch.Tensor) -> int:
@@ -81,16 +83,18 @@ def headed(points: torch.Tensor) -> torch.Tensor:
     poses = torch.eye(4, dtype=torch.float64).repeat(len(points), 1, 1)
     poses[:, 0, 0], poses[:, 0, 1] = yaw.cos(), -yaw.sin()
     poses[:, 1, 0], poses[:, 1, 1] = yaw.sin(), yaw.cos()
-    return torch.cat([poses[:, :, :3], torch.cat([points, torch.ones(len(points), 1)], 1)[:, :, None]], 2)
+    poses[:, :3, 3] = points
+    return poses
 
 
-# The gradient of the clearance smooths the path and keeps half a metre of room where there is some.
+# Gradient steps smooth the path and keep half a metre of room where there is some.
 inner = path[1:-1, :2].clone().requires_grad_()
 optimizer = torch.optim.Adam([inner], lr=0.02)
 for _ in range(100):
     points = torch.cat([path[:1], torch.cat([inner, path[1:-1, 2:]], 1), path[-1:]])
     bend = (points[2:] - 2 * points[1:-1] + points[:-2]).square().sum()
-    too_close = (0.5 - BODY.clearance(m, headed(points), DEVIATIONS, DENSITY)).clamp_min(0).square().sum()
+    gaps = BODY.clearance(m, headed(points), DEVIATIONS, DENSITY)
+    too_close = (0.5 - gaps).clamp_min(0).square().sum()
     optimizer.zero_grad()
     (20 * bend + too_close).backward()
     optimizer.step()
@@ -100,10 +104,12 @@ for name, points in (("search", path), ("smoothed", smooth)):
     length = float((points[1:] - points[:-1]).norm(dim=1).sum())
     gap = float(BODY.clearance(m, headed(points), DEVIATIONS, DENSITY).min())
     risk = float(BODY.collision_probability(m, headed(points)).max())
-    print(f"{name}: {length:.1f} m, smallest clearance {gap:.2f} m, largest collision probability {risk:.3f}")
+    print(f"{name}: {length:.1f} m, smallest clearance {gap:.2f} m, ", end="")
+    print(f"largest collision probability {risk:.3f}")
 
 occupancy = m.occupancy(places, resolution=STEP).view(shape)
-extent = (float(low[0]), float(low[0]) + STEP * shape[0], float(low[1]), float(low[1]) + STEP * shape[1])
+left, bottom = low.tolist()
+extent = (left, left + STEP * shape[0], bottom, bottom + STEP * shape[1])
 plt.imshow(occupancy.T, origin="lower", extent=extent, cmap="gray_r", vmin=0, vmax=1)
 plt.plot(path[:, 0], path[:, 1], ":", color="tab:blue", label="search")
 plt.plot(smooth[:, 0], smooth[:, 1], color="tab:orange", label="smoothed")

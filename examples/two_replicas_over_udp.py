@@ -36,5 +36,6 @@ while replica_0.digest() != replica_1.digest() and time.monotonic() < until:
 
 for number, (replica, transport) in enumerate(robots):
     digest = replica.digest().hex()[:8]
-    print(f"robot {number} holds {replica.map().n_components:,} components, digest {digest}")
+    n = replica.map().n_components
+    print(f"robot {number} holds {n:,} components, digest {digest}")
     transport.close()

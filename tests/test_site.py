@@ -14,6 +14,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 MODULES = re.findall(r"automodule:: (\S+)", (DOCS / "api.rst").read_text("utf-8"))
+COLUMNS = 90
+"""The widest line of code that the site shows without scrolling. examples/ruff.toml has it too."""
 LOADED = re.compile(r'<(?:script|img|link)\b[^>]*?(?:src|href)="([^"]*)"')
 """Addresses that a browser loads with a page. Icons and search descriptions are relative as well."""
 
@@ -98,6 +100,12 @@ def test_every_public_name_has_a_docstring(module):
                 described = inspect.getdoc(getattr(item, member) if member else item)
                 lacking += [] if described or not callable(item) else [f"{name}.{member}"]
     assert not lacking
+
+
+@pytest.mark.parametrize("page", [*ROOT.glob("*.md"), *DOCS.rglob("*.md")], ids=lambda page: page.stem)
+def test_lines_of_code_are_as_wide_as_the_site_shows_them(page):
+    blocks = re.findall(r"^```.*?^```", page.read_text("utf-8"), re.DOTALL | re.MULTILINE)
+    assert not [line for block in blocks for line in block.splitlines() if len(line) > COLUMNS]
 
 
 def test_every_page_is_in_the_table_of_contents():

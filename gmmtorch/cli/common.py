@@ -13,7 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from gmmtorch.errors import InvalidArgumentError, MissingDataError, check_whole
+from gmmtorch.errors import GmmTorchError, InvalidArgumentError, MissingDataError, check_whole
 from gmmtorch.evaluation.events import Row
 from gmmtorch.report.table import format_table
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from gmmtorch.report.tensorboard_writer import Board
 
 logger = logging.getLogger("gmmtorch")
+_NAMES_ARGUMENTS = (InvalidArgumentError, MissingDataError)
 _ARGUMENT = re.compile(r"(?<![\w.])[\w.]+(?==| is not set)")
 
 
@@ -44,7 +45,9 @@ def naming(options: Mapping[str, str]) -> Iterator[None]:
     """
     try:
         yield
-    except (InvalidArgumentError, MissingDataError) as error:
+    except GmmTorchError as error:
+        if type(error) is not GmmTorchError and not isinstance(error, _NAMES_ARGUMENTS):
+            raise
         text = re.sub(_ARGUMENT, lambda name: options.get(name[0], name[0]), str(error))
         raise type(error)(text) from error
 
@@ -75,7 +78,11 @@ def set_up(config: DictConfig) -> str:
 
 
 def use_runtime(runtime: DictConfig) -> str:
-    """Apply `runtime.*`; returns the device. Raises `InvalidArgumentError` for an invalid option."""
+    """Apply `runtime.*`; returns the device.
+
+    Raises `InvalidArgumentError` for an invalid option, and `GmmTorchError` for `runtime.kernels=fused` if
+    the kernel compiler is missing or broken.
+    """
     import torch
 
     from gmmtorch.kernels import use_kernels

@@ -19,6 +19,7 @@ import gmmtorch
 from gmmtorch.cli import common, map, occupancy
 from gmmtorch.cli.options import command_options, schema
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.kernels import compiler
 
 
 @pytest.fixture
@@ -89,6 +90,14 @@ def test_a_launcher_that_is_not_installed_names_its_extra(launcher, has_other_pl
     message = command_options.explained("occupancy", overrides, RuntimeError("not found"))
     assert f"hydra-{launcher}-launcher" in message
     assert "gmmtorch[sweep]" in message
+
+
+@pytest.mark.parametrize("command", ["fit", "map", "ros"])
+def test_fused_kernels_without_a_compiler_are_refused_by_the_name_of_the_option(command, run, monkeypatch):
+    monkeypatch.setattr(compiler, "compiler_failure", lambda: "the package warp-lang does not load (test)")
+    line = refused(run(command, "runtime.kernels=fused"))
+    assert "runtime.kernels=fused needs the kernel compiler" in line
+    assert "pip install 'gmmtorch[fast]', or choose runtime.kernels=auto or runtime.kernels=torch." in line
 
 
 def test_a_folder_that_cannot_be_written_is_a_one_line_error(run, tmp_path):

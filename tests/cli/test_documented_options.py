@@ -221,7 +221,7 @@ def test_documented_defaults_match_the_configuration(command):
 
 def command_lines(page: Path) -> list[tuple[str, str]]:
     """Each `gmmtorch-` line of a page's shell blocks: the command, and its arguments."""
-    text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+    text = page.read_text(encoding="utf-8").replace("\\\n", "")
     blocks = re.findall(r"^```sh\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
     return [
         (found[1], found[2])

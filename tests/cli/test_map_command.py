@@ -121,6 +121,20 @@ def test_scans_of_a_bag_that_cannot_be_used_are_counted_and_printed(monkeypatch,
     assert "a: no scan of 1 can be used: message without a valid point" in refused(empty)
 
 
+@pytest.mark.parametrize("motion", ["dataset", "imu"])
+def test_a_motion_without_odometry_is_refused(monkeypatch, tmp_path, motion):
+    text = refused(run_here(monkeypatch, "map", tmp_path / "run", f"dataset.motion={motion}", *QUIET))
+    assert f"dataset.motion={motion} predicts the poses of odometry, but dataset.odometry=none" in text
+    assert "use dataset.odometry=mixture, or dataset.motion=constant" in text
+
+
+@pytest.mark.parametrize("odometry", ["none", "auto", "mixture"])
+def test_an_unknown_motion_lists_the_choices(monkeypatch, tmp_path, odometry):
+    options = [f"dataset.odometry={odometry}", "dataset.motion=wheels", *QUIET]
+    text = refused(run_here(monkeypatch, "map", tmp_path / "run", *options))
+    assert "dataset.motion='wheels' is not one of constant, dataset, imu" in text
+
+
 @pytest.fixture
 def recording(tmp_path: Path) -> tuple[Path, np.ndarray]:
     """A folder of three scans without poses, and their true poses in the frame of the first one."""

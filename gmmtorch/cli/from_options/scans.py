@@ -21,7 +21,7 @@ from gmmtorch.evaluation.fits.fit_pruning import Views
 from gmmtorch.evaluation.protocol_options import FitOptions
 from gmmtorch.evaluation.trajectories import UNSCORED, absolute_trajectory_error, relative_pose_error
 from gmmtorch.localization.odometry.odometry import Trajectory
-from gmmtorch.localization.odometry.recorded_poses import with_odometry
+from gmmtorch.localization.odometry.recorded_poses import METHODS, MOTIONS, with_odometry
 from gmmtorch.scan import Scan
 
 _WITHOUT_POSES = ("scan_folder", "rosbag")  # data sets that `dataset.poses=standing` reads without poses
@@ -50,7 +50,13 @@ def open_with_trajectory(config: DictConfig) -> OpenedDataset:
     }
     method, name = options.pop("odometry", "none"), options.pop("name")
     motion = options.pop("motion", "constant")
-    check_choice("dataset.odometry", method, ("none", "auto", "kiss_icp", "mixture"))
+    check_choice("dataset.odometry", method, ("none", "auto", *METHODS))
+    check_choice("dataset.motion", motion, MOTIONS)
+    if method == "none" and motion != "constant":
+        raise InvalidArgumentError(
+            f"dataset.motion={motion} predicts the poses of odometry, but dataset.odometry=none estimates no "
+            "poses; use dataset.odometry=mixture, or dataset.motion=constant."
+        )
     try:
         found = datasets.load(name, options.pop("path", None), **options)
         if method == "none" or (method == "auto" and found.pose(0) is not None):

@@ -64,7 +64,7 @@ class Node:
     Usage::
 
         with Node("listener") as node:
-            node.subscribe("/scan", "sensor_msgs/msg/LaserScan", lambda scan: print(len(scan["ranges"])))
+            node.subscribe("/scan", "sensor_msgs/msg/LaserScan", print)
             node.spin(seconds=10)
 
     Messages are dictionaries of their fields. Callbacks run in the thread that calls `spin` or `spin_once`.

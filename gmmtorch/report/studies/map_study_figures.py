@@ -94,7 +94,8 @@ _PANELS = {
     "free_recall": "free points:\ncalled free",
 }
 _MAX_CELLS = 400_000
-_SIDE = 3.4  # inches of a panel in space
+_SIDE = 3.4  # inches, width of a panel in space
+_TEXT_HEIGHT = 0.4  # inches of the title above a panel
 _POINT_PIXELS = 2.5  # radius of a measured point
 _CAMERA = Camera(-60.0, 24.0)
 
@@ -154,9 +155,9 @@ def cells_figure(
     high: Sequence[float],
     resolution: float,
 ) -> Figure:
-    """Draws cells in the box [low, high] (m): one row per map, one column per title.
+    """Draws cells in the box [low, high] (m): one column per map, one row per title.
 
-    The first column shows the held-out points. All panels have the same colours of height.
+    The first row shows the held-out points. All panels have the same colours of height.
 
     Args:
         maps: by number of components: centres (M, 3) of cells → masks (M,) of the cells to draw, by title.
@@ -173,11 +174,12 @@ def cells_figure(
     centres = torch.cartesian_prod(*steps)
     scale = Normalize(low[2], high[2], clip=True)
     drawn = {n: masks(centres) for n, masks in maps.items()}
-    n_columns = 1 + max(len(masks) for masks in drawn.values())
-    figure = style.new_figure(_SIDE * n_columns + 1.0, _SIDE * len(maps) + 0.6)
-    grid = figure.subplots(len(maps), n_columns, squeeze=False)
     canvas = canvas_around(low, high, _CAMERA, int(_SIDE * style.SAVED_DPI))
-    for row, (n_components, masks) in zip(grid, drawn.items(), strict=True):
+    side = _SIDE * (canvas.top - canvas.bottom) / (canvas.right - canvas.left) + _TEXT_HEIGHT
+    n_rows = 1 + max(len(masks) for masks in drawn.values())
+    figure = style.new_figure(_SIDE * len(maps) + 1.0, side * n_rows + 0.6)
+    grid = figure.subplots(n_rows, len(maps), squeeze=False)
+    for column, (n_components, masks) in zip(grid.T, drawn.items(), strict=True):
         shown = [
             (
                 hits[inside(hits, (low, high))],
@@ -186,7 +188,7 @@ def cells_figure(
             )
         ]
         shown += [(centres[mask], size / 2, title) for title, mask in masks.items()]
-        for axes, (places, radius, title) in zip(row, shown, strict=True):
+        for axes, (places, radius, title) in zip(column, shown, strict=True):
             part = balls(places, radius, height_colours(places[:, 2], scale))
             draw_scene(axes, [part], low, high, _CAMERA, canvas, n_ticks=3)
             axes.set_title(title, fontsize=style.TITLE_SIZE)
