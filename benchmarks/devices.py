@@ -14,7 +14,7 @@ from pathlib import Path
 
 import torch
 from public_work import Work, counted, large_works, prepare, works
-from tables import hardware, markdown, publish
+from tables import hardware, markdown, publish, three_digits
 
 
 def seconds(work: Work, repeats: int, device: str) -> float:
@@ -54,7 +54,7 @@ def main() -> None:
     table = markdown(
         header,
         [
-            [name, f"{cpu:.3g}", f"{gpu:.3g}", f"{cpu / gpu:.2g}", "{:,} ({:,})".format(*counts[name])]
+            [name, *map(three_digits, (cpu, gpu, cpu / gpu)), "{:,} ({:,})".format(*counts[name])]
             for name, (cpu, gpu) in rows.items()
         ],
     )

@@ -3,8 +3,9 @@
     python benchmarks/kernels.py --data $GMMTORCH_DATA [--threads 1] [--device cuda]
     python benchmarks/kernels.py --data $GMMTORCH_DATA --against FOLDER_OF_ANOTHER_VERSION
 
-Writes the tables `kernels` and `operations` of BENCHMARKS.md, or with --against the table `against`: the work
-of `public_work.py` by both versions in turn, on one thread. A time is the least of several runs.
+Writes the tables `kernels` and `operations` of BENCHMARKS.md, on a GPU the table `kernels-gpu`, or with
+--against the table `against`: the work of `public_work.py` by both versions in turn, on one thread. A time is
+the least of several runs.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from pathlib import Path
 
 import torch
 from public_work import counted
-from tables import ROOT, hardware, markdown, publish
+from tables import ROOT, hardware, markdown, publish, three_digits
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
@@ -189,8 +190,8 @@ def compared(work: Work, repeats: int, device: str) -> list[str]:
     for choice in ("torch", "fused"):
         with kernels(choice):
             seconds.append(least(function, repeats, device))
-    shown = [f"{size / s:.3g}" if size else f"{s:.3g}" for s in seconds]
-    return [name, unit, *shown, f"{seconds[0] / seconds[1]:.1f}"]
+    shown = [three_digits(size / s if size else s) for s in seconds]
+    return [name, unit, *shown, three_digits(seconds[0] / seconds[1])]
 
 
 def main() -> None:
@@ -218,8 +219,12 @@ def main() -> None:
             work_on_maps = map_work(options.data, options.points, options.device)
             rows += [compared(work, options.repeats, options.device) for work in work_on_maps]
         header = ["work", "", "tensor operations", "fused", "times faster"]
-        publish("kernels", f"{options.rays:,} rays. {hardware(options.device)}\n\n{markdown(header, rows)}")
-        publish("operations", operations_table(options.device))
+        facts = f"{options.rays:,} rays. {hardware(options.device)}"
+        publish(
+            "kernels" if options.device == "cpu" else "kernels-gpu", f"{facts}\n\n{markdown(header, rows)}"
+        )
+        if options.device == "cpu":
+            publish("operations", operations_table(options.device))
 
 
 if __name__ == "__main__":

@@ -37,6 +37,11 @@ def hardware(device: str = "cpu") -> str:
     )
 
 
+def three_digits(value: float) -> str:
+    """The value with three significant digits, never as a power of ten above 1."""
+    return f"{value:.3g}" if abs(value) < 1000 else f"{float(f'{value:.3g}'):,.0f}"
+
+
 def markdown(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """A Markdown table."""
     lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
