@@ -208,14 +208,17 @@ class ConeIndex:
                 f"A box of {float((high - low).amax()):.4g} m is larger than the index's "
                 f"extent={self.extent:.4g} m; make the index with the extent of the largest box."
             )
-        bucket = self.buckets(0.5 * (low + high))
+        center = 0.5 * (low + high)
+        bucket = self.buckets(center)
         box = (bucket >= 0).nonzero().squeeze(1)
         bucket = bucket[box]
         chunk = torch.cumsum(self.list_lengths()[bucket], 0) // _CHUNK_PAIRS
         sizes = torch.unique_consecutive(chunk, return_counts=True)[1].tolist()
         for boxes, buckets in zip(box.split(sizes), bucket.split(sizes), strict=True):
             place, cone = self.listed(buckets)
-            yield boxes[place], cone
+            pair = boxes[place]
+            near = self.hulls.near(cone, center[pair], 0.0).nonzero().squeeze(1)
+            yield pair[near], cone[near]
 
 
 class _Lattice(NamedTuple):
