@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import tempfile
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # k-means has threads of its own
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -88,3 +90,22 @@ def ros_domain() -> Iterator[int]:
             yield number
             return
     pytest.fail("all domains are in use")
+
+
+@pytest.fixture(params=["dds", "zenoh"])
+def ros_options(request: pytest.FixtureRequest, ros_domain: int) -> Iterator[dict[str, Any]]:
+    """Options of nodes over DDS, and over Zenoh with a router, that no other process hears."""
+    package = {"dds": "cyclonedds", "zenoh": "zenoh"}[request.param]
+    pytest.importorskip(package, reason=f"needs the extra [ros]: {package}")
+    options = {"middleware": request.param, "domain": ros_domain}
+    if request.param == "dds":
+        yield options
+        return
+    from gmmtorch.live.ros.zenoh_middleware import open_router
+
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        options["router"] = f"tcp/127.0.0.1:{found.getsockname()[1]}"
+    router = open_router(options["router"])
+    yield options
+    router.close()

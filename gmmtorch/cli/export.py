@@ -8,6 +8,7 @@ from omegaconf import DictConfig
 
 from gmmtorch.cli import app, common
 from gmmtorch.errors import InvalidArgumentError, check_choice
+from gmmtorch.optional_packages import load_pyoctomap
 from gmmtorch.report.progress import ProgressBars
 
 _OF_SPACE = ("map_server", "octomap", "ply", "pcd", "mesh", "distance_field")
@@ -39,6 +40,8 @@ def run(config: DictConfig) -> None:
         if not config[name]:
             raise InvalidArgumentError(f"{name} is not set; give {name}=FILE.")
     config.format = _format(config)
+    if config.format == "octomap":
+        load_pyoctomap()  # before the cells are computed
     common.use_runtime(config.runtime)
     with ProgressBars(enabled=config.report.progress) as bars:
         if config.format == _OF_POSES:

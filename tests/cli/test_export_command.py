@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from export.map_examples import read_map_image
 
 from gmmtorch.baselines.occupancy_grid import LogOdds, OccupancyGrid
 from gmmtorch.cli import common
+from gmmtorch.cli.reporting import exported_files
 from gmmtorch.datasets import load
 from gmmtorch.export.mixture_formats import read_gira_csv, read_npz
 from gmmtorch.export.trajectory_files import write_tum
@@ -184,6 +186,14 @@ def test_octree_has_the_occupancy_of_the_map(name, run, files, tmp_path):
     answers = loaded.occupancy(centers[:, : int(name[-1])], 0.5)
     found = [tree.search(center).getOccupancy() for center in centers]
     np.testing.assert_allclose(found, answers, atol=1e-5)
+
+
+def test_octomap_without_its_package_is_refused_before_the_cells_are_computed(run, files, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyoctomap", None)
+    monkeypatch.setattr(exported_files, "write_space", pytest.fail)
+    assert "pip install 'gmmtorch[baselines]'" in refused(
+        run(f"path={files / 'map_3.safetensors'}", "output=map.ot", "resolution=0.5")
+    )
 
 
 def test_bounds_limit_the_cells(run, files, tmp_path):

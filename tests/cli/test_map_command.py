@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -83,6 +84,12 @@ def test_a_wrong_export_is_refused_before_any_work(run):
     error = refused(run("export=[mesch]"))
     assert "'mesch' is not one of map_server" in error
     assert "resolution=0" in refused(run("resolution=0"))
+
+
+def test_an_export_whose_package_is_missing_is_refused_before_any_work(run, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyoctomap", None)
+    monkeypatch.setattr(MapBuilder, "insert_all", pytest.fail)
+    assert "pip install 'gmmtorch[baselines]'" in refused(run("export=[octomap]"))
 
 
 def test_scans_of_a_bag_that_cannot_be_used_are_counted_and_printed(monkeypatch, tmp_path):

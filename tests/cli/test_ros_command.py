@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import signal
@@ -19,7 +20,6 @@ import torch
 from command_runs import CHECKOUT, composed, environment, refused, run_here, run_script, succeeded
 
 pytest.importorskip("rosbags", reason="needs the extra [ros]: rosbags")
-pytest.importorskip("cyclonedds", reason="needs the extra [ros]: cyclonedds")
 
 from exploration.replays import content
 from mapping.random_components import random_components
@@ -44,12 +44,21 @@ from gmmtorch.sharing.transport.udp import UdpTransport
 LASER = "sensor_msgs/msg/LaserScan"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
+needs_dds = pytest.mark.skipif(
+    importlib.util.find_spec("cyclonedds") is None, reason="needs the extra [ros]: cyclonedds"
+)
 
-def test_a_missing_topic_is_an_error_that_lists_what_is_there(monkeypatch, tmp_path, ros_domain):
-    error = refused(run_here(monkeypatch, "ros", tmp_path, f"node.domain={ros_domain}", "wait=0.2"))
+
+def of_node(options: dict[str, Any]) -> list[str]:
+    return [f"node.{name}={value}" for name, value in options.items()]
+
+
+def test_a_missing_topic_is_an_error_that_lists_what_is_there(monkeypatch, tmp_path, ros_options):
+    error = refused(run_here(monkeypatch, "ros", tmp_path, *of_node(ros_options), "wait=0.2"))
     assert "no topic of a range sensor after 0.2 s. Published topics: none" in error
 
 
+@needs_dds
 @pytest.mark.parametrize(
     ("option", "words"),
     [
@@ -84,13 +93,14 @@ def test_a_robot_that_starts_again_keeps_its_frame(monkeypatch, tmp_path, dim):
 
 
 @pytest.mark.slow
-def test_ctrl_c_saves_the_map_of_a_played_recording(monkeypatch, tmp_path, ros_domain):
+def test_ctrl_c_saves_the_map_of_a_played_recording(monkeypatch, tmp_path, ros_options):
+    on_network = of_node(ros_options)
     with BagWriter(tmp_path / "a.mcap") as bag:
         for i in range(20):
             bag.laser("/scan", i / 10, "laser", [2.0 + k / 50 for k in range(60)], -1.5, 0.05, 9.0)
 
     def play_and_stop() -> None:
-        options = [f"node.domain={ros_domain}", "rate=4", "wait=60", f"play={tmp_path / 'a.mcap'}"]
+        options = [*on_network, "rate=4", "wait=60", f"play={tmp_path / 'a.mcap'}"]
         played.append(run_script("ros", tmp_path / "play", *options, "report.progress=false"))
         end = time.monotonic() + 60
         while not any(count["received"] == 20 for count in counts()) and time.monotonic() < end:
@@ -110,7 +120,7 @@ def test_ctrl_c_saves_the_map_of_a_played_recording(monkeypatch, tmp_path, ros_d
     monkeypatch.setattr(Node, "__init__", remember)
     thread = threading.Thread(target=play_and_stop)
     thread.start()
-    options = [f"node.domain={ros_domain}", "wait=60", "sensor.poses=standing", "sensor.max_latency=null"]
+    options = [*on_network, "wait=60", "sensor.poses=standing", "sensor.max_latency=null"]
     done = succeeded(run_here(monkeypatch, "ros", tmp_path / "run", *options, "report.progress=false"))
     thread.join()
     assert "played    20 of 20 messages" in succeeded(played[0]).stdout
@@ -155,6 +165,7 @@ def mapped(sweeps: list[int]) -> GaussianMap:
     return builder.map
 
 
+@needs_dds
 @pytest.mark.slow
 def test_a_killed_mapper_of_a_team_goes_on_after_its_last_checkpoint(tmp_path, ros_domain):
     folder, (here, other) = tmp_path / "run", links.free_addresses(2)

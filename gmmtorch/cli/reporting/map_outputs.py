@@ -25,6 +25,7 @@ from gmmtorch.localization.scan_locations import scan_times
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.map_builder import MapBuilder
+from gmmtorch.optional_packages import load_pyoctomap
 from gmmtorch.report.maps.map_figures import map_figure
 from gmmtorch.report.maps.map_images import MapPanel
 from gmmtorch.report.maps.map_regions import robust_bounds
@@ -49,12 +50,14 @@ _STANDING = 1.0  # m of a path, below which bytes a metre say nothing
 
 
 def check_exports(config: DictConfig) -> None:
-    """Raises `InvalidArgumentError` for an unknown export."""
+    """Raises `InvalidArgumentError` for an unknown export, `GmmTorchError` if its package is missing."""
     for name in config.export:
         if name not in EXPORTS:
             raise InvalidArgumentError(
                 f"export={list(config.export)}: {name!r} is not one of {', '.join(EXPORTS)}."
             )
+    if "octomap" in config.export:
+        load_pyoctomap()
 
 
 def run_facts(config: DictConfig, source: str) -> dict[str, Any]:

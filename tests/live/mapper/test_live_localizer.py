@@ -9,7 +9,6 @@ import pytest
 import torch
 
 pytest.importorskip("rosbags", reason="needs the extra [ros]: rosbags")
-pytest.importorskip("cyclonedds", reason="needs the extra [ros]: cyclonedds")
 
 from gmmtorch.datasets import load
 from gmmtorch.datasets.base import Ranges
@@ -72,8 +71,8 @@ def known() -> GaussianMap:
 
 
 @pytest.fixture
-def node(ros_domain):
-    with Node("test", domain=ros_domain) as made:
+def node(ros_options):
+    with Node("test", **ros_options) as made:
         yield made
 
 

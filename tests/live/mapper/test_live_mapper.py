@@ -13,7 +13,6 @@ import pytest
 import torch
 
 pytest.importorskip("rosbags", reason="needs the extra [ros]: rosbags")
-pytest.importorskip("cyclonedds", reason="needs the extra [ros]: cyclonedds")
 
 from test_live_scans import laser, recorded
 
@@ -41,9 +40,9 @@ LASER_TYPE, GRID = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/OccupancyGrid"
 
 
 @pytest.fixture
-def node(ros_domain: int) -> Callable[..., Node]:
+def node(ros_options: dict[str, Any]) -> Callable[..., Node]:
     """Makes nodes that hear each other, and no other process."""
-    return lambda name="test", **options: Node(name, domain=ros_domain, **options)
+    return lambda name="test", **options: Node(name, **ros_options, **options)
 
 
 def test_a_played_recording_gives_the_map_of_the_recording(node, tmp_path):

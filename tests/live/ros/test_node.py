@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import time
 from collections.abc import Callable, Iterator
 from xml.etree import ElementTree
@@ -22,12 +21,6 @@ CLOUD, STRING, GRID = "sensor_msgs/msg/PointCloud2", "std_msgs/msg/String", "nav
 MakeNode = Callable[..., Node]
 
 
-def free_port() -> int:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return int(found.getsockname()[1])
-
-
 def wait_until(is_done: Callable[[], bool], *nodes: Node, seconds: float = 30.0) -> None:
     """Spins the nodes until the condition holds."""
     end = time.monotonic() + seconds
@@ -37,27 +30,18 @@ def wait_until(is_done: Callable[[], bool], *nodes: Node, seconds: float = 30.0)
             node.spin_once(0.02)
 
 
-@pytest.fixture(params=["dds", "zenoh"])
-def make_node(request, ros_domain) -> Iterator[MakeNode]:
+@pytest.fixture
+def make_node(ros_options) -> Iterator[MakeNode]:
     """Makes nodes that hear each other, and no other process."""
-    package = {"dds": "cyclonedds", "zenoh": "zenoh"}[request.param]
-    pytest.importorskip(package, reason=f"needs the extra [ros]: {package}")
-    nodes, router, options = [], None, {"middleware": request.param, "domain": ros_domain}
-    if request.param == "zenoh":
-        from gmmtorch.live.ros.zenoh_middleware import open_router
-
-        options["router"] = f"tcp/127.0.0.1:{free_port()}"
-        router = open_router(options["router"])
+    nodes = []
 
     def make(name: str = "test", **more: object) -> Node:
-        nodes.append(Node(name, **{**options, **more}))
+        nodes.append(Node(name, **{**ros_options, **more}))
         return nodes[-1]
 
     yield make
     for node in nodes:
         node.close()
-    if router is not None:
-        router.close()
 
 
 @pytest.fixture
