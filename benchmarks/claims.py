@@ -273,7 +273,7 @@ RUNS = {
         *of_table(RESULTS, "registration-hall", 1, ALIGNED),
         *of_table(RESULTS, "registration-courtyard", 1, ALIGNED),
     ]),
-    "odometry": Run(f"{ODOMETRY} --seeds 0 1 2 --names courtyard && "
+    "odometry": Run(f"{ODOMETRY} --seeds 0 1 2 3 4 --names courtyard && "
                     f"{ODOMETRY} --seeds 0 --names street && "
                     f"{ODOMETRY} --seeds 0 1 --names hall && "
                     f"{ODOMETRY} --seeds 0 1 --names intel && "

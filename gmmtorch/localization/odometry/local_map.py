@@ -23,6 +23,10 @@ from gmmtorch.scan import Scan
 
 _BLURS = {2: (0.2, 0.08, 0.03), 3: (0.25, 0.1, 0.04)}  # metres
 _STEPS = 15  # of a level
+_SLIDE = 1.0  # metres that the best pose is moved at most along its loosest direction, to
+_SLIDES = 16  # places, each of which climbs by
+_SLIDE_STEPS = 3
+_DECISIVE = 4.0  # nats by which such a place must be better: smaller gains do not make poses more exact
 _SPACING = {2: 0.25, 3: 0.5}  # metres between the starts of the first search
 _COARSE = {2: 0.5, 3: 1.0}  # metres of blur, and between the starts, of the last search
 _TURNED = {
@@ -180,6 +184,12 @@ class LocalMap:
             order = order[:kept]
             found, total, view = found.at(order), total[order], view.at(order)
             motions = found.motions
+        # A climb has the points' score alone, which can rise along a wall while the sum of evidence falls.
+        slid = align(points, targets[-1], _slid(found, points), _SLIDE_STEPS)
+        slid_total, slid_view = self._total(slid, points, expected)
+        order = slid_total.argsort(descending=True, stable=True)
+        if float(slid_total[order[0]] - total[0]) > _DECISIVE:
+            found, total, view = slid.at(order), slid_total[order], slid_view.at(order)
         return self._judged(points, found, total, view, expected)
 
     def _total(self, found: Alignment, points: Tensor, expected: Expectation) -> tuple[Tensor, View]:
@@ -241,6 +251,16 @@ class LocalMap:
         poses[:, :-1, :-1] = left @ right
         poses[:, :-1, -1] = motions.translations + self._center
         return poses
+
+
+def _slid(found: Alignment, points: Tensor) -> Motions:
+    """The first motion, moved along the direction that the points fix least, by up to two deviations."""
+    covariance, loosest = pose_covariance(found.information[0], points)
+    scale = torch.ones(len(covariance)).double()
+    scale[points.shape[1] :] = 1 / points.norm(dim=1).median().clamp_min(1e-3)
+    axis = torch.linalg.eigh(covariance / scale[:, None] / scale)[1][:, -1] * scale
+    steps = torch.linspace(-1, 1, _SLIDES).double() * min(2 * loosest, _SLIDE)
+    return found.motions.at(torch.zeros(_SLIDES, dtype=torch.int64)).moved(steps[:, None] * axis)
 
 
 def nowhere(dim: int) -> Tensor:
