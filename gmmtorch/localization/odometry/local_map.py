@@ -187,6 +187,9 @@ class LocalMap:
         # A climb has the points' score alone, which can rise along a wall while the sum of evidence falls.
         slid = align(points, targets[-1], _slid(found, points), _SLIDE_STEPS)
         slid_total, slid_view = self._total(slid, points, expected)
+        # A place whose own direction stays open would lose to any pose of a wider search without a doubt.
+        is_open = [pose_covariance(one, points)[1] > _LOOSEST for one in slid.information]
+        slid_total = torch.where(torch.tensor(is_open), -torch.inf, slid_total)
         order = slid_total.argsort(descending=True, stable=True)
         if float(slid_total[order[0]] - total[0]) > _DECISIVE:
             found, total, view = slid.at(order), slid_total[order], slid_view.at(order)
