@@ -9,24 +9,11 @@ GPU, and how many of them wait for it. Writes the table `devices` of BENCHMARKS.
 from __future__ import annotations
 
 import argparse
-import time
 from pathlib import Path
 
 import torch
-from public_work import Work, counted, large_works, prepare, works
+from public_work import counted, large_works, least_seconds, prepare, works
 from tables import hardware, markdown, publish, three_digits
-
-
-def seconds(work: Work, repeats: int, device: str) -> float:
-    """The least of several runs."""
-    times = []
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        work()
-        if device != "cpu":
-            torch.cuda.synchronize()
-        times.append(time.perf_counter() - begin)
-    return min(times)
 
 
 def main() -> None:
@@ -48,7 +35,7 @@ def main() -> None:
                 continue
             work = prepared()
             counts[name] = counted(work)  # and what is compiled or loaded once
-            rows.setdefault(name, []).append(seconds(work, options.repeats, device))
+            rows.setdefault(name, []).append(least_seconds(work, options.repeats, device))
             print(device, name, f"{rows[name][-1]:.3g}", counts[name], flush=True)
     header = ["work", "s on the CPU", "s on the GPU", "times faster", "operations (waits)"]
     table = markdown(

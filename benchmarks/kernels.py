@@ -15,12 +15,11 @@ import json
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import torch
-from public_work import counted
+from public_work import counted, least_seconds
 from tables import ROOT, hardware, markdown, publish, three_digits
 from threadpoolctl import threadpool_limits
 from torch import Tensor
@@ -173,23 +172,12 @@ def against(other: Path, data: Path, repeats: int) -> str:
     return markdown(["work", "s before", "s now", "times faster", "operations before", "now"], rows)
 
 
-def least(work: Callable[[], object], repeats: int, device: str) -> float:
-    times = []
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        work()
-        if device != "cpu":
-            torch.cuda.synchronize()
-        times.append(time.perf_counter() - begin)
-    return min(times)
-
-
 def compared(work: Work, repeats: int, device: str) -> list[str]:
     name, function, size, unit = work
     seconds = []
     for choice in ("torch", "fused"):
         with kernels(choice):
-            seconds.append(least(function, repeats, device))
+            seconds.append(least_seconds(function, repeats, device))
     shown = [three_digits(size / s if size else s) for s in seconds]
     return [name, unit, *shown, three_digits(seconds[0] / seconds[1])]
 

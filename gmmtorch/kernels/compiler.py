@@ -139,7 +139,7 @@ class FusedKernel:
         return launch
 
     def _cuda_launch_of_thread(self, device: torch.device) -> _CudaLaunch:
-        """The same on a GPU."""
+        """The launch of this thread on a GPU, which is repeated in the same way."""
         launches: dict[torch.device, _CudaLaunch] = self._threads.__dict__.setdefault("on_gpu", {})
         if device not in launches:
             launches[device] = _CudaLaunch(self._kernels["cuda"], device, len(self._parameters))

@@ -22,10 +22,9 @@ SKIPPED = 37.0
 
 _FEW_ROWS = 2048  # in fewer rows, their order matters little
 _PARTS = 64  # most parts of the rows; each has its own sums, so that threads write apart
-_GPU_THREADS = (
-    1 << 18
-)  # as many as a large GPU holds at a time; each sums one component over a part of the rows
-_GPU_ROWS = 32  # least rows of a part
+_GPU_THREADS = 1 << 18
+"""As many as a large GPU holds at a time; each sums one component over a part of the rows."""
+_GPU_ROWS = 32  # least rows of such a part
 
 PRODUCTS = """
         vec a = x[0] * w[0], b = x[0] * w[WIDTH], c = x[0] * w[2 * WIDTH], d = x[0] * w[3 * WIDTH];
@@ -192,8 +191,8 @@ def expectation(
         features: φ (N, F). sample_weight: p (N,). natural: W (K, F).
     """
     if _is_fused(features, sample_weight, natural):
-        on_cpu = features.device.type == "cpu"
-        return (_fused if on_cpu else _fused_on_gpu)(features, sample_weight, natural)
+        fused = _fused if features.device.type == "cpu" else _fused_on_gpu
+        return fused(features, sample_weight, natural)
     return _batched(features, sample_weight, natural, softmax_dtype)
 
 

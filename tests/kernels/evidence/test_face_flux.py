@@ -13,13 +13,17 @@ from gmmtorch.occupancy.forms.flux.box_flux import cell_flux, flux_evidence
 from gmmtorch.occupancy.grid import VoxelGrid
 
 
+def cones_around_the_grid(dim: int, kind: str) -> Cones:
+    """Some sensor origins lie in the grid, some outside, and some on a corner of its cells."""
+    cones = cones_of(dim, kind, 12, thin=0.03)
+    cones.origins[:2] = torch.tensor([0.5, 1.0, -1.5][:dim])
+    return Cones(*cones[:3], torch.ones(12), cones.max_range)
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("kind", ["any", "flat", "around"])
 def test_fused_flux_equals_the_twin(dim, kind):
-    # Some sensor origins lie in the grid, some outside, and some on a corner of its cells.
-    cones = cones_of(dim, kind, 12, thin=0.03)
-    cones.origins[:2] = torch.tensor([0.5, 1.0, -1.5][:dim])
-    cones = Cones(*cones[:3], torch.ones(12), cones.max_range)
+    cones = cones_around_the_grid(dim, kind)
     grid, found = VoxelGrid((-3.0,) * dim, 0.5, (12, 13, 14)[:dim]), []
     for choice in ("torch", "fused"):
         with kernels(choice):
@@ -43,9 +47,7 @@ def test_a_looser_tolerance_stays_within_itself():
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("kind", ["any", "flat", "around"])
 def test_fused_flux_of_listed_cells_equals_that_of_boxes(dim, kind):
-    cones = cones_of(dim, kind, 12, thin=0.03)
-    cones.origins[:2] = torch.tensor([0.5, 1.0, -1.5][:dim])
-    cones = Cones(*cones[:3], torch.ones(12), cones.max_range)
+    cones = cones_around_the_grid(dim, kind)
     cells = torch.cartesian_prod(*[torch.arange(-6, 7)] * dim)[::5].flip(0).double()
     found = []
     for choice in ("torch", "fused"):
