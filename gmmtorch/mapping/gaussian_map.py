@@ -24,7 +24,14 @@ from gmmtorch.mapping.learning.forgetting import Doubts
 from gmmtorch.mapping.learning.rules import IncrementalRule, LearningRule, WindowedRule, read_rule
 from gmmtorch.mapping.map_state import MapState
 from gmmtorch.mapping.query import Query
-from gmmtorch.mapping.query_options import HitLength, MapOptions, QueryOptions, Sampling, check_method
+from gmmtorch.mapping.query_options import (
+    AUTO,
+    HitLength,
+    MapOptions,
+    QueryOptions,
+    Sampling,
+    check_method,
+)
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import VoxelGrid, check_resolution
 from gmmtorch.occupancy.protocol import check_queries, check_scan
@@ -83,7 +90,7 @@ class GaussianMap(MapState):
         codec: str = "quantized",
         prior: float = 1.0,
         cutoff: float | None = None,
-        hit_length: HitLength = 1.0,
+        hit_length: HitLength = AUTO,
         n_samples: int = 1_000_000,
         sampling: Sampling = "sobol",
         memory_limit: int = 4 << 30,

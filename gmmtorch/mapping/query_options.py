@@ -41,7 +41,7 @@ class QueryOptions:
 
     prior: float = 1.0
     cutoff: float | None = None
-    hit_length: HitLength = 1.0
+    hit_length: HitLength = AUTO
     n_samples: int = 1_000_000
     sampling: Sampling = "sobol"
     random_state: int = 0

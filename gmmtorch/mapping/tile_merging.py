@@ -116,7 +116,9 @@ def _tile(
 
 
 def _index(rows: Sequence[dict[str, Any]], dim: int, settings: MapSettings, side: float) -> bytes:
-    return TileIndex.joined(rows, dim).to_bytes(side=float(side), **map_file.settings_facts(settings))
+    sums = sum((row["range_sums"].cpu() for row in rows), torch.zeros(2, dtype=torch.float64))
+    facts = {"side": float(side), "range_sums": sums.tolist(), **map_file.settings_facts(settings)}
+    return TileIndex.joined(rows, dim).to_bytes(**facts)
 
 
 def canonical(components: Components) -> Components:

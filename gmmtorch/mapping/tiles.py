@@ -13,13 +13,21 @@ import zlib
 from collections import OrderedDict
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
-from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, MissingDataError, check_whole
+from gmmtorch.errors import (
+    DataError,
+    InvalidArgumentError,
+    MemoryLimitError,
+    MissingDataError,
+    check_number,
+    check_whole,
+)
 from gmmtorch.mapping.codec import map_file
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
@@ -52,7 +60,8 @@ class TiledMap:
     Attributes:
         index: see `TileIndex`. dim: 2 or 3. side: of the tiles (m).
         resolution, method, query_options: as of a `GaussianMap`; the cutoff is that of the whole map. With
-            hit_length="auto" the first query reads all tiles once, for their mean range.
+            hit_length="auto" the index states the mean range; if it is older and does not, the first query
+            reads all tiles once.
         settings: of the tiles' files.
         n_read: number of tile files read so far.
 
@@ -75,6 +84,7 @@ class TiledMap:
         query = self.settings.query
         self._cutoff = self.index.cutoff if query.cutoff is None else query.cutoff
         self._options = replace(query, cutoff=self._cutoff, memory_limit=memory_limit)
+        self._range_sums = _read_range_sums(facts, self.folder / INDEX)
         self.n_read = 0
         self._open: OrderedDict[int, Query] = OrderedDict()
 
@@ -88,8 +98,11 @@ class TiledMap:
     def query_options(self) -> QueryOptions:
         """How queries are answered; the same in all tiles."""
         if self._options.hit_length == AUTO:
-            sums = [range_sums(self.components(row).cones()) for row in range(len(self.index))]
-            self._options = with_hit_length(self._options, sum(sums, torch.zeros(2, dtype=torch.float64)))
+            sums = self._range_sums
+            if sums is None:
+                each = [range_sums(self.components(row).cones()) for row in range(len(self.index))]
+                sums = sum(each, torch.zeros(2, dtype=torch.float64))
+            self._options = with_hit_length(self._options, sums)
         return self._options
 
     @query_options.setter
@@ -209,3 +222,14 @@ class TiledMap:
         while len(self._open) > self.most_open:
             self._open.popitem(last=False)
         return self._open[row]
+
+
+def _read_range_sums(facts: dict[str, Any], path: Path) -> Tensor | None:
+    """`range_sums` of all tiles, as the index states them; None if it does not."""
+    if "range_sums" not in facts:
+        return None
+    try:
+        total, count = (check_number("range_sums", value) for value in facts["range_sums"])
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{path}: its range_sums are damaged ({error}).") from error
+    return torch.tensor([total, count], dtype=torch.float64)

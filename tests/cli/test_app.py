@@ -118,7 +118,7 @@ def test_characters_that_the_encoding_of_the_output_lacks_are_no_error(monkeypat
     monkeypatch.setattr(sys, "argv", ["gmmtorch-map", "--help"])
     map.main()
     output.flush()
-    assert re.search(r"map.hit_length=1.0 +\? \(m\);", output.buffer.getvalue().decode("cp1252"))
+    assert re.search(r"map.hit_length=auto +\? \(m\);", output.buffer.getvalue().decode("cp1252"))
 
 
 def test_the_version_is_that_of_the_package(run):

@@ -26,7 +26,7 @@ def maps() -> dict[int, tuple[GaussianMap, list[torch.Tensor]]]:
     found = {}
     for dim, name in ((2, "synthetic_building_2d"), (3, "synthetic_building")):
         scans = load(name, n_scans=3)
-        built = GaussianMap()
+        built = GaussianMap(hit_length=1.0)
         for scan in scans:
             built.insert(scan.select(torch.arange(scan.n_beams) % (1 if dim == 2 else 8) == 0))
         found[dim] = built, [torch.stack([scan.origin for scan in scans])]

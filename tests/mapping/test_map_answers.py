@@ -98,7 +98,9 @@ def test_hit_length_auto_is_half_the_mean_range(dim):
     found = GaussianMap.from_components(**given, hit_length="auto").occupancy(lattice(dim), 0.25)
     expected = GaussianMap.from_components(**given, hit_length=mean_range / 2).occupancy(lattice(dim), 0.25)
     torch.testing.assert_close(found, expected, rtol=1e-12, atol=0)
-    assert not torch.equal(found, GaussianMap.from_components(**given).occupancy(lattice(dim), 0.25))
+    assert torch.equal(found, GaussianMap.from_components(**given).occupancy(lattice(dim), 0.25))
+    counts = GaussianMap.from_components(**given, hit_length=1.0).occupancy(lattice(dim), 0.25)
+    assert not torch.equal(found, counts)
     free = {**given, "max_range": [True] * 3}
     assert bool((GaussianMap.from_components(**free, hit_length="auto").occupancy(means) < 0.5).all())
 

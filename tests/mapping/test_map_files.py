@@ -70,7 +70,7 @@ def test_only_settings_that_differ_from_the_defaults_are_written(tmp_path):
         "codec": "float",
         "robot": 0,
         "cutoff": None,
-        "hit_length": 1.0,
+        "hit_length": "auto",
     }
     assert GaussianMap.load(tmp_path / "m.safetensors").query_options == GaussianMap().query_options
 

@@ -23,7 +23,7 @@ from gmmtorch.mapping.tile_merging import canonical, merge, tile_files
 from gmmtorch.mapping.tiles import TiledMap
 
 SIDE = 10.0
-SETTINGS = MapSettings(0.3, "point", "quantized", 0, QueryOptions(n_samples=200_000))
+SETTINGS = MapSettings(0.3, "point", "quantized", 0, QueryOptions(n_samples=200_000, hit_length=1.0))
 
 
 def recording(dim: int, seed: int, k: int = 60, codec: str = "quantized") -> Components:
