@@ -65,7 +65,7 @@ def main() -> None:
             continue
         rule = IncrementalRule(max_bytes=max_bytes)
         # What gmmtorch-occupancy takes unless it is told otherwise.
-        factories = choose(METHODS, methods(partial(GaussianMap, rule, cutoff=3.0, hit_length=1.0)))
+        factories = choose(METHODS, methods(partial(GaussianMap, rule, cutoff=3.0)))
         protocol = Protocol(test_every, KEPT, "beams", resolutions, max_beams=MAX_BEAMS)
         outcome = evaluate(name, list(dataset), factories, protocol)
         for resolution in resolutions:

@@ -226,7 +226,7 @@ def static_rows(folder: Path) -> list[list[object]]:
         protocol = Protocol(test_every, (1.0,), "beams", resolutions[:1], max_beams=20_000)
         found = []
         for rule in rules:
-            make = methods(partial(GaussianMap, rule, cutoff=3.0, hit_length=1.0))
+            make = methods(partial(GaussianMap, rule, cutoff=3.0))
             found += evaluate(name, list(dataset), choose(["point"], make), protocol).rows
         off, kept = found
         budget = f"{max_bytes / 1e3:.0f} kB" if max_bytes else "none"

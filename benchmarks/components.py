@@ -77,7 +77,7 @@ def factory(changes: dict[str, float], dim: int):
         if whole in options:
             options[whole] = int(options[whole])
     rule = WindowedRule(window=window, **options)  # type: ignore[arg-type]
-    return lambda resolution: GaussianMap(rule, cutoff=5.0, hit_length=None)
+    return lambda resolution: GaussianMap(rule, cutoff=5.0, prior=1.0)
 
 
 def columns(name: str, rows: list[dict]) -> tuple[list[str], list[object]]:

@@ -51,7 +51,7 @@ def learned(
         support.append(moved.weights.cpu() * points.shape[0])
         origins.append(pose[:3, 3].expand_as(means[-1]))
     parts = (torch.cat(part) for part in (means, covariances, support, origins))
-    built = GaussianMap.from_components(*parts, cutoff=5.0, hit_length=None)
+    built = GaussianMap.from_components(*parts, cutoff=5.0, prior=1.0)
     return built, 1e3 * statistics.median(seconds), statistics.mean(likelihood)
 
 

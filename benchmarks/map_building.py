@@ -48,9 +48,7 @@ def main() -> None:
     for name, stride, options in RULES:
         seconds = []
         for _ in range(2):  # the first pays for what is loaded but once
-            built = GaussianMap(
-                IncrementalRule(max_bytes=arguments.max_bytes, **options), cutoff=3.0, hit_length=1.0
-            )
+            built = GaussianMap(IncrementalRule(max_bytes=arguments.max_bytes, **options), cutoff=3.0)
             begin = time.process_time()
             built.insert_depth(frames, intrinsics, stride)
             built.finish()

@@ -93,7 +93,7 @@ def measured(scans: Dataset, method: str, seed: int, name: str) -> dict[str, obj
 def map_score(scans: Dataset, name: str) -> float:
     """AUC of the map of the scans that are not held out, without a budget of bytes."""
     resolution = RESOLUTION[scans[0].dim]
-    factories = choose(("point",), methods(partial(gt.GaussianMap, cutoff=3.0, hit_length=1.0)))
+    factories = choose(("point",), methods(partial(gt.GaussianMap, cutoff=3.0)))
     protocol = Protocol(HELD_OUT.get(name, 10), (1.0,), "beams", (resolution,), max_beams=50_000)
     return float(evaluate(name, list(scans), factories, protocol).rows[0]["auc"])
 

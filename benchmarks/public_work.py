@@ -22,7 +22,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 import gmmtorch as gt
 
 Work = Callable[[], object]
-MAP = {"cutoff": 3.0, "hit_length": 1.0}
+MAP = {"cutoff": 3.0}
 FAST = {"cell": 0.05, "iterations": 4, "window": 16, "window_components": 200}
 
 

@@ -127,7 +127,7 @@ def measure_points(task: Task) -> Rows:
     scores = {}
     for cell in sorted({r, 2 * r, 4 * r, max(r, own)}):
         scores |= answers(filled(OccupancyGrid(cell), scans), asked, "grid", [cell])
-    scores |= answers(filled(GaussianMap(cutoff=5.0, hit_length=None), scans), asked, "mixture", [r, 2 * r])
+    scores |= answers(filled(GaussianMap(cutoff=5.0, prior=1.0), scans), asked, "mixture", [r, 2 * r])
     return [row(task, data, frames, points, scores)]
 
 
@@ -168,7 +168,7 @@ def measure_mixtures(task: Task) -> Rows:
         datagrams = [encode_components(components, kind) for components in sent]
         held = [Components.concatenate([components_of(d) for d in frame]) for frame in datagrams]
         points = [drawn(c, len(frame.scan.points)) for c, frame in zip(held, frames, strict=True)]
-        built = GaussianMap.of(compact(Components.concatenate(held), RECEIVED), cutoff=None, hit_length=None)
+        built = GaussianMap.of(compact(Components.concatenate(held), RECEIVED), cutoff=None, prior=1.0)
         r = RESOLUTIONS[task.dataset]
         scores = answers(built, asked, "mixture", [r, 2 * r])
         data = [b"".join(frame) for frame in datagrams]

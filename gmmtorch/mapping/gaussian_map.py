@@ -25,13 +25,12 @@ from gmmtorch.mapping.learning.rules import IncrementalRule, LearningRule, Windo
 from gmmtorch.mapping.map_state import MapState
 from gmmtorch.mapping.query import Query
 from gmmtorch.mapping.query_options import (
-    AUTO,
-    HitLength,
     MapOptions,
     QueryOptions,
     Sampling,
     check_method,
 )
+from gmmtorch.occupancy.calibration import Calibration
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import VoxelGrid, check_resolution
 from gmmtorch.occupancy.protocol import check_queries, check_scan
@@ -58,16 +57,16 @@ class GaussianMap(MapState):
         robot: first half of the components' ids.
         codec: rounding of components in files and queries: "quantized", about 10 bytes a component, or
             "float", every number as it is.
-        prior: N_p of (3.9), counts added to each outcome.
+        prior: None: probabilities are calibrated: the map predicts each window before it learns from it, see
+            `occupancy.calibration`. A number N_p: they follow from counts, as in the thesis (3.9).
         cutoff: Mahalanobis distance at which a component ends. None: 3 if components have many points (a
             median of at least 50 for each viewpoint), otherwise 5.
-        hit_length: ℓ (m). Occupancy multiplies hits by ℓ/resolution, so that thin walls count as occupied;
-            cells above ℓ lose hits. "auto": half the mean range of the map's beams. None: the factor is 1.
-            `evidence` is not affected.
         n_samples: number of rays of method "monte_carlo", drawn from the whole map.
         sampling: sequence of these rays, "sobol", "stratified" or "plain".
         memory_limit: largest number of bytes of the evidence of a grid, and of Monte Carlo evidence.
         compiled: use torch.compile where a compiled form exists.
+        calibration: from which the map's own goes on, such as that of another map. None: that of the sensor
+            model, for the ranges of the map's beams.
 
     Queries do not change the map: the scans of an unfinished window are learned for the answer, and learned
     again when the window is full. The first query after an insertion builds an index of the components;
@@ -88,13 +87,13 @@ class GaussianMap(MapState):
         random_state: int = 0,
         robot: int = 0,
         codec: str = "quantized",
-        prior: float = 1.0,
+        prior: float | None = None,
         cutoff: float | None = None,
-        hit_length: HitLength = AUTO,
         n_samples: int = 1_000_000,
         sampling: Sampling = "sobol",
         memory_limit: int = 4 << 30,
         compiled: bool = False,
+        calibration: Calibration | None = None,
     ) -> None:
         check_method(method)
         check_choice("codec", codec, map_file.CODECS)
@@ -107,12 +106,12 @@ class GaussianMap(MapState):
         query = QueryOptions(
             prior=prior,
             cutoff=cutoff,
-            hit_length=hit_length,
             n_samples=n_samples,
             sampling=sampling,
             random_state=random_state,
             memory_limit=memory_limit,
             compiled=compiled,
+            calibration=calibration,
         )
         number = check_whole("robot", robot, 0)
         settings = map_file.MapSettings(check_resolution(resolution), method, codec, number, query)
@@ -206,7 +205,16 @@ class GaussianMap(MapState):
             self._commit(*self._upcoming())
         self.learning = self.learning.fitted([first])
         taken = (frame_of(index).to(self._device) for index in range(len(frames)))
-        self._commit(*self._absorbed(taken, self.learning, float(pixel_stride**2)))
+        calibrator, n_windows = self._calibrator, self._n_windows
+
+        def predict(known: Components, window: Sequence[Scan | DepthFrame]) -> None:
+            nonlocal calibrator, n_windows
+            calibrator = self._predicted(known, window, calibrator, n_windows)
+            n_windows += 1
+
+        learned = self._absorbed(taken, self.learning, float(pixel_stride**2), predict)
+        self._calibrator, self._n_windows = calibrator, n_windows
+        self._commit(*learned)
 
     def finish(self) -> None:
         """Learns from the scans of the unfinished window now instead of at the first query. Changes no

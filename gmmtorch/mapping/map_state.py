@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import fields
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import fields, replace
 from functools import partial
 from typing import Any, cast
 
@@ -16,9 +16,12 @@ from gmmtorch.mapping.codec.quantization import number_after, numbered
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.depth_frame import DepthFrame, as_scans
 from gmmtorch.mapping.learning.forgetting import Doubts, joined
+from gmmtorch.mapping.learning.prediction import SIDES, predicted
 from gmmtorch.mapping.learning.rules import LearningRule, WindowedRule, read_rule, rule_facts
-from gmmtorch.mapping.learning.windows import absorb, learn_window
+from gmmtorch.mapping.learning.windows import BeforeWindow, absorb, learn_window, no_prediction
 from gmmtorch.mapping.query import Query
+from gmmtorch.mapping.query_options import QueryOptions
+from gmmtorch.occupancy.calibration import Calibrator
 from gmmtorch.scan import Scan
 
 _LONGEST_WINDOW = 40  # scans, if no scan yet shows how many points it holds
@@ -63,7 +66,9 @@ class MapState(nn.Module):
     def __init__(self, learning: LearningRule, settings: MapSettings, random_state: int) -> None:
         super().__init__()
         self.resolution, self.method, self.codec = settings.resolution, settings.method, settings.codec
-        self.robot, self.query_options = settings.robot, settings.query
+        self.robot, self._query_options = settings.robot, settings.query
+        known = settings.query.calibration
+        self._calibrator = None if known is None else Calibrator.continued(known, len(SIDES))
         self.learning = learning
         self._random_state = random_state
         self._pending: list[Scan] = []
@@ -101,6 +106,13 @@ class MapState(nn.Module):
         return len(self._pending)
 
     @property
+    def query_options(self) -> QueryOptions:
+        """How queries are answered, with the calibration that the map has learned."""
+        if self._calibrator is None or self._query_options.prior is not None:
+            return self._query_options
+        return replace(self._query_options, calibration=self._calibrator.calibration)
+
+    @property
     def settings(self) -> MapSettings:
         """What the map's file states about it, besides the components and the learning rule."""
         options = self.resolution, self.method, self.codec, self.robot, self.query_options
@@ -128,9 +140,16 @@ class MapState(nn.Module):
         return self._learned
 
     def _absorbed(
-        self, scans: Iterable[Scan | DepthFrame], rule: LearningRule, weight: float = 1.0
+        self,
+        scans: Iterable[Scan | DepthFrame],
+        rule: LearningRule,
+        weight: float = 1.0,
+        before: BeforeWindow = no_prediction,
     ) -> tuple[Components, int]:
-        """`_upcoming`, with the components of scans, or of frames whose points each stand for `weight`."""
+        """`_upcoming`, with the components of scans, or of frames whose points each stand for `weight`.
+
+        before: is called with each window before it is learned, see `absorb`.
+        """
         known = self._final()
         if isinstance(rule, WindowedRule):
             generator = torch.Generator().manual_seed(hash((self._random_state, self._n_windows)) % 2**63)
@@ -139,7 +158,7 @@ class MapState(nn.Module):
             learned, self._next_doubts = joined(known, new, window, rule, self._doubts)
         else:
             size = partial(file_size, rule=rule, settings=self.settings, next_number=self._next_number)
-            learned, self._next_doubts = absorb(known, scans, rule, size, weight, self._doubts)
+            learned, self._next_doubts = absorb(known, scans, rule, size, weight, self._doubts, before)
         return numbered(learned, self.robot, self._next_number)
 
     def _add(self, scan: Scan) -> None:
@@ -156,7 +175,20 @@ class MapState(nn.Module):
         except GmmTorchError:
             self._pending.pop()
             raise
+        self._calibrator = self._predicted(self._final(), self._pending, self._calibrator, self._n_windows)
         self._commit(*learned)
+
+    def _predicted(
+        self,
+        known: Components,
+        window: Sequence[Scan | DepthFrame],
+        calibrator: Calibrator | None,
+        number: int,
+    ) -> Calibrator | None:
+        """`predicted`, unless probabilities follow from counts."""
+        if self._query_options.prior is not None:
+            return None
+        return predicted(known, window, calibrator, number)
 
     def _prepare(self, dim: int, device: torch.device, what: str) -> None:
         """Gives an empty map its dimension. Raises if the map has another one."""
@@ -204,6 +236,7 @@ class MapState(nn.Module):
             "n_windows": self._n_windows,
             "n_numbered": self._next_number,
             "doubts": dict(vars(self._doubts)),
+            "calibrator": None if self._calibrator is None else dict(vars(self._calibrator)),
         }
 
     def _load_from_state_dict(
@@ -236,7 +269,8 @@ class MapState(nn.Module):
             self._buffers.pop(name, None)
         self._pending = []
         if extra is not None:
-            self.learning, self._pending, self._n_windows, self._next_number, self._doubts = extra
+            self.learning, self._pending, self._n_windows, self._next_number, self._doubts = extra[:5]
+            self._calibrator = extra[5]
             self._next_doubts = self._doubts
         if components is not None:
             self._set(Components(**{n: v.detach().clone().to(device) for n, v in vars(components).items()}))
@@ -244,7 +278,9 @@ class MapState(nn.Module):
         self._forget()
 
 
-def _read_extra(state: dict[str, Any]) -> tuple[LearningRule, list[Scan], int, int, Doubts]:
+def _read_extra(
+    state: dict[str, Any],
+) -> tuple[LearningRule, list[Scan], int, int, Doubts, Calibrator | None]:
     """The values of `get_extra_state`. Raises an error of any kind if the state is damaged."""
     return (
         read_rule(**state["learning"]),
@@ -252,4 +288,5 @@ def _read_extra(state: dict[str, Any]) -> tuple[LearningRule, list[Scan], int, i
         check_whole("n_windows", state["n_windows"], 0),
         check_whole("n_numbered", state["n_numbered"], 0),
         Doubts.read(state["doubts"]) if "doubts" in state else Doubts.none(),
+        Calibrator.restored(state["calibrator"]) if state.get("calibrator") else None,
     )

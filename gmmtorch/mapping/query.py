@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from gmmtorch.mapping.query_options import AUTO, QueryOptions, check_method
+from gmmtorch.mapping.query_options import QueryOptions, check_method
+from gmmtorch.occupancy.calibration import Calibration
 from gmmtorch.occupancy.cone_index import ConeIndex
 from gmmtorch.occupancy.cones import CUTOFF, Cones
-from gmmtorch.occupancy.evidence import Evidence, occupancy_probability
+from gmmtorch.occupancy.evidence import Evidence, Rule, probability
 from gmmtorch.occupancy.forms.cone.cone_evidence import cone_evidence
 from gmmtorch.occupancy.forms.flux.box_flux import cell_flux, flux_evidence
 from gmmtorch.occupancy.forms.monte_carlo import sample_rays
@@ -20,7 +22,9 @@ from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 
 _RAYS_AT_ONCE = 1 << 20
 _CELLS_AT_ONCE = 1 << 20
-_SHARP_CUTOFF, _MANY_POINTS = 3.0, 50
+_SHARP_CUTOFF = 3.0
+MANY_POINTS = 50
+"""A viewpoint with this count shows where a surface ends."""
 
 
 def cutoff_by_support(cones: Cones) -> float:
@@ -30,7 +34,7 @@ def cutoff_by_support(cones: Cones) -> float:
 
 def count_many(cones: Cones) -> tuple[int, int]:
     """Number of cones with a count, and number of cones with a count of at least 50 points."""
-    return int((cones.counts > 0).sum()), int((cones.counts >= _MANY_POINTS).sum())
+    return int((cones.counts > 0).sum()), int((cones.counts >= MANY_POINTS).sum())
 
 
 def cutoff_of(n_seen: int, n_many: int) -> float:
@@ -38,23 +42,22 @@ def cutoff_of(n_seen: int, n_many: int) -> float:
     return _SHARP_CUTOFF if n_seen - n_many <= (n_seen - 1) // 2 else CUTOFF
 
 
-def range_sums(cones: Cones) -> Tensor:
-    """Sum (m) of the ranges of the beams with a return, to their components' means; number of these beams."""
-    weight = cones.counts * ~cones.max_range
-    return torch.stack([(weight * (cones.means - cones.origins).norm(dim=1)).sum(), weight.sum()])
+def mean_range(parts: Iterable[Cones]) -> float:
+    """Mean range (m) of the beams with a return, to their components' means; 1 if there are none."""
+    total = count = 0.0
+    for cones in parts:
+        weight = cones.counts * ~cones.max_range
+        ranges = (cones.means - cones.origins).norm(dim=1)
+        found = torch.stack([(weight * ranges).sum(), weight.sum()]).tolist()
+        total, count = total + found[0], count + found[1]
+    return total / count if total > 0 else 1.0
 
 
-def with_hit_length(options: QueryOptions, sums: Tensor) -> QueryOptions:
-    """The options with ℓ in metres: for "auto" half the mean range of beams with these `range_sums`."""
-    total, count = sums.tolist()
-    return replace(options, hit_length=0.5 * total / count if total > 0 else None)
-
-
-def probability(evidence: PointEvidence, resolution: float, options: QueryOptions) -> Tensor:
-    """θ (M,) of cubes of side `resolution` (m) with hits (M,) and misses (M,); ℓ of the options in metres."""
-    length = options.hit_length
-    hits = evidence.hits if length is None else evidence.hits * (float(length) / resolution)
-    return occupancy_probability(hits, evidence.misses, options.prior)
+def rule_of(options: QueryOptions, parts: Iterable[Cones]) -> Rule:
+    """How probabilities follow from evidence; without a prior or a calibration, from the ranges of cones."""
+    if options.prior is not None:
+        return float(options.prior)
+    return options.calibration or Calibration.prior(mean_range(parts))
 
 
 class Query:
@@ -62,7 +65,7 @@ class Query:
 
     def __init__(self, cones: Cones, options: QueryOptions) -> None:
         self.cones = cones
-        self.options = with_hit_length(options, range_sums(cones)) if options.hit_length == AUTO else options
+        self.options, self.rule = options, rule_of(options, [cones])
         self.cutoff = cutoff_by_support(cones) if options.cutoff is None else options.cutoff
         self._lattices: dict[float, SparseEvidence] = {}
         self._forms: dict[float, PointForm] = {}
@@ -74,7 +77,8 @@ class Query:
         Method "point" takes the cube centred at the point; the others take the cell of the lattice
         [i·resolution, (i+1)·resolution) that contains the point. Points at infinity are unknown (½).
         """
-        return probability(self.evidence_at(points, resolution, method), resolution, self.options)
+        found = self.evidence_at(points, resolution, method)
+        return probability(found.hits, found.misses, resolution, self.cones.dim, self.rule)
 
     def evidence_at(self, points: Tensor, resolution: float, method: str) -> PointEvidence:
         """Hits and misses (M,) of the cubes of `occupancy`. Those of disjoint sets of cones add up."""
@@ -98,20 +102,20 @@ class Query:
         return PointEvidence(*(zeros.index_copy(0, place, values[cell]) for values in found))
 
     def evidence(self, grid: VoxelGrid, method: str) -> Evidence:
-        """Hits and misses of every cell of a grid: counts, which `hit_length` does not change.
+        """Hits and misses of every cell of a grid, and the rule by which probabilities follow from them.
 
         Raises `MemoryLimitError` if they take more bytes than the memory limit.
         """
         check_method(method)
         grid.check_memory(self.options.memory_limit)
-        evidence = Evidence.empty(grid, self.cones.means.device)
+        evidence = replace(Evidence.empty(grid, self.cones.means.device), rule=self.rule)
         if len(self.cones.counts) == 0:
             return evidence
         if method == "monte_carlo":
             self._cast(evidence)
             return evidence
         if method == "flux":
-            return flux_evidence(self.cones, grid, self.cutoff)
+            return replace(flux_evidence(self.cones, grid, self.cutoff), rule=self.rule)
         half, parts = 0.5 * grid.resolution, []
         for first in range(0, grid.n_cells, _CELLS_AT_ONCE):  # centres of all cells take more than evidence
             centers = grid.centers(self.cones.means.device, range(first, first + _CELLS_AT_ONCE))
@@ -120,7 +124,7 @@ class Query:
             else:
                 parts.append(self._in_boxes(centers - half, centers + half, grid.resolution))
         hits, misses = (torch.cat(values).view(grid.shape) for values in zip(*parts, strict=True))
-        return Evidence(grid, hits, misses)
+        return Evidence(grid, hits, misses, self.rule)
 
     def _form(self, resolution: float) -> PointForm:
         if resolution not in self._forms:

@@ -13,7 +13,7 @@ from torch import Tensor
 from gmmtorch.errors import DataError, GmmTorchError, check_number
 from gmmtorch.files import MAX_FILE_BYTES, pack_tensors, read_tensors, require
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.query import count_many, cutoff_of, range_sums
+from gmmtorch.mapping.query import count_many, cutoff_of
 from gmmtorch.occupancy.cones import CUTOFF, cone_bounds
 from gmmtorch.scan import FARTHEST
 
@@ -115,7 +115,6 @@ def index_row(
         "crc32": crc32,
         "n_seen": n_seen,
         "n_many": n_many,
-        "range_sums": range_sums(cones),  # of all tiles together, a fact of the index
     }
 
 

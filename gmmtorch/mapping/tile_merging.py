@@ -21,8 +21,10 @@ from gmmtorch.mapping.codec.quantization import quantized, spatial_order
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.merging import compact_to_bytes
 from gmmtorch.mapping.learning.rules import IncrementalRule
+from gmmtorch.mapping.query import mean_range
 from gmmtorch.mapping.tile_index import INDEX, TileIndex, index_row, tile_name
 from gmmtorch.mapping.tiles import TiledMap
+from gmmtorch.occupancy.calibration import Calibration
 
 SIDE = 100.0
 """Side (m) of the tiles if none is given."""
@@ -39,7 +41,7 @@ def tile_files(components: Components, settings: MapSettings, side: float = SIDE
         side: of the tiles (m).
     """
     check_number("tile", side, above=True)
-    settings = replace(settings, robot=0)
+    settings = _calibrated(replace(settings, robot=0), components)
     place = (components.means[:, :2].detach() / side).floor().long()
     tiles, which = torch.unique(place, dim=0, return_inverse=True)
     files, rows = {}, []
@@ -76,12 +78,18 @@ def merge(
     if tile_bytes is not None:
         check_whole("tile_bytes", tile_bytes, 1)
     first, folder = parts[0], Path(folder)
+    known = [part.settings.query.calibration for part in parts]
+    calibration = Calibration.merged([one for one in known if one is not None]) if any(known) else None
+    settings = _with(first.settings, calibration)
     for part in parts[1:]:
         for name in ("dim", "side", "settings"):
-            if getattr(part, name) != getattr(first, name):
+            found = [getattr(one, name) for one in (part, first)]
+            if name == "settings":
+                found = [_with(one, None) for one in found]
+            if found[0] != found[1]:
                 raise InvalidArgumentError(
-                    f"{part.folder} has {name}={getattr(part, name)}, but {first.folder} has "
-                    f"{getattr(first, name)}; map all recordings with the same options."
+                    f"{part.folder} has {name}={found[0]}, but {first.folder} has {found[1]}; map all "
+                    "recordings with the same options."
                 )
     owners: dict[tuple[int, ...], list[tuple[TiledMap, int]]] = {}
     for part in parts:
@@ -93,13 +101,25 @@ def merge(
     rows = []
     for done, tile in enumerate(sorted(owners), 1):
         joined = Components.concatenate([part.components(number) for part, number in owners[tile]])
-        data, row = _tile(tile, joined, first.settings, tile_bytes)
+        data, row = _tile(tile, joined, settings, tile_bytes)
         write_bytes(folder / tile_name(tile), data)
         rows.append(row)
         if on_event is not None:
             on_event("merging tiles", done, len(owners))
-    write_bytes(folder / INDEX, _index(rows, first.dim, first.settings, first.side))
+    write_bytes(folder / INDEX, _index(rows, first.dim, settings, first.side))
     return TiledMap(folder, first.device)
+
+
+def _calibrated(settings: MapSettings, components: Components) -> MapSettings:
+    """The settings with the calibration of the sensor model, for the ranges of the components, if they have
+    none. A tile alone does not show these ranges."""
+    if settings.query.calibration is not None or settings.query.prior is not None:
+        return settings
+    return _with(settings, Calibration.prior(mean_range([components.cones()])))
+
+
+def _with(settings: MapSettings, calibration: Calibration | None) -> MapSettings:
+    return replace(settings, query=replace(settings.query, calibration=calibration))
 
 
 def _tile(
@@ -116,9 +136,7 @@ def _tile(
 
 
 def _index(rows: Sequence[dict[str, Any]], dim: int, settings: MapSettings, side: float) -> bytes:
-    sums = sum((row["range_sums"].cpu() for row in rows), torch.zeros(2, dtype=torch.float64))
-    facts = {"side": float(side), "range_sums": sums.tolist(), **map_file.settings_facts(settings)}
-    return TileIndex.joined(rows, dim).to_bytes(**facts)
+    return TileIndex.joined(rows, dim).to_bytes(side=float(side), **map_file.settings_facts(settings))
 
 
 def canonical(components: Components) -> Components:

@@ -13,7 +13,6 @@ import zlib
 from collections import OrderedDict
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -25,15 +24,16 @@ from gmmtorch.errors import (
     InvalidArgumentError,
     MemoryLimitError,
     MissingDataError,
-    check_number,
     check_whole,
 )
 from gmmtorch.mapping.codec import map_file
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.query import Query, probability, range_sums, with_hit_length
-from gmmtorch.mapping.query_options import AUTO, QueryOptions, check_method
+from gmmtorch.mapping.query import Query, mean_range, rule_of
+from gmmtorch.mapping.query_options import check_method
 from gmmtorch.mapping.tile_index import INDEX, read_index, tile_name
+from gmmtorch.occupancy.calibration import Calibration
+from gmmtorch.occupancy.evidence import Rule, probability
 from gmmtorch.occupancy.forms.point import PointEvidence
 from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.occupancy.protocol import check_queries
@@ -59,9 +59,7 @@ class TiledMap:
 
     Attributes:
         index: see `TileIndex`. dim: 2 or 3. side: of the tiles (m).
-        resolution, method, query_options: as of a `GaussianMap`; the cutoff is that of the whole map. With
-            hit_length="auto" the index states the mean range; if it is older and does not, the first query
-            reads all tiles once.
+        resolution, method, query_options: as of a `GaussianMap`; the cutoff is that of the whole map.
         settings: of the tiles' files.
         n_read: number of tile files read so far.
 
@@ -83,8 +81,7 @@ class TiledMap:
         self.resolution, self.method = self.settings.resolution, self.settings.method
         query = self.settings.query
         self._cutoff = self.index.cutoff if query.cutoff is None else query.cutoff
-        self._options = replace(query, cutoff=self._cutoff, memory_limit=memory_limit)
-        self._range_sums = _read_range_sums(facts, self.folder / INDEX)
+        self.query_options = replace(query, cutoff=self._cutoff, memory_limit=memory_limit)
         self.n_read = 0
         self._open: OrderedDict[int, Query] = OrderedDict()
 
@@ -95,19 +92,15 @@ class TiledMap:
         )
 
     @property
-    def query_options(self) -> QueryOptions:
-        """How queries are answered; the same in all tiles."""
-        if self._options.hit_length == AUTO:
-            sums = self._range_sums
-            if sums is None:
-                each = [range_sums(self.components(row).cones()) for row in range(len(self.index))]
-                sums = sum(each, torch.zeros(2, dtype=torch.float64))
-            self._options = with_hit_length(self._options, sums)
-        return self._options
-
-    @query_options.setter
-    def query_options(self, options: QueryOptions) -> None:
-        self._options = options
+    def _rule(self) -> Rule:
+        """How probabilities follow from the evidence of all tiles. Written tiles state their calibration; of
+        those of version 1.0 all are read once, for the ranges of the sensor model."""
+        options = self.query_options
+        if options.prior is None and options.calibration is None:
+            cones = (self.components(row).cones() for row in range(len(self.index)))
+            known = Calibration.prior(mean_range(cones))
+            self.query_options = replace(options, calibration=known)
+        return rule_of(self.query_options, ())
 
     @property
     def n_components(self) -> int:
@@ -133,7 +126,7 @@ class TiledMap:
         check_method(method)
         resolution = self.resolution if resolution is None else check_resolution(resolution)
         evidence = self._evidence(query.to(self.device), resolution, method)
-        theta = probability(evidence, resolution, self.query_options)
+        theta = probability(evidence.hits, evidence.misses, resolution, self.dim, self._rule)
         return theta.to(query.device) if isinstance(points, Tensor) else theta.detach().cpu().numpy()
 
     def _evidence(self, points: Tensor, resolution: float, method: str) -> PointEvidence:
@@ -181,7 +174,7 @@ class TiledMap:
         """
         far = torch.full((self.dim,), math.inf)
         rows = self.near(-far if low is None else low, far if high is None else high, resolution)
-        n, limit = int(self.index.n_components[rows].sum()), self._options.memory_limit
+        n, limit = int(self.index.n_components[rows].sum()), self.query_options.memory_limit
         if n * _BYTES_EACH > limit:
             raise MemoryLimitError(
                 f"{len(rows)} tiles with {n:,} components need about {n * _BYTES_EACH:,} bytes, more than "
@@ -222,14 +215,3 @@ class TiledMap:
         while len(self._open) > self.most_open:
             self._open.popitem(last=False)
         return self._open[row]
-
-
-def _read_range_sums(facts: dict[str, Any], path: Path) -> Tensor | None:
-    """`range_sums` of all tiles, as the index states them; None if it does not."""
-    if "range_sums" not in facts:
-        return None
-    try:
-        total, count = (check_number("range_sums", value) for value in facts["range_sums"])
-    except (TypeError, ValueError) as error:
-        raise DataError(f"{path}: its range_sums are damaged ({error}).") from error
-    return torch.tensor([total, count], dtype=torch.float64)

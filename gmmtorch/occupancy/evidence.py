@@ -20,8 +20,22 @@ from gmmtorch.kernels.rays.cell_entropy import bernoulli_entropy as bernoulli_en
 from gmmtorch.kernels.rays.cell_entropy import occupancy_probability as occupancy_probability
 from gmmtorch.kernels.rays.ray_counting import count_in_grid
 from gmmtorch.kernels.rays.ray_traversal import CHUNK_VISITS
+from gmmtorch.occupancy.calibration import Calibration
 from gmmtorch.occupancy.grid import VoxelGrid
 from gmmtorch.occupancy.voxels.boxes import flat_index
+
+Rule = Calibration | float
+"""How a probability follows from evidence: calibrated, or with a count N_p by the thesis's (3.9)."""
+
+
+def probability(hits: Tensor, misses: Tensor, side: float, dim: int, rule: Rule) -> Tensor:
+    """Probabilities that cubes of a side (m) with hits and misses of any shape are occupied.
+
+    Maps, exports, viewers and planners all take them from here.
+    """
+    if isinstance(rule, Calibration):
+        return rule.probability(hits, misses, side, dim)
+    return occupancy_probability(hits, misses, rule)
 
 
 class CellClass(IntEnum):
@@ -79,12 +93,15 @@ class Thresholds:
 class Evidence:
     """Expected number of rays that end in each cell of a grid (`hits`) and that pass through it (`misses`).
 
-    Both have the shape of the grid, and are float64. Raises `InvalidArgumentError` for another shape.
+    Both have the shape of the grid, and are float64. `rule` says how probabilities follow from them: (3.9)
+    with N_p = 1 for counted rays, that of the map for its evidence. Raises `InvalidArgumentError` for another
+    shape.
     """
 
     grid: VoxelGrid
     hits: Tensor
     misses: Tensor
+    rule: Rule = 1.0
 
     def __post_init__(self) -> None:
         for name in ("hits", "misses"):
@@ -100,7 +117,7 @@ class Evidence:
         return (
             f"Evidence({seen} of {self.grid.n_cells} cells seen, {float(self.hits.sum()):.6g} hits, "
             f"{float(self.misses.sum()):.6g} misses, {self.hits.nbytes + self.misses.nbytes} bytes, "
-            f"{self.hits.device}, {self.grid})"
+            f"{_about(self.rule)}, {self.hits.device}, {self.grid})"
         )
 
     @classmethod
@@ -109,27 +126,31 @@ class Evidence:
         zeros = torch.zeros(grid.shape, dtype=torch.float64, device=device)
         return cls(grid, zeros, zeros.clone())
 
-    def probability(self, prior: float = 1.0) -> Tensor:
-        """Occupancy θ of each cell (3.9)."""
-        return occupancy_probability(self.hits, self.misses, prior)
+    def probability(self, prior: float | None = None) -> Tensor:
+        """Occupancy θ of each cell, by the rule; or (3.9) with a count N_p."""
+        return self._theta(self.hits, self.misses, prior)
 
-    def variance(self, prior: float = 1.0) -> Tensor:
+    def variance(self, prior: float | None = None) -> Tensor:
         """θ(1 − θ) of each cell."""
         return bernoulli_variance(self.probability(prior))
 
-    def entropy(self, prior: float = 1.0) -> Tensor:
+    def entropy(self, prior: float | None = None) -> Tensor:
         """Entropy of each cell in bits."""
         return bernoulli_entropy(self.probability(prior))
 
-    def classify(self, variance_threshold: float = 0.06, prior: float = 1.0) -> Tensor:
+    def classify(self, variance_threshold: float = 0.06, prior: float | None = None) -> Tensor:
         """`CellClass` values (int8) of all cells, with the dead band of (3.10)."""
         return classify(self.probability(prior), variance_threshold)
 
-    def lookup(self, points: ArrayLike, prior: float = 1.0) -> Tensor:
+    def lookup(self, points: ArrayLike, prior: float | None = None) -> Tensor:
         """Occupancy (M,) of the cells that contain points (M, D), world metres; ½ outside the grid."""
         cell, inside = self.grid.flat_index(as_tensor(points, "points", device=self.hits.device))
-        theta = occupancy_probability(self.hits.flatten()[cell], self.misses.flatten()[cell], prior)
+        theta = self._theta(self.hits.flatten()[cell], self.misses.flatten()[cell], prior)
         return torch.where(inside, theta, torch.full_like(theta, 0.5))
+
+    def _theta(self, hits: Tensor, misses: Tensor, prior: float | None) -> Tensor:
+        rule = self.rule if prior is None else prior
+        return probability(hits, misses, self.grid.resolution, self.grid.dim, rule)
 
     def add_rays(
         self,
@@ -167,6 +188,13 @@ class Evidence:
                 counted = counted & is_hit[part]
             added = counted.double() if counts is None else counts * counted
             self.hits.view(-1).scatter_add_(0, cell, added)
+
+
+def _about(rule: Rule) -> str:
+    if not isinstance(rule, Calibration):
+        return f"prior {rule:g}"
+    n = rule.n_predicted
+    return f"calibrated by {n} predictions" if n else "calibrated by the sensor model alone"
 
 
 def checked_rays(

@@ -16,7 +16,7 @@ from command_runs import COMMANDS, QUIET, Finished, refused, run_here, succeeded
 from omegaconf import DictConfig
 
 import gmmtorch
-from gmmtorch.cli import common, map, occupancy
+from gmmtorch.cli import common, explore, occupancy
 from gmmtorch.cli.options import command_options, schema
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import compiler
@@ -70,6 +70,7 @@ def test_an_interrupt_that_python_drops_ends_the_command(monkeypatch, tmp_path):
         ("fit", "-m mixture.n_componets=3,4", "did you mean mixture.n_components?"),
         ("robot", "dataset@log.dataset=carmn", "did you mean dataset@log.dataset=carmen?"),
         ("explore", "network.los=0.1", "did you mean network.loss?"),
+        ("map", "map.hit_length=2", "map.hit_length is no longer an option: map.prior=1"),
     ],
 )
 def test_a_typo_names_the_nearest_option_or_choice(command, options, words, run):
@@ -115,10 +116,10 @@ def test_a_folder_that_cannot_be_written_is_a_one_line_error(run, tmp_path):
 def test_characters_that_the_encoding_of_the_output_lacks_are_no_error(monkeypatch):
     output = io.TextIOWrapper(io.BytesIO(), encoding="cp1252")
     monkeypatch.setattr(sys, "stdout", output)
-    monkeypatch.setattr(sys, "argv", ["gmmtorch-map", "--help"])
-    map.main()
+    monkeypatch.setattr(sys, "argv", ["gmmtorch-explore", "--help"])
+    explore.main()
     output.flush()
-    assert re.search(r"map.hit_length=auto +\? \(m\);", output.buffer.getvalue().decode("cp1252"))
+    assert "edges of the image, below ?" in output.buffer.getvalue().decode("cp1252")
 
 
 def test_the_version_is_that_of_the_package(run):

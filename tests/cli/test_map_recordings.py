@@ -23,6 +23,7 @@ from gmmtorch.errors import MissingDataError
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.tiles import TiledMap
+from gmmtorch.occupancy.calibration import Calibration
 
 Run = Callable[..., Finished]
 OPTIONS = ["dataset=carmen", "map.window=3", "tile=4", *QUIET]
@@ -101,13 +102,15 @@ def test_recordings_are_mapped_and_merged_into_the_map_of_all(whole, generator):
     assert theta[0] < 0.1
     assert theta[1] > 0.5
     assert theta[2] == 0.5
-    parts = []
+    parts, known = [], []
     for number in range(3):
         built = GaussianMap(window=3)
         for scan in load("carmen", whole.folder.parent / "logs" / f"drive{number}.log"):
             built.insert(scan)
         parts.append(built.components())
-    together = GaussianMap.of(Components.concatenate(parts), codec="quantized")
+        known.append(built.query_options.calibration)
+    together = Components.concatenate(parts)
+    together = GaussianMap.of(together, codec="quantized", calibration=Calibration.merged(known))
     points = torch.rand(200, 2, generator=generator, dtype=torch.float64) * torch.tensor([14, 8])
     torch.testing.assert_close(tiled.occupancy(points), together.occupancy(points), rtol=0, atol=1e-9)
     assert {"navigation.pgm", "navigation.yaml"} <= whole.files()

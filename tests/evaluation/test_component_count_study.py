@@ -115,7 +115,7 @@ def test_modes_match_scikit_learn_mean_shift(generator):
 def test_map_row_matches_a_map_with_that_rule(rows, scans):
     first = of(rows, "map_flat_pieces")[0]
     rule = component_count.WindowedRule(noise=0.02, window=5)
-    built = GaussianMap(rule, n_samples=20_000, cutoff=5.0, hit_length=None)  # as the study's maps
+    built = GaussianMap(rule, n_samples=20_000, cutoff=5.0, prior=1.0)  # as the study's maps
     for number, scan in enumerate(scans):
         if number % 4:
             built.insert(scan)

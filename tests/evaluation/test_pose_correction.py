@@ -21,7 +21,7 @@ NOISE = (0.3, 0.1)
 
 
 def per_scan() -> GaussianMap:
-    return GaussianMap(WindowedRule(window=1), n_samples=100_000)
+    return GaussianMap(WindowedRule(window=1), n_samples=100_000, prior=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def test_correction_restores_the_auc(building):
     assert order == [(k, m, r) for k in (1.0, 0.5) for m in ("point", "monte_carlo") for r in (0.2,)]
     for row in rows:
         assert row["auc"] < row["auc_clean"] - 0.02
-        exact = 1e-4 if row["method"] == "point" else 0.01  # Monte Carlo draws its rays in another order
+        exact = 1e-4 if row["method"] == "point" else 0.02  # Monte Carlo draws its rays in another order
         assert row["auc_corrected"] == pytest.approx(row["auc_clean"], abs=exact)
         assert (row["pose_noise_m"], row["pose_noise_rad"]) == NOISE
         assert row["dataset"] == "building"

@@ -13,10 +13,11 @@ from gmmtorch.evaluation.studies.variance_threshold import (
     decided,
     run,
     seen_past,
-    weighed,
 )
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule
+from gmmtorch.occupancy.calibration import Calibration
+from gmmtorch.occupancy.evidence import probability
 from gmmtorch.occupancy.forms.point import PointEvidence
 from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 from gmmtorch.scan import Scan
@@ -66,7 +67,7 @@ def test_thin_structures_of_a_laser_are_passed_on_both_sides():
 
 @pytest.mark.parametrize("width", [0.02, 0.04])
 def test_the_occupancy_of_a_rail_cell_follows_from_its_width(width):
-    """docs/occupancy.md: by counts θ = w/h; with the hit length ℓ the odds are (w ℓ/h²)/(1 − w/h)."""
+    """docs/occupancy.md: by counts θ = w/h."""
     side, depth, n = 0.1, 3.0, 100_000
     height = (torch.arange(n, dtype=torch.float64) + 0.5) / n * side
     on_rail = (height - 0.5 * side).abs() < 0.5 * width
@@ -74,35 +75,33 @@ def test_the_occupancy_of_a_rail_cell_follows_from_its_width(width):
     lattice = SparseEvidence(side, 2)
     lattice.add_rays(torch.stack([torch.zeros(n), height], 1), ends)
     evidence = PointEvidence(*lattice.at_points(torch.tensor([[1.05, 0.05]], dtype=torch.float64)))
-    sums = torch.tensor([0.0, 0.0])
-    by_counts = float(weighed(evidence, sums, side, 0.0, None))
-    assert by_counts == pytest.approx(width / side, abs=1e-3)
-    weight = float(weighed(evidence, sums, side, 0.0, 2.0))
-    odds = width * 2.0 / side**2 / (1 - width / side)
-    assert weight / (1 - weight) == pytest.approx(odds, rel=1e-2)
+    hits, misses = evidence
+    assert float(probability(hits, misses, side, 2, 0.0)) == pytest.approx(width / side, abs=1e-3)
+    known = Calibration.prior(10.0).probability(hits, misses, side, 2)
+    assert float(known) > 0.9  # a beam that ends here says more than one that passes beside the rail
 
 
-def test_a_larger_threshold_decides_more_points_and_hit_length_keeps_the_rail():
+def test_a_larger_threshold_decides_more_points_and_calibration_keeps_the_rail():
     railing = Railing(0.04)
     study = VarianceThresholdStudy(
-        method=(COUNTS, "point"), n_components=(20, 80), resolution=(0.2,), prior=(1.0,), test_every=4
+        method=(COUNTS, "point"), n_components=(20, 80), resolution=(0.2,), prior=(1.0, None), test_every=4
     )
 
     def new_map(n: int) -> GaussianMap:
         return GaussianMap(window=4, learning=IncrementalRule(n_components=n))
 
     found = run("railing", railing.scans(5, seed=0), new_map, study, is_thin=railing.holds)
-    assert [row["n_components"] for row in found.rows[:6]] == [None] * 6
-    assert len(found.rows) == 3 * 3 * 2
+    assert [row["n_components"] for row in found.rows[:4]] == [None] * 4
+    assert len(found.rows) == 3 * 2 * 2
     for strict, loose in zip(found.rows[::2], found.rows[1::2], strict=True):
         assert strict["share_decided"] < loose["share_decided"]
         assert strict["occupied_recall"] <= loose["occupied_recall"]
-    for rows in (found.rows[:6], found.rows[6:12], found.rows[12:]):
-        counts, auto = rows[0], rows[4]
-        assert (counts["hit_length"], auto["hit_length"]) == (None, "auto")
+    for rows in (found.rows[:4], found.rows[4:8], found.rows[8:]):
+        counts, known = rows[0], rows[2]
+        assert (counts["prior"], known["prior"]) == (1.0, None)
         assert counts["thin_recall"] == 0
-        assert auto["thin_kept"] > counts["thin_kept"]
-        assert auto["brier"] < counts["brier"]
+        assert known["thin_kept"] > counts["thin_kept"]
+        assert known["brier"] < counts["brier"]
     centers = torch.cartesian_prod(*[torch.arange(-1, 1, 0.2, dtype=torch.float64)] * 3)
     drawn = cells_by_setting(found, study)
     assert list(drawn) == [20, 80]
@@ -118,7 +117,7 @@ def test_a_larger_threshold_decides_more_points_and_hit_length_keeps_the_rail():
         ({"variance_threshold": (0.3,)}, "variance_threshold=0.3"),
         ({"thin_width": 0.0}, "thin_width=0"),
         ({"railing": 0.0}, "railing=0"),
-        ({"hit_length": ("long",)}, "hit_length=long"),
+        ({"prior": (-1.0,)}, "prior=-1.0"),
         ({"resolution": (-1.0,)}, "resolution=-1"),
         ({"test_every": 1}, "test_every=1"),
     ],

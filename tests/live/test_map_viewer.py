@@ -14,6 +14,7 @@ from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.live import viewer_scene
 from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping.query import Query
 from gmmtorch.report.scenes.ellipsoids import unit_sphere
 
 pytest.importorskip("viser")
@@ -26,7 +27,7 @@ def maps() -> dict[int, tuple[GaussianMap, list[torch.Tensor]]]:
     found = {}
     for dim, name in ((2, "synthetic_building_2d"), (3, "synthetic_building")):
         scans = load(name, n_scans=3)
-        built = GaussianMap(hit_length=1.0)
+        built = GaussianMap()
         for scan in scans:
             built.insert(scan.select(torch.arange(scan.n_beams) % (1 if dim == 2 else 8) == 0))
         found[dim] = built, [torch.stack([scan.origin for scan in scans])]
@@ -127,9 +128,10 @@ def test_a_place_has_the_evidence_from_which_its_occupancy_follows(dim, maps):
     built, _ = maps[dim]
     position = built.components().means[3]
     known = viewer_scene.place_at(built, position, 0.1)
-    options = built.query_options
-    hits = known.hits * options.hit_length / 0.1
-    expected = (hits + options.prior) / (hits + known.misses + 2 * options.prior)
+    hits, misses = (torch.tensor(value).double() for value in (known.hits, known.misses))
+    expected = float(
+        Query(built.components().cones(), built.query_options).rule.probability(hits, misses, 0.1, dim)
+    )
     assert known.hits > 0
     assert known.occupancy == pytest.approx(expected)
 

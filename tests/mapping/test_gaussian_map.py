@@ -231,7 +231,6 @@ INVALID = {
     "method": ["magic"],
     "codec": ["zip"],
     "cutoff": [0.0],
-    "hit_length": [-1.0, "long"],
 }
 
 

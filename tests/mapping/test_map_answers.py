@@ -14,6 +14,7 @@ from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.query import Query, cutoff_by_support
 from gmmtorch.mapping.query_options import METHODS, QueryOptions
+from gmmtorch.occupancy.calibration import Calibration
 from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.grid import VoxelGrid
 
@@ -72,7 +73,7 @@ def test_occupancy_is_the_same_far_from_the_world_origin(dim, method):
 @dims
 @methods
 def test_grid_evidence_equals_the_occupancy_at_cell_centres(dim, method):
-    made = built(drive(2, dim), method=method, hit_length=None)
+    made = built(drive(2, dim), method=method)
     grid = VoxelGrid.covering([-1.0] * dim, [3.5] * dim, 0.25)
     evidence = made.evidence(grid)
     assert float(evidence.hits.min()) >= 0
@@ -85,7 +86,7 @@ def test_grid_evidence_equals_the_occupancy_at_cell_centres(dim, method):
 
 
 @dims
-def test_hit_length_auto_is_half_the_mean_range(dim):
+def test_a_map_of_given_components_has_the_calibration_of_its_ranges(dim):
     means, origins = points([1.0, 4.0, 9.0], dim), points([0.0, 0.0, 1.0], dim)
     given = {
         "means": means,
@@ -94,20 +95,19 @@ def test_hit_length_auto_is_half_the_mean_range(dim):
         "origins": origins,
         "max_range": [False, False, True],  # beams without a return do not count
     }
-    mean_range = (30 * 1.0 + 10 * 4.0) / 40
-    found = GaussianMap.from_components(**given, hit_length="auto").occupancy(lattice(dim), 0.25)
-    expected = GaussianMap.from_components(**given, hit_length=mean_range / 2).occupancy(lattice(dim), 0.25)
-    torch.testing.assert_close(found, expected, rtol=1e-12, atol=0)
-    assert torch.equal(found, GaussianMap.from_components(**given).occupancy(lattice(dim), 0.25))
-    counts = GaussianMap.from_components(**given, hit_length=1.0).occupancy(lattice(dim), 0.25)
+    known = Calibration.prior((30 * 1.0 + 10 * 4.0) / 40)
+    found = GaussianMap.from_components(**given).occupancy(lattice(dim), 0.25)
+    expected = GaussianMap.from_components(**given, calibration=known).occupancy(lattice(dim), 0.25)
+    assert torch.equal(found, expected)
+    counts = GaussianMap.from_components(**given, prior=1.0).occupancy(lattice(dim), 0.25)
     assert not torch.equal(found, counts)
     free = {**given, "max_range": [True] * 3}
-    assert bool((GaussianMap.from_components(**free, hit_length="auto").occupancy(means) < 0.5).all())
+    assert bool((GaussianMap.from_components(**free).occupancy(means) < 0.5).all())
 
 
 @dims
 def test_all_methods_approximate_monte_carlo_occupancy(dim):
-    made = built(drive(2, dim), n_samples=1 << 17)
+    made = built(drive(2, dim), n_samples=1 << 17, prior=1.0)
     exact = made.occupancy(lattice(dim), method="monte_carlo")
     for method, tolerance in (("flux", 0.01), ("cone", 0.1), ("point", 0.1)):
         theta = made.occupancy(lattice(dim), method=method)

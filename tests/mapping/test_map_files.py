@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import base64
 import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from invalid_values import each_value
-from mapping.map_cases import FINE, assert_same_components, built, open_drive
+from mapping.map_cases import FINE, assert_same_components, built, drive, open_drive
 from mapping.random_components import random_components
 from occupancy.protocol_contract import lattice, wall_scan
 from torch import Tensor
@@ -25,6 +27,7 @@ from gmmtorch.mapping.components import UNNUMBERED
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
 from gmmtorch.mapping.query_options import QueryOptions
+from gmmtorch.occupancy.calibration import Calibration
 
 # -- saved and loaded ------------------------------------------------------------------------------------
 
@@ -39,8 +42,9 @@ from gmmtorch.mapping.query_options import QueryOptions
     ],
     ids=["windowed", "windowed, plain", "incremental", "under budgets"],
 )
-def test_settings_and_components_are_restored(dim, codec, learning, tmp_path):
-    options = {"prior": 0.5, "random_state": 4, "sampling": "stratified", "cutoff": 4.0, "hit_length": 0.1}
+@pytest.mark.parametrize("prior", [None, 0.5])
+def test_settings_and_components_are_restored(dim, codec, learning, prior, tmp_path):
+    options = {"prior": prior, "random_state": 4, "sampling": "stratified", "cutoff": 4.0}
     made = built(open_drive(3, dim), learning, codec=codec, robot=2, method="flux", **options)
     made.save(tmp_path / "m.safetensors")
     loaded = GaussianMap.load(tmp_path / "m.safetensors")
@@ -52,14 +56,38 @@ def test_settings_and_components_are_restored(dim, codec, learning, tmp_path):
     assert (tmp_path / "again.safetensors").read_bytes() == (tmp_path / "m.safetensors").read_bytes()
 
 
-def test_hit_length_auto_is_restored(tmp_path):
-    made = built(open_drive(2, 2), FINE, hit_length="auto")
+def test_a_learned_calibration_is_restored_and_costs_at_most_64_bytes(tmp_path):
+    scans = drive(8, 2)
+    made, counts = (built(scans, FINE, prior=prior) for prior in (None, 1.0))
+    known = made.query_options.calibration
+    assert known.n_predicted > 0
+    assert 0 < made.nbytes - counts.nbytes <= 64
     made.save(tmp_path / "m.safetensors")
-    assert GaussianMap.load(tmp_path / "m.safetensors").query_options.hit_length == "auto"
+    loaded = GaussianMap.load(tmp_path / "m.safetensors")
+    assert loaded.query_options.calibration == known
+    assert torch.equal(loaded.occupancy(lattice(2), 0.1), made.occupancy(lattice(2), 0.1))
+
+
+def test_a_file_of_version_1_0_with_a_hit_length_is_calibrated_by_its_ranges(tmp_path, packed):
+    tensors, facts = packed
+    facts = {key: value for key, value in facts.items() if key not in ("calibration", "prior")}
+    loaded = load_parts(tmp_path, tensors, {**facts, "hit_length": 1.0})
+    assert (loaded.query_options.prior, loaded.query_options.calibration) == (None, None)
+    parts = loaded.components()
+    expected = GaussianMap.of(parts, cutoff=loaded.query_options.cutoff).occupancy(lattice(2), 0.2)
+    assert torch.equal(loaded.occupancy(lattice(2), 0.2), expected)
+
+
+@pytest.mark.parametrize(
+    "text", [5, "", "AAAA", "!" * 35, "~" * 35, base64.b85encode(np.full(14, np.nan, "<f2")).decode()]
+)
+def test_a_damaged_calibration_is_refused(tmp_path, packed, text):
+    with pytest.raises(DataError, match=r"m\.safetensors.*calibration"):
+        load_parts(tmp_path, packed[0], {**packed[1], "calibration": text})
 
 
 def test_only_settings_that_differ_from_the_defaults_are_written(tmp_path):
-    made = built([wall_scan(2)], FINE, n_samples=1_000_000, compiled=True)
+    made = built([wall_scan(2)], FINE, n_samples=1_000_000)
     made.save(tmp_path / "m.safetensors")
     facts = read_tensors(tmp_path / "m.safetensors", storage.FILE_KIND, storage.FILE_VERSION)[1]
     assert facts.pop("n_numbered") == made.n_components
@@ -70,16 +98,16 @@ def test_only_settings_that_differ_from_the_defaults_are_written(tmp_path):
         "codec": "float",
         "robot": 0,
         "cutoff": None,
-        "hit_length": "auto",
+        "prior": None,  # the window is not full: nothing is predicted yet
     }
-    assert GaussianMap.load(tmp_path / "m.safetensors").query_options == GaussianMap().query_options
+    assert GaussianMap.load(tmp_path / "m.safetensors").query_options == made.query_options
 
 
-def test_a_file_without_cutoff_and_hit_length_has_the_format_defaults(tmp_path, packed):
+def test_a_file_without_cutoff_and_prior_has_the_format_defaults(tmp_path, packed):
     tensors, facts = packed
-    facts = {key: value for key, value in facts.items() if key not in ("cutoff", "hit_length")}
+    facts = {key: value for key, value in facts.items() if key not in ("cutoff", "prior", "calibration")}
     options = load_parts(tmp_path, tensors, facts).query_options
-    assert (options.cutoff, options.hit_length) == (5.0, None)
+    assert (options.cutoff, options.prior) == (5.0, 1.0)
 
 
 @settings(max_examples=30)
@@ -93,7 +121,8 @@ def test_a_file_without_cutoff_and_hit_length_has_the_format_defaults(tmp_path, 
 def test_file_size_equals_the_length_of_the_written_file(dim, k, n_known, seed, codec):
     components = random_components(dim, k=k, seed=seed)
     components.ids[n_known:, 1] = UNNUMBERED
-    rule, map_settings = IncrementalRule(), storage.MapSettings(0.1, "point", codec, 3, QueryOptions())
+    options = QueryOptions(calibration=Calibration.prior(5.0))
+    rule, map_settings = IncrementalRule(), storage.MapSettings(0.1, "point", codec, 3, options)
     size = storage.file_size(components, rule, map_settings, next_number=40)
     written = storage.to_bytes(numbered(components, 3, 40)[0], rule, map_settings, 40)
     assert size == len(written) + 48  # room for settings that change
@@ -218,7 +247,7 @@ DAMAGED_FACTS = {
     "resolution": [0, "x", None],
     "prior": ["x", -1],
     "cutoff": ["x", 0],
-    "hit_length": ["x"],
+    "calibration": ["x", 3],
     "random_state": [None, 2**80],
     "method": ["magic", ["point"]],
     "codec": ["zip", {}],

@@ -81,7 +81,7 @@ def correction(dim: int) -> Tensor:
 def test_a_pose_correction_equals_learning_from_the_corrected_scans(dim):
     rule = WindowedRule(window=1, dtype="float64")
     scans, matrix = [drive(1, dim)[0], *open_drive(3, dim)[1:]], correction(dim)
-    made = built([], rule)
+    made = built([], rule, prior=1.0)
     of_window = []
     for scan in scans:
         known = names(made.ids) if made.dim else set()
@@ -89,7 +89,7 @@ def test_a_pose_correction_equals_learning_from_the_corrected_scans(dim):
         of_window.append(sorted(names(made.ids) - known))
     wrong = made.occupancy(lattice(dim))
     made.transform(matrix, ids=of_window[1])
-    expected = built([scans[0], scans[1].transformed(matrix), scans[2]], rule)
+    expected = built([scans[0], scans[1].transformed(matrix), scans[2]], rule, prior=1.0)
     # New ids follow the position, which the rotation changes: components are matched by their means.
     ours, theirs = made.components(), expected.components()
     distance, nearest = torch.cdist(theirs.means, ours.means).min(1)

@@ -21,9 +21,11 @@ from gmmtorch.mapping.query_options import QueryOptions
 from gmmtorch.mapping.tile_index import INDEX
 from gmmtorch.mapping.tile_merging import canonical, merge, tile_files
 from gmmtorch.mapping.tiles import TiledMap
+from gmmtorch.occupancy.calibration import Calibration
 
 SIDE = 10.0
-SETTINGS = MapSettings(0.3, "point", "quantized", 0, QueryOptions(n_samples=200_000, hit_length=1.0))
+KNOWN = Calibration.prior(8.0)
+SETTINGS = MapSettings(0.3, "point", "quantized", 0, QueryOptions(n_samples=200_000, calibration=KNOWN))
 
 
 def recording(dim: int, seed: int, k: int = 60, codec: str = "quantized") -> Components:
@@ -63,14 +65,32 @@ ERRORS = {"point": 1e-9, "flux": 1e-6, "cone": 0.05}
 outside the hull of a cone, where it depends on the index whether the cone is asked."""
 
 
-def test_hit_length_auto_is_that_of_the_whole_map(tmp_path, generator):
-    set_to = replace(SETTINGS, query=replace(SETTINGS.query, hit_length="auto"))
+def test_the_calibrations_of_the_parts_are_merged_by_what_they_have_predicted(tmp_path, generator):
+    far = Calibration.prior(20.0)._replace(n_predicted=300)
+    near = Calibration.prior(5.0)._replace(n_predicted=100)
+    known = [replace(SETTINGS, query=replace(SETTINGS.query, calibration=c)) for c in (near, far)]
     parts = [recording(3, seed) for seed in range(2)]
-    tiled = merge(tmp_path / "all", [written(tmp_path / str(i), c, set_to) for i, c in enumerate(parts)])
+    each = [written(tmp_path / str(i), c, known[i]) for i, c in enumerate(parts)]
+    tiled, other = merge(tmp_path / "all", each), merge(tmp_path / "other", each[::-1])
+    merged = tiled.query_options.calibration
+    assert merged == other.query_options.calibration == Calibration.merged([far, near])
+    assert merged.length == pytest.approx(2.5**0.25 * 10**0.75, rel=1e-3)
+    assert merged.n_predicted == pytest.approx(400, rel=1e-2)
+    set_to = replace(SETTINGS, query=replace(SETTINGS.query, calibration=merged))
     points = 3 + 40 * (torch.rand(100, 3, generator=generator, dtype=torch.float64) - 0.5)
     expected = whole(parts, set_to).occupancy(points)
     torch.testing.assert_close(tiled.occupancy(points), expected, rtol=0, atol=1e-9)
     torch.testing.assert_close(tiled.open().occupancy(points), expected, rtol=0, atol=1e-9)
+
+
+def test_tiles_without_a_calibration_have_that_of_the_sensor_model(tmp_path, generator):
+    set_to = replace(SETTINGS, query=replace(SETTINGS.query, calibration=None))
+    parts = recording(2, 0)
+    tiled = written(tmp_path / "a", parts, set_to)
+    points = 3 + 40 * (torch.rand(100, 2, generator=generator, dtype=torch.float64) - 0.5)
+    expected = GaussianMap.of(parts, resolution=0.3).occupancy(points)
+    torch.testing.assert_close(tiled.occupancy(points), expected, rtol=0, atol=1e-6)
+    assert tiled.query_options.calibration.n_predicted == 0
 
 
 @pytest.mark.parametrize(

@@ -118,16 +118,6 @@ def test_hits_of_all_cubes_sum_to_the_count():
     assert float(point_evidence(cones, points, 0.05).hits.sum()) == pytest.approx(70.0, rel=1e-4)
 
 
-def test_hit_length_scales_only_hits():
-    cones = random_cones(3, 5, 0)
-    points = near_rays(cones, 20, 0)
-    form = PointForm(cones, 0.1)
-    plain, longer = form(points), form(points, hit_length=2.0)
-    torch.testing.assert_close(longer.hits, plain.hits * 20)
-    assert torch.equal(longer.misses, plain.misses)
-    assert torch.equal(form(points, hit_length=0.1).hits, plain.hits)
-
-
 # -- independence of index, order and chunks -----------------------------------------------------------
 
 
@@ -270,8 +260,6 @@ def test_invalid_point_queries_are_refused():
         point_evidence(cones, torch.zeros(1, 3), 0)
     with pytest.raises(InvalidArgumentError, match="cutoff"):
         point_evidence(cones, torch.zeros(1, 3), 0.1, cutoff=0)
-    with pytest.raises(InvalidArgumentError, match="hit_length"):
-        point_evidence(cones, torch.zeros(1, 3), 0.1, hit_length=-1)
     with pytest.raises(NumericalError, match=r"covariances\[0\]"):
         point_evidence(cones._replace(covariances=-cones.covariances), torch.zeros(1, 3), 0.1)
 

@@ -39,24 +39,23 @@ def test_auc_memory_draws_each_method_through_its_sizes():
     assert axes.get_xscale() == "log"
 
 
-def test_variance_threshold_draws_bars_of_the_first_resolution_prior_and_threshold():
+def test_variance_threshold_draws_bars_of_the_first_resolution_and_threshold():
     rows = [
         {
             "dataset": "hall",
             "method": method,
             "n_components": n,
             "resolution": h,
-            "prior": 1.0,
-            "hit_length": length,
+            "prior": prior,
             "variance_threshold": v,
             "occupied_recall": v,
             "thin_recall": None,
             "thin_kept": 0.5,
-            "free_recall": 0.25 if length is None else 0.75,
+            "free_recall": 0.75 if prior is None else 0.25,
         }
         for method, n in (("counts", None), ("point", 200))
         for h in (0.1, 0.2)
-        for length in (None, "auto")
+        for prior in (1.0, None)
         for v in (0.06, 0.2)
     ]
     (figure,) = map_study_figures.variance_threshold_figures(rows).values()
@@ -68,8 +67,8 @@ def test_variance_threshold_draws_bars_of_the_first_resolution_prior_and_thresho
     labels = [text.get_text() for text in free.get_xticklabels()]
     assert labels == ["counted rays", "point,\n200 components"]
     assert [text.get_text() for text in figure.legends[0].get_texts()] == [
-        "hits as counts",
-        "hit_length=auto",
+        "counts, prior 1",
+        "calibrated",
     ]
 
 

@@ -31,6 +31,10 @@ from gmmtorch.errors import InvalidArgumentError
 
 _NEAR = 0.6
 """Least similarity of a name to the name that is proposed for it."""
+_REPLACED = {
+    "map.hit_length": "map.prior=1 gives the probabilities of counts; without it they are calibrated.",
+}
+"""Options of earlier versions, and what replaces them."""
 _LAUNCHERS = ("joblib", "ray")
 """Hydra's launchers of the extra [sweep]."""
 _GROUPS = "== Configuration groups =="
@@ -235,6 +239,8 @@ def explained(command: str, overrides: Sequence[str], error: Exception) -> str:
         name = _key(one)
         if "/" in name or name in groups or name in names or _is_free(config, name):
             continue
+        if name in _REPLACED:
+            return f"{name} is no longer an option: {_REPLACED[name]}"
         known = [option.name for option in options_of(config)]
         known += [*groups, *_of_other_choices(groups)]
         if name.startswith("hydra"):

@@ -47,9 +47,9 @@ STUDIES: dict[str, type] = {
 
 def _map_schema(rule: type) -> type:
     """Options of a map: of its learning rule, and of its queries."""
-    runtime = ("dtype", "random_state", "memory_limit", "compiled")
+    not_options = ("dtype", "random_state", "memory_limit", "compiled", "calibration")
     shared = (map_schema.MapFile, PruneOptions, MixtureRule)
-    return schema_of(*shared, rule, QueryOptions, without=runtime)
+    return schema_of(*shared, rule, QueryOptions, without=not_options)
 
 
 def _sensor_schema() -> type:

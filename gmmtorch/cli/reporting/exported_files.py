@@ -201,7 +201,7 @@ class _Space:
                 lambda points: torch.as_tensor(source.occupancy(points, resolution, method)), grid, on_event
             )
         on_event(f"evidence by {method}", 0, None)  # of all cells together
-        return grid, source.evidence(grid, method).probability(source.query_options.prior)
+        return grid, source.evidence(grid, method).probability()
 
     def box(self) -> tuple[list[float], list[float]]:
         """Lowest and highest corner (m): `bounds`, or the extent of the map; limited to the height band."""

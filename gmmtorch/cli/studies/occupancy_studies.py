@@ -59,7 +59,7 @@ def _auc_memory(config: DictConfig, device: str, on_event: Event, on_rows: OnRow
 
 
 def _variance_threshold(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
-    """Thin structures with several forms, sizes, cells, priors, hit lengths and thresholds."""
+    """Thin structures with several forms, sizes, cells, priors and thresholds."""
     study = build(VarianceThresholdStudy, common.as_options(config.study), "study")
     if study.railing is None:
         (name, scans), is_thin = all_scans(config, device, on_event), None
@@ -84,12 +84,12 @@ def _variance_threshold(config: DictConfig, device: str, on_event: Event, on_row
         return drawn
 
     table = (
-        "method n_components resolution hit_length occupied_recall thin_recall thin_kept free_recall "
+        "method n_components resolution prior occupied_recall thin_recall thin_kept free_recall "
         "free_occupied auc auc_thin brier"
     )
-    prior, threshold = study.prior[0], study.variance_threshold[0]
-    shown = [r for r in found.rows if (r["prior"], r["variance_threshold"]) == (prior, threshold)]
-    about = f"{name}: {len(scans)} scans; prior {prior:g}, variance threshold {threshold:g}"
+    threshold = study.variance_threshold[0]
+    shown = [row for row in found.rows if row["variance_threshold"] == threshold]
+    about = f"{name}: {len(scans)} scans; variance threshold {threshold:g}"
     return Found(found.rows, figures, table, about, shown)
 
 

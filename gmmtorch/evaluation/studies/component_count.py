@@ -224,7 +224,7 @@ def map_rows(
             learning,
             window=study.window,
             cutoff=5.0,  # the options with which the published figures were made
-            hit_length=None,
+            prior=1.0,
             n_samples=study.n_samples,
             random_state=seed,
         )

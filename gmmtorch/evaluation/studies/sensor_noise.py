@@ -219,7 +219,7 @@ def _as_map(
         viewpoints,
         resolution=study.resolution,
         cutoff=5.0,  # the options with which the published figures were made
-        hit_length=None,
+        prior=1.0,
         n_samples=study.n_samples,
         random_state=seed,
     )

@@ -6,7 +6,6 @@ need torch are imported when an object is made.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -159,7 +158,7 @@ class VarianceThresholdStudy:
         method: forms of evidence, and "counts": the training rays counted in cells, without a map.
         n_components: sizes; a map is built for each.
         resolution: sides (m) of the cells.
-        prior, hit_length: of the queries, as in `QueryOptions`.
+        prior: of the queries, as in `QueryOptions`: N_p of counts; None: calibrated.
         variance_threshold: values v of (3.10).
         test_every, max_beams: the test, as in `Protocol`.
         thin_width: width (m) of thin structures in a data set, see `variance_threshold.seen_past`.
@@ -170,8 +169,7 @@ class VarianceThresholdStudy:
     method: Sequence[str] = (COUNTS, "point", "monte_carlo")
     n_components: Sequence[int] = (200, 850)
     resolution: Sequence[float] = (0.1, 0.25)
-    prior: Sequence[float] = (1.0, 0.1)
-    hit_length: Sequence[Any] = (None, 1.0, "auto")
+    prior: Sequence[Any] = (1.0, 0.1, None)
     variance_threshold: Sequence[float] = (0.06, 0.24)
     test_every: int = 5
     max_beams: int = 10_000
@@ -182,15 +180,15 @@ class VarianceThresholdStudy:
 
         from gmmtorch.occupancy.evidence import classify
 
-        check_not_empty(self, "method", "n_components", "resolution", "prior", "hit_length")
+        check_not_empty(self, "method", "n_components", "resolution", "prior")
         check_not_empty(self, "variance_threshold")
         for method in self.method:
             if method != COUNTS:
                 check_method(method)
         for n in self.n_components:
             check_whole("n_components", n, 1)
-        for prior, length in itertools.product(self.prior, self.hit_length):
-            QueryOptions(prior=prior, hit_length=length)
+        for prior in self.prior:
+            QueryOptions(prior=prior)
         for threshold in self.variance_threshold:
             classify(torch.zeros(1), threshold)
         for resolution in self.resolution:

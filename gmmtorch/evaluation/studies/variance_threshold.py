@@ -6,7 +6,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import torch
@@ -18,9 +18,9 @@ from gmmtorch.evaluation.events import Event, OnRows, Row, ignore
 from gmmtorch.evaluation.queries import FREE, OCCUPIED
 from gmmtorch.evaluation.studies.study_options import COUNTS, VarianceThresholdStudy
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.query import Query, probability, range_sums, with_hit_length
-from gmmtorch.mapping.query_options import AUTO, QueryOptions
-from gmmtorch.occupancy.evidence import CellClass, classify
+from gmmtorch.mapping.query import Query
+from gmmtorch.occupancy.calibration import Calibration
+from gmmtorch.occupancy.evidence import CellClass, classify, probability
 from gmmtorch.occupancy.forms.point import PointEvidence
 from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 from gmmtorch.scan import Scan
@@ -45,21 +45,18 @@ class Thresholds:
 class Source(NamedTuple):
     """Evidence at points, from a map or from the rays themselves.
 
-    evidence: (points (M, D), resolution (m), method) → hits and misses. sums: `range_sums` of the rays.
+    evidence: (points (M, D), resolution (m), method) → hits and misses. calibration: of the map; of the
+    sensor model, for rays.
     """
 
     evidence: Callable[[Tensor, float, str], PointEvidence]
-    sums: Tensor
+    calibration: Calibration
     facts: Row
 
-
-def weighed(
-    evidence: PointEvidence, sums: Tensor, resolution: float, prior: float, hit_length: float | str | None
-) -> Tensor:
-    """Occupancy (M,) of evidence with a prior and a hit length; `sums`: `range_sums` of the rays."""
-    options = QueryOptions(prior=prior, hit_length=hit_length)
-    options = with_hit_length(options, sums) if hit_length == AUTO else options
-    return probability(evidence, resolution, options).cpu()
+    def occupancy(self, found: PointEvidence, resolution: float, dim: int, prior: float | None) -> Tensor:
+        """Probabilities (M,) that follow from evidence: from counts with a prior, or calibrated (None)."""
+        rule = self.calibration if prior is None else prior
+        return probability(found.hits, found.misses, resolution, dim, rule).cpu()
 
 
 def run(
@@ -72,7 +69,7 @@ def run(
     on_rows: OnRows = lambda rows: None,
     is_thin: Callable[[Scan], Tensor] | None = None,
 ) -> Thresholds:
-    """A row for each number of components, form, cell, prior, hit length and threshold.
+    """A row for each number of components, form, cell, prior and threshold.
 
     Method "counts" needs no map: it counts the training rays in cells. Fields over held-out points: see
     `decided`, `auc`, `auc_thin`, `brier`. `thin_share`: share of the hits that lie on thin structures, by
@@ -97,9 +94,8 @@ def run(
         for method, resolution in itertools.product(methods, study.resolution):
             evidence = source.evidence(points, resolution, method)
             shared = {"dataset": name, "method": method, "resolution": resolution, "thin_share": share}
-            found.rows += _rows(
-                {**shared, **source.facts}, evidence, source.sums, labels, len(asked.points), study
-            )
+            thetas = {p: source.occupancy(evidence, resolution, points.shape[1], p) for p in study.prior}
+            found.rows += _rows({**shared, **source.facts}, thetas, labels, len(asked.points), study)
         on_rows(found.rows)
         on_event("maps", len(found.sources), len(study.n_components) + 1)
     return found
@@ -119,9 +115,10 @@ def _sources(
             built.insert(scan)
         built.finish()
         seconds = time.perf_counter() - begin
-        cones = built.components().cones()
+        query = Query(built.components().cones(), replace(built.query_options, prior=None))
         facts = {"n_components": built.n_components, "nbytes": built.nbytes, "build_seconds": seconds}
-        yield n_components, Source(Query(cones, built.query_options).evidence_at, range_sums(cones), facts)
+        assert isinstance(query.rule, Calibration)  # without a prior
+        yield n_components, Source(query.evidence_at, query.rule, facts)
 
 
 def _counted(train: Sequence[Scan]) -> Source:
@@ -138,8 +135,11 @@ def _counted(train: Sequence[Scan]) -> Source:
         return PointEvidence(*lattices[resolution].at_points(points))
 
     ranges = torch.cat([(scan.points - scan.origin).norm(dim=1).double().cpu() for scan in train])
-    sums = torch.tensor([float(ranges.sum()), float(len(ranges))], dtype=torch.float64)
-    return Source(evidence, sums, {"n_components": None, "nbytes": None, "build_seconds": 0.0})
+    return Source(
+        evidence,
+        Calibration.prior(float(ranges.mean())),
+        {"n_components": None, "nbytes": None, "build_seconds": 0.0},
+    )
 
 
 def cells_by_setting(
@@ -147,9 +147,9 @@ def cells_by_setting(
 ) -> dict[int, Callable[[Tensor], dict[str, Tensor]]]:
     """For each number of components: centres (M, D) of cells → masks (M,) of the cells to draw, by a title.
 
-    Cells have the first side and prior of the study. At its lowest threshold, with hits as counts: the
-    occupied cells, and those with a hit that are not free; with hit_length="auto": the latter, and the cells
-    that are occupied at the highest threshold.
+    Cells have the first side and prior of the study. At its lowest threshold, from counts: the occupied
+    cells, and those with a hit that are not free; calibrated: the latter, and the cells that are occupied at
+    the highest threshold.
     """
     methods = [name for name in study.method if name != COUNTS]
     resolution, prior = study.resolution[0], study.prior[0]
@@ -159,14 +159,14 @@ def cells_by_setting(
         def masks(centers: Tensor) -> dict[str, Tensor]:
             evidence = source.evidence(centers, resolution, methods[-1])
             hit = evidence.hits.cpu() >= 0.5
-            counts, auto = (weighed(evidence, source.sums, resolution, prior, x) for x in (None, AUTO))
+            counts, known = (
+                source.occupancy(evidence, resolution, centers.shape[1], x) for x in (prior, None)
+            )
             return {
-                f"hits as counts, v = {strict:g}:\noccupied": _is(counts, strict, CellClass.OCCUPIED),
-                f"hits as counts, v = {strict:g}:\nhit and not free": hit
-                & ~_is(counts, strict, CellClass.FREE),
-                f"hit_length=auto, v = {strict:g}:\nhit and not free": hit
-                & ~_is(auto, strict, CellClass.FREE),
-                f"hit_length=auto, v = {lenient:g}:\noccupied": _is(auto, lenient, CellClass.OCCUPIED),
+                f"counts, v = {strict:g}:\noccupied": _is(counts, strict, CellClass.OCCUPIED),
+                f"counts, v = {strict:g}:\nhit and not free": hit & ~_is(counts, strict, CellClass.FREE),
+                f"calibrated, v = {strict:g}:\nhit and not free": hit & ~_is(known, strict, CellClass.FREE),
+                f"calibrated, v = {lenient:g}:\noccupied": _is(known, lenient, CellClass.OCCUPIED),
             }
 
         return masks
@@ -180,16 +180,14 @@ def _is(theta: Tensor, threshold: float, label: CellClass) -> Tensor:
 
 def _rows(
     shared: Row,
-    evidence: PointEvidence,
-    sums: Tensor,
+    thetas: dict[float | None, Tensor],
     labels: Tensor,
     n_asked: int,
     study: VarianceThresholdStudy,
 ) -> list[Row]:
-    """A row for each prior, hit length and threshold; points after the first `n_asked` are thin."""
+    """A row for each prior and threshold; points after the first `n_asked` are thin."""
     rows = []
-    for prior, hit_length in itertools.product(study.prior, study.hit_length):
-        theta = weighed(evidence, sums, shared["resolution"], prior, hit_length)
+    for prior, theta in thetas.items():
         asked, thin, truth = theta[:n_asked], theta[n_asked:], labels[:n_asked]
         occupied, free = asked[truth == OCCUPIED], asked[truth == FREE]
         scores = {
@@ -198,7 +196,7 @@ def _rows(
             "brier": float((asked - (truth == OCCUPIED).double()).square().mean()),
         }
         for threshold in study.variance_threshold:
-            setting = {"prior": prior, "hit_length": hit_length, "variance_threshold": threshold}
+            setting = {"prior": prior, "variance_threshold": threshold}
             rows.append({**shared, **setting, **scores, **decided(occupied, free, thin, threshold)})
     return rows
 

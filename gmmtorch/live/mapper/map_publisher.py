@@ -18,8 +18,8 @@ from gmmtorch.live import viewer_scene
 from gmmtorch.live.ros import Node
 from gmmtorch.live.ros.quality import LATCHED
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.query import Query, probability
-from gmmtorch.occupancy.evidence import CellClass, Thresholds
+from gmmtorch.mapping.query import Query
+from gmmtorch.occupancy.evidence import CellClass, Thresholds, probability
 from gmmtorch.occupancy.forms.kept_evidence import KeptEvidence
 from gmmtorch.occupancy.grid import VoxelGrid
 
@@ -96,10 +96,11 @@ class MapPublisher:
             low, high = self._box(shown)
             grid = VoxelGrid.covering(low, high, self._resolution, shown.query_options.memory_limit)
             if shown.method != "point":
-                return grid, shown.evidence(grid).probability(shown.query_options.prior).cpu()
+                return grid, shown.evidence(grid).probability().cpu()
             query = Query(shown.components().cones(), shown.query_options)
             evidence = self._evidence.update(query.cones, grid, query.cutoff)
-            return grid, probability(evidence, self._resolution, query.options).cpu()
+            theta = probability(*evidence, self._resolution, grid.dim, query.rule)
+            return grid, theta.cpu()
         except (InvalidArgumentError, MemoryLimitError) as error:  # no floor yet, or too large
             self._node.warn("grid", f"topic map is not published: {error}")
             return None, torch.empty(0)

@@ -26,16 +26,18 @@ from gmmtorch.mapping.codec.quantization import number_after, quantize_numbered
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import LearningRule, changed_options, rule_facts
 from gmmtorch.mapping.query_options import QueryOptions, check_method
+from gmmtorch.occupancy.calibration import Calibration
 
 FILE_KIND, FILE_VERSION = "gmmtorch.map", 2
 
 CODECS = ("quantized", "float")
 """About 10 bytes a component, rounded within bounds; or every number as it is, about 150 bytes."""
 
-FILE_OPTIONS = QueryOptions(cutoff=5.0, hit_length=None)
+FILE_OPTIONS = QueryOptions(prior=1.0, cutoff=5.0)
 """The query options of a file that contains none; they are not those of `GaussianMap()`."""
 
 _MACHINE_OPTIONS = ("memory_limit", "compiled")  # query options that a file does not contain
+_WEIGHTED = "hit_length"  # in files of 1.0, which weighted hits by a length; their answers are calibrated now
 _ROOM_FOR_SETTINGS = 48  # bytes by which settings may grow while a map is built; part of its byte budget
 
 
@@ -66,6 +68,9 @@ def file_size(components: Components, rule: LearningRule, settings: MapSettings,
     """Bytes of the file of components before they are numbered, without writing it; and room for settings
     that change while the map is built."""
     n_new = int((components.ids[:, 1] < 0).sum())
+    if settings.query.prior is None:  # a map that has predicted its next window states its calibration
+        known = settings.query.calibration or Calibration.prior(1.0)
+        settings = replace(settings, query=replace(settings.query, calibration=known))
     facts = _facts(rule, settings, number_after(components.ids, next_number + n_new))
     if settings.codec == "float":
         data = pack_tensors(vars(components), FILE_KIND, FILE_VERSION, **facts)
@@ -88,7 +93,7 @@ def from_bytes(data: bytes, path: str | Path) -> tuple[Components, dict[str, Any
 def _content(
     tensors: dict[str, Tensor], facts: dict[str, Any], path: str | Path
 ) -> tuple[Components, dict[str, Any]]:
-    facts = {"cutoff": FILE_OPTIONS.cutoff, "hit_length": FILE_OPTIONS.hit_length, **facts}
+    facts = {"cutoff": FILE_OPTIONS.cutoff, **_with_calibration(facts, path)}
     if tensors.keys() == {f.name for f in fields(Components)}:
         return _exact(tensors, path), facts
     batch = require(tensors, "components", (None,), torch.uint8, path)
@@ -105,18 +110,38 @@ def _facts(rule: LearningRule, settings: MapSettings, next_number: int) -> dict[
 
 def settings_facts(settings: MapSettings) -> dict[str, Any]:
     """The settings as plain values; query options only if they differ from `FILE_OPTIONS`."""
+    query = settings.query
+    known = query.calibration if query.prior is None else None
+    if known is not None:  # which implies that there is no prior
+        query = replace(query, prior=FILE_OPTIONS.prior)
     return {
         "resolution": settings.resolution,
         "method": settings.method,
         "codec": settings.codec,
         "robot": settings.robot,
-        **changed_options(settings.query, FILE_OPTIONS, leave_out=_MACHINE_OPTIONS),
+        **changed_options(query, FILE_OPTIONS, leave_out=(*_MACHINE_OPTIONS, "calibration")),
+        **({} if known is None else {"calibration": known.text()}),
     }
+
+
+def _with_calibration(facts: dict[str, Any], path: str | Path) -> dict[str, Any]:
+    """The facts with `prior` and `calibration` as options of queries. Raises `DataError` if it is damaged."""
+    facts = dict(facts)
+    weighted = facts.pop(_WEIGHTED, None) is not None
+    usual = FILE_OPTIONS.prior if facts.get("calibration") is None else None
+    facts["prior"] = None if weighted else facts.get("prior", usual)
+    if facts.get("calibration") is not None:
+        try:
+            facts["calibration"] = Calibration.read(facts["calibration"])
+        except DataError as error:
+            raise DataError(f"{path}: {error}") from error
+    return facts
 
 
 def read_settings(facts: dict[str, Any], path: str | Path) -> MapSettings:
     """The settings of `settings_facts`; other facts are ignored. Raises `DataError` if they are damaged."""
     names = {field.name for field in fields(QueryOptions)} - {*_MACHINE_OPTIONS}
+    facts = _with_calibration(facts, path)
     try:
         check_choice("codec", facts["codec"], CODECS)
         check_method(facts["method"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from itertools import islice
 
@@ -23,6 +23,14 @@ from gmmtorch.mixture.em.exact import SOFTMAX_DTYPES
 from gmmtorch.mixture.em.partition import FlatnessRule, surface_rule
 from gmmtorch.scan import Scan
 
+BeforeWindow = Callable[[Components, Sequence[Scan | DepthFrame]], None]
+"""Is called with the components of a map before a window, and the window."""
+
+
+def no_prediction(known: Components, window: Sequence[Scan | DepthFrame]) -> None:
+    """Ignores the window."""
+
+
 # -- an IncrementalRule ---------------------------------------------------------------------------------
 
 
@@ -33,6 +41,7 @@ def absorb(
     size: Size = estimated_bytes,
     weight: float = 1.0,
     doubts: Doubts | None = None,
+    before: BeforeWindow = no_prediction,
 ) -> tuple[Components, Doubts]:
     """The components of a map with scans added, merged until they meet the budget; and the doubts after them.
 
@@ -47,12 +56,14 @@ def absorb(
         size: number of bytes of given components, for `rule.max_bytes`.
         weight: number of measured points for which each point of the scans stands.
         doubts: of `forgetting`, before these scans; None: none.
+        before: is called before each window is learned.
     """
     if None in (rule.noise, rule.length, rule.cell, rule.window):
         scans = as_scans(scans)
         rule = rule.fitted(scans)
     doubts, left = doubts or Doubts.none(), iter(scans)
     while window := list(islice(left, rule.window)):
+        before(components, window)
         components, doubts = _absorb_window(components, window, rule, size, weight, doubts)
     return components, doubts
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -92,7 +92,6 @@ def point_evidence(
     resolution: float,
     cutoff: float = CUTOFF,
     *,
-    hit_length: float | None = None,
     compiled: bool = False,
 ) -> PointEvidence:
     """Evidence of the cube of side `resolution` (m) centred at each point (M, D), world metres.
@@ -100,7 +99,38 @@ def point_evidence(
     For several calls with the same cones use a `PointForm`.
     """
     form = PointForm(cones, resolution, cutoff, compiled=compiled, indexed=len(points) > _FEW)
-    return form(points, hit_length)
+    return form(points)
+
+
+def listed_points(
+    cones: Cones,
+    axes: Tensor,
+    points: Tensor,
+    lists: tuple[Tensor, Tensor],
+    resolutions: Sequence[float],
+    cutoff: float,
+) -> list[PointEvidence]:
+    """Evidence (M,) of a few points (M, D), float64, each from the cones listed for it; for cubes of several
+    sides (m). Needs no index.
+
+    axes: (C, D, D), see `axes_of`. lists: point (P,) and cone (P,) of each entry; points ascend.
+    """
+    point, cone = lists
+    tables = [_table_of(cones, axes, side) for side in resolutions]
+    if not is_fused(points, axes):
+        blocks, zeros = points.T[:, None].contiguous(), torch.zeros_like(points[:, 0])
+        each = [
+            pair_evidence(blocks, point, table.columns, cone, side, cutoff, table.oblique)
+            for table, side in zip(tables, resolutions, strict=True)
+        ]
+        return [PointEvidence(*(zeros.index_add(0, point, v[0]) for v in pairs)) for pairs in each]
+    order = torch.arange(len(points), device=points.device)
+    ends = torch.cumsum(torch.bincount(point, minlength=len(points)), 0)
+    starts = torch.cat([ends.new_zeros(1), ends])
+    return [
+        PointEvidence(*listed_evidence(points, order, order, (starts, cone), t.rows(side), side, cutoff))
+        for t, side in zip(tables, resolutions, strict=True)
+    ]
 
 
 class PointForm:
@@ -149,16 +179,16 @@ class PointForm:
         if not 0 < cutoff < math.inf:
             raise InvalidArgumentError(f"cutoff={cutoff} must be finite and above zero.")
         self.dim, self.cutoff, self.compiled = cones.dim, float(cutoff), compiled
-        self._table = _table_of(cones, self.resolution)
+        safe_cholesky(cones.covariances.double().detach())  # raises if one is not positive definite
+        self._table = _table_of(cones, axes_of(cones.covariances), self.resolution)
         self.rows = self._table.rows(self.resolution)
         entries = None if indexed else 0
         self.index = ConeIndex(cones, self.resolution, cutoff, smoothed=True, entries_per_cone=entries)
 
-    def __call__(self, points: ArrayLike, hit_length: float | None = None) -> PointEvidence:
+    def __call__(self, points: ArrayLike) -> PointEvidence:
         """Hits and misses at points (M, D), world metres; zero at infinite points.
 
-        hit_length: ℓ (m); hits are multiplied by ℓ/h. It recalibrates the evidence of thin surfaces.
-        Raises `InvalidArgumentError` for another shape, NaN, or a length that is not above zero.
+        Raises `InvalidArgumentError` for another shape, or NaN.
         """
         query = check_queries(points, self.dim)
 
@@ -167,8 +197,6 @@ class PointForm:
 
         parts = list(chunked(len(query), _CHUNK_POINTS, evaluated)) or [evaluated(slice(0))]
         hits, misses = parts[0] if len(parts) == 1 else map(torch.cat, zip(*parts, strict=True))
-        if hit_length is not None:
-            hits = hits * (_check_length(hit_length) / self.resolution)
         return PointEvidence(hits, misses)
 
     def _evaluate(self, points: Tensor) -> PointEvidence:
@@ -219,21 +247,17 @@ class PointForm:
         return n_rows * blocks.points.shape[1] / query.shape[0]
 
 
-def _check_length(length: float) -> float:
-    if not 0 < float(length) < math.inf:
-        raise InvalidArgumentError(
-            f"hit_length={length} must be metres above zero, or None for the cube's side."
-        )
-    return float(length)
+def axes_of(covariances: Tensor) -> Tensor:
+    """The axes V (C, D, D) of components with covariances (C, D, D).
+
+    V has no gradient where variances are equal. It is held constant, which is exact to first order in Σ.
+    """
+    return torch.linalg.eigh(covariances.detach().double())[1]
 
 
-def _table_of(cones: Cones, resolution: float) -> PointTable:
+def _table_of(cones: Cones, axes: Tensor, resolution: float) -> PointTable:
     dim = cones.dim
     covariances = cones.covariances.double()
-    safe_cholesky(covariances.detach())  # raises if one is not positive definite
-    # V has no gradient where variances are equal. It is held constant, which is exact to first order in
-    # Σ.
-    axes = torch.linalg.eigh(covariances.detach())[1]
     turned = axes.transpose(1, 2) @ covariances @ axes
     variances = turned.diagonal(dim1=1, dim2=2)
     variances = variances.clamp_min(1e-12 * float(resolution) ** 2)

@@ -101,25 +101,25 @@ _CAMERA = Camera(-60.0, 24.0)
 
 
 def variance_threshold_figures(rows: style.Rows) -> dict[str, Figure]:
-    """Draws `variance_threshold`: the decisions with each hit length, a group of bars for each form and size.
+    """Draws `variance_threshold`: the decisions with each prior, a group of bars for each form and size.
 
-    Shown are the rows with the first resolution, prior and threshold.
+    Shown are the rows with the first resolution and threshold.
     """
-    fixed = {name: rows[0][name] for name in ("resolution", "prior", "variance_threshold")}
+    fixed = {name: rows[0][name] for name in ("resolution", "variance_threshold")}
     shown = [row for row in rows if all(row[name] == value for name, value in fixed.items())]
     groups = list(dict.fromkeys((row["method"], row["n_components"]) for row in shown))
-    lengths = list(dict.fromkeys(row["hit_length"] for row in shown))
+    priors = list(dict.fromkeys(row["prior"] for row in shown))
     figure = style.new_figure(15.5, 4.8)
-    width = 0.8 / len(lengths)
+    width = 0.8 / len(priors)
     for axes, (field, title) in zip(
         figure.subplots(1, len(_PANELS), sharey=True), _PANELS.items(), strict=True
     ):
-        for index, length in enumerate(lengths):
-            own = {(r["method"], r["n_components"]): r[field] for r in shown if r["hit_length"] == length}
+        for index, prior in enumerate(priors):
+            own = {(r["method"], r["n_components"]): r[field] for r in shown if r["prior"] == prior}
             bars = [(place, own[group]) for place, group in enumerate(groups) if own.get(group) is not None]
-            places = [place + width * (index - 0.5 * (len(lengths) - 1)) for place, _ in bars]
+            places = [place + width * (index - 0.5 * (len(priors) - 1)) for place, _ in bars]
             axes.bar(
-                places, [value for _, value in bars], width, label=_length(length), color=style.colour(index)
+                places, [value for _, value in bars], width, label=_label(prior), color=style.colour(index)
             )
         names = [
             "counted rays" if n is None else f"{style.label_of(m)},\n{n:,} components" for m, n in groups
@@ -137,8 +137,8 @@ def variance_threshold_figures(rows: style.Rows) -> dict[str, Figure]:
     return {"variance_threshold": figure}
 
 
-def _length(length: object) -> str:
-    return "hits as counts" if length is None else f"hit_length={length}"
+def _label(prior: float | None) -> str:
+    return "calibrated" if prior is None else f"counts, prior {prior:g}"
 
 
 def closest_look(thin: Tensor, hits: Tensor) -> Corners:

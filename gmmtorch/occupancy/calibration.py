@@ -1,0 +1,269 @@
+"""Calibration: the probability that follows from evidence, and how a map learns it while it grows.
+
+A cube of side h (m) in D dimensions with H hits and M misses is occupied with the log-odds
+
+    t(z) = b₋ z + (b₊ − b₋)(log(1 + e^z) − log 2),   z = log((w H + n) / (M + n)),
+
+with w = a ℓ/h and n = ν h^(D−1).
+
+ℓ is half the mean range of the beams (m), so that a hit counts about as much as the misses of a beam; ν is
+the number of rays per area (per length in 2D) below which evidence says little; the slope of t goes from b₋,
+where evidence is for free space, to b₊, where it is for a surface. The logarithms of a, ν, b₊ and b₋ are
+quadratic functions of a smooth scale of h/ℓ, so that 12 coefficients serve all sides. With w = 1, n = N_p
+and b₊ = b₋ = 1 it is the thesis's (3.9).
+
+The log-odds rise with H, fall with M, are zero without evidence, and are smooth in all of these and in h.
+
+A map predicts the beams of each window before it learns from them: the end of a beam is occupied, and a
+point drawn uniformly from the rest is free. The coefficients follow from these predictions by logistic
+regression, updated window by window with a Gaussian posterior (an extended Kalman filter). Its prior comes
+from the sensor model, so a map that has predicted little leans on it.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import DataError, check_number
+from gmmtorch.linalg import on_cpu
+
+_CENTER, _WIDTH = 0.05, math.log(10.0)  # of h/ℓ; the scale is nearly log(h/ℓ / 0.05) from 0.01 to 0.25
+_MEAN = torch.tensor(  # of the prior: constant, linear and quadratic part of the logarithm of a, ν, b and b
+    [[-0.3, -0.38, 0.14], [1.5, -0.3, 0.0], [0.35, 0.17, 0.0], [0.1, 0.12, 0.06]], dtype=torch.float64
+)
+_DEVIATION = torch.tensor(
+    [[0.4, 0.15, 0.05], [1.0, 0.3, 0.05], [0.25, 0.1, 0.05], [0.25, 0.1, 0.05]], dtype=torch.float64
+)
+_FARTHEST = 3.0  # deviations of the prior that a coefficient moves at most
+_INFORMATION = torch.tensor(  # of a predicted point about each coefficient, about
+    [[0.1, 0.1, 0.1], [0.02, 0.02, 0.02], [0.2, 0.2, 0.2], [0.2, 0.2, 0.2]], dtype=torch.float64
+)
+_STEPS = 2  # of Gauss and Newton, of an update
+_INDEPENDENT = 0.08  # what a prediction counts: those of one beam for several sides share their errors
+_MEMORY = 0.98  # share of what was learned that remains after another window
+_HALF = math.log(2.0)  # log(1 + e⁰)
+_LARGEST = 30.0  # of a coefficient in a file
+_N_BINS = 15
+
+
+class Calibration(NamedTuple):
+    """The mapping from evidence to probability.
+
+    length: ℓ (m). coefficients: 12 numbers: of log a, log ν, log b where evidence is for a surface, and log b
+    where it is for free space, each a constant, linear and quadratic part. n_predicted: number of points that
+    the map has predicted; 0 if the coefficients are those of the sensor model. All are rounded to float16.
+    """
+
+    length: float
+    coefficients: tuple[float, ...]
+    n_predicted: int = 0
+
+    @classmethod
+    def prior(cls, mean_range: float) -> Calibration:
+        """What the sensor model says, for beams of a mean range (m).
+
+        Of the points of a beam of length L its end is occupied, and a point drawn from the rest lies in a
+        given cell on its way with the probability h/L. So w = L/h in a map without errors, that is a = 2,
+        which holds for small cells. The other constants are those of simulated and real rooms, see
+        benchmarks/calibration.py.
+        """
+        return cls(*_rounded(_length_of(mean_range), _MEAN))
+
+    def log_odds(self, hits: Tensor, misses: Tensor, side: float, dim: int) -> Tensor:
+        """Log-odds of cubes of `side` (m) with hits and misses of any shape."""
+        mean = torch.tensor(self.coefficients, dtype=torch.float64)
+        weight, least, up, down = _quantities(mean, side, self.length, dim)
+        z = ((hits * weight + least) / (misses + least)).log()
+        return down * z + (up - down) * (torch.nn.functional.softplus(z) - _HALF)
+
+    def probability(self, hits: Tensor, misses: Tensor, side: float, dim: int) -> Tensor:
+        """Probabilities of cubes of `side` (m) with hits and misses of any shape; ½ without evidence."""
+        return torch.sigmoid(self.log_odds(hits, misses, side, dim))
+
+    @classmethod
+    def merged(cls, parts: Sequence[Calibration]) -> Calibration:
+        """The calibration of several maps together: the mean, weighted by what they have predicted.
+
+        It does not depend on the order of the parts.
+        """
+        parts = sorted(parts)
+        weight = np.array([max(1, part.n_predicted) for part in parts], dtype=np.float64)
+        values = np.array([[math.log(part.length), *part.coefficients] for part in parts])
+        length, *mean = (weight @ values / weight.sum()).tolist()
+        n_predicted = _short_count(sum(part.n_predicted for part in parts))
+        return cls(*_rounded(math.exp(length), torch.tensor(mean, dtype=torch.float64)), n_predicted)
+
+    def text(self) -> str:
+        """35 characters, from which `read` makes the calibration again."""
+        values = [math.log(self.length), math.log1p(self.n_predicted), *self.coefficients]
+        return base64.b85encode(np.array(values, dtype="<f2").tobytes()).decode()
+
+    @classmethod
+    def read(cls, text: object) -> Calibration:
+        """The calibration of a `text`. Raises `DataError` for any other object."""
+        try:
+            data = base64.b85decode(text) if isinstance(text, str) else b""
+        except ValueError:
+            data = b""
+        values = (
+            np.frombuffer(data, dtype="<f2").astype(np.float64) if len(data) == 28 else np.full(14, np.nan)
+        )
+        if not (np.abs(values) <= _LARGEST).all() or values[1] < 0:  # NaN compares false
+            raise DataError(f"calibration={text!r} is damaged; remove it to use that of the sensor model.")
+        length, n_predicted, *mean = values.tolist()
+        return cls(_short(math.exp(length)), tuple(mean), round(math.expm1(n_predicted)))
+
+
+def _length_of(mean_range: float) -> float:
+    """ℓ (m) of beams with a mean range (m)."""
+    return 0.5 * check_number("mean_range", mean_range, above=True)
+
+
+def _rounded(length: float, mean: Tensor) -> tuple[float, tuple[float, ...]]:
+    return _short(length), tuple(mean.flatten().to(torch.float16).double().tolist())
+
+
+def _short(length: float) -> float:
+    """The length (m) with a logarithm of float16."""
+    return math.exp(float(np.float16(math.log(length))))
+
+
+def _powers(ratio: float) -> Tensor:
+    """(3,) powers 0, 1, 2 of the scale of h/ℓ, which has bounds: far sides lean on near ones."""
+    s = _WIDTH * math.tanh(math.log(ratio / _CENTER) / _WIDTH)
+    return torch.tensor([1.0, s, s * s], dtype=torch.float64)
+
+
+def _quantities(mean: Tensor, side: float, length: float, dim: int) -> list[float]:
+    """w, n, and the slopes b above and below zero, for cubes of a side (m)."""
+    a, density, up, down = (mean.view(4, 3) @ _powers(side / length)).exp().tolist()
+    return [a * length / side, density * side ** (dim - 1), up, down]
+
+
+def _derivatives(
+    hits: Tensor, misses: Tensor, side: float, length: float, dim: int, mean: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Log-odds (M,), and their derivatives (12, M) with respect to the coefficients."""
+    weight, least, up, down = _quantities(mean, side, length, dim)
+    strong = hits * weight
+    z = ((strong + least) / (misses + least)).log()
+    above = torch.nn.functional.softplus(z) - _HALF
+    slope = down + (up - down) * torch.sigmoid(z)
+    t = down * z + (up - down) * above
+    each = [
+        slope * strong / (strong + least),
+        slope * (least / (strong + least) - least / (misses + least)),
+        up * above,
+        down * (z - above),
+    ]
+    return t, (torch.stack(each)[:, None] * _powers(side / length)[:, None]).flatten(0, 1)
+
+
+class Prediction(NamedTuple):
+    """What a map knew about M places and what was then seen: hits, misses, occupied (M,), for a side (m)."""
+
+    hits: Tensor
+    misses: Tensor
+    occupied: Tensor
+    side: float
+
+    def on_cpu(self) -> Prediction:
+        hits, misses, occupied = on_cpu(self.hits, self.misses, self.occupied)
+        return Prediction(hits.double(), misses.double(), occupied.double(), self.side)
+
+
+def _short_count(n: int) -> int:
+    """The number with a logarithm of float16."""
+    return round(math.expm1(float(np.float16(math.log1p(n)))))
+
+
+@dataclass(frozen=True)
+class Calibrator:
+    """What a map has learned about its calibration: a Gaussian of the coefficients.
+
+    length: ℓ (m), that of the first window. mean (12,), precision (12, 12). n_predicted: number of points.
+    next_window: number of the window that is predicted next.
+    tally: (S, 15, 3), for each of the sides that are predicted and each bin of probability the number of
+    points, the sum of their probabilities, and the number of those that were occupied. All on the CPU.
+    """
+
+    length: float
+    mean: Tensor
+    precision: Tensor
+    tally: Tensor
+    n_predicted: int = 0
+    next_window: int = 0
+
+    @classmethod
+    def of(cls, mean_range: float, n_sides: int) -> Calibrator:
+        """Nothing is learned yet; the beams have a mean range (m)."""
+        length = _length_of(mean_range)
+        return cls(
+            length, _MEAN.flatten(), _prior_precision(), torch.zeros(n_sides, _N_BINS, 3, dtype=torch.float64)
+        )
+
+    @classmethod
+    def continued(cls, known: Calibration, n_sides: int) -> Calibrator:
+        """Goes on from a calibration, which states how much was learned, but not about which coefficient."""
+        mean = torch.tensor(known.coefficients, dtype=torch.float64)
+        seen = min(known.n_predicted, 1 / (1 - _MEMORY) * 50)
+        precision = _prior_precision() + torch.diag(_INDEPENDENT * seen * _INFORMATION.flatten())
+        tally = torch.zeros(n_sides, _N_BINS, 3, dtype=torch.float64)
+        return cls(known.length, mean, precision, tally, known.n_predicted)
+
+    @classmethod
+    def restored(cls, state: dict[str, Any]) -> Calibrator:
+        """The calibrator of a state, `vars` of another. Raises `ValueError` if it is damaged."""
+        made = cls(**state)
+        check_number("length", made.length, above=True)
+        shapes = tuple(made.mean.shape), tuple(made.precision.shape), tuple(made.tally.shape[1:])
+        is_finite = bool(torch.isfinite(made.mean).all()) and bool(torch.isfinite(made.precision).all())
+        if shapes != ((12,), (12, 12), (_N_BINS, 3)) or not is_finite:
+            raise ValueError("the calibration is damaged")
+        return made
+
+    @property
+    def calibration(self) -> Calibration:
+        """The calibration so far."""
+        n_predicted = _short_count(self.n_predicted)
+        return Calibration(*_rounded(self.length, self.mean), n_predicted)
+
+    def updated(self, predictions: Sequence[Prediction], dim: int) -> Calibrator:
+        """After the predictions of a window, one for each of the sides of the tally."""
+        each = [p.on_cpu() for p in predictions]
+        occupied = torch.cat([p.occupied for p in each])
+        prior = _prior_precision()
+        before = prior + _MEMORY * (self.precision - prior)
+        now, precision = self.mean, before
+        room = _FARTHEST * _DEVIATION.flatten()
+        for step in range(_STEPS):
+            parts = [_derivatives(p.hits, p.misses, p.side, self.length, dim, now) for p in each]
+            theta = torch.sigmoid(torch.cat([t for t, _ in parts]))
+            jacobian = torch.cat([derivative for _, derivative in parts], 1)
+            precision = before + _INDEPENDENT * (jacobian * (theta * (1 - theta))) @ jacobian.T
+            gradient = _INDEPENDENT * jacobian @ (occupied - theta) - before @ (now - self.mean)
+            if step == 0:
+                tally = self._tallied(theta, occupied, [len(p.hits) for p in each])
+            now = now + torch.linalg.solve(precision, gradient)
+            now = torch.minimum(torch.maximum(now, _MEAN.flatten() - room), _MEAN.flatten() + room)
+        n_predicted = self.n_predicted + len(occupied)
+        return replace(self, mean=now, precision=precision, tally=tally, n_predicted=n_predicted)
+
+    def _tallied(self, theta: Tensor, occupied: Tensor, sizes: list[int]) -> Tensor:
+        """The tally with the probabilities (M,) of points, `sizes` of them for each side in turn."""
+        number = torch.arange(len(sizes)).repeat_interleave(torch.tensor(sizes))
+        place = number * _N_BINS + (theta * _N_BINS).long().clamp(0, _N_BINS - 1)
+        values = torch.stack([torch.ones_like(theta), theta, occupied], 1)
+        return self.tally.flatten(0, 1).index_add(0, place, values).view(self.tally.shape)
+
+
+def _prior_precision() -> Tensor:
+    return torch.diag(_DEVIATION.flatten() ** -2)
