@@ -35,11 +35,11 @@ def test_every_page_has_the_text_of_its_claims_once(claims):
 def test_a_claim_holds_within_its_interval_only(claims, tmp_path):
     (tmp_path / "stdout").write_text("ratio 1,240.5\n")
     claim = claims.Claim(
-        "README.md", "median # on these surface points", lambda out: [0.9], claims.within(0.05)
+        "README.md", "median # on these surface points", lambda out: [0.95], claims.within(0.05)
     )
     assert claims.checked(claim, tmp_path)[-1] == "yes"
     assert "0.7" in claims.checked(claim._replace(read=lambda out: [0.7]), tmp_path)[-1]
-    assert "2 numbers" in claims.checked(claim._replace(read=lambda out: [0.9, 0.9]), tmp_path)[-1]
+    assert "2 numbers" in claims.checked(claim._replace(read=lambda out: [0.95, 0.95]), tmp_path)[-1]
     assert claims.checked(claim, None)[-1].startswith("no")
     assert claims.checked(claim._replace(read=claims.published("t", ["x"], "y")), tmp_path)[-1].startswith(
         "no"

@@ -62,7 +62,7 @@ def test_losses_of_the_network_are_repaired(budget):
 def test_robots_without_known_starts_share_a_map_in_one_frame():
     scans, network = load("synthetic_building_2d", n_scans=60), Network(2)
     team, frames = [], []
-    for number, chosen in enumerate((range(40), range(20, 60))):
+    for number, chosen in enumerate((range(50), range(10, 60))):
         frames.append(start_frame(scans, chosen[0]))
         replica = Replica(number, own_frame=True)
         own = DatasetShard(scans, chosen, torch.linalg.inv(frames[-1]))
