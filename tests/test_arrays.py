@@ -406,7 +406,9 @@ def test_repr_says_in_one_line_what_matters():
         "cpu)"
     )
     assert repr(grid) == "VoxelGrid(2 × 4 cells of 0.5 m, x 0 to 1, y 1 to 3 m)"
-    assert repr(evidence) == f"Evidence(2 of 8 cells seen, 1 hits, 1 misses, 128 bytes, prior 1, cpu, {grid!r})"
+    assert (
+        repr(evidence) == f"Evidence(2 of 8 cells seen, 1 hits, 1 misses, 128 bytes, prior 1, cpu, {grid!r})"
+    )
     known = repr(given_map().components())
     assert known.startswith("Components(3 in 2D seen from 3 origins, x ")
     assert known.endswith(" m, 59 points, 339 bytes in memory, cpu)")
