@@ -5,12 +5,15 @@ Camera frame: x right, y down, z forward, metres.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor, is_floating
 from gmmtorch.errors import InvalidArgumentError, check_number
 
+_LARGEST_OFFSET = 0.2  # of the principal point from the middle, share of the width or height
 _LARGEST_SKEW = 1e-3  # share of the focal length
 _LEAST_MARGIN = 64  # pixels; small images are crops
 
@@ -38,6 +41,26 @@ def metric_depth(depth: ArrayLike, depth_scale: float | None = None) -> Tensor:
             "depth_scale, its metres per unit: 0.001 for millimetres, 0.0002 for the TUM data set."
         )
     return image
+
+
+def pinhole_matrix(values: Sequence[float]) -> Tensor:
+    """The pinhole matrix (3, 3) of fx, fy, cx, cy in pixels. Raises `InvalidArgumentError`."""
+    try:
+        fx, fy, cx, cy = (float(value) for value in values)
+        return check_intrinsics([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    except (TypeError, ValueError) as error:
+        raise InvalidArgumentError(
+            f"dataset.intrinsics={values} must be fx, fy, cx, cy in pixels."
+        ) from error
+
+
+def is_centered(intrinsics: Tensor, shape: tuple[int, int]) -> bool:
+    """Whether the principal point is as near to the middle of an image (H, W) as in one that is not cropped.
+
+    If it is not, the matrix (3, 3) is usually that of images of another size.
+    """
+    middles = ((float(c) + 0.5 - n / 2, n) for c, n in zip(intrinsics[:2, 2], shape[::-1], strict=True))
+    return all(abs(offset) <= max(_LARGEST_OFFSET * n, 2) for offset, n in middles)
 
 
 def check_intrinsics(intrinsics: ArrayLike, shape: tuple[int, ...] | None = None) -> Tensor:

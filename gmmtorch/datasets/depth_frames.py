@@ -18,13 +18,12 @@ from torch import Tensor
 from gmmtorch.datasets.base import Dataset, Ranges, check_pose, natural_key, require_path
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_number, check_whole
 from gmmtorch.linalg import nearest_rotations
-from gmmtorch.pinhole import back_project, check_intrinsics
+from gmmtorch.pinhole import back_project, check_intrinsics, is_centered
 from gmmtorch.scan import Scan
 
 _INVALID = (0, 65535)
 MAX_PIXELS = 1 << 23
 """An image of 4K has 8.3 million; a damaged header may announce billions."""
-_LARGEST_OFFSET = 0.2  # of the principal point from the middle of the image, share of its width or height
 
 _UPRIGHT = {
     "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
@@ -104,14 +103,13 @@ class DepthFrames(Dataset):
         """Depth (H, W) in metres, float64; 0 for invalid pixels."""
         path = self._files[index]
         depth = metric(read_png(path, str(path)), self.depth_scale)
-        size = depth.shape[1], depth.shape[0]
-        center = float(self.intrinsics[0, 2]), float(self.intrinsics[1, 2])
-        offsets = (abs((c + 0.5) / n - 0.5) for c, n in zip(center, size, strict=True))
-        if max(offsets) > _LARGEST_OFFSET:
+        height, width = depth.shape
+        if not is_centered(self.intrinsics, (height, width)):
+            (_, _, cx), (_, _, cy), _ = self.intrinsics.tolist()
             raise DataError(
-                f"{path} has {size[0]}×{size[1]} pixels, but camera-intrinsics.txt is for images of about "
-                f"{2 * center[0]:.0f}×{2 * center[1]:.0f}: its principal point is not near the middle of the "
-                "image. Scale the intrinsics, or give the images in full size."
+                f"{path} has {width}×{height} pixels, but camera-intrinsics.txt is for images of about "
+                f"{2 * cx:.0f}×{2 * cy:.0f}: its principal point is not near the middle of the image. Scale "
+                "the intrinsics, or give the images in full size."
             )
         return depth
 

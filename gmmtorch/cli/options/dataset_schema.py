@@ -60,6 +60,8 @@ class RosbagDataset(FileDataset):
     deskew: each point with a time gets the pose of its own time.
     camera_info: topic of the camera parameters of depth images; null: the nearest by name.
     pixel_stride: every n-th pixel of every n-th row of depth images.
+    depth_scale: metres per unit of depth images; null: 0.001 for whole numbers, 1 for floating ones.
+    intrinsics: [fx,fy,cx,cy] in pixels of depth images without distortion; null: of camera_info.
     imu_topic: topic of the IMU of motion=imu; null: the only one.
     """
 
@@ -72,6 +74,8 @@ class RosbagDataset(FileDataset):
     deskew: bool = True
     camera_info: str | None = None
     pixel_stride: int = 1
+    depth_scale: float | None = None
+    intrinsics: list[float] | None = None
     imu_topic: str | None = None
 
 

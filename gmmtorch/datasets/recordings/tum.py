@@ -13,9 +13,10 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset, Ranges, require_path
-from gmmtorch.datasets.depth_frames import back_project, read_png
+from gmmtorch.datasets.depth_frames import read_png
 from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, increasing, read_trajectory, to_nanoseconds
-from gmmtorch.errors import DataError, InvalidArgumentError, check_number, check_whole
+from gmmtorch.errors import DataError, check_number, check_whole
+from gmmtorch.pinhole import back_project, pinhole_matrix
 from gmmtorch.scan import Scan
 
 _INTRINSICS = (525.0, 525.0, 319.5, 239.5)
@@ -61,7 +62,7 @@ class TumRgbd(Dataset):
         self.pixel_stride = check_whole("dataset.pixel_stride", pixel_stride, 1)
         check_number("dataset.depth_scale", depth_scale, above=True)
         self._scale = depth_scale
-        self.intrinsics = _pinhole(_INTRINSICS if intrinsics is None else intrinsics)
+        self.intrinsics = pinhole_matrix(_INTRINSICS if intrinsics is None else intrinsics)
         times, files = _listed(path / "depth.txt")
         kept = increasing(times)
         self._skip("stamp out of order (the clock jumped)", *({*range(len(times))} - {*kept.tolist()}))
@@ -98,14 +99,6 @@ class TumRgbd(Dataset):
     def _depth(self, index: int) -> Tensor:
         path = self._files[index]
         return torch.from_numpy(read_png(path, str(path)) * self._scale)
-
-
-def _pinhole(values: tuple[float, ...] | list[float]) -> Tensor:
-    numbers = [float(value) for value in values]
-    if len(numbers) != 4 or not np.isfinite(numbers).all() or min(numbers[:2]) <= 0:
-        raise InvalidArgumentError(f"dataset.intrinsics={list(values)} must be fx, fy, cx, cy in pixels.")
-    fx, fy, cx, cy = numbers
-    return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
 
 
 def _listed(path: Path) -> tuple[np.ndarray, list[Path]]:

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset, Ranges
-from gmmtorch.datasets.recordings.ros import sensor_messages
 from gmmtorch.datasets.recordings.ros.bag_topics import Sensor
+from gmmtorch.datasets.recordings.ros.depth_camera import DepthCamera
 from gmmtorch.datasets.recordings.ros.pose_sources import PoseSource, Standing, TfPoses
 from gmmtorch.datasets.recordings.ros.scan_conversion import ScanConversion
 from gmmtorch.datasets.recordings.ros.sensor_messages import Reading
@@ -49,6 +49,8 @@ class LiveOptions:
     deskew: each point with a time gets the pose of its own time.
     stride: use every n-th scan.
     pixel_stride: every n-th pixel of every n-th row of depth images.
+    depth_scale: metres per unit of depth images; None: 0.001 for whole numbers, 1 for floating ones.
+    intrinsics: [fx,fy,cx,cy] in pixels of depth images without distortion; None: of the CameraInfo.
     max_latency: seconds after which a scan that waits is dropped; None: scans wait.
     """
 
@@ -60,6 +62,8 @@ class LiveOptions:
     deskew: bool = True
     stride: int = 1
     pixel_stride: int = 1
+    depth_scale: float | None = None
+    intrinsics: list[float] | None = None
     max_latency: float | None = 2.0
 
     def __post_init__(self) -> None:
@@ -109,7 +113,8 @@ class LiveScans(Dataset):
         super().__init__(sensor.topic.name, ranges)
         self.newest: LiveScan | None = None
         self.n_dropped = 0
-        self.intrinsics: Tensor | None = None
+        camera = options.pixel_stride, options.depth_scale, options.intrinsics
+        self._camera = DepthCamera(sensor, None, *camera) if sensor.is_camera else None
         self._sensor, self._tree, self._options = sensor, tree, options
         self._waiting: deque[_Waiting] = deque()
         self._waiting_bytes = 0
@@ -150,10 +155,9 @@ class LiveScans(Dataset):
             self._drop()
 
     def note_camera(self, message: dict[str, Any]) -> None:
-        """Takes the pinhole matrix of a CameraInfo."""
-        self.intrinsics = sensor_messages.camera_matrix(message)
-        if self._conversion is not None:
-            self._conversion.intrinsics = self.intrinsics
+        """Takes a CameraInfo."""
+        if self._camera is not None:
+            self._camera.take(message)
 
     @property
     def n_waiting(self) -> int:
@@ -196,7 +200,7 @@ class LiveScans(Dataset):
 
     def _is_ready(self, item: _Waiting) -> bool:
         """Whether everything that the conversion of a message needs has arrived, or never will."""
-        if self._sensor.is_camera and self.intrinsics is None:
+        if self._camera is not None and not self._camera.is_known:
             self.trouble = "no CameraInfo has arrived"
             return False
         try:
@@ -204,9 +208,8 @@ class LiveScans(Dataset):
                 source = self._settled(item.frame)
                 if source is None:
                     return False
-                pixel_stride = self._options.pixel_stride
-                arguments = self._options.deskew, self.intrinsics, pixel_stride
-                self._conversion = ScanConversion(self._sensor, self.ranges, source, *arguments)
+                arguments = source, self._options.deskew, self._camera
+                self._conversion = ScanConversion(self._sensor, self.ranges, *arguments)
             if not isinstance(self._conversion.source, TfPoses):
                 return True
             chain = self._conversion.source.chain(item.frame)
@@ -277,7 +280,7 @@ class LiveScans(Dataset):
                 return False
             found = conversion.points(item.message, item.stamp)
         except (DataError, ValueError, KeyError, OverflowError) as error:
-            self.trouble = str(error)
+            self.trouble = str(error).replace("dataset.", "sensor.")
             self._note("message that cannot be decoded")
             return False
         self._n_posed += 1

@@ -78,7 +78,7 @@ def open_scans(
     scans = LiveScans(sensor, node.transforms, ranges, options)
     if options.poses != "standing":
         node.listen_to_transforms()
-    if sensor.is_camera:
+    if sensor.is_camera and options.intrinsics is None:
         info = camera_info or _camera_info(node, sensor.topic.name)
         node.subscribe(info, bag_topics.INFO_TYPE, reading(scans.note_camera))
     node.subscribe(
@@ -95,6 +95,7 @@ def _camera_info(node: Node, image: str) -> str:
     if len(best) != 1:
         raise InvalidArgumentError(
             f"sensor.camera_info is not clear for the images of {image}; topics of type CameraInfo are "
-            f"{', '.join(infos) or 'none: publish the one of the camera'}."
+            f"{', '.join(infos) or 'none'}. Choose one, or state sensor.intrinsics=[fx,fy,cx,cy] in pixels, "
+            "without distortion."
         )
     return best[0]

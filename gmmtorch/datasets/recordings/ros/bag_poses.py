@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from gmmtorch.datasets.recordings.trajectory import Trajectory, read_trajectory
 from gmmtorch.errors import DataError, InvalidArgumentError
 
 _HEAD_BYTES = 1024
+_STAMP_BYTES = 12  # in which headers differ: the CDR head and the stamp, or the number and the stamp of ROS 1
 
 
 class Record(NamedTuple):
@@ -51,12 +52,14 @@ class BagSurvey:
         self,
         reader: BagReader,
         topic: str,
+        info_topic: str | None,
         poses: str | None,
         frame: str | None,
         extrinsic: list[float] | None,
         max_gap: float,
     ) -> None:
-        self._reader, self._topic = reader, topic
+        self._reader, self._topic, self._info_topic = reader, topic, info_topic
+        self._infos: dict[bytes, dict[str, Any]] = {}
         self._poses, self._frame, self.max_gap = poses, frame, max_gap
         self._extrinsic = mount_matrix(extrinsic)
         self._pose_topic = poses if poses in {t.name for t in reader.topics} else None
@@ -81,7 +84,7 @@ class BagSurvey:
         self._samples: list[tuple[int, np.ndarray]] = []
         self._bodies: Counter[str] = Counter()
         for message in reader.messages(
-            {topic, *transforms, *([self._pose_topic] if self._pose_topic else [])}
+            {topic, *transforms, *(name for name in (info_topic, self._pose_topic) if name)}
         ):
             self._note(message)
 
@@ -90,6 +93,11 @@ class BagSurvey:
             self.heads.append((message.time, message.data[:_HEAD_BYTES]))
             return
         try:
+            if message.topic == self._info_topic:
+                without_stamp = message.data[_STAMP_BYTES:]
+                if without_stamp not in self._infos and len(self._infos) < 2:
+                    self._infos[without_stamp] = self._reader.decode(message)
+                return
             content = self._reader.decode(message)
             if message.type in TF_TYPES:
                 self.tree.add(content, static=message.topic.endswith("tf_static"))
@@ -99,6 +107,16 @@ class BagSurvey:
             return  # a transform that is missed leaves a gap, which `max_gap` notices
         self._samples.append((time, matrix))
         self._bodies[body] += 1
+
+    def camera_info(self) -> dict[str, Any] | None:
+        """The decoded CameraInfo; None without its topic. Raises `DataError` if it changes."""
+        if self._info_topic is not None and len(self._infos) != 1:
+            what = "changes" if self._infos else "cannot be decoded"
+            raise DataError(
+                f"{self._reader.path}: the camera info of {self._info_topic} {what}. State the images' own: "
+                "dataset.intrinsics=[fx,fy,cx,cy] in pixels, without distortion."
+            )
+        return next(iter(self._infos.values()), None)
 
     def _check_pose_topic(self) -> None:
         types = [t.type for t in self._reader.topics if t.name == self._pose_topic]

@@ -131,7 +131,8 @@ def choose_camera_info(reader: BagReader, image: str, wanted: str | None) -> str
     if wanted is not None or len(best) != 1:
         raise InvalidArgumentError(
             f"{reader.path}: dataset.camera_info={wanted} is not clear for the images of {image}; topics of "
-            f"type CameraInfo are {', '.join(infos) or 'none: record the one of the camera'}."
+            f"type CameraInfo are {', '.join(infos) or 'none'}. Choose one, or state dataset.intrinsics="
+            "[fx,fy,cx,cy] in pixels, without distortion."
         )
     return best[0]
 

@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset, Ranges, require_path
-from gmmtorch.datasets.recordings.ros import bag_topics, sensor_messages
+from gmmtorch.datasets.recordings.ros import bag_topics
 from gmmtorch.datasets.recordings.ros.bag_poses import BagSurvey, Record
 from gmmtorch.datasets.recordings.ros.bag_reader import BagReader, RawMessage
+from gmmtorch.datasets.recordings.ros.depth_camera import DepthCamera
 from gmmtorch.datasets.recordings.ros.gyroscope import read_gyroscope, sensor_turns
 from gmmtorch.datasets.recordings.ros.scan_conversion import ScanConversion
 from gmmtorch.datasets.recordings.ros.sensor_messages import Reading
@@ -41,6 +42,8 @@ def open_rosbag(
     deskew: bool = True,
     camera_info: str | None = None,
     pixel_stride: int = 1,
+    depth_scale: float | None = None,
+    intrinsics: list[float] | None = None,
     imu_topic: str | None = None,
 ) -> RosBag:
     """The scans of one topic of a bag; see docs/recordings.md.
@@ -58,6 +61,8 @@ def open_rosbag(
         deskew: whether points with times get the pose of their own time.
         camera_info: topic of the camera parameters of depth images.
         pixel_stride: every n-th pixel of every n-th row of depth images is used.
+        depth_scale: metres per unit of depth images; None: 0.001 for whole numbers, 1 for floating ones.
+        intrinsics: fx, fy, cx, cy in pixels of depth images without distortion; None: of `camera_info`.
         imu_topic: of the IMU of `RosBag.turns`; None: the only one.
     """
     source = "A bag of ROS 1 is a file; one of ROS 2 is a file or its folder."
@@ -67,14 +72,15 @@ def open_rosbag(
         raise InvalidArgumentError(f"dataset.max_gap={max_gap} must be a time above zero seconds.")
     reader = BagReader(file)
     sensor = bag_topics.choose_sensor(reader, topic)
-    intrinsics = None
-    if sensor.is_camera:
+    info = None
+    if sensor.is_camera and intrinsics is None:
         info = bag_topics.choose_camera_info(reader, sensor.topic.name, camera_info)
-        intrinsics = sensor_messages.camera_matrix(reader.decode(next(reader.messages([info]))))
-    survey = BagSurvey(reader, sensor.topic.name, poses, frame, extrinsic, max_gap)
-    kind = DepthBag if sensor.is_camera else RosBag
-    options = sensor_frame, clock, deskew, intrinsics, pixel_stride, imu_topic
-    return kind(reader, sensor, survey, ranges, stride, *options)
+    survey = BagSurvey(reader, sensor.topic.name, info, poses, frame, extrinsic, max_gap)
+    camera = DepthCamera(sensor, survey.camera_info(), pixel_stride, depth_scale, intrinsics)
+    options = sensor_frame, clock, deskew, imu_topic
+    if sensor.is_camera:
+        return DepthBag(reader, sensor, survey, ranges, stride, *options, camera)
+    return RosBag(reader, sensor, survey, ranges, stride, *options)
 
 
 class RosBag(Dataset):
@@ -98,12 +104,11 @@ class RosBag(Dataset):
         sensor_frame: str | None,
         clock: str,
         deskew: bool,
-        intrinsics: Tensor | None,
-        pixel_stride: int,
         imu_topic: str | None,
+        camera: DepthCamera | None = None,
     ) -> None:
         super().__init__(reader.path.stem, ranges, stride)
-        self._reader, self._sensor, self._clock = reader, sensor, clock
+        self._reader, self._camera, self._clock = reader, camera, clock
         self._imu_topic, self._tree, self._max_gap = imu_topic, survey.tree, survey.max_gap
         self.topic = sensor.topic.name
         self._where = f"{reader.path}, topic {self.topic}"
@@ -112,7 +117,7 @@ class RosBag(Dataset):
         self._received = np.array([time for time, _ in survey.heads])
         records = self._ordered(self._of_frame(self._read_headers(survey.heads), sensor_frame))
         self._source = survey.source(records, self._where)
-        self._conversion = ScanConversion(sensor, ranges, self._source, deskew, intrinsics, pixel_stride)
+        self._conversion = ScanConversion(sensor, ranges, self._source, deskew, camera)
         delay = float(np.median([record.time - record.stamp for record in records]))
         self._delay = None if clock == "received" else delay
         self._records, self._matrices = self._posed(records)
@@ -235,7 +240,8 @@ class RosBag(Dataset):
             return self._conversion.points(message, record.stamp)
         except (DataError, ValueError, KeyError, OverflowError) as error:
             raise DataError(
-                f"{self._where}, frame {record.frame}, stamp {record.stamp / NANOSECONDS:.3f} s: {error}."
+                f"{self._where}, frame {record.frame}, stamp {record.stamp / NANOSECONDS:.3f} s: "
+                f"{str(error).removesuffix('.')}."
             ) from error
 
     def _message(self, index: int) -> dict[str, Any]:
@@ -256,16 +262,16 @@ class RosBag(Dataset):
 class DepthBag(RosBag):
     """Scans from depth images of a bag. `intrinsics` is the pinhole matrix (3, 3) in pixels.
 
-    `image` returns the full depth image of a scan. Lens distortion is not removed: record rectified images.
+    `image` returns the full depth image of a scan, without lens distortion.
     """
+
+    _camera: DepthCamera
 
     @property
     def intrinsics(self) -> Tensor:
-        matrix = self._conversion.intrinsics
-        assert matrix is not None
-        return matrix
+        return self._camera.intrinsics
 
     def image(self, index: int) -> tuple[Tensor, Tensor]:
         """Depth (H, W) in metres, 0 for invalid pixels, and pose (4, 4), world ← camera, of a scan."""
         position = self._position(index)
-        return self._conversion.depth(self._message(position)), self._poses[position]
+        return self._camera.image(self._message(position)), self._poses[position]

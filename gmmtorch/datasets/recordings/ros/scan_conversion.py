@@ -13,10 +13,9 @@ from torch import Tensor
 from gmmtorch.datasets.base import Ranges
 from gmmtorch.datasets.recordings.ros import bag_topics, sensor_messages
 from gmmtorch.datasets.recordings.ros.bag_topics import Sensor
+from gmmtorch.datasets.recordings.ros.depth_camera import DepthCamera
 from gmmtorch.datasets.recordings.ros.pose_sources import PoseSource
 from gmmtorch.datasets.recordings.ros.sensor_messages import Reading
-from gmmtorch.errors import check_whole
-from gmmtorch.pinhole import back_project
 from gmmtorch.scan import FARTHEST, Scan
 
 _LEVEL = math.cos(math.radians(10))
@@ -34,8 +33,7 @@ class ScanConversion:
         ranges: how range readings are interpreted.
         source: poses of the sensor.
         deskew: whether points with times get the pose of their own time, if the source has one.
-        intrinsics: pinhole matrix (3, 3) in pixels of depth images.
-        pixel_stride: every n-th pixel of every n-th row of depth images is used.
+        camera: of depth images.
     """
 
     def __init__(
@@ -44,13 +42,11 @@ class ScanConversion:
         ranges: Ranges,
         source: PoseSource,
         deskew: bool = True,
-        intrinsics: Tensor | None = None,
-        pixel_stride: int = 1,
+        camera: DepthCamera | None = None,
     ) -> None:
-        self.source, self.intrinsics = source, intrinsics
+        self.source, self._camera = source, camera
         self._sensor, self._ranges = sensor, ranges
         self._deskew = deskew and source.can_deskew
-        self._pixel_stride = check_whole("dataset.pixel_stride", pixel_stride, 1)
 
     def points(self, message: dict[str, Any], stamp: int) -> Reading:
         """The points of a decoded message that was measured at a stamp (ns), in the sensor's frame."""
@@ -61,19 +57,13 @@ class ScanConversion:
             return sensor_messages.listed_points(message, self._sensor.field, stamp)
         if kind == bag_topics.LASER:
             return sensor_messages.laser_points(message)
-        assert self.intrinsics is not None
-        points = back_project(self.depth(message), self.intrinsics, self._pixel_stride)
-        return sensor_messages.reading(points.numpy(), None, None)
-
-    def depth(self, message: dict[str, Any]) -> Tensor:
-        """The depth image (H, W) in metres of a decoded message of a camera."""
-        if self._sensor.kind == bag_topics.DEPTH:
-            return sensor_messages.depth_image(message)
-        return sensor_messages.compressed_depth_image(message)
+        assert self._camera is not None
+        return sensor_messages.reading(self._camera.points(message), None, None)
 
     def is_flat(self, matrices: np.ndarray, first: Reading) -> bool:
         """Whether scans are 2D: the sensor is level at all poses (N, 4, 4), and a laser or a planar lidar."""
-        is_planar_sensor = self._sensor.kind == bag_topics.LASER or is_planar(first, _MIN_PLANAR)
+        is_planar_cloud = not self._sensor.is_camera and is_planar(first, _MIN_PLANAR)
+        is_planar_sensor = self._sensor.kind == bag_topics.LASER or is_planar_cloud
         return is_planar_sensor and self.is_level(matrices)
 
     @staticmethod

@@ -132,8 +132,11 @@ def laser_points(message: dict[str, Any]) -> Reading:
     return reading(points, no_return, offsets)
 
 
-def depth_image(message: dict[str, Any]) -> Tensor:
-    """Depth (H, W) in metres, float64, 0 where it is unknown, of an Image with 16UC1, mono16 or 32FC1."""
+def depth_image(message: dict[str, Any], scale: float | None = None) -> Tensor:
+    """Depth (H, W) in metres, float64, 0 where it is unknown, of an Image with 16UC1, mono16 or 32FC1.
+
+    scale: metres per unit; None: 0.001 for whole numbers, 1 for 32FC1.
+    """
     width, height, step = int(message["width"]), int(message["height"]), int(message["step"])
     kind = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}.get(message["encoding"])
     if kind is None:
@@ -145,10 +148,10 @@ def depth_image(message: dict[str, Any]) -> Tensor:
     if (height - 1) * step + width * dtype.itemsize > len(data):
         raise DataError(f"{width} × {height} pixels are announced, but the image has {len(data)} bytes")
     raw = np.ndarray((height, width), dtype, bytes(data), 0, (step, dtype.itemsize))
-    return metric(raw, _MILLIMETRE) if kind == "u2" else _finite(raw.astype(np.float64))
+    return metric(raw, scale or _MILLIMETRE) if kind == "u2" else _finite(raw.astype(np.float64), scale)
 
 
-def compressed_depth_image(message: dict[str, Any]) -> Tensor:
+def compressed_depth_image(message: dict[str, Any], scale: float | None = None) -> Tensor:
     """Depth (H, W) in metres of a CompressedImage of compressed_depth_image_transport, in PNG.
 
     For 32FC1 the image stores q = a / d + b with the two parameters in the header of the data.
@@ -161,20 +164,13 @@ def compressed_depth_image(message: dict[str, Any]) -> Tensor:
         )
     raw = read_png(io.BytesIO(data[start:]), "the compressed image")
     if "32FC1" not in form or start == 0:
-        return metric(raw, _MILLIMETRE)
+        return metric(raw, scale or _MILLIMETRE)
     a, b = np.frombuffer(data, "<f4", 2, 4).astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return _finite(np.where(raw > 0, a / (raw.astype(np.float64) - b), 0))
+        return _finite(np.where(raw > 0, a / (raw.astype(np.float64) - b), 0), scale)
 
 
-def _finite(depth: np.ndarray) -> Tensor:
+def _finite(depth: np.ndarray, scale: float | None) -> Tensor:
     with np.errstate(invalid="ignore"):
-        return torch.from_numpy(np.where(np.isfinite(depth) & (depth > 0), depth, 0.0))
-
-
-def camera_matrix(message: dict[str, Any]) -> Tensor:
-    """The pinhole matrix (3, 3) in pixels of a CameraInfo. Raises `DataError` if it is not one."""
-    matrix = torch.tensor(np.asarray(message["k"] if "k" in message else message["K"]), dtype=torch.float64)
-    if matrix.shape != (9,) or not bool(torch.isfinite(matrix).all()) or min(matrix[0], matrix[4]) <= 0:
-        raise DataError(f"the camera matrix {matrix.tolist()} has no focal lengths above zero")
-    return matrix.reshape(3, 3)
+        valid = torch.from_numpy(np.where(np.isfinite(depth) & (depth > 0), depth, 0.0))
+    return valid if scale is None else valid * scale
