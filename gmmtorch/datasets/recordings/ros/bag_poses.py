@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,11 +11,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gmmtorch.datasets.recordings.ros.bag_reader import BagReader, RawMessage
-from gmmtorch.datasets.recordings.ros.bag_topics import POSE_TYPES, TF_TYPES, listed
+from gmmtorch.datasets.recordings.ros.bag_topics import CLOUD, LIST, POSE_TYPES, TF_TYPES, Sensor, listed
 from gmmtorch.datasets.recordings.ros.pose_sources import (
     BodyPoses,
     PosesByIndex,
     PoseSource,
+    RegisteredPoses,
     Standing,
     TfPoses,
     mount_matrix,
@@ -24,6 +26,7 @@ from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree
 from gmmtorch.datasets.recordings.trajectory import Trajectory, read_trajectory
 from gmmtorch.errors import DataError, InvalidArgumentError
 
+_log = logging.getLogger(__name__)
 _HEAD_BYTES = 1024
 _STAMP_BYTES = 12  # in which headers differ: the CDR head and the stamp, or the number and the stamp of ROS 1
 
@@ -51,14 +54,16 @@ class BagSurvey:
     def __init__(
         self,
         reader: BagReader,
-        topic: str,
+        sensor: Sensor,
         info_topic: str | None,
         poses: str | None,
         frame: str | None,
         extrinsic: list[float] | None,
         max_gap: float,
     ) -> None:
+        topic = sensor.topic.name
         self._reader, self._topic, self._info_topic = reader, topic, info_topic
+        self._is_cloud = sensor.kind in (CLOUD, LIST)
         self._infos: dict[bytes, dict[str, Any]] = {}
         self._poses, self._frame, self.max_gap = poses, frame, max_gap
         self._extrinsic = mount_matrix(extrinsic)
@@ -82,7 +87,7 @@ class BagSurvey:
         self.heads: list[tuple[int, bytes]] = []
         self.tree = TransformTree()
         self._samples: list[tuple[int, np.ndarray]] = []
-        self._bodies: Counter[str] = Counter()
+        self._frames: Counter[tuple[str, str]] = Counter()  # of world and body
         for message in reader.messages(
             {topic, *transforms, *(name for name in (info_topic, self._pose_topic) if name)}
         ):
@@ -102,11 +107,11 @@ class BagSurvey:
             if message.type in TF_TYPES:
                 self.tree.add(content, static=message.topic.endswith("tf_static"))
                 return
-            time, matrix, body = pose_sample(content)
+            time, matrix, *pose_frames = pose_sample(content)
         except (DataError, ValueError, KeyError, TypeError):  # also a definition in the bag that is damaged
             return  # a transform that is missed leaves a gap, which `max_gap` notices
         self._samples.append((time, matrix))
-        self._bodies[body] += 1
+        self._frames[pose_frames[0], pose_frames[1]] += 1
 
     def camera_info(self) -> dict[str, Any] | None:
         """The decoded CameraInfo; None without its topic. Raises `DataError` if it changes."""
@@ -133,18 +138,64 @@ class BagSurvey:
             f"KITTI trajectory, or dataset.poses=TOPIC; topics of poses: {listed(topics)}."
         )
 
-    def source(self, records: Sequence[Record], where: str) -> PoseSource:
-        """The poses of the sensor. Raises `DataError` if the sensor's frames are not connected to them."""
+    def of_frame(self, records: list[Record], wanted: str, where: str) -> list[Record]:
+        """The messages of the frame of the sensor that is stated.
+
+        If none has it, those without a frame, or of the only one that TF does not have, are taken to be in
+        it. Points in a fixed frame above it stay there. Raises `InvalidArgumentError`.
+        """
         frames = Counter(record.frame for record in records)
-        mount = self._extrinsic
+        if wanted in frames:
+            return [record for record in records if record.frame == wanted]
+        if len(frames) == 1 and self._seen_from(next(iter(frames)), wanted) is not None:
+            return records
+        unknown = frames.keys() - set(self.tree.frames)
+        if "" in unknown or (len(unknown) == 1 and wanted in self.tree.frames):
+            nameless = "" if "" in unknown else next(iter(unknown))
+            return [record._replace(frame=wanted) for record in records if record.frame == nameless]
+        counts = ", ".join(f"{name} ({n} times)" for name, n in frames.items())
+        raise InvalidArgumentError(
+            f"dataset.sensor_frame={wanted} is not a frame of {where}, whose frames are {counts}; choose one."
+        )
+
+    def _seen_from(self, frame: str, wanted: str | None) -> str | None:
+        """The frame of the sensor if points of `frame` are in a fixed frame already, otherwise None.
+
+        wanted: the frame of the sensor that is stated.
+        """
+        if not self._is_cloud or frame in ("", wanted):
+            return None
+        if self._pose_topic is not None:
+            world, body = self._frames.most_common(1)[0][0] if self._frames else ("", "")
+            return (body if wanted is None else wanted) if frame == world != body else None
+        if wanted is not None:
+            return wanted if frame in self.tree.above(wanted) else None
+        return self.tree.traveller(frame)
+
+    def source(self, records: Sequence[Record], where: str, sensor_frame: str | None = None) -> PoseSource:
+        """The poses of the sensor, whose frame may be stated.
+
+        Raises `DataError` if the sensor's frames are not connected to them.
+        """
+        frames = Counter(record.frame for record in records)
+        mount, first = self._extrinsic, next(iter(frames))
+        seen_from = self._seen_from(first, sensor_frame) if len(frames) == 1 else None
+        if seen_from is not None and sensor_frame is None and self._poses != "standing":
+            _log.warning(
+                "%s: points are in the fixed frame %s already, and seen from %s. If %s is the frame of the "
+                "sensor instead, choose dataset.sensor_frame=%s.",
+                *(where, first, seen_from or "the poses", first, first),
+            )
         if self._poses in (None, "tf"):
-            return self._from_tf(frames, where)
+            return self._from_tf(frames, where, seen_from)
         if self._pose_topic is not None:
             times, matrices = [list(column) for column in zip(*self._samples, strict=True)] or ([], [])
             stamps, poses = np.array(times, np.int64), np.array(matrices).reshape(-1, 4, 4)
             trajectory = Trajectory.from_samples(stamps, poses)
-            mounts = {frame: self._mount(frame, where) if mount is None else mount for frame in frames}
-            return BodyPoses(trajectory, mounts, self.max_gap, f"topic {self._pose_topic}")
+            sensors = frames if seen_from is None else [seen_from]
+            mounts = {frame: self._mount(frame, where) if mount is None else mount for frame in sensors}
+            source = BodyPoses(trajectory, mounts, self.max_gap, f"topic {self._pose_topic}")
+            return source if seen_from is None else RegisteredPoses(source, seen_from, Standing())
         if len(frames) > 1:
             counts = ", ".join(f"{frame or '(unnamed)'} ({n} scans)" for frame, n in frames.most_common())
             raise InvalidArgumentError(
@@ -153,26 +204,36 @@ class BagSurvey:
             )
         if self._file is None:
             return Standing()
+        if seen_from is not None:
+            raise InvalidArgumentError(
+                f"dataset.poses={self._poses} would move the points of {where} again: they are in the fixed "
+                f"frame {first} already. Choose dataset.poses=tf, or dataset.sensor_frame={first} if that is "
+                "the frame of the sensor."
+            )
         fixed = np.eye(4) if mount is None else mount
         trajectory = read_trajectory(self._file, len(self.heads))
         if not trajectory.has_times:
             return PosesByIndex({r.stamp: trajectory.matrices[r.number] for r in records}, fixed)
         return BodyPoses(trajectory, dict.fromkeys(frames, fixed), self.max_gap, str(self._file))
 
-    def _from_tf(self, frames: Counter[str], where: str) -> PoseSource:
+    def _from_tf(self, frames: Counter[str], where: str, seen_from: str | None) -> PoseSource:
+        if seen_from is not None:
+            source = TfPoses(self.tree, self._frame or next(iter(frames)), self.max_gap, where)
+            return RegisteredPoses(source, seen_from, source)
         source = TfPoses(self.tree, self._frame, self.max_gap, where)
         chains = [source.chain(frame) for frame in frames]
         chosen = self._poses is not None or self._frame is not None
         if not chosen and not any(self.tree.is_moving(chain) for chain in chains):
             raise DataError(
                 f"{where}: TF has only static transforms from frame {chains[0][0]} up to {chains[0][-1]}, so "
-                f"the sensor's motion is unknown. {self._remedy()}"
+                f"the sensor's motion is unknown. {self._remedy()} If points are in {chains[0][0]} already, "
+                "as SLAM systems publish them, state the frame of the sensor: dataset.sensor_frame=NAME."
             )
         return source
 
     def _mount(self, frame: str, where: str) -> np.ndarray:
         """body ← sensor from the static transforms."""
-        body = self._bodies.most_common(1)[0][0] if self._bodies else ""
+        body = self._frames.most_common(1)[0][0][1] if self._frames else ""
         if body in ("", frame):
             return np.eye(4)
         try:

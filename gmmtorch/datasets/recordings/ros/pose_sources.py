@@ -103,6 +103,30 @@ class BodyPoses:
         return f"{self._name} has poses from {times[0]:.3f} to {times[-1]:.3f} s"
 
 
+class RegisteredPoses:
+    """Poses of a sensor whose points are in a fixed frame already, as SLAM systems publish them.
+
+    source: poses of the sensor. sensor: its frame. fixed: poses of the frame of the points.
+    """
+
+    can_deskew = False
+
+    def __init__(self, source: PoseSource, sensor: str, fixed: PoseSource) -> None:
+        self.sensor, self._source, self._fixed = sensor, source, fixed
+
+    def at(self, times: np.ndarray, frame: str) -> Poses:
+        poses = self._source.at(times, self.sensor)
+        return poses._replace(known=poses.known & self._fixed.at(times, frame).known)
+
+    def of_points(self, time: int, frame: str) -> np.ndarray:
+        """The pose (4, 4) at a known time (ns) of the frame of the points."""
+        matrix: np.ndarray = self._fixed.at(np.array([time]), frame).matrices[0]
+        return matrix
+
+    def explain(self, time: int, frame: str) -> str:
+        return self._source.explain(time, self.sensor)
+
+
 class PosesByIndex:
     """Poses of a file without times. poses: time (ns) → world ← body; mount: body ← sensor."""
 
@@ -119,8 +143,8 @@ class PosesByIndex:
         return "all poses are known"
 
 
-def pose_sample(message: dict[str, Any]) -> tuple[int, np.ndarray, str]:
-    """(time in ns, world ← body (4, 4), body's frame or "") of a message of a pose topic.
+def pose_sample(message: dict[str, Any]) -> tuple[int, np.ndarray, str, str]:
+    """(time in ns, world ← body (4, 4), frames of world and body or "") of a message of a pose topic.
 
     Raises `ValueError` if it is not a pose.
     """
@@ -132,7 +156,8 @@ def pose_sample(message: dict[str, Any]) -> tuple[int, np.ndarray, str]:
         content = message["pose"]
         content = content.get("pose", content)  # with covariance
         matrix = transform_matrix(content["position"], content["orientation"])
-    return time, matrix, frame_name(message.get("child_frame_id", ""))
+    world, body = message["header"]["frame_id"], message.get("child_frame_id", "")
+    return time, matrix, frame_name(world), frame_name(body)
 
 
 def mount_matrix(extrinsic: list[float] | None) -> np.ndarray | None:

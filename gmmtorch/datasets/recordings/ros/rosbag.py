@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from gmmtorch.datasets.recordings.ros.bag_poses import BagSurvey, Record
 from gmmtorch.datasets.recordings.ros.bag_reader import BagReader, RawMessage
 from gmmtorch.datasets.recordings.ros.depth_camera import DepthCamera
 from gmmtorch.datasets.recordings.ros.gyroscope import read_gyroscope, sensor_turns
+from gmmtorch.datasets.recordings.ros.pose_sources import RegisteredPoses
 from gmmtorch.datasets.recordings.ros.scan_conversion import ScanConversion
 from gmmtorch.datasets.recordings.ros.sensor_messages import Reading
 from gmmtorch.datasets.recordings.ros.transform_tree import frame_name, stamp_of
@@ -54,7 +54,7 @@ def open_rosbag(
         topic: of the sensor; None: the only one of its kind.
         poses: "tf", "standing", a topic of poses, or a trajectory file; None: TF.
         frame: the fixed frame of TF; None: the root of the sensor's tree.
-        sensor_frame: only messages of this frame are read.
+        sensor_frame: only messages of this frame are read; those without a frame are taken to be in it.
         extrinsic: x, y, z, qx, qy, qz, qw of the sensor on the body whose poses a topic or file states.
         max_gap: longest time (s) between two poses that are interpolated.
         clock: "header", the stamps of the messages, or "received", the times of recording.
@@ -75,7 +75,7 @@ def open_rosbag(
     info = None
     if sensor.is_camera and intrinsics is None:
         info = bag_topics.choose_camera_info(reader, sensor.topic.name, camera_info)
-    survey = BagSurvey(reader, sensor.topic.name, info, poses, frame, extrinsic, max_gap)
+    survey = BagSurvey(reader, sensor, info, poses, frame, extrinsic, max_gap)
     camera = DepthCamera(sensor, survey.camera_info(), pixel_stride, depth_scale, intrinsics)
     options = sensor_frame, clock, deskew, imu_topic
     if sensor.is_camera:
@@ -115,8 +115,14 @@ class RosBag(Dataset):
         self._stream: Iterator[RawMessage] | None = None
         self._next = 0  # number of the message that the stream yields next
         self._received = np.array([time for time, _ in survey.heads])
-        records = self._ordered(self._of_frame(self._read_headers(survey.heads), sensor_frame))
-        self._source = survey.source(records, self._where)
+        records = self._read_headers(survey.heads)
+        if sensor_frame is not None:
+            sensor_frame = frame_name(sensor_frame)
+            kept = survey.of_frame(records, sensor_frame, self._where)
+            self._skip("message of another frame", *({r.number for r in records} - {r.number for r in kept}))
+            records = kept
+        records = self._ordered(records)
+        self._source = survey.source(records, self._where, sensor_frame)
         self._conversion = ScanConversion(sensor, ranges, self._source, deskew, camera)
         delay = float(np.median([record.time - record.stamp for record in records]))
         self._delay = None if clock == "received" else delay
@@ -139,19 +145,6 @@ class RosBag(Dataset):
         if not records:
             raise DataError(f"{self._where}: none of {len(messages)} messages can be decoded; it is damaged.")
         return records
-
-    def _of_frame(self, records: list[Record], frame: str | None) -> list[Record]:
-        if frame is None:
-            return records
-        wanted = frame_name(frame)
-        kept = [record for record in records if record.frame == wanted]
-        if not kept:
-            frames = ", ".join(f"{name} ({n} times)" for name, n in Counter(r.frame for r in records).items())
-            raise InvalidArgumentError(
-                f"dataset.sensor_frame={frame} is not a frame of {self._where}, whose frames are {frames}."
-            )
-        self._skip("message of another frame", *(r.number for r in records if r.frame != wanted))
-        return kept
 
     def _ordered(self, records: list[Record]) -> list[Record]:
         """The longest series of messages whose stamps do not run backwards."""
@@ -205,7 +198,9 @@ class RosBag(Dataset):
         """
         records, matrices = self._records[:: self.stride], self._matrices[:: self.stride]
         gyroscope = read_gyroscope(self._reader, self._imu_topic, self._clock)
-        frames, stamps = [record.frame for record in records], np.array([record.stamp for record in records])
+        stamps = np.array([record.stamp for record in records])
+        source = self._source
+        frames = [source.sensor if isinstance(source, RegisteredPoses) else r.frame for r in records]
         turns = sensor_turns(gyroscope, self._tree, frames, stamps, self._max_gap)
         if self._is_flat:  # as the heading changes in the plane, also of a sensor on its head
             motions = np.tile(np.eye(4), (len(turns) - 1, 1, 1))

@@ -14,7 +14,7 @@ from gmmtorch.datasets.base import Ranges
 from gmmtorch.datasets.recordings.ros import bag_topics, sensor_messages
 from gmmtorch.datasets.recordings.ros.bag_topics import Sensor
 from gmmtorch.datasets.recordings.ros.depth_camera import DepthCamera
-from gmmtorch.datasets.recordings.ros.pose_sources import PoseSource
+from gmmtorch.datasets.recordings.ros.pose_sources import PoseSource, RegisteredPoses
 from gmmtorch.datasets.recordings.ros.sensor_messages import Reading
 from gmmtorch.scan import FARTHEST, Scan
 
@@ -97,6 +97,8 @@ class ScanConversion:
         elif is_flat and not is_planar(found):
             skip("points of several heights among planar scans")
             return Scan(origin.new_empty(0, dim), origin)
+        if isinstance(self.source, RegisteredPoses):
+            matrix = self.source.of_points(stamp, frame)
         ends = self._in_world(found, stamp, frame, matrix, delay, skip)
         ends[(ends.abs() > FARTHEST).any(1)] = torch.nan  # no sensor measures them
         return self._ranges.scan(ends[:, :dim].contiguous(), origin, torch.from_numpy(found.no_return))

@@ -12,6 +12,9 @@ import numpy as np
 from gmmtorch.datasets.recordings.trajectory import MIN_NORM, NANOSECONDS, Poses, Trajectory, pose_matrix
 from gmmtorch.errors import DataError
 
+_TRAVEL = 0.1
+"""A frame travels if it moves farther, in metres; noise and the joints of wheels do not."""
+
 
 class TransformTree:
     """Transforms parent ← child, each static or over time. Frames are named without a leading slash.
@@ -128,7 +131,7 @@ class TransformTree:
 
         Raises `DataError` if there is no such frame.
         """
-        ours, others = self._above(frame), self._above(other)
+        ours, others = self.above(frame), self.above(other)
         top = next((name for name in ours if name in others), None)
         if top is None:
             raise DataError(
@@ -139,7 +142,7 @@ class TransformTree:
         down = self.lookup(others[: others.index(top) + 1], times, max_gap)
         return Poses(np.linalg.inv(up.matrices) @ down.matrices, up.known & down.known)
 
-    def _above(self, frame: str) -> list[str]:
+    def above(self, frame: str) -> list[str]:
         """A frame and those above it, as far as each has one parent."""
         found = [frame]
         while (
@@ -147,6 +150,35 @@ class TransformTree:
         ):
             found.append(up)
         return found
+
+    def traveller(self, frame: str) -> str | None:
+        """The only frame below `frame` that travels in it, farther than `frame` does in the root of the tree.
+
+        If another one travels farther still in that, as base_link does in odom and odom in map, it is that
+        one. None if there is none, or if there are several, such as those of a team.
+        """
+        children: dict[str, list[str]] = {}
+        for child, parents in self._parents.items():
+            children.setdefault(next(iter(parents)), []).append(child)
+        found, seen = None, {frame}
+        least = max(_TRAVEL, sum(map(self._extent, self.above(frame)[:-1])))
+        while True:
+            waiting, travelling = [found or frame], list[str]()
+            while waiting:
+                below = [child for child in children.get(waiting.pop(), []) if child not in seen]
+                seen.update(below)
+                for child in below:
+                    (travelling if self._extent(child) > least else waiting).append(child)
+            if len(travelling) != 1:
+                return found
+            found = travelling[0]
+            least = self._extent(found)
+
+    def _extent(self, child: str) -> float:
+        """The diagonal (m) of the box around the positions of a frame in its parent."""
+        if child not in self._samples or len(edge := self._edge(child)) == 0:
+            return 0.0
+        return float(np.linalg.norm(np.ptp(edge.matrices[:, :3, 3], axis=0)))
 
     def latest(self, chain: list[str]) -> int | None:
         """The time (ns) up to which all transforms of a chain are known; None if all are static."""

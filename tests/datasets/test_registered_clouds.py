@@ -1,0 +1,136 @@
+"""Clouds in the fixed frame, as SLAM systems publish them: points stay, the sensor's path gives origins."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from test_rosbag import POINTS, moved
+
+from gmmtorch.datasets import load
+from gmmtorch.errors import DataError, InvalidArgumentError
+
+pytest.importorskip("rosbags")
+
+from gmmtorch.export.bag import BagWriter
+
+TIMES = (0.0, 0.5, 1.0)
+ROOM = np.random.default_rng(0).uniform(-5, 5, (40, 3)).astype(np.float32)
+
+
+def slam(
+    path: Path,
+    edges: dict[tuple[str, str], float],
+    world: str = "camera_init",
+    body: str = "body",
+    odometry: str = "/Odometry",
+) -> Path:
+    """A drive of 4 m along x: clouds in the frame `world`, odometry, and TF.
+
+    edges: (parent, child) → share of the drive that the child moves in its parent.
+    """
+    with BagWriter(path) as bag:
+        bag.transforms(0.0, {(body, "lidar"): moved(0, 0, 0.5)}, static=True)
+        for time in TIMES:
+            if edges:
+                bag.transforms(time, {edge: moved(4 * share * time) for edge, share in edges.items()})
+            bag.odometry(odometry, time, world, body, moved(4 * time, yaw=time))
+            bag.cloud("/cloud_registered", time, world, ROOM)
+    return path
+
+
+def origins(dataset) -> list[list[float]]:
+    assert all(torch.equal(scan.points, torch.from_numpy(ROOM).double()) for scan in dataset)
+    assert all(torch.equal(dataset[i].origin, dataset.pose(i)[:3, 3]) for i in range(3))
+    return [scan.origin.tolist() for scan in dataset]
+
+
+PATH = [[0, 0, 0], [2, 0, 0], [4, 0, 0]]
+
+
+@pytest.mark.parametrize(
+    ("world", "body", "edges"),
+    [
+        ("camera_init", "body", {("camera_init", "body"): 1}),  # FAST-LIO
+        ("/camera_init", "/aft_mapped", {("/camera_init", "/aft_mapped"): 1}),  # LOAM
+        ("odom", "base", {("map", "odom"): 0, ("odom", "base"): 1}),  # LIO-SAM
+        ("map", "base", {("map", "odom"): 0, ("odom", "base"): 1}),
+        ("odom", "base", {("map", "odom"): 0.1, ("odom", "base"): 1}),
+        ("odom", "base", {("odom", "base"): 1, ("base", "wheel"): 0, ("base", "mast"): 0.2}),
+    ],
+)
+@pytest.mark.parametrize("options", [{}, {"poses": "tf"}])
+def test_clouds_in_a_fixed_frame_of_tf_are_seen_from_the_frame_that_travels(
+    tmp_path, caplog, world, body, edges, options
+):
+    dataset = load("rosbag", slam(tmp_path / "a.mcap", edges, world, body), **options)
+    assert origins(dataset) == PATH
+    assert f"in the fixed frame {world.strip('/')} already, and seen from {body.strip('/')}" in caplog.text
+
+
+def test_corrections_of_odometry_are_part_of_the_path(tmp_path):
+    path = slam(tmp_path / "a.mcap", {("map", "odom"): 0.1, ("odom", "base"): 1}, "map", "base")
+    assert origins(load("rosbag", path))[2] == pytest.approx([4.4, 0, 0])
+
+
+@pytest.mark.parametrize("edges", [{}, {("camera_init", "body"): 1}, {("odom", "base"): 1}])
+def test_clouds_in_the_frame_of_a_topic_of_poses_are_seen_from_its_body(tmp_path, caplog, edges):
+    path = slam(tmp_path / "a.mcap", edges)
+    assert origins(load("rosbag", path, poses="/Odometry")) == PATH
+    assert "points are in the fixed frame camera_init already, and seen from body" in caplog.text
+    caplog.clear()
+    at_lidar = load("rosbag", path, poses="/Odometry", sensor_frame="lidar")
+    assert origins(at_lidar) == [[x, 0, 0.5] for x, _, _ in PATH]
+    raised = load("rosbag", path, poses="/Odometry", extrinsic=[0, 0, 2, 0, 0, 0, 1])
+    assert origins(raised) == [[x, 0, 2] for x, _, _ in PATH]
+
+
+def test_the_frame_of_the_sensor_can_be_stated(tmp_path, caplog):
+    path = slam(tmp_path / "a.mcap", {("camera_init", "body"): 1})
+    assert origins(load("rosbag", path, sensor_frame="lidar")) == [[x, 0, 0.5] for x, _, _ in PATH]
+    assert caplog.records == []
+    as_sensor = load("rosbag", path, poses="tf", sensor_frame="camera_init")
+    assert origins(as_sensor) == [[0, 0, 0]] * 3
+
+
+def test_clouds_of_a_fixed_frame_follow_it_into_the_one_that_is_chosen(tmp_path):
+    path = slam(tmp_path / "a.mcap", {("map", "odom"): 0.1, ("odom", "base"): 1}, "odom", "base")
+    scan = load("rosbag", path, frame="map")[2]
+    np.testing.assert_allclose(scan.points.numpy(), ROOM + np.float64([0.4, 0, 0]), atol=1e-12)
+    np.testing.assert_allclose(scan.origin.numpy(), [4.4, 0, 0])
+
+
+def test_several_frames_that_travel_ask_for_the_one_of_the_sensor(tmp_path):
+    edges = {("camera_init", "body"): 1, ("camera_init", "other"): 2}
+    path = slam(tmp_path / "a.mcap", edges)
+    with pytest.raises(DataError, match=r"only static transforms.*dataset\.sensor_frame=NAME"):
+        load("rosbag", path)
+    assert origins(load("rosbag", path, sensor_frame="body")) == PATH
+    assert origins(load("rosbag", path, sensor_frame="other"))[2] == [8, 0, 0]
+    with pytest.raises(
+        InvalidArgumentError, match=r"sensor_frame=rear is not a frame.*camera_init \(3 times"
+    ):
+        load("rosbag", path, sensor_frame="rear")
+
+
+def test_a_file_of_poses_does_not_move_registered_points_again(tmp_path):
+    path = slam(tmp_path / "a.mcap", {("camera_init", "body"): 1})
+    (tmp_path / "t.txt").write_text("0 0 0 0 0 0 0 1\n1 4 0 0 0 0 0 1\n")
+    with pytest.raises(InvalidArgumentError, match=r"move the points of .* again.*dataset\.poses=tf"):
+        load("rosbag", path, poses=str(tmp_path / "t.txt"))
+
+
+@pytest.mark.parametrize("mast", [0.0, 0.2])
+def test_clouds_in_the_frame_of_a_body_with_joints_are_moved_with_it(tmp_path, caplog, mast):
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        for time in TIMES:
+            edges = {("odom", "base"): moved(time), ("base", "wheel"): moved(0, yaw=9 * time)}
+            bag.transforms(time, {**edges, ("base", "mast"): moved(0, 0, mast * time)})
+            bag.cloud("/points", time, "base", POINTS)
+    dataset = load("rosbag", tmp_path / "a.mcap")
+    np.testing.assert_array_equal(dataset[2].points.numpy(), POINTS + np.float64([1, 0, 0]))
+    assert dataset[2].origin.tolist() == [1, 0, 0]
+    assert [r for r in caplog.records if r.levelno >= logging.WARNING] == []
