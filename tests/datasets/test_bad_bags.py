@@ -187,7 +187,7 @@ def test_two_sensors_on_one_topic_are_told_apart_by_their_frame(tmp_path):
         load("rosbag", tmp_path / "a.mcap", poses="standing")
     one = load("rosbag", tmp_path / "a.mcap", poses="standing", sensor_frame="lidar")
     assert (len(one), one.skipped) == (2, {"message of another frame": 1})
-    with pytest.raises(InvalidArgumentError, match=r"sensor_frame=front is not.*lidar \(2 times\)"):
+    with pytest.raises(InvalidArgumentError, match=r"sensor_frame=front is not.*lidar \(2 scans\)"):
         load("rosbag", tmp_path / "a.mcap", sensor_frame="front")
 
 

@@ -111,7 +111,7 @@ def test_several_frames_that_travel_ask_for_the_one_of_the_sensor(tmp_path):
     assert origins(load("rosbag", path, sensor_frame="body")) == PATH
     assert origins(load("rosbag", path, sensor_frame="other"))[2] == [8, 0, 0]
     with pytest.raises(
-        InvalidArgumentError, match=r"sensor_frame=rear is not a frame.*camera_init \(3 times"
+        InvalidArgumentError, match=r"sensor_frame=rear is not a frame.*camera_init \(3 scans"
     ):
         load("rosbag", path, sensor_frame="rear")
 

@@ -153,9 +153,10 @@ class BagSurvey:
         if "" in unknown or (len(unknown) == 1 and wanted in self.tree.frames):
             nameless = "" if "" in unknown else next(iter(unknown))
             return [record._replace(frame=wanted) for record in records if record.frame == nameless]
-        counts = ", ".join(f"{name} ({n} times)" for name, n in frames.items())
+        best = next(frame for frame, _ in frames.most_common() if frame)
         raise InvalidArgumentError(
-            f"dataset.sensor_frame={wanted} is not a frame of {where}, whose frames are {counts}; choose one."
+            f"dataset.sensor_frame={wanted} is not a frame of {where}, whose frames are {_counted(frames)}; "
+            f"choose one: dataset.sensor_frame={best}."
         )
 
     def _seen_from(self, frame: str, wanted: str | None) -> str | None:
@@ -197,10 +198,10 @@ class BagSurvey:
             source = BodyPoses(trajectory, mounts, self.max_gap, f"topic {self._pose_topic}")
             return source if seen_from is None else RegisteredPoses(source, seen_from, Standing())
         if len(frames) > 1:
-            counts = ", ".join(f"{frame or '(unnamed)'} ({n} scans)" for frame, n in frames.most_common())
+            best = next(frame for frame, _ in frames.most_common() if frame)
             raise InvalidArgumentError(
-                f"{where}: several sensors share the topic, with frames {counts}; choose one: "
-                f"dataset.sensor_frame={frames.most_common(1)[0][0]}."
+                f"{where}: several sensors share the topic, with frames {_counted(frames)}; choose one: "
+                f"dataset.sensor_frame={best}."
             )
         if self._file is None:
             return Standing()
@@ -249,3 +250,8 @@ class BagSurvey:
             )
         matrix: np.ndarray = self.tree.lookup(chain, np.zeros(1, np.int64), np.inf).matrices[0]
         return matrix
+
+
+def _counted(frames: Counter[str]) -> str:
+    """Frames with the numbers of their messages, for errors."""
+    return ", ".join(f"{frame or '(unnamed)'} ({n} scans)" for frame, n in frames.most_common())

@@ -7,8 +7,10 @@ messages are decoded by `MessageDecoder`; definitions in a bag are used only for
 from __future__ import annotations
 
 import io
+import logging
+import re
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +23,7 @@ from gmmtorch.datasets.recordings.ros.rosbags_access import (
 )
 from gmmtorch.errors import DataError, GmmTorchError
 
+_log = logging.getLogger(__name__)
 _SUFFIXES = (".bag", ".mcap", ".db3")
 _ZSTD = b"\x28\xb5\x2f\xfd"
 """Start of a compressed message: the file alone, without metadata.yaml, does not state the compression."""
@@ -63,8 +66,7 @@ class BagReader:
         with self._errors():
             for file in sorted(self.path.glob("*.db3")) if self.path.is_dir() else [self.path]:
                 _check_length(file)
-            self._reader: Any = reader_class(self._is_ros1)(_bounded(self.path))
-            self._reader.open()
+            self._reader: Any = self._opened()
             self._connections = [
                 c for c in self._reader.connections if isinstance(c.topic, str) and isinstance(c.msgtype, str)
             ]  # columns of a damaged database can be empty
@@ -111,6 +113,21 @@ class BagReader:
                 f"{self.path}, topic {message.topic}, recorded at {message.time / 1e9:.3f} s: {error}."
             ) from error
 
+    def _opened(self) -> Any:
+        """The opened reader of rosbags: of the folder, or of its only file if metadata.yaml is unusable."""
+        *tried, last = self.path, *_only_file(self.path)
+        for path in tried:
+            reader = reader_class(self._is_ros1)(_bounded(path))
+            with suppress(Exception):  # the parser of metadata.yaml raises many kinds
+                reader.open()
+                if reader.connections:
+                    return reader
+        reader = reader_class(self._is_ros1)(_bounded(last))
+        reader.open()
+        if tried:
+            _log.warning("%s/metadata.yaml is unusable; %s is read without it.", self.path, last.name)
+        return reader
+
     def _own_definitions(self) -> dict[str, Any]:
         """Definitions in the bag. One that cannot be parsed is left out."""
         found: dict[str, Any] = {}
@@ -152,6 +169,17 @@ def _bag_file(path: Path) -> Path:
     if path.is_file() and path.stat().st_size == 0:
         raise DataError(f"{path} is empty; record or copy it again.")
     return path
+
+
+def _only_file(path: Path) -> list[Path]:
+    """The file of a bag's folder, if there is one and metadata.yaml names no other."""
+    metadata = path / "metadata.yaml"
+    if not metadata.is_file():
+        return []
+    files = [file for file in path.iterdir() if file.suffix in _SUFFIXES]
+    text = metadata.read_text("utf-8", errors="replace")
+    named = {name.split(": ")[-1].strip(" -") for name in re.findall(r"[^\n/,'\"[]+\.(?:mcap|db3)\b", text)}
+    return files if len(files) == 1 and named <= {files[0].name} else []
 
 
 def _check_length(path: Path) -> None:

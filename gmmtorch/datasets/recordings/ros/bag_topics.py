@@ -52,7 +52,8 @@ def choose_sensor(reader: BagReader, wanted: str | None) -> Sensor:
     named = [topic for topic in reader.topics if topic.name == wanted]
     if wanted is not None and not named:
         raise InvalidArgumentError(
-            f"dataset.topic={wanted} is not in {reader.path}, whose topics are {listed(reader.topics)}."
+            f"dataset.topic={wanted} is not in {reader.path}, whose topics are {listed(reader.topics)}. "
+            "Choose another dataset.topic."
         )
     if len(named) > 1:
         raise DataError(
@@ -64,10 +65,10 @@ def choose_sensor(reader: BagReader, wanted: str | None) -> Sensor:
     ]
     if not found:
         what = f"dataset.topic={wanted} is not" if wanted else "has no topic of"
+        remedy = "Choose another dataset.topic." if wanted else "Record such a topic."
         raise DataError(
             f"{reader.path} {what} a range sensor with messages (PointCloud2, LaserScan, depth Image, or a "
-            f"list of points). Its topics are {listed(reader.topics)}. Record such a topic, or choose "
-            "dataset.topic."
+            f"list of points). Its topics are {listed(reader.topics)}. {remedy}"
         )
     kind = min((sensor.kind for sensor in found), key=_PREFERENCE.index)
     found = [sensor for sensor in found if sensor.kind == kind]
@@ -129,10 +130,11 @@ def choose_camera_info(reader: BagReader, image: str, wanted: str | None) -> str
         return wanted
     best = nearest_names(infos, image)
     if wanted is not None or len(best) != 1:
+        choice = f"Choose one: dataset.camera_info={best[0]}, or state" if best else "State"
         raise InvalidArgumentError(
             f"{reader.path}: dataset.camera_info={wanted} is not clear for the images of {image}; topics of "
-            f"type CameraInfo are {', '.join(infos) or 'none'}. Choose one, or state dataset.intrinsics="
-            "[fx,fy,cx,cy] in pixels, without distortion."
+            f"type CameraInfo are {', '.join(infos) or 'none'}. {choice} dataset.intrinsics=[fx,fy,cx,cy] in "
+            "pixels, without distortion."
         )
     return best[0]
 

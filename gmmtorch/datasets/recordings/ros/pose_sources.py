@@ -59,8 +59,8 @@ class TfPoses:
             if frame not in self._tree.frames:
                 raise DataError(
                     f"{self._where}: TF has no frame {frame or '(unnamed)'}, in which the sensor measures; "
-                    f"its frames are {self._tree.describe()}. State the sensor's frame "
-                    "(dataset.sensor_frame), or choose other poses: dataset.poses=TOPIC, FILE or standing."
+                    f"its frames are {self._tree.describe()}. State which of them is the sensor's: "
+                    "dataset.sensor_frame=NAME, or choose other poses: dataset.poses=TOPIC, FILE or standing."
                 )
             try:
                 self._chains[frame] = self._tree.chain(frame, self._top)

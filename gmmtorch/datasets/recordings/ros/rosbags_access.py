@@ -19,6 +19,7 @@ MAX_BAG_BYTES = 1 << 35
 space of the temporary folder."""
 
 _ZSTD_HEADER_BYTES = 18
+_MAGIC = {b"\x89MCAP0\r\n": ".mcap", b"SQLite f": ".db3"}
 
 
 def reader_class(is_ros1: bool) -> Any:
@@ -28,7 +29,7 @@ def reader_class(is_ros1: bool) -> Any:
         import rosbags.rosbag2
     ros1, ros2 = rosbags.rosbag1, rosbags.rosbag2
     _limit_codecs(ros1.reader, ros2.reader, ros2.storage_mcap)
-    return _limited_ros1_reader(ros1) if is_ros1 else ros2.Reader
+    return _limited_ros1_reader(ros1) if is_ros1 else _reader_by_magic(ros2)
 
 
 def standard_definitions(is_ros1: bool) -> dict[str, Any]:
@@ -115,6 +116,20 @@ def _check_bag(bytes_left: int) -> None:
             f"free space of {tempfile.gettempdir()}. If you trust it, unpack its files with 'zstd -d', "
             "and write its metadata.yaml again with 'ros2 bag reindex'."
         )
+
+
+def _reader_by_magic(rosbag2: Any) -> Any:
+    class ReaderByMagic(rosbag2.Reader):
+        """Knows the storage of a file by its first bytes, whatever its name."""
+
+        def __init__(self, path: Any) -> None:
+            super().__init__(path)
+            if not path.is_dir():
+                with path.open("rb") as file:
+                    suffix = _MAGIC.get(file.read(8), path.suffix)
+                self.storage = self.STORAGE_PLUGINS[suffix](path)
+
+    return ReaderByMagic
 
 
 def _limited_ros1_reader(rosbag1: Any) -> Any:

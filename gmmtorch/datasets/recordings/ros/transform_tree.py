@@ -101,8 +101,8 @@ class TransformTree:
         if top is not None and found[-1] != top:
             raise DataError(
                 f"TF has no transform between frame {top} and frame {frame}, whose tree is "
-                f"{' → '.join(found)}; all frames: {self.describe()}. Choose dataset.frame, "
-                "dataset.sensor_frame or dataset.poses."
+                f"{' → '.join(found)}; all frames: {self.describe()}. Choose dataset.frame={found[-1]}, or "
+                "other poses: dataset.poses=TOPIC, FILE or standing."
             )
         return found
 
