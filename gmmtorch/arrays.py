@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, Self
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from gmmtorch.errors import InvalidArgumentError
 
@@ -14,6 +16,7 @@ ArrayLike = Tensor | np.ndarray | list | tuple
 
 _REAL_KINDS = "biuf"  # NumPy's kinds of bool, int, unsigned and float
 _SHARED_DTYPES = [np.dtype(code) for code in "?Bbhilqefd"]  # bool to float64, without uint16 and wider
+_MISSING = (RuntimeError, AssertionError, NotImplementedError)  # of torch for a device that it does not have
 _KEPT_DTYPES = (torch.float32, torch.float64)
 
 
@@ -38,7 +41,52 @@ def as_tensor(
     tensor = _tensor(value, name)
     if dtype is None:
         dtype = tensor.dtype if tensor.dtype in _KEPT_DTYPES else torch.float64
-    return tensor.to(device or tensor.device, dtype)
+    if device is None:
+        return tensor.to(dtype)
+    with naming_device(device):
+        return tensor.to(device, dtype)
+
+
+def check_device(name: str, device: Any) -> None:
+    """Raise `InvalidArgumentError`, which names the argument, unless torch can compute on the device."""
+    try:
+        torch.zeros(1, device=device).item()  # item() also refuses the device "meta"
+    except _MISSING as error:
+        reason = str(error).splitlines()[0].split(". ")[0]
+        raise InvalidArgumentError(
+            f"{name}={device} is not available ({reason}); use cpu, or install a torch build for this device."
+        ) from error
+
+
+@contextmanager
+def naming_device(device: Any) -> Iterator[None]:
+    """Errors of torch inside, if a device is the reason, become `InvalidArgumentError`s that name it."""
+    try:
+        yield
+    except _MISSING:
+        check_device("device", device)
+        raise
+
+
+class DeviceModule(nn.Module):
+    """A module that moves between devices, but keeps the types of its buffers: positions need float64."""
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        super()._apply(lambda tensor: tensor.to(fn(tensor.new_empty(0)).device), recurse)
+        return self
+
+    def to(self, *args: Any, **kwargs: Any) -> Self:
+        """The module itself, on a device; see `torch.nn.Module.to`.
+
+        Raises `InvalidArgumentError` for a device that torch does not have.
+        """
+        target = kwargs.get("device", args[0] if args else None)
+        with naming_device("cpu" if target is None or isinstance(target, torch.dtype | Tensor) else target):
+            return super().to(*args, **kwargs)
+
+    def cuda(self, device: int | torch.device | None = None) -> Self:
+        """The module itself, on a GPU; see `to`."""
+        return self.to(torch.device("cuda", device) if isinstance(device, int) else device or "cuda")
 
 
 def _is_plain(value: Tensor) -> bool:

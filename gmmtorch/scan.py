@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike as ArrayLike
-from gmmtorch.arrays import as_tensor
+from gmmtorch.arrays import as_tensor, naming_device
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.linalg import check_rigid
 
@@ -165,7 +165,8 @@ class Scan:
 
     def to(self, device: torch.device | str | None) -> Scan:
         """The scan on another device. None: where it is."""
-        return self._with(*(x.to(device) for x in (self.points, self.origin, self.no_return)))
+        with naming_device(device):
+            return self._with(*(x.to(device) for x in (self.points, self.origin, self.no_return)))
 
     def _with(self, points: Tensor, origin: Tensor, no_return: Tensor) -> Scan:
         """The scan with the same numbers in other tensors, which are not checked again."""

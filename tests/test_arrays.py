@@ -415,3 +415,21 @@ def test_repr_says_in_one_line_what_matters():
     assert repr(given_map()).startswith("GaussianMap(3 components in 2D, x ")
     for text in (scan, grid, evidence, given_map(), given_map().components(), gt.Components.empty(3)):
         assert "\n" not in repr(text)
+
+
+@pytest.mark.parametrize("name", ["cuda", "cuda:99", "abacus"])
+def test_a_device_that_torch_does_not_have_is_named_with_the_remedy(name):
+    if name == "cuda" and torch.cuda.is_available():
+        pytest.skip("there is a GPU")
+    points = torch.rand(40, 3, dtype=torch.float64)
+    mixture, scan = gt.GaussianMixture(2).fit(points), gt.Scan(points, torch.zeros(3))
+    learned = gt.GaussianMap()
+    learned.insert(scan)
+    moves = [thing.to for thing in (mixture, learned, learned.components(), scan)]
+    for move in (*moves, lambda device: as_tensor(points, "points", device=device)):
+        with pytest.raises(InvalidArgumentError, match=rf"device={name} is not available .*use cpu"):
+            move(name)
+    if name == "cuda":
+        with pytest.raises(InvalidArgumentError, match="device=cuda is not available"):
+            mixture.cuda()
+    assert mixture.to(torch.float32).means.dtype == torch.float64

@@ -85,6 +85,7 @@ def use_runtime(runtime: DictConfig) -> str:
     """
     import torch
 
+    from gmmtorch.arrays import check_device
     from gmmtorch.kernels import use_kernels
 
     if runtime.threads is not None:
@@ -95,14 +96,7 @@ def use_runtime(runtime: DictConfig) -> str:
         raise InvalidArgumentError(f"runtime.memory_limit={runtime.memory_limit} must be above zero bytes.")
     with naming({"kernels": "runtime.kernels"}):
         use_kernels(runtime.kernels)
-    try:
-        torch.zeros(1, device=runtime.device).item()  # item() also refuses the device "meta"
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        reason = str(error).splitlines()[0]
-        raise InvalidArgumentError(
-            f"runtime.device={runtime.device} is not available ({reason}); use cpu, or install a torch build "
-            "for this device."
-        ) from error
+    check_device("runtime.device", runtime.device)
     return str(runtime.device)
 
 

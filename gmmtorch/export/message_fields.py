@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from gmmtorch.datasets.recordings.trajectory import NANOSECONDS
+from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.scan import ArrayLike
 
 _BASE, _NAME, _ARRAY = 1, 2, 3
@@ -75,9 +76,20 @@ def odometry_fields(frame: str, child: str, matrix: ArrayLike) -> dict[str, Any]
 
 
 def cloud_fields(frame: str, table: np.ndarray) -> dict[str, Any]:
-    """A PointCloud2 from a structured array (N,) or (H, W): its fields, in its byte order."""
-    rows = np.atleast_2d(table)
+    """A PointCloud2 from a structured array (N,) or (H, W): its fields, in its byte order.
+
+    Raises `InvalidArgumentError` for other arrays, and for types of fields that PointCloud2 does not have.
+    """
     dtypes = {name: (entry[0], entry[1]) for name, entry in (table.dtype.fields or {}).items()}
+    unknown = [f"{name} {dtype}" for name, (dtype, _) in dtypes.items() if dtype.str[1:] not in _POINT_TYPES]
+    if unknown or not dtypes or table.ndim not in (1, 2):
+        raise InvalidArgumentError(
+            f"table of shape {table.shape} with fields {', '.join(unknown or dtypes) or 'none'} cannot be a "
+            "PointCloud2; give a structured array (N,) or (H, W) whose fields are float32, float64, or whole "
+            "numbers of at most 32 bits."
+        )
+    is_big = any(dtype.str[0] == ">" for dtype, _ in dtypes.values())
+    rows = np.atleast_2d(table.astype(table.dtype.newbyteorder(">" if is_big else "<"), copy=False))
     point_fields = [
         {"name": name, "offset": offset, "datatype": _POINT_TYPES[dtype.str[1:]], "count": 1}
         for name, (dtype, offset) in dtypes.items()
@@ -88,7 +100,7 @@ def cloud_fields(frame: str, table: np.ndarray) -> dict[str, Any]:
         "height": rows.shape[0],
         "width": rows.shape[1],
         "fields": point_fields,
-        "is_bigendian": any(dtype.byteorder == ">" for dtype, _ in dtypes.values()),
+        "is_bigendian": is_big,
         "point_step": step,
         "row_step": step * rows.shape[1],
         "is_dense": True,

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.arrays import ArrayLike, as_tensor
+from gmmtorch.arrays import ArrayLike, as_tensor, naming_device
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.linalg import argsort, check_symmetric, on_cpu, safe_cholesky
 from gmmtorch.occupancy.cones import Cones
@@ -134,11 +134,12 @@ class Components:
 
     def to(self, device: torch.device | str) -> Components:
         """The components on a device."""
-        if self.means.device == torch.device(device):
-            return self
-        if torch.device(device).type == "cpu":
-            return self.on_cpu()
-        return Components(**{name: value.to(device) for name, value in vars(self).items()})
+        with naming_device(device):
+            if self.means.device == torch.device(device):
+                return self
+            if torch.device(device).type == "cpu":
+                return self.on_cpu()
+            return Components(**{name: value.to(device) for name, value in vars(self).items()})
 
     def on_cpu(self) -> Components:
         """The components on the CPU, without gradients."""

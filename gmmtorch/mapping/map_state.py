@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, replace
 from functools import partial
-from typing import Any, cast
+from typing import Any, Self, cast
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from gmmtorch.arrays import DeviceModule
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
 from gmmtorch.mapping.codec.map_file import MapSettings, file_size
 from gmmtorch.mapping.codec.quantization import number_after, numbered
@@ -40,7 +41,7 @@ def _field(name: str, about: str) -> Any:
     return property(read, doc=f"{about} Not rounded; with the components of the unfinished window.")
 
 
-class MapState(nn.Module):
+class MapState(DeviceModule):
     """The final components of a map (buffers), the pending scans of its unfinished window, and its settings.
 
     Args:
@@ -220,9 +221,9 @@ class MapState(nn.Module):
 
     # -- torch ----------------------------------------------------------------------------------------
 
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> MapState:
-        """Moves the map and its pending scans between devices. Types stay: positions need float64."""
-        super()._apply(lambda tensor: tensor.to(fn(tensor.new_empty(0)).device), recurse)
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Moves the map and its pending scans between devices."""
+        super()._apply(fn, recurse)
         if self.dim is not None:
             self._pending = [scan.to(self._device) for scan in self._pending]
         self._forget()

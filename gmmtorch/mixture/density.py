@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -15,7 +14,7 @@ from sklearn.utils._param_validation import InvalidParameterError as ScikitLearn
 from sklearn.utils.validation import validate_data
 from torch import Tensor, nn
 
-from gmmtorch.arrays import check_unmasked
+from gmmtorch.arrays import DeviceModule, check_unmasked
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.kernels.chunks import chunk_elements
 from gmmtorch.linalg import inverse_factor, safe_cholesky
@@ -38,7 +37,7 @@ class InvalidParameterError(InvalidArgumentError, ScikitLearnInvalidParameterErr
     """A parameter of an estimator has an invalid value."""
 
 
-class MixtureDensity(DensityMixin, BaseEstimator, nn.Module):
+class MixtureDensity(DensityMixin, BaseEstimator, DeviceModule):
     """The queries of a fitted mixture, with the interfaces of scikit-learn and of a torch module.
 
     Arrays give arrays and tensors give tensors. The buffers `weights` (K,), `means` (K, D) and
@@ -176,11 +175,6 @@ class MixtureDensity(DensityMixin, BaseEstimator, nn.Module):
         for name, value in zip(Parameters._fields, (weights, means, covariances), strict=True):
             self.register_buffer(name, value)
         self._fitted_type = self.covariance_type
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> MixtureDensity:
-        """Moves buffers between devices. They stay float64 if the surrounding network changes its dtype."""
-        super()._apply(lambda tensor: tensor.to(fn(tensor.new_empty(0)).device), recurse)
-        return self
 
     def _as_points(self, X: Array, reset: bool = False) -> Tensor:
         """X as a checked float64 tensor (N, D). With `reset`, stores D and the kind of X."""

@@ -69,3 +69,28 @@ def test_unusable_paths_are_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot be written"):
         BagWriter(tmp_path / "file" / "a.mcap")
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        (np.zeros(3, [("x", "<f4"), ("stamp", "<u8"), ("on", "?")]), "fields stamp uint64, on bool cannot"),
+        (np.zeros(3, [("x", "<f4", (3,))]), r"fields x \('<f4', \(3,\)\) cannot"),
+        (np.zeros((3, 3), "<f4"), r"shape \(3, 3\) with fields none cannot"),
+        (np.zeros((1, 2, 3), [("x", "<f4")]), r"shape \(1, 2, 3\) with fields x cannot"),
+    ],
+)
+def test_tables_that_a_point_cloud_cannot_store_are_refused(tmp_path, table, message):
+    with (
+        BagWriter(tmp_path / "a.mcap") as bag,
+        pytest.raises(InvalidArgumentError, match=message + r".*PointCloud2; give .*float32"),
+    ):
+        bag.cloud_table("/points", 0.0, "lidar", table)
+
+
+def test_fields_of_both_byte_orders_are_written_in_one(tmp_path):
+    table = np.zeros(2, [("x", ">f4"), ("y", "<f4"), ("z", "<f8")])
+    table["x"], table["y"], table["z"] = [1, 2], [3, 4], [5, 6]
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        bag.cloud_table("/points", 0.0, "lidar", table)
+    assert load("rosbag", tmp_path / "a.mcap", poses="standing")[0].points.tolist() == [[1, 3, 5], [2, 4, 6]]
