@@ -22,6 +22,7 @@ _SWEEP = (2_000_000, 600_000_000)
 """Shortest and longest plausible sweep of a sensor in ns; at most one unit of time falls into it."""
 _NEAR = 10_000_000_000
 _MILLIMETRE = 0.001
+_ALIGNMENT = 8  # bytes; a row of points is padded by less
 _COMPRESSED_DEPTH_BYTES = 12
 _PNG = b"\x89PNG"
 
@@ -49,9 +50,10 @@ def cloud_points(message: dict[str, Any], stamp: int) -> Reading:
     """The points of a PointCloud2 with any layout of fields and either byte order."""
     width, height, step = int(message["width"]), int(message["height"]), int(message["point_step"])
     data = message["data"]
-    row = int(message["row_step"]) if height > 1 else width * step
-    if width * height == 0:
+    if len(data) == 0 and width * height == 0:
         return reading(np.empty((0, 3)), None, None)
+    row = _row_bytes((height, width), step, int(message["row_step"]), _ALIGNMENT, len(data))
+    _check_fields(message["fields"])
     order = ">" if message["is_bigendian"] else "<"
     fields = {f["name"]: f for f in message["fields"]}
     missing = [axis for axis in "xyz" if axis not in fields]
@@ -66,13 +68,39 @@ def cloud_points(message: dict[str, Any], stamp: int) -> Reading:
             raise DataError(f"field {name} does not fit into a point of {step} bytes")
         layout["formats"].append(order + kind)
         layout["offsets"].append(offset)
-    if row < width * step or (height - 1) * row + width * step > len(data):
-        raise DataError(
-            f"{height} × {width} points of {step} bytes are announced, but the cloud has {len(data)} bytes"
-        )
     table = np.ndarray((height, width), np.dtype(cast(Any, layout)), bytes(data), 0, (row, step)).ravel()
     points = _coordinates(table)
     return reading(points, None, point_offsets(table[time], stamp) if time else None)
+
+
+def _row_bytes(shape: tuple[int, int], item: int, step: int, most_padding: int, n_bytes: int) -> int:
+    """The bytes of a row of items (H, W), which are `step` if rows are padded, but only if all data is used.
+
+    Raises `DataError` otherwise: if one of the sizes is wrong, the items would be others.
+    """
+    height, width = shape
+    if 0 < height * width * item == n_bytes:
+        return width * item
+    padding = step - width * item
+    if height > 1 and height * step == n_bytes and 0 <= padding < most_padding:
+        return step
+    raise DataError(
+        f"{height} × {width} items of {item} bytes, in rows of {step} bytes, do not fit the {n_bytes} bytes "
+        "of the message"
+    )
+
+
+def _check_fields(fields: list[dict[str, Any]]) -> None:
+    """Raise `DataError` if coordinates are not numbers of one kind in places of their own."""
+    places = [(int(f["offset"]), _TYPES.get(int(f["datatype"]), "V0"), f["name"]) for f in fields]
+    ours = [place for place in places if place[2] in ("x", "y", "z")]
+    for offset, kind, name in ours:
+        for other, their_kind, their_name in places:
+            is_other = (other, their_kind, their_name) != (offset, kind, name)
+            if is_other and offset < other + int(their_kind[1:]) and other < offset + int(kind[1:]):
+                raise DataError(f"the fields {name} and {their_name} overlap")
+    if len({name for _, _, name in ours}) < len(ours) or len({kind[0] for _, kind, _ in ours}) > 1:
+        raise DataError(f"x, y, z are not three fields of one kind, but {ours}")
 
 
 def _coordinates(table: np.ndarray) -> np.ndarray:
@@ -143,11 +171,10 @@ def depth_image(message: dict[str, Any], scale: float | None = None) -> Tensor:
         raise DataError(f"encoding {message['encoding']} is not a depth: expected 16UC1, mono16 or 32FC1")
     dtype = np.dtype((">" if message["is_bigendian"] else "<") + kind)
     data = message["data"]
-    if not 0 < width * height <= MAX_PIXELS or step < width * dtype.itemsize:
-        raise DataError(f"{width} × {height} pixels in rows of {step} bytes are not an image")
-    if (height - 1) * step + width * dtype.itemsize > len(data):
-        raise DataError(f"{width} × {height} pixels are announced, but the image has {len(data)} bytes")
-    raw = np.ndarray((height, width), dtype, bytes(data), 0, (step, dtype.itemsize))
+    if width * height > MAX_PIXELS:
+        raise DataError(f"{width} × {height} pixels are announced; at most {MAX_PIXELS:,} are read")
+    row = _row_bytes((height, width), dtype.itemsize, step, width * dtype.itemsize, len(data))
+    raw = np.ndarray((height, width), dtype, bytes(data), 0, (row, dtype.itemsize))
     return metric(raw, scale or _MILLIMETRE) if kind == "u2" else _finite(raw.astype(np.float64), scale)
 
 
