@@ -50,7 +50,7 @@ def cloud_points(message: dict[str, Any], stamp: int) -> Reading:
     """The points of a PointCloud2 with any layout of fields and either byte order."""
     width, height, step = int(message["width"]), int(message["height"]), int(message["point_step"])
     data = message["data"]
-    if len(data) == 0 and width * height == 0:
+    if width * height == 0:
         return reading(np.empty((0, 3)), None, None)
     row = _row_bytes((height, width), step, int(message["row_step"]), _ALIGNMENT, len(data))
     _check_fields(message["fields"])
