@@ -43,6 +43,7 @@ class LiveOptions:
     poses: tf; standing for a sensor that does not move; mixture or kiss_icp for odometry from the scans.
     frame: the fixed frame of TF, such as odom; None: the root of the sensor's tree. Of odometry: the name of
         its frame; None: odom.
+    sensor_frame: the frame of the sensor; None: that of the messages.
     loops: whether odometry by mixtures closes loops, which moves earlier poses and the present one.
     max_gap: longest time (s) between two poses that are interpolated.
     clock: header, stamps of the messages; or received, times of receipt.
@@ -56,6 +57,7 @@ class LiveOptions:
 
     poses: str = "tf"
     frame: str | None = None
+    sensor_frame: str | None = None
     loops: bool = True
     max_gap: float = 2.0
     clock: str = "header"
@@ -148,7 +150,8 @@ class LiveScans(Dataset):
         stamp = stamp_of(header) if self._options.clock == "header" else received
         if len(self._delays) < _DELAYS:
             self._delays.append(received - stamp)
-        self._waiting.append(_Waiting(message, stamp, frame_name(header["frame_id"]), since))
+        frame = frame_name(self._options.sensor_frame or header["frame_id"])
+        self._waiting.append(_Waiting(message, stamp, frame, since))
         self._waiting_bytes += _size(message)
         while self._waiting_bytes > _WAITING_BYTES:
             self._pop()
@@ -220,7 +223,7 @@ class LiveScans(Dataset):
                 self.trouble = self._tree.unknown_step(chain, item.stamp, self._options.max_gap)
             return is_ready
         except DataError as error:
-            self.trouble = str(error)
+            self.trouble = _of_live(error)
             return False
 
     def _last_needed(self, item: _Waiting) -> int:
@@ -280,7 +283,7 @@ class LiveScans(Dataset):
                 return False
             found = conversion.points(item.message, item.stamp)
         except (DataError, ValueError, KeyError, OverflowError) as error:
-            self.trouble = str(error).replace("dataset.", "sensor.")
+            self.trouble = _of_live(error)
             self._note("message that cannot be decoded")
             return False
         self._n_posed += 1
@@ -386,6 +389,11 @@ class LiveScans(Dataset):
 
     def _known_times(self) -> Tensor | None:
         return None if self._first else torch.tensor(self._stamps, dtype=torch.float64)
+
+
+def _of_live(error: Exception) -> str:
+    """The text of an error with the names of live options."""
+    return str(error).replace("dataset.", "sensor.")
 
 
 def _size(message: dict[str, Any]) -> int:

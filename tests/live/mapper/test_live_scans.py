@@ -182,3 +182,41 @@ def test_memory_of_waiting_messages_is_bounded(clock, monkeypatch):
     for index in range(50):
         scans.receive(laser(float(index)), 0)
     assert (scans.n_waiting, scans.n_dropped) == (5, 45)
+
+
+def test_a_camera_of_another_size_is_scaled_to_the_image_and_can_change(clock):
+    """The same function reads the camera info of recordings."""
+    scans, _ = live(DEPTH, poses="standing", depth_scale=0.01)
+    header = {"stamp": {"sec": 1, "nanosec": 0}, "frame_id": ""}
+    pixels = np.full((8, 10), 150, np.uint16).view(np.uint8).ravel()
+    image = {"header": header, "height": 8, "width": 10, "encoding": "16UC1", "is_bigendian": 0, "step": 20}
+    whole = {"d": np.zeros(5), "distortion_model": "", "p": np.zeros(12), "binning_x": 0, "binning_y": 0}
+    whole |= {"roi": dict.fromkeys(("x_offset", "y_offset", "width", "height"), 0), "header": header}
+    for factor, size in ((2, (20, 16)), (1, (10, 8)), (1, (11, 8))):
+        k = np.array([9.0 * factor, 0, 5 * factor, 0, 9 * factor, 4 * factor, 0, 0, 1])
+        scans.note_camera({**whole, "width": size[0], "height": size[1], "k": k})
+        scans.receive({**image, "data": pixels}, 0)
+        if scans.advance():
+            assert scans[-1].points[0].tolist() == pytest.approx([-5 / 9 * 1.5, -4 / 9 * 1.5, 1.5])
+    assert len(scans) == 2
+    assert "the image has 10×8 pixels. State the images' own: sensor.intrinsics=" in scans.trouble
+
+
+def test_messages_without_a_frame_have_the_one_that_is_stated(clock):
+    for options in ({}, {"sensor_frame": "base"}):
+        scans, tree = live(LASER, **options)
+        for time in (0, 2):
+            stamp = {"sec": time, "nanosec": 0}
+            entry = {"header": {"frame_id": "odom", "stamp": stamp}, "child_frame_id": "base"}
+            entry["transform"] = {
+                "translation": dict.fromkeys("xyz", float(time)),
+                "rotation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
+            }
+            tree.add({"transforms": [entry]}, static=False)
+        message = laser(1.0)
+        scans.receive({**message, "header": {**message["header"], "frame_id": ""}}, 0)
+        scans.advance()
+        clock.seconds += 1.0
+        assert scans.advance() == bool(options)
+        if not options:
+            assert "sensor.sensor_frame=NAME" in scans.trouble
