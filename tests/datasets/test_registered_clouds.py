@@ -134,3 +134,17 @@ def test_clouds_in_the_frame_of_a_body_with_joints_are_moved_with_it(tmp_path, c
     np.testing.assert_array_equal(dataset[2].points.numpy(), POINTS + np.float64([1, 0, 0]))
     assert dataset[2].origin.tolist() == [1, 0, 0]
     assert [r for r in caplog.records if r.levelno >= logging.WARNING] == []
+
+
+def test_stating_a_frame_below_a_body_that_moves_moves_its_points_with_the_body(tmp_path):
+    """A camera on an arm, whose points the driver has put into the frame of the body."""
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        bag.transforms(0.0, {("base", "mast"): moved(0, 0, 1)}, static=True)
+        for time in TIMES:
+            bag.transforms(time, {("odom", "base"): moved(time), ("base", "arm"): moved(0, time)})
+            bag.cloud("/points", time, "base", POINTS)
+    scan = load("rosbag", tmp_path / "a.mcap", sensor_frame="arm")[2]
+    np.testing.assert_array_equal(scan.points.numpy(), POINTS + np.float64([1, 0, 0]))
+    assert scan.origin.tolist() == [1, 1, 0]
+    with pytest.raises(InvalidArgumentError, match=r"sensor_frame=mast is not a frame .*sensor_frame=base"):
+        load("rosbag", tmp_path / "a.mcap", sensor_frame="mast")

@@ -149,11 +149,10 @@ class BagSurvey:
             return [record for record in records if record.frame == wanted]
         if len(frames) == 1 and self._seen_from(next(iter(frames)), wanted) is not None:
             return records
-        unknown = frames.keys() - set(self.tree.frames)
+        unknown = {""} if "" in frames else frames.keys() - set(self.tree.frames)
         if "" in unknown or (len(unknown) == 1 and wanted in self.tree.frames):
-            nameless = "" if "" in unknown else next(iter(unknown))
-            return [record._replace(frame=wanted) for record in records if record.frame == nameless]
-        best = next(frame for frame, _ in frames.most_common() if frame)
+            return [record._replace(frame=wanted) for record in records if record.frame in unknown]
+        best = frames.most_common(1)[0][0]
         raise InvalidArgumentError(
             f"dataset.sensor_frame={wanted} is not a frame of {where}, whose frames are {_counted(frames)}; "
             f"choose one: dataset.sensor_frame={best}."
@@ -169,9 +168,11 @@ class BagSurvey:
         if self._pose_topic is not None:
             world, body = self._frames.most_common(1)[0][0] if self._frames else ("", "")
             return (body if wanted is None else wanted) if frame == world != body else None
-        if wanted is not None:
-            return wanted if frame in self.tree.above(wanted) else None
-        return self.tree.traveller(frame)
+        if wanted is None:
+            return self.tree.traveller(frame)
+        above = self.tree.above(wanted)
+        is_seen = frame in above and self.tree.is_moving(above[: above.index(frame) + 1])
+        return wanted if is_seen else None
 
     def source(self, records: Sequence[Record], where: str, sensor_frame: str | None = None) -> PoseSource:
         """The poses of the sensor, whose frame may be stated.
@@ -188,7 +189,7 @@ class BagSurvey:
                 *(where, first, seen_from or "the poses", first, first),
             )
         if self._poses in (None, "tf"):
-            return self._from_tf(frames, where, seen_from)
+            return self._from_tf(frames, where, seen_from, first if sensor_frame is None else None)
         if self._pose_topic is not None:
             times, matrices = [list(column) for column in zip(*self._samples, strict=True)] or ([], [])
             stamps, poses = np.array(times, np.int64), np.array(matrices).reshape(-1, 4, 4)
@@ -217,9 +218,11 @@ class BagSurvey:
             return PosesByIndex({r.stamp: trajectory.matrices[r.number] for r in records}, fixed)
         return BodyPoses(trajectory, dict.fromkeys(frames, fixed), self.max_gap, str(self._file))
 
-    def _from_tf(self, frames: Counter[str], where: str, seen_from: str | None) -> PoseSource:
+    def _from_tf(
+        self, frames: Counter[str], where: str, seen_from: str | None, fixed: str | None
+    ) -> PoseSource:
         if seen_from is not None:
-            source = TfPoses(self.tree, self._frame or next(iter(frames)), self.max_gap, where)
+            source = TfPoses(self.tree, self._frame or fixed, self.max_gap, where)
             return RegisteredPoses(source, seen_from, source)
         source = TfPoses(self.tree, self._frame, self.max_gap, where)
         chains = [source.chain(frame) for frame in frames]
