@@ -16,10 +16,8 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.queries import OCCUPIED
+from gmmtorch.occupancy.calibration import N_BINS
 from gmmtorch.occupancy.evidence import CellClass, classify
-
-N_BINS = 15
-"""Number of equal-width bins, as in Guo et al. 2017."""
 
 PRIORS = (0.1, 0.5, 1.0, 2.0, 5.0)
 VARIANCE_THRESHOLDS = (0.25, 0.2, 0.15, 0.1, 0.06, 0.03)
@@ -79,13 +77,33 @@ def accuracy(theta: Tensor, labels: Tensor) -> float:
     return float(np.where(p == 0.5, 0.5, (p > 0.5) == (truth == 1)).mean())
 
 
+def brier_score(theta: Tensor, labels: Tensor) -> float:
+    """Mean squared difference of probabilities (M,) and labels (M,); θ = ½ everywhere scores ¼."""
+    truth, p = _checked(theta, labels)
+    return float(np.square(p - truth).mean())
+
+
 def scores(theta: Tensor, labels: Tensor) -> dict[str, float]:
-    """`ece`, `log_loss_bits` and `accuracy` of occupied and free points."""
+    """`ece`, `brier`, `log_loss_bits` and `accuracy` of occupied and free points."""
     return {
         "ece": reliability(theta, labels).expected_error,
+        "brier": brier_score(theta, labels),
         "log_loss_bits": log_loss_bits(theta, labels),
         "accuracy": accuracy(theta, labels),
     }
+
+
+def reliability_of(tally: Tensor) -> Reliability:
+    """Reliability curve of a tally (15, 6) of predictions, see `occupancy.calibration.Calibrator`."""
+    count, predicted, observed = tally[tally[:, 0] > 0, :3].T.numpy()
+    return Reliability(predicted / count, observed / count, count)
+
+
+def scores_of(tally: Tensor) -> dict[str, float]:
+    """`scores` of a tally (15, 6) of at least one prediction."""
+    brier, log_loss, right = (tally[:, 3:].sum(0) / tally[:, 0].sum()).tolist()
+    ece = reliability_of(tally).expected_error
+    return {"ece": ece, "brier": brier, "log_loss_bits": log_loss, "accuracy": right}
 
 
 def prior_and_dead_band(
@@ -110,14 +128,10 @@ def prior_and_dead_band(
     occupied = labels == OCCUPIED
     for prior in priors:
         theta = theta_of(prior).cpu()
-        curve = reliability(theta, labels)
-        scores_of_prior = {
+        of_prior = {
             "prior": float(prior),
-            "ece": curve.expected_error,
-            "mce": curve.maximum_error,
-            "brier": float((theta.double() - labels.double().cpu()).square().mean()),
-            "log_loss_bits": log_loss_bits(theta, labels),
-            "accuracy": accuracy(theta, labels),
+            **scores(theta, labels),
+            "mce": reliability(theta, labels).maximum_error,
         }
         for threshold in variance_thresholds:
             called = classify(theta, threshold)
@@ -125,7 +139,7 @@ def prior_and_dead_band(
             right = (called == CellClass.OCCUPIED) == occupied.cpu()
             rows.append(
                 {
-                    **scores_of_prior,
+                    **of_prior,
                     "variance_threshold": float(threshold),
                     "decided": float(decided.double().mean()),
                     "accuracy_decided": float(right[decided].double().mean())

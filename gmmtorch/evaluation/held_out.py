@@ -183,7 +183,6 @@ def _score(
         "auc": curve.auc,
         "auc_low": low,
         "auc_high": high,
-        "brier": metrics.brier(occupied, free),
         **calibration.scores(theta[known], asked.labels[known]),
         "n_components": built.n_components if isinstance(built, GaussianMap) else None,
         "nbytes": built.nbytes,

@@ -9,17 +9,20 @@ import numpy as np
 import pytest
 import torch
 from sklearn.calibration import calibration_curve
-from sklearn.metrics import log_loss
+from sklearn.metrics import brier_score_loss, log_loss
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.calibration import (
-    N_BINS,
     accuracy,
+    brier_score,
     log_loss_bits,
     prior_and_dead_band,
     reliability,
+    reliability_of,
     scores,
+    scores_of,
 )
+from gmmtorch.occupancy.calibration import N_BINS, Calibrator
 from gmmtorch.occupancy.evidence import occupancy_probability
 
 
@@ -76,10 +79,28 @@ def test_log_loss_is_one_bit_at_one_half_and_52_for_a_certain_mistake():
     assert log_loss_bits(torch.tensor([1.0, 0.0]), labels) == pytest.approx(52)
 
 
-def test_scores_contain_ece_log_loss_and_accuracy():
+def test_brier_score_matches_scikit_learn():
+    theta, labels = drawn()
+    assert brier_score(theta, labels) == pytest.approx(brier_score_loss(labels, theta), rel=1e-9)
+    assert brier_score(torch.full((10,), 0.5), torch.arange(10) % 2) == 0.25
+
+
+def test_a_tally_of_predictions_has_the_scores_of_its_points():
+    theta, labels = drawn()
+    theta = (theta.round(decimals=3) + 1e-5).clamp(max=1)  # inside the bins
+    tally = Calibrator.of(10.0, 1)._tallied(theta, labels.double(), [len(theta)])[0]
+    found, expected = scores_of(tally), scores(theta, labels)
+    assert list(found) == list(expected)
+    for name, value in found.items():
+        assert value == pytest.approx(expected[name], rel=1e-9), name
+    for one, other in zip(reliability_of(tally), reliability(theta, labels), strict=True):
+        assert one == pytest.approx(other)
+
+
+def test_scores_contain_ece_brier_log_loss_and_accuracy():
     theta, labels = drawn()
     found = scores(theta.float(), labels)
-    assert list(found) == ["ece", "log_loss_bits", "accuracy"]
+    assert list(found) == ["ece", "brier", "log_loss_bits", "accuracy"]
     assert found["ece"] == pytest.approx(reliability(theta, labels).expected_error, abs=1e-4)
     assert found["accuracy"] == accuracy(theta, labels)
     assert all(type(value) is float for value in found.values())
@@ -127,7 +148,7 @@ def test_accuracy_decided_is_none_if_nothing_is_decided():
         ([[0.5]], [[1]], "must be \\(M,\\)"),
     ],
 )
-@pytest.mark.parametrize("score", [reliability, log_loss_bits, accuracy])
+@pytest.mark.parametrize("score", [reliability, brier_score, log_loss_bits, accuracy])
 def test_invalid_probabilities_and_labels_raise(score, theta, labels, says):
     with pytest.raises(InvalidArgumentError, match=says):
         score(torch.tensor(theta), torch.tensor(labels))
