@@ -20,6 +20,7 @@ from gmmtorch.occupancy.calibration import N_BINS
 from gmmtorch.occupancy.evidence import CellClass, classify
 
 PRIORS = (0.1, 0.5, 1.0, 2.0, 5.0)
+_FEWEST = 20  # predictions of a bin; fewer show little but chance
 VARIANCE_THRESHOLDS = (0.25, 0.2, 0.15, 0.1, 0.06, 0.03)
 
 
@@ -94,8 +95,14 @@ def scores(theta: Tensor, labels: Tensor) -> dict[str, float]:
 
 
 def reliability_of(tally: Tensor) -> Reliability:
-    """Reliability curve of a tally (15, 6) of predictions, see `occupancy.calibration.Calibrator`."""
-    count, predicted, observed = tally[tally[:, 0] > 0, :3].T.numpy()
+    """Reliability curve of a tally (15, 6) of predictions, see `occupancy.calibration.Calibrator`.
+
+    Neighbouring bins are pooled until they hold 20 predictions; the last one may have fewer.
+    """
+    before = tally[:, 0].cumsum(0) - tally[:, 0]
+    pool = torch.unique((before / _FEWEST).floor(), return_inverse=True)[1]
+    pooled = torch.zeros_like(tally).index_add(0, pool, tally)
+    count, predicted, observed = pooled[pooled[:, 0] > 0, :3].T.numpy()
     return Reliability(predicted / count, observed / count, count)
 
 

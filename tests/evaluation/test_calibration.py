@@ -97,6 +97,17 @@ def test_a_tally_of_predictions_has_the_scores_of_its_points():
         assert one == pytest.approx(other)
 
 
+def test_bins_of_a_tally_with_few_predictions_are_pooled():
+    tally = torch.zeros(15, 6, dtype=torch.float64)
+    tally[2, :3] = torch.tensor([12.0, 2.0, 3.0])
+    tally[5, :3] = torch.tensor([9.0, 3.5, 3.0])
+    tally[14, :3] = torch.tensor([4.0, 3.9, 4.0])
+    curve = reliability_of(tally)
+    assert curve.n_points.tolist() == [21, 4]
+    assert curve.predicted == pytest.approx([5.5 / 21, 3.9 / 4])
+    assert curve.observed == pytest.approx([6 / 21, 1])
+
+
 def test_scores_contain_ece_brier_log_loss_and_accuracy():
     theta, labels = drawn()
     found = scores(theta.float(), labels)
