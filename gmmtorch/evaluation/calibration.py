@@ -7,7 +7,9 @@ points are occupied, while most of real space is free. Scores of two tests with 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,11 +17,15 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.evaluation import queries
 from gmmtorch.evaluation.queries import OCCUPIED
-from gmmtorch.occupancy.calibration import N_BINS
+from gmmtorch.occupancy.calibration import N_BINS, Calibrator, Prediction
 from gmmtorch.occupancy.evidence import CellClass, classify
+from gmmtorch.scan import Scan
 
 PRIORS = (0.1, 0.5, 1.0, 2.0, 5.0)
+_BEAMS = 100  # of a scan whose prediction calibrates a map
+_RAYS = 1e4  # that stand for a probability
 _FEWEST = 20  # predictions of a bin; fewer show little but chance
 VARIANCE_THRESHOLDS = (0.25, 0.2, 0.15, 0.1, 0.06, 0.03)
 
@@ -111,6 +117,41 @@ def scores_of(tally: Tensor) -> dict[str, float]:
     brier, log_loss, right = (tally[:, 3:].sum(0) / tally[:, 0].sum()).tolist()
     ece = reliability_of(tally).expected_error
     return {"ece": ece, "brier": brier, "log_loss_bits": log_loss, "accuracy": right}
+
+
+class SeenPredictions:
+    """The calibration of a map that has none of its own: it learns as a `GaussianMap` does, from what the map
+    says about some scans before it learns from them. side: of the map's cells (m)."""
+
+    def __init__(self, side: float) -> None:
+        self._side = side
+        start = Calibrator.of(2 * side, 1)  # with these numbers the map's own probabilities, to start with
+        self._calibrator = replace(start, mean=torch.zeros_like(start.mean))
+        self._dim = 0
+
+    def note(self, answer: Callable[[Tensor], Tensor], scan: Scan, seed: int) -> None:
+        """Learns from a scan that the map, which answers with probabilities, has not learned from yet."""
+        if not bool((scan.points != scan.origin).any()):
+            return
+        origins, ends = queries.test_beams([scan], _BEAMS, seed)
+        asked = queries.hit_and_free(origins, ends, "uniform", self._side, seed)
+        theta = answer(asked.points).cpu().double()
+        seen = Prediction(*_counts(theta), asked.labels == OCCUPIED, self._side)
+        self._dim = scan.dim
+        self._calibrator = self._calibrator.updated([seen], scan.dim, farthest=math.inf)
+
+    def calibrated(self, theta: Tensor) -> Tensor:
+        """The calibrated probabilities (M,) where the map says theta (M,)."""
+        if not self._dim:
+            return theta
+        found = self._calibrator.calibration
+        return found.probability(*_counts(theta.double()), self._side, self._dim)
+
+
+def _counts(theta: Tensor) -> tuple[Tensor, Tensor]:
+    """Hits and misses that stand for a probability; none for ½ exactly."""
+    n = _RAYS * (theta != 0.5)
+    return n * theta, n * (1 - theta)
 
 
 def prior_and_dead_band(

@@ -42,7 +42,7 @@ _MEAN = torch.tensor(  # of the prior: constant, linear and quadratic part of th
 _DEVIATION = torch.tensor(
     [[0.4, 0.15, 0.05], [1.0, 0.3, 0.05], [0.25, 0.1, 0.05], [0.25, 0.1, 0.05]], dtype=torch.float64
 )
-_FARTHEST = 3.0  # deviations of the prior that a coefficient moves at most
+_FARTHEST = 3.0  # deviations of the prior that a coefficient of a map moves at most
 _INFORMATION = torch.tensor(  # of a predicted point about each coefficient, about
     [[0.1, 0.1, 0.1], [0.02, 0.02, 0.02], [0.2, 0.2, 0.2], [0.2, 0.2, 0.2]], dtype=torch.float64
 )
@@ -252,14 +252,17 @@ class Calibrator:
         n_predicted = _short_count(self.n_predicted)
         return Calibration(*_rounded(self.length, self.mean), n_predicted)
 
-    def updated(self, predictions: Sequence[Prediction], dim: int) -> Calibrator:
-        """After the predictions of a window, one for each of the sides of the tally."""
+    def updated(self, predictions: Sequence[Prediction], dim: int, farthest: float = _FARTHEST) -> Calibrator:
+        """After the predictions of a window, one for each of the sides of the tally.
+
+        farthest: deviations that a coefficient may be from that of the sensor model.
+        """
         each = [p.on_cpu() for p in predictions]
         occupied = torch.cat([p.occupied for p in each])
         prior = _prior_precision()
         before = prior + _MEMORY * (self.precision - prior)
         now, precision = self.mean, before
-        room = _FARTHEST * _DEVIATION.flatten()
+        room = farthest * _DEVIATION.flatten()
         for step in range(_STEPS):
             parts = [_derivatives(p.hits, p.misses, p.side, self.length, dim, now) for p in each]
             theta = torch.sigmoid(torch.cat([t for t, _ in parts]))

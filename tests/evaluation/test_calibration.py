@@ -13,6 +13,7 @@ from sklearn.metrics import brier_score_loss, log_loss
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.calibration import (
+    SeenPredictions,
     accuracy,
     brier_score,
     log_loss_bits,
@@ -22,8 +23,10 @@ from gmmtorch.evaluation.calibration import (
     scores,
     scores_of,
 )
+from gmmtorch.evaluation.queries import hit_and_free
 from gmmtorch.occupancy.calibration import N_BINS, Calibrator
 from gmmtorch.occupancy.evidence import occupancy_probability
+from gmmtorch.scan import Scan
 
 
 def drawn(n: int = 5000, seed: int = 0, bend: float = 1.0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -95,6 +98,40 @@ def test_a_tally_of_predictions_has_the_scores_of_its_points():
         assert value == pytest.approx(expected[name], rel=1e-9), name
     for one, other in zip(reliability_of(tally), reliability(theta, labels), strict=True):
         assert one == pytest.approx(other)
+
+
+@pytest.mark.parametrize("power", [0.4, 1.0, 3.0])
+def test_predictions_calibrate_a_map_that_has_no_calibration(power):
+    """The ends of beams have the density 2x/25 up to 5 m, so a point at x is an end with probability x/5. The
+    log-odds of the map are wrong by a factor, like those of rays that are counted as independent."""
+    seen, generator = SeenPredictions(0.1), torch.Generator().manual_seed(0)
+
+    def beams(n: int) -> torch.Tensor:
+        ends = torch.zeros(n, 2, dtype=torch.float64)
+        ends[:, 0] = 5 * torch.rand(n, generator=generator, dtype=torch.float64).sqrt()
+        return ends
+
+    def answer(points: torch.Tensor) -> torch.Tensor:
+        return torch.sigmoid(power * torch.logit(points[:, 0] / 5))
+
+    for number in range(60):
+        seen.note(answer, Scan(beams(200), torch.zeros(2, dtype=torch.float64)), number)
+    ends = beams(20_000)
+    asked = hit_and_free(torch.zeros_like(ends), ends, "uniform", 0.1, 3)
+    theta = seen.calibrated(answer(asked.points))
+    assert reliability(theta, asked.labels).expected_error < 0.02
+    assert float((theta - asked.points[:, 0] / 5).abs().mean()) < 0.02
+
+
+def test_predictions_keep_the_order_of_probabilities_and_one_half():
+    seen = SeenPredictions(0.2)
+    theta = torch.tensor([0.0, 0.1, 0.5, 0.9, 1.0])
+    assert torch.equal(seen.calibrated(theta), theta)  # nothing is seen yet
+    scan = Scan(torch.rand(50, 3, dtype=torch.float64) + 1, torch.zeros(3, dtype=torch.float64))
+    seen.note(lambda points: torch.full((len(points),), 0.8), scan, 0)
+    found = seen.calibrated(theta)
+    assert (found.diff() > 0).all()
+    assert float(found[2]) == 0.5
 
 
 def test_bins_of_a_tally_with_few_predictions_are_pooled():
