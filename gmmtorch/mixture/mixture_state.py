@@ -204,7 +204,7 @@ class MixtureState(MixtureDensity):
             if names and [type(name) for name in names] != [str] * dim:
                 raise DataError(f"features={names} are not the names of {dim} columns.")
             if names:
-                vars(mixture)["feature_names_in_"] = np.array(names, object)
+                mixture.__dict__["feature_names_in_"] = np.array(names, object)
         except (KeyError, TypeError, ValueError, GmmTorchError) as error:
             raise DataError(f"{path} does not hold a mixture: {error}") from error
         return mixture
