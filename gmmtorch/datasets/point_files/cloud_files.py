@@ -9,18 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gmmtorch.datasets.point_files.headers import SUFFIXES, point_path
 from gmmtorch.datasets.point_files.pcd_files import pcd_rows
 from gmmtorch.datasets.point_files.ply_files import ply_rows
 from gmmtorch.datasets.point_files.point_rows import LasRows, NpyRows, Rows
-from gmmtorch.errors import InvalidArgumentError, MissingDataError
 
-_READERS: dict[str, Callable[[Path], Rows]] = {
-    ".npy": NpyRows,
-    ".las": LasRows,
-    ".laz": LasRows,
-    ".pcd": pcd_rows,
-    ".ply": ply_rows,
-}
+_READERS: dict[str, Callable[[Path], Rows]] = dict(
+    zip(SUFFIXES, (NpyRows, LasRows, LasRows, pcd_rows, ply_rows), strict=True)
+)
 
 
 def open_rows(path: str | Path) -> Rows:
@@ -29,15 +25,8 @@ def open_rows(path: str | Path) -> Rows:
     Raises `MissingDataError` if the file does not exist, `InvalidArgumentError` for another suffix, and
     `DataError` for a damaged file.
     """
-    path = Path(path).expanduser()
-    reader = _READERS.get(path.suffix.lower())
-    known = ", ".join(_READERS)
-    if reader is None:
-        raise InvalidArgumentError(f"points={path} has an unknown suffix {path.suffix!r}; known are {known}.")
-    if not path.is_file():
-        what = "is not a file" if path.exists() else "does not exist"
-        raise MissingDataError(f"points={path} {what}; give a file of points ({known}).")
-    return reader(path)
+    path = point_path(path)
+    return _READERS[path.suffix.lower()](path)
 
 
 def read_cloud(path: Path) -> Tensor:

@@ -1,4 +1,4 @@
-"""Headers of PCD and PLY files, which are lines of words."""
+"""What is checked before a point file is read: its name, its size, and headers of lines of words."""
 
 from __future__ import annotations
 
@@ -6,11 +6,27 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from gmmtorch.errors import DataError
+from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
 
 AXES = ("x", "y", "z")
+SUFFIXES = (".npy", ".las", ".laz", ".pcd", ".ply")
 _HEADER_BYTES = 1 << 16
 _MAX_PADDING = 1 << 16
+
+
+def point_path(path: str | Path) -> Path:
+    """The path of a point file, with ~ expanded.
+
+    Raises `InvalidArgumentError` for an unknown suffix, and `MissingDataError` if the file does not exist.
+    """
+    path = Path(path).expanduser()
+    known = ", ".join(SUFFIXES)
+    if path.suffix.lower() not in SUFFIXES:
+        raise InvalidArgumentError(f"points={path} has an unknown suffix {path.suffix!r}; known are {known}.")
+    if not path.is_file():
+        what = "is not a file" if path.exists() else "does not exist"
+        raise MissingDataError(f"points={path} {what}; give a file of points ({known}).")
+    return path
 
 
 @contextmanager
