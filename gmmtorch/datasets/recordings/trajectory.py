@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from gmmtorch.datasets.base import check_pose
+from gmmtorch.datasets.number_rows import number_rows
 from gmmtorch.errors import DataError, MissingDataError
 
 NANOSECONDS = 1_000_000_000
@@ -153,15 +154,11 @@ def read_trajectory(path: str | Path, n_scans: int | None = None) -> Trajectory:
 
 def read_rows(path: Path) -> np.ndarray:
     """The numbers of a text file, one row a line; # begins a comment. Raises `DataError`."""
-    lines = [
-        line for line in path.read_text("utf-8", errors="replace").splitlines() if line.split("#")[0].strip()
-    ]
+    text = path.read_text("utf-8", errors="replace")
+    lines = [line for line in (line.split("#")[0] for line in text.splitlines()) if line.strip()]
     if not lines:
         raise DataError(f"{path} contains no row of numbers.")
-    try:
-        return np.loadtxt(lines, dtype=np.float64, ndmin=2)
-    except ValueError as error:
-        raise DataError(f"{path} is not a table of numbers: {error}") from error
+    return number_rows(lines, None, f"{path}, row")
 
 
 def kitti_matrices(path: Path, rows: np.ndarray) -> np.ndarray:
