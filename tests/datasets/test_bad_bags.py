@@ -205,7 +205,7 @@ def test_clocks_that_jump_are_left_out_and_counted(tmp_path):
     with BagWriter(tmp_path / "a.mcap") as bag:
         drive(bag)
         for i, stamp in enumerate(stamps):
-            content = {"header": {"frame_id": "lidar"}, "ranges": np.ones(3, np.float32), "range_max": 9.0}
+            content = {"header": {"frame_id": "lidar"}, "ranges": np.ones(1, np.float32), "range_max": 9.0}
             bag.message("/scan", "sensor_msgs/msg/LaserScan", stamp, content, received=float(i))
     dataset = load("rosbag", tmp_path / "a.mcap")
     assert dataset.times.tolist() == [0.0, 0.25, 0.5, 0.75, 1.0]
@@ -226,7 +226,7 @@ def test_transforms_whose_clock_runs_backwards_keep_the_longest_run(tmp_path):
 def test_a_sensor_with_a_clock_of_its_own_needs_the_times_of_recording(tmp_path):
     with BagWriter(tmp_path / "a.mcap") as bag:
         drive(bag)
-        content = {"header": {"frame_id": "lidar"}, "ranges": np.ones(3, np.float32), "range_max": 9.0}
+        content = {"header": {"frame_id": "lidar"}, "ranges": np.ones(1, np.float32), "range_max": 9.0}
         bag.message("/scan", "sensor_msgs/msg/LaserScan", 5000.0, content, received=1.0)
     with pytest.raises(
         DataError,

@@ -116,7 +116,14 @@ def test_live_scans_equal_those_of_the_recording_to_the_bit(tmp_path, clock, kin
 def laser(stamp: float) -> dict[str, Any]:
     seconds = int(stamp)
     header = {"frame_id": "sensor", "stamp": {"sec": seconds, "nanosec": round((stamp - seconds) * 1e9)}}
-    about = {"range_min": 0.0, "range_max": 9.0, "angle_min": 0.0, "angle_increment": 0.1}
+    about = {
+        "range_min": 0.0,
+        "range_max": 9.0,
+        "angle_min": 0.0,
+        "angle_increment": 0.1,
+        "angle_max": 0.4,
+        "scan_time": 0.0,
+    }
     return {"header": header, **about, "time_increment": 0.0, "ranges": np.full(5, 2.0, np.float32)}
 
 
