@@ -98,17 +98,16 @@ class PointTimes:
         rule = self._rule
         if rule.trouble:
             raise DataError(rule.trouble)
-        found, kept = _whole(values), None
-        if not self._is_laser:
-            kept = _of_one_sweep(found, rule.longest / rule.unit)
-            found = found if kept is None else found[kept]
-            if len(found) < (1 - _MOST_WRONG) * len(values):
-                raise DataError("their times are not of one sweep")
+        found = _whole(values)
+        kept = _of_one_sweep(found, rule.longest / rule.unit)
+        found = found if kept is None else found[kept]
+        if len(found) < (1 - _MOST_WRONG) * len(values):
+            raise DataError("their times are not of one sweep")
         low = found.min()
         offsets = np.round((found - low).astype(np.float64) * rule.unit).astype(np.int64)
-        if not rule.is_apart:
-            first = _nanoseconds(low, rule.unit) - (stamp if rule.is_absolute else 0)
-            if abs(first) > _NEAR:
+        if rule.clock != _OTHER:
+            first = _nanoseconds(low, rule.unit) - (stamp if rule.clock == _STAMP else 0)
+            if abs(first - rule.first) > (rule.longest if rule.clock == _MESSAGE else _NEAR):
                 raise DataError("their times are far from the stamp")
             offsets += first
         last = int(offsets.max())
@@ -117,18 +116,22 @@ class PointTimes:
         return offsets - last if rule.is_at_end and last > 0 else offsets, kept
 
 
-class _Rule(NamedTuple):
-    """unit: ns per unit of the field. longest: duration of a sweep, ns, with slack.
+_MESSAGE, _STAMP, _OTHER = "the stamp of the message", "the clock of the stamps", "another clock"
 
-    is_absolute: times are on the clock of the stamps. is_apart: they are on another clock, so the first point
-    is at the stamp. is_at_end: the last point is at the stamp. interval: see `Rate`. trouble: why times
-    cannot be used; empty if they can.
+
+class _Rule(NamedTuple):
+    """How a sensor states times of points.
+
+    unit: ns per unit of the field. clock: what times count from; of another clock, the first point is at the
+    stamp. first: usual time of the first point in ns after the stamp. longest: sweep in ns, with slack.
+    is_at_end: times count from the first point, but the last one is at the stamp. interval: see `Rate`.
+    trouble: why times cannot be used; empty if they can.
     """
 
     unit: float = 1
-    longest: float = 0
-    is_absolute: bool = False
-    is_apart: bool = False
+    clock: str = _MESSAGE
+    first: float = 0.0
+    longest: float = np.inf
     is_at_end: bool = False
     interval: float | None = None
     trouble: str = ""
@@ -146,12 +149,6 @@ class _Sample(NamedTuple):
     stamp: int
 
 
-def _laser_rule(samples: list[_Sample], rate: Rate) -> _Rule:
-    sweep = float(np.median([sample.high for sample in samples]))
-    trouble = _CONTRADICTION if rate.interval is not None and sweep > _OVERLAP * rate.interval else ""
-    return _Rule(is_at_end=_is_at_end(sweep, rate), interval=rate.interval, trouble=trouble)
-
-
 def _rule(samples: list[_Sample], rate: Rate) -> _Rule:
     durations = np.array([sample.high - sample.low for sample in samples], np.float64)
     usual = float(np.median(durations))
@@ -163,20 +160,42 @@ def _rule(samples: list[_Sample], rate: Rate) -> _Rule:
     if unit is None:
         return _Rule(trouble=trouble)
     sweep = float(durations[durations <= _ALIKE * usual].max()) * unit
-    if rate.interval is not None and sweep > rate.interval / 2:  # the sensor turns without a pause
+    if rate.interval is not None and sweep > 0.75 * rate.interval:  # the sensor turns without a pause
         sweep = max(sweep, min(rate.interval, _SWEEP[1]))
-    first = np.array([_nanoseconds(sample.low, unit) for sample in samples], np.float64)
-    after = np.array([_nanoseconds(sample.low, unit) - sample.stamp for sample in samples], np.float64)
-    near_stamp, near_zero = (abs(float(np.median(times))) < _NEAR for times in (after, first))
-    is_relative = (
-        near_zero and _spread(first) < sweep and not (near_stamp and _spread(after) < _spread(first))
-    )
-    is_absolute = near_stamp and not is_relative
-    counts_from_first = not is_relative or float(np.median(first)) > -sweep / 10
-    is_at_end = not is_absolute and (rate.delay is None or counts_from_first) and _is_at_end(sweep, rate)
-    return _Rule(
-        unit, _SLACK * sweep, is_absolute, not is_relative and not is_absolute, is_at_end, rate.interval
-    )
+    clock, first = _clock(samples, unit, sweep)
+    counts_from_first = clock == _OTHER or (clock == _MESSAGE and first > -sweep / 10)
+    is_at_end = (counts_from_first or rate.delay is None) and clock != _STAMP and _is_at_end(sweep, rate)
+    return _Rule(unit, clock, first, _SLACK * sweep, is_at_end, rate.interval)
+
+
+def _laser_rule(samples: list[_Sample], rate: Rate) -> _Rule:
+    """The rule for times in ns after the first beam of each message."""
+    sweep = float(np.median([sample.high for sample in samples]))
+    trouble = _CONTRADICTION if rate.interval is not None and sweep > _OVERLAP * rate.interval else ""
+    return _Rule(is_at_end=_is_at_end(sweep, rate), interval=rate.interval, trouble=trouble)
+
+
+def _clock(samples: list[_Sample], unit: float, sweep: float) -> tuple[str, float]:
+    """What times count from, and the usual time (ns) of the first point from there.
+
+    Times from the stamp are near zero and alike in all messages; those on its clock are near the stamp.
+    """
+    lows = [_nanoseconds(sample.low, unit) for sample in samples]
+    first = np.array(lows, np.float64)
+    after = np.array([low - sample.stamp for low, sample in zip(lows, samples, strict=True)], np.float64)
+    (first_at, first_spread), (after_at, after_spread) = _centre(first), _centre(after)
+    is_alike = (first_spread, abs(first_at)) <= (after_spread, abs(after_at))
+    if abs(after_at) < _NEAR and not is_alike:
+        return _STAMP, after_at
+    if abs(first_at) < _NEAR and first_spread < sweep:
+        return _MESSAGE, first_at
+    return (_STAMP if abs(after_at) < _NEAR else _OTHER), after_at
+
+
+def _centre(times: np.ndarray) -> tuple[float, float]:
+    """The median, and the median distance from it."""
+    middle = float(np.median(times))
+    return middle, float(np.median(np.abs(times - middle)))
 
 
 def _is_at_end(sweep: float, rate: Rate) -> bool:
@@ -203,10 +222,6 @@ def _unit(samples: list[_Sample], usual: float, rate: Rate) -> tuple[float | Non
     if rate.interval is None or not rate.is_regular or rate.interval > _LONGEST_TURN:
         return None, "their times are shares of a sweep, whose duration the rate of the scans does not state"
     return rate.interval, ""
-
-
-def _spread(times: np.ndarray) -> float:
-    return float(np.median(np.abs(times - np.median(times))))
 
 
 def _whole(values: np.ndarray) -> np.ndarray:
@@ -256,13 +271,14 @@ def _sample(values: np.ndarray, stamp: int) -> _Sample | None:
     ordered = np.sort(_whole(values if values.dtype.kind in "iu" else values[np.isfinite(values)]))
     if len(ordered) == 0:
         return None
-    middle, n_tail = ordered[len(ordered) // 2], len(ordered) // 20
+    middle, n_core = ordered[len(ordered) // 2], len(ordered) - int(_MOST_WRONG * len(ordered))
     after = (ordered - middle).astype(np.float64)
-    core = after[n_tail : len(after) - n_tail]
+    begin = int(np.argmin(after[n_core - 1 :] - after[: len(after) - n_core + 1]))
+    core = after[begin : begin + n_core]
     duration = core[-1] - core[0]
     gap = max(4 * np.diff(core).max(initial=0), duration / 50)
-    last = core[-1] + _reach(after[len(after) - n_tail :] - core[-1], gap, duration / 2)
-    first = core[0] - _reach(core[0] - after[:n_tail][::-1], gap, duration / 2)
+    last = core[-1] + _reach(after[begin + n_core :] - core[-1], gap, duration / 2)
+    first = core[0] - _reach(core[0] - after[:begin][::-1], gap, duration / 2)
     is_whole = ordered.dtype.kind == "i"
     low, high = (middle.item() + (int(end) if is_whole else end) for end in (first, last))
     step = float(np.spacing(np.abs(middle))) if ordered.dtype == np.float32 else 0.0
