@@ -235,6 +235,7 @@ def _nanoseconds(value: float, unit: float) -> int:
     return int(value) * int(unit) if is_whole else round(float(value) * unit)
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def _of_one_sweep(times: np.ndarray, longest: float) -> np.ndarray | None:
     """Which times (N,) bool are of the sweep of the given duration that most of them are of; None: all.
 
@@ -248,9 +249,11 @@ def _of_one_sweep(times: np.ndarray, longest: float) -> np.ndarray | None:
         ordered = np.sort(inside)
         reach = int(longest) if ordered.dtype.kind == "i" else longest
         ends = np.searchsorted(ordered, ordered + reach, "right")
-        start = int(np.argmax(ends - np.arange(len(ordered))))
-        with np.errstate(invalid="ignore"):
-            kept = (times >= ordered[start]) & (times <= ordered[max(ends[start] - 1, start)])
+        counts = ends - np.arange(len(ordered))
+        most = np.flatnonzero(counts == counts.max())
+        lasts = ordered[ends[most] - 1]
+        shortest = int(np.argmin(lasts - ordered[most]))
+        kept = (times >= ordered[most[shortest]]) & (times <= lasts[shortest])
         inside = times[kept]
     falls = np.flatnonzero(inside[:-1] - inside[1:] > longest / 100)
     if 0 < len(falls) <= max(1, len(inside) // 100) and len(inside) > _FEW:
@@ -262,6 +265,7 @@ def _of_one_sweep(times: np.ndarray, longest: float) -> np.ndarray | None:
     return kept
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def _sample(values: np.ndarray, stamp: int) -> _Sample | None:
     """Where the times of a message begin and end; None without a finite one.
 
@@ -272,7 +276,7 @@ def _sample(values: np.ndarray, stamp: int) -> _Sample | None:
     if len(ordered) == 0:
         return None
     middle, n_core = ordered[len(ordered) // 2], len(ordered) - int(_MOST_WRONG * len(ordered))
-    after = (ordered - middle).astype(np.float64)
+    after = ordered.astype(np.float64) - float(middle)
     begin = int(np.argmin(after[n_core - 1 :] - after[: len(after) - n_core + 1]))
     core = after[begin : begin + n_core]
     duration = core[-1] - core[0]
