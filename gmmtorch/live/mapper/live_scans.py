@@ -38,7 +38,7 @@ SETTLING = 0.5  # s without a new frame above the sensor's, after which the root
 _PATIENCE = 10.0  # s that a scan waits for its pose if there is no limit of the latency
 _WAITING_BYTES = 1 << 28
 _BACKWARDS = 30 * NANOSECONDS  # a clock that is set back further starts again
-_N_FIRST = 1001  # messages whose stamps and receipt show how the sensor keeps time
+_N_FIRST = 101  # messages whose stamps and receipt show how the sensor keeps time
 
 
 @dataclass(frozen=True)
