@@ -10,7 +10,14 @@ _LARGEST_CELL = 1e9  # metres; powers of larger sides overflow
 
 
 class GmmTorchError(Exception):
-    """Base class of all errors that gmmtorch raises deliberately."""
+    """Base class of all errors that gmmtorch raises deliberately.
+
+    Their text is one line that is safe to print: control characters, as in a file's name, are escaped.
+    """
+
+    def __str__(self) -> str:  # also because OSError would print a bare tuple
+        text = str(self.args[0]) if self.args else ""
+        return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 class InvalidArgumentError(GmmTorchError, ValueError):
@@ -24,15 +31,9 @@ class DataError(GmmTorchError, ValueError):
 class MissingDataError(GmmTorchError, FileNotFoundError):
     """A requested file or folder does not exist."""
 
-    def __str__(self) -> str:  # FileNotFoundError would print a bare tuple
-        return str(self.args[0]) if self.args else ""
-
 
 class OutputError(GmmTorchError, OSError):
     """A file could not be written."""
-
-    def __str__(self) -> str:  # OSError would print a bare tuple
-        return str(self.args[0]) if self.args else ""
 
 
 class MemoryLimitError(GmmTorchError, MemoryError):

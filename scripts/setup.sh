@@ -37,7 +37,7 @@ if ! .venv/bin/python -c 'import open3d' 2> .venv/open3d-error.txt; then
   else
     tail -n 1 .venv/open3d-error.txt >&2
     echo "setup: Open3D does not load. On Debian or Ubuntu: sudo apt-get install -y $PACKAGES" >&2
-    echo "setup: without it PCD and PLY files cannot be read; all else works." >&2
+    echo "setup: without it no scans can be simulated in meshes; all else works." >&2
   fi
 fi
 rm -f .venv/open3d-error.txt

@@ -51,7 +51,7 @@ def parsed_octree(data: bytes, path: str | Path) -> tuple[Any, float]:
     path = Path(path)
     header = _header(data, path)
     check = _count_binary if header.binary else _count_full
-    n_nodes = check(data, header.begin, path) if header.n_nodes else 0
+    n_nodes = check(data, header.begin, path) if len(data) > header.begin else 0
     if n_nodes != header.n_nodes:
         raise DataError(f"{path} announces {header.n_nodes:,} nodes, but has {n_nodes:,}; it is damaged.")
     return _parsed(data[header.begin :], header), header.resolution

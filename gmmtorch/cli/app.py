@@ -191,14 +191,17 @@ def _raising() -> Iterator[None]:
 
 def _with_memory(run: Callable[[DictConfig], Any], config: DictConfig) -> Any:
     """The result of a command. Raises `MemoryLimitError` if the memory of the device is too small."""
-    import torch
-
-    from gmmtorch.kernels.chunks import memory_error
-
+    common.check_inputs(config)
     try:
         return run(config)
-    except torch.OutOfMemoryError as error:
-        raise memory_error(error) from error
+    except RuntimeError as error:
+        import torch  # takes a second, which errors of options need not wait for
+
+        from gmmtorch.kernels.chunks import memory_error
+
+        if isinstance(error, torch.OutOfMemoryError):
+            raise memory_error(error) from error
+        raise
 
 
 def _guarded(run: Callable[[DictConfig], Any], config: DictConfig) -> Any:

@@ -71,6 +71,25 @@ def is_job_of_sweep() -> bool:
     return config.mode == RunMode.MULTIRUN and config.output_subdir is not None
 
 
+def check_inputs(config: DictConfig) -> None:
+    """Raises the error of an input that does not exist, before a command imports what takes seconds."""
+    points = OmegaConf.select(config, "points")
+    if points is not None:
+        from gmmtorch.datasets.point_files.headers import point_path
+
+        point_path(points)
+    for option in ("path", "map.path", "world.path"):
+        path = OmegaConf.select(config, option)
+        if path and not Path(path).expanduser().exists():
+            raise MissingDataError(f"{option}={path} does not exist; give a file or folder that exists.")
+    path = OmegaConf.select(config, "dataset.path")
+    is_read = points is None and not OmegaConf.select(config, "inputs")
+    if is_read and path and not Path(path).expanduser().exists():
+        from gmmtorch import datasets
+
+        datasets.load(config.dataset.name, path)  # its error describes the files it needs
+
+
 def set_up(config: DictConfig) -> str:
     """Check the seed and apply `runtime.*`; returns the device."""
     check_whole("seed", config.seed, 0)

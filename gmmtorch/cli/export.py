@@ -34,12 +34,12 @@ def main() -> None:
 
 def run(config: DictConfig) -> None:
     """Run the command; prints the written files."""
-    from gmmtorch.cli.reporting import exported_files
-
     for name in ("path", "output"):
         if not config[name]:
             raise InvalidArgumentError(f"{name} is not set; give {name}=FILE.")
     config.format = _format(config)
+    from gmmtorch.cli.reporting import exported_files  # takes seconds, so options are checked first
+
     if config.format == "octomap":
         load_pyoctomap()  # before the cells are computed
     common.use_runtime(config.runtime)

@@ -11,7 +11,10 @@ from gmmtorch.errors import check_whole
 from gmmtorch.evaluation.events import Event, Row
 from gmmtorch.report.progress import ProgressBars
 
-TABLE = "method resolution kept auc auc_low auc_high brier n_components nbytes build_seconds query_seconds"
+TABLE = (
+    "method resolution kept auc auc_low auc_high ece log_loss_bits accuracy n_components nbytes "
+    "build_seconds query_seconds"
+)
 
 
 def main() -> None:

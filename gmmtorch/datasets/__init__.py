@@ -1,6 +1,6 @@
 """Data sets of scans: log files, scan folders, meshes, and simulated buildings.
 
-`load` opens a data set by name and imports its module only then.
+`load` opens a data set by name and imports its module only then. The other names are imported on first use.
 """
 
 from __future__ import annotations
@@ -8,12 +8,17 @@ from __future__ import annotations
 import importlib
 import inspect
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from gmmtorch.datasets.base import Dataset, Ranges
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.lazy_names import lazy_names
 
-__all__ = ["Dataset", "Ranges", "load"]
+if TYPE_CHECKING:
+    from gmmtorch.datasets.base import Dataset as Dataset
+    from gmmtorch.datasets.base import Ranges as Ranges
+
+__getattr__, __dir__, _lazy = lazy_names(__name__, {"Dataset": "base", "Ranges": "base"})
+__all__ = [*_lazy, "load"]
 
 
 class _Source(NamedTuple):
@@ -74,6 +79,8 @@ def load(
     Raises `InvalidArgumentError` for an unknown name or option or an invalid value, `MissingDataError` for a
     path that does not exist, and `DataError`, now or when a scan is read, for unreadable data.
     """
+    from gmmtorch.datasets.base import Ranges
+
     if name not in _SOURCES:
         raise InvalidArgumentError(f"dataset={name!r} is not known; choose one of {', '.join(_SOURCES)}.")
     source = _SOURCES[name]

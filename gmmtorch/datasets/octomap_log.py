@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset, Ranges, check_pose, gunzip, require_path
+from gmmtorch.datasets.number_rows import number_rows
 from gmmtorch.errors import DataError
 from gmmtorch.scan import Scan
 
@@ -85,7 +86,7 @@ class OctomapLog(Dataset):
             text = file.read() if stop is None else file.read(stop - self._nodes[index])
         _, *lines = text.decode("ascii", errors="replace").splitlines()
         lines = [line for line in lines if line.strip() and not line.startswith("#")]
-        return torch.from_numpy(_numbers(lines, 3, where))
+        return torch.from_numpy(number_rows(lines, 3, f"{where}, row"))
 
     def _known_pose(self, index: int) -> Tensor:
         where = f"{self._path}, scan {index}"
@@ -99,7 +100,7 @@ class OctomapLog(Dataset):
 
 def _node_pose(line: str, where: str) -> Tensor:
     """The pose (4, 4) in a NODE line."""
-    numbers = _numbers([line.removeprefix("NODE")], 6, where + ", NODE line")[0]
+    numbers = number_rows([line.removeprefix("NODE")], 6, where + ", NODE line")[0]
     if not np.isfinite(numbers).all():
         raise DataError(f"{where}: the pose {numbers.tolist()} is not finite.")
     pose = torch.eye(4, dtype=torch.float64)
@@ -122,18 +123,6 @@ def _node_positions(file: io.BufferedIOBase) -> list[int]:
             positions.append(position)
         position += len(line)
     return positions
-
-
-def _numbers(lines: list[str], columns: int, where: str) -> np.ndarray:
-    try:
-        table = np.array([line.split() for line in lines], dtype=np.float64)
-    except ValueError as error:
-        raise DataError(f"{where}: expected {columns} numbers per line ({error}).") from error
-    if not lines:
-        return np.empty((0, columns))
-    if table.ndim != 2 or table.shape[1] != columns:
-        raise DataError(f"{where}: expected {columns} numbers per line, found {table.shape[-1]}.")
-    return table
 
 
 # -- binary graphs --------------------------------------------------------------------------------------

@@ -12,7 +12,9 @@ from pathlib import Path
 import torch
 
 from gmmtorch.datasets.base import Dataset, Ranges, natural_key, require_path
-from gmmtorch.datasets.point_files.cloud_files import pcd_header, read_cloud
+from gmmtorch.datasets.number_rows import number_rows
+from gmmtorch.datasets.point_files.cloud_files import read_cloud
+from gmmtorch.datasets.point_files.pcd_files import pcd_header
 from gmmtorch.datasets.recordings.trajectory import kitti_matrices, read_rows
 from gmmtorch.errors import DataError
 from gmmtorch.scan import Scan
@@ -105,10 +107,12 @@ class PcdViewpoint(Dataset):
 def _viewpoint(path: Path) -> torch.Tensor:
     """The sensor position (3,) in the header of a PCD file."""
     words = pcd_header(path).get("VIEWPOINT", [])
-    try:
-        origin = torch.tensor([float(w) for w in words[:3]], dtype=torch.float64)
-    except ValueError as error:
-        raise DataError(f"{path}: VIEWPOINT {' '.join(words)} does not consist of numbers.") from error
-    if origin.shape != (3,) or not bool(torch.isfinite(origin).all()):
+    if len(words) not in (3, 7):
+        raise DataError(
+            f"{path}: VIEWPOINT {' '.join(words)} has {len(words)} numbers; it needs a position and a "
+            "quaternion, 7 numbers."
+        )
+    origin = torch.from_numpy(number_rows([" ".join(words)], len(words), f"{path}: VIEWPOINT")[0, :3])
+    if not bool(torch.isfinite(origin).all()):
         raise DataError(f"{path}: VIEWPOINT {' '.join(words)} does not begin with a sensor position.")
     return origin

@@ -7,7 +7,9 @@ points are occupied, while most of real space is free. Scores of two tests with 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,13 +17,16 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.evaluation import queries
 from gmmtorch.evaluation.queries import OCCUPIED
+from gmmtorch.occupancy.calibration import N_BINS, Calibrator, Prediction
 from gmmtorch.occupancy.evidence import CellClass, classify
-
-N_BINS = 15
-"""Number of equal-width bins, as in Guo et al. 2017."""
+from gmmtorch.scan import Scan
 
 PRIORS = (0.1, 0.5, 1.0, 2.0, 5.0)
+_BEAMS = 100  # of a scan whose prediction calibrates a map
+_RAYS = 1e4  # that stand for a probability
+_FEWEST = 20  # predictions of a bin; fewer show little but chance
 VARIANCE_THRESHOLDS = (0.25, 0.2, 0.15, 0.1, 0.06, 0.03)
 
 
@@ -79,13 +84,74 @@ def accuracy(theta: Tensor, labels: Tensor) -> float:
     return float(np.where(p == 0.5, 0.5, (p > 0.5) == (truth == 1)).mean())
 
 
+def brier_score(theta: Tensor, labels: Tensor) -> float:
+    """Mean squared difference of probabilities (M,) and labels (M,); θ = ½ everywhere scores ¼."""
+    truth, p = _checked(theta, labels)
+    return float(np.square(p - truth).mean())
+
+
 def scores(theta: Tensor, labels: Tensor) -> dict[str, float]:
-    """`ece`, `log_loss_bits` and `accuracy` of occupied and free points."""
+    """`ece`, `brier`, `log_loss_bits` and `accuracy` of occupied and free points."""
     return {
         "ece": reliability(theta, labels).expected_error,
+        "brier": brier_score(theta, labels),
         "log_loss_bits": log_loss_bits(theta, labels),
         "accuracy": accuracy(theta, labels),
     }
+
+
+def reliability_of(tally: Tensor) -> Reliability:
+    """Reliability curve of a tally (15, 6) of predictions, see `occupancy.calibration.Calibrator`.
+
+    Neighbouring bins are pooled until they hold 20 predictions; the last one may have fewer.
+    """
+    before = tally[:, 0].cumsum(0) - tally[:, 0]
+    pool = torch.unique((before / _FEWEST).floor(), return_inverse=True)[1]
+    pooled = torch.zeros_like(tally).index_add(0, pool, tally)
+    count, predicted, observed = pooled[pooled[:, 0] > 0, :3].T.numpy()
+    return Reliability(predicted / count, observed / count, count)
+
+
+def scores_of(tally: Tensor) -> dict[str, float]:
+    """`scores` of a tally (15, 6) of at least one prediction."""
+    brier, log_loss, right = (tally[:, 3:].sum(0) / tally[:, 0].sum()).tolist()
+    ece = reliability_of(tally).expected_error
+    return {"ece": ece, "brier": brier, "log_loss_bits": log_loss, "accuracy": right}
+
+
+class SeenPredictions:
+    """The calibration of a map that has none of its own: it learns as a `GaussianMap` does, from what the map
+    says about some scans before it learns from them. side: of the map's cells (m)."""
+
+    def __init__(self, side: float) -> None:
+        self._side = side
+        start = Calibrator.of(2 * side, 1)  # with these numbers the map's own probabilities, to start with
+        self._calibrator = replace(start, mean=torch.zeros_like(start.mean))
+        self._dim = 0
+
+    def note(self, answer: Callable[[Tensor], Tensor], scan: Scan, seed: int) -> None:
+        """Learns from a scan that the map, which answers with probabilities, has not learned from yet."""
+        if not bool((scan.points != scan.origin).any()):
+            return
+        origins, ends = queries.test_beams([scan], _BEAMS, seed)
+        asked = queries.hit_and_free(origins, ends, "uniform", self._side, seed)
+        theta = answer(asked.points).cpu().double()
+        seen = Prediction(*_counts(theta), asked.labels == OCCUPIED, self._side)
+        self._dim = scan.dim
+        self._calibrator = self._calibrator.updated([seen], scan.dim, farthest=math.inf)
+
+    def calibrated(self, theta: Tensor) -> Tensor:
+        """The calibrated probabilities (M,) where the map says theta (M,)."""
+        if not self._dim:
+            return theta
+        found = self._calibrator.calibration
+        return found.probability(*_counts(theta.double()), self._side, self._dim)
+
+
+def _counts(theta: Tensor) -> tuple[Tensor, Tensor]:
+    """Hits and misses that stand for a probability; none for ½ exactly."""
+    n = _RAYS * (theta != 0.5)
+    return n * theta, n * (1 - theta)
 
 
 def prior_and_dead_band(
@@ -110,14 +176,10 @@ def prior_and_dead_band(
     occupied = labels == OCCUPIED
     for prior in priors:
         theta = theta_of(prior).cpu()
-        curve = reliability(theta, labels)
-        scores_of_prior = {
+        of_prior = {
             "prior": float(prior),
-            "ece": curve.expected_error,
-            "mce": curve.maximum_error,
-            "brier": float((theta.double() - labels.double().cpu()).square().mean()),
-            "log_loss_bits": log_loss_bits(theta, labels),
-            "accuracy": accuracy(theta, labels),
+            **scores(theta, labels),
+            "mce": reliability(theta, labels).maximum_error,
         }
         for threshold in variance_thresholds:
             called = classify(theta, threshold)
@@ -125,7 +187,7 @@ def prior_and_dead_band(
             right = (called == CellClass.OCCUPIED) == occupied.cpu()
             rows.append(
                 {
-                    **scores_of_prior,
+                    **of_prior,
                     "variance_threshold": float(threshold),
                     "decided": float(decided.double().mean()),
                     "accuracy_decided": float(right[decided].double().mean())

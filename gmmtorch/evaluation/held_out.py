@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation import calibration, metrics, queries
+from gmmtorch.evaluation.calibration import SeenPredictions
 from gmmtorch.evaluation.events import Event, OnRows, Row, ignore
 from gmmtorch.evaluation.methods import Form, MapFactory
 from gmmtorch.evaluation.protocol_options import Protocol
@@ -21,6 +22,8 @@ from gmmtorch.files import check_writable
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.occupancy.protocol import OccupancyMap
 from gmmtorch.scan import Scan
+
+_PREDICTED_SCANS = 50  # of which a map without a calibration predicts some beams
 
 Answer = Callable[[Tensor], Tensor]
 """Points (M, D), world metres → occupancy probabilities (M,)."""
@@ -89,10 +92,11 @@ def evaluate(
     largest = max(protocol.kept)
     for kept in protocol.kept:
         shown = queries.keep_share(train, kept, protocol.removal, seed)
-        for method, resolution, built, seconds, answer in _built_maps(
+        for method, resolution, built, seconds, answer, seen in _built_maps(
             factories, shown, kept, protocol, on_event
         ):
             made = _score(built, answer, asked[resolution], resolution, seed, protocol.unknown)
+            made.row.update(_calibrated_scores(made, seen))
             made.row.update(
                 dataset=name,
                 method=method,
@@ -112,22 +116,23 @@ def evaluate(
 
 def _built_maps(
     factories: dict[str, MapFactory], shown: Sequence[Scan], kept: float, protocol: Protocol, on_event: Event
-) -> Iterator[tuple[str, float, OccupancyMap, float, Answer]]:
-    """Method, resolution, map, seconds of its building, and its answers, for each method and resolution."""
+) -> Iterator[tuple[str, float, OccupancyMap, float, Answer, SeenPredictions | None]]:
+    """Method, resolution, map, seconds of its building, its answers, and the calibration of a map that has
+    none of its own, for each method and resolution."""
     # A map that serves several resolutions or forms of evidence is built once.
-    cache: dict[Any, tuple[OccupancyMap, float]] = {}
+    cache: dict[Any, tuple[OccupancyMap, float, SeenPredictions | None]] = {}
     for method, factory in factories.items():
         made_as = "mixture" if isinstance(factory, Form) else method
         shared = factory.new_map if isinstance(factory, Form) else method
         for resolution in protocol.resolution:
             if shared not in cache:
                 label = f"{made_as}, {kept:.0%} of the {protocol.removal}"
-                cache[shared] = _build(factory(resolution), shown, label, on_event)
-            built, seconds = cache[shared]
+                cache[shared] = _build(factory(resolution), shown, label, resolution, on_event)
+            built, seconds, seen = cache[shared]
             if not built.any_resolution:
                 del cache[shared]
             _set_defaults(built, factory, resolution)
-            yield method, resolution, built, seconds, _answerer(built, factory, resolution)
+            yield method, resolution, built, seconds, _answerer(built, factory, resolution), seen
 
 
 def _answerer(built: OccupancyMap, factory: MapFactory, resolution: float) -> Answer:
@@ -156,16 +161,34 @@ def _questions(
 
 
 def _build(
-    empty: OccupancyMap, scans: Sequence[Scan], label: str, on_event: Event
-) -> tuple[OccupancyMap, float]:
-    """The map of the scans, and its build time (s), which includes the fit of an incomplete window."""
+    empty: OccupancyMap, scans: Sequence[Scan], label: str, resolution: float, on_event: Event
+) -> tuple[OccupancyMap, float, SeenPredictions | None]:
+    """The map of the scans, its build time (s), which includes the fit of an incomplete window, and its
+    calibration, if it has none of its own. The build time is without that of the calibration."""
+    seen = None if isinstance(empty, GaussianMap) else SeenPredictions(resolution)
+    every = max(1, len(scans) // _PREDICTED_SCANS)
     on_event(label, 0, len(scans))
-    begin = time.perf_counter()
-    for number, scan in enumerate(scans, 1):
+    seconds = 0.0
+    for number, scan in enumerate(scans):
+        if seen is not None and number % every == every - 1 and number:
+            seen.note(lambda points: torch.as_tensor(empty.occupancy(points, resolution)), scan, number)
+        begin = time.perf_counter()
         empty.insert(scan)
-        on_event(label, number, len(scans))
+        seconds += time.perf_counter() - begin
+        on_event(label, number + 1, len(scans))
+    begin = time.perf_counter()
     empty.finish()
-    return empty, time.perf_counter() - begin
+    return empty, seconds + time.perf_counter() - begin, seen
+
+
+def _calibrated_scores(made: Built, seen: SeenPredictions | None) -> Row:
+    """The scores of a map that has no calibration of its own, with one."""
+    names = ("ece", "log_loss_bits", "accuracy")
+    if seen is None:
+        return {f"calibrated_{name}": None for name in names}
+    known = made.asked.labels != UNKNOWN
+    found = calibration.scores(seen.calibrated(made.theta)[known], made.asked.labels[known])
+    return {f"calibrated_{name}": found[name] for name in names}
 
 
 def _score(
@@ -183,7 +206,6 @@ def _score(
         "auc": curve.auc,
         "auc_low": low,
         "auc_high": high,
-        "brier": metrics.brier(occupied, free),
         **calibration.scores(theta[known], asked.labels[known]),
         "n_components": built.n_components if isinstance(built, GaussianMap) else None,
         "nbytes": built.nbytes,
@@ -208,6 +230,9 @@ _COLUMNS = [
     "ece",
     "log_loss_bits",
     "accuracy",
+    "calibrated_ece",
+    "calibrated_log_loss_bits",
+    "calibrated_accuracy",
     "n_train_points",
     "n_components",
     "nbytes",

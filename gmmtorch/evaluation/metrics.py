@@ -105,11 +105,6 @@ def _shares_of_auc(occupied: Tensor, free: Tensor) -> tuple[Tensor, Tensor]:
     return below(occupied, free), 1 - below(free, occupied)
 
 
-def brier(occupied: Tensor, free: Tensor) -> float:
-    """Mean squared difference of probability and label: 0 is perfect, θ = ½ everywhere scores ¼."""
-    return float(torch.cat([(1 - occupied) ** 2, free**2]).mean())
-
-
 def unknown_scores(unknown: Tensor, free: Tensor) -> dict[str, float | None]:
     """Scores of unknown points (U,) against free points (Q,), given their probabilities.
 

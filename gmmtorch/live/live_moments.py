@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 
 import torch
 from torch import Tensor
@@ -93,14 +92,13 @@ class BuildMoments:
         built, poses = self._builder.map, self._builder.poses
         if built.dim is None:
             return Moment(GaussianMap(), (), *self._record.copy())
-        options = {**asdict(built.query_options), "resolution": built.resolution, "method": built.method}
-        components, number = built.components(), 0
+        shown, number = built.snapshot() if self._shared is None else self._shared.map(built), 0
         teammates: list[ViewedRobot] = []
         if self._shared is not None:
-            components, number = self._shared.components(), self._shared.replica.robot
-            teammates = [robot for robot in seen_paths(components) if robot.number != number]
+            number = self._shared.replica.robot
+            teammates = [robot for robot in seen_paths(shown.components()) if robot.number != number]
         own = ViewedRobot(number, poses[:, :-1, -1], poses[-1, :-1, :-1])
-        return Moment(GaussianMap.of(components, **options), [own, *teammates], *self._record.copy())
+        return Moment(shown, [own, *teammates], *self._record.copy())
 
 
 class MissionMoments:
@@ -213,7 +211,7 @@ class ReplayMoments:
         replica, own = self._mission.replica, self._mission.map
         if not replica.n_components:
             return Moment(GaussianMap(), (), *self._record.copy())
-        shown = replica.map(resolution=own.resolution, **asdict(own.query_options))
+        shown = own.snapshot(replica.components(), calibration=replica.calibration)
         return Moment(shown, seen_paths(shown.components()), *self._record.copy())
 
 

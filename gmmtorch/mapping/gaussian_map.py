@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Unpack
+from typing import Any, Unpack
 
 import numpy as np
 import torch
@@ -158,6 +158,16 @@ class GaussianMap(MapState):
         made = cls(**options)
         made._commit(components.checked())
         return made
+
+    def snapshot(self, components: Components | None = None, **options: Unpack[MapOptions]) -> GaussianMap:
+        """A map that answers like this one and does not grow with it.
+
+        Args:
+            components: others than those of this map.
+            options: those that differ; the default `codec` is "float".
+        """
+        own: Any = {**asdict(self.query_options), "resolution": self.resolution, "method": self.method}
+        return GaussianMap.of(self.components() if components is None else components, **{**own, **options})
 
     # -- learning -------------------------------------------------------------------------------------
 

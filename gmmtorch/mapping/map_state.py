@@ -114,6 +114,18 @@ class MapState(DeviceModule):
         return replace(self._query_options, calibration=self._calibrator.calibration)
 
     @property
+    def predictions(self) -> dict[float, Tensor]:
+        """What the map predicted and then saw: a tally (15, 6) for each side (m) of cubes that it predicted,
+        as in `occupancy.calibration.Calibrator`."""
+        if self._calibrator is None:
+            return {}
+        return {
+            side: tally
+            for side, tally in zip(SIDES, self._calibrator.tally, strict=True)
+            if float(tally[:, 0].sum())
+        }
+
+    @property
     def settings(self) -> MapSettings:
         """What the map's file states about it, besides the components and the learning rule."""
         options = self.resolution, self.method, self.codec, self.robot, self.query_options

@@ -23,6 +23,10 @@ from gmmtorch.mixture.validation import Array, checked_parameter
 
 _FILE_KIND, _FILE_VERSION = "gmmtorch.mixture", 1
 _EXTRA = "extra."  # prefix of the names of extra tensors in a file
+_FITTED = (
+    *("_tensors", "n_features_in_", "feature_names_in_"),
+    *("lower_bounds_", "lower_bound_", "n_iter_", "converged_"),
+)
 _EXTRA_DTYPES = (torch.float64, torch.int64, torch.bool)
 
 
@@ -116,6 +120,7 @@ class MixtureState(MixtureDensity):
             check_type(covariances, self.covariance_type)
             self._set_buffers(weights, means, covariances)
             self.n_features_in_ = means.shape[1]
+            self.__dict__.pop("feature_names_in_", None)
             if self.n_components is not None:  # None means: determined by the fit
                 self.n_components = means.shape[0]
             extra = ((name, state_dict.get(prefix + name)) for name in self._extra_names)
@@ -142,8 +147,7 @@ class MixtureState(MixtureDensity):
         moved = type(self)(**BaseEstimator.get_params(self, deep=False))
         if self._fitted_type == "diag":
             moved.covariance_type = "full"
-        for name in ("_tensors", "n_features_in_", "lower_bounds_", "lower_bound_", "n_iter_", "converged_"):
-            setattr(moved, name, getattr(self, name))
+        moved.__dict__.update({name: vars(self)[name] for name in _FITTED if name in vars(self)})
         moved._set_buffers(
             self.weights.clone(), means @ rotation.T + translation, rotation @ self.covariances @ rotation.T
         )
@@ -161,6 +165,8 @@ class MixtureState(MixtureDensity):
             "arrays": not self._tensors,
             "parameters": self._scalar_options(),
         }
+        if "feature_names_in_" in vars(self):
+            facts["features"] = list(vars(self)["feature_names_in_"])
         write_bytes(path, pack_tensors(tensors, _FILE_KIND, _FILE_VERSION, **facts))
 
     @classmethod
@@ -194,6 +200,11 @@ class MixtureState(MixtureDensity):
             )
             mixture._set_extra(extra)
             mixture._tensors = not facts["arrays"]
+            names = facts.get("features", [])
+            if names and [type(name) for name in names] != [str] * dim:
+                raise DataError(f"features={names} are not the names of {dim} columns.")
+            if names:
+                mixture.__dict__["feature_names_in_"] = np.array(names, object)
         except (KeyError, TypeError, ValueError, GmmTorchError) as error:
             raise DataError(f"{path} does not hold a mixture: {error}") from error
         return mixture

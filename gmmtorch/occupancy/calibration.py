@@ -42,7 +42,7 @@ _MEAN = torch.tensor(  # of the prior: constant, linear and quadratic part of th
 _DEVIATION = torch.tensor(
     [[0.4, 0.15, 0.05], [1.0, 0.3, 0.05], [0.25, 0.1, 0.05], [0.25, 0.1, 0.05]], dtype=torch.float64
 )
-_FARTHEST = 3.0  # deviations of the prior that a coefficient moves at most
+_FARTHEST = 3.0  # deviations of the prior that a coefficient of a map moves at most
 _INFORMATION = torch.tensor(  # of a predicted point about each coefficient, about
     [[0.1, 0.1, 0.1], [0.02, 0.02, 0.02], [0.2, 0.2, 0.2], [0.2, 0.2, 0.2]], dtype=torch.float64
 )
@@ -51,7 +51,11 @@ _INDEPENDENT = 0.08  # what a prediction counts: those of one beam for several s
 _MEMORY = 0.98  # share of what was learned that remains after another window
 _HALF = math.log(2.0)  # log(1 + e⁰)
 _LARGEST = 30.0  # of a coefficient in a file
-_N_BINS = 15
+N_BINS = 15
+"""Number of equal-width bins of probabilities, as in Guo et al. 2017."""
+N_BYTES = 28
+"""Size of a calibration in files and messages."""
+_LEAST = 2.0**-52  # probability by which a certain mistake is scored
 
 
 class Calibration(NamedTuple):
@@ -101,25 +105,39 @@ class Calibration(NamedTuple):
         n_predicted = _short_count(sum(part.n_predicted for part in parts))
         return cls(*_rounded(math.exp(length), torch.tensor(mean, dtype=torch.float64)), n_predicted)
 
-    def text(self) -> str:
-        """35 characters, from which `read` makes the calibration again."""
+    def to_bytes(self) -> bytes:
+        """`N_BYTES`, from which `of_bytes` makes the calibration again."""
         values = [math.log(self.length), math.log1p(self.n_predicted), *self.coefficients]
-        return base64.b85encode(np.array(values, dtype="<f2").tobytes()).decode()
+        return np.array(values, dtype="<f2").tobytes()
+
+    @classmethod
+    def of_bytes(cls, data: bytes) -> Calibration:
+        """The calibration of `to_bytes`. Raises `DataError` for any other bytes."""
+        values = (
+            np.frombuffer(data, dtype="<f2").astype(np.float64)
+            if len(data) == N_BYTES
+            else np.full(14, np.nan)
+        )
+        if (np.abs(values) <= _LARGEST).all() and values[1] >= 0:  # NaN compares false
+            length, n_predicted, *mean = values.tolist()
+            made = cls(_short(math.exp(length)), tuple(mean), round(math.expm1(n_predicted)))
+            if made.to_bytes() == data:
+                return made
+        raise DataError("The calibration is damaged.")
+
+    def text(self) -> str:
+        """`to_bytes` as 35 characters, from which `read` makes the calibration again."""
+        return base64.b85encode(self.to_bytes()).decode()
 
     @classmethod
     def read(cls, text: object) -> Calibration:
         """The calibration of a `text`. Raises `DataError` for any other object."""
         try:
-            data = base64.b85decode(text) if isinstance(text, str) else b""
-        except ValueError:
-            data = b""
-        values = (
-            np.frombuffer(data, dtype="<f2").astype(np.float64) if len(data) == 28 else np.full(14, np.nan)
-        )
-        if not (np.abs(values) <= _LARGEST).all() or values[1] < 0:  # NaN compares false
-            raise DataError(f"calibration={text!r} is damaged; remove it to use that of the sensor model.")
-        length, n_predicted, *mean = values.tolist()
-        return cls(_short(math.exp(length)), tuple(mean), round(math.expm1(n_predicted)))
+            return cls.of_bytes(base64.b85decode(text) if isinstance(text, str) else b"")
+        except (ValueError, DataError):
+            raise DataError(
+                f"calibration={text!r} is damaged; remove it to use that of the sensor model."
+            ) from None
 
 
 def _length_of(mean_range: float) -> float:
@@ -191,8 +209,9 @@ class Calibrator:
 
     length: ℓ (m), that of the first window. mean (12,), precision (12, 12). n_predicted: number of points.
     next_window: number of the window that is predicted next.
-    tally: (S, 15, 3), for each of the sides that are predicted and each bin of probability the number of
-    points, the sum of their probabilities, and the number of those that were occupied. All on the CPU.
+    tally: (S, 15, 6), for each of the sides that are predicted and each bin of probability: the number of
+    points; the sum of their probabilities; the number of those that were occupied; and the sums of their
+    squared errors, of their log-losses (bits), and of those that ½ separates right. All on the CPU.
     """
 
     length: float
@@ -206,9 +225,7 @@ class Calibrator:
     def of(cls, mean_range: float, n_sides: int) -> Calibrator:
         """Nothing is learned yet; the beams have a mean range (m)."""
         length = _length_of(mean_range)
-        return cls(
-            length, _MEAN.flatten(), _prior_precision(), torch.zeros(n_sides, _N_BINS, 3, dtype=torch.float64)
-        )
+        return cls(length, _MEAN.flatten(), _prior_precision(), _empty_tally(n_sides))
 
     @classmethod
     def continued(cls, known: Calibration, n_sides: int) -> Calibrator:
@@ -216,8 +233,7 @@ class Calibrator:
         mean = torch.tensor(known.coefficients, dtype=torch.float64)
         seen = min(known.n_predicted, 1 / (1 - _MEMORY) * 50)
         precision = _prior_precision() + torch.diag(_INDEPENDENT * seen * _INFORMATION.flatten())
-        tally = torch.zeros(n_sides, _N_BINS, 3, dtype=torch.float64)
-        return cls(known.length, mean, precision, tally, known.n_predicted)
+        return cls(known.length, mean, precision, _empty_tally(n_sides), known.n_predicted)
 
     @classmethod
     def restored(cls, state: dict[str, Any]) -> Calibrator:
@@ -226,7 +242,7 @@ class Calibrator:
         check_number("length", made.length, above=True)
         shapes = tuple(made.mean.shape), tuple(made.precision.shape), tuple(made.tally.shape[1:])
         is_finite = bool(torch.isfinite(made.mean).all()) and bool(torch.isfinite(made.precision).all())
-        if shapes != ((12,), (12, 12), (_N_BINS, 3)) or not is_finite:
+        if shapes != ((12,), (12, 12), _empty_tally(1).shape[1:]) or not is_finite:
             raise ValueError("the calibration is damaged")
         return made
 
@@ -236,14 +252,17 @@ class Calibrator:
         n_predicted = _short_count(self.n_predicted)
         return Calibration(*_rounded(self.length, self.mean), n_predicted)
 
-    def updated(self, predictions: Sequence[Prediction], dim: int) -> Calibrator:
-        """After the predictions of a window, one for each of the sides of the tally."""
+    def updated(self, predictions: Sequence[Prediction], dim: int, farthest: float = _FARTHEST) -> Calibrator:
+        """After the predictions of a window, one for each of the sides of the tally.
+
+        farthest: deviations that a coefficient may be from that of the sensor model.
+        """
         each = [p.on_cpu() for p in predictions]
         occupied = torch.cat([p.occupied for p in each])
         prior = _prior_precision()
         before = prior + _MEMORY * (self.precision - prior)
         now, precision = self.mean, before
-        room = _FARTHEST * _DEVIATION.flatten()
+        room = farthest * _DEVIATION.flatten()
         for step in range(_STEPS):
             parts = [_derivatives(p.hits, p.misses, p.side, self.length, dim, now) for p in each]
             theta = torch.sigmoid(torch.cat([t for t, _ in parts]))
@@ -260,9 +279,16 @@ class Calibrator:
     def _tallied(self, theta: Tensor, occupied: Tensor, sizes: list[int]) -> Tensor:
         """The tally with the probabilities (M,) of points, `sizes` of them for each side in turn."""
         number = torch.arange(len(sizes)).repeat_interleave(torch.tensor(sizes))
-        place = number * _N_BINS + (theta * _N_BINS).long().clamp(0, _N_BINS - 1)
-        values = torch.stack([torch.ones_like(theta), theta, occupied], 1)
-        return self.tally.flatten(0, 1).index_add(0, place, values).view(self.tally.shape)
+        place = number * N_BINS + (theta * N_BINS).long().clamp(0, N_BINS - 1)
+        given = torch.where(occupied == 1, theta, 1 - theta)
+        loss = -given.clamp_min(_LEAST).log2()
+        right = (given > 0.5) + 0.5 * (given == 0.5)
+        values = [torch.ones_like(theta), theta, occupied, (1 - given).square(), loss, right]
+        return self.tally.flatten(0, 1).index_add(0, place, torch.stack(values, 1)).view(self.tally.shape)
+
+
+def _empty_tally(n_sides: int) -> Tensor:
+    return torch.zeros(n_sides, N_BINS, 6, dtype=torch.float64)
 
 
 def _prior_precision() -> Tensor:

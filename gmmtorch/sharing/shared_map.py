@@ -68,6 +68,8 @@ class SharedMap:
         moved = None
         if windows.moved or self.replica.is_corrected:
             moved = MovedMap(*windows.as_inserted(own), windows.motions)
+        if own.query_options.calibration is not None:
+            self.replica.calibrate(own.query_options.calibration)
         self.replica.publish(own.components(), whole=True, moved=moved)
 
     def correct(self, motion_at: MotionAt) -> None:
@@ -97,6 +99,10 @@ class SharedMap:
     def content(self) -> int:
         """Changes whenever records are added to the team's map."""
         return self.replica.version
+
+    def map(self, own: GaussianMap, codec: str = "float") -> GaussianMap:
+        """The `components` as a map that answers like the robot's own, with the calibration of the team."""
+        return own.snapshot(self.components(), codec=codec, calibration=self.replica.calibration)
 
     def components(self) -> Components:
         """The components of the team that are placed relative to this robot's, in this robot's frame."""

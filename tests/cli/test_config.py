@@ -413,6 +413,37 @@ def test_configuration_is_shown_without_heavy_imports(tmp_path):
         assert configuration == OmegaConf.to_container(composed(command))
 
 
+_REFUSE = """
+import importlib, sys
+from hydra.core.global_hydra import GlobalHydra
+for command, *arguments in {runs}:
+    sys.argv = ["gmmtorch-" + command, *arguments, "hydra.run.dir=run"]
+    try:
+        importlib.import_module("gmmtorch.cli." + command).main()
+    except SystemExit as end:
+        print(end.code)
+    GlobalHydra.instance().clear()
+print(*sys.modules, file=sys.stderr)
+"""
+
+
+def test_inputs_that_do_not_exist_are_refused_without_heavy_imports(tmp_path):
+    runs = [
+        ("fit", "points=none.ply"),
+        ("fit", "points=none.doc"),
+        ("view", "none"),
+        ("export", "path=none", "output=a.ply"),
+        ("export", "path=.", "output=a.doc"),
+        ("localize", "map=none"),
+        ("explore", "world=mesh", "world.path=none.ply"),
+    ]
+    done = run_python(["-c", _REFUSE.format(runs=runs)], cwd=tmp_path)
+    assert not _HEAVY & set(done.stderr.split())
+    options = ("points", "points", "path", "path", "output", "map.path", "world.path")
+    for option, line in zip(options, done.stdout.splitlines(), strict=True):
+        assert line.startswith(f"gmmtorch: error: {option}=")
+
+
 @pytest.mark.parametrize(
     "commands", [["export"], pytest.param(["occupancy", "explore", "robot"], marks=pytest.mark.slow)]
 )

@@ -48,6 +48,7 @@ def test_a_run_writes_the_map_its_trajectory_pictures_exports_and_results(whole)
     assert row["metres"] == pytest.approx(steps.sum(), rel=1e-6)
     files = whole.files()
     assert {"navigation.yaml", "navigation.pgm", "cloud.ply", "above.png", "components.png"} <= files
+    assert ("reliability.png" in files) == bool(row["predictions"])
     assert any(name.startswith("tensorboard/events") for name in files)
     assert "checkpoint.safetensors" not in files
     assert "navigation.pgm" in whole.stdout

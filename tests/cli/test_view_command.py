@@ -35,7 +35,7 @@ def test_html_of_a_run_directory_and_errors(monkeypatch, tmp_path):
     assert "open it in a browser" in done.stdout
     assert "path is not set" in refused(run_here(monkeypatch, "view", tmp_path))
     (tmp_path / "trajectory.tum").write_text("no numbers\n")
-    assert "is not a table of numbers" in refused(
+    assert "'no' is not a number" in refused(
         run_here(monkeypatch, "view", tmp_path, f"path={tmp_path}", html)
     )
 

@@ -140,6 +140,10 @@ FORMATS: dict[str, tuple[Callable[[Path], object], Callable[[Path], list[torch.T
     "octomap_graph": (octomap_graph, all_scans("octomap_log", "a.graph")),
     "depth_frames": (frames, all_scans("depth_frames", "")),
     **{
+        f"scans/{form}": (lambda folder, form=form: scans(folder, form), all_scans("scan_folder", ""))
+        for form in ("binary.pcd", "ascii.pcd", "ascii.ply")
+    },
+    **{
         name: (lambda folder, name=name: test_point_chunks.written(folder, name), all_points(name))
         for name in ("c.npy", *test_point_chunks.RECORDS, *test_point_chunks.TEXT, "a.las", "a.laz")
     },
@@ -162,10 +166,6 @@ RECORDINGS: dict[str, tuple[Callable[[Path], object], Callable[[Path], list[torc
     },
 }
 WITH_OPEN3D = {
-    **{
-        f"scans/{form}": (lambda folder, form=form: scans(folder, form), all_scans("scan_folder", ""))
-        for form in ("binary.pcd", "ascii.pcd", "ascii.ply")
-    },
     "compressed.pcd": (compressed, all_points("a.pcd")),
     **{
         f"mesh.{suffix}": (

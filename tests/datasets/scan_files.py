@@ -2,28 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 import struct
 from pathlib import Path
 
 import numpy as np
-import pytest
 from PIL import Image
 
 TURN_LEFT = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-
-
-def open3d_loads() -> bool:
-    if importlib.util.find_spec("open3d") is None:
-        return False
-    try:
-        import open3d  # noqa: F401
-    except (ImportError, OSError):
-        return False
-    return True
-
-
-needs_open3d = pytest.mark.skipif(not open3d_loads(), reason="Open3D does not load on this machine")
 
 
 def flaser(readings: list[float], pose: tuple[float, ...] = (0.0, 0.0, 0.0)) -> str:

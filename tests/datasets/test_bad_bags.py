@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from test_rosbag import POINTS, clouds, drive, moved
 
 from gmmtorch.datasets import load
@@ -205,7 +206,7 @@ def test_clocks_that_jump_are_left_out_and_counted(tmp_path):
     with BagWriter(tmp_path / "a.mcap") as bag:
         drive(bag)
         for i, stamp in enumerate(stamps):
-            content = {"header": {"frame_id": "lidar"}, "ranges": np.ones(3, np.float32), "range_max": 9.0}
+            content = {"header": {"frame_id": "lidar"}, "ranges": np.ones(1, np.float32), "range_max": 9.0}
             bag.message("/scan", "sensor_msgs/msg/LaserScan", stamp, content, received=float(i))
     dataset = load("rosbag", tmp_path / "a.mcap")
     assert dataset.times.tolist() == [0.0, 0.25, 0.5, 0.75, 1.0]
@@ -226,7 +227,7 @@ def test_transforms_whose_clock_runs_backwards_keep_the_longest_run(tmp_path):
 def test_a_sensor_with_a_clock_of_its_own_needs_the_times_of_recording(tmp_path):
     with BagWriter(tmp_path / "a.mcap") as bag:
         drive(bag)
-        content = {"header": {"frame_id": "lidar"}, "ranges": np.ones(3, np.float32), "range_max": 9.0}
+        content = {"header": {"frame_id": "lidar"}, "ranges": np.ones(1, np.float32), "range_max": 9.0}
         bag.message("/scan", "sensor_msgs/msg/LaserScan", 5000.0, content, received=1.0)
     with pytest.raises(
         DataError,
@@ -310,6 +311,57 @@ def test_a_damaged_message_gives_an_empty_scan_and_is_counted(tmp_path):
     dataset = load("rosbag", tmp_path / "a.mcap")
     assert [len(scan.points) for scan in dataset] == [2, 0]
     assert dataset.skipped == {"message that cannot be decoded": 1}
+
+
+def lasers(path: Path, n: int = 12, **fields: object) -> Path:
+    """A robot that turns, with a laser of 90 beams over 270° and 10 scans a second of 0.075 s."""
+    about = {"angle_min": -2.35, "angle_max": 2.35, "angle_increment": 4.7 / 89, "range_max": 9.0}
+    about |= {"time_increment": 0.075 / 89, "scan_time": 0.1, "ranges": np.full(90, 2.0, np.float32)}
+    with BagWriter(path) as bag:
+        for tick in range(3 * n):
+            bag.transforms(tick / 20, {("odom", "laser"): moved(0, yaw=tick / 20)})
+        for index in range(n):
+            content = {"header": {"frame_id": "laser"}, **about, **(fields if index != 5 or n > 12 else {})}
+            bag.message("/scan", "sensor_msgs/msg/LaserScan", index / 10, content)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason"),
+    [
+        ({"time_increment": 0.75 / 89}, "time_increment contradicts scan_time"),
+        ({"time_increment": 0.75 / 89, "scan_time": 0.0}, "their times contradict the rate of the scans"),
+        ({"time_increment": 1e-6}, "time_increment contradicts scan_time"),
+        ({"time_increment": 0.5}, "time_increment gives no sweep of 0 to 2 s"),
+        ({"time_increment": -0.001}, "time_increment gives no sweep of 0 to 2 s"),
+        ({"time_increment": float("nan")}, "time_increment gives no sweep of 0 to 2 s"),
+    ],
+)
+def test_lasers_whose_beams_have_wrong_times_are_counted(tmp_path, fields, reason):
+    dataset = load("rosbag", lasers(tmp_path / "a.mcap", 13, **fields))
+    assert load("rosbag", tmp_path / "a.mcap", deskew=False).skipped == {}
+    still = load("rosbag", lasers(tmp_path / "b.mcap", 13, time_increment=0.0))
+    for scan, expected in zip(dataset, still, strict=True):
+        assert torch.equal(scan.points, expected.points)
+    assert (dataset.skipped, still.skipped) == ({f"points not deskewed: {reason}": 13}, {})
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"angle_increment": 0.0}, "all 90 beams have one direction: angle_increment is 0"),
+        ({"angle_increment": 0.1}, r"90 beams from angle_min=-2\.35.*end at 6\.55.*, not at angle_max=2\.35"),
+        ({"angle_max": -2.35, "angle_increment": 0.05}, r"not at angle_max=-2\.35"),
+        ({"ranges": np.full(45, 2.0, np.float32)}, r"45 beams.*not at angle_max"),
+        ({"angle_min": float("nan")}, "the angles of the laser are not finite"),
+    ],
+)
+def test_lasers_whose_directions_are_not_known_are_refused_or_counted(tmp_path, fields, message):
+    with pytest.raises(DataError, match=rf"/scan, frame laser, stamp 0\.000 s: .*{message}"):
+        load("rosbag", lasers(tmp_path / "a.mcap", 13, **fields))
+    dataset = load("rosbag", lasers(tmp_path / "a.mcap", **fields))
+    assert [len(scan.points) for scan in dataset] == [90 if i == 5 else 0 for i in range(12)]
+    assert dataset.skipped == {"message that cannot be decoded": 11}
 
 
 def test_random_bytes_as_coordinates_give_finite_points_and_no_warning(tmp_path):

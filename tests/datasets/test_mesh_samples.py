@@ -144,9 +144,11 @@ def test_read_triangles_accepts_relative_indices_and_textures(tmp_path):
     ("text", "message"),
     [
         (ply(faces=[(0, 1, 9)]), "missing corner"),
-        ("not a mesh", "no readable triangles"),
+        ("not a mesh", "another kind of file"),
         (ply(faces=[]), "no readable triangles"),
-        (ply()[:-12], "no readable triangles"),
+        (ply()[:-12], "may be truncated"),
+        (ply(faces=[(0, 1, 0.5)]), "missing corner"),
+        (ply() + "7\n", "more data than its header announces"),
         (ply([*CORNERS[:3], (float("nan"), 0.0, 0.0)]), "NaN or infinite"),
         (ply([(1.0, 2.0, 3.0)] * 4), "no area"),
     ],

@@ -63,12 +63,12 @@ def test_octomap_log_rotation_is_yaw_pitch_roll():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("NODE 0 0 0\n1 2 3\n", "NODE line: expected 6 numbers"),
-        ("NODE\n1 2 3\n", "NODE line: expected 6 numbers"),
+        ("NODE 0 0 0\n1 2 3\n", "NODE line 1 has 3 numbers instead of 6"),
+        ("NODE\n1 2 3\n", "NODE line 1 has 0 numbers instead of 6"),
         ("NODE 0 0 0 0 0 nan\n1 2 3\n", "pose.*not finite"),
-        ("NODE 0 0 0 0 0 0\n1 2\n", "scan 0: expected 3 numbers per line, found 2"),
-        ("NODE 0 0 0 0 0 0\n1 2 3\n1 2\n", "scan 0: expected 3 numbers per line"),
-        ("NODE 0 0 0 0 0 0\nx y z\n", "scan 0: expected 3 numbers per line"),
+        ("NODE 0 0 0 0 0 0\n1 2\n", "scan 0, row 1 has 2 numbers instead of 3"),
+        ("NODE 0 0 0 0 0 0\n1 2 3\n1 2\n", "scan 0, row 2 has 2 numbers"),
+        ("NODE 0 0 0 0 0 0\nx y z\n", "scan 0, row 1: 'x' is not a number"),
     ],
 )
 def test_octomap_log_rejects_damaged_scans(tmp_path, text, message):

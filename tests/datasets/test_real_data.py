@@ -22,8 +22,6 @@ def real(name: str, relative: str, **options) -> Dataset:
     path = Path(root) / relative
     if not path.exists():
         pytest.skip(f"{path} does not exist")
-    if name in ("scan_folder", "pcd_viewpoint"):
-        pytest.importorskip("open3d", exc_type=ImportError)
     return load(name, path, **options)
 
 

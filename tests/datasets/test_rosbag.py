@@ -149,6 +149,7 @@ def test_a_message_received_before_its_sweep_could_end_has_the_stamp_of_the_end(
     with BagWriter(tmp_path / "a.mcap") as bag:
         drive(bag, speed=10.0)
         content = {"ranges": np.array([5, 5, 5], np.float32), "range_max": 9.0, "time_increment": 0.05}
+        content["angle_increment"] = 1e-9
         header = {"header": {"frame_id": "lidar"}}
         bag.message("/scan", "sensor_msgs/msg/LaserScan", 1.0, {**header, **content}, received)
     along = load("rosbag", tmp_path / "a.mcap")[0].points[:, 0]
@@ -163,29 +164,6 @@ def test_a_sweep_that_outlasts_the_poses_is_kept_and_counted(tmp_path):
     dataset = load("rosbag", tmp_path / "a.mcap")
     assert dataset[0].points.shape == (2, 3)
     assert dataset.skipped == {"points not deskewed: no poses during the sweep": 1}
-
-
-@pytest.mark.parametrize(
-    ("values", "expected"),
-    [
-        (np.array([0, 50_000_000], np.uint32), [0, 50]),  # ns after the stamp
-        (np.array([0, 50_000], np.uint32), [0, 50]),  # µs
-        (np.array([0.0, 0.05], np.float32), [0, 50]),  # s
-        (np.array([-0.05, 0.0], np.float32), [-50, 0]),  # before the stamp
-        (np.array([100.0, 100.05]), [0, 50]),  # absolute, in s
-        (np.array([100_000_000_000, 100_050_000_000], np.uint64), [0, 50]),  # absolute, in ns
-        (np.array([5000.0, 5000.05]), [0, 50]),  # a clock of its own
-        (np.array([0.05, np.nan]), None),
-        (np.array([7, 7], np.uint32), None),
-    ],
-)
-def test_times_of_points_are_understood_in_every_unit(values, expected):
-    from gmmtorch.datasets.recordings.ros.sensor_messages import point_offsets
-
-    found = point_offsets(values, 100_000_000_000)
-    assert (found is None) == (expected is None)
-    if expected is not None:
-        np.testing.assert_allclose(found / 1e6, expected, atol=1e-2)
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
@@ -210,21 +188,35 @@ def test_clouds_have_any_layout_of_fields(tmp_path, order, suffix):
 
 
 def test_clouds_of_one_height_are_2d_scans(tmp_path):
-    """Merged laser scans are such clouds. A later cloud that leaves the plane is left out and counted."""
+    """Merged laser scans are such clouds. A cloud that leaves the plane is left out and counted."""
     rng = np.random.default_rng(0)
     merged = np.column_stack([rng.uniform(1, 9, (30, 2)), np.full(30, 0.25)])
+    clouds = POINTS[:0], rng.normal(size=(30, 3)), merged, merged
     with BagWriter(tmp_path / "a.mcap") as bag:
         drive(bag)
-        for time, points in ((0.0, POINTS[:0]), (0.5, merged), (1.0, rng.normal(size=(30, 3)))):
-            bag.cloud("/points", time, "lidar", points)
+        for index, points in enumerate(clouds):
+            bag.cloud("/points", index / 2, "lidar", points)
     dataset = load("rosbag", tmp_path / "a.mcap")
-    assert [tuple(scan.points.shape) for scan in dataset] == [(0, 2), (30, 2), (0, 2)]
-    np.testing.assert_allclose(dataset[1].points.numpy(), merged[:, :2] + [0.5, 0], atol=1e-6)
+    assert [tuple(scan.points.shape) for scan in dataset] == [(0, 2), (0, 2), (30, 2), (30, 2)]
+    np.testing.assert_allclose(dataset[2].points.numpy(), merged[:, :2] + [1.0, 0], atol=1e-6)
     assert dataset.pose(1).shape == (3, 3)
     assert dataset.skipped == {
         "message without a valid point": 1,
         "points of several heights among planar scans": 1,
     }
+
+
+def test_one_planar_cloud_does_not_make_a_recording_2d(tmp_path):
+    """A lidar that starts may see one ring only."""
+    rng = np.random.default_rng(0)
+    ring = np.column_stack([rng.uniform(1, 9, (30, 2)), np.full(30, 0.25)])
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        drive(bag)
+        for index, points in enumerate([ring, *rng.normal(size=(2, 30, 3))]):
+            bag.cloud("/points", index / 2, "lidar", points)
+    dataset = load("rosbag", tmp_path / "a.mcap")
+    assert [tuple(scan.points.shape) for scan in dataset] == [(30, 3)] * 3
+    assert dataset.skipped == {}
 
 
 @FORMATS

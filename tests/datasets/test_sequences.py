@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from pathlib import Path
 
@@ -113,6 +114,22 @@ def test_tum_images_get_interpolated_poses(rgbd):
     points = [[15, 0, 1], [15, 0.02, 2], [15.005, 0.005, 0.5]]
     np.testing.assert_allclose(dataset[1].points.numpy(), points, atol=1e-6)
     assert load("tum", rgbd).intrinsics.diagonal().tolist() == [525, 525, 1]
+
+
+@pytest.mark.parametrize("name", ["depth.txt", "groundtruth.txt"])
+def test_tum_rows_out_of_order_are_sorted_and_said(rgbd, caplog, name):
+    expected = load("tum", rgbd)
+    rows = (rgbd / name).read_text().splitlines()
+    (rgbd / name).write_text("\n".join([*rows[2:], *rows[:2]]) + "\n")
+    with caplog.at_level(logging.WARNING):
+        dataset = load("tum", rgbd)
+    assert f"{name}: {2 - rows[0].startswith('#')} of" in caplog.text
+    assert "rows are out of order; they are sorted by time" in caplog.text
+    assert torch.equal(dataset.times, expected.times)
+    assert dataset.skipped == expected.skipped
+    for index in range(len(expected)):
+        assert torch.equal(dataset.pose(index), expected.pose(index))
+        assert torch.equal(dataset[index].points, expected[index].points)
 
 
 @pytest.mark.parametrize(

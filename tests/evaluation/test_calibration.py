@@ -9,18 +9,24 @@ import numpy as np
 import pytest
 import torch
 from sklearn.calibration import calibration_curve
-from sklearn.metrics import log_loss
+from sklearn.metrics import brier_score_loss, log_loss
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.calibration import (
-    N_BINS,
+    SeenPredictions,
     accuracy,
+    brier_score,
     log_loss_bits,
     prior_and_dead_band,
     reliability,
+    reliability_of,
     scores,
+    scores_of,
 )
+from gmmtorch.evaluation.queries import hit_and_free
+from gmmtorch.occupancy.calibration import N_BINS, Calibrator
 from gmmtorch.occupancy.evidence import occupancy_probability
+from gmmtorch.scan import Scan
 
 
 def drawn(n: int = 5000, seed: int = 0, bend: float = 1.0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -76,10 +82,73 @@ def test_log_loss_is_one_bit_at_one_half_and_52_for_a_certain_mistake():
     assert log_loss_bits(torch.tensor([1.0, 0.0]), labels) == pytest.approx(52)
 
 
-def test_scores_contain_ece_log_loss_and_accuracy():
+def test_brier_score_matches_scikit_learn():
+    theta, labels = drawn()
+    assert brier_score(theta, labels) == pytest.approx(brier_score_loss(labels, theta), rel=1e-9)
+    assert brier_score(torch.full((10,), 0.5), torch.arange(10) % 2) == 0.25
+
+
+def test_a_tally_of_predictions_has_the_scores_of_its_points():
+    theta, labels = drawn()
+    theta = (theta.round(decimals=3) + 1e-5).clamp(max=1)  # inside the bins
+    tally = Calibrator.of(10.0, 1)._tallied(theta, labels.double(), [len(theta)])[0]
+    found, expected = scores_of(tally), scores(theta, labels)
+    assert list(found) == list(expected)
+    for name, value in found.items():
+        assert value == pytest.approx(expected[name], rel=1e-9), name
+    for one, other in zip(reliability_of(tally), reliability(theta, labels), strict=True):
+        assert one == pytest.approx(other)
+
+
+@pytest.mark.parametrize("power", [0.4, 1.0, 3.0])
+def test_predictions_calibrate_a_map_that_has_no_calibration(power):
+    """The ends of beams have the density 2x/25 up to 5 m, so a point at x is an end with probability x/5. The
+    log-odds of the map are wrong by a factor, like those of rays that are counted as independent."""
+    seen, generator = SeenPredictions(0.1), torch.Generator().manual_seed(0)
+
+    def beams(n: int) -> torch.Tensor:
+        ends = torch.zeros(n, 2, dtype=torch.float64)
+        ends[:, 0] = 5 * torch.rand(n, generator=generator, dtype=torch.float64).sqrt()
+        return ends
+
+    def answer(points: torch.Tensor) -> torch.Tensor:
+        return torch.sigmoid(power * torch.logit(points[:, 0] / 5))
+
+    for number in range(60):
+        seen.note(answer, Scan(beams(200), torch.zeros(2, dtype=torch.float64)), number)
+    ends = beams(20_000)
+    asked = hit_and_free(torch.zeros_like(ends), ends, "uniform", 0.1, 3)
+    theta = seen.calibrated(answer(asked.points))
+    assert reliability(theta, asked.labels).expected_error < 0.02
+    assert float((theta - asked.points[:, 0] / 5).abs().mean()) < 0.02
+
+
+def test_predictions_keep_the_order_of_probabilities_and_one_half():
+    seen = SeenPredictions(0.2)
+    theta = torch.tensor([0.0, 0.1, 0.5, 0.9, 1.0])
+    assert torch.equal(seen.calibrated(theta), theta)  # nothing is seen yet
+    scan = Scan(torch.rand(50, 3, dtype=torch.float64) + 1, torch.zeros(3, dtype=torch.float64))
+    seen.note(lambda points: torch.full((len(points),), 0.8), scan, 0)
+    found = seen.calibrated(theta)
+    assert (found.diff() > 0).all()
+    assert float(found[2]) == 0.5
+
+
+def test_bins_of_a_tally_with_few_predictions_are_pooled():
+    tally = torch.zeros(15, 6, dtype=torch.float64)
+    tally[2, :3] = torch.tensor([12.0, 2.0, 3.0])
+    tally[5, :3] = torch.tensor([9.0, 3.5, 3.0])
+    tally[14, :3] = torch.tensor([4.0, 3.9, 4.0])
+    curve = reliability_of(tally)
+    assert curve.n_points.tolist() == [21, 4]
+    assert curve.predicted == pytest.approx([5.5 / 21, 3.9 / 4])
+    assert curve.observed == pytest.approx([6 / 21, 1])
+
+
+def test_scores_contain_ece_brier_log_loss_and_accuracy():
     theta, labels = drawn()
     found = scores(theta.float(), labels)
-    assert list(found) == ["ece", "log_loss_bits", "accuracy"]
+    assert list(found) == ["ece", "brier", "log_loss_bits", "accuracy"]
     assert found["ece"] == pytest.approx(reliability(theta, labels).expected_error, abs=1e-4)
     assert found["accuracy"] == accuracy(theta, labels)
     assert all(type(value) is float for value in found.values())
@@ -127,7 +196,7 @@ def test_accuracy_decided_is_none_if_nothing_is_decided():
         ([[0.5]], [[1]], "must be \\(M,\\)"),
     ],
 )
-@pytest.mark.parametrize("score", [reliability, log_loss_bits, accuracy])
+@pytest.mark.parametrize("score", [reliability, brier_score, log_loss_bits, accuracy])
 def test_invalid_probabilities_and_labels_raise(score, theta, labels, says):
     with pytest.raises(InvalidArgumentError, match=says):
         score(torch.tensor(theta), torch.tensor(labels))

@@ -11,14 +11,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.distance import cdist
-from sklearn.metrics import brier_score_loss, roc_auc_score
+from sklearn.metrics import roc_auc_score
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.metrics import (
     auc_gain,
     auc_interval,
-    brier,
     psnr2,
     psnr_terms,
     roc,
@@ -156,13 +155,6 @@ def test_auc_gain_of_equal_answers_is_exactly_zero():
 
 
 # -- the other scores -----------------------------------------------------------------------------
-
-
-def test_brier_is_the_mean_squared_error():
-    assert brier(torch.tensor([1.0, 0.5]), torch.tensor([0.0, 0.25])) == pytest.approx(0.3125 / 4)
-    occupied, free = scores(60, 1.0, 0), scores(40, -1.0, 1)
-    assert brier(occupied, free) == pytest.approx(brier_score_loss(*labelled(occupied, free)), abs=1e-12)
-    assert brier(torch.full((3,), 0.5), torch.full((7,), 0.5)) == 0.25
 
 
 def test_unknown_scores_match_a_hand_count():

@@ -196,7 +196,7 @@ def table(values: np.ndarray, *names: str) -> Table:
     return found
 
 
-def test_names_of_columns_are_stored_and_compared(monkeypatch):
+def test_names_of_columns_are_stored_and_compared(tmp_path, monkeypatch):
     def names_of(X: object) -> np.ndarray | None:
         return np.array(X.names, dtype=object) if isinstance(X, Table) else None
 
@@ -204,8 +204,15 @@ def test_names_of_columns_are_stored_and_compared(monkeypatch):
     x = cloud()
     mixture = GaussianMixture(2, random_state=0).fit(table(x, "east", "north", "up"))
     assert list(mixture.feature_names_in_) == ["east", "north", "up"]
-    with pytest.raises(ValueError, match="feature names"):
-        mixture.predict(table(x, "north", "east", "up"))
+    mixture.save(tmp_path / "m.safetensors")
+    for same in (mixture, GaussianMixture.load(tmp_path / "m.safetensors"), mixture.moved(np.eye(4))):
+        assert (
+            same.predict(table(x, "east", "north", "up")) == mixture.predict(table(x, "east", "north", "up"))
+        ).all()
+        with pytest.raises(ValueError, match="feature names"):
+            same.predict(table(x, "north", "east", "up"))
+    same.load_state_dict(mixture.state_dict())
+    assert not hasattr(same, "feature_names_in_")
     assert not hasattr(mixture.fit(torch.from_numpy(x)), "feature_names_in_")
 
 

@@ -119,6 +119,7 @@ def test_file_with_invalid_tensors_is_rejected(tmp_path, change):
         {"parameters": 7},
         {"parameters": "text"},
         {"arrays": None, "parameters": None},
+        *({"features": names} for names in (["x"], ["x", 2], [["x"], "y"], 7, "text", True)),
         *({name: MISSING} for name in ("lower_bounds", "converged", "arrays", "parameters")),
     ],
 )

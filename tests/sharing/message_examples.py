@@ -13,6 +13,7 @@ from mapping.random_components import random_components
 
 from gmmtorch.mapping.codec.quantization import spatial_order
 from gmmtorch.mapping.components import Components
+from gmmtorch.occupancy.calibration import Calibration, Calibrator
 from gmmtorch.sharing.messages.fields import pose_of
 from gmmtorch.sharing.messages.message_registry import (
     CODECS,
@@ -25,6 +26,7 @@ from gmmtorch.sharing.messages.message_registry import (
     quantized_poses,
 )
 from gmmtorch.sharing.messages.record_messages import (
+    CalibrationMessage,
     CorrectionMessage,
     FrameMessage,
     RecordMessage,
@@ -82,7 +84,7 @@ def span(robot: int, begin: int, end: int) -> Intervals:
 
 
 def records() -> list[RecordMessage]:
-    """One record of every kind except components."""
+    """One record of every kind except components and calibrations."""
     return [
         SupersessionMessage(first_key(2, 5), span(2, 0, 3) | span(2, 7, 8), span(2, 30, 32)),
         counters_message(first_key(1, 9), {1: 5.0, 2: 0.0, first_key(4) + 3: 800.0}),
@@ -92,7 +94,8 @@ def records() -> list[RecordMessage]:
 
 
 def examples() -> list[bytes]:
-    """A valid datagram of every kind, in the order of the kinds."""
+    """A valid datagram of every kind, in the order of the kinds, with kind 0 last."""
+    calibration = Calibrator.continued(Calibration.prior(12.0)._replace(n_predicted=900), 3).calibration
     components, counts = frame_of_components(9), {(0, 3): 5.0, (0, 4): 7.5, (2, 900): 0.0}
     ends = torch.arange(30, dtype=torch.float64).reshape(10, 3)
     made = [encode_components(components, codec) for codec in CODECS]
@@ -101,5 +104,6 @@ def examples() -> list[bytes]:
     made += [encode_plan(2, 5, 12.0, 0.2, views(11).poses, views(3).poses)]
     made += [encode_announcements(1, 2, span(0, 0, 70) | span(3, 5, 7) | span(3, 900, 901))]
     made += [[encode_record(record)] for record in records()]
+    made += [[encode_record(CalibrationMessage(first_key(2, 9) + 4, calibration))]]
     assert all(len(datagrams) == 1 for datagrams in made)
     return [datagrams[0] for datagrams in made]

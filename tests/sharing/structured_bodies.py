@@ -331,6 +331,19 @@ def _frame(rng: Random) -> bytes:
     return writer.to_bytes()
 
 
+def _calibration(rng: Random) -> bytes:
+    writer = BitWriter()
+    _key(writer, rng)
+    values = np.array([rng.gauss(0, 1) for _ in range(14)])
+    values[:2] = 2.0, 6.125
+    if rng.random() < 3 * _ODD:
+        values[rng.randrange(14)] = rng.choice(_REAL)
+    with np.errstate(over="ignore"):
+        data = values.astype("<f2").tobytes()
+    writer.fixed(np.frombuffer(data, np.uint8).astype(np.int64), 8)
+    return writer.to_bytes()
+
+
 def _motion(writer: BitWriter, rng: Random) -> None:
     dim = rng.choice([2, 3])
     writer.one(dim - 2, 1)
@@ -342,6 +355,7 @@ def _motion(writer: BitWriter, rng: Random) -> None:
 
 
 _BODIES: dict[Kind, Callable[[Random], bytes]] = {
+    Kind.CALIBRATION: _calibration,
     Kind.COMPONENTS: _batch,
     Kind.FLOAT_COMPONENTS: _float_components,
     Kind.THESIS_COMPONENTS: _thesis_components,

@@ -30,6 +30,7 @@ from gmmtorch.sharing.messages.component_messages import MOST_COMPONENTS_SENT
 from gmmtorch.sharing.messages.envelope import FARTHEST, Kind
 from gmmtorch.sharing.messages.message_registry import (
     AnnouncementMessage,
+    CalibrationMessage,
     ComponentsMessage,
     CorrectionMessage,
     CountersMessage,
@@ -59,8 +60,9 @@ def sound() -> list[bytes]:
 def test_every_kind_decodes_to_its_message(sound):
     kinds = [ComponentsMessage] * 3 + [CountsMessage] * 3 + [PointsMessage, ViewsMessage, PlanMessage]
     kinds += [AnnouncementMessage, SupersessionMessage, CountersMessage, CorrectionMessage, FrameMessage]
+    kinds.append(CalibrationMessage)
     assert [type(decode(datagram)) for datagram in sound] == kinds
-    assert [datagram[0] for datagram in sound] == [0x10 | kind for kind in [*range(1, 14), 15]]
+    assert [datagram[0] for datagram in sound] == [0x10 | kind for kind in [*range(1, 14), 15, 0]]
 
 
 def test_every_damage_of_a_datagram_is_detected(sound):

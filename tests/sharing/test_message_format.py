@@ -182,7 +182,9 @@ def test_a_points_message_equals_bytes_by_hand():
 
 def test_every_message_kind_has_a_name():
     """In the order of the kinds, so that a new kind needs a name here."""
-    names = ["components"] * 3 + ["counts"] * 3 + ["points", "views", "plans", "announcements"]
+    names = (
+        ["calibrations"] + ["components"] * 3 + ["counts"] * 3 + ["points", "views", "plans", "announcements"]
+    )
     names += ["supersessions", "counts", "corrections", "frames"]
     assert [kind_of(bytes([VERSION << 4 | kind])) for kind in sorted(Kind)] == names
-    assert [kind_of(datagram) for datagram in examples()] == names
+    assert [kind_of(datagram) for datagram in examples()] == [*names[1:], names[0]]

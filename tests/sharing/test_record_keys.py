@@ -14,6 +14,7 @@ from sharing.message_examples import examples
 from sharing.schedules import act
 
 from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.occupancy.calibration import Calibrator
 from gmmtorch.sharing.messages.count_messages import counts_of
 from gmmtorch.sharing.messages.message_registry import ComponentsMessage, decode, encode_components
 from gmmtorch.sharing.messages.record_messages import CountersMessage
@@ -147,6 +148,8 @@ def test_keys_in_datagrams_equal_the_decoded_keys():
     for _ in range(25):
         act(rng, replica)
         datagrams += replica.datagrams()
+    replica.calibrate(Calibrator.of(12.0, 3).calibration._replace(n_predicted=90))
+    datagrams += replica.datagrams()
     for dim in (2, 3):
         for k in (1, 2, 150):
             made = random_components(dim, k=k, robot=1023)

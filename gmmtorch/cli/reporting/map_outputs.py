@@ -18,6 +18,7 @@ from gmmtorch.cli.reporting import exported_files
 from gmmtorch.datasets import Dataset
 from gmmtorch.datasets.recordings.trajectory import read_trajectory
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError, MissingDataError, check_number
+from gmmtorch.evaluation.calibration import reliability_of, scores_of
 from gmmtorch.evaluation.events import Event, Row
 from gmmtorch.export import trajectory_files
 from gmmtorch.localization.odometry.odometry import Trajectory
@@ -26,12 +27,14 @@ from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.map_builder import MapBuilder
 from gmmtorch.optional_packages import load_pyoctomap
+from gmmtorch.report.maps.accuracy_figures import reliability_figure
 from gmmtorch.report.maps.map_figures import map_figure
 from gmmtorch.report.maps.map_images import MapPanel
 from gmmtorch.report.maps.map_regions import robust_bounds
 from gmmtorch.report.scenes.ellipsoids import first_viewpoints
 from gmmtorch.report.scenes.mixture_figures import mixture_figure
 from gmmtorch.report.scenes.scene import mixture_scene_figure
+from gmmtorch.report.style import metres
 from gmmtorch.report.table import byte_text
 from gmmtorch.report.tensorboard_writer import Board
 
@@ -220,6 +223,10 @@ def result_row(name: str, builder: MapBuilder, config: DictConfig, odometry: Row
         "scans_per_second": now.n_read / seconds,
         "metres_per_second": now.metres / seconds,
         "memory_bytes": max(row["memory_bytes"] for row in record.history),
+        "predictions": [
+            {"side": side, "n_predictions": round(float(tally[:, 0].sum())), **scores_of(tally)}
+            for side, tally in built.predictions.items()
+        ],
         "history": record.history,
         **({} if odometry is None else {"odometry": odometry}),
     }
@@ -274,12 +281,19 @@ def _shown(built: GaussianMap) -> Components:
 
 
 def _figures(built: GaussianMap, trajectories: Sequence[Tensor], row: Row) -> dict[str, Any]:
-    """The map from above, and its components: in 3D in space."""
+    """The map from above, its components, in 3D in space, and how reliable its predictions were."""
     surfaces = _shown(built)
     title = f"{row['dataset']}: {row['n_components']:,} components, {byte_text(row['nbytes'])}"
     title += f", {row['metres']:,.0f} m travelled" if row["metres"] >= _STANDING else ""
     panel = map_panel(built, trajectories)
     figures = {"above": map_figure([panel], trajectories, title=title)}
+    if built.predictions:
+        curves = {
+            f"cubes of {metres(side)}, {float(tally[:, 0].sum()):,.0f} predictions": reliability_of(tally)
+            for side, tally in built.predictions.items()
+        }
+        heading = f"{row['dataset']}: what each window showed, and what the map predicted"
+        figures["reliability"] = reliability_figure(curves, heading)
     shown = surfaces.means.cpu(), surfaces.covariances.cpu()
     if surfaces.dim == 3:
         seen_from = first_viewpoints(surfaces).cpu()

@@ -19,7 +19,8 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike
 from gmmtorch.datasets.base import is_beyond
-from gmmtorch.datasets.point_files.point_rows import ArrayRows, Rows, open_rows
+from gmmtorch.datasets.point_files.cloud_files import open_rows
+from gmmtorch.datasets.point_files.point_rows import ArrayRows, Rows
 from gmmtorch.errors import InvalidArgumentError, check_whole
 
 CHUNK_POINTS = 1 << 17

@@ -7,7 +7,7 @@ contains less than its header announces, a `DataError` names the file.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
@@ -16,15 +16,10 @@ import numpy as np
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor, check_unmasked
-from gmmtorch.datasets.point_files.cloud_files import (
-    AXES,
-    Layout,
-    check_length,
-    read_cloud,
-    read_header,
-)
+from gmmtorch.datasets.number_rows import number_rows
+from gmmtorch.datasets.point_files.headers import AXES, check_size
 from gmmtorch.datasets.point_files.las_header import read_las_header
-from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError
+from gmmtorch.errors import DataError, GmmTorchError
 from gmmtorch.optional_packages import needs_extra
 
 _LAS_BLOCK_BYTES = 1 << 25
@@ -76,6 +71,8 @@ class NpyRows:
             ) from error
         if not isinstance(mapped, np.ndarray):
             raise DataError(f"{self._path} is a zip archive, not one array; write the array with numpy.save.")
+        if isinstance(mapped, np.memmap):  # an empty array is none
+            check_size(self._path, mapped.offset + mapped.nbytes, f"an array {mapped.shape}")
         return mapped
 
     def blocks(self, begin: int, end: int, size: int) -> Iterator[np.ndarray]:
@@ -137,27 +134,18 @@ def _las_errors(path: Path) -> Iterator[None]:
 
 
 class RecordRows:
-    """The points of a binary PCD or PLY file, mapped into memory."""
+    """The points of a binary file, mapped into memory: records with the fields x, y and z from a byte on."""
 
     dim = 3
 
-    def __init__(self, path: Path, n_points: int, layout: Layout) -> None:
-        self._path = path
+    def __init__(self, path: Path, n_points: int, start: int, record: np.dtype) -> None:
+        self._path, self._start, self._record = path, start, record
         self.name, self.n_rows = path.stem, n_points
-        self._skip = layout.skip
-        self._record = np.dtype(
-            {
-                "names": list(AXES),
-                "formats": [code for code, _ in layout.axes],
-                "offsets": [offset for _, offset in layout.axes],
-                "itemsize": layout.width,
-            }
-        )
 
     def blocks(self, begin: int, end: int, size: int) -> Iterator[np.ndarray]:
         for first in range(begin, end, size):
             n = min(size, end - first)
-            offset = self._skip + first * self._record.itemsize
+            offset = self._start + first * self._record.itemsize
             records = np.memmap(self._path, self._record, "r", offset, (n,))
             with np.errstate(invalid="ignore"):  # a signalling NaN of a damaged file
                 block = np.stack([records[axis].astype(np.float64) for axis in AXES], 1)
@@ -165,73 +153,47 @@ class RecordRows:
 
 
 class TextRows:
-    """The points of an ascii PCD or PLY file, one per line; all lines before the first row are read too."""
+    """The points of a text file, one in each line that is not blank; earlier lines are read, too.
+
+    Args:
+        n_lines: lines of the header.
+        width: numbers in the line of a point.
+        columns: those of x, y and z.
+        n_before, n_after: lines that are not blank, before and after the points.
+    """
 
     dim = 3
 
-    def __init__(self, path: Path, n_points: int, layout: Layout) -> None:
-        self._path, self._layout = path, layout
+    def __init__(
+        self,
+        path: Path,
+        n_points: int,
+        n_lines: int,
+        width: int,
+        columns: list[int],
+        n_before: int = 0,
+        n_after: int = 0,
+    ) -> None:
+        self._path, self._n_lines, self._width, self._columns = path, n_lines, width, columns
+        self._n_before, self._n_after = n_before, n_after
         self.name, self.n_rows = path.stem, n_points
 
     def blocks(self, begin: int, end: int, size: int) -> Iterator[np.ndarray]:
-        if begin >= end:
-            return
         with self._path.open(encoding="ascii", errors="replace") as file:
-            data = (line for line in itertools.islice(file, self._layout.skip, None) if line.strip())
-            lines = itertools.islice(data, begin, None)
+            data = filter(str.strip, itertools.islice(file, self._n_lines, None))
+            lines = itertools.islice(data, self._n_before + begin, None)
             for first in range(begin, end, size):
                 wanted = min(size, end - first)
                 taken = list(itertools.islice(lines, wanted))
                 _check_count(self._path, first, len(taken), wanted, self.n_rows)
-                yield self._numbers(taken, first)
-
-    def _numbers(self, lines: list[str], first: int) -> np.ndarray:
-        try:
-            # All columns are read, so that a truncated line is detected whichever column it lacks.
-            table = np.loadtxt(lines, dtype=np.float64, ndmin=2, comments=None)
-        except ValueError as error:
-            raise DataError(f"{self._path}, from point {first} on: {error}; it is damaged.") from error
-        if table.shape[1] != self._layout.width:
-            raise DataError(
-                f"{self._path}: point {first} has {table.shape[1]} numbers; its header announces "
-                f"{self._layout.width}. Write it again."
-            )
-        return table[:, self._layout.axes]
-
-
-def open_rows(path: str | Path) -> Rows:
-    """A reader of the points of a .npy, .las, .laz, .pcd or .ply file.
-
-    Raises `MissingDataError` if the file does not exist, `InvalidArgumentError` for another suffix, and
-    `DataError` for a damaged file.
-    """
-    path = Path(path).expanduser()
-    readers: dict[str, Callable[[Path], Rows]] = {
-        ".npy": NpyRows,
-        ".las": LasRows,
-        ".laz": LasRows,
-        ".pcd": _cloud_rows,
-        ".ply": _cloud_rows,
-    }
-    reader = readers.get(path.suffix.lower())
-    if reader is None:
-        raise InvalidArgumentError(
-            f"points={path} has an unknown suffix {path.suffix!r}; known are {', '.join(readers)}."
-        )
-    if not path.is_file():
-        what = "is not a file" if path.exists() else "does not exist"
-        raise MissingDataError(f"points={path} {what}; give a file of points ({', '.join(readers)}).")
-    return reader(path)
-
-
-def _cloud_rows(path: Path) -> Rows:
-    header = read_header(path)
-    if header.layout is None:
-        return ArrayRows(read_cloud(path), path.stem)
-    if header.is_text:
-        return TextRows(path, header.n_points, header.layout)
-    check_length(path, header)
-    return RecordRows(path, header.n_points, header.layout)
+                # All columns are read, so that a truncated line is detected whichever column it lacks.
+                table = number_rows(taken, self._width, f"{self._path}, row", first + 1)
+                yield table[:, self._columns]
+            if end == self.n_rows and (n_after := sum(1 for _ in lines)) != self._n_after:
+                raise DataError(
+                    f"{self._path} has {n_after:,} lines after its {self.n_rows:,} points instead of "
+                    f"{self._n_after:,}; it is truncated or damaged. Write or fetch it again."
+                )
 
 
 def _table_shape(array: np.ndarray, name: str) -> tuple[int, int]:

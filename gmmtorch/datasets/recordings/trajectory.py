@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -11,11 +12,13 @@ import numpy as np
 import torch
 
 from gmmtorch.datasets.base import check_pose
+from gmmtorch.datasets.number_rows import number_rows
 from gmmtorch.errors import DataError, MissingDataError
 
 NANOSECONDS = 1_000_000_000
 MIN_NORM = 1e-6
 """A quaternion with a smaller norm states no rotation."""
+_log = logging.getLogger(__name__)
 
 
 class Poses(NamedTuple):
@@ -129,7 +132,8 @@ def pose_matrix(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
 def read_trajectory(path: str | Path, n_scans: int | None = None) -> Trajectory:
     """A trajectory file: TUM rows (time x y z qx qy qz qw), or KITTI rows (12 numbers, no time).
 
-    n_scans: wanted number of poses without times, one for each scan; None: any. Raises `MissingDataError`
+    TUM rows out of order are sorted, with a warning. n_scans: wanted number of poses without times, one for
+    each scan; None: any. Raises `MissingDataError`
     and `DataError`, which names the row.
     """
     path = Path(path).expanduser()
@@ -153,15 +157,11 @@ def read_trajectory(path: str | Path, n_scans: int | None = None) -> Trajectory:
 
 def read_rows(path: Path) -> np.ndarray:
     """The numbers of a text file, one row a line; # begins a comment. Raises `DataError`."""
-    lines = [
-        line for line in path.read_text("utf-8", errors="replace").splitlines() if line.split("#")[0].strip()
-    ]
+    text = path.read_text("utf-8", errors="replace")
+    lines = [line for line in (line.split("#")[0] for line in text.splitlines()) if line.strip()]
     if not lines:
         raise DataError(f"{path} contains no row of numbers.")
-    try:
-        return np.loadtxt(lines, dtype=np.float64, ndmin=2)
-    except ValueError as error:
-        raise DataError(f"{path} is not a table of numbers: {error}") from error
+    return number_rows(lines, None, f"{path}, row")
 
 
 def kitti_matrices(path: Path, rows: np.ndarray) -> np.ndarray:
@@ -180,7 +180,20 @@ def _tum(path: Path, rows: np.ndarray) -> Trajectory:
         matrices = pose_matrix(rows[:, 1:4], rows[:, 4:])
     except ValueError as error:
         raise DataError(f"{path}: a row is not a pose; a TUM row is: time x y z qx qy qz qw.") from error
-    return Trajectory.from_samples(to_nanoseconds(rows[:, 0]), matrices)
+    times = to_nanoseconds(rows[:, 0])
+    order = order_of_rows(path, times)
+    return Trajectory.from_samples(times[order], matrices[order])
+
+
+def order_of_rows(path: Path, times: np.ndarray) -> np.ndarray:
+    """The order (N,) of the rows of a file by their times (N,). A warning states how many rows it moves."""
+    order = np.argsort(times, kind="stable")
+    n_moved = len(times) - len(increasing(times))
+    if n_moved:
+        _log.warning(
+            "%s: %d of %d rows are out of order; they are sorted by time.", path, n_moved, len(times)
+        )
+    return order
 
 
 def to_nanoseconds(seconds: np.ndarray) -> np.ndarray:

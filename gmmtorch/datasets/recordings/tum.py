@@ -14,7 +14,12 @@ from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset, Ranges, require_path
 from gmmtorch.datasets.depth_frames import read_png
-from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, increasing, read_trajectory, to_nanoseconds
+from gmmtorch.datasets.recordings.trajectory import (
+    NANOSECONDS,
+    order_of_rows,
+    read_trajectory,
+    to_nanoseconds,
+)
 from gmmtorch.errors import DataError, check_number, check_whole
 from gmmtorch.pinhole import back_project, pinhole_matrix
 from gmmtorch.scan import Scan
@@ -24,7 +29,7 @@ _INTRINSICS = (525.0, 525.0, 319.5, 239.5)
 
 
 class TumRgbd(Dataset):
-    """Depth images as scans, in the order of depth.txt, with poses interpolated at their times.
+    """Depth images as scans, in the order of their times, with poses interpolated at their times.
 
     Images without a pose are left out and counted. `intrinsics` is the pinhole matrix (3, 3) in pixels;
     `image` returns the full depth image of a scan.
@@ -64,25 +69,22 @@ class TumRgbd(Dataset):
         self._scale = depth_scale
         self.intrinsics = pinhole_matrix(_INTRINSICS if intrinsics is None else intrinsics)
         times, files = _listed(path / "depth.txt")
-        kept = increasing(times)
-        self._skip("stamp out of order (the clock jumped)", *({*range(len(times))} - {*kept.tolist()}))
         trajectory = read_trajectory(poses or path / "groundtruth.txt")
         if not trajectory.has_times:
             raise DataError(
                 f"{poses or path / 'groundtruth.txt'} has poses without times; give a TUM trajectory."
             )
-        found = trajectory.at(times[kept], max_gap)
-        self._skip("no pose at the time of the scan", *kept[~found.known].tolist())
+        found = trajectory.at(times, max_gap)
+        self._skip("no pose at the time of the scan", *np.flatnonzero(~found.known).tolist())
         if not found.known.any():
             raise DataError(
                 f"{path}: no depth image has a pose. Images are from {times[0] / NANOSECONDS:.3f} to "
                 f"{times[-1] / NANOSECONDS:.3f} s, poses from {trajectory.times[0] / NANOSECONDS:.3f} to "
                 f"{trajectory.times[-1] / NANOSECONDS:.3f} s."
             )
-        kept = kept[found.known]
-        self._files = [files[index] for index in kept]
+        self._files = [files[index] for index in np.flatnonzero(found.known)]
         self._poses = torch.from_numpy(found.matrices[found.known])
-        self._times = torch.from_numpy(times[kept] / NANOSECONDS)
+        self._times = torch.from_numpy(times[found.known] / NANOSECONDS)
 
     def _count(self) -> int:
         return len(self._files)
@@ -102,7 +104,7 @@ class TumRgbd(Dataset):
 
 
 def _listed(path: Path) -> tuple[np.ndarray, list[Path]]:
-    """Times (ns) and files of a list of images. Files must be inside the folder of the list."""
+    """Times (ns), increasing, and files of a list of images. Files must be inside the folder of the list."""
     if not path.is_file():
         raise DataError(f"{path} is missing; it lists a time and a file for each depth image.")
     times, files = [], []
@@ -120,4 +122,6 @@ def _listed(path: Path) -> tuple[np.ndarray, list[Path]]:
         files.append(path.parent / name)
     if not files:
         raise DataError(f"{path} lists no image.")
-    return to_nanoseconds(np.array(times)), files
+    stamps = to_nanoseconds(np.array(times))
+    order = order_of_rows(path, stamps)
+    return stamps[order], [files[index] for index in order]

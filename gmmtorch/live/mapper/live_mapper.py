@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict
 
 import torch
 
@@ -102,9 +101,7 @@ class LiveMapper:
     def snapshot(self, codec: str = "float") -> GaussianMap:
         """A copy of the map that does not grow; of the team's map, if it is shared."""
         built = self.builder.map
-        options = {**asdict(built.query_options), "resolution": built.resolution, "method": built.method}
-        components = built.components() if self.shared is None else self.shared.components()
-        return GaussianMap.of(components, codec=codec, **options)
+        return built.snapshot(codec=codec) if self.shared is None else self.shared.map(built, codec)
 
     def _insert(self) -> bool:
         self._correct()

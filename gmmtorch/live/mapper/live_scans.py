@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from array import array
 from collections import Counter, deque
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -13,8 +16,10 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset, Ranges
+from gmmtorch.datasets.recordings.ros.bag_poses import Record
 from gmmtorch.datasets.recordings.ros.bag_topics import Sensor
 from gmmtorch.datasets.recordings.ros.depth_camera import DepthCamera
+from gmmtorch.datasets.recordings.ros.point_times import Rate
 from gmmtorch.datasets.recordings.ros.pose_sources import PoseSource, Standing, TfPoses
 from gmmtorch.datasets.recordings.ros.scan_conversion import ScanConversion
 from gmmtorch.datasets.recordings.ros.sensor_messages import Reading
@@ -33,7 +38,7 @@ SETTLING = 0.5  # s without a new frame above the sensor's, after which the root
 _PATIENCE = 10.0  # s that a scan waits for its pose if there is no limit of the latency
 _WAITING_BYTES = 1 << 28
 _BACKWARDS = 30 * NANOSECONDS  # a clock that is set back further starts again
-_DELAYS = 1001  # first messages, whose median delay counts
+_N_FIRST = 101  # messages whose stamps and receipt show how the sensor keeps time
 
 
 @dataclass(frozen=True)
@@ -121,7 +126,7 @@ class LiveScans(Dataset):
         self._waiting: deque[_Waiting] = deque()
         self._waiting_bytes = 0
         self._counts: Counter[str] = Counter()
-        self._delays: list[int] = []
+        self._first_records: list[Record] = []
         self._conversion: ScanConversion | None = None
         self._candidate: tuple[list[str], float] = ([], 0.0)
         self._odometry = odometry_of(options.poses) if options.poses in METHODS else None
@@ -148,9 +153,9 @@ class LiveScans(Dataset):
         header = message["header"]
         since = time.monotonic() if since is None else since
         stamp = stamp_of(header) if self._options.clock == "header" else received
-        if len(self._delays) < _DELAYS:
-            self._delays.append(received - stamp)
         frame = frame_name(self._options.sensor_frame or header["frame_id"])
+        if len(self._first_records) < _N_FIRST:
+            self._first_records.append(Record(len(self._first_records), received, stamp, frame))
         self._waiting.append(_Waiting(message, stamp, frame, since))
         self._waiting_bytes += _size(message)
         while self._waiting_bytes > _WAITING_BYTES:
@@ -230,10 +235,11 @@ class LiveScans(Dataset):
         """The last time (ns) at which a pose is needed."""
         assert self._conversion is not None
         try:
-            found = self._conversion.points(item.message, item.stamp)
+            found = self._conversion.points(item.message)
         except (DataError, ValueError, KeyError, OverflowError):
             return item.stamp
-        return self._conversion.times(found, item.stamp, self._delay)[1]
+        self._conversion.learn_times(found, item.stamp, Rate.of(self._first_records, self._options.clock))
+        return self._conversion.times(found, item.stamp)[1]
 
     def _settled(self, frame: str) -> PoseSource | None:
         """The source of poses once the fixed frame is clear."""
@@ -264,10 +270,6 @@ class LiveScans(Dataset):
             return "map"
         return self._options.frame or self._candidate[0][-1]
 
-    @property
-    def _delay(self) -> float | None:
-        return None if self._options.clock == "received" else float(np.median(self._delays))
-
     # -- scans ----------------------------------------------------------------------------------------
 
     def _convert(self, item: _Waiting) -> bool:
@@ -281,7 +283,7 @@ class LiveScans(Dataset):
             if not poses.known[0] or (np.abs(poses.matrices[0, :3, 3]) > FARTHEST).any():
                 self._note("no pose at the time of the scan")
                 return False
-            found = conversion.points(item.message, item.stamp)
+            found = conversion.points(item.message)
         except (DataError, ValueError, KeyError, OverflowError) as error:
             self.trouble = _of_live(error)
             self._note("message that cannot be decoded")
@@ -303,11 +305,11 @@ class LiveScans(Dataset):
             if not len(found.points):
                 self._note("message without a valid point")
                 return False
-            self._is_flat = conversion.is_flat(matrix[None], found)
+            self._is_flat = conversion.is_flat(matrix[None], [found, *self._readings_ahead()])
         if self._is_flat and not conversion.is_level(matrix[None]):
             self._note("tilted sensor among planar scans")
             return False
-        scan = conversion.scan(found, item.stamp, item.frame, matrix, self._is_flat, self._delay, self._note)
+        scan = conversion.scan(found, item.stamp, item.frame, matrix, self._is_flat, self._note)
         if scan.n_beams == 0:
             return False
         location = None
@@ -322,6 +324,13 @@ class LiveScans(Dataset):
         self._stamps.append(item.stamp / NANOSECONDS)
         self._posed.append(self._n_added - 1)
         return True
+
+    def _readings_ahead(self) -> Iterator[Reading]:
+        """The points of the next messages that wait."""
+        assert self._conversion is not None
+        for item in itertools.islice(self._waiting, self._conversion.n_samples):
+            with suppress(DataError, ValueError, KeyError, OverflowError):
+                yield self._conversion.points(item.message)
 
     def _located(self, scan: Scan, stamp: int) -> Location:
         """Where odometry finds a scan, which is in the frame of its sensor, in the fixed frame."""

@@ -34,9 +34,9 @@ def predicted(
 ) -> Calibrator | None:
     """What is known about the calibration after a map has predicted the beams of a window.
 
-    Of each chosen beam, its end is occupied and a point drawn uniformly from the rest is free. Points with
-    less evidence than half of the others are left out: they lie where the map has only begun, and later it
-    is asked mostly about places that it knows well.
+    Of each chosen beam, its end is occupied and a point drawn uniformly from the rest is free. Points without
+    evidence are left out, and those with less than half of the others: they lie where the map has only begun,
+    and later it is asked mostly about places that it knows well.
 
     Args:
         known: the components before the window.
@@ -60,7 +60,7 @@ def predicted(
     evidence, n_pairs = few_points(known, points, SIDES)
     for side, (hits, misses) in zip(SIDES, evidence, strict=True):
         seen = hits * (calibrator.length / side) + misses
-        kept = seen >= seen.median()
+        kept = (seen >= seen.median()) & (seen > 0)
         predictions.append(Prediction(hits[kept], misses[kept], occupied[kept], side))
     due = number + _windows_between(n_pairs, sum(map(_size, window)))
     return replace(calibrator.updated(predictions, known.dim), next_window=due)

@@ -133,6 +133,7 @@ def fit_stream(
                 writer = CheckpointWriter(checkpoint, facts, first.center)
             result = _exact(run, e_step, survey.n_points, done, writer)
     mixture._tensors, mixture.n_features_in_ = True, source.dim
+    mixture.__dict__.pop("feature_names_in_", None)
     seen = {"n_samples_seen": run.center.new_tensor(survey.n_points)}
     mixture._store_fit(result.parameters, run.center, result.lower_bounds, result.converged, seen)
     if processes.rank == 0:

@@ -28,6 +28,7 @@ _CHECKSUM_BYTES = 4
 class Kind(IntEnum):
     """The low half of a datagram's first byte; the high half is the version. 14 is retired."""
 
+    CALIBRATION = 0
     COMPONENTS = 1
     FLOAT_COMPONENTS = 2
     THESIS_COMPONENTS = 3

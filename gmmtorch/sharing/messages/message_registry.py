@@ -22,6 +22,7 @@ from gmmtorch.sharing.messages.envelope import CODECS, MAX_BYTES, Kind, parse_da
 from gmmtorch.sharing.messages.point_messages import PointsMessage, encode_points
 from gmmtorch.sharing.messages.record_messages import (
     AnnouncementMessage,
+    CalibrationMessage,
     CorrectionMessage,
     CountersMessage,
     FrameMessage,
@@ -39,6 +40,7 @@ __all__ = [
     "CODECS",
     "MAX_BYTES",
     "AnnouncementMessage",
+    "CalibrationMessage",
     "ComponentsMessage",
     "CorrectionMessage",
     "CountersMessage",
@@ -70,6 +72,7 @@ Message = (
     | CountersMessage
     | CorrectionMessage
     | FrameMessage
+    | CalibrationMessage
 )
 
 _KINDS: dict[Kind, tuple[str, Callable[[bytes], Message]]] = {
@@ -87,6 +90,7 @@ _KINDS: dict[Kind, tuple[str, Callable[[bytes], Message]]] = {
     Kind.COUNTERS: ("counts", record_messages.read_counters),
     Kind.CORRECTION: ("corrections", record_messages.read_correction),
     Kind.FRAME: ("frames", record_messages.read_frame),
+    Kind.CALIBRATION: ("calibrations", record_messages.read_calibration),
 }
 """Name of the contents for statistics, and reader of the body."""
 

@@ -1,4 +1,4 @@
-"""Datagrams of records other than components: supersessions, counters, corrections, frames; and
+"""Datagrams of records other than components: supersessions, counters, corrections, frames, calibrations; and
 announcements.
 
 docs/messages.md describes the formats.
@@ -16,6 +16,7 @@ from torch import Tensor
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter
 from gmmtorch.mapping.codec.quantization import LARGEST_COUNT, NO_COUNT, count_steps
+from gmmtorch.occupancy.calibration import N_BYTES, Calibration
 from gmmtorch.sharing.messages.count_messages import counts_of
 from gmmtorch.sharing.messages.envelope import FARTHEST, MAX_BYTES, Kind, make_datagram, split
 from gmmtorch.sharing.messages.fields import (
@@ -128,7 +129,16 @@ class FrameMessage:
         return None if self.pose is None else motion_dim(self.pose)
 
 
-RecordMessage = SupersessionMessage | CountersMessage | CorrectionMessage | FrameMessage
+@dataclass(frozen=True, eq=False)
+class CalibrationMessage:
+    """Record `key`: how probabilities follow from the evidence of its robot's map. Of two records of a robot
+    the one with more predictions counts, then the one with the higher key."""
+
+    key: int
+    calibration: Calibration
+
+
+RecordMessage = SupersessionMessage | CountersMessage | CorrectionMessage | FrameMessage | CalibrationMessage
 _Record = TypeVar("_Record", bound=RecordMessage)
 
 
@@ -150,6 +160,9 @@ def encode_record(record: RecordMessage) -> bytes:
         write_keys(writer, record.components[order])
         writer.column(record.steps[order])
         return make_datagram(Kind.COUNTERS, writer.to_bytes())
+    if isinstance(record, CalibrationMessage):
+        writer.fixed(np.frombuffer(record.calibration.to_bytes(), np.uint8).astype(np.int64), 8)
+        return make_datagram(Kind.CALIBRATION, writer.to_bytes())
     if isinstance(record, FrameMessage):
         for value in (record.frame & LARGEST_INCARNATION, record.version, record.anchor + 1):
             write_number(writer, "version", value)
@@ -202,6 +215,14 @@ def read_frame(body: bytes) -> FrameMessage:
     return _checked(FrameMessage(key, frame, version, anchor - 1, pose))
 
 
+def read_calibration(body: bytes) -> CalibrationMessage:
+    reader = BitReader(body)
+    key, _ = _read_key(reader)
+    data = bytes(reader.fixed(N_BYTES, 8).tolist())
+    reader.finish()
+    return _checked(CalibrationMessage(key, Calibration.of_bytes(data)))
+
+
 def _read_key(reader: BitReader) -> tuple[int, Intervals]:
     """A record's key, and all keys of its robot."""
     key = reader.number()
@@ -237,6 +258,8 @@ def _checked(record: _Record) -> _Record:
             raise InvalidArgumentError(f"Record {key} counts from {steps.min()} to {steps.max()} steps.")
     elif isinstance(record, FrameMessage):
         _check_frame(record)
+    elif isinstance(record, CalibrationMessage):
+        _check_calibration(record)
     elif not (is_motion(record.pose) and mine.covers(record.moved)):
         raise InvalidArgumentError(
             f"Record {key} corrects {record.moved!r} by {record.pose.tolist()}: it must move components "
@@ -259,6 +282,19 @@ def _check_frame(record: FrameMessage) -> None:
         raise InvalidArgumentError(
             f"Record {key} has the pose {pose.tolist()}: it must be up to {FARTHEST:g} m from the origin on "
             "each axis, with a rotation of unit length."
+        )
+
+
+def _check_calibration(record: CalibrationMessage) -> None:
+    """Raise `InvalidArgumentError` unless the calibration is the same after encoding."""
+    try:
+        is_same = Calibration.of_bytes(record.calibration.to_bytes()) == record.calibration
+    except (DataError, ValueError, OverflowError):
+        is_same = False
+    if not is_same:
+        raise InvalidArgumentError(
+            f"Record {record.key} has the calibration {record.calibration}: its numbers must be in range, "
+            "and rounded as those of `Calibrator.calibration`."
         )
 
 

@@ -13,12 +13,14 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.codec.quantization import NO_COUNT, order_of, quantize, quantized
 from gmmtorch.mapping.components import Components
+from gmmtorch.occupancy.calibration import Calibration
 from gmmtorch.sharing.messages.component_messages import fitted
 from gmmtorch.sharing.messages.envelope import split
 from gmmtorch.sharing.messages.fields import pose_of
 from gmmtorch.sharing.messages.message_registry import decode
 from gmmtorch.sharing.messages.record_messages import (
     RECORD_BYTES,
+    CalibrationMessage,
     CorrectionMessage,
     CountersMessage,
     FrameMessage,
@@ -50,6 +52,8 @@ _MOST_OUTDATED = 64
 _MOST_SHORT = 16
 """Records of counters shorter than half of `RECORD_BYTES` before they are merged."""
 _MOST_POINTS = 2.0**40
+_MORE_PREDICTIONS = 1.5
+"""Growth of the number of predictions after which a calibration is written again."""
 
 
 class Published(NamedTuple):
@@ -232,6 +236,16 @@ class Author:
         written = self._write(FrameMessage(self._first + self._n, frame, version, anchor, pose))
         old = Intervals.of(np.array([r.key for r in before], np.int64))
         return written | self._supersede(old, written)
+
+    def calibrate(self, calibration: Calibration) -> Intervals:
+        """Write the calibration of this robot's map, if it rests on many more predictions than the one that
+        was written before; returns the new records."""
+        before = [r for r in self._records.of(CalibrationMessage) if r.key in self._keys_of_robot]
+        known = max((r.calibration.n_predicted for r in before), default=0)
+        if calibration.n_predicted <= _MORE_PREDICTIONS * known:
+            return Intervals.empty()
+        written = self._write(CalibrationMessage(self._first + self._n, calibration))
+        return written | self._supersede(Intervals.of(np.array([r.key for r in before], np.int64)), written)
 
     def _write_counters(self, points: Mapping[int, float]) -> Intervals:
         keys = sorted(points)

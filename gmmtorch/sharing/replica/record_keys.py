@@ -198,7 +198,16 @@ END = 1 << (ROBOT_BITS + SEQUENCE_BITS)
 WORLD = -1
 """The frame of records of authors that have no frame of their own; other frames have the number of their
 author."""
-RECORD_KINDS = frozenset({Kind.COMPONENTS, Kind.SUPERSESSION, Kind.COUNTERS, Kind.CORRECTION, Kind.FRAME})
+RECORD_KINDS = frozenset(
+    {
+        Kind.COMPONENTS,
+        Kind.SUPERSESSION,
+        Kind.COUNTERS,
+        Kind.CORRECTION,
+        Kind.FRAME,
+        Kind.CALIBRATION,
+    }
+)
 """Kinds of datagrams that contain records."""
 
 

@@ -154,7 +154,7 @@ class Records:
             self._log.counted(record.components)
         elif isinstance(record, CorrectionMessage):
             self._moved(record)
-        else:
+        elif isinstance(record, FrameMessage):
             self._place_frames()
         self._hold(held)
         return span

@@ -14,11 +14,13 @@ from torch import Tensor
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.occupancy.calibration import Calibration
 from gmmtorch.scan import ArrayLike
 from gmmtorch.sharing.messages.envelope import MAX_BYTES
 from gmmtorch.sharing.messages.message_registry import ComponentsMessage, Message, decode
 from gmmtorch.sharing.messages.record_messages import (
     AnnouncementMessage,
+    CalibrationMessage,
     CorrectionMessage,
     FrameMessage,
     RecordMessage,
@@ -120,6 +122,8 @@ class Replica:
                     f"The map has components of robots {robots}, this is robot={self.robot}: make the map "
                     f"with robot={self.robot}, or give components."
                 )
+            if new.query_options.calibration is not None:
+                self.calibrate(new.query_options.calibration)
             return self.publish(components, whole=False)
         old = Intervals.empty() if supersedes is None else Intervals.of(_keys("supersedes", supersedes))
         return self._due(self._author.publish(self._checked(new), old, self._max_bytes))
@@ -161,6 +165,11 @@ class Replica:
                 f"transform has shape {tuple(matrix.shape)}; the map is {self._records.dim}-dimensional."
             )
         self._backlog.add(self._author.correct(scan, matrix, Intervals.of(_keys("ids", ids))))
+
+    def calibrate(self, calibration: Calibration) -> None:
+        """Say how probabilities follow from the evidence of this robot's map, if it has learned much since it
+        said so last."""
+        self._backlog.add(self._author.calibrate(calibration))
 
     def join(self, frame: int, transform: ArrayLike) -> None:
         """Place the frame of this robot in another frame; its components, also later ones, move with it.
@@ -354,8 +363,21 @@ class Replica:
         """
         return self._records.changes()
 
+    @property
+    def calibration(self) -> Calibration | None:
+        """How probabilities follow from the evidence of the team: of each robot's calibration that rests on
+        the most predictions, the mean. None if no robot has written one."""
+        best: dict[int, CalibrationMessage] = {}
+        for record in self._records.of(CalibrationMessage):  # by key
+            known = best.get(robot_of(record.key))
+            if known is None or record.calibration.n_predicted >= known.calibration.n_predicted:
+                best[robot_of(record.key)] = record
+        return Calibration.merged([record.calibration for record in best.values()]) if best else None
+
     def map(self, **options: Any) -> GaussianMap:
-        """The components as a new map; `options` as for `GaussianMap`."""
+        """The components as a new map, with the calibration of the team; `options` as for `GaussianMap`."""
+        if options.get("prior") is None:
+            options.setdefault("calibration", self.calibration)
         if not len(self._records.table):
             return GaussianMap(robot=self.robot, **options)
         return GaussianMap.of(self.components(), robot=self.robot, **options)

@@ -113,10 +113,40 @@ def test_live_scans_equal_those_of_the_recording_to_the_bit(tmp_path, clock, kin
     assert scans.world_frame == "odom"
 
 
+@pytest.mark.parametrize("form", ["s after the stamp", "s of another clock", "shares of the sweep"])
+def test_points_with_wrong_times_are_dropped_and_counted_as_in_the_recording(tmp_path, clock, form):
+    rng = np.random.default_rng(0)
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        for tick in range(61):
+            bag.transforms(tick / 20, {("odom", "sensor"): pose(tick / 20, tick / 40)})
+            if 0 < tick < 58 and tick % 2:
+                table = np.zeros(200, [*((axis, "<f4") for axis in "xyz"), ("time", "<f8")])
+                table["x"], table["y"], table["z"] = rng.normal(0, 3, (3, 200))
+                table["time"] = np.linspace(0, 1.0 if form == "shares of the sweep" else 0.1, 200)
+                table["time"] += (form == "s of another clock") * tick / 20
+                table["time"][rng.integers(1, 200)] += rng.choice([-1e9, 3, np.nan])
+                bag.cloud_table("/points", tick / 20, "sensor", table)
+    whole = load("rosbag", tmp_path / "a.mcap")
+    scans, tree = live(CLOUD)
+    found = feed(tmp_path / "a.mcap", scans, tree, clock)
+    assert len(found) == len(whole) == 29
+    for (scan, _), expected in zip(found, whole, strict=True):
+        assert torch.equal(scan.points, expected.points)
+        assert len(scan.points) == 199
+    assert scans.skipped == whole.skipped == {"points dropped: their times do not fit into the sweep": 29}
+
+
 def laser(stamp: float) -> dict[str, Any]:
     seconds = int(stamp)
     header = {"frame_id": "sensor", "stamp": {"sec": seconds, "nanosec": round((stamp - seconds) * 1e9)}}
-    about = {"range_min": 0.0, "range_max": 9.0, "angle_min": 0.0, "angle_increment": 0.1}
+    about = {
+        "range_min": 0.0,
+        "range_max": 9.0,
+        "angle_min": 0.0,
+        "angle_increment": 0.1,
+        "angle_max": 0.4,
+        "scan_time": 0.0,
+    }
     return {"header": header, **about, "time_increment": 0.0, "ranges": np.full(5, 2.0, np.float32)}
 
 

@@ -16,6 +16,7 @@ from gmmtorch.datasets.recordings.ros.bag_poses import BagSurvey, Record
 from gmmtorch.datasets.recordings.ros.bag_reader import BagReader, RawMessage
 from gmmtorch.datasets.recordings.ros.depth_camera import DepthCamera
 from gmmtorch.datasets.recordings.ros.gyroscope import read_gyroscope, sensor_turns
+from gmmtorch.datasets.recordings.ros.point_times import Rate
 from gmmtorch.datasets.recordings.ros.pose_sources import RegisteredPoses
 from gmmtorch.datasets.recordings.ros.scan_conversion import ScanConversion
 from gmmtorch.datasets.recordings.ros.sensor_messages import Reading
@@ -124,10 +125,12 @@ class RosBag(Dataset):
         records = self._ordered(records)
         self._source = survey.source(records, self._where, sensor_frame)
         self._conversion = ScanConversion(sensor, ranges, self._source, deskew, camera)
-        delay = float(np.median([record.time - record.stamp for record in records]))
-        self._delay = None if clock == "received" else delay
         self._records, self._matrices = self._posed(records)
-        self._is_flat = self._conversion.is_flat(self._matrices, self._first_reading())
+        self._samples = self._first_readings()
+        rate = Rate.of(records, clock)
+        for index, found in self._samples.items():
+            self._conversion.learn_times(found, self._records[index].stamp, rate)
+        self._is_flat = self._conversion.is_flat(self._matrices, self._samples.values())
         self._poses = torch.from_numpy(in_plane(self._matrices) if self._is_flat else self._matrices)
         seconds = [record.stamp / NANOSECONDS for record in self._records]
         self._times = torch.tensor(seconds, dtype=torch.float64)
@@ -174,21 +177,19 @@ class RosBag(Dataset):
         self._skip("no pose at the time of the scan", *unknown)
         return [records[i] for i in np.flatnonzero(known)], matrices[known]
 
-    def _first_reading(self) -> Reading:
-        """The first of ten readings that has points. Raises `DataError` if none of them can be decoded."""
-        empty, failures = [], []
-        for index in range(min(len(self._records), 10)):
+    def _first_readings(self) -> dict[int, Reading]:
+        """The first readings with points of ten, by index. Raises `DataError` if none can be decoded."""
+        found, failures = {}, []
+        for index in range(0, len(self._records), self.stride)[:10]:
             try:
-                found = self._reading(index)
+                found[index] = self._reading(index)
             except DataError as error:
                 failures.append(error)
-                continue
-            if len(found.points):
-                return found
-            empty.append(found)
-        if not empty:
+            if sum(len(each.points) > 0 for each in found.values()) == self._conversion.n_samples:
+                break
+        if not found:
             raise failures[0]
-        return empty[0]
+        return found
 
     def turns(self) -> Tensor:
         """Rotations (N, D, D) of the sensor since the scan before, from the gyroscope of the bag's IMU.
@@ -219,20 +220,18 @@ class RosBag(Dataset):
             self._skip(reason, record.number)
 
         try:
-            found = self._reading(index)
+            found = self._samples.pop(index, None) or self._reading(index)
         except DataError:
             skip("message that cannot be decoded")
             origin = torch.from_numpy(matrix[: 2 if self._is_flat else 3, 3].copy())
             return Scan(origin.new_empty(0, len(origin)), origin)
-        return self._conversion.scan(
-            found, record.stamp, record.frame, matrix, self._is_flat, self._delay, skip
-        )
+        return self._conversion.scan(found, record.stamp, record.frame, matrix, self._is_flat, skip)
 
     def _reading(self, index: int) -> Reading:
         record = self._records[index]
         message = self._message(index)
         try:
-            return self._conversion.points(message, record.stamp)
+            return self._conversion.points(message)
         except (DataError, ValueError, KeyError, OverflowError) as error:
             raise DataError(
                 f"{self._where}, frame {record.frame}, stamp {record.stamp / NANOSECONDS:.3f} s: "

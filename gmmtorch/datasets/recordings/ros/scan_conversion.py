@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -14,13 +14,17 @@ from gmmtorch.datasets.base import Ranges
 from gmmtorch.datasets.recordings.ros import bag_topics, sensor_messages
 from gmmtorch.datasets.recordings.ros.bag_topics import Sensor
 from gmmtorch.datasets.recordings.ros.depth_camera import DepthCamera
+from gmmtorch.datasets.recordings.ros.point_times import N_SAMPLES, PointTimes, Rate
 from gmmtorch.datasets.recordings.ros.pose_sources import PoseSource, RegisteredPoses
 from gmmtorch.datasets.recordings.ros.sensor_messages import Reading
+from gmmtorch.errors import DataError
 from gmmtorch.scan import FARTHEST, Scan
 
 _LEVEL = math.cos(math.radians(10))
 _MIN_PLANAR = 16
 """Fewer points at one height do not show that a cloud is the scan of a laser."""
+_N_SHAPES = 3
+"""Readings that show whether a lidar is planar."""
 _KNOTS = 1024
 """Poses per sweep for deskewing: of a sweep of 0.1 s, one for every 0.1 ms."""
 
@@ -46,25 +50,39 @@ class ScanConversion:
     ) -> None:
         self.source, self._camera = source, camera
         self._sensor, self._ranges = sensor, ranges
-        self._deskew = deskew and source.can_deskew
+        self._times = PointTimes(sensor.kind == bag_topics.LASER) if deskew and source.can_deskew else None
 
-    def points(self, message: dict[str, Any], stamp: int) -> Reading:
-        """The points of a decoded message that was measured at a stamp (ns), in the sensor's frame."""
+    def points(self, message: dict[str, Any]) -> Reading:
+        """The points of a decoded message, in the sensor's frame."""
         kind = self._sensor.kind
         if kind == bag_topics.CLOUD:
-            return sensor_messages.cloud_points(message, stamp)
+            return sensor_messages.cloud_points(message)
         if kind == bag_topics.LIST:
-            return sensor_messages.listed_points(message, self._sensor.field, stamp)
+            return sensor_messages.listed_points(message, self._sensor.field)
         if kind == bag_topics.LASER:
             return sensor_messages.laser_points(message)
         assert self._camera is not None
         return sensor_messages.reading(self._camera.points(message), None, None)
 
-    def is_flat(self, matrices: np.ndarray, first: Reading) -> bool:
-        """Whether scans are 2D: the sensor is level at all poses (N, 4, 4), and a laser or a planar lidar."""
-        is_planar_cloud = not self._sensor.is_camera and is_planar(first, _MIN_PLANAR)
+    @property
+    def n_samples(self) -> int:
+        """Number of the first readings with points that show how the sensor measures."""
+        return 1 if self._sensor.is_camera else _N_SHAPES if self._times is None else N_SAMPLES
+
+    def is_flat(self, matrices: np.ndarray, samples: Iterable[Reading]) -> bool:
+        """Whether scans are 2D: the sensor is level at all poses (N, 4, 4), and a laser or a planar lidar.
+
+        A lidar is planar if most of its samples are; those with few points do not count.
+        """
+        planar = [is_planar(found) for found in samples if len(found.points) >= _MIN_PLANAR]
+        is_planar_cloud = not self._sensor.is_camera and 2 * sum(planar) > len(planar)
         is_planar_sensor = self._sensor.kind == bag_topics.LASER or is_planar_cloud
         return is_planar_sensor and self.is_level(matrices)
+
+    def learn_times(self, found: Reading, stamp: int, rate: Rate) -> None:
+        """Learns from one of the first readings how the sensor states times of points."""
+        if self._times is not None:
+            self._times.learn(found.times, stamp, rate)
 
     @staticmethod
     def is_level(matrices: np.ndarray) -> bool:
@@ -78,7 +96,6 @@ class ScanConversion:
         frame: str,
         matrix: np.ndarray,
         is_flat: bool,
-        delay: float | None,
         skip: Callable[[str], None],
     ) -> Scan:
         """The scan of some points, in the world frame.
@@ -87,8 +104,7 @@ class ScanConversion:
             found: the points. stamp: of their message, ns. frame: of the sensor.
             matrix: (4, 4) pose of the sensor at the stamp.
             is_flat: whether scans are 2D.
-            delay: usual time in ns from stamps to receipt; None: stamps are times of receipt.
-            skip: is called with the reason if the scan has no points or is not deskewed.
+            skip: is called with the reason if the scan has no points, lacks some, or is not deskewed.
         """
         dim = 2 if is_flat else 3
         origin = torch.from_numpy(matrix[:dim, 3].copy())
@@ -97,32 +113,53 @@ class ScanConversion:
         elif is_flat and not is_planar(found):
             skip("points of several heights among planar scans")
             return Scan(origin.new_empty(0, dim), origin)
+        found, offsets = self._timed(found, stamp, skip)
         if isinstance(self.source, RegisteredPoses):
             matrix = self.source.of_points(stamp, frame)
-        ends = self._in_world(found, stamp, frame, matrix, delay, skip)
+        ends = self._in_world(found.points, offsets, stamp, frame, matrix, skip)
         ends[(ends.abs() > FARTHEST).any(1)] = torch.nan  # no sensor measures them
         return self._ranges.scan(ends[:, :dim].contiguous(), origin, torch.from_numpy(found.no_return))
 
-    def times(self, found: Reading, stamp: int, delay: float | None) -> tuple[int, int]:
+    def times(self, found: Reading, stamp: int) -> tuple[int, int]:
         """The first and last times (ns) at which poses are needed."""
-        if not self._deskew or found.offsets is None or not len(found.points):
+        _, offsets = self._timed(found, stamp, lambda reason: None)
+        if offsets is None:
             return stamp, stamp
-        offsets = causal_offsets(found.offsets, delay)
         return min(stamp, stamp + int(offsets.min())), max(stamp, stamp + int(offsets.max()))
+
+    def _timed(
+        self, found: Reading, stamp: int, skip: Callable[[str], None]
+    ) -> tuple[Reading, np.ndarray | None]:
+        """The points whose times fit, and these (N,) in ns after the stamp; all points and None if scans are
+        not deskewed or the times cannot be used."""
+        if self._times is None or not len(found.points):
+            return found, None
+        try:
+            if found.doubt:
+                raise DataError(found.doubt)
+            if found.times is None:
+                return found, None
+            offsets, kept = self._times.offsets(found.times, stamp)
+        except DataError as error:
+            skip(f"points not deskewed: {error}")
+            return found, None
+        if kept is None:
+            return found, offsets
+        skip("points dropped: their times do not fit into the sweep")
+        return found.where(kept), offsets
 
     def _in_world(
         self,
-        found: Reading,
+        points: np.ndarray,
+        offsets: np.ndarray | None,
         stamp: int,
         frame: str,
         matrix: np.ndarray,
-        delay: float | None,
         skip: Callable[[str], None],
     ) -> Tensor:
-        """The points (N, 3) in the world frame, each with the pose of its own time if that is known."""
-        points, pose = torch.from_numpy(found.points), torch.from_numpy(matrix)
-        if self._deskew and found.offsets is not None and len(points):
-            offsets = causal_offsets(found.offsets, delay)
+        """Points (N, 3) in the world frame, each with the pose of its own time (N,) if that is known."""
+        local, pose = torch.from_numpy(points), torch.from_numpy(matrix)
+        if offsets is not None:
             first, last = int(offsets.min()), int(offsets.max())
             n_knots = min(_KNOTS, len(points)) if last > first else 1
             knots = np.linspace(first, last, n_knots).round().astype(np.int64)
@@ -130,23 +167,11 @@ class ScanConversion:
             if poses.known.all():
                 nearest = np.round((offsets - first) * ((n_knots - 1) / max(last - first, 1)))
                 own = torch.from_numpy(poses.matrices)[torch.from_numpy(nearest.astype(np.int64))]
-                return (own[:, :3, :3] @ points[:, :, None])[:, :, 0] + own[:, :3, 3]
+                return (own[:, :3, :3] @ local[:, :, None])[:, :, 0] + own[:, :3, 3]
             skip("points not deskewed: no poses during the sweep")
-        return points @ pose[:3, :3].T + pose[:3, 3]
+        return local @ pose[:3, :3].T + pose[:3, 3]
 
 
-def causal_offsets(offsets: np.ndarray, delay: float | None) -> np.ndarray:
-    """Times of points as ns after the stamp, all before the message was received.
-
-    A message that arrives sooner after its stamp than its sweep lasts has the stamp of the sweep's end,
-    as some drivers write it. If both times are equal, the recording does not state when it was received.
-    delay: see `ScanConversion.scan`.
-    """
-    last = int(offsets.max())
-    at_end = delay is None or 0 < delay < last / 2
-    return offsets - last if at_end and last > 0 else offsets
-
-
-def is_planar(found: Reading, n_least: int = 1) -> bool:
-    """Whether a reading has at least `n_least` points, all at one height of the sensor's frame."""
-    return len(found.points) >= n_least and bool(np.ptp(found.points[:, 2]) == 0)
+def is_planar(found: Reading) -> bool:
+    """Whether all points of a reading are at one height of the sensor's frame."""
+    return bool(np.ptp(found.points[:, 2]) == 0)

@@ -6,6 +6,7 @@ Input are messages as `MessageDecoder` returns them. Every size in them is check
 from __future__ import annotations
 
 import io
+from collections.abc import Iterable
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -16,11 +17,12 @@ from gmmtorch.datasets.depth_frames import MAX_PIXELS, metric, read_png
 from gmmtorch.errors import DataError
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-_TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "offset_time", "timeoffset", "time_offset")
-_UNITS = (1_000_000_000, 1_000_000, 1_000, 1)  # nanoseconds in s, ms, µs, ns
-_SWEEP = (2_000_000, 600_000_000)
-"""Shortest and longest plausible sweep of a sensor in ns; at most one unit of time falls into it."""
-_NEAR = 10_000_000_000
+_TIME_FIELDS = frozenset(
+    {"t", "ts", "time", "times", "timestamp", "timestamps", "stamp", "stamps", "offsettime", "timeoffset"}
+    | {"timeoffsetns", "offsetns", "pointtime", "pointtimeoffset", "deltatime", "reltime", "relativetime"}
+)
+"""Names of fields with times of points, in lower case and without underscores."""
+_LONGEST_LASER_SWEEP = 2.0  # s
 _MILLIMETRE = 0.001
 _ALIGNMENT = 8  # bytes; a row of points is padded by less
 _COMPRESSED_DEPTH_BYTES = 12
@@ -31,22 +33,28 @@ class Reading(NamedTuple):
     """The points of one message.
 
     points: (N, 3) float64, sensor frame, metres; finite and not at the sensor. no_return: (N,) whether the
-    beam met nothing. offsets: (N,) int64, ns after the stamp of the message; None without times of points.
+    beam met nothing. times: (N,) as the message states them, see `PointTimes`; None without times of points.
+    doubt: why the times that the message states cannot be used, if so.
     """
 
     points: np.ndarray
     no_return: np.ndarray
-    offsets: np.ndarray | None
+    times: np.ndarray | None
+    doubt: str = ""
+
+    def where(self, kept: np.ndarray) -> Reading:
+        """The points of a mask (N,)."""
+        times = None if self.times is None else self.times[kept]
+        return Reading(self.points[kept], self.no_return[kept], times, self.doubt)
 
 
-def reading(points: np.ndarray, no_return: np.ndarray | None, offsets: np.ndarray | None) -> Reading:
+def reading(points: np.ndarray, no_return: np.ndarray | None, times: np.ndarray | None) -> Reading:
     """The valid ones of some points: finite, and not at the sensor."""
-    valid = np.isfinite(points).all(1) & (points != 0).any(1)
     empty = np.zeros(len(points), bool) if no_return is None else no_return
-    return Reading(points[valid], empty[valid], None if offsets is None else offsets[valid])
+    return Reading(points, empty, times).where(np.isfinite(points).all(1) & (points != 0).any(1))
 
 
-def cloud_points(message: dict[str, Any], stamp: int) -> Reading:
+def cloud_points(message: dict[str, Any]) -> Reading:
     """The points of a PointCloud2 with any layout of fields and either byte order."""
     width, height, step = int(message["width"]), int(message["height"]), int(message["point_step"])
     data = message["data"]
@@ -59,7 +67,7 @@ def cloud_points(message: dict[str, Any], stamp: int) -> Reading:
     missing = [axis for axis in "xyz" if axis not in fields]
     if missing:
         raise DataError(f"the cloud has no field {missing[0]}, only {', '.join(fields) or 'none'}")
-    time = next((name for name in fields if name.lower() in _TIME_FIELDS), None)
+    time = _time_field(fields)
     names = [*"xyz", *([time] if time else [])]
     layout: dict[str, Any] = {"names": names, "formats": [], "offsets": [], "itemsize": step}
     for name in names:
@@ -69,8 +77,16 @@ def cloud_points(message: dict[str, Any], stamp: int) -> Reading:
         layout["formats"].append(order + kind)
         layout["offsets"].append(offset)
     table = np.ndarray((height, width), np.dtype(cast(Any, layout)), bytes(data), 0, (row, step)).ravel()
-    points = _coordinates(table)
-    return reading(points, None, point_offsets(table[time], stamp) if time else None)
+    return _table_points(table, time)
+
+
+def _time_field(names: Iterable[str]) -> str | None:
+    return next((name for name in names if name.lower().replace("_", "") in _TIME_FIELDS), None)
+
+
+def _table_points(table: np.ndarray, time: str | None) -> Reading:
+    times = None if time is None else table[time].astype(table[time].dtype.newbyteorder("="), copy=False)
+    return reading(_coordinates(table), None, times)
 
 
 def _row_bytes(shape: tuple[int, int], item: int, step: int, most_padding: int, n_bytes: int) -> int:
@@ -109,36 +125,12 @@ def _coordinates(table: np.ndarray) -> np.ndarray:
         return np.stack([table[axis].astype(np.float64) for axis in "xyz"], 1)
 
 
-def listed_points(message: dict[str, Any], field: str, stamp: int) -> Reading:
+def listed_points(message: dict[str, Any], field: str) -> Reading:
     """The points of a message with a list of points in `field`, such as Livox's CustomMsg."""
     table = message[field]
     if len(table) == 0:
         return reading(np.empty((0, 3)), None, None)
-    points = _coordinates(table)
-    time = next((name for name in table.dtype.names if name.lower() in _TIME_FIELDS), None)
-    return reading(points, None, point_offsets(table[time], stamp) if time else None)
-
-
-def point_offsets(values: np.ndarray, stamp: int) -> np.ndarray | None:
-    """Times of points as ns after the stamp; None if they do not vary, or if their unit is not clear.
-
-    The unit is the one that gives a plausible length of the sweep. Times near the stamp are absolute; times
-    far from it count from the stamp if they begin near zero, and otherwise from the first point.
-    """
-    finite = np.isfinite(values)
-    if not finite.any():
-        return None
-    whole = np.where(finite, values, values[finite].min())
-    low, high = whole.min(), whole.max()
-    span = float(high) - float(low)
-    unit = next((unit for unit in _UNITS if _SWEEP[0] <= span * unit <= _SWEEP[1]), None)
-    if unit is None:
-        return None
-    offsets = np.round((whole - low).astype(np.float64) * unit).astype(np.int64)
-    first = round(float(low) * unit) if values.dtype.kind == "f" else int(low) * unit
-    if abs(first) < _NEAR:
-        return offsets + first
-    return offsets + (first - stamp if abs(first - stamp) < _NEAR else 0)
+    return _table_points(table, _time_field(table.dtype.names))
 
 
 def laser_points(message: dict[str, Any]) -> Reading:
@@ -147,17 +139,45 @@ def laser_points(message: dict[str, Any]) -> Reading:
     farthest = float(message["range_max"])
     limit = farthest if 0 < farthest < np.inf else np.inf
     angles = float(message["angle_min"]) + np.arange(len(ranges)) * float(message["angle_increment"])
-    if not np.isfinite(angles).all():
-        raise DataError("the angles of the laser are not finite")
+    _check_angles(angles, message)
     with np.errstate(invalid="ignore"):
         no_return = (ranges > limit) | (ranges == np.inf)
         valid = (ranges > 0) & (ranges >= float(message["range_min"])) & (no_return | (ranges <= limit))
     length = np.where(valid & ~no_return, ranges, np.where(valid, limit if limit < np.inf else 1.0, 0.0))
     points = np.stack([length * np.cos(angles), length * np.sin(angles), np.zeros_like(length)], 1)
-    step = float(message["time_increment"])
-    sweep = step * len(ranges) * 1e9
-    offsets = np.round(np.arange(len(ranges)) * step * 1e9).astype(np.int64) if 0 < sweep < 2e9 else None
-    return reading(points, no_return, offsets)
+    times, doubt = _beam_times(message, len(ranges))
+    return reading(points, no_return, times)._replace(doubt=doubt)
+
+
+def _beam_times(message: dict[str, Any], n_beams: int) -> tuple[np.ndarray | None, str]:
+    """Times (N,) of the beams of a LaserScan in ns after the first; None if it states none. And why they
+    cannot be used, or nothing."""
+    step, scan_time = float(message["time_increment"]), float(message["scan_time"])
+    sweep = step * (n_beams - 1)
+    if step == 0 or n_beams < 2:
+        return None, ""
+    if not 0 < sweep < _LONGEST_LASER_SWEEP:
+        return None, f"time_increment gives no sweep of 0 to {_LONGEST_LASER_SWEEP:g} s"
+    if scan_time > 0 and not scan_time / 20 < sweep < 1.2 * scan_time:
+        return None, "time_increment contradicts scan_time"
+    return np.round(np.arange(n_beams) * step * 1e9).astype(np.int64), ""
+
+
+def _check_angles(angles: np.ndarray, message: dict[str, Any]) -> None:
+    """Raise `DataError` unless the beams (N,) of a LaserScan have the directions that its limits state.
+
+    Drivers differ by up to two beams in what they call the last angle; some do not state it, as 0.
+    """
+    increment, last = float(message["angle_increment"]), float(message["angle_max"])
+    if not np.isfinite(angles).all():
+        raise DataError("the angles of the laser are not finite")
+    if len(angles) > 1 and increment == 0:
+        raise DataError(f"all {len(angles)} beams have one direction: angle_increment is 0")
+    if len(angles) > 1 and last != 0 and not abs(angles[-1] - last) < 2.5 * abs(increment):
+        raise DataError(
+            f"{len(angles)} beams from angle_min={angles[0]:.4f} with angle_increment={increment:.6f} end at "
+            f"{angles[-1]:.4f}, not at angle_max={last:.4f}; the directions of the beams are not known"
+        )
 
 
 def depth_image(message: dict[str, Any], scale: float | None = None) -> Tensor:

@@ -1,0 +1,120 @@
+"""PCD files: their header, and their points as text, as records, or compressed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from gmmtorch.datasets.point_files.headers import (
+    AXES,
+    check_fields,
+    check_size,
+    check_text,
+    damaged_headers,
+    header_lines,
+    whole_number,
+)
+from gmmtorch.datasets.point_files.point_rows import ArrayRows, RecordRows, Rows, TextRows
+from gmmtorch.errors import DataError
+
+_MAX_POINT_BYTES = 1 << 24
+_LZF_LITERALS = 32  # a smaller control byte announces literal bytes, another one repeats earlier bytes
+
+
+def pcd_header(path: Path) -> dict[str, list[str]]:
+    """Header fields of a PCD file, such as {"VIEWPOINT": ["0", "0", "0", "1", "0", "0", "0"]}."""
+    return _entries(header_lines(path, "DATA")[0])
+
+
+def _entries(lines: list[list[str]]) -> dict[str, list[str]]:
+    return {words[0]: words[1:] for words in lines if words and not words[0].startswith("#")}
+
+
+def pcd_rows(path: Path) -> Rows:
+    """The points of a PCD file. Raises `DataError` if its header is damaged or its size another one."""
+    lines, n_bytes = header_lines(path, "DATA")
+    with damaged_headers(path):
+        header = _entries(lines)
+        (form,), (n_points,), fields = header["DATA"], map(whole_number, header["POINTS"]), header["FIELDS"]
+        sides = [whole_number(word) for side in ("WIDTH", "HEIGHT") for word in header.get(side, ["1"])]
+        counts = [whole_number(word) for word in header.get("COUNT", ["1"] * len(fields))]
+        sizes = [whole_number(word) for word in header["SIZE"]]
+        widths = [count * size for count, size in zip(counts, sizes, strict=True)]
+        codes = [f"<{kind.lower()}{size}" for kind, size in zip(header["TYPE"], sizes, strict=True)]
+        check_fields(path, fields)
+        if len(fields) != len(codes) or min(widths) < 1 or sum(widths) > _MAX_POINT_BYTES:
+            raise ValueError("the sizes of the fields")
+        if "WIDTH" in header and sides[0] * sides[1] != n_points:
+            raise ValueError(f"POINTS {n_points} is not WIDTH times HEIGHT")
+        columns = [fields.index(axis) for axis in AXES]
+        record = np.dtype(
+            {
+                "names": AXES,
+                "formats": [codes[column] for column in columns],
+                "offsets": [sum(widths[:column]) for column in columns],
+                "itemsize": sum(widths),
+            }
+        )
+    if form == "ascii":
+        check_text(path, n_points)
+        places = [sum(counts[:column]) for column in columns]
+        return TextRows(path, n_points, len(lines), sum(counts), places)
+    if form == "binary":
+        check_size(path, n_bytes + n_points * record.itemsize, f"{n_points} points")
+        return RecordRows(path, n_points, n_bytes, record)
+    if form == "binary_compressed":
+        data = _unpacked(path, n_bytes, n_points * record.itemsize)
+        return ArrayRows(_of_columns(data, n_points, record, widths, columns), path.stem)
+    raise DataError(f"{path} has DATA {form}; known are ascii, binary and binary_compressed.")
+
+
+def _of_columns(
+    data: bytes, n_points: int, record: np.dtype, widths: Sequence[int], columns: Sequence[int]
+) -> np.ndarray:
+    """Points (N, 3), float64, of unpacked data, which have one field of all points after the other."""
+    points = np.empty((n_points, 3))
+    for axis, column in enumerate(columns):
+        start, width = n_points * sum(widths[:column]), widths[column]
+        field = np.dtype({"names": ["value"], "formats": [record[axis]], "offsets": [0], "itemsize": width})
+        with np.errstate(invalid="ignore"):  # a signalling NaN of a damaged file
+            points[:, axis] = np.frombuffer(data, field, n_points, start)["value"]
+    return points
+
+
+def _unpacked(path: Path, n_bytes: int, expected: int) -> bytes:
+    """The data of a compressed file after a header of `n_bytes`: the lengths before and after packing, LZF.
+
+    Raises `DataError` unless they unpack to `expected` bytes.
+    """
+    data = path.read_bytes()[n_bytes:]
+    packed, unpacked = np.frombuffer(data[:8].ljust(8, b"\0"), "<u4").tolist()
+    check_size(path, n_bytes + 8 + packed, "compressed points")
+    found = bytearray()
+    try:
+        place = 8
+        # LZF repeats at most 264 bytes for three.
+        while place < len(data) and len(found) <= expected <= 88 * packed + 264:
+            control = data[place]
+            place += 1
+            if control < _LZF_LITERALS:
+                found += data[place : place + control + 1]
+                place += control + 1
+                continue
+            length = (control >> 5) + 2
+            if length == 9:
+                length += data[place]
+                place += 1
+            start = len(found) - ((control & 31) << 8) - data[place] - 1
+            place += 1
+            piece = found[start : start + length] if start >= 0 else b""
+            found += (piece * -(-length // len(piece)))[:length]
+    except (IndexError, ZeroDivisionError):
+        expected = -1
+    if not unpacked == expected == len(found) or place != len(data):
+        raise DataError(
+            f"{path} announces {unpacked:,} bytes of points, which its compressed ones are not; it is "
+            "damaged. Write it again."
+        )
+    return bytes(found)

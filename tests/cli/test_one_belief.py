@@ -1,0 +1,181 @@
+"""One belief: whatever shows or writes a map's probabilities gets them from its evidence by one formula."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from command_runs import as_it_was, run_here, succeeded
+from export.map_examples import read_map_image
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+
+from gmmtorch.datasets import load
+from gmmtorch.live import viewer_scene
+from gmmtorch.live.mapper.map_publisher import MapPublisher
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping.tile_merging import tile_files
+from gmmtorch.mapping.tiles import TiledMap
+from gmmtorch.occupancy.calibration import Calibration
+from gmmtorch.occupancy.evidence import Thresholds
+from gmmtorch.occupancy.grid import VoxelGrid
+from gmmtorch.report.maps import map_images
+from gmmtorch.report.maps.map_images import MapPanel
+
+SIDE = 0.25
+UNUSUAL = Calibration.of_bytes(np.array([1, 8, 1, 0, 0, -1, 0, 0, -0.5, 0, 0, 0.5, 0, 0], "<f2").tobytes())
+"""A calibration far from the sensor model's, so that a consumer that ignores it shows."""
+
+
+@pytest.fixture(autouse=True)
+def hydra_as_it_was():
+    with as_it_was():
+        yield
+
+
+@pytest.fixture(scope="module", params=[2, 3])
+def built(request: pytest.FixtureRequest) -> GaussianMap:
+    torch.set_num_threads(1)
+    dataset = load("synthetic_building_2d" if request.param == 2 else "synthetic_building", n_scans=4)
+    made = GaussianMap(resolution=SIDE)
+    for i in range(4):
+        scan = dataset[i]
+        made.insert(scan.select(torch.arange(scan.n_beams) % (1 if request.param == 2 else 5) == 0))
+    made.finish()
+    return made.snapshot(calibration=UNUSUAL, codec="quantized")
+
+
+@pytest.fixture
+def file(built: GaussianMap, tmp_path: Path) -> Path:
+    built.save(tmp_path / "map.safetensors")
+    return tmp_path / "map.safetensors"
+
+
+def believed(built: GaussianMap, grid: VoxelGrid) -> Tensor:
+    """The probabilities of a grid, from its hits and misses by the formula of `occupancy.calibration`."""
+    evidence = GaussianMap.of(built.components(), prior=1.0).evidence(grid)
+    return UNUSUAL.probability(evidence.hits, evidence.misses, grid.resolution, grid.dim)
+
+
+def around(built: GaussianMap) -> VoxelGrid:
+    """A grid of about a thousand cells around surfaces."""
+    middle = built.components().means.median(0).values
+    size = 24 if built.dim == 2 else 10
+    corner = ((middle / SIDE).round() - size / 2) * SIDE
+    return VoxelGrid(tuple(corner.tolist()), SIDE, (size,) * len(corner))
+
+
+def test_the_calibration_makes_a_difference(built):
+    theta = believed(built, around(built))
+    usual = torch.as_tensor(built.snapshot(calibration=None).evidence(around(built)).probability())
+    assert float((theta - usual).abs().max()) > 0.05
+    assert set(Thresholds().classify(theta).flatten().tolist()) == {-1, 0, 1}
+
+
+def test_answers_of_a_map_its_file_and_its_tiles(built, file, tmp_path):
+    grid = around(built)
+    theta, points = believed(built, grid).flatten(), grid.centers()
+    for name, data in tile_files(built.components(), built.settings, 8.0).items():
+        (tmp_path / name).write_bytes(data)
+    for answers in (built, GaussianMap.load(file), TiledMap(tmp_path)):
+        found = torch.as_tensor(answers.occupancy(points, SIDE))
+        torch.testing.assert_close(found, theta, rtol=0, atol=1e-6)
+    torch.testing.assert_close(built.evidence(grid).probability().flatten(), theta, rtol=0, atol=1e-6)
+
+
+def exported(monkeypatch: pytest.MonkeyPatch, file: Path, output: str, *options: str) -> Path:
+    monkeypatch.chdir(file.parent)
+    given = [f"path={file}", f"output={output}", f"resolution={SIDE}", "report.progress=false", *options]
+    succeeded(run_here(monkeypatch, "export", file.parent, *given))
+    return file.parent / output
+
+
+def test_the_image_of_map_server(built, file, monkeypatch):
+    band = ["z_min=0.3", "z_max=0.4"] if built.dim == 3 else []
+    found = read_map_image(exported(monkeypatch, file, "floor.yaml", *band))
+    grid = found.grid
+    if built.dim == 3:
+        grid = VoxelGrid((*grid.origin, 0.25), SIDE, (*grid.shape, 1))
+    theta = believed(built, grid).view(found.grid.shape)
+    assert float((found.probability - theta).abs().max()) <= 1 / 255
+
+
+def test_the_log_odds_of_octomap(built, file, monkeypatch):
+    pyoctomap = pytest.importorskip("pyoctomap")
+    if built.dim == 2:
+        pytest.skip("an octree of a 2D map is a layer of the same cells")
+    tree = pyoctomap.OcTree(SIDE).read(str(exported(monkeypatch, file, "map.ot")))
+    grid = around(built)
+    theta = believed(built, grid).flatten()
+    nodes = [tree.search(center) for center in grid.centers().numpy()]
+    known = [row for row, node in enumerate(nodes) if node is not None]
+    assert len(known) > 200
+    odds = torch.tensor([nodes[row].getLogOdds() for row in known], dtype=torch.float64)
+    torch.testing.assert_close(odds, torch.logit(theta[known], eps=1e-6), rtol=0, atol=2e-3)
+
+
+def test_the_distance_field(built, file, monkeypatch):
+    band = ["z_min=0.3", "z_max=0.7"] if built.dim == 3 else []
+    with np.load(exported(monkeypatch, file, "field.npz", "format=distance_field", *band)) as field:
+        origin, distance = field["origin"], field["distance"]
+    grid = VoxelGrid(tuple(origin.tolist()), SIDE, distance.shape)
+    occupied = Thresholds().classify(believed(built, grid).view(distance.shape)).numpy() == 1
+    expected = distance_transform_edt(~occupied, sampling=SIDE)
+    outside = ~occupied
+    assert occupied.any()
+    np.testing.assert_allclose(distance[outside], expected[outside], atol=1e-5)
+
+
+def test_the_cells_of_a_cloud(built, file, monkeypatch):
+    import open3d
+
+    cloud = np.asarray(
+        open3d.io.read_point_cloud(str(exported(monkeypatch, file, "c.ply", "format=ply"))).points
+    )
+    points = torch.from_numpy(cloud)[:, : built.dim]
+    corner = tuple(((points.amin(0) / SIDE).floor() * SIDE).tolist())
+    size = tuple(((points.amax(0) - torch.tensor(corner)) / SIDE + 1).long().tolist())
+    grid = VoxelGrid(corner, SIDE, size)
+    occupied = believed(built, grid).flatten() > Thresholds().occupied
+    place = ((points - torch.tensor(corner)) / SIDE).floor().long()
+    seen = torch.zeros(size, dtype=torch.bool)
+    seen[tuple(place.T)] = True
+    assert torch.equal(seen.flatten(), occupied)
+
+
+def test_the_viewer(built, monkeypatch):
+    middle = around(built).centers()[:40]
+    for point in middle:
+        cell = VoxelGrid(tuple((point - SIDE / 2).tolist()), SIDE, (1,) * len(point))
+        assert viewer_scene.place_at(built, point, SIDE).occupancy == pytest.approx(
+            float(believed(built, cell)), abs=1e-6
+        )
+    asked: list[MapPanel] = []
+
+    def slice_image(panel: MapPanel, *options: Any) -> Any:
+        asked.append(panel)
+        return map_images.slice_image(panel, *options)
+
+    monkeypatch.setattr(viewer_scene, "slice_image", slice_image)
+    viewer_scene.occupancy_slice(built, SIDE, 1.0, viewer_scene.frame(built.components(), []))
+    grid = around(built)
+    found = asked[0].occupancy(grid.centers())
+    torch.testing.assert_close(found, believed(built, grid).flatten(), rtol=0, atol=1e-6)
+
+
+def test_the_grid_of_a_live_map(built):
+    class Recorder:
+        def publisher(self, *_: Any) -> Any:
+            return lambda *_: None
+
+        def warn(self, *_: Any) -> None:
+            raise AssertionError
+
+    band = (0.25, 0.75) if built.dim == 3 else (None, None)
+    publisher = MapPublisher(Recorder(), SIDE, *band, cloud="none", ellipsoids=False)  # type: ignore[arg-type]
+    grid, theta = publisher._probabilities(built)
+    assert grid is not None
+    torch.testing.assert_close(theta.flatten(), believed(built, grid).flatten(), rtol=0, atol=1e-6)
