@@ -35,6 +35,7 @@ _FEWEST_STEPS = 20
 _SMALL = 1e5
 """Times below it, in any unit, are not those of a calendar."""
 _ALIKE = 1.3
+_CONSTANT = "their times do not vary"
 _CONTRADICTION = "their times contradict the rate of the scans"
 _WHOLE_SWEEP = 0.8
 _MOST_SAMPLED = 8192
@@ -113,7 +114,10 @@ class PointTimes:
                 raise DataError("their times are far from the stamp")
             offsets += first
         last = int(offsets.max())
-        if rule.interval is not None and last - int(offsets.min()) > _OVERLAP * rule.interval:
+        duration = last - int(offsets.min())
+        if duration == 0 and len(found) > _FEW:
+            raise DataError(_CONSTANT)
+        if rule.interval is not None and duration > _OVERLAP * rule.interval:
             raise DataError(_CONTRADICTION)
         return offsets - last if rule.is_at_end and last > 0 else offsets, kept
 
@@ -157,7 +161,7 @@ def _rule(samples: list[_Sample], rate: Rate) -> _Rule:
     if samples[0].step > 0 and usual < _FEWEST_STEPS * samples[0].step and abs(samples[0].low) > _SMALL:
         return _Rule(trouble="their times are absolute in float32, which is too coarse")
     if usual == 0:
-        return _Rule(trouble="their times do not vary")
+        return _Rule(trouble=_CONSTANT)
     unit, trouble = _unit(samples, usual, rate)
     if unit is None:
         return _Rule(trouble=trouble)
