@@ -218,6 +218,10 @@ def test_points_in_any_order_keep_theirs(tmp_path):
         assert (off_the_walls(dataset) < 1e-3, dataset.skipped) == (True, {})
 
 
+def scaled(factor: float) -> Callable[[np.ndarray], None]:
+    return lambda table: np.multiply(table["t"], factor, out=table["t"])
+
+
 def one_of(index: int, fault: Callable[[np.ndarray], None]) -> Callable[[np.ndarray], None]:
     """A fault of one cloud only."""
     clouds = iter(range(100))
@@ -229,6 +233,7 @@ def one_of(index: int, fault: Callable[[np.ndarray], None]) -> Callable[[np.ndar
     [
         (set_time(slice(0, 200), math.nan), "their times are not of one sweep"),
         (set_time(slice(0, 200), 7.0), "their times are not of one sweep"),
+        (scaled(0), "their times do not vary"),
         (lambda table: np.add(table["t"], 0.5, out=table["t"]), "their times are far from the stamp"),
         (lambda table: np.add(table["t"], 99, out=table["t"]), "their times are far from the stamp"),
     ],
@@ -241,10 +246,6 @@ def test_one_scan_with_unusable_times_is_counted_and_the_others_are_deskewed(tmp
     assert [len(scan.points) for scan in scans] == [len(AT)] * 4
     assert dataset.skipped == {f"points not deskewed: {reason}": 1}
     assert off_the_walls([scan for i, scan in enumerate(scans) if i != index]) < 1e-3
-
-
-def scaled(factor: float) -> Callable[[np.ndarray], None]:
-    return lambda table: np.multiply(table["t"], factor, out=table["t"])
 
 
 @pytest.mark.parametrize(

@@ -64,14 +64,7 @@ def ranges(pose: np.ndarray, noise: np.ndarray) -> np.ndarray:
 def lap(n: int) -> tuple[list[dict[str, Any]], Tensor]:
     """Messages of n scans, and the true poses (n, 3, 3) in the frame of the first one."""
     rng, poses, messages = np.random.default_rng(0), path(n), []
-    about = {
-        "range_min": 0.0,
-        "range_max": 20.0,
-        "angle_min": -np.pi,
-        "angle_increment": 2 * np.pi / N_BEAMS,
-        "angle_max": 0.0,
-        "scan_time": 0.0,
-    }
+    about = {"range_min": 0.0, "range_max": 20.0, "angle_min": -np.pi, "angle_increment": 2 * np.pi / N_BEAMS}
     for number, pose in enumerate(poses):
         stamp = {"sec": number // 5, "nanosec": number % 5 * 200_000_000}
         measured = ranges(pose, rng.normal(scale=0.005, size=N_BEAMS)).astype(np.float32)

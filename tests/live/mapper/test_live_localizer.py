@@ -46,14 +46,7 @@ def room(x: float, y: float, yaw: float) -> np.ndarray:
 
 def laser(stamp: float, ranges: np.ndarray) -> dict[str, Any]:
     header = {"frame_id": "laser", "stamp": {"sec": int(stamp), "nanosec": round(stamp % 1 * 1e9)}}
-    about = {
-        "range_min": 0.0,
-        "range_max": 20.0,
-        "angle_min": -np.pi,
-        "angle_increment": 2 * np.pi / N_BEAMS,
-        "angle_max": 0.0,
-        "scan_time": 0.0,
-    }
+    about = {"range_min": 0.0, "range_max": 20.0, "angle_min": -np.pi, "angle_increment": 2 * np.pi / N_BEAMS}
     return {"header": header, **about, "time_increment": 0.0, "ranges": ranges.astype(np.float32)}
 
 

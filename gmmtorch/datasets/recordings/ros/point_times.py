@@ -23,9 +23,16 @@ _SWEEP = (2_000_000, 600_000_000)
 """Shortest and longest plausible sweep of a sensor in ns; at most one unit of time falls into it."""
 _LONGEST_TURN = 150_000_000
 """Scans further apart (ns) may be thinned out, so that their rate does not state how long a sweep is."""
+_SHARES = (0.25, 0.8)
+"""Numbers up to 1 with a range below the first are seconds, those above the second shares of a sweep."""
 _NEAR = NANOSECONDS
 """Times of points within this of the stamp (ns) are of its clock."""
 _SLACK = 1.05
+"""Sweeps of a sensor differ by less than this factor."""
+_ALIKE = 1.3
+"""Messages whose times spread more than this over the usual have a wrong one."""
+_CONTINUOUS = 0.75
+"""A sweep of this share of the time between scans, or more, may last until the next scan."""
 _OVERLAP = 1.3
 """Longest sweep as a multiple of the time between scans."""
 _MOST_WRONG = 0.1
@@ -34,13 +41,14 @@ _FEWEST_STEPS = 20
 """Fewest steps of a float32 in a sweep: absolute times in float32 have steps of 128 s."""
 _SMALL = 1e5
 """Times below it, in any unit, are not those of a calendar."""
-_ALIKE = 1.3
-_CONTRADICTION = "their times contradict the rate of the scans"
-_WHOLE_SWEEP = 0.8
 _MOST_SAMPLED = 8192
 """Points of a message that show how long its sweep is."""
 _FEW = 20
 """Fewer points do not show that their times increase."""
+_CONSTANT = "their times do not vary"
+_CONTRADICTION = "their times contradict the rate of the scans"
+_NO_UNIT = "the unit of their times is not clear"
+_NO_DURATION = "their times are shares of a sweep, whose duration the rate of the scans does not state"
 
 
 class Rate(NamedTuple):
@@ -113,7 +121,10 @@ class PointTimes:
                 raise DataError("their times are far from the stamp")
             offsets += first
         last = int(offsets.max())
-        if rule.interval is not None and last - int(offsets.min()) > _OVERLAP * rule.interval:
+        duration = last - int(offsets.min())
+        if duration == 0 and len(found) > _FEW:
+            raise DataError(_CONSTANT)
+        if rule.interval is not None and duration > _OVERLAP * rule.interval:
             raise DataError(_CONTRADICTION)
         return offsets - last if rule.is_at_end and last > 0 else offsets, kept
 
@@ -157,12 +168,12 @@ def _rule(samples: list[_Sample], rate: Rate) -> _Rule:
     if samples[0].step > 0 and usual < _FEWEST_STEPS * samples[0].step and abs(samples[0].low) > _SMALL:
         return _Rule(trouble="their times are absolute in float32, which is too coarse")
     if usual == 0:
-        return _Rule(trouble="their times do not vary")
+        return _Rule(trouble=_CONSTANT)
     unit, trouble = _unit(samples, usual, rate)
     if unit is None:
         return _Rule(trouble=trouble)
     sweep = float(durations[durations <= _ALIKE * usual].max()) * unit
-    if rate.interval is not None and sweep > 0.75 * rate.interval:  # the sensor turns without a pause
+    if rate.interval is not None and sweep > _CONTINUOUS * rate.interval:
         sweep = max(sweep, min(rate.interval, _SWEEP[1]))
     clock, first = _clock(samples, unit, sweep)
     counts_from_first = clock == _OTHER or (clock == _MESSAGE and first > -sweep / 10)
@@ -213,16 +224,15 @@ def _unit(samples: list[_Sample], usual: float, rate: Rate) -> tuple[float | Non
     """Nanoseconds per unit of times whose usual duration is known; or None, and why it is not clear."""
     unit = next((unit for unit in _UNITS if _SWEEP[0] <= usual * unit <= _SWEEP[1]), None)
     largest = float(np.median([max(abs(sample.low), abs(sample.high)) for sample in samples]))
-    if not isinstance(samples[0].low, float) or largest > _SLACK or unit not in (None, NANOSECONDS):
-        return unit, "the unit of their times is not clear"
-    if unit is not None and usual * unit <= _LONGEST_TURN:
-        return unit, ""
+    may_be_shares = isinstance(samples[0].low, float) and largest < _SLACK and usual > _SHARES[0]
+    if not may_be_shares:
+        return unit, _NO_UNIT
     if unit is not None and rate.interval is not None and 0.7 < usual * unit / rate.interval < 1.3:
         return unit, ""
-    if usual < _WHOLE_SWEEP:
-        return None, "the unit of their times is not clear"
+    if usual < _SHARES[1]:
+        return None, _NO_UNIT
     if rate.interval is None or not rate.is_regular or rate.interval > _LONGEST_TURN:
-        return None, "their times are shares of a sweep, whose duration the rate of the scans does not state"
+        return None, _NO_DURATION
     return rate.interval, ""
 
 

@@ -89,8 +89,8 @@ class RosBag(Dataset):
 
     The whole bag is read once when it is opened, for stamps and poses. Messages without a pose, out of order,
     or of another frame are left out and counted in `skipped`. A damaged message gives a scan without points.
-    Scans of a level laser are 2D, and so are clouds of a level sensor whose points have one height. `topic`
-    is the sensor's topic.
+    Scans of a level laser are 2D, and so are clouds of a level sensor if the points of most of the first
+    clouds have one height. `topic` is the sensor's topic.
     """
 
     _poses: Tensor

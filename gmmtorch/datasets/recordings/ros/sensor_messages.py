@@ -152,7 +152,7 @@ def laser_points(message: dict[str, Any]) -> Reading:
 def _beam_times(message: dict[str, Any], n_beams: int) -> tuple[np.ndarray | None, str]:
     """Times (N,) of the beams of a LaserScan in ns after the first; None if it states none. And why they
     cannot be used, or nothing."""
-    step, scan_time = float(message["time_increment"]), float(message["scan_time"])
+    step, scan_time = float(message["time_increment"]), float(message.get("scan_time", 0))
     sweep = step * (n_beams - 1)
     if step == 0 or n_beams < 2:
         return None, ""
@@ -168,7 +168,7 @@ def _check_angles(angles: np.ndarray, message: dict[str, Any]) -> None:
 
     Drivers differ by up to two beams in what they call the last angle; some do not state it, as 0.
     """
-    increment, last = float(message["angle_increment"]), float(message["angle_max"])
+    increment, last = float(message["angle_increment"]), float(message.get("angle_max", 0))
     if not np.isfinite(angles).all():
         raise DataError("the angles of the laser are not finite")
     if len(angles) > 1 and increment == 0:
