@@ -134,6 +134,16 @@ def test_open_points_rejects_a_truncated_file(tmp_path, name):
         list(open_points(path, chunk_points=6))
 
 
+@needs_laspy
+@given(cut=st.integers(0, 1 << 16), name=st.sampled_from(["c.npy", "a.las", "a.laz"]))
+def test_a_file_cut_at_any_byte_is_an_error(tmp_path, cut, name):
+    path = written(tmp_path, name)
+    data = path.read_bytes()
+    path.write_bytes(data[: cut % len(data)])
+    with pytest.raises(DataError, match=str(path)):
+        list(open_points(path))
+
+
 @pytest.mark.parametrize("suffix", [".npy", ".pcd", ".ply", pytest.param(".las", marks=needs_laspy)])
 @pytest.mark.parametrize("data", [b"", b"\x89PNG\r\n\x1a\n" + bytes(300), b"x y z\n1 2 3\n"])
 def test_open_points_rejects_other_content(tmp_path, suffix, data):
