@@ -35,7 +35,7 @@ settings.register_profile(
         HealthCheck.differing_executors,  # a contract's tests run in every class that inherits it
     ],
 )
-settings.register_profile("long", settings.get_profile("gmmtorch"), derandomize=False, max_examples=100_000)
+settings.register_profile("long", settings.get_profile("gmmtorch"), derandomize=False, max_examples=20_000)
 settings.load_profile("gmmtorch")
 
 

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset, Ranges, gunzip, require_path
+from gmmtorch.datasets.number_rows import number_rows
 from gmmtorch.errors import DataError
 from gmmtorch.scan import Scan
 
@@ -80,7 +81,7 @@ def _read_records(path: Path) -> tuple[list[Tensor], Tensor]:
         for number, line in enumerate(io.TextIOWrapper(file, errors="replace"), 1):
             if line.startswith("FLASER "):
                 words = line.split()
-                records.append(_parse(words, f"{path}, line {number}"))
+                records.append(_parse(words, path, number))
                 stamps.append(_stamp(words))
     if not records:
         raise DataError(f"{path} has no FLASER line, so it is not a CARMEN log of a front laser.")
@@ -95,18 +96,19 @@ def _stamp(words: list[str]) -> float:
         return math.nan
 
 
-def _parse(words: list[str], where: str) -> Tensor:
-    try:
-        n = int(words[1])
-        if not 1 <= n <= _MAX_BEAMS:
-            raise DataError(f"{where}: FLASER announces {n} beams; expected 1 to {_MAX_BEAMS}.")
-        if len(words) < 2 + n + 3:
-            raise DataError(f"{where}: FLASER announces {n} beams, but the line ends early.")
-        record = torch.tensor([float(w) for w in words[2 : 2 + n + 3]], dtype=torch.float64)
-    except DataError:
-        raise
-    except (ValueError, IndexError) as error:
-        raise DataError(f"{where}: not a number in a FLASER line ({error}).") from error
+def _parse(words: list[str], path: Path, number: int) -> Tensor:
+    """[r_1 … r_n, x, y, theta] of the words of the line with this number."""
+    where = f"{path}, line {number}"
+    n = int(words[1]) if len(words) > 1 and words[1].isdecimal() else 0
+    if not 1 <= n <= _MAX_BEAMS:
+        raise DataError(
+            f"{where}: FLASER announces {' '.join(words[1:2]) or 'no'} beams; expected 1 to {_MAX_BEAMS}."
+        )
+    if len(words) < 2 + n + 3:
+        raise DataError(f"{where}: FLASER announces {n} beams, but the line ends early.")
+    record = torch.from_numpy(
+        number_rows([" ".join(words[2 : 2 + n + 3])], n + 3, f"{path}, line", number)[0]
+    )
     if not bool(torch.isfinite(record[-3:]).all()):
         raise DataError(f"{where}: the pose {record[-3:].tolist()} is not finite.")
     return record

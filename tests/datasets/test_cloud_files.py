@@ -230,6 +230,10 @@ def test_compressed_pcd_files_repeat_earlier_bytes(tmp_path):
     packed = b"".join(pieces)
     path.write_bytes(compressed(points, packed))
     np.testing.assert_array_equal(read(path)[0], points)
+    path.write_bytes(compressed(points, packed) + bytes(100))
+    np.testing.assert_array_equal(read(path)[0], points)
+    path.write_bytes(compressed(points[:0], b""))
+    assert len(read(path)[0]) == 0
     for wrong in (packed[:-1], packed + b"\0\0", b"\x20\x09" + packed[2:], packed[:5] + b"\0\0" + packed[5:]):
         path.write_bytes(compressed(points, wrong))
         with pytest.raises(DataError, match="compressed"):
@@ -260,6 +264,54 @@ def test_an_organised_pcd_file_with_padding_of_zeros_is_read(tmp_path):
     path.write_bytes(data.replace(b"HEIGHT 2", b"HEIGHT 3"))
     with pytest.raises(DataError, match="WIDTH times HEIGHT"):
         read(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("TYPE F F F", "TYPE F F O", "damaged header"),
+        ("TYPE F F F", "TYPE F F C", "damaged header"),
+        ("SIZE 4 4 8", "SIZE 4 4 3", "damaged header"),
+        ("SIZE 4 4 8", "SIZE 4 4", "damaged header"),
+        ("SIZE 4 4 8", "SIZE 4 4 99999999", "damaged header"),
+        ("FIELDS x y z", "FIELDS x w z", "no field y"),
+        ("FIELDS x y z", "FIELDS x y z x", "several fields x"),
+        ("POINTS 1", "POINTS 1_0", "damaged header"),
+        ("DATA binary", "DATA zipped", "known are ascii"),
+    ],
+)
+def test_a_pcd_header_is_checked(tmp_path, old, new, message):
+    cloud = Cloud("pcd", "binary", {"x": "f4", "y": "f4", "z": "f8"}, np.ones((1, 3)))
+    path = cloud.write(tmp_path)
+    path.write_bytes(path.read_bytes().replace(old.encode(), new.encode()))
+    with pytest.raises(DataError, match=message):
+        read(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("property float z", "property float  x", "damaged header"),
+        ("property float z", "property float w", "no field z"),
+        ("property float z", "property half z", "damaged header"),
+        ("property float z", "propertz float z", "damaged header"),
+        ("element face", "element vertex", "damaged header"),
+        ("vertex 1", "vertex 1_0", "damaged header"),
+        ("vertex 1", "vertex -1", "damaged header"),
+        ("vertex 1", f"vertex {10**30}", "truncated"),
+        ("element vertex", "element point", "number of points"),
+        ("binary_little", "binary_middle", "known are ascii"),
+    ],
+)
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+def test_a_ply_header_is_checked(tmp_path, form, old, new, message):
+    cloud = Cloud("ply", form, {"x": "f4", "y": "f4", "z": "f4"}, np.ones((1, 3)))
+    path = cloud.write(tmp_path)
+    data = path.read_bytes()
+    path.write_bytes(data.replace(old.encode(), new.encode()))
+    if old.encode() in data:
+        with pytest.raises(DataError, match=message):
+            read(path)
 
 
 # -- words ----------------------------------------------------------------------------------------

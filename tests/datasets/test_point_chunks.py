@@ -134,6 +134,16 @@ def test_open_points_rejects_a_truncated_file(tmp_path, name):
         list(open_points(path, chunk_points=6))
 
 
+@needs_laspy
+@given(cut=st.integers(0, 1 << 16), name=st.sampled_from(["c.npy", "a.las", "a.laz"]))
+def test_a_file_cut_at_any_byte_is_an_error(tmp_path, cut, name):
+    path = written(tmp_path, name)
+    data = path.read_bytes()
+    path.write_bytes(data[: cut % len(data)])
+    with pytest.raises(DataError, match=str(path)):
+        list(open_points(path))
+
+
 @pytest.mark.parametrize("suffix", [".npy", ".pcd", ".ply", pytest.param(".las", marks=needs_laspy)])
 @pytest.mark.parametrize("data", [b"", b"\x89PNG\r\n\x1a\n" + bytes(300), b"x y z\n1 2 3\n"])
 def test_open_points_rejects_other_content(tmp_path, suffix, data):
@@ -170,6 +180,9 @@ def chunk_table(data: bytes) -> int:
         ("las laz", 96, b"\xff\xff\xff\x7f", "points from byte 2147483647"),
         ("las laz", 105, b"\x01\x00", "1 bytes"),
         ("las laz", 25, b"\x09", r"1\.9"),
+        ("las laz", 131, struct.pack("<d", 0.0), "scales"),
+        ("las laz", 139, struct.pack("<d", float("nan")), "scales"),
+        ("las laz", 155, struct.pack("<d", float("inf")), "offsets"),
         ("las", 107, b"\xff" * 4, "4294967295 points"),
         ("laz", lambda data: chunk_table(data) + 4, b"\0\0\0\x80", "2147483648 chunks"),
         ("laz", lambda data: data.index(b"laszip encoded") + 64, b"\0\0\0\x80", "2,147,483,648 points"),

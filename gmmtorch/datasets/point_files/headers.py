@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -30,14 +31,17 @@ def point_path(path: str | Path) -> Path:
 
 
 @contextmanager
-def damaged_headers(path: Path) -> Iterator[None]:
-    """Turns the errors of words that are missing or wrong into a `DataError`."""
+def damaged(path: Path, what: str) -> Iterator[None]:
+    """Turns errors of missing and wrong content into a `DataError`: path, what is wrong, and the remedy."""
     try:
         yield
-    except (ValueError, KeyError, IndexError, TypeError) as error:
-        if isinstance(error, DataError):
-            raise
-        raise DataError(f"{path} has a damaged header ({error!r}); write it again.") from error
+    except DataError:
+        raise
+    except (ValueError, KeyError, IndexError, TypeError, OverflowError, struct.error) as error:
+        raise DataError(
+            f"{path} {what} ({error!r}); it is truncated, damaged or another kind of file. Write or fetch it "
+            "again."
+        ) from error
 
 
 def header_lines(path: Path, last: str) -> tuple[list[list[str]], int]:

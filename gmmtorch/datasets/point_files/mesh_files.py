@@ -6,7 +6,6 @@ Sizes that a header announces are compared with the data before anything is allo
 from __future__ import annotations
 
 import re
-import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets.point_files.headers import AXES
+from gmmtorch.datasets.point_files.headers import AXES, damaged
 from gmmtorch.datasets.point_files.ply_files import ply_elements
 from gmmtorch.errors import DataError
 
@@ -34,15 +33,8 @@ def read_triangles(path: Path) -> Tensor:
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise DataError(f"{path} is not a PLY, OBJ or STL file; convert the mesh to one of these formats.")
-    try:
+    with damaged(path, "contains no readable triangles"):
         triangles = reader(path)
-    except DataError:
-        raise
-    except (ValueError, IndexError, KeyError, OverflowError, struct.error) as error:
-        raise DataError(
-            f"{path} contains no readable triangles ({error}); it is truncated, a point cloud, or not a "
-            "mesh. Give a PLY, OBJ or STL file with faces."
-        ) from error
     if len(triangles) == 0:
         raise DataError(f"{path} contains no readable triangles; give a PLY, OBJ or STL file with faces.")
     if not np.isfinite(triangles).all():

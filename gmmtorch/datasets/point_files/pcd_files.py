@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ from gmmtorch.datasets.point_files.headers import (
     check_fields,
     check_size,
     check_text,
-    damaged_headers,
+    damaged,
     header_lines,
     whole_number,
 )
@@ -20,6 +19,11 @@ from gmmtorch.datasets.point_files.point_rows import ArrayRows, RecordRows, Rows
 from gmmtorch.errors import DataError
 
 _MAX_POINT_BYTES = 1 << 24
+_CODES = {
+    **{f"{kind}{size}": f"<{kind.lower()}{size}" for kind in "IU" for size in (1, 2, 4, 8)},
+    "F4": "<f4",
+    "F8": "<f8",
+}
 _LZF_LITERALS = 32  # a smaller control byte announces literal bytes, another one repeats earlier bytes
 
 
@@ -35,25 +39,26 @@ def _entries(lines: list[list[str]]) -> dict[str, list[str]]:
 def pcd_rows(path: Path) -> Rows:
     """The points of a PCD file. Raises `DataError` if its header is damaged or its size another one."""
     lines, n_bytes = header_lines(path, "DATA")
-    with damaged_headers(path):
+    with damaged(path, "has a damaged header"):
         header = _entries(lines)
         (form,), (n_points,), fields = header["DATA"], map(whole_number, header["POINTS"]), header["FIELDS"]
         sides = [whole_number(word) for side in ("WIDTH", "HEIGHT") for word in header.get(side, ["1"])]
         counts = [whole_number(word) for word in header.get("COUNT", ["1"] * len(fields))]
         sizes = [whole_number(word) for word in header["SIZE"]]
         widths = [count * size for count, size in zip(counts, sizes, strict=True)]
-        codes = [f"<{kind.lower()}{size}" for kind, size in zip(header["TYPE"], sizes, strict=True)]
+        codes = [f"{kind}{size}" for kind, size in zip(header["TYPE"], sizes, strict=True)]
         check_fields(path, fields)
         if len(fields) != len(codes) or min(widths) < 1 or sum(widths) > _MAX_POINT_BYTES:
             raise ValueError("the sizes of the fields")
         if "WIDTH" in header and sides[0] * sides[1] != n_points:
             raise ValueError(f"POINTS {n_points} is not WIDTH times HEIGHT")
         columns = [fields.index(axis) for axis in AXES]
+        offsets = [sum(widths[:column]) for column in columns]
         record = np.dtype(
             {
                 "names": AXES,
-                "formats": [codes[column] for column in columns],
-                "offsets": [sum(widths[:column]) for column in columns],
+                "formats": [_CODES[codes[column]] for column in columns],
+                "offsets": offsets,
                 "itemsize": sum(widths),
             }
         )
@@ -66,21 +71,13 @@ def pcd_rows(path: Path) -> Rows:
         return RecordRows(path, n_points, n_bytes, record)
     if form == "binary_compressed":
         data = _unpacked(path, n_bytes, n_points * record.itemsize)
-        return ArrayRows(_of_columns(data, n_points, record, widths, columns), path.stem)
-    raise DataError(f"{path} has DATA {form}; known are ascii, binary and binary_compressed.")
-
-
-def _of_columns(
-    data: bytes, n_points: int, record: np.dtype, widths: Sequence[int], columns: Sequence[int]
-) -> np.ndarray:
-    """Points (N, 3), float64, of unpacked data, which have one field of all points after the other."""
-    points = np.empty((n_points, 3))
-    for axis, column in enumerate(columns):
-        start, width = n_points * sum(widths[:column]), widths[column]
-        field = np.dtype({"names": ["value"], "formats": [record[axis]], "offsets": [0], "itemsize": width})
+        axes = [
+            np.ndarray(n_points, record[axis], data, n_points * offset, (widths[column],))
+            for axis, offset, column in zip(AXES, offsets, columns, strict=True)
+        ]  # one field of all points follows the other
         with np.errstate(invalid="ignore"):  # a signalling NaN of a damaged file
-            points[:, axis] = np.frombuffer(data, field, n_points, start)["value"]
-    return points
+            return ArrayRows(np.stack([axis.astype(np.float64) for axis in axes], 1), path.stem)
+    raise DataError(f"{path} has DATA {form}; known are ascii, binary and binary_compressed.")
 
 
 def _unpacked(path: Path, n_bytes: int, expected: int) -> bytes:
@@ -91,6 +88,7 @@ def _unpacked(path: Path, n_bytes: int, expected: int) -> bytes:
     data = path.read_bytes()[n_bytes:]
     packed, unpacked = np.frombuffer(data[:8].ljust(8, b"\0"), "<u4").tolist()
     check_size(path, n_bytes + 8 + packed, "compressed points")
+    data = data[: 8 + packed]
     found = bytearray()
     try:
         place = 8

@@ -15,7 +15,7 @@ from gmmtorch.datasets.point_files.headers import (
     check_fields,
     check_size,
     check_text,
-    damaged_headers,
+    damaged,
     header_lines,
     whole_number,
 )
@@ -63,7 +63,7 @@ def _read_header(path: Path) -> _Header:
     form = element = ""
     counts: dict[str, int] = {}
     properties: dict[str, list[_Property]] = {}
-    with damaged_headers(path):
+    with damaged(path, "has a damaged header"):
         for words in lines[1:-1]:
             match words:
                 case [] | ["comment" | "obj_info", *_]:
@@ -152,13 +152,8 @@ def ply_elements(path: Path) -> dict[str, Columns]:
         header = header._replace(properties=doubles)
     found, start = {}, 0
     for name in header.counts:
-        try:
+        with damaged(path, f"has an element {name} that cannot be read"):
             found[name], start = _element(raw, start, header, name)
-        except (struct.error, ValueError, OverflowError) as error:
-            raise DataError(
-                f"{path}: its element {name} cannot be read ({error}); the file is truncated or damaged. "
-                "Write or fetch it again."
-            ) from error
     if start != len(raw):
         raise DataError(f"{path} has more data than its header announces; it is damaged. Write it again.")
     return found

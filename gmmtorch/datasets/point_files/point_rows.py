@@ -98,6 +98,13 @@ class LasRows:
         with _las_errors(path), self._open() as reader:
             if int(reader.header.point_count) != self.n_rows:
                 raise DataError(f"{path} announces two numbers of points; it is damaged. Write it again.")
+            scales, offsets = (
+                np.asarray(of, np.float64) for of in (reader.header.scales, reader.header.offsets)
+            )
+            if not (np.isfinite(offsets).all() and np.isfinite(scales).all() and (scales > 0).all()):
+                raise DataError(
+                    f"{path} has scales {scales} and offsets {offsets}; it is damaged. Write it again."
+                )
 
     def _open(self) -> Any:
         return self._laspy.open(self._path, read_evlrs=False)
