@@ -58,7 +58,7 @@ def main() -> None:
         data, test_every, sides = opened(options.data, name)
         scans = list(data)
         for side in sides:
-            names = METHODS if side >= 0.05 else METHODS[:-1]  # OctoMap takes minutes with smaller cells
+            names = METHODS if side >= 0.1 else METHODS[:-1]  # OctoMap takes minutes with smaller cells
             protocol = Protocol(test_every, (1.0,), "beams", (side,), max_beams=MAX_BEAMS)
             outcome = evaluate(name, scans, choose(names, methods(GaussianMap)), protocol)
             rows: dict[str, Any] = {row["method"]: row for row in outcome.rows}
