@@ -84,7 +84,8 @@ class Calibration(NamedTuple):
     def log_odds(self, hits: Tensor, misses: Tensor, side: float, dim: int) -> Tensor:
         """Log-odds of cubes of `side` (m) with hits and misses of any shape."""
         mean = torch.tensor(self.coefficients, dtype=torch.float64)
-        weight, least, up, down = _quantities(mean, side, self.length, dim)
+        at = torch.tensor(side, dtype=torch.float64)
+        weight, least, up, down = (x.item() for x in _quantities(mean, at, self.length, dim))
         z = ((hits * weight + least) / (misses + least)).log()
         return down * z + (up - down) * (torch.nn.functional.softplus(z) - _HALF)
 
@@ -154,22 +155,22 @@ def _short(length: float) -> float:
     return math.exp(float(np.float16(math.log(length))))
 
 
-def _powers(ratio: float) -> Tensor:
-    """(3,) powers 0, 1, 2 of the scale of h/ℓ, which has bounds: far sides lean on near ones."""
-    s = _WIDTH * math.tanh(math.log(ratio / _CENTER) / _WIDTH)
-    return torch.tensor([1.0, s, s * s], dtype=torch.float64)
+def _powers(ratio: Tensor) -> Tensor:
+    """(3, ...) powers 0, 1, 2 of the scale of h/ℓ, which has bounds: far sides lean on near ones."""
+    s = _WIDTH * torch.tanh((ratio / _CENTER).log() / _WIDTH)
+    return torch.stack([torch.ones_like(s), s, s * s])
 
 
-def _quantities(mean: Tensor, side: float, length: float, dim: int) -> list[float]:
-    """w, n, and the slopes b above and below zero, for cubes of a side (m)."""
-    a, density, up, down = (mean.view(4, 3) @ _powers(side / length)).exp().tolist()
-    return [a * length / side, density * side ** (dim - 1), up, down]
+def _quantities(mean: Tensor, side: Tensor, length: float, dim: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """w, n, and the slopes b above and below zero, for cubes of sides (m) of any shape."""
+    a, density, up, down = (mean.view(4, 3) @ _powers(side / length)).exp()
+    return a * length / side, density * side ** (dim - 1), up, down
 
 
 def _derivatives(
-    hits: Tensor, misses: Tensor, side: float, length: float, dim: int, mean: Tensor
+    hits: Tensor, misses: Tensor, side: Tensor, length: float, dim: int, mean: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Log-odds (M,), and their derivatives (12, M) with respect to the coefficients."""
+    """Log-odds (M,) of cubes of sides (M,), and their derivatives (12, M) by the coefficients."""
     weight, least, up, down = _quantities(mean, side, length, dim)
     strong = hits * weight
     z = ((strong + least) / (misses + least)).log()
@@ -182,7 +183,7 @@ def _derivatives(
         up * above,
         down * (z - above),
     ]
-    return t, (torch.stack(each)[:, None] * _powers(side / length)[:, None]).flatten(0, 1)
+    return t, (torch.stack(each)[:, None] * _powers(side / length)).flatten(0, 1)
 
 
 class Prediction(NamedTuple):
@@ -258,27 +259,28 @@ class Calibrator:
         farthest: deviations that a coefficient may be from that of the sensor model.
         """
         each = [p.on_cpu() for p in predictions]
-        occupied = torch.cat([p.occupied for p in each])
+        hits, misses, occupied = (torch.cat(parts) for parts in list(zip(*each, strict=True))[:3])
+        sizes = torch.tensor([len(p.hits) for p in each])
+        side = torch.tensor([p.side for p in each], dtype=torch.float64).repeat_interleave(sizes)
         prior = _prior_precision()
         before = prior + _MEMORY * (self.precision - prior)
         now, precision = self.mean, before
         room = farthest * _DEVIATION.flatten()
         for step in range(_STEPS):
-            parts = [_derivatives(p.hits, p.misses, p.side, self.length, dim, now) for p in each]
-            theta = torch.sigmoid(torch.cat([t for t, _ in parts]))
-            jacobian = torch.cat([derivative for _, derivative in parts], 1)
+            t, jacobian = _derivatives(hits, misses, side, self.length, dim, now)
+            theta = torch.sigmoid(t)
             precision = before + _INDEPENDENT * (jacobian * (theta * (1 - theta))) @ jacobian.T
             gradient = _INDEPENDENT * jacobian @ (occupied - theta) - before @ (now - self.mean)
             if step == 0:
-                tally = self._tallied(theta, occupied, [len(p.hits) for p in each])
+                tally = self._tallied(theta, occupied, sizes)
             now = now + torch.linalg.solve(precision, gradient)
             now = torch.minimum(torch.maximum(now, _MEAN.flatten() - room), _MEAN.flatten() + room)
         n_predicted = self.n_predicted + len(occupied)
         return replace(self, mean=now, precision=precision, tally=tally, n_predicted=n_predicted)
 
-    def _tallied(self, theta: Tensor, occupied: Tensor, sizes: list[int]) -> Tensor:
-        """The tally with the probabilities (M,) of points, `sizes` of them for each side in turn."""
-        number = torch.arange(len(sizes)).repeat_interleave(torch.tensor(sizes))
+    def _tallied(self, theta: Tensor, occupied: Tensor, sizes: Tensor) -> Tensor:
+        """The tally with the probabilities (M,) of points, `sizes` (S,) of them for each side in turn."""
+        number = torch.arange(len(sizes)).repeat_interleave(sizes)
         place = number * N_BINS + (theta * N_BINS).long().clamp(0, N_BINS - 1)
         given = torch.where(occupied == 1, theta, 1 - theta)
         loss = -given.clamp_min(_LEAST).log2()

@@ -91,7 +91,7 @@ def test_brier_score_matches_scikit_learn():
 def test_a_tally_of_predictions_has_the_scores_of_its_points():
     theta, labels = drawn()
     theta = (theta.round(decimals=3) + 1e-5).clamp(max=1)  # inside the bins
-    tally = Calibrator.of(10.0, 1)._tallied(theta, labels.double(), [len(theta)])[0]
+    tally = Calibrator.of(10.0, 1)._tallied(theta, labels.double(), torch.tensor([len(theta)]))[0]
     found, expected = scores_of(tally), scores(theta, labels)
     assert list(found) == list(expected)
     for name, value in found.items():

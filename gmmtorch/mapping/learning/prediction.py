@@ -23,10 +23,10 @@ from gmmtorch.scan import Scan
 SIDES = (0.02, 0.1, 0.4)
 """Sides (m) of the cubes for which a map predicts."""
 
-_BEAMS = 12  # of a window, from one scan, whose neighbourhood few components reach
+_BEAMS = 24  # of a window, from one scan, whose neighbourhood few components reach
 _PREDICTING = 5.0, 1.2e-3  # ms of a prediction, and of each pair of a point and a cone, on one core
-_LEARNING, _MOST = (25.0, 1e-3), 200_000  # ms of a window, and of each of its points, at most so many
-_SHARE = 0.04  # of the time of learning that predictions take
+_LEARNING, _MOST = (20.0, 5e-4), 200_000  # ms of a window, and of each of its points, at most so many
+_SHARE = 0.045  # of the time of learning that predictions take
 
 
 def predicted(
