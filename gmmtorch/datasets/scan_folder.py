@@ -24,7 +24,8 @@ class ScanFolder(Dataset):
     """Scans in the natural order of their file names (scan_2 before scan_10).
 
     Points at or beyond `max_range` have no return. NaN, infinite points and points at the sensor origin are
-    invalid and dropped. With `standing`, poses.txt is not read, and every scan is in the frame of the sensor.
+    invalid and dropped; scans with infinite points, or NaN in a PLY file, are counted. With `standing`,
+    poses.txt is not read, and every scan is in the frame of the sensor.
     """
 
     _poses: torch.Tensor
@@ -55,7 +56,17 @@ class ScanFolder(Dataset):
         return len(self._files)
 
     def _read(self, index: int) -> Scan:
-        return self.ranges.posed(read_cloud(self._files[index]), self._poses[index])
+        points = read_cloud(self._files[index])
+        self._count_invalid(points, index)
+        return self.ranges.posed(points, self._poses[index])
+
+    def _count_invalid(self, points: torch.Tensor, index: int) -> None:
+        """Counts a scan with points that are not finite. NaN in a PCD file is a beam without return instead."""
+        usual = torch.isfinite(points)
+        if self._files[index].suffix == ".pcd":
+            usual |= points.isnan()
+        if not bool(usual.all()):
+            self._skip("points dropped: their coordinates are not finite", index)
 
 
 def _read_poses(path: Path) -> torch.Tensor:

@@ -344,7 +344,13 @@ def test_scan_folders_drop_points_that_are_not_finite_and_refuse_decimal_commas(
     text = cloud.header() + "1 2 3\n4 -inf 6\n7 8 9\n"
     (tmp_path / "right").mkdir()
     folder = scan_folder(tmp_path / "right", {f"0.{kind}": text.encode()}, kitti(np.eye(3), [0.0, 0.0, 0.0]))
-    assert load("scan_folder", folder)[0].points.tolist() == [[1, 2, 3], [7, 8, 9]]
+    scans = load("scan_folder", folder)
+    assert scans[0].points.tolist() == [[1, 2, 3], [7, 8, 9]]
+    assert scans.skipped == {"points dropped: their coordinates are not finite": 1}
+    (folder / "scans" / f"0.{kind}").write_text(text.replace("-inf", "nan"))
+    scans = load("scan_folder", folder)
+    assert scans[0].points.tolist() == [[1, 2, 3], [7, 8, 9]]
+    assert len(scans.skipped) == (kind == "ply")  # NaN in a PCD file is a beam without return
     (folder / "scans" / f"0.{kind}").write_text(text.replace("7 8", "7,5 8"))
     with pytest.raises(
         DataError, match=rf"0\.{kind}, row 3: '7,5' is not a number; write decimals with a point"
