@@ -61,7 +61,7 @@ class ScanFolder(Dataset):
         return self.ranges.posed(points, self._poses[index])
 
     def _count_invalid(self, points: torch.Tensor, index: int) -> None:
-        """Counts a scan with points that are not finite. NaN in a PCD file is a beam without return instead."""
+        """Counts a scan with points that are not finite. NaN in a PCD file is a beam without return."""
         usual = torch.isfinite(points)
         if self._files[index].suffix == ".pcd":
             usual |= points.isnan()
