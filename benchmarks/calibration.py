@@ -78,7 +78,7 @@ def main() -> None:
     note = "Our map with its defaults: one map of each data set, asked at all resolutions."
     first = f"{note} {hardware()}\n\n{markdown(header, ours)}"
     header = ["data", "cell (m)", *(f"log-loss, {m}" for m in METHODS), *(f"ECE, {m}" for m in METHODS)]
-    note = "Beside peers, which are built anew for each resolution: as they are → calibrated. —: more than 4 GiB or ten minutes."
+    note = "Beside peers, which are built anew for each resolution: as they are → calibrated."
     publish("calibration", f"{first}\n\n{note}\n\n{markdown(header, peers)}")
 
 
