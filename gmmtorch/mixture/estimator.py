@@ -164,12 +164,13 @@ class MixtureEstimator(MixtureState, ABC):
         points = self._as_points(X, reset=reset).detach()
         warn_if_coarse(X, points)
         weight = checked_weight(sample_weight, points)
-        points, weight = points[weight > 0], weight[weight > 0]
+        if bool((weight == 0).any()):
+            points, weight = points[weight > 0], weight[weight > 0]
         if not self._accepts_any_total_weight:
             check_weight_scale(weight)
         if reset:
             self.check_parameters(points.shape[0])
-        center = (points * (weight / weight.sum())[:, None]).sum(0)
+        center = points.mT @ (weight / weight.sum())
         return Cloud(points - center, weight, center)
 
     def _store_fit(

@@ -29,8 +29,8 @@ from gmmtorch.linalg import inverse_factor, safe_cholesky, triangle_indices, unp
 SOFTMAX_DTYPES = {"float32": torch.float32, "float64": torch.float64}
 """Dtypes for the exponentials of the E-step, by name."""
 
-_LOG_2PI = 1.8378770664093453
-_MIN_LOG_WEIGHT = -1e30  # replaces log 0: finite, so that products are not NaN
+LOG_2PI = 1.8378770664093453
+MIN_LOG_WEIGHT = -1e30  # replaces log 0: finite, so that products are not NaN
 
 
 class Parameters(NamedTuple):
@@ -43,10 +43,10 @@ class Parameters(NamedTuple):
 
 def quadratic_features(points: Tensor) -> Tensor:
     """φ(x) = [1, x, x_i x_j (i ≤ j)]: (N, D) → (N, 1 + D + D(D+1)/2)."""
-    return torch.cat([points.new_ones(points.shape[0], 1), points, _products(points, points)], 1)
+    return torch.cat([points.new_ones(points.shape[0], 1), points, products(points, points)], 1)
 
 
-def _products(left: Tensor, right: Tensor) -> Tensor:
+def products(left: Tensor, right: Tensor) -> Tensor:
     """x_i y_j, i ≤ j: (…, D) and (…, D) → (…, D(D+1)/2). Slices are much faster here than index arrays."""
     return torch.cat([left[..., i : i + 1] * right[..., i:] for i in range(left.shape[-1])], -1)
 
@@ -57,7 +57,7 @@ def shift_features(features: Tensor, offset: Tensor) -> Tensor:
     """
     dim = offset.shape[-1]
     count, first, second = features[..., :1], features[..., 1 : 1 + dim], features[..., 1 + dim :]
-    second = second + _products(first, offset) + _products(offset, first) + count * _products(offset, offset)
+    second = second + products(first, offset) + products(offset, first) + count * products(offset, offset)
     return torch.cat([count, first + count * offset, second], -1)
 
 
@@ -76,12 +76,17 @@ def _natural_parameters(parameters: Parameters, factors: Tensor) -> Tensor:
     weights, means, _ = parameters
     dim = means.shape[1]
     whiten = inverse_factor(factors)
-    precision = whiten @ whiten.transpose(-2, -1)
-    linear = (precision @ means[:, :, None]).squeeze(-1)
-    log_weight = torch.log(weights).clamp_min(_MIN_LOG_WEIGHT)
+    log_weight = torch.log(weights).clamp_min(MIN_LOG_WEIGHT)
     half_log_det = torch.log(factors.diagonal(dim1=-2, dim2=-1)).sum(-1)
-    constant = log_weight - half_log_det - 0.5 * (dim * _LOG_2PI + (linear * means).sum(1))
-    rows, cols = triangle_indices(dim, means.device)
+    constant = log_weight - half_log_det - 0.5 * dim * LOG_2PI
+    return natural_of_precisions(whiten @ whiten.transpose(-2, -1), means, constant)
+
+
+def natural_of_precisions(precision: Tensor, means: Tensor, constant: Tensor) -> Tensor:
+    """W (K, F) such that φ(x)·W_k = c_k − ½ (x − μ_k)ᵀ Λ_k (x − μ_k), with Λ (K, D, D), c (K,)."""
+    linear = (precision @ means[:, :, None]).squeeze(-1)
+    constant = constant - 0.5 * (linear * means).sum(1)
+    rows, cols = triangle_indices(means.shape[1], means.device)
     # φ has each off-diagonal product once, for two matrix entries.
     quadratic = torch.where(rows == cols, -0.5, -1.0) * precision[:, rows, cols]
     return torch.cat([constant[:, None], linear, quadratic], 1)
@@ -174,7 +179,7 @@ def log_joint(points: Tensor, parameters: Parameters) -> Tensor:
     offset = points[:, None, :] - means
     squared = torch.einsum("nkd,kde->nke", offset, whiten).square().sum(-1)
     half_log_det = torch.log(factors.diagonal(dim1=-2, dim2=-1)).sum(-1)
-    constant = torch.log(weights).clamp_min(_MIN_LOG_WEIGHT) - half_log_det - 0.5 * means.shape[1] * _LOG_2PI
+    constant = torch.log(weights).clamp_min(MIN_LOG_WEIGHT) - half_log_det - 0.5 * means.shape[1] * LOG_2PI
     return constant - 0.5 * squared
 
 

@@ -11,10 +11,12 @@ from typing import Generic, TypeVar
 import torch
 from torch import Tensor
 
+from gmmtorch.errors import NumericalError
 from gmmtorch.kernels.mixtures.e_step import in_spatial_order
-from gmmtorch.mixture.em import exact
-from gmmtorch.mixture.em.covariance_types import constrain
+from gmmtorch.mixture.em import by_type, exact
+from gmmtorch.mixture.em.covariance_types import compact, constrain, expand
 from gmmtorch.mixture.em.exact import Parameters
+from gmmtorch.mixture.em.grouping import Rows
 
 _STEPS_AHEAD = 8  # on a GPU: steps between two waits for their bounds
 State = TypeVar("State")  # what an iteration improves: `Parameters`, or a posterior
@@ -71,6 +73,64 @@ def run_em(
 def has_converged(bounds: Sequence[float], tol: float, previous_bound: float = -math.inf) -> bool:
     """Whether the last iteration changed the bound by less than `tol`."""
     return len(bounds) > 0 and abs(bounds[-1] - [previous_bound, *bounds][-2]) < tol
+
+
+def em_step(
+    rows: Rows, reg_covar: float, softmax_dtype: torch.dtype, covariance_type: str = "full"
+) -> Step[Parameters]:
+    """EM steps on points, centred, or cells. Covariances have the shape of their type."""
+    points = rows.values if rows.are_points else None
+    if points is not None and points.shape[1] > 3:
+        return _typed_step(points, rows.weight, reg_covar, softmax_dtype, covariance_type)
+    natural = natural_step(rows.features(), rows.weight, reg_covar, softmax_dtype, points, covariance_type)
+    if covariance_type == "full":
+        return natural
+    known: list[tuple[Parameters, Parameters]] = []  # the last result, in both shapes
+
+    def step(parameters: Parameters) -> tuple[Parameters, float]:
+        if known and known[0][0] is parameters:
+            given = known[0][1]
+        else:
+            given = parameters._replace(
+                covariances=expand(parameters.covariances, covariance_type, *parameters.means.shape)
+            )
+        new, bound = natural(given)
+        found = new._replace(covariances=compact(new.covariances, covariance_type))
+        known[:] = [(found, new)]
+        return found, bound
+
+    return step
+
+
+def _typed_step(
+    points: Tensor, sample_weight: Tensor, reg_covar: float, softmax_dtype: torch.dtype, kind: str
+) -> Step[Parameters]:
+    """EM steps with the arithmetic of the covariance type; direct ones from the first that loses digits."""
+    total, has_linear = sample_weight.sum(), by_type.has_linear_form(points.shape[1], kind)
+    direct = [not has_linear]
+
+    def take(parameters: Parameters, linear: bool, check: bool) -> tuple[Parameters, Tensor]:
+        factors = by_type.Factors(parameters, kind, check)
+        sums, value = by_type.expected_moments(points, sample_weight, factors, softmax_dtype, linear)
+        moments, second = sums.moments()
+        new = by_type.maximized(moments, reg_covar, parameters, kind)
+        failed = factors.failed
+        if linear:
+            failed = failed | factors.lost_digits() | by_type.have_cancelled(second, new.covariances, kind)
+        return new, (value / total).masked_fill(failed, math.nan)
+
+    def checked(parameters: Parameters) -> tuple[Parameters, float]:
+        direct[0] = True
+        new, bound = take(parameters, False, True)
+        if not math.isfinite(float(bound)):
+            raise NumericalError(
+                "The log-likelihood is not finite: columns of X are too large or too different in scale; "
+                "scale X, for example with StandardScaler."
+            )
+        return new, float(bound)
+
+    n_ahead = 1 if points.device.type == "cpu" else _STEPS_AHEAD
+    return _ahead(lambda parameters: take(parameters, not direct[0], False), checked, n_ahead)
 
 
 def natural_step(
@@ -162,6 +222,6 @@ def guarded_step(
 
 
 def of_type(parameters: Parameters, covariance_type: str) -> Parameters:
-    """The parameters with covariances of the type (see `covariance_types`)."""
+    """The parameters with the nearest covariances (K, D, D) of the type (see `covariance_types`)."""
     covariances = constrain(parameters.covariances, covariance_type, parameters.weights)
     return parameters._replace(covariances=covariances)

@@ -1,0 +1,344 @@
+"""EM in many dimensions: each covariance type has the arithmetic that it needs.
+
+Covariances have the shape of their type: full (K, D, D), tied (D, D), diag (K, D), spherical (K,).
+
+ - spherical, diag: log π_k + log N(x|k) is linear in [1, x, |x|²] or [1, x, x²]: products of O(NKD).
+ - tied: the same as spherical after one whitening, x ↦ L⁻¹ x.
+ - full, few dimensions: linear in [1, x, x_i x_j (i ≤ j)], see `exact`; its products are the smallest.
+ - full, more dimensions: ‖L⁻¹x − L⁻¹μ‖², a block of components at a time. Second moments are taken about
+   the component's last mean, on a CPU only of the points that it has a share in.
+
+Arrays of components and points are (K, n): such products are the fastest. Features and responsibilities
+exist for one chunk of points at a time.
+
+The linear forms cancel digits if components are thin and far apart. A step that loses too many is taken
+again in the direct form, ‖L⁻¹x − L⁻¹μ‖² for every type.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import NumericalError
+from gmmtorch.kernels.chunks import chunk_elements, chunked
+from gmmtorch.kernels.mixtures.e_step import softmax
+from gmmtorch.linalg import safe_cholesky, unpack_symmetric
+from gmmtorch.mixture.em.covariance_types import compact, constrain, type_shape
+from gmmtorch.mixture.em.exact import LOG_2PI, MIN_LOG_WEIGHT, Parameters, natural_of_precisions, products
+
+_FEATURES_UP_TO = 24
+"""Dimensions up to which full covariances use products x_i x_j: measured, see `benchmarks/dimensions.py`."""
+_MOST_LOST = 1e-6  # nats a dimension that the log-density of the linear form may lose
+_MOST_LOST_VARIANCE = 1e-5  # share of a variance that the moments of the linear form may lose
+_NO_SHARE = 1e-16  # of the largest responsibility of a component in a chunk: such points do not count
+
+
+class Joint(Protocol):
+    """From points (n, D) to log π_k + log N(x|k), (K, n). `square`: their `squares`, if they are known."""
+
+    def __call__(self, points: Tensor, square: Tensor | None = None) -> Tensor: ...
+
+
+def has_linear_form(dim: int, kind: str) -> bool:
+    """Whether the linear form is the fastest of a covariance type: the one place of this choice."""
+    return kind != "full" or dim <= _FEATURES_UP_TO
+
+
+def compacted(parameters: Parameters, kind: str) -> Parameters:
+    """The nearest covariances of the type, in its shape, to those (K, D, D)."""
+    covariances = constrain(parameters.covariances, kind, parameters.weights)
+    return parameters._replace(covariances=compact(covariances, kind))
+
+
+# -- log-densities --------------------------------------------------------------------------------
+
+
+class Factors:
+    """Parameters with what their log-densities need: L⁻¹ in the shape of the type, and log-constants (K,).
+
+    With `check`, covariances that are not positive definite raise `NumericalError`. Without it, nothing
+    waits for the device, and `failed` () tells.
+    """
+
+    def __init__(self, parameters: Parameters, kind: str, check: bool = True) -> None:
+        self.weights, self.means, covariances = parameters
+        self.kind, self.dim = kind, self.means.shape[1]
+        if kind in ("full", "tied"):
+            if check:
+                factors = safe_cholesky(covariances.view(-1, self.dim, self.dim)).view_as(covariances)
+                self.failed = torch.zeros((), dtype=torch.bool, device=self.means.device)
+            else:
+                factors, info = torch.linalg.cholesky_ex(covariances)
+                self.failed = (info != 0).any()
+            eye = torch.eye(self.dim, dtype=factors.dtype, device=factors.device)
+            self.whiten = torch.linalg.solve_triangular(factors, eye, upper=False)
+            half_log_det = factors.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        else:
+            self.failed = ~(covariances > 0).all()
+            if check and bool(self.failed):
+                raise NumericalError(
+                    f"The least variance of a component is {float(covariances.min()):.3g}, not above zero; "
+                    "raise reg_covar, or use fewer components."
+                )
+            self.whiten = covariances.rsqrt()
+            half_log_det = 0.5 * covariances.log() * (self.dim if kind == "spherical" else 1)
+            half_log_det = half_log_det.sum(-1) if kind == "diag" else half_log_det
+        log_weight = self.weights.log().clamp_min(MIN_LOG_WEIGHT)
+        self.constant = log_weight - half_log_det - 0.5 * self.dim * LOG_2PI
+
+    def whitened_means(self) -> Tensor:
+        """L⁻¹ μ (K, D)."""
+        if self.kind in ("full", "tied"):
+            return (self.whiten @ self.means[:, :, None]).squeeze(-1)
+        return self.means * self.whiten.view(self.means.shape[0], -1)
+
+    def lost_digits(self, reach: Tensor | None = None) -> Tensor:
+        """Whether the linear form loses too many digits, (); also for points up to `reach` (D,) from 0."""
+        size = self.whitened_means().square().sum(1) * self.weights.sign()
+        if reach is not None:
+            if self.kind in ("full", "tied"):
+                far = (self.whiten.abs() @ reach).square().sum(-1)
+            else:
+                far = (reach * self.whiten.view(-1, self.dim if self.kind == "diag" else 1)).square().sum(1)
+            size = torch.maximum(size, far.amax())
+        return size.amax() * torch.finfo(size.dtype).eps > _MOST_LOST * self.dim
+
+    def linear(self) -> Joint:
+        """The linear form."""
+        kind, means, dim = self.kind, self.means, self.dim
+        if kind == "full":
+            weights = natural_of_precisions(self.whiten.mT @ self.whiten, means, self.constant)
+            constant, slope, curve = weights[:, 0], weights[:, 1 : 1 + dim], weights[:, 1 + dim :]
+        elif kind == "tied":
+            slope = self.whitened_means()
+            constant = self.constant - 0.5 * slope.square().sum(1)
+            curve = means.new_full((means.shape[0], 1), -0.5)
+        else:
+            precision = self.whiten.square().view(means.shape[0], -1)
+            slope, curve = means * precision, -0.5 * precision
+            constant = self.constant - 0.5 * (slope * means).sum(1)
+
+        def joint(points: Tensor, square: Tensor | None = None) -> Tensor:
+            points = points @ self.whiten.mT if kind == "tied" else points
+            square = squares(points, "spherical" if kind == "tied" else kind) if square is None else square
+            found = torch.addmm(constant[:, None], slope, points.mT)
+            return torch.addmm(found, curve, square.mT)
+
+        return joint
+
+    def direct(self) -> Joint:
+        """The direct form, a block of components at a time."""
+        middle = self.whitened_means()
+        k, dim = middle.shape
+
+        def block(points: Tensor, part: slice) -> Tensor:
+            if self.kind == "full":
+                # L⁻¹ is lower triangular: of many dimensions, half of the product is zero.
+                width = dim if dim < 96 else -(-dim // 4)
+                total = points.new_zeros(())
+                for a in range(0, dim, width):
+                    rows = self.whiten[part, a : a + width, : a + width]
+                    z = rows.reshape(-1, rows.shape[2]) @ points[:, : a + width].mT
+                    z = z.view(*rows.shape[:2], -1) - middle[part, a : a + width, None]
+                    total = total + (z * z).sum(1)
+                return total
+            if self.kind == "tied":
+                z = points - middle[part, None, :]
+            else:
+                z = (points - self.means[part, None, :]) * self.whiten[part].view(
+                    -1, 1, self.whiten[0].numel()
+                )
+            return (z * z).sum(2)
+
+        def joint(points: Tensor, square: Tensor | None = None) -> Tensor:
+            points = points @ self.whiten.mT if self.kind == "tied" else points
+            least = 8 * chunk_elements(points.device)
+            rows = max(64, min(1024 if points.device.type == "cpu" else 1 << 16, least // dim))
+            found = []
+            for some in points.split(rows):
+                n = max(1, least // (some.shape[0] * dim))
+                found.append(torch.cat([block(some, slice(i, i + n)) for i in range(0, k, n)]))
+            return self.constant[:, None] - 0.5 * torch.cat(found, 1)
+
+        return joint
+
+
+def squares(points: Tensor, kind: str) -> Tensor:
+    """The quadratic features of a type: |x|² (n, 1), x² (n, D), or x_i x_j (i ≤ j)."""
+    if kind == "spherical":
+        return (points * points).sum(1, keepdim=True)
+    return points * points if kind == "diag" else products(points, points)
+
+
+def log_joint(points: Tensor, center: Tensor, parameters: Parameters, kind: str) -> Joint:
+    """The fastest form with enough digits for these points (N, D) relative to `center` (D,), the origin of
+    the parameters.
+    """
+    factors = Factors(parameters, kind)
+    if has_linear_form(points.shape[1], kind):
+        low, high = points.detach().aminmax(dim=0)
+        if not bool(factors.lost_digits(torch.maximum(high - center, center - low))):
+            return factors.linear()
+    return factors.direct()
+
+
+def rows_of_chunk(n_components: int, dim: int, kind: str, device: torch.device) -> int:
+    """Points of a chunk, such that its largest array is small."""
+    linear = has_linear_form(dim, kind)
+    width = dim * (dim + 1) // 2 if linear and kind == "full" else dim
+    # The direct form looks up the points of each component, which is worthwhile in large chunks.
+    most = chunk_elements(device) * (1 if linear or device.type != "cpu" else 8)
+    return max(64, most // max(n_components, width))
+
+
+# -- moments --------------------------------------------------------------------------------------
+
+
+class Sums:
+    """Moments of points with responsibilities, added up chunk by chunk.
+
+    With `about` (K, D), second moments are about these points: no digits cancel if they are near the
+    means. Otherwise they are sums of the linear form's features, about 0.
+    """
+
+    def __init__(self, n_components: int, like: Tensor, kind: str, about: Tensor | None = None) -> None:
+        k, dim = n_components, like.shape[1]
+        self._kind, self._about = kind, about
+        self._count, self._first = like.new_zeros(k), like.new_zeros(k, dim)
+        if kind in ("diag", "spherical"):
+            self._second = like.new_zeros(k, dim if kind == "diag" else 1)
+        elif about is None and kind == "full":
+            self._second = like.new_zeros(k, dim * (dim + 1) // 2)
+        else:
+            self._second = like.new_zeros((k, dim, dim) if kind == "full" else (dim, dim))
+
+    def add(self, points: Tensor, gamma: Tensor, square: Tensor | None = None) -> None:
+        """Add points (n, D) with responsibilities (K, n). `square`: their `squares`, if they are known."""
+        self._count += gamma.sum(1)
+        self._first.addmm_(gamma, points)
+        if self._about is not None:
+            self._add_about(points, gamma, self._about)
+        elif self._kind == "tied":
+            self._second.addmm_((points * gamma.sum(0)[:, None]).mT, points)
+        else:
+            self._second.addmm_(gamma, squares(points, self._kind) if square is None else square)
+
+    def _add_about(self, points: Tensor, gamma: Tensor, about: Tensor) -> None:
+        (n, dim), sparse = points.shape, points.device.type == "cpu"
+        size = 1 if sparse else max(1, chunk_elements(points.device) // (n * dim))
+        near = gamma > _NO_SHARE * gamma.amax(1, keepdim=True).clamp_min(1e-20) if sparse else None
+        for i in range(0, gamma.shape[0], size):
+            part, x, g = slice(i, i + size), points, gamma[i : i + size]
+            if near is not None:
+                index = near[i].nonzero().squeeze(1)
+                if index.shape[0] == 0:
+                    continue
+                if 4 * index.shape[0] < 3 * n:
+                    x, g = points.index_select(0, index), g.index_select(1, index)
+            d = x - about[part, None, :]
+            if self._kind in ("diag", "spherical"):
+                sums = (g[:, None, :] @ d.square_()).squeeze(1)
+                self._second[part] += sums if self._kind == "diag" else sums.sum(1, keepdim=True)
+                continue
+            scaled = (d * g[:, :, None]).mT
+            if self._kind == "full":
+                self._second[part].baddbmm_(scaled, d)
+            else:
+                self._second += (scaled @ d).sum(0)
+
+    def moments(self) -> tuple[Parameters, Tensor]:
+        """Number of points, mean and covariance of each component, and the second moments that the
+        covariances come from: (K, D), tied (1, D), spherical (K, 1).
+        """
+        count = self._count + 10 * torch.finfo(self._count.dtype).eps
+        means, dim = self._first / count[:, None], self._first.shape[1]
+        shift = means if self._about is None else means - self._about * (self._count / count)[:, None]
+        if self._kind == "tied":
+            second = self._second / count.sum()
+            covariances = second - (shift * (count / count.sum())[:, None]).mT @ shift
+        elif self._kind == "full":
+            second = self._second / count.view(-1, *[1] * (self._second.ndim - 1))
+            second = unpack_symmetric(second, dim) if second.ndim == 2 else second
+            covariances = second - shift[:, :, None] * shift[:, None, :]
+        else:
+            second, square = self._second / count[:, None], shift.square()
+            if self._kind == "spherical":
+                second, square = second / dim, square.mean(1, keepdim=True)
+            covariances = (second - square).clamp_min(0)
+            return Parameters(self._count, means, covariances.view(self._type_shape())), second
+        covariances.diagonal(dim1=-2, dim2=-1).clamp_min_(0)
+        return Parameters(self._count, means, covariances), second.diagonal(dim1=-2, dim2=-1).view(-1, dim)
+
+    def _type_shape(self) -> tuple[int, ...]:
+        return type_shape(self._kind, *self._first.shape)
+
+
+def have_cancelled(second: Tensor, covariances: Tensor, kind: str) -> Tensor:
+    """Whether covariances, as differences of second moments, lost digits that they need, ()."""
+    if kind in ("full", "tied"):
+        scale = torch.maximum(
+            second.view(covariances.shape[:-1]), covariances.diagonal(dim1=-2, dim2=-1)
+        ).rsqrt()
+        factors, info = torch.linalg.cholesky_ex(covariances * scale[..., None] * scale[..., None, :])
+        left = factors.diagonal(dim1=-2, dim2=-1).square().amin().masked_fill((info != 0).any(), 0.0)
+    else:
+        left = (covariances.view(second.shape) / torch.maximum(second, covariances.view(second.shape))).amin()
+    return ~(left * _MOST_LOST_VARIANCE > torch.finfo(left.dtype).eps)
+
+
+def expected_moments(
+    points: Tensor, sample_weight: Tensor, factors: Factors, softmax_dtype: torch.dtype, linear: bool
+) -> tuple[Sums, Tensor]:
+    """E-step (2.3): moments of the responsibilities, and Σ_n p_n log p(x_n), (); direct unless `linear`."""
+    (n, dim), k, kind = points.shape, factors.means.shape[0], factors.kind
+    joint = factors.linear() if linear else factors.direct()
+
+    def shares(part: slice) -> tuple[Tensor, Tensor | None, Tensor, Tensor]:
+        square = squares(points[part], kind) if linear and kind != "tied" else None
+        return points[part], square, *softmax(joint(points[part], square), sample_weight[part], softmax_dtype)
+
+    sums = Sums(k, points, kind, None if linear else factors.means)
+    total = points.new_zeros(())
+    for some, square, gamma, value in chunked(n, rows_of_chunk(k, dim, kind, points.device), shares):
+        sums.add(some, gamma, square)
+        total += value
+    return sums, total
+
+
+def moments_of_labels(
+    points: Tensor, weight: Tensor, labels: Tensor, n_components: int, kind: str
+) -> Parameters:
+    """Number of points, mean and covariance of the points (N, D) of each label (N,), labels below K."""
+    dim = points.shape[1]
+    count = weight.new_zeros(n_components).index_add_(0, labels, weight)
+    means = points.new_zeros(n_components, dim)
+    rows = rows_of_chunk(n_components, dim, kind, points.device)
+    for some, p, own in zip(points.split(rows), weight.split(rows), labels.split(rows), strict=True):
+        means.index_add_(0, own, some * p[:, None])
+    sums = Sums(n_components, points, kind, means / count[:, None].clamp_min(1e-300))
+    for some, p, own in zip(points.split(rows), weight.split(rows), labels.split(rows), strict=True):
+        gamma = points.new_zeros(n_components, len(own)).scatter_(0, own[None], p[None])
+        sums.add(some, gamma)
+    return sums.moments()[0]
+
+
+def maximized(moments: Parameters, reg_covar: float, previous: Parameters | None, kind: str) -> Parameters:
+    """M-step (2.4)-(2.6). A component that lost all its points keeps its `previous` mean and covariance."""
+    count, means, covariances = moments
+    eps = 10 * torch.finfo(count.dtype).eps
+    alive, weights = count > eps, count + eps
+    weights = weights / weights.sum()
+    if kind in ("full", "tied"):
+        covariances.diagonal(dim1=-2, dim2=-1).add_(reg_covar)
+    else:
+        covariances = covariances + reg_covar
+    if previous is None:
+        return Parameters(weights, means, covariances)
+    if kind != "tied":
+        keep = alive.view(-1, *[1] * (covariances.ndim - 1))
+        covariances = torch.where(keep, covariances, previous.covariances)
+    means = torch.where(alive[:, None], means, previous.means)
+    return Parameters(torch.where(alive, weights, 0.0), means, covariances)
