@@ -74,7 +74,7 @@ class MixtureDensity(DensityMixin, BaseEstimator, nn.Module):
     def score_samples(self, X: Array) -> Array:
         """log p(x) of each point, (N,), nats."""
         points = self._as_points(X)
-        return self._as_kind_of(X, torch.cat([torch.logsumexp(part, 1) for part in self._joint(points)]))
+        return self._as_kind_of(X, torch.cat([torch.logsumexp(part, 0) for part in self._joint(points)]))
 
     def forward(self, X: Tensor) -> Tensor:
         """log p(x) of each point, (N,), nats: `score_samples` for use inside a network."""
@@ -87,32 +87,32 @@ class MixtureDensity(DensityMixin, BaseEstimator, nn.Module):
     def predict_proba(self, X: Array) -> Array:
         """Responsibilities γ (N, K). Each row sums to one."""
         points = self._as_points(X)
-        return self._as_kind_of(X, torch.cat([torch.softmax(part, 1) for part in self._joint(points)]))
+        return self._as_kind_of(X, torch.cat([torch.softmax(part, 0).T for part in self._joint(points)]))
 
     def predict(self, X: Array) -> Array:
         """Index (N,) of the most likely component of each point."""
         points = self._as_points(X)
-        labels = torch.cat([part.argmax(1) for part in self._joint(points)])
+        labels = torch.cat([part.argmax(0) for part in self._joint(points)])
         return labels if isinstance(X, Tensor) else labels.cpu().numpy()
 
     def _joint(self, points: Tensor) -> Iterator[Tensor]:
-        """log π_k + log N(x|k), in chunks (n, K)."""
+        """log π_k + log N(x|k), in chunks (K, n)."""
         (k, dim), kind = self.means.shape, self._fitted_type
         center = (self.weights[:, None] * self.means).sum(0)
         if dim > 3:
             parameters = Parameters(self.weights, self.means - center, self._typed_covariances())
-            joint = by_type.log_joint(points, center, parameters, kind)
+            joint = by_type.log_joint(parameters, kind)
             rows = by_type.rows_of_chunk(k, dim, kind, points.device)
-            yield from (joint(part - center).T for part in points.split(rows))
+            yield from (joint(part - center) for part in points.split(rows))
             return
         centered = points - center
         parameters = Parameters(self.weights, self.means - center, self.covariances)
         rows = max(64, chunk_elements(points.device) // k)
         if em.is_ill_conditioned(parameters) or bool((centered.abs() > _FAR).any()):
-            yield from (em.log_joint(part, parameters) for part in centered.split(rows))
+            yield from (em.log_joint(part, parameters).T for part in centered.split(rows))
             return
-        natural = em.natural_parameters(parameters).T.contiguous()
-        yield from (em.quadratic_features(part) @ natural for part in centered.split(rows))
+        natural = em.natural_parameters(parameters)
+        yield from (natural @ em.quadratic_features(part).T for part in centered.split(rows))
 
     def n_parameters(self) -> int:
         """Number of free parameters: for full covariances K(1 + D + D(D+1)/2) − 1."""

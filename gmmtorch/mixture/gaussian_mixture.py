@@ -244,9 +244,11 @@ class GaussianMixture(MixtureEstimator):
         reg, dtype = float(self.reg_covar), em.SOFTMAX_DTYPES[self.dtype]
         first, owner = self._start(rows, center, generator)
         if not self._truncates(rows.weight.shape[0], *first.means.shape):
+            start = [first]
+            del first  # which may be most of the memory
             return loop.run_em(
                 loop.em_step(rows, reg, dtype, self.covariance_type),
-                first,
+                start.pop(),
                 tol=self.tol,
                 max_iter=self.max_iter,
                 on_iteration=on_iteration,

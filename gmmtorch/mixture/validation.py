@@ -55,7 +55,7 @@ def warn_if_coarse(X: Array, points: Tensor) -> None:
     """Warn if X is float32 and so far from the origin that rounding exceeds 1 % of its spread."""
     if getattr(X, "dtype", None) not in (torch.float32, np.float32):
         return
-    largest = torch.stack(points.aminmax(dim=0)).abs().amax(0)
+    largest = torch.maximum(points.amax(0), -points.amin(0))
     rounding = torch.finfo(torch.float32).eps * largest
     spread = points.std(0, correction=0)
     if bool(((rounding > 0.01 * spread) & (spread > 0)).any()):

@@ -29,10 +29,9 @@ from gmmtorch.linalg import safe_cholesky, unpack_symmetric
 from gmmtorch.mixture.em.covariance_types import compact, constrain, type_shape
 from gmmtorch.mixture.em.exact import LOG_2PI, MIN_LOG_WEIGHT, Parameters, natural_of_precisions, products
 
-_FEATURES_UP_TO = 24
-"""Dimensions up to which full covariances use products x_i x_j: measured, see `benchmarks/dimensions.py`."""
 _MOST_LOST = 1e-6  # nats a dimension that the log-density of the linear form may lose
 _MOST_LOST_VARIANCE = 1e-5  # share of a variance that the moments of the linear form may lose
+_ROWS = (512, 1 << 16)  # points of a product of the direct form, on a CPU and elsewhere
 _NO_SHARE = 1e-16  # of the largest responsibility of a component in a chunk: such points do not count
 
 
@@ -42,9 +41,13 @@ class Joint(Protocol):
     def __call__(self, points: Tensor, square: Tensor | None = None) -> Tensor: ...
 
 
-def has_linear_form(dim: int, kind: str) -> bool:
-    """Whether the linear form is the fastest of a covariance type: the one place of this choice."""
-    return kind != "full" or dim <= _FEATURES_UP_TO
+def has_linear_form(n_components: int, dim: int, kind: str) -> bool:
+    """Whether the linear form is the fastest of a covariance type: the one place of this choice.
+
+    For full covariances it was measured: in 50 dimensions, making the D (D + 1)/2 features of a point takes
+    as long as their products with 50 components.
+    """
+    return kind != "full" or dim <= 20 or dim <= min(n_components, 50)
 
 
 def compacted(parameters: Parameters, kind: str) -> Parameters:
@@ -73,9 +76,8 @@ class Factors:
             else:
                 factors, info = torch.linalg.cholesky_ex(covariances)
                 self.failed = (info != 0).any()
-            eye = torch.eye(self.dim, dtype=factors.dtype, device=factors.device)
-            self.whiten = torch.linalg.solve_triangular(factors, eye, upper=False)
             half_log_det = factors.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+            self.whiten = _invert(factors)
         else:
             self.failed = ~(covariances > 0).all()
             if check and bool(self.failed):
@@ -95,15 +97,11 @@ class Factors:
             return (self.whiten @ self.means[:, :, None]).squeeze(-1)
         return self.means * self.whiten.view(self.means.shape[0], -1)
 
-    def lost_digits(self, reach: Tensor | None = None) -> Tensor:
-        """Whether the linear form loses too many digits, (); also for points up to `reach` (D,) from 0."""
+    def lost_digits(self) -> Tensor:
+        """Whether the linear form loses too many digits near a component, (). Far from all components its
+        error is small beside the log-density.
+        """
         size = self.whitened_means().square().sum(1) * self.weights.sign()
-        if reach is not None:
-            if self.kind in ("full", "tied"):
-                far = (self.whiten.abs() @ reach).square().sum(-1)
-            else:
-                far = (reach * self.whiten.view(-1, self.dim if self.kind == "diag" else 1)).square().sum(1)
-            size = torch.maximum(size, far.amax())
         return size.amax() * torch.finfo(size.dtype).eps > _MOST_LOST * self.dim
 
     def linear(self) -> Joint:
@@ -133,17 +131,17 @@ class Factors:
         """The direct form, a block of components at a time."""
         middle = self.whitened_means()
         k, dim = middle.shape
+        width = max(16, -(-dim // 8)) if self.kind == "full" else dim
 
         def block(points: Tensor, part: slice) -> Tensor:
             if self.kind == "full":
-                # L⁻¹ is lower triangular: of many dimensions, half of the product is zero.
-                width = dim if dim < 96 else -(-dim // 4)
+                # L⁻¹ is lower triangular: products of its parts without zeros take almost half the time.
                 total = points.new_zeros(())
                 for a in range(0, dim, width):
                     rows = self.whiten[part, a : a + width, : a + width]
-                    z = rows.reshape(-1, rows.shape[2]) @ points[:, : a + width].mT
-                    z = z.view(*rows.shape[:2], -1) - middle[part, a : a + width, None]
-                    total = total + (z * z).sum(1)
+                    bias = -middle[part, a : a + width].reshape(-1, 1)
+                    z = torch.addmm(bias, rows.reshape(-1, rows.shape[2]), points[:, : a + width].mT)
+                    total = total + (z * z).view(*rows.shape[:2], -1).sum(1)
                 return total
             if self.kind == "tied":
                 z = points - middle[part, None, :]
@@ -155,15 +153,26 @@ class Factors:
 
         def joint(points: Tensor, square: Tensor | None = None) -> Tensor:
             points = points @ self.whiten.mT if self.kind == "tied" else points
-            least = 8 * chunk_elements(points.device)
-            rows = max(64, min(1024 if points.device.type == "cpu" else 1 << 16, least // dim))
+            most = 2 * chunk_elements(points.device)
+            rows = max(64, min(_ROWS[points.device.type != "cpu"], most // dim))
             found = []
             for some in points.split(rows):
-                n = max(1, least // (some.shape[0] * dim))
+                n = max(1, most // (rows * width))
                 found.append(torch.cat([block(some, slice(i, i + n)) for i in range(0, k, n)]))
             return self.constant[:, None] - 0.5 * torch.cat(found, 1)
 
         return joint
+
+
+def _invert(lower: Tensor) -> Tensor:
+    """Inverts lower triangular matrices (…, D, D) in place, by halves: products are faster than solvers."""
+    half = lower.shape[-1] // 2
+    if half <= 48:
+        eye = torch.eye(lower.shape[-1], dtype=lower.dtype, device=lower.device)
+        return lower.copy_(torch.linalg.solve_triangular(lower, eye, upper=False))
+    first, last = _invert(lower[..., :half, :half]), _invert(lower[..., half:, half:])
+    lower[..., half:, :half] = -last @ (lower[..., half:, :half] @ first)
+    return lower
 
 
 def squares(points: Tensor, kind: str) -> Tensor:
@@ -173,21 +182,17 @@ def squares(points: Tensor, kind: str) -> Tensor:
     return points * points if kind == "diag" else products(points, points)
 
 
-def log_joint(points: Tensor, center: Tensor, parameters: Parameters, kind: str) -> Joint:
-    """The fastest form with enough digits for these points (N, D) relative to `center` (D,), the origin of
-    the parameters.
-    """
+def log_joint(parameters: Parameters, kind: str) -> Joint:
+    """The fastest form with enough digits, of parameters about their own centre."""
     factors = Factors(parameters, kind)
-    if has_linear_form(points.shape[1], kind):
-        low, high = points.detach().aminmax(dim=0)
-        if not bool(factors.lost_digits(torch.maximum(high - center, center - low))):
-            return factors.linear()
+    if has_linear_form(*parameters.means.shape, kind) and not bool(factors.lost_digits()):
+        return factors.linear()
     return factors.direct()
 
 
 def rows_of_chunk(n_components: int, dim: int, kind: str, device: torch.device) -> int:
     """Points of a chunk, such that its largest array is small."""
-    linear = has_linear_form(dim, kind)
+    linear = has_linear_form(n_components, dim, kind)
     width = dim * (dim + 1) // 2 if linear and kind == "full" else dim
     # The direct form looks up the points of each component, which is worthwhile in large chunks.
     most = chunk_elements(device) * (1 if linear or device.type != "cpu" else 8)
@@ -251,26 +256,30 @@ class Sums:
 
     def moments(self) -> tuple[Parameters, Tensor]:
         """Number of points, mean and covariance of each component, and the second moments that the
-        covariances come from: (K, D), tied (1, D), spherical (K, 1).
+        covariances come from: (K, D), tied (1, D), spherical (K, 1). Overwrites the sums.
         """
         count = self._count + 10 * torch.finfo(self._count.dtype).eps
         means, dim = self._first / count[:, None], self._first.shape[1]
         shift = means if self._about is None else means - self._about * (self._count / count)[:, None]
-        if self._kind == "tied":
-            second = self._second / count.sum()
-            covariances = second - (shift * (count / count.sum())[:, None]).mT @ shift
-        elif self._kind == "full":
-            second = self._second / count.view(-1, *[1] * (self._second.ndim - 1))
-            second = unpack_symmetric(second, dim) if second.ndim == 2 else second
-            covariances = second - shift[:, :, None] * shift[:, None, :]
-        else:
+        if self._kind in ("diag", "spherical"):
             second, square = self._second / count[:, None], shift.square()
             if self._kind == "spherical":
                 second, square = second / dim, square.mean(1, keepdim=True)
-            covariances = (second - square).clamp_min(0)
+            covariances = (second - square).clamp_min_(0)
             return Parameters(self._count, means, covariances.view(self._type_shape())), second
+        # In place, because the matrices may be most of the memory.
+        covariances = self._second
+        if self._kind == "tied":
+            covariances = covariances.div_(count.sum())
+            second = covariances.diagonal().clone()[None]
+            covariances.addmm_((shift * (count / count.sum())[:, None]).mT, shift, alpha=-1)
+        else:
+            covariances.div_(count.view(-1, *[1] * (covariances.ndim - 1)))
+            covariances = unpack_symmetric(covariances, dim) if covariances.ndim == 2 else covariances
+            second = covariances.diagonal(dim1=-2, dim2=-1).clone()
+            covariances.baddbmm_(shift[:, :, None], shift[:, None, :], alpha=-1)
         covariances.diagonal(dim1=-2, dim2=-1).clamp_min_(0)
-        return Parameters(self._count, means, covariances), second.diagonal(dim1=-2, dim2=-1).view(-1, dim)
+        return Parameters(self._count, means, covariances), second
 
     def _type_shape(self) -> tuple[int, ...]:
         return type_shape(self._kind, *self._first.shape)
@@ -326,19 +335,19 @@ def moments_of_labels(
 
 
 def maximized(moments: Parameters, reg_covar: float, previous: Parameters | None, kind: str) -> Parameters:
-    """M-step (2.4)-(2.6). A component that lost all its points keeps its `previous` mean and covariance."""
+    """M-step (2.4)-(2.6), in place. A component that lost all its points keeps its `previous` mean and
+    covariance.
+    """
     count, means, covariances = moments
     eps = 10 * torch.finfo(count.dtype).eps
     alive, weights = count > eps, count + eps
     weights = weights / weights.sum()
-    if kind in ("full", "tied"):
-        covariances.diagonal(dim1=-2, dim2=-1).add_(reg_covar)
-    else:
-        covariances = covariances + reg_covar
+    diagonal = covariances.diagonal(dim1=-2, dim2=-1) if kind in ("full", "tied") else covariances
+    diagonal.add_(reg_covar)
     if previous is None:
         return Parameters(weights, means, covariances)
     if kind != "tied":
         keep = alive.view(-1, *[1] * (covariances.ndim - 1))
-        covariances = torch.where(keep, covariances, previous.covariances)
+        torch.where(keep, covariances, previous.covariances, out=covariances)
     means = torch.where(alive[:, None], means, previous.means)
     return Parameters(torch.where(alive, weights, 0.0), means, covariances)

@@ -121,7 +121,7 @@ def from_random_responsibilities(
     points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator, kind: str
 ) -> Parameters:
     """The moments of uniformly random responsibilities: scikit-learn's "random"."""
-    linear = by_type.has_linear_form(points.shape[1], kind)
+    linear = by_type.has_linear_form(n_components, points.shape[1], kind)
     about = None if linear else points.new_zeros(n_components, points.shape[1])
     sums = by_type.Sums(n_components, points, kind, about)
     rows = by_type.rows_of_chunk(n_components, points.shape[1], kind, points.device)

@@ -106,10 +106,11 @@ def _typed_step(
     points: Tensor, sample_weight: Tensor, reg_covar: float, softmax_dtype: torch.dtype, kind: str
 ) -> Step[Parameters]:
     """EM steps with the arithmetic of the covariance type; direct ones from the first that loses digits."""
-    total, has_linear = sample_weight.sum(), by_type.has_linear_form(points.shape[1], kind)
-    direct = [not has_linear]
+    total = sample_weight.sum()
+    direct = [False]
 
-    def take(parameters: Parameters, linear: bool, check: bool) -> tuple[Parameters, Tensor]:
+    def take(parameters: Parameters, check: bool) -> tuple[Parameters, Tensor]:
+        linear = by_type.has_linear_form(*parameters.means.shape, kind) and not direct[0]
         factors = by_type.Factors(parameters, kind, check)
         sums, value = by_type.expected_moments(points, sample_weight, factors, softmax_dtype, linear)
         moments, second = sums.moments()
@@ -121,7 +122,7 @@ def _typed_step(
 
     def checked(parameters: Parameters) -> tuple[Parameters, float]:
         direct[0] = True
-        new, bound = take(parameters, False, True)
+        new, bound = take(parameters, True)
         if not math.isfinite(float(bound)):
             raise NumericalError(
                 "The log-likelihood is not finite: columns of X are too large or too different in scale; "
@@ -130,7 +131,7 @@ def _typed_step(
         return new, float(bound)
 
     n_ahead = 1 if points.device.type == "cpu" else _STEPS_AHEAD
-    return _ahead(lambda parameters: take(parameters, not direct[0], False), checked, n_ahead)
+    return _ahead(lambda parameters: take(parameters, False), checked, n_ahead)
 
 
 def natural_step(
