@@ -185,7 +185,8 @@ def squares(points: Tensor, kind: str) -> Tensor:
 def log_joint(parameters: Parameters, kind: str) -> Joint:
     """The fastest form with enough digits, of parameters about their own centre."""
     factors = Factors(parameters, kind)
-    if has_linear_form(*parameters.means.shape, kind) and not bool(factors.lost_digits()):
+    k, dim = parameters.means.shape
+    if has_linear_form(k, dim, kind) and not bool(factors.lost_digits()):
         return factors.linear()
     return factors.direct()
 

@@ -110,7 +110,8 @@ def _typed_step(
     direct = [False]
 
     def take(parameters: Parameters, check: bool) -> tuple[Parameters, Tensor]:
-        linear = by_type.has_linear_form(*parameters.means.shape, kind) and not direct[0]
+        k, dim = parameters.means.shape
+        linear = by_type.has_linear_form(k, dim, kind) and not direct[0]
         factors = by_type.Factors(parameters, kind, check)
         sums, value = by_type.expected_moments(points, sample_weight, factors, softmax_dtype, linear)
         moments, second = sums.moments()
