@@ -17,7 +17,7 @@ again in the direct form, ‖L⁻¹x − L⁻¹μ‖² for every type.
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -286,23 +286,37 @@ class Sums:
         return type_shape(self._kind, *self._first.shape)
 
 
-def have_cancelled(second: Tensor, covariances: Tensor, kind: str) -> Tensor:
-    """Whether covariances, as differences of second moments, lost digits that they need, ()."""
+def have_cancelled(second: Tensor, covariances: Tensor, kind: str, linear: bool) -> Tensor:
+    """Whether covariances, as differences of second moments, lost digits that they need, ().
+
+    Those of the linear form also if they are thin in a direction that is not an axis.
+    """
     if kind in ("full", "tied"):
-        scale = torch.maximum(
-            second.view(covariances.shape[:-1]), covariances.diagonal(dim1=-2, dim2=-1)
-        ).rsqrt()
-        factors, info = torch.linalg.cholesky_ex(covariances * scale[..., None] * scale[..., None, :])
-        left = factors.diagonal(dim1=-2, dim2=-1).square().amin().masked_fill((info != 0).any(), 0.0)
+        diagonal = covariances.diagonal(dim1=-2, dim2=-1).view_as(second)
+        scale = torch.maximum(second, diagonal).rsqrt().view(covariances.shape[:-1])
+        if linear:
+            factors, info = torch.linalg.cholesky_ex(covariances * scale[..., None] * scale[..., None, :])
+            left = factors.diagonal(dim1=-2, dim2=-1).square().amin().masked_fill((info != 0).any(), 0.0)
+        else:
+            left = (diagonal * scale.view_as(second).square()).amin()
     else:
-        left = (covariances.view(second.shape) / torch.maximum(second, covariances.view(second.shape))).amin()
+        variances = covariances.view(second.shape)
+        left = (variances / torch.maximum(second, variances)).amin()
     return ~(left * _MOST_LOST_VARIANCE > torch.finfo(left.dtype).eps)
 
 
 def expected_moments(
-    points: Tensor, sample_weight: Tensor, factors: Factors, softmax_dtype: torch.dtype, linear: bool
+    points: Tensor,
+    sample_weight: Tensor,
+    factors: Factors,
+    softmax_dtype: torch.dtype,
+    linear: bool,
+    about: Tensor | None = None,
 ) -> tuple[Sums, Tensor]:
-    """E-step (2.3): moments of the responsibilities, and Σ_n p_n log p(x_n), (); direct unless `linear`."""
+    """E-step (2.3): moments of the responsibilities, and Σ_n p_n log p(x_n), ().
+
+    Direct unless `linear`, with second moments about the last means, or `about` (K, D).
+    """
     (n, dim), k, kind = points.shape, factors.means.shape[0], factors.kind
     joint = factors.linear() if linear else factors.direct()
 
@@ -310,7 +324,8 @@ def expected_moments(
         square = squares(points[part], kind) if linear and kind != "tied" else None
         return points[part], square, *softmax(joint(points[part], square), sample_weight[part], softmax_dtype)
 
-    sums = Sums(k, points, kind, None if linear else factors.means)
+    about = None if linear else factors.means if about is None else about
+    sums = Sums(k, points, kind, about)
     total = points.new_zeros(())
     for some, square, gamma, value in chunked(n, rows_of_chunk(k, dim, kind, points.device), shares):
         sums.add(some, gamma, square)
@@ -352,3 +367,45 @@ def maximized(moments: Parameters, reg_covar: float, previous: Parameters | None
         torch.where(keep, covariances, previous.covariances, out=covariances)
     means = torch.where(alive[:, None], means, previous.means)
     return Parameters(torch.where(alive, weights, 0.0), means, covariances)
+
+
+class Moved(NamedTuple):
+    """An EM step: points (K,), the new parameters, Σ_n p_n log p(x_n), and whether digits are lost."""
+
+    count: Tensor
+    parameters: Parameters
+    value: Tensor
+    lost: Tensor
+
+
+def em_step(
+    points: Tensor,
+    sample_weight: Tensor,
+    factors: Factors,
+    softmax_dtype: torch.dtype,
+    reg_covar: float,
+    previous: Parameters | None,
+    linear: bool,
+    about: Tensor | None = None,
+) -> Moved:
+    """E- and M-step in one of the forms: `expected_moments`, `maximized`. Does not wait for the device."""
+    sums, value = expected_moments(points, sample_weight, factors, softmax_dtype, linear, about)
+    moments, second = sums.moments()
+    new = maximized(moments, reg_covar, previous, factors.kind)
+    lost = have_cancelled(second, new.covariances, factors.kind, linear)
+    lost = lost | factors.lost_digits() if linear else lost
+    return Moved(moments.weights, new, value, lost | factors.failed)
+
+
+def exact_step(
+    points: Tensor,
+    sample_weight: Tensor,
+    factors: Factors,
+    softmax_dtype: torch.dtype,
+    reg_covar: float,
+    previous: Parameters | None,
+) -> Moved:
+    """`em_step` in the direct form; if a component moves far, once more with moments about its new mean."""
+    given = (points, sample_weight, factors, softmax_dtype, reg_covar, previous, False)
+    found = em_step(*given)
+    return em_step(*given, about=found.parameters.means) if bool(found.lost) else found

@@ -109,30 +109,28 @@ def _typed_step(
     total = sample_weight.sum()
     direct = [False]
 
-    def take(parameters: Parameters, check: bool) -> tuple[Parameters, Tensor]:
+    given = points, sample_weight
+
+    def step(parameters: Parameters) -> tuple[Parameters, Tensor]:
         k, dim = parameters.means.shape
         linear = by_type.has_linear_form(k, dim, kind) and not direct[0]
-        factors = by_type.Factors(parameters, kind, check)
-        sums, value = by_type.expected_moments(points, sample_weight, factors, softmax_dtype, linear)
-        moments, second = sums.moments()
-        new = by_type.maximized(moments, reg_covar, parameters, kind)
-        failed = factors.failed
-        if linear:
-            failed = failed | factors.lost_digits() | by_type.have_cancelled(second, new.covariances, kind)
-        return new, (value / total).masked_fill(failed, math.nan)
+        factors = by_type.Factors(parameters, kind, check=False)
+        found = by_type.em_step(*given, factors, softmax_dtype, reg_covar, parameters, linear)
+        return found.parameters, (found.value / total).masked_fill(found.lost, math.nan)
 
     def checked(parameters: Parameters) -> tuple[Parameters, float]:
         direct[0] = True
-        new, bound = take(parameters, True)
-        if not math.isfinite(float(bound)):
+        factors = by_type.Factors(parameters, kind)
+        found = by_type.exact_step(*given, factors, softmax_dtype, reg_covar, parameters)
+        bound = float(found.value / total)
+        if not math.isfinite(bound):
             raise NumericalError(
                 "The log-likelihood is not finite: columns of X are too large or too different in scale; "
                 "scale X, for example with StandardScaler."
             )
-        return new, float(bound)
+        return found.parameters, bound
 
-    n_ahead = 1 if points.device.type == "cpu" else _STEPS_AHEAD
-    return _ahead(lambda parameters: take(parameters, False), checked, n_ahead)
+    return _ahead(step, checked, 1 if points.device.type == "cpu" else _STEPS_AHEAD)
 
 
 def natural_step(
