@@ -62,15 +62,16 @@ class GaussianMixture(MixtureEstimator):
         n_init: number of starts; the one with the best lower bound is kept.
         init_params: "kmeans", "k-means++", "random" (random responsibilities) and "random_from_data" are
             those of scikit-learn; further "kmeans_restarts", "random_points", "bounding_box" and
-            "flat_pieces". "auto": k-means for small problems; flat pieces for large ones, where they are
-            as good and take a thousandth of the time. Unused for n_components=None.
+            "flat_pieces". "auto": k-means for small problems and above eight dimensions; flat pieces for
+            large ones, where they are as good and take a thousandth of the time. Unused for
+            n_components=None.
         weights_init, means_init, precisions_init: (K,), (K, D) and, in the shape of the covariance type,
             precisions: initial parameters that replace those of the initialization.
         random_state: a seed, a `RandomState`, a `torch.Generator`, or None for a random seed.
         algorithm: "exact" compares every point with every component. "truncated" compares it with nearby
             components only, with a momentum (see `truncated`): the method for many components, whose
             `lower_bound_` is a few thousandths of a nat below the mean log-likelihood. "auto": truncated
-            from 48 components and 4·10⁶ pairs of point and component on.
+            from 48 components and 4·10⁶ pairs of point and component on, in up to eight dimensions.
         max_cells: if given, EM runs on the moments of at most this number of cells of points (see
             `cells`; 2D and 3D): much faster for many points per component, at a slightly lower likelihood.
         dtype: of the exponentials in exact EM, whose products are always float64, and of the whole E-step

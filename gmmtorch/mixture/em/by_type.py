@@ -372,7 +372,7 @@ def maximized(moments: Parameters, reg_covar: float, previous: Parameters | None
 class Moved(NamedTuple):
     """An EM step: points (K,), the new parameters, Σ_n p_n log p(x_n), and whether digits are lost."""
 
-    count: Tensor
+    points: Tensor
     parameters: Parameters
     value: Tensor
     lost: Tensor

@@ -284,7 +284,7 @@ def _typed_moments(
     if found is None or bool(found.lost):
         found = by_type.exact_step(*given)
     covariances = expand(found.parameters.covariances, kind, k, dim)
-    return Parameters(found.count, found.parameters.means, covariances), found.value
+    return Parameters(found.points, found.parameters.means, covariances), found.value
 
 
 def _unregularized(moments: Parameters, reg_covar: float) -> Parameters:
