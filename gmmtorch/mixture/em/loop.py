@@ -6,7 +6,7 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -16,7 +16,9 @@ from gmmtorch.kernels.mixtures.e_step import in_spatial_order
 from gmmtorch.mixture.em import by_type, exact
 from gmmtorch.mixture.em.covariance_types import compact, constrain, expand
 from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.em.grouping import Rows
+
+if TYPE_CHECKING:
+    from gmmtorch.mixture.em.grouping import Rows
 
 _STEPS_AHEAD = 8  # on a GPU: steps between two waits for their bounds
 State = TypeVar("State")  # what an iteration improves: `Parameters`, or a posterior
