@@ -12,6 +12,7 @@ from mixture.mixture_cases import random_parameters, scipy_log_joint
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
+from gmmtorch.datasets.point_files.point_chunks import in_memory
 from gmmtorch.errors import GmmTorchError, NumericalError
 from gmmtorch.mixture import GaussianMixture
 from gmmtorch.mixture.em import by_type, stepwise
@@ -21,6 +22,7 @@ from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.initialization import INITIALIZATIONS, initialize
 from gmmtorch.mixture.estimators import gaussian_wishart
 from gmmtorch.mixture.reduction.moments import merge_pairs
+from gmmtorch.mixture.streaming.stream_fit import fit_stream
 
 types = pytest.mark.parametrize("kind", COVARIANCE_TYPES)
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
@@ -203,6 +205,19 @@ def test_states_hold_the_shape_of_the_type_and_accept_matrices(kind):
         assert torch.equal(other.covariances, mixture.covariances)
     sample, _ = mixture.sample(20_000, 0)
     np.testing.assert_allclose(sample.mean(0), mixture.weights_ @ mixture.means_, atol=0.1)
+
+
+@types
+@pytest.mark.parametrize("dim", [6, 25])
+@pytest.mark.parametrize("gap", [0.0, 1e7])
+def test_a_streamed_fit_of_a_type_is_that_of_all_points(kind, dim, gap):
+    x = cloud(200, dim)
+    x[::2] += gap
+    options = {**start(kind, x), "max_iter": 3, "tol": 0, "dtype": "float64"}
+    expected = GaussianMixture(**options).fit(x)
+    found = fit_stream(GaussianMixture(**options), in_memory(x, chunk_points=70))
+    torch.testing.assert_close(found.covariances, expected.covariances, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(found.lower_bounds_, expected.lower_bounds_, rtol=1e-7)
 
 
 @types

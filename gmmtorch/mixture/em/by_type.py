@@ -255,6 +255,10 @@ class Sums:
             else:
                 self._second += (scaled @ d).sum(0)
 
+    def tensors(self) -> tuple[Tensor, Tensor, Tensor]:
+        """What is summed: tensors of equal sums may be added."""
+        return self._count, self._first, self._second
+
     def moments(self) -> tuple[Parameters, Tensor]:
         """Number of points, mean and covariance of each component, and the second moments that the
         covariances come from: (K, D), tied (1, D), spherical (K, 1). Overwrites the sums.
@@ -388,8 +392,15 @@ def em_step(
     linear: bool,
     about: Tensor | None = None,
 ) -> Moved:
-    """E- and M-step in one of the forms: `expected_moments`, `maximized`. Does not wait for the device."""
+    """E- and M-step in one of the forms: `expected_moments`, `moved`. Does not wait for the device."""
     sums, value = expected_moments(points, sample_weight, factors, softmax_dtype, linear, about)
+    return moved(sums, value, factors, reg_covar, previous, linear)
+
+
+def moved(
+    sums: Sums, value: Tensor, factors: Factors, reg_covar: float, previous: Parameters | None, linear: bool
+) -> Moved:
+    """The M-step from the sums of an E-step, see `maximized`."""
     moments, second = sums.moments()
     new = maximized(moments, reg_covar, previous, factors.kind)
     lost = have_cancelled(second, new.covariances, factors.kind, linear)

@@ -18,8 +18,9 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike
 from gmmtorch.datasets.point_files.point_chunks import PointChunks, Survey, in_memory
 from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.mixture.em import by_type, loop
 from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em import loop
+from gmmtorch.mixture.em.covariance_types import expand
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.grouping import Rows, nearest
 from gmmtorch.mixture.em.truncated import fit_truncated
@@ -275,4 +276,33 @@ def _stream_step(run: _Run, e_step: EStep, n_points: int) -> loop.Step[Parameter
 
         return em.direct_maximization(sums, scatter, reg_covar, parameters), total
 
-    return loop.guarded_step(gather, direct, reg_covar, float(n_points), run.mixture.covariance_type)
+    if run.source.dim <= 3 or not isinstance(e_step, ExactEStep):
+        return loop.guarded_step(gather, direct, reg_covar, float(n_points), run.mixture.covariance_type)
+    kind, dtype = run.mixture.covariance_type, em.SOFTMAX_DTYPES[e_step.dtype]
+
+    def typed_step(given: Parameters) -> tuple[Parameters, float]:
+        """A step with the arithmetic of the covariance type, direct if the linear form loses digits."""
+        parameters, (k, dim) = by_type.compacted(given, kind), given.means.shape
+        factors = by_type.Factors(parameters, kind)
+
+        def moved(linear: bool, about: Tensor | None) -> by_type.Moved:
+            def terms() -> Iterator[tuple[Tensor, ...]]:
+                for chunk in centered():
+                    sums, value = by_type.expected_moments(*chunk, factors, dtype, linear, about)
+                    yield *sums.tensors(), value
+
+            *parts, value = summed(terms())
+            whole = by_type.Sums(k, center[None], kind, None if linear else about)
+            for own, part in zip(whole.tensors(), parts, strict=True):
+                own += part
+            return by_type.moved(whole, value, factors, reg_covar, parameters, linear)
+
+        found = moved(True, None) if by_type.has_linear_form(k, dim, kind) else None
+        if found is None or bool(found.lost):
+            found = moved(False, factors.means)
+        if bool(found.lost):
+            found = moved(False, found.parameters.means)
+        covariances = expand(found.parameters.covariances, kind, k, dim)
+        return found.parameters._replace(covariances=covariances), float(found.value) / n_points
+
+    return typed_step
