@@ -175,7 +175,7 @@ class MixtureEstimator(MixtureState, ABC):
         if reset:
             self._check_component_count(points.shape[0])
         center = points.mT @ (weight / weight.sum())
-        return Cloud(points - center, weight, center)
+        return Cloud((points - center).contiguous(), weight, center)
 
     def _store_fit(
         self,

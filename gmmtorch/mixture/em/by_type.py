@@ -131,7 +131,7 @@ class Factors:
         """The direct form, a block of components at a time."""
         middle = self.whitened_means()
         k, dim = middle.shape
-        width = max(16, -(-dim // 8)) if self.kind == "full" else dim
+        width = min(dim, max(16, -(-dim // 8))) if self.kind == "full" else dim
 
         def block(points: Tensor, part: slice) -> Tensor:
             if self.kind == "full":
@@ -420,3 +420,12 @@ def exact_step(
     given = (points, sample_weight, factors, softmax_dtype, reg_covar, previous, False)
     found = em_step(*given)
     return em_step(*given, about=found.parameters.means) if bool(found.lost) else found
+
+
+def direct_step(
+    points: Tensor, sample_weight: Tensor, parameters: Parameters, reg_covar: float
+) -> tuple[Parameters, Tensor]:
+    """`exact_step` of full covariances in float64: new parameters and Σ_n p_n log p(x_n)."""
+    factors = Factors(parameters, "full")
+    found = exact_step(points, sample_weight, factors, torch.float64, reg_covar, parameters)
+    return found.parameters, found.value

@@ -14,13 +14,11 @@ that never decreases (Verbeek, Nunnink & Vlassis, 2006).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels.chunks import chunk_elements
 from gmmtorch.kernels.mixtures import e_step, m_step
 from gmmtorch.kernels.mixtures.e_step import expectation as expectation
 from gmmtorch.kernels.mixtures.e_step import exponent_floor as exponent_floor
@@ -181,60 +179,3 @@ def log_joint(points: Tensor, parameters: Parameters) -> Tensor:
     half_log_det = torch.log(factors.diagonal(dim1=-2, dim2=-1)).sum(-1)
     constant = torch.log(weights).clamp_min(MIN_LOG_WEIGHT) - half_log_det - 0.5 * means.shape[1] * LOG_2PI
     return constant - 0.5 * squared
-
-
-def _responsibilities(
-    points: Tensor, sample_weight: Tensor, parameters: Parameters
-) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Points (n, D), their weighted responsibilities (n, K) (2.3) and Σ_n p_n log p(x_n), in chunks."""
-    rows = max(1, chunk_elements(points.device) // parameters.weights.shape[0])
-    for part, p in zip(points.split(rows), sample_weight.split(rows), strict=True):
-        joint = log_joint(part, parameters)
-        norm = torch.logsumexp(joint, 1)
-        yield part, torch.exp(joint - norm[:, None]) * p[:, None], torch.dot(p, norm)
-
-
-def direct_sums(points: Tensor, sample_weight: Tensor, parameters: Parameters) -> tuple[Tensor, Tensor]:
-    """First pass of the direct form: N_k and Σγx (K, 1 + D), and Σ_n p_n log p(x_n)."""
-    sums = torch.cat([torch.zeros_like(parameters.weights)[:, None], torch.zeros_like(parameters.means)], 1)
-    total = points.new_zeros(())
-    for part, gamma, value in _responsibilities(points, sample_weight, parameters):
-        sums[:, 0] += gamma.sum(0)
-        sums[:, 1:] += gamma.T @ part
-        total += value
-    return sums, total
-
-
-def direct_scatter(points: Tensor, sample_weight: Tensor, parameters: Parameters, means: Tensor) -> Tensor:
-    """Second pass of the direct form: Σγ(x−μ)(x−μ)ᵀ (K, D, D) about the new means (K, D)."""
-    scatter = torch.zeros_like(parameters.covariances)
-    for part, gamma, _ in _responsibilities(points, sample_weight, parameters):
-        offset = part[:, None, :] - means
-        scatter += torch.einsum("nk,nki,nkj->kij", gamma, offset, offset)
-    return scatter
-
-
-def direct_maximization(
-    sums: Tensor, scatter: Callable[[Tensor], Tensor], reg_covar: float, previous: Parameters
-) -> Parameters:
-    """M-step (2.4)-(2.6) from the sums (K, 1 + D) of the first pass; `scatter` of means is the second."""
-    eps = 10 * torch.finfo(sums.dtype).eps
-    count = sums[:, 0] + eps
-    means = sums[:, 1:] / count[:, None]
-    covariances = scatter(means) / count[:, None, None]
-    covariances.diagonal(dim1=-2, dim2=-1).add_(reg_covar)
-    return _keep_empty(Parameters(count / count.sum(), means, covariances), sums[:, 0] > eps, previous)
-
-
-def direct_step(
-    points: Tensor, sample_weight: Tensor, parameters: Parameters, reg_covar: float
-) -> tuple[Parameters, Tensor]:
-    """One E- and M-step without natural parameters: new parameters and Σ_n p_n log p(x_n).
-
-    A second pass over the points computes the second moments about the new means.
-    """
-    sums, total = direct_sums(points, sample_weight, parameters)
-    new = direct_maximization(
-        sums, lambda means: direct_scatter(points, sample_weight, parameters, means), reg_covar, parameters
-    )
-    return new, total

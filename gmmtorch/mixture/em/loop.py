@@ -155,7 +155,7 @@ def natural_step(
         return exact.expectation(*rows, exact.natural_parameters(parameters), softmax_dtype)
 
     if points is not None:
-        direct = functools.partial(exact.direct_step, points, sample_weight, reg_covar=reg_covar)
+        direct = functools.partial(by_type.direct_step, points, sample_weight, reg_covar=reg_covar)
         return guarded_step(gather, direct, reg_covar, float(total), covariance_type)
 
     def maximized(parameters: Parameters, statistics: Tensor, value: Tensor) -> tuple[Parameters, Tensor]:

@@ -259,7 +259,7 @@ def _expected_moments(
         found = em.maximization(sums, reg_covar)._replace(weights=sums[:, 0])
         if not em.has_cancelled(sums, found._replace(weights=(sums[:, 0] > 1e-9).to(sums))):
             return found, value
-    found, value = em.direct_step(points, sample_weight, unnormalised, reg_covar)
+    found, value = by_type.direct_step(points, sample_weight, unnormalised, reg_covar)
     total = sample_weight.sum()
     return found._replace(weights=found.weights * total), value + log_weight.max() * total
 

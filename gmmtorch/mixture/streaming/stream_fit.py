@@ -267,20 +267,11 @@ def _stream_step(run: _Run, e_step: EStep, n_points: int) -> loop.Step[Parameter
         statistics, total = summed(accumulate(points) for points, _ in centered())
         return statistics, total
 
-    def direct(parameters: Parameters) -> tuple[Parameters, Tensor]:
-        sums, total = summed(em.direct_sums(*chunk, parameters) for chunk in centered())
+    typed = e_step if isinstance(e_step, ExactEStep) and run.source.dim > 3 else None
+    dtype = torch.float64 if typed is None else em.SOFTMAX_DTYPES[typed.dtype]
+    kind = run.mixture.covariance_type
 
-        def scatter(means: Tensor) -> Tensor:
-            (total_scatter,) = summed((em.direct_scatter(*chunk, parameters, means),) for chunk in centered())
-            return total_scatter
-
-        return em.direct_maximization(sums, scatter, reg_covar, parameters), total
-
-    if run.source.dim <= 3 or not isinstance(e_step, ExactEStep):
-        return loop.guarded_step(gather, direct, reg_covar, float(n_points), run.mixture.covariance_type)
-    kind, dtype = run.mixture.covariance_type, em.SOFTMAX_DTYPES[e_step.dtype]
-
-    def typed_step(given: Parameters) -> tuple[Parameters, float]:
+    def typed_step(given: Parameters) -> tuple[Parameters, Tensor]:
         """A step with the arithmetic of the covariance type, direct if the linear form loses digits."""
         parameters, (k, dim) = by_type.compacted(given, kind), given.means.shape
         factors = by_type.Factors(parameters, kind)
@@ -297,12 +288,19 @@ def _stream_step(run: _Run, e_step: EStep, n_points: int) -> loop.Step[Parameter
                 own += part
             return by_type.moved(whole, value, factors, reg_covar, parameters, linear)
 
-        found = moved(True, None) if by_type.has_linear_form(k, dim, kind) else None
+        found = moved(True, None) if typed and by_type.has_linear_form(k, dim, kind) else None
         if found is None or bool(found.lost):
             found = moved(False, factors.means)
         if bool(found.lost):
             found = moved(False, found.parameters.means)
         covariances = expand(found.parameters.covariances, kind, k, dim)
-        return found.parameters._replace(covariances=covariances), float(found.value) / n_points
+        return found.parameters._replace(covariances=covariances), found.value
 
-    return typed_step
+    if typed is None:
+        return loop.guarded_step(gather, typed_step, reg_covar, float(n_points), kind)
+
+    def step(parameters: Parameters) -> tuple[Parameters, float]:
+        new, value = typed_step(parameters)
+        return new, float(value) / n_points
+
+    return step
