@@ -64,8 +64,10 @@ def safe_cholesky(matrices: Tensor, name: str = "covariances") -> Tensor:
         if not bool(bad.any()):
             return factors
     first = int(bad.nonzero()[0])
+    few = matrices.shape[-1] <= 8
+    shown = matrices[first].tolist() if few else f"diagonal {matrices[first].diagonal().tolist()[:8]} …"
     raise NumericalError(
-        f"{name}[{first}] is not positive definite: {matrices[first].tolist()}; "
+        f"{name}[{first}] is not positive definite: {shown}; "
         "raise reg_covar (1e-6 m² is usual), or check that the covariances are symmetric."
     )
 

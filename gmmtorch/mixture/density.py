@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+from collections.abc import Iterator
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -18,8 +19,9 @@ from gmmtorch.arrays import DeviceModule, check_unmasked
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.kernels.chunks import chunk_elements
 from gmmtorch.linalg import inverse_factor, safe_cholesky
+from gmmtorch.mixture.em import by_type
 from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em.covariance_types import compact, count_free_entries
+from gmmtorch.mixture.em.covariance_types import compact, count_free_entries, expand
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.validation import Array, RandomState, as_generator, checked_tensor
 
@@ -40,8 +42,9 @@ class InvalidParameterError(InvalidArgumentError, ScikitLearnInvalidParameterErr
 class MixtureDensity(DensityMixin, BaseEstimator, DeviceModule):
     """The queries of a fitted mixture, with the interfaces of scikit-learn and of a torch module.
 
-    Arrays give arrays and tensors give tensors. The buffers `weights` (K,), `means` (K, D) and
-    `covariances` (K, D, D) are always float64 tensors, and move with `.to(device)`. The attributes
+    Arrays give arrays and tensors give tensors. The tensors `weights` (K,), `means` (K, D) and
+    `covariances` (K, D, D) are always float64, and move with `.to(device)`; the state dict has the
+    covariances in the shape of the covariance type. The attributes
     `weights_`, `means_`, `covariances_`, `precisions_` and `precisions_cholesky_` are of the kind (array or
     tensor) of the points given to `fit`. The last three have scikit-learn's shape for the covariance type:
     full (K, D, D), tied (D, D), diag (K, D), spherical (K,).
@@ -52,7 +55,6 @@ class MixtureDensity(DensityMixin, BaseEstimator, DeviceModule):
     random_state: RandomState
     weights: Tensor
     means: Tensor
-    covariances: Tensor
     _tensors: bool  # whether fit was given a tensor
     _fitted_type: str  # the covariance type of the fit
 
@@ -72,7 +74,7 @@ class MixtureDensity(DensityMixin, BaseEstimator, DeviceModule):
     def score_samples(self, X: Array) -> Array:
         """log p(x) of each point, (N,), nats."""
         points = self._as_points(X)
-        return self._as_kind_of(X, torch.cat([torch.logsumexp(part, 1) for part in self._joint(points)]))
+        return self._as_kind_of(X, torch.cat([torch.logsumexp(part, 0) for part in self._joint(points)]))
 
     def forward(self, X: Tensor) -> Tensor:
         """log p(x) of each point, (N,), nats: `score_samples` for use inside a network."""
@@ -85,24 +87,32 @@ class MixtureDensity(DensityMixin, BaseEstimator, DeviceModule):
     def predict_proba(self, X: Array) -> Array:
         """Responsibilities γ (N, K). Each row sums to one."""
         points = self._as_points(X)
-        return self._as_kind_of(X, torch.cat([torch.softmax(part, 1) for part in self._joint(points)]))
+        return self._as_kind_of(X, torch.cat([torch.softmax(part, 0).T for part in self._joint(points)]))
 
     def predict(self, X: Array) -> Array:
         """Index (N,) of the most likely component of each point."""
         points = self._as_points(X)
-        labels = torch.cat([part.argmax(1) for part in self._joint(points)])
+        labels = torch.cat([part.argmax(0) for part in self._joint(points)])
         return labels if isinstance(X, Tensor) else labels.cpu().numpy()
 
-    def _joint(self, points: Tensor) -> list[Tensor]:
-        """log π_k + log N(x|k), in chunks (n, K)."""
+    def _joint(self, points: Tensor) -> Iterator[Tensor]:
+        """log π_k + log N(x|k), in chunks (K, n)."""
+        (k, dim), kind = self.means.shape, self._fitted_type
         center = (self.weights[:, None] * self.means).sum(0)
+        if dim > 3:
+            parameters = Parameters(self.weights, self.means - center, self._typed_covariances())
+            joint = by_type.log_joint(parameters, kind)
+            rows = by_type.rows_of_chunk(k, dim, kind, points.device)
+            yield from (joint(part - center) for part in points.split(rows))
+            return
         centered = points - center
         parameters = Parameters(self.weights, self.means - center, self.covariances)
-        rows = max(64, chunk_elements(points.device) // self.weights.shape[0])
+        rows = max(64, chunk_elements(points.device) // k)
         if em.is_ill_conditioned(parameters) or bool((centered.abs() > _FAR).any()):
-            return [em.log_joint(part, parameters) for part in centered.split(rows)]
-        natural = em.natural_parameters(parameters).T.contiguous()
-        return [em.quadratic_features(part) @ natural for part in centered.split(rows)]
+            yield from (em.log_joint(part, parameters).T for part in centered.split(rows))
+            return
+        natural = em.natural_parameters(parameters)
+        yield from (natural @ em.quadratic_features(part).T for part in centered.split(rows))
 
     def n_parameters(self) -> int:
         """Number of free parameters: for full covariances K(1 + D + D(D+1)/2) − 1."""
@@ -133,8 +143,14 @@ class MixtureDensity(DensityMixin, BaseEstimator, DeviceModule):
         labels = torch.multinomial(weights, n_samples, True, generator=generator).sort().values
         normals = torch.randn(n_samples, means.shape[1], dtype=torch.float64, generator=generator)
         labels, normals = labels.to(means.device), normals.to(means.device)
-        factors = safe_cholesky(self.covariances)
-        points = means[labels] + (factors[labels] @ normals[:, :, None]).squeeze(-1)
+        spread = self._typed_covariances()
+        if self._fitted_type in ("full", "tied"):
+            factors = safe_cholesky(spread.view(-1, *spread.shape[-2:])).expand(len(means), -1, -1)
+            sizes = labels.bincount(minlength=len(means)).tolist()
+            parts = zip(normals.split(sizes), factors, strict=True)
+            points = means[labels] + torch.cat([part @ factor.T for part, factor in parts])
+        else:
+            points = means[labels] + normals * spread.sqrt().view(len(means), -1)[labels]
         return (points, labels) if self._tensors else (points.cpu().numpy(), labels.cpu().numpy())
 
     @property
@@ -149,32 +165,48 @@ class MixtureDensity(DensityMixin, BaseEstimator, DeviceModule):
         return self._as_fit_kind(self._fitted())
 
     @property
+    def covariances(self) -> Tensor:
+        """Covariances (K, D, D)."""
+        if "covariances" not in self._buffers:
+            raise AttributeError("covariances")  # nn.Module then says so of the class
+        return expand(self._typed_covariances(), self._fitted_type, *self.means.shape)
+
+    def _typed_covariances(self) -> Tensor:
+        """The buffer: covariances in the shape of the covariance type."""
+        self._fitted()
+        return cast(Tensor, self._buffers["covariances"])
+
+    @property
     def covariances_(self) -> Array:
         """Covariances, in the shape of the covariance type."""
-        self._fitted()
-        return self._as_fit_kind(compact(self.covariances, self._fitted_type))
+        return self._as_fit_kind(self._typed_covariances())
 
     @property
     def precisions_(self) -> Array:
         """Inverse covariances, in the shape of the covariance type."""
         whiten = self._whiten()
-        return self._as_fit_kind(compact(whiten @ whiten.transpose(-2, -1), self._fitted_type))
+        diagonal = self._fitted_type in ("diag", "spherical")
+        return self._as_fit_kind(whiten.square() if diagonal else whiten @ whiten.mT)
 
     @property
     def precisions_cholesky_(self) -> Array:
         """Upper triangular factors U of the precisions U Uᵀ, in the shape of the covariance type."""
-        return self._as_fit_kind(compact(self._whiten(), self._fitted_type))
+        return self._as_fit_kind(self._whiten())
 
     def _whiten(self) -> Tensor:
-        self._fitted()
-        return inverse_factor(safe_cholesky(self.covariances))
+        spread = self._typed_covariances()
+        if self._fitted_type in ("diag", "spherical"):
+            return spread.rsqrt()
+        return inverse_factor(safe_cholesky(spread.view(-1, *spread.shape[-2:]))).view_as(spread)
 
     # -- buffers and conversions ------------------------------------------------------------------
 
     def _set_buffers(self, weights: Tensor, means: Tensor, covariances: Tensor) -> None:
-        for name, value in zip(Parameters._fields, (weights, means, covariances), strict=True):
-            self.register_buffer(name, value)
         self._fitted_type = self.covariance_type
+        if covariances.ndim == 3:
+            covariances = compact(covariances, self._fitted_type)
+        for name, value in zip(Parameters._fields, (weights, means, covariances), strict=True):
+            self._buffers[name] = value
 
     def _as_points(self, X: Array, reset: bool = False) -> Tensor:
         """X as a checked float64 tensor (N, D). With `reset`, stores D and the kind of X."""
@@ -185,7 +217,8 @@ class MixtureDensity(DensityMixin, BaseEstimator, DeviceModule):
             checked = validate_data(
                 self, X, reset=reset, dtype=[np.float64, np.float32], ensure_min_samples=1
             )
-            points = torch.from_numpy(np.array(checked, dtype=np.float64))
+            checked = checked.astype(np.float64, copy=not checked.flags.writeable or min(checked.strides) < 0)
+            points = torch.from_numpy(checked)
             points = points if reset else points.to(self.means.device)
         else:
             points = checked_tensor(X).double()

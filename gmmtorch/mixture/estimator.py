@@ -110,6 +110,7 @@ class MixtureEstimator(MixtureState, ABC):
 
     tol: float
     max_iter: int
+    n_init: int
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         "n_components": [COUNT],
         "tol": [AT_LEAST_ZERO],
@@ -129,6 +130,9 @@ class MixtureEstimator(MixtureState, ABC):
         except ScikitLearnInvalidParameterError as error:
             name = str(error).split("'")[1]
             raise InvalidParameterError(f"{name}={getattr(self, name)!r}: {error}") from None
+        self._check_component_count(n_points)
+
+    def _check_component_count(self, n_points: int | None) -> None:
         if self.n_components is not None and not self._finds_n_components:
             check_component_count(self.n_components, n_points)
 
@@ -164,13 +168,14 @@ class MixtureEstimator(MixtureState, ABC):
         points = self._as_points(X, reset=reset).detach()
         warn_if_coarse(X, points)
         weight = checked_weight(sample_weight, points)
-        points, weight = points[weight > 0], weight[weight > 0]
+        if bool((weight == 0).any()):
+            points, weight = points[weight > 0], weight[weight > 0]
         if not self._accepts_any_total_weight:
             check_weight_scale(weight)
         if reset:
-            self.check_parameters(points.shape[0])
-        center = (points * (weight / weight.sum())[:, None]).sum(0)
-        return Cloud(points - center, weight, center)
+            self._check_component_count(points.shape[0])
+        center = points.mT @ (weight / weight.sum())
+        return Cloud((points - center).contiguous(), weight, center)
 
     def _store_fit(
         self,
@@ -212,9 +217,8 @@ class MixtureEstimator(MixtureState, ABC):
         `run` makes one start and passes the bounds on. Raises `NumericalError` if a component collapses.
         """
         best: EMResult[State] | None = None
-        options = BaseEstimator.get_params(self, deep=False)
-        verbose, interval = int(options.get("verbose", 0)), int(options.get("verbose_interval", 10))
-        for start in range(1 if self._continues() else options["n_init"]):
+        verbose, interval = int(getattr(self, "verbose", 0)), int(getattr(self, "verbose_interval", 10))
+        for start in range(1 if self._continues() else self.n_init):
             report = Report(start, verbose, interval, on_iteration)
             try:
                 found = run(report)

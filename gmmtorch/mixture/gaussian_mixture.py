@@ -11,8 +11,8 @@ from sklearn.utils._param_validation import Interval, StrOptions
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.mixture.em import by_type, loop, stepwise
 from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em import loop, stepwise
 from gmmtorch.mixture.em.cells import pool_into_cells
 from gmmtorch.mixture.em.covariance_types import COVARIANCE_TYPES
 from gmmtorch.mixture.em.exact import Parameters
@@ -39,6 +39,7 @@ from gmmtorch.mixture.validation import (
 
 _KMEANS_IS_CHEAP = 2_000_000  # pairs of point and component: k-means takes about a second
 _MANY_COMPONENTS, _MANY_PAIRS = 48, 4_000_000  # truncated EM is faster from here on
+_FEW_DIMENSIONS = 8  # up to which clouds have flat pieces, and truncated EM is faster
 
 
 class GaussianMixture(MixtureEstimator):
@@ -61,15 +62,16 @@ class GaussianMixture(MixtureEstimator):
         n_init: number of starts; the one with the best lower bound is kept.
         init_params: "kmeans", "k-means++", "random" (random responsibilities) and "random_from_data" are
             those of scikit-learn; further "kmeans_restarts", "random_points", "bounding_box" and
-            "flat_pieces". "auto": k-means for small problems; flat pieces for large ones, where they are
-            as good and take a thousandth of the time. Unused for n_components=None.
+            "flat_pieces". "auto": k-means for small problems and above eight dimensions; flat pieces for
+            large ones, where they are as good and take a thousandth of the time. Unused for
+            n_components=None.
         weights_init, means_init, precisions_init: (K,), (K, D) and, in the shape of the covariance type,
             precisions: initial parameters that replace those of the initialization.
         random_state: a seed, a `RandomState`, a `torch.Generator`, or None for a random seed.
         algorithm: "exact" compares every point with every component. "truncated" compares it with nearby
             components only, with a momentum (see `truncated`): the method for many components, whose
             `lower_bound_` is a few thousandths of a nat below the mean log-likelihood. "auto": truncated
-            from 48 components and 4·10⁶ pairs of point and component on.
+            from 48 components and 4·10⁶ pairs of point and component on, in up to eight dimensions.
         max_cells: if given, EM runs on the moments of at most this number of cells of points (see
             `cells`; 2D and 3D): much faster for many points per component, at a slightly lower likelihood.
         dtype: of the exponentials in exact EM, whose products are always float64, and of the whole E-step
@@ -201,11 +203,11 @@ class GaussianMixture(MixtureEstimator):
         else:
             rows, generator = Rows(points, weight), as_generator(self.random_state)
             previous, _ = self._start(rows, center, generator)
-        features, dtype = em.quadratic_features(points), em.SOFTMAX_DTYPES[self.dtype]
-        step = loop.natural_step(features, weight, float(self.reg_covar), dtype, points, self.covariance_type)
+        kind, dtype = self.covariance_type, em.SOFTMAX_DTYPES[self.dtype]
+        step = loop.em_step(Rows(points, weight), float(self.reg_covar), dtype, kind)
         update, bound = step(previous)
         eta = stepwise.step_size(float(weight.sum()), past, kappa)
-        blended = loop.of_type(stepwise.blend(previous, update, eta), self.covariance_type)
+        blended = stepwise.blend(previous, update, eta, kind)
         self._store_fit(blended, center, [bound], False, {"n_samples_seen": past + weight.sum()})
         return self
 
@@ -242,11 +244,12 @@ class GaussianMixture(MixtureEstimator):
         """EM from one start."""
         reg, dtype = float(self.reg_covar), em.SOFTMAX_DTYPES[self.dtype]
         first, owner = self._start(rows, center, generator)
-        if not self._truncates(rows.weight.shape[0], first.weights.shape[0]):
-            points = rows.points if rows.are_points else None
+        if not self._truncates(rows.weight.shape[0], *first.means.shape):
+            start = [first]
+            del first  # which may be most of the memory
             return loop.run_em(
-                loop.natural_step(rows.features(), rows.weight, reg, dtype, points, self.covariance_type),
-                first,
+                loop.em_step(rows, reg, dtype, self.covariance_type),
+                start.pop(),
                 tol=self.tol,
                 max_iter=self.max_iter,
                 on_iteration=on_iteration,
@@ -273,20 +276,23 @@ class GaussianMixture(MixtureEstimator):
     ) -> tuple[Parameters, Tensor | None]:
         """Start of EM in the centred frame, and a likely component of each row (N,), if known."""
         if self._continues():
-            return loop.of_type(self._current_parameters(rows.points, center), self.covariance_type), None
+            return self._current_parameters(rows.points, center), None
         n, k, reg, owner = rows.weight.shape[0], self.n_components, float(self.reg_covar), None
+        dim = rows.points.shape[1]
         features = None if rows.are_points else rows.values
-        given = self._given_start(rows.points.shape[1], center)
+        given = self._given_start(dim, center)
         if k is None:
             found, owner = surface_pieces(rows.points, rows.weight, float(self.noise), reg, features)
         elif len(given) == len(Parameters._fields):
             return Parameters(**given), None
-        elif not given and self._truncates(n, k) and self._initialization(n, k) == "flat_pieces":
+        elif not given and self._truncates(n, k, dim) and self._initialization(n, k, dim) == "flat_pieces":
             found, owner = flat_pieces(rows.points, rows.weight, k, reg, features)
             found, _ = replicated(found, k)
         else:
-            found = initialize(self._initialization(n, k), rows.points, rows.weight, k, reg, generator)
-        return loop.of_type(found, self.covariance_type)._replace(**given), owner
+            method, kind = self._initialization(n, k, dim), self.covariance_type
+            found = initialize(method, rows.points, rows.weight, k, reg, generator, kind)
+            return found._replace(**given), owner
+        return by_type.compacted(found, self.covariance_type)._replace(**given), owner
 
     def _given_start(self, dim: int, center: Tensor) -> dict[str, Tensor]:
         """Those of the initial `Parameters` that were given, in the centred frame."""
@@ -300,25 +306,28 @@ class GaussianMixture(MixtureEstimator):
             given["covariances"] = checked_precisions(self.precisions_init, kind, k, dim, device)
         return given
 
-    def _initialization(self, n_rows: int, n_components: int) -> str:
+    def _initialization(self, n_rows: int, n_components: int, dim: int) -> str:
         """The initialization that `init_params` selects."""
         if self.init_params != "auto":
             return self.init_params
-        return "kmeans" if n_rows * n_components <= _KMEANS_IS_CHEAP else "flat_pieces"
+        many = n_rows * n_components > _KMEANS_IS_CHEAP and dim <= _FEW_DIMENSIONS
+        return "flat_pieces" if many else "kmeans"
 
-    def _truncates(self, n_rows: int, n_components: int) -> bool:
+    def _truncates(self, n_rows: int, n_components: int, dim: int) -> bool:
         """Whether `algorithm` selects truncated EM."""
         if self.covariance_type != "full":
             return False
         if self.algorithm != "auto":
             return self.algorithm == "truncated"
-        return n_components >= _MANY_COMPONENTS and n_rows * n_components >= _MANY_PAIRS
+        many = n_components >= _MANY_COMPONENTS and n_rows * n_components >= _MANY_PAIRS
+        return many and dim <= _FEW_DIMENSIONS
 
     def _current_parameters(self, points: Tensor, center: Tensor) -> Parameters:
         """The current parameters, in the centred frame."""
         self._check_continues(points)
         means = self.means.to(points.device) - center
-        return Parameters(self.weights.to(points.device), means, self.covariances.to(points.device))
+        covariances = self._typed_covariances().to(points.device)
+        return Parameters(self.weights.to(points.device), means, covariances)
 
     # -- arguments --------------------------------------------------------------------------------
 

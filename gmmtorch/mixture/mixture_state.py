@@ -13,11 +13,11 @@ from sklearn.base import BaseEstimator
 from torch import Tensor
 
 from gmmtorch.arrays import as_tensor
-from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, NumericalError
 from gmmtorch.files import pack_tensors, read_tensors, require, write_bytes
 from gmmtorch.linalg import check_rigid, check_symmetric, safe_cholesky
 from gmmtorch.mixture.density import MixtureDensity
-from gmmtorch.mixture.em.covariance_types import check_type, expand, type_shape
+from gmmtorch.mixture.em.covariance_types import check_type, compact, type_shape
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.validation import Array, checked_parameter
 
@@ -66,16 +66,21 @@ class MixtureState(MixtureDensity):
         k, dim = mean.shape
         mixture = cls(**{"n_components": k, **options})
         kind = mixture.covariance_type
-        shape: tuple[int, ...] = (k, dim, dim)
-        if len(np.shape(covariances)) < 3:
-            shape = type_shape(kind, k, dim)
+        is_full = len(np.shape(covariances)) == 3
+        shape = (k, dim, dim) if is_full else type_shape(kind, k, dim)
         weight = checked_parameter(weights, (k,), "weights", mean.device)
         mean = checked_parameter(means, (k, dim), "means", mean.device)
         covariance = checked_parameter(covariances, shape, "covariances", mean.device)
-        covariance = covariance if len(shape) == 3 else expand(covariance, kind, k, dim)
         if bool((weight < 0).any()) or abs(float(weight.sum()) - 1) > 1e-6:
             raise InvalidArgumentError(f"weights={weight.tolist()} must be at least zero and add up to one.")
-        safe_cholesky(check_type(check_symmetric(covariance, "covariances"), kind))
+        if is_full:
+            covariance = compact(check_type(check_symmetric(covariance, "covariances"), kind), kind)
+        if kind in ("full", "tied"):
+            safe_cholesky(check_symmetric(covariance.view(-1, dim, dim), "covariances"))
+        elif not bool((covariance > 0).all()):
+            raise NumericalError(
+                f"covariances has {float(covariance.min()):.3g}; variances must be above zero."
+            )
         mixture._tensors = isinstance(means, Tensor)
         mixture.n_features_in_ = dim
         mixture._set_history(lower_bounds, converged)
@@ -117,8 +122,10 @@ class MixtureState(MixtureDensity):
         given = [state_dict.get(prefix + name) for name in Parameters._fields]
         if all(isinstance(value, Tensor) for value in given):
             weights, means, covariances = (cast(Tensor, value).double().clone() for value in given)
-            check_type(covariances, self.covariance_type)
+            if covariances.ndim == 3:
+                check_type(covariances, self.covariance_type)
             self._set_buffers(weights, means, covariances)
+            state_dict[prefix + "covariances"] = self._typed_covariances()
             self.n_features_in_ = means.shape[1]
             self.__dict__.pop("feature_names_in_", None)
             if self.n_components is not None:  # None means: determined by the fit

@@ -11,7 +11,7 @@ from torch import Tensor
 from gmmtorch.arrays import as_tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.linalg import inverse_factor
-from gmmtorch.mixture.em.covariance_types import expand, type_shape
+from gmmtorch.mixture.em.covariance_types import type_shape
 
 _LEAST_MEAN_WEIGHT, _LARGEST_MEAN_WEIGHT = 1e-6, 1e12
 
@@ -55,11 +55,12 @@ def warn_if_coarse(X: Array, points: Tensor) -> None:
     """Warn if X is float32 and so far from the origin that rounding exceeds 1 % of its spread."""
     if getattr(X, "dtype", None) not in (torch.float32, np.float32):
         return
-    rounding = torch.finfo(torch.float32).eps * points.abs().amax(0)
+    largest = torch.maximum(points.amax(0), -points.amin(0))
+    rounding = torch.finfo(torch.float32).eps * largest
     spread = points.std(0, correction=0)
     if bool(((rounding > 0.01 * spread) & (spread > 0)).any()):
         warnings.warn(
-            f"X is float32 and up to {float(points.abs().max()):.3g} from the origin, where it is rounded to "
+            f"X is float32 and up to {float(largest.max()):.3g} from the origin, where it is rounded to "
             f"{float(rounding.max()):.1g}; use float64, or subtract an offset before the cast to float32.",
             UserWarning,
             stacklevel=3,
@@ -121,7 +122,7 @@ def checked_mixing_weights(value: Array, n_components: int, device: torch.device
 
 
 def checked_precisions(value: Array, covariance_type: str, k: int, dim: int, device: torch.device) -> Tensor:
-    """The covariances (K, D, D) of `precisions_init`, given in the shape of the covariance type.
+    """The covariances of `precisions_init`, both in the shape of the covariance type.
 
     Raises `InvalidArgumentError` unless the precisions are symmetric and positive definite.
     """
@@ -130,15 +131,18 @@ def checked_precisions(value: Array, covariance_type: str, k: int, dim: int, dev
         precisions = checked_parameter(value, type_shape(covariance_type, k, dim), name, device)
     except InvalidArgumentError as error:
         raise InvalidArgumentError(f"precisions_init: {error}") from None
-    precisions = expand(precisions, covariance_type, k, dim)
-    factors, info = torch.linalg.cholesky_ex(precisions)
-    asymmetric = (precisions - precisions.mT).abs().amax((1, 2)) > 1e-6 * precisions.abs().amax((1, 2))
-    bad = (info != 0) | asymmetric
+    if covariance_type in ("full", "tied"):
+        factors, info = torch.linalg.cholesky_ex(precisions)
+        scale = precisions.abs().amax((-2, -1))
+        bad = (info != 0) | ((precisions - precisions.mT).abs().amax((-2, -1)) > 1e-6 * scale)
+    else:
+        bad = (precisions <= 0).view(precisions.shape[0], -1).any(1)
     if bool(bad.any()):
         what = "symmetric, positive-definite" if covariance_type in ("full", "tied") else "positive"
-        raise InvalidArgumentError(
-            f"'{name}' should be {what}; precisions_init[{int(bad.nonzero()[0])}] is not."
-        )
+        which = "" if covariance_type == "tied" else f"[{int(bad.nonzero()[0])}]"
+        raise InvalidArgumentError(f"'{name}' should be {what}; precisions_init{which} is not.")
+    if covariance_type not in ("full", "tied"):
+        return 1 / precisions
     whiten = inverse_factor(factors)
     return whiten @ whiten.mT
 

@@ -15,8 +15,8 @@ from scipy.special import logsumexp
 from torch import Tensor
 
 from gmmtorch.kernels import chunks
+from gmmtorch.mixture.em import by_type, loop
 from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em import loop
 from gmmtorch.mixture.em.cells import pool_into_cells
 from gmmtorch.mixture.em.exact import Parameters, quadratic_features
 
@@ -147,7 +147,7 @@ def test_direct_and_natural_steps_agree(dim):
     weight = random_weight(200, 1)
     start = random_parameters(4, dim)
     natural, bound = loop.natural_step(quadratic_features(points), weight, 1e-4, torch.float64)(start)
-    direct, total = em.direct_step(points, weight, start, 1e-4)
+    direct, total = by_type.direct_step(points, weight, start, 1e-4)
     torch.testing.assert_close(natural, direct, rtol=1e-10, atol=1e-12)
     assert bound == pytest.approx(float(total / weight.sum()), rel=1e-12)
 
@@ -201,7 +201,7 @@ def test_component_of_weight_zero_stays_unchanged(dtype, direct):
     ones = points.new_ones(80)
     for _ in range(5):
         if direct:
-            parameters, bound = em.direct_step(points, ones, parameters, 1e-6)
+            parameters, bound = by_type.direct_step(points, ones, parameters, 1e-6)
         else:
             parameters, bound = loop.natural_step(quadratic_features(points), ones, 1e-6, dtype)(parameters)
         assert math.isfinite(bound)

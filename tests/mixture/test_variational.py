@@ -18,6 +18,7 @@ from gmmtorch.errors import DataError, InvalidArgumentError, NumericalError
 from gmmtorch.files import pack_tensors, read_tensors
 from gmmtorch.mixture import GaussianMixture, VariationalGaussianMixture
 from gmmtorch.mixture.density import NotFittedError
+from gmmtorch.mixture.em import by_type
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.initialization import initialize
 from gmmtorch.mixture.estimators.gaussian_wishart import (
@@ -178,9 +179,9 @@ def test_direct_form_gives_the_same_fit(prior_type, monkeypatch):
     weight = np.random.default_rng(1).random(len(x)) + 0.5
     expected = variational(5, prior_type, max_iter=15, tol=0).fit(x, sample_weight=weight)
     calls = []
-    direct = em.direct_step
+    direct = by_type.direct_step
     monkeypatch.setattr(em, "is_ill_conditioned", lambda parameters: True)
-    monkeypatch.setattr(em, "direct_step", lambda *args: calls.append(1) or direct(*args))
+    monkeypatch.setattr(by_type, "direct_step", lambda *args: calls.append(1) or direct(*args))
     mixture = variational(5, prior_type, max_iter=15, tol=0).fit(x, sample_weight=weight)
     assert len(calls) == 15
     for name, value in mixture.state_dict().items():

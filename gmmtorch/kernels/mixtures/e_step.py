@@ -286,30 +286,29 @@ def _batched(
     features: Tensor, sample_weight: Tensor, natural: Tensor, softmax_dtype: torch.dtype
 ) -> tuple[Tensor, Tensor]:
     """The twin."""
-    n, k = features.shape[0], natural.shape[0]
-    rows = max(64, chunk_elements(features.device) // k)
-    floor = exponent_floor(softmax_dtype)
-    transposed = natural.T.contiguous()
-    kept: list[Tensor] = []  # the block of all chunks; one that the device has no memory for is not kept
+    rows = max(64, chunk_elements(features.device) // natural.shape[0])
 
     def sums_of(part: slice) -> tuple[Tensor, Tensor]:
-        rows_of, p = features[part], sample_weight[part]
-        if not kept or kept[0].shape[0] < rows_of.shape[0]:
-            kept[:] = [features.new_empty(rows_of.shape[0], k)]
-        logits = torch.mm(rows_of, transposed, out=kept[0][: rows_of.shape[0]])
-        peak = logits.amax(1)
-        gamma = logits.sub_(peak[:, None]).to(softmax_dtype).clamp_(min=floor).exp_()
-        norm = gamma.sum(1)
-        value = torch.dot(p, peak + norm.to(p.dtype).log())
-        gamma.mul_((p / norm).to(softmax_dtype)[:, None])
-        return rows_of.T @ gamma.to(rows_of.dtype), value
+        gamma, value = softmax(natural @ features[part].T, sample_weight[part], softmax_dtype)
+        return gamma @ features[part], value
 
-    statistics = torch.zeros_like(transposed)
+    statistics = torch.zeros_like(natural)
     total = features.new_zeros(())
-    for sums, value in chunked(n, rows, sums_of):
+    for sums, value in chunked(features.shape[0], rows, sums_of):
         statistics += sums
         total += value
-    return statistics.T, total
+    return statistics, total
+
+
+def softmax(logits: Tensor, sample_weight: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Weighted responsibilities p_n γ_kn (K, n) of logits (K, n), which are overwritten; and
+    Σ_n p_n logsumexp_k. Exponentials are computed in `dtype`.
+    """
+    peak = logits.amax(0)
+    gamma = logits.sub_(peak).to(dtype).clamp_(min=exponent_floor(dtype)).exp_()
+    norm = gamma.sum(0)
+    value = torch.dot(sample_weight, peak + norm.to(peak.dtype).log())
+    return gamma.mul_((sample_weight / norm).to(dtype)).to(peak.dtype), value
 
 
 def exponent_floor(dtype: torch.dtype) -> float:

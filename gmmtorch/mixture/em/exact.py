@@ -14,13 +14,11 @@ that never decreases (Verbeek, Nunnink & Vlassis, 2006).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels.chunks import chunk_elements
 from gmmtorch.kernels.mixtures import e_step, m_step
 from gmmtorch.kernels.mixtures.e_step import expectation as expectation
 from gmmtorch.kernels.mixtures.e_step import exponent_floor as exponent_floor
@@ -29,8 +27,8 @@ from gmmtorch.linalg import inverse_factor, safe_cholesky, triangle_indices, unp
 SOFTMAX_DTYPES = {"float32": torch.float32, "float64": torch.float64}
 """Dtypes for the exponentials of the E-step, by name."""
 
-_LOG_2PI = 1.8378770664093453
-_MIN_LOG_WEIGHT = -1e30  # replaces log 0: finite, so that products are not NaN
+LOG_2PI = 1.8378770664093453
+MIN_LOG_WEIGHT = -1e30  # replaces log 0: finite, so that products are not NaN
 
 
 class Parameters(NamedTuple):
@@ -43,10 +41,10 @@ class Parameters(NamedTuple):
 
 def quadratic_features(points: Tensor) -> Tensor:
     """φ(x) = [1, x, x_i x_j (i ≤ j)]: (N, D) → (N, 1 + D + D(D+1)/2)."""
-    return torch.cat([points.new_ones(points.shape[0], 1), points, _products(points, points)], 1)
+    return torch.cat([points.new_ones(points.shape[0], 1), points, products(points, points)], 1)
 
 
-def _products(left: Tensor, right: Tensor) -> Tensor:
+def products(left: Tensor, right: Tensor) -> Tensor:
     """x_i y_j, i ≤ j: (…, D) and (…, D) → (…, D(D+1)/2). Slices are much faster here than index arrays."""
     return torch.cat([left[..., i : i + 1] * right[..., i:] for i in range(left.shape[-1])], -1)
 
@@ -57,7 +55,7 @@ def shift_features(features: Tensor, offset: Tensor) -> Tensor:
     """
     dim = offset.shape[-1]
     count, first, second = features[..., :1], features[..., 1 : 1 + dim], features[..., 1 + dim :]
-    second = second + _products(first, offset) + _products(offset, first) + count * _products(offset, offset)
+    second = second + products(first, offset) + products(offset, first) + count * products(offset, offset)
     return torch.cat([count, first + count * offset, second], -1)
 
 
@@ -76,12 +74,17 @@ def _natural_parameters(parameters: Parameters, factors: Tensor) -> Tensor:
     weights, means, _ = parameters
     dim = means.shape[1]
     whiten = inverse_factor(factors)
-    precision = whiten @ whiten.transpose(-2, -1)
-    linear = (precision @ means[:, :, None]).squeeze(-1)
-    log_weight = torch.log(weights).clamp_min(_MIN_LOG_WEIGHT)
+    log_weight = torch.log(weights).clamp_min(MIN_LOG_WEIGHT)
     half_log_det = torch.log(factors.diagonal(dim1=-2, dim2=-1)).sum(-1)
-    constant = log_weight - half_log_det - 0.5 * (dim * _LOG_2PI + (linear * means).sum(1))
-    rows, cols = triangle_indices(dim, means.device)
+    constant = log_weight - half_log_det - 0.5 * dim * LOG_2PI
+    return natural_of_precisions(whiten @ whiten.transpose(-2, -1), means, constant)
+
+
+def natural_of_precisions(precision: Tensor, means: Tensor, constant: Tensor) -> Tensor:
+    """W (K, F) such that φ(x)·W_k = c_k − ½ (x − μ_k)ᵀ Λ_k (x − μ_k), with Λ (K, D, D), c (K,)."""
+    linear = (precision @ means[:, :, None]).squeeze(-1)
+    constant = constant - 0.5 * (linear * means).sum(1)
+    rows, cols = triangle_indices(means.shape[1], means.device)
     # φ has each off-diagonal product once, for two matrix entries.
     quadratic = torch.where(rows == cols, -0.5, -1.0) * precision[:, rows, cols]
     return torch.cat([constant[:, None], linear, quadratic], 1)
@@ -174,62 +177,5 @@ def log_joint(points: Tensor, parameters: Parameters) -> Tensor:
     offset = points[:, None, :] - means
     squared = torch.einsum("nkd,kde->nke", offset, whiten).square().sum(-1)
     half_log_det = torch.log(factors.diagonal(dim1=-2, dim2=-1)).sum(-1)
-    constant = torch.log(weights).clamp_min(_MIN_LOG_WEIGHT) - half_log_det - 0.5 * means.shape[1] * _LOG_2PI
+    constant = torch.log(weights).clamp_min(MIN_LOG_WEIGHT) - half_log_det - 0.5 * means.shape[1] * LOG_2PI
     return constant - 0.5 * squared
-
-
-def _responsibilities(
-    points: Tensor, sample_weight: Tensor, parameters: Parameters
-) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Points (n, D), their weighted responsibilities (n, K) (2.3) and Σ_n p_n log p(x_n), in chunks."""
-    rows = max(1, chunk_elements(points.device) // parameters.weights.shape[0])
-    for part, p in zip(points.split(rows), sample_weight.split(rows), strict=True):
-        joint = log_joint(part, parameters)
-        norm = torch.logsumexp(joint, 1)
-        yield part, torch.exp(joint - norm[:, None]) * p[:, None], torch.dot(p, norm)
-
-
-def direct_sums(points: Tensor, sample_weight: Tensor, parameters: Parameters) -> tuple[Tensor, Tensor]:
-    """First pass of the direct form: N_k and Σγx (K, 1 + D), and Σ_n p_n log p(x_n)."""
-    sums = torch.cat([torch.zeros_like(parameters.weights)[:, None], torch.zeros_like(parameters.means)], 1)
-    total = points.new_zeros(())
-    for part, gamma, value in _responsibilities(points, sample_weight, parameters):
-        sums[:, 0] += gamma.sum(0)
-        sums[:, 1:] += gamma.T @ part
-        total += value
-    return sums, total
-
-
-def direct_scatter(points: Tensor, sample_weight: Tensor, parameters: Parameters, means: Tensor) -> Tensor:
-    """Second pass of the direct form: Σγ(x−μ)(x−μ)ᵀ (K, D, D) about the new means (K, D)."""
-    scatter = torch.zeros_like(parameters.covariances)
-    for part, gamma, _ in _responsibilities(points, sample_weight, parameters):
-        offset = part[:, None, :] - means
-        scatter += torch.einsum("nk,nki,nkj->kij", gamma, offset, offset)
-    return scatter
-
-
-def direct_maximization(
-    sums: Tensor, scatter: Callable[[Tensor], Tensor], reg_covar: float, previous: Parameters
-) -> Parameters:
-    """M-step (2.4)-(2.6) from the sums (K, 1 + D) of the first pass; `scatter` of means is the second."""
-    eps = 10 * torch.finfo(sums.dtype).eps
-    count = sums[:, 0] + eps
-    means = sums[:, 1:] / count[:, None]
-    covariances = scatter(means) / count[:, None, None]
-    covariances.diagonal(dim1=-2, dim2=-1).add_(reg_covar)
-    return _keep_empty(Parameters(count / count.sum(), means, covariances), sums[:, 0] > eps, previous)
-
-
-def direct_step(
-    points: Tensor, sample_weight: Tensor, parameters: Parameters, reg_covar: float
-) -> tuple[Parameters, Tensor]:
-    """One E- and M-step without natural parameters: new parameters and Σ_n p_n log p(x_n).
-
-    A second pass over the points computes the second moments about the new means.
-    """
-    sums, total = direct_sums(points, sample_weight, parameters)
-    new = direct_maximization(
-        sums, lambda means: direct_scatter(points, sample_weight, parameters, means), reg_covar, parameters
-    )
-    return new, total

@@ -15,7 +15,9 @@ import torch
 from torch import Tensor
 
 from gmmtorch.linalg import argsort
+from gmmtorch.mixture.em import by_type
 from gmmtorch.mixture.em.cells import pool_into_cells
+from gmmtorch.mixture.em.covariance_types import type_shape
 from gmmtorch.mixture.em.exact import (
     Parameters,
     feature_dimension,
@@ -29,20 +31,30 @@ _FEWEST_CELLS, _CELLS_OF_A_COMPONENT = 4096, 8  # lower limits of the cells for 
 _FINEST_CELLS = 1 << 14  # along the longest side
 _SURFACE_CELLS = 1 << 17  # `surface_pieces` partitions cells from twice this number of points on
 
-Initialization = Callable[[Tensor, Tensor, int, float, torch.Generator], Parameters]
-"""(points (N, D), weight (N,), K, reg_covar, generator) → parameters. Points centred, float64."""
+Initialization = Callable[[Tensor, Tensor, int, float, torch.Generator, str], Parameters]
+"""(points (N, D), weight (N,), K, reg_covar, generator, covariance type) → parameters, with covariances in
+the shape of the type. Points centred, float64.
+"""
 
 
 def distinct_points(points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Distinct rows in lexicographic order, and the sum of the weights of each."""
-    order = argsort(points[:, -1].contiguous())
-    for column in reversed(points[:, :-1].unbind(1)):
-        order = order[argsort(column[order])]
+    order = argsort(points[:, 0].contiguous())
+    column = points[order, 0]
+    same = column[1:] == column[:-1]
+    if points.shape[1] > 1 and bool(same.any()):
+        # Only rows that are equal in the first column need the other columns.
+        tied = torch.cat([same.new_zeros(1), same]) | torch.cat([same, same.new_zeros(1)])
+        among = order[tied]
+        for axis in reversed(range(points.shape[1])):
+            among = among[argsort(points[among, axis])]
+        order[tied] = among
     rows = points[order]
     is_new = torch.ones_like(order, dtype=torch.bool)
     is_new[1:] = (rows[1:] != rows[:-1]).any(1)
-    number, distinct = is_new.cumsum(0) - 1, rows[is_new]
-    return distinct, weight.new_zeros(len(distinct)).index_add_(0, number, weight[order])
+    number = is_new.cumsum(0) - 1
+    rows = rows if bool(is_new.all()) else rows[is_new]
+    return rows, weight.new_zeros(len(rows)).index_add_(0, number, weight[order])
 
 
 def from_kmeans(
@@ -51,6 +63,7 @@ def from_kmeans(
     n_components: int,
     reg_covar: float,
     generator: torch.Generator,
+    kind: str,
     n_init: int = 1,
 ) -> Parameters:
     """The moments of scikit-learn's k-means clusters; of `n_init` runs, the clustering with least scatter."""
@@ -58,19 +71,24 @@ def from_kmeans(
     from sklearn.exceptions import ConvergenceWarning
 
     seed = int(torch.randint(2**31 - 1, (), generator=generator))
-    kmeans = KMeans(n_components, n_init=n_init, random_state=seed)
+    kmeans = KMeans(n_components, n_init=n_init, random_state=seed, copy_x=False)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)  # raised for empty clusters
         labels = kmeans.fit(points.cpu().numpy(), sample_weight=weight.cpu().numpy()).labels_
     labels = torch.from_numpy(labels.astype(np.int64)).to(points.device)
-    return moments_of(quadratic_features(points), weight, labels, n_components, reg_covar, points)
+    if points.shape[1] > 3:
+        found = by_type.moments_of_labels(points, weight, labels, n_components, kind)
+        return by_type.maximized(found, reg_covar, None, kind)
+    return by_type.compacted(
+        moments_of(quadratic_features(points), weight, labels, n_components, reg_covar, points), kind
+    )
 
 
 def from_random_points(
-    points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator
+    points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator, kind: str
 ) -> Parameters:
     """Means at distinct random points, drawn by weight; isotropic covariance, uniform weights."""
-    return _tiling(points[_draw(weight, n_components, generator)], points, weight, reg_covar)
+    return _tiling(points[_draw(weight, n_components, generator)], points, weight, reg_covar, kind)
 
 
 def _draw(weight: Tensor, n: int, generator: torch.Generator) -> Tensor:
@@ -80,14 +98,14 @@ def _draw(weight: Tensor, n: int, generator: torch.Generator) -> Tensor:
 
 
 def from_single_points(
-    points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator
+    points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator, kind: str
 ) -> Parameters:
     """Components of one random point each, with variance `reg_covar`: scikit-learn's "random_from_data"."""
-    return _isotropic(points[_draw(weight, n_components, generator)], reg_covar)
+    return _isotropic(points[_draw(weight, n_components, generator)], reg_covar, kind)
 
 
 def from_kmeans_plus_plus(
-    points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator
+    points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator, kind: str
 ) -> Parameters:
     """Components of one point each, chosen far apart as k-means++ does, with variance `reg_covar`."""
     from sklearn.cluster import kmeans_plusplus
@@ -96,49 +114,57 @@ def from_kmeans_plus_plus(
     means, _ = kmeans_plusplus(
         points.cpu().numpy(), n_components, sample_weight=weight.cpu().numpy(), random_state=seed
     )
-    return _isotropic(torch.from_numpy(means).to(points.device), reg_covar)
+    return _isotropic(torch.from_numpy(means).to(points.device), reg_covar, kind)
 
 
 def from_random_responsibilities(
-    points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator
+    points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator, kind: str
 ) -> Parameters:
     """The moments of uniformly random responsibilities: scikit-learn's "random"."""
-    shape = (points.shape[0], n_components)
-    share = torch.rand(shape, generator=generator, dtype=torch.float64).to(points.device)
-    share = share * (weight / share.sum(1))[:, None]
-    return maximization(share.T @ quadratic_features(points), reg_covar)
+    linear = by_type.has_linear_form(n_components, points.shape[1], kind)
+    about = None if linear else points.new_zeros(n_components, points.shape[1])
+    sums = by_type.Sums(n_components, points, kind, about)
+    rows = by_type.rows_of_chunk(n_components, points.shape[1], kind, points.device)
+    for some, p in zip(points.split(rows), weight.split(rows), strict=True):
+        share = torch.rand(some.shape[0], n_components, generator=generator, dtype=torch.float64)
+        share = share.to(points.device).T
+        sums.add(some, share * (p / share.sum(0)))
+    return by_type.maximized(sums.moments()[0], reg_covar, None, kind)
 
 
 def from_bounding_box(
-    points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator
+    points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator, kind: str
 ) -> Parameters:
     """Means uniform in the bounding box; isotropic covariance, uniform weights."""
     low, high = points.amin(0), points.amax(0)
     uniform = torch.rand(n_components, points.shape[1], generator=generator, dtype=torch.float64)
-    return _tiling(low + (high - low) * uniform.to(points.device), points, weight, reg_covar)
+    return _tiling(low + (high - low) * uniform.to(points.device), points, weight, reg_covar, kind)
 
 
-def _tiling(means: Tensor, points: Tensor, weight: Tensor, reg_covar: float) -> Parameters:
+def _tiling(means: Tensor, points: Tensor, weight: Tensor, reg_covar: float, kind: str) -> Parameters:
     """Components with the cloud's mean variance, reduced as if they tile the cloud: σ² K^(−2/D)."""
     n_components, dim = means.shape
     center = (weight[:, None] * points).sum(0) / weight.sum()
     spread = (weight[:, None] * (points - center) ** 2).sum() / weight.sum() / dim
-    return _isotropic(means, spread * n_components ** (-2 / dim) + reg_covar)
+    return _isotropic(means, spread * n_components ** (-2 / dim) + reg_covar, kind)
 
 
-def _isotropic(means: Tensor, variance: Tensor | float) -> Parameters:
+def _isotropic(means: Tensor, variance: Tensor | float, kind: str) -> Parameters:
     """Components of equal weight and variance at the means (K, D)."""
     k, dim = means.shape
-    covariances = (torch.eye(dim, dtype=means.dtype, device=means.device) * variance).repeat(k, 1, 1)
-    return Parameters(means.new_full((k,), 1 / k), means, covariances)
+    weights = means.new_full((k,), 1 / k)
+    values = means.new_ones(type_shape(kind, k, dim)) * variance
+    if kind in ("full", "tied"):
+        values *= torch.eye(dim, dtype=means.dtype, device=means.device)
+    return Parameters(weights, means, values)
 
 
 def from_flat_pieces(
-    points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator
+    points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator, kind: str
 ) -> Parameters:
     """One component for each of the cloud's flat pieces: deterministic, and fast for any K."""
     found, _ = flat_pieces(points, weight, n_components, reg_covar)
-    return replicated(found, n_components)[0]
+    return by_type.compacted(replicated(found, n_components)[0], kind)
 
 
 def flat_pieces(
@@ -244,25 +270,30 @@ def initialize(
     n_components: int,
     reg_covar: float,
     generator: torch.Generator,
+    covariance_type: str = "full",
 ) -> Parameters:
     """Starting parameters of K components for centred points with any number of distinct rows.
+
+    Covariances have the shape of the type.
 
     If there are fewer distinct points than components, each distinct point gives one component, and the
     other components are copies that share its weight. The density is then that of the distinct points.
     """
     points, weight = distinct_points(points, weight)
     n = min(n_components, points.shape[0])
-    found = INITIALIZATIONS[method](points, weight, n, reg_covar, generator)
-    return replicated(found, n_components)[0]
+    found = INITIALIZATIONS[method](points, weight, n, reg_covar, generator, covariance_type)
+    return replicated(found, n_components, covariance_type)[0]
 
 
-def replicated(found: Parameters, n_components: int) -> tuple[Parameters, Tensor]:
+def replicated(found: Parameters, n_components: int, kind: str = "full") -> tuple[Parameters, Tensor]:
     """K components from fewer: copies share the weight.
 
     Also the index (K,) of the component each one copies.
     """
     n = found.weights.shape[0]
     copy = torch.arange(n_components, device=found.weights.device) % n
+    if n == n_components:
+        return found, copy
     shares = torch.bincount(copy, minlength=n)[copy]
-    parameters = Parameters(found.weights[copy] / shares, found.means[copy], found.covariances[copy])
-    return parameters, copy
+    covariances = found.covariances if kind == "tied" else found.covariances[copy]
+    return Parameters(found.weights[copy] / shares, found.means[copy], covariances), copy

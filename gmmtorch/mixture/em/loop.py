@@ -6,15 +6,19 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import torch
 from torch import Tensor
 
+from gmmtorch.errors import NumericalError
 from gmmtorch.kernels.mixtures.e_step import in_spatial_order
-from gmmtorch.mixture.em import exact
-from gmmtorch.mixture.em.covariance_types import constrain
+from gmmtorch.mixture.em import by_type, exact
+from gmmtorch.mixture.em.covariance_types import compact, constrain, expand
 from gmmtorch.mixture.em.exact import Parameters
+
+if TYPE_CHECKING:
+    from gmmtorch.mixture.em.grouping import Rows
 
 _STEPS_AHEAD = 8  # on a GPU: steps between two waits for their bounds
 State = TypeVar("State")  # what an iteration improves: `Parameters`, or a posterior
@@ -73,6 +77,64 @@ def has_converged(bounds: Sequence[float], tol: float, previous_bound: float = -
     return len(bounds) > 0 and abs(bounds[-1] - [previous_bound, *bounds][-2]) < tol
 
 
+def em_step(
+    rows: Rows, reg_covar: float, softmax_dtype: torch.dtype, covariance_type: str = "full"
+) -> Step[Parameters]:
+    """EM steps on points, centred, or cells. Covariances have the shape of their type."""
+    points = rows.values if rows.are_points else None
+    if points is not None and points.shape[1] > 3:
+        return _typed_step(points, rows.weight, reg_covar, softmax_dtype, covariance_type)
+    natural = natural_step(rows.features(), rows.weight, reg_covar, softmax_dtype, points, covariance_type)
+    if covariance_type == "full":
+        return natural
+    known: list[tuple[Parameters, Parameters]] = []  # the last result, in both shapes
+
+    def step(parameters: Parameters) -> tuple[Parameters, float]:
+        if known and known[0][0] is parameters:
+            given = known[0][1]
+        else:
+            given = parameters._replace(
+                covariances=expand(parameters.covariances, covariance_type, *parameters.means.shape)
+            )
+        new, bound = natural(given)
+        found = new._replace(covariances=compact(new.covariances, covariance_type))
+        known[:] = [(found, new)]
+        return found, bound
+
+    return step
+
+
+def _typed_step(
+    points: Tensor, sample_weight: Tensor, reg_covar: float, softmax_dtype: torch.dtype, kind: str
+) -> Step[Parameters]:
+    """EM steps with the arithmetic of the covariance type; direct ones from the first that loses digits."""
+    total = sample_weight.sum()
+    direct = [False]
+
+    given = points, sample_weight
+
+    def step(parameters: Parameters) -> tuple[Parameters, Tensor]:
+        k, dim = parameters.means.shape
+        linear = by_type.has_linear_form(k, dim, kind) and not direct[0]
+        factors = by_type.Factors(parameters, kind, check=False)
+        found = by_type.em_step(*given, factors, softmax_dtype, reg_covar, parameters, linear)
+        return found.parameters, (found.value / total).masked_fill(found.lost, math.nan)
+
+    def checked(parameters: Parameters) -> tuple[Parameters, float]:
+        direct[0] = True
+        factors = by_type.Factors(parameters, kind)
+        found = by_type.exact_step(*given, factors, softmax_dtype, reg_covar, parameters)
+        bound = float(found.value / total)
+        if not math.isfinite(bound):
+            raise NumericalError(
+                "The log-likelihood is not finite: columns of X are too large or too different in scale; "
+                "scale X, for example with StandardScaler."
+            )
+        return found.parameters, bound
+
+    return _ahead(step, checked, 1 if points.device.type == "cpu" else _STEPS_AHEAD)
+
+
 def natural_step(
     features: Tensor,
     sample_weight: Tensor,
@@ -93,7 +155,7 @@ def natural_step(
         return exact.expectation(*rows, exact.natural_parameters(parameters), softmax_dtype)
 
     if points is not None:
-        direct = functools.partial(exact.direct_step, points, sample_weight, reg_covar=reg_covar)
+        direct = functools.partial(by_type.direct_step, points, sample_weight, reg_covar=reg_covar)
         return guarded_step(gather, direct, reg_covar, float(total), covariance_type)
 
     def maximized(parameters: Parameters, statistics: Tensor, value: Tensor) -> tuple[Parameters, Tensor]:
@@ -162,6 +224,6 @@ def guarded_step(
 
 
 def of_type(parameters: Parameters, covariance_type: str) -> Parameters:
-    """The parameters with covariances of the type (see `covariance_types`)."""
+    """The parameters with the nearest covariances (K, D, D) of the type (see `covariance_types`)."""
     covariances = constrain(parameters.covariances, covariance_type, parameters.weights)
     return parameters._replace(covariances=covariances)

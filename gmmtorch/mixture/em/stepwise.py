@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import numbers
 
+import torch
+
 from gmmtorch.errors import InvalidArgumentError, check_number
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.reduction.moments import merge_pairs
@@ -25,16 +27,29 @@ def step_size(batch: float, seen: float, kappa: float) -> float:
     return float((batch / (seen + batch)) ** kappa)
 
 
-def blend(previous: Parameters, update: Parameters, step: float) -> Parameters:
+def blend(previous: Parameters, update: Parameters, step: float, kind: str = "full") -> Parameters:
     """The M-step on (1 − η) S + η s, η = `step`, where `previous` and `update` are the parameters of S and s.
 
     `update` is an EM step from `previous`, in the same frame. The regularisation variance, which is part
-    of both, is in the result once.
+    of both, is in the result once. Covariances have the shape of their type, `kind`.
     """
-    return merge_pairs(
-        previous._replace(weights=(1 - step) * previous.weights),
-        update._replace(weights=step * update.weights),
-    )
+    first = previous._replace(weights=(1 - step) * previous.weights)
+    second = update._replace(weights=step * update.weights)
+    if kind == "full":
+        return merge_pairs(first, second)
+    weights = first.weights + second.weights
+    share = torch.where(weights > 0, second.weights / weights, 0.5)[:, None]
+    offset = second.means - first.means
+    means = first.means + share * offset
+    if kind == "tied":
+        between = (weights[:, None] * share * (1 - share) * offset).T @ offset
+        within = first.weights.sum() * first.covariances + second.weights.sum() * second.covariances
+        return Parameters(weights, means, (within + between) / weights.sum())
+    square = offset.square()
+    if kind == "spherical":
+        share, square = share[:, 0], square.mean(1)
+    covariances = (1 - share) * first.covariances + share * second.covariances + (1 - share) * share * square
+    return Parameters(weights, means, covariances)
 
 
 def weight_of_past(seen: float | None, memory: float | None) -> float:

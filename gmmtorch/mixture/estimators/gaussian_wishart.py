@@ -19,9 +19,9 @@ from torch import Tensor
 
 from gmmtorch.kernels.chunks import chunk_elements
 from gmmtorch.linalg import inverse_factor, safe_cholesky
+from gmmtorch.mixture.em import by_type, loop
 from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em import loop
-from gmmtorch.mixture.em.covariance_types import constrain
+from gmmtorch.mixture.em.covariance_types import constrain, expand
 from gmmtorch.mixture.em.exact import Parameters
 
 _LOG_2PI = math.log(2 * math.pi)
@@ -217,14 +217,19 @@ def variational_step(
     The bound (nats per point) is that of the returned posterior. Covariances of the points of a component
     include `reg_covar` (m²).
     """
-    features = em.quadratic_features(points)
+    features = em.quadratic_features(points) if points.shape[1] <= 3 else None
     total = float(sample_weight.sum())
 
     def step(posterior: Posterior) -> tuple[Posterior, float]:
         log_weight, gaussians = expected_log_density(posterior)
-        found, value = _expected_moments(
-            features, points, sample_weight, log_weight, gaussians, reg_covar, softmax_dtype
-        )
+        if features is None:
+            found, value = _typed_moments(
+                points, sample_weight, log_weight, gaussians, reg_covar, softmax_dtype, covariance_type
+            )
+        else:
+            found, value = _expected_moments(
+                features, points, sample_weight, log_weight, gaussians, reg_covar, softmax_dtype
+            )
         new = update(prior, found, process, covariance_type)
         entropy = value - assigned_log_density(_unregularized(found, reg_covar), log_weight, gaussians)
         return new, float(entropy + log_evidence(prior, new, total)) / total
@@ -254,9 +259,32 @@ def _expected_moments(
         found = em.maximization(sums, reg_covar)._replace(weights=sums[:, 0])
         if not em.has_cancelled(sums, found._replace(weights=(sums[:, 0] > 1e-9).to(sums))):
             return found, value
-    found, value = em.direct_step(points, sample_weight, unnormalised, reg_covar)
+    found, value = by_type.direct_step(points, sample_weight, unnormalised, reg_covar)
     total = sample_weight.sum()
     return found._replace(weights=found.weights * total), value + log_weight.max() * total
+
+
+def _typed_moments(
+    points: Tensor,
+    sample_weight: Tensor,
+    log_weight: Tensor,
+    gaussians: Parameters,
+    reg_covar: float,
+    softmax_dtype: torch.dtype,
+    kind: str,
+) -> tuple[Parameters, Tensor]:
+    """The same with the arithmetic of the covariance type, for many dimensions."""
+    k, dim = gaussians.means.shape
+    factors = by_type.Factors(by_type.compacted(gaussians, kind), kind)
+    factors.constant = factors.constant + log_weight
+    given = (points, sample_weight, factors, softmax_dtype, reg_covar, None)
+    found = None
+    if by_type.has_linear_form(k, dim, kind):
+        found = by_type.em_step(*given, linear=True)
+    if found is None or bool(found.lost):
+        found = by_type.exact_step(*given)
+    covariances = expand(found.parameters.covariances, kind, k, dim)
+    return Parameters(found.points, found.parameters.means, covariances), found.value
 
 
 def _unregularized(moments: Parameters, reg_covar: float) -> Parameters:

@@ -32,6 +32,7 @@ from torch import Tensor, nn
 
 from gmmtorch.errors import NumericalError
 from gmmtorch.linalg import inverse_factor, pack_symmetric, safe_cholesky, triangle_indices, unpack_symmetric
+from gmmtorch.mixture.em import by_type
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.initialization import initialize
@@ -198,9 +199,11 @@ class Likelihood:
         means, total = parameters.means, self.weight.sum()
         dim = means.shape[1]
         if em.is_ill_conditioned(parameters):
-            sums, value = em.direct_sums(self.points, self.weight, parameters)
-            count, first = sums[:, 0], sums[:, 1:] - sums[:, :1] * means
-            second = em.direct_scatter(self.points, self.weight, parameters, means)
+            factors = by_type.Factors(parameters, "full")
+            given = self.points, self.weight, factors, torch.float64, False
+            found, value = by_type.expected_moments(*given)
+            count, first, second = found.tensors()
+            first = first - count[:, None] * means
         else:
             natural = em.natural_parameters(parameters)
             sums, value = em.expectation(self._features, self.weight, natural, self.softmax_dtype)

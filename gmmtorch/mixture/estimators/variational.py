@@ -213,9 +213,9 @@ class VariationalGaussianMixture(MixtureEstimator):
             self._check_continues(cloud.points)
             covariances = constrain(last.covariances, self.covariance_type)
             return last._replace(means=last.means - cloud.center, covariances=covariances)
-        first = initialize(
-            self.init_params, cloud.points, cloud.weight, self.n_components, float(self.reg_covar), generator
-        )
+        k, kind, reg = self.n_components, self.covariance_type, float(self.reg_covar)
+        first = initialize(self.init_params, cloud.points, cloud.weight, k, reg, generator, kind)
+        first = first._replace(covariances=expand(first.covariances, kind, *first.means.shape))
         # Stick-breaking depends on the order of components. With the largest component first the bound is
         # best and does not depend on the frame.
         order = first.weights.argsort(descending=True, stable=True)

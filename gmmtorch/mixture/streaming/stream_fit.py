@@ -18,8 +18,9 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike
 from gmmtorch.datasets.point_files.point_chunks import PointChunks, Survey, in_memory
 from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.mixture.em import by_type, loop
 from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em import loop
+from gmmtorch.mixture.em.covariance_types import expand
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.grouping import Rows, nearest
 from gmmtorch.mixture.em.truncated import fit_truncated
@@ -266,13 +267,40 @@ def _stream_step(run: _Run, e_step: EStep, n_points: int) -> loop.Step[Parameter
         statistics, total = summed(accumulate(points) for points, _ in centered())
         return statistics, total
 
-    def direct(parameters: Parameters) -> tuple[Parameters, Tensor]:
-        sums, total = summed(em.direct_sums(*chunk, parameters) for chunk in centered())
+    typed = e_step if isinstance(e_step, ExactEStep) and run.source.dim > 3 else None
+    dtype = torch.float64 if typed is None else em.SOFTMAX_DTYPES[typed.dtype]
+    kind = run.mixture.covariance_type
 
-        def scatter(means: Tensor) -> Tensor:
-            (total_scatter,) = summed((em.direct_scatter(*chunk, parameters, means),) for chunk in centered())
-            return total_scatter
+    def typed_step(given: Parameters) -> tuple[Parameters, Tensor]:
+        """A step with the arithmetic of the covariance type, direct if the linear form loses digits."""
+        parameters, (k, dim) = by_type.compacted(given, kind), given.means.shape
+        factors = by_type.Factors(parameters, kind)
 
-        return em.direct_maximization(sums, scatter, reg_covar, parameters), total
+        def moved(linear: bool, about: Tensor | None) -> by_type.Moved:
+            def terms() -> Iterator[tuple[Tensor, ...]]:
+                for chunk in centered():
+                    sums, value = by_type.expected_moments(*chunk, factors, dtype, linear, about)
+                    yield *sums.tensors(), value
 
-    return loop.guarded_step(gather, direct, reg_covar, float(n_points), run.mixture.covariance_type)
+            *parts, value = summed(terms())
+            whole = by_type.Sums(k, center[None], kind, None if linear else about)
+            for own, part in zip(whole.tensors(), parts, strict=True):
+                own += part
+            return by_type.moved(whole, value, factors, reg_covar, parameters, linear)
+
+        found = moved(True, None) if typed and by_type.has_linear_form(k, dim, kind) else None
+        if found is None or bool(found.lost):
+            found = moved(False, factors.means)
+        if bool(found.lost):
+            found = moved(False, found.parameters.means)
+        covariances = expand(found.parameters.covariances, kind, k, dim)
+        return found.parameters._replace(covariances=covariances), found.value
+
+    if typed is None:
+        return loop.guarded_step(gather, typed_step, reg_covar, float(n_points), kind)
+
+    def step(parameters: Parameters) -> tuple[Parameters, float]:
+        new, value = typed_step(parameters)
+        return new, float(value) / n_points
+
+    return step

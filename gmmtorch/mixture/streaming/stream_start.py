@@ -10,6 +10,7 @@ import torch
 from gmmtorch.datasets.point_files.point_chunks import PointChunks, Survey, merge_surveys
 from gmmtorch.datasets.point_files.point_chunks import survey as survey_source
 from gmmtorch.errors import check_whole
+from gmmtorch.mixture.em.covariance_types import expand
 from gmmtorch.mixture.em.grouping import Rows
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 from gmmtorch.mixture.streaming.checkpoints import Checkpoint, RunFacts, State
@@ -62,6 +63,8 @@ def first_state(
             points = survey.points - center
             rows = Rows(points, points.new_ones(points.shape[0]))
             parameters, _ = mixture._start(rows, center, generator)
+            covariances = expand(parameters.covariances, mixture.covariance_type, *parameters.means.shape)
+            parameters = parameters._replace(covariances=covariances)
             state = State(parameters, center, [])
         packed = state.pack()
     return State.unpack(processes.broadcast(packed), mixture.n_components, survey.low.shape[0])
