@@ -78,7 +78,7 @@ class AlignmentTarget:
     def sums(self, points: Tensor, motions: Motions) -> AlignmentSums:
         """ℓ of points (N, D) under each motion, and its derivatives."""
         moved = points @ motions.rotations.mT + motions.translations[:, None]
-        lists = self.index.buckets(moved.flatten(0, 1)), self.index.starts, self.index.entries
+        lists = self.index.buckets(moved.flatten(0, 1)), *self.index.lists
         target = self.means, self.precisions, self.normals
         limits = self.blur, CUTOFF**2, _OUTLIERS, _EXPLAINED
         return alignment_sums(points, motions, lists, target, limits)

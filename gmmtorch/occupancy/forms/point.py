@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -13,6 +14,7 @@ from gmmtorch.arrays import ArrayLike
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.chunks import chunked
+from gmmtorch.kernels.evidence.hull_test import Lists
 from gmmtorch.kernels.evidence.point_evidence import (
     PointTable,
     compiled_pair_evidence,
@@ -20,7 +22,7 @@ from gmmtorch.kernels.evidence.point_evidence import (
     pair_evidence,
 )
 from gmmtorch.linalg import safe_cholesky
-from gmmtorch.occupancy.cone_index import ConeIndex
+from gmmtorch.occupancy.cone_index import ConeIndex, chunks_of, replaced_rows
 from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.occupancy.protocol import check_queries
@@ -62,14 +64,6 @@ class PointBlocks(NamedTuple):
         radius = (fixed - centers[:, None]).norm(dim=2).amax(1)
         owner = torch.repeat_interleave(touched, n_blocks)
         return cls(gathered.permute(2, 1, 0).contiguous(), owner, centers, radius, point, slot)
-
-    def chunks(self, index: ConeIndex) -> Iterator[slice]:
-        """Runs of blocks whose lists together have about `CHUNK_PAIRS` entries, or a single block."""
-        chunk = torch.cumsum(index.list_lengths()[self.bucket], 0) // CHUNK_PAIRS
-        begin = 0
-        for count in torch.unique_consecutive(chunk, return_counts=True)[1].tolist():
-            yield slice(begin, begin + count)
-            begin += count
 
 
 CHUNK_PAIRS = 1 << 16
@@ -120,17 +114,16 @@ def listed_points(
     if not is_fused(points, axes):
         blocks, zeros = points.T[:, None].contiguous(), torch.zeros_like(points[:, 0])
         each = [
-            pair_evidence(blocks, point, table.columns, cone, side, cutoff, table.oblique)
+            pair_evidence(blocks, point, *table, cone, side, cutoff)
             for table, side in zip(tables, resolutions, strict=True)
         ]
         return [PointEvidence(*(zeros.index_add(0, point, v[0]) for v in pairs)) for pairs in each]
     order = torch.arange(len(points), device=points.device)
-    ends = torch.cumsum(torch.bincount(point, minlength=len(points)), 0)
-    starts = torch.cat([ends.new_zeros(1), ends])
-    return [
-        PointEvidence(*listed_evidence(points, order, order, (starts, cone), t.rows(side), side, cutoff))
-        for t, side in zip(tables, resolutions, strict=True)
-    ]
+    lists = Lists.of(torch.bincount(point, minlength=len(points)), cone.int())
+    found = points.new_empty(len(tables), 2, len(points))
+    for table, side, values in zip(tables, resolutions, found, strict=True):
+        listed_evidence(points, order, order, lists, table.rows, side, cutoff, values)
+    return [PointEvidence(*values) for values in found]
 
 
 class PointForm:
@@ -161,7 +154,6 @@ class PointForm:
             which is faster for a few points.
 
     Attributes:
-        rows: (C, n) what the evidence depends on, a row for each cone. Equal rows give equal evidence.
         index: lists the cones near a point.
     """
 
@@ -181,9 +173,25 @@ class PointForm:
         self.dim, self.cutoff, self.compiled = cones.dim, float(cutoff), compiled
         safe_cholesky(cones.covariances.double().detach())  # raises if one is not positive definite
         self._table = _table_of(cones, axes_of(cones.covariances), self.resolution)
-        self.rows = self._table.rows(self.resolution)
-        entries = None if indexed else 0
+        entries = None if indexed else 0  # per cone
         self.index = ConeIndex(cones, self.resolution, cutoff, smoothed=True, entries_per_cone=entries)
+
+    @property
+    def rows(self) -> Tensor:
+        """(C, n) what the evidence depends on, a row for each cone. Equal rows give equal evidence."""
+        return self._table.rows
+
+    def replaced(self, cones: Cones, former: Tensor) -> PointForm:
+        """The form of other cones, which keeps what it can; arguments as for `ConeIndex.replaced`."""
+        made, is_new = copy.copy(self), former < 0
+        new = Cones(*(part[is_new] for part in cones.checked()))
+        safe_cholesky(new.covariances.double().detach())
+        table = _table_of(new, axes_of(new.covariances), self.resolution)
+        made._table = PointTable(
+            *(replaced_rows(rows, former, rest) for rows, rest in zip(self._table, table, strict=True))
+        )
+        made.index = self.index.replaced(cones, former)
+        return made
 
     def __call__(self, points: ArrayLike) -> PointEvidence:
         """Hits and misses at points (M, D), world metres; zero at infinite points.
@@ -200,27 +208,34 @@ class PointForm:
         return PointEvidence(hits, misses)
 
     def _evaluate(self, points: Tensor) -> PointEvidence:
-        bucket = self.index.buckets(points)
+        parts = self.index.parts(points)
         if is_fused(points, self.rows):
-            lists = self.index.starts, self.index.entries
-            order = self.index.in_space_order(points, bucket)
-            found = listed_evidence(points, order, bucket, lists, self.rows, self.resolution, self.cutoff)
+            found = torch.zeros(2, len(points), dtype=torch.float64, device=points.device)
+            bucket = torch.empty_like(points[:, 0], dtype=torch.int64)
+            for rows, number in parts:
+                bucket[rows] = number
+                order = rows[self.index.in_space_order(points[rows], number)]
+                evidence = self.rows, self.resolution, self.cutoff, found
+                listed_evidence(points, order, bucket, self.index.lists, *evidence)
             return PointEvidence(*found)
-        zeros = torch.zeros_like(points[:, 0])
-        if not bool((bucket >= 0).any()):
-            return PointEvidence(zeros, zeros.clone())
-        blocks = PointBlocks.of(points, bucket, self.index)
-        parts = [self._of_blocks(blocks, part) for part in blocks.chunks(self.index)]
-        evidence = torch.cat(parts, 1).flatten(1)[:, blocks.slot]
-        hits, misses = (zeros.index_copy(0, blocks.point, values) for values in evidence)
+        hits, misses = torch.zeros_like(points[:, 0]), torch.zeros_like(points[:, 0])
+        for rows, number in parts:
+            if not bool((number >= 0).any()):
+                continue
+            blocks = PointBlocks.of(points[rows], number, self.index)
+            chunks = chunks_of(self.index.lists.lengths()[blocks.bucket], CHUNK_PAIRS)
+            evidence = torch.cat([self._of_blocks(blocks, part) for part in chunks], 1)
+            place, (hit, miss) = rows[blocks.point], evidence.flatten(1)[:, blocks.slot]
+            hits, misses = hits.index_copy(0, place, hit), misses.index_copy(0, place, miss)
         return PointEvidence(hits, misses)
 
     def _near_cones(self, blocks: PointBlocks, part: slice) -> tuple[Tensor, Tensor]:
         """Pairs of a block (R,), counted from the start of `part`, and a cone (R,) near it."""
-        block, cone = self.index.listed(blocks.bucket[part])
-        centers, radius = blocks.centers[part], blocks.radius[part]
-        near = self.index.hulls.near(cone, centers[block], radius[block], self.compiled)
-        return block[near], cone[near]
+        bucket, index = blocks.bucket[part], self.index
+        found = index.hulls.near(
+            index.lists, bucket, blocks.centers[part], blocks.radius[part], self.compiled
+        )
+        return found.taken(torch.arange(len(bucket), device=bucket.device))
 
     def _of_blocks(self, blocks: PointBlocks, part: slice) -> Tensor:
         """Hits and misses (2, b, B) of the blocks in `part`."""
@@ -229,22 +244,22 @@ class PointForm:
         hits = points.new_zeros(points.shape[2], points.shape[1])
         misses = hits.clone()
         evaluate = compiled_pair_evidence() if self.compiled else pair_evidence
-        settings = (self.resolution, self.cutoff, self._table.oblique)
         n_rows = max(1, CHUNK_PAIRS // points.shape[1])
         for rows, cones in zip(block.split(n_rows), cone.split(n_rows), strict=True):
-            hit, miss = evaluate(points, rows, self._table.columns, cones, *settings)
+            hit, miss = evaluate(points, rows, *self._table, cones, self.resolution, self.cutoff)
             hits, misses = hits.index_add(0, rows, hit.T), misses.index_add(0, rows, miss.T)
         return torch.stack([hits, misses])
 
     def visited(self, points: Tensor) -> float:
         """Average number of cones evaluated for each of the points (M, D)."""
         query = check_queries(points, self.dim)
-        bucket = self.index.buckets(query)
-        if not bool((bucket >= 0).any()):
-            return 0.0
-        blocks = PointBlocks.of(query, bucket, self.index)
-        n_rows = sum(self._near_cones(blocks, part)[0].shape[0] for part in blocks.chunks(self.index))
-        return n_rows * blocks.points.shape[1] / query.shape[0]
+        n_rows = 0
+        for rows, number in self.index.parts(query):
+            if bool((number >= 0).any()):
+                blocks = PointBlocks.of(query[rows], number, self.index)
+                for part in chunks_of(self.index.lists.lengths()[blocks.bucket], CHUNK_PAIRS):
+                    n_rows += len(self._near_cones(blocks, part)[0]) * blocks.points.shape[1]
+        return n_rows / query.shape[0]
 
 
 def axes_of(covariances: Tensor) -> Tensor:
@@ -256,8 +271,8 @@ def axes_of(covariances: Tensor) -> Tensor:
 
 
 def _table_of(cones: Cones, axes: Tensor, resolution: float) -> PointTable:
-    dim = cones.dim
-    covariances = cones.covariances.double()
+    """The table of cones with the axes V (C, D, D), for cubes of side `resolution` (m)."""
+    dim, covariances = cones.dim, cones.covariances.double()
     turned = axes.transpose(1, 2) @ covariances @ axes
     variances = turned.diagonal(dim1=1, dim2=2)
     variances = variances.clamp_min(1e-12 * float(resolution) ** 2)
@@ -266,15 +281,13 @@ def _table_of(cones: Cones, axes: Tensor, resolution: float) -> PointTable:
     seen = (axes.transpose(1, 2) @ toward[:, :, None]).squeeze(2)
     spread = resolution**2 / 12
     log_scale = -0.5 * (2 * math.pi * (variances + spread)).log().sum(1) + dim * math.log(resolution)
-    columns = [axes.flatten(1), means, origins, seen, variances]
-    columns += [
+    rows = [axes.flatten(1), means, origins, seen, variances, 1 / (variances + spread)]
+    rows += [
         spread * (toward * toward).sum(1, keepdim=True),
         log_scale[:, None],
         counts[:, None],
         (counts * ~cones.max_range)[:, None],
     ]
-    oblique = covariances.requires_grad
-    if oblique:
-        above = torch.triu_indices(dim, dim, 1, device=covariances.device)
-        columns.append(turned[:, above[0], above[1]])
-    return PointTable(torch.cat(columns, 1).T.contiguous(), dim, oblique)
+    above = torch.triu_indices(dim, dim, 1, device=covariances.device)
+    tilts = turned[:, above[0], above[1]] if covariances.requires_grad else turned.new_zeros(len(means), 0)
+    return PointTable(torch.cat(rows, 1), tilts)
