@@ -2,7 +2,8 @@
 
 A bucket lists every cone whose hull (`Hulls`) meets a cube of side `extent` around any point of the
 bucket. Lists are conservative: they can contain a cone that gives no evidence, and never miss one that
-does. They are made when a point of the bucket is asked about.
+does. They are made when a point of the bucket is asked about: from the list of a larger bucket around it,
+and those of the largest buckets from all cones. Where there are few points, a larger bucket's list serves.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels.evidence.hull_test import Lists, near_lists
+from gmmtorch.kernels.simd import CPU_LANES
 from gmmtorch.linalg import argsort, dense_ranks
 from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.grid import check_resolution
@@ -71,9 +73,7 @@ class Hulls:
         arguments as for `near_lists`."""
         chunks = chunks_of(given.lengths()[lists], _TESTS_AT_ONCE)
         parts = [
-            near_lists(
-                self.table, given, lists[t], centers[t], radii[t], self.reach, self.spread, compiled
-            )
+            near_lists(self.table, given, lists[t], centers[t], radii[t], self.reach, self.spread, compiled)
             for t in chunks
         ]
         if len(parts) == 1:
@@ -93,8 +93,7 @@ _ENTRIES_PER_CONE = {2: 64, 3: 512}  # of all buckets, which decides their side
 _KEPT_PER_CONE, _KEPT = 64, 1 << 22  # entries of the lists that are kept, for each cone, and at least
 _KEY_BITS = {2: 31, 3: 21}  # bits of one bucket coordinate in a packed key
 _SAMPLE = 128  # cones, and places around each, by which the side is chosen
-_FEW_GROUPS = 8  # of buckets, at which the search for lists starts
-_SHIFT = 2  # a group of buckets is made of 2^_SHIFT smaller ones along an axis
+_SHIFT = 2  # buckets of the next level are 2^_SHIFT times as large
 _PER_LIST = 8  # entries that take as much memory as what else is kept of a list
 _BUCKETS_AT_ONCE = 1 << 12
 _PAIRS_AT_ONCE = 1 << 20
@@ -106,8 +105,8 @@ class ConeIndex:
     """Lists of cones, one for each bucket, made for the buckets that are asked about, and kept.
 
     What is kept is bounded in proportion to the number of cones; lists that were not used for the longest
-    time go first. So the cost of a query depends on the cones near it; a bucket without a list also costs its
-    share of a test of the boxes around all cones.
+    time go first. The cost of a query depends on the cones near its points; only the largest buckets, whose
+    lists are kept like the others, are compared with the boxes of all cones.
 
     Args:
         cones: must not change afterwards; gradients do not pass through the index.
@@ -117,10 +116,12 @@ class ConeIndex:
             False for boxes that meet the cones themselves.
         entries_per_cone: the buckets are halved while at most about this many entries per cone list all of
             them; 0 makes a single bucket that lists all cones.
+        points_per_list: a larger bucket's list serves its points if, on average, fewer of one query lie in
+            the buckets within it.
 
     Attributes:
         lists: the kept lists; queries append to them, or drop the oldest.
-        side: of the buckets, metres.
+        side: of the smallest buckets, metres. At level k, buckets are 4^k times as large.
     """
 
     def __init__(
@@ -130,11 +131,13 @@ class ConeIndex:
         cutoff: float = CUTOFF,
         smoothed: bool = False,
         entries_per_cone: int | None = None,
+        points_per_list: int = CPU_LANES,
     ) -> None:
         self.extent = check_resolution(extent)
         cones = cones.checked()
         self.dim = cones.dim
         self._options = self.extent, cutoff, smoothed, entries_per_cone
+        self._points_per_list = points_per_list
         self.hulls = Hulls(cones, self.extent, cutoff, smoothed)
         self._set_lattice()
 
@@ -147,14 +150,16 @@ class ConeIndex:
         span = float((hulls.high.amax(0) - self.origin).amax()) * (1 + 1e-9) if n_cones else 0.0
         # The finest buckets whose coordinates fit the bits of the key, with room to grow.
         finest = max(self.extent, span / (self._limit - 1))
-        self._drop_all()
         if per_cone == 0:
-            self.side = max(span, finest)
+            self.side, self._n_levels = max(span, finest), 1
+            self._drop_all()
             cell = torch.zeros(min(n_cones, 1), self.dim, dtype=torch.int64, device=device)
             every = torch.arange(n_cones, dtype=torch.int32, device=device)
-            self._add(self._pack(cell), Lists(cell.new_tensor([0, n_cones])[: len(cell) + 1], every))
+            self._add(0, cell, Lists.of(cell.new_full((len(cell),), n_cones), every))
         else:
             self.side = _chosen_side(hulls, finest, span, per_cone or _ENTRIES_PER_CONE[self.dim])
+            self._n_levels = 1 + math.ceil(math.log2(max(span / self.side, 1.0)) / _SHIFT)
+            self._drop_all()
 
     def replaced(self, cones: Cones, former: Tensor) -> ConeIndex:
         """The index of other cones. It keeps the lists of buckets that no new cone, and none that is gone,
@@ -171,18 +176,27 @@ class ConeIndex:
         gone = self.hulls.taken(~stays)
         made.hulls = self.hulls.replaced(former, new)
         corners = (torch.cat([new.low, new.high]) - self.origin) / self.side
-        if self._options[3] == 0 or len(former) > 2 * self._n_chosen or bool((corners.abs() > self._limit).any()):
+        if (
+            self._options[3] == 0
+            or len(former) > 2 * self._n_chosen
+            or bool((corners.abs() > self._limit).any())
+        ):
             made._set_lattice()
             return made
         if not bool(stays.any()):
             made._drop_all()
             return made
-        cells = self._unpack(self._keys)
         kept = torch.ones_like(self._used, dtype=torch.bool)
         for hulls in (new, gone):
-            kept[self._numbers[self._lists_of(hulls, cells).lengths() > 0]] = False
+            probe = copy.copy(self)
+            probe.hulls = hulls
+            probe._drop_all()
+            for level in reversed(range(self._n_levels)):
+                keys, numbers = self._buckets[level]
+                found = probe._numbered(level, self._unpack(keys))
+                kept[numbers[probe.lists.lengths()[found] > 0]] = False
         made._keep(kept)
-        if bool(gone.low.numel()) and made.lists.entries.numel():
+        if len(gone.low) and len(made.lists.entries):
             number = torch.full_like(stays, -1, dtype=torch.int32)
             number[former[~is_new]] = (~is_new).nonzero().squeeze(1).int()
             made.lists.entries.copy_(number[made.lists.entries])
@@ -192,8 +206,9 @@ class ConeIndex:
 
     def _drop_all(self) -> None:
         none = torch.zeros(0, dtype=torch.int64, device=self.hulls.table.device)
-        self._keys, self._numbers = none, none  # of the buckets, sorted; and their lists
+        self._buckets = [(none, none)] * self._n_levels  # of each level, sorted keys and the buckets' lists
         self._used, self._now = none, 0  # when each list was used last
+        self._levels = none  # of the bucket of each list
         self._buffer = none.int()  # begins with the entries of the lists
         self.lists = Lists.of(none, self._buffer)
 
@@ -202,69 +217,67 @@ class ConeIndex:
         lengths = self.lists.lengths()
         self._buffer = self.lists.entries[torch.repeat_interleave(kept, lengths)]
         self.lists = Lists.of(lengths[kept], self._buffer)
-        self._used = self._used[kept]
-        place = kept[self._numbers]
-        self._keys, self._numbers = self._keys[place], (kept.cumsum(0) - 1)[self._numbers[place]]
+        self._used, self._levels = self._used[kept], self._levels[kept]
+        rank, buckets = kept.cumsum(0) - 1, []
+        for keys, numbers in self._buckets:
+            stays = kept[numbers]
+            buckets.append((keys[stays], rank[numbers[stays]]))
+        self._buckets = buckets
 
-    def _make_room(self, n_entries: int) -> None:
-        """Drops lists that were not used for the longest time, if so many more entries are too many."""
+    def _make_room(self) -> None:
+        """Drops lists that were not used for the longest time, if there are more than the bound."""
         most = max(_KEPT, _KEPT_PER_CONE * len(self.hulls.table))
         sizes = self.lists.lengths() + _PER_LIST
-        if int(sizes.sum()) + n_entries <= most:
+        if int(sizes.sum()) <= most:
             return
         newest = argsort(-self._used)
         kept = torch.zeros_like(self._used, dtype=torch.bool)
         kept[newest[sizes[newest].cumsum(0) <= most // 2]] = True
         self._keep(kept)
 
-    def _add(self, keys: Tensor, lists: Lists) -> None:
-        """Keeps the lists (n,) of new buckets with these keys (n,)."""
+    def _add(self, level: int, cells: Tensor, lists: Lists) -> Tensor:
+        """Keeps the lists (n,) of new buckets with these coordinates (n, D), and returns their numbers."""
         n_lists, n_entries, n_added = len(self._used), len(self.lists.entries), len(lists.entries)
         if n_entries + n_added > len(self._buffer):
             self._buffer = torch.cat([self.lists.entries, lists.entries.new_empty(n_entries // 2 + n_added)])
         self._buffer[n_entries : n_entries + n_added] = lists.entries
         starts = torch.cat([self.lists.starts, n_entries + lists.starts[1:]])
         self.lists = Lists(starts, self._buffer[: n_entries + n_added])
-        self._used = torch.cat([self._used, torch.full_like(keys, self._now)])
-        numbers = torch.arange(n_lists, n_lists + len(keys), device=keys.device)
-        keys, numbers = torch.cat([self._keys, keys]), torch.cat([self._numbers, numbers])
+        self._used = torch.cat([self._used, torch.full_like(cells[:, 0], self._now)])
+        self._levels = torch.cat([self._levels, torch.full_like(cells[:, 0], level)])
+        added = torch.arange(n_lists, n_lists + len(cells), device=cells.device)
+        keys, numbers = self._buckets[level]
+        keys, numbers = torch.cat([keys, self._pack(cells)]), torch.cat([numbers, added])
         order = argsort(keys)
-        self._keys, self._numbers = keys[order], numbers[order]
+        self._buckets[level] = keys[order], numbers[order]
+        return added
 
-    # -- the search for lists -------------------------------------------------------------------------
-
-    def _lists_of(self, hulls: Hulls, cells: Tensor) -> Lists:
-        """The lists of distinct buckets with these coordinates (B, D).
-
-        Groups of buckets have lists too: each list is chosen from that of the group around it, and those of
-        the largest groups from all cones.
-        """
-        levels, owners = [(cells, cells + 1, cells)], [torch.arange(len(cells), device=cells.device)]
-        while len(owners[-1]) > _FEW_GROUPS:
-            low, high, cell = levels[-1]
-            cell = cell >> _SHIFT
-            owner, n_groups = dense_ranks(self._pack(cell))
-            row = owner[:, None].expand_as(cell)
-            shape = cell.new_zeros(n_groups, self.dim)
-            levels.append(
-                (
-                    shape.scatter_reduce(0, row, low, "amin", include_self=False),
-                    shape.scatter_reduce(0, row, high, "amax", include_self=False),
-                    shape.scatter(0, row, cell),
-                )
-            )
-            owners[-1] = owner
-            owners.append(torch.arange(n_groups, device=cells.device))
-        boxes = [(self.origin + low * self.side, self.origin + high * self.side) for low, high, _ in levels]
-        found = [
-            ((hulls.low <= high) & (hulls.high >= low)).all(1).nonzero().squeeze(1).int()
-            for low, high in zip(*boxes[-1], strict=True)
-        ]
-        lengths = cells.new_tensor([len(cones) for cones in found])
-        lists = Lists.of(lengths, torch.cat(found) if found else cells.new_zeros(0).int())
-        for (low, high), owner in zip(reversed(boxes), reversed(owners), strict=True):
-            lists = hulls.near(lists, owner, 0.5 * (low + high), 0.5 * (high - low).norm(dim=1))
-        return lists
+    def _numbered(self, level: int, cells: Tensor) -> Tensor:
+        """The lists (B,) of distinct buckets with these coordinates (B, D); makes those that are missing."""
+        number = self._find(level, self._pack(cells))
+        missing = (number < 0).nonzero().squeeze(1)
+        self._used[number[number >= 0]] = self._now
+        if not len(missing):
+            return number
+        hulls, side = self.hulls, self.side * (1 << _SHIFT * level)
+        if level + 1 == self._n_levels:
+            low = self.origin + cells[missing] * side
+            boxes = zip(low, low + side, strict=True)
+            met = [((hulls.low <= b) & (hulls.high >= a)).all(1).nonzero().squeeze(1).int() for a, b in boxes]
+            lengths = cells.new_tensor([len(cones) for cones in met])
+            number[missing] = self._add(level, cells[missing], Lists.of(lengths, torch.cat(met)))
+            return number
+        owner, n_owners = dense_ranks(self._pack(cells[missing] >> _SHIFT))
+        order = argsort(owner)
+        missing, owner = missing[order], owner[order]
+        parents = cells.new_zeros(n_owners, self.dim)
+        parents[owner] = cells[missing] >> _SHIFT
+        lists = self._numbered(level + 1, parents)[owner]
+        centers = self.origin + (cells[missing] + 0.5) * side
+        radii = torch.full_like(centers[:, 0], 0.5 * side * self.dim**0.5)
+        made = hulls.near(self.lists, lists, centers, radii)
+        number[missing] = self._add(level, cells[missing], made)
+        return number
 
     # -- queries --------------------------------------------------------------------------------------
 
@@ -285,52 +298,78 @@ class ConeIndex:
         parts = [keys >> bits * axis & ((1 << bits) - 1) for axis in reversed(range(self.dim))]
         return torch.stack(parts, 1) - self._limit
 
-    def _find(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """The list (M,) of the bucket of each point (M, D), −1 for no or an empty list, −2 if there is none
-        yet; and the keys (M,) of the buckets."""
-        cell = ((points.detach().double() - self.origin) / self.side).floor()
-        inside = (cell.abs() <= self._limit).all(1)
-        key = self._pack(torch.where(inside[:, None], cell, 0.0).long())
-        if len(self._keys) == 0:
-            return torch.where(inside, -2, -1), key
-        place = torch.searchsorted(self._keys, key).clamp_max_(len(self._keys) - 1)
-        number = self._numbers[place]
-        number = torch.where(self.lists.lengths()[number] > 0, number, -1)
-        number = torch.where(self._keys[place] == key, number, -2)
-        return torch.where(inside, number, -1), key
+    def _find(self, level: int, key: Tensor) -> Tensor:
+        """The list (B,) of each bucket with these keys (B,), −1 if there is none yet."""
+        keys, numbers = self._buckets[level]
+        if not len(keys):
+            return torch.full_like(key, -1)
+        place = torch.searchsorted(keys, key).clamp_max_(len(keys) - 1)
+        return torch.where(keys[place] == key, numbers[place], -1)
 
     def parts(self, points: Tensor, bounded: bool = True) -> Iterator[tuple[Tensor, Tensor]]:
-        """Parts of points (M, D): their rows (R,), ascending, and the list (R,) in `lists` of all cones that
-        can give evidence to each; −1 where there is none. Later parts change `lists`: use it part by part.
+        """Parts of points (M, D): their rows (R,), and the list (R,) in `lists` of all cones that can give
+        evidence to each. Later parts change `lists`: use it part by part. Points that are in no part have no
+        evidence.
 
         bounded: False keeps the lists of all these points, beyond the bound.
         """
-        if len(self.hulls.table) == 0:
-            yield torch.arange(len(points), device=points.device), points.new_full((len(points),), -1).long()
+        if not len(self.hulls.table):
             return
         self._now += 1
-        number, key = self._find(points)
-        missing = number == -2
-        rows = (~missing).nonzero().squeeze(1)
-        number = number[rows]
-        self._used[number[number >= 0]] = self._now
-        if len(rows):
-            yield rows, number
-        rows = missing.nonzero().squeeze(1)
-        if not len(rows):
+        cell = ((points.detach().double() - self.origin) / self.side).floor()
+        rows = (cell.abs() <= self._limit).all(1).nonzero().squeeze(1)
+        cell = cell[rows].long()
+        key = self._pack(cell)
+        number = self._find(0, key)
+        found = number >= 0
+        if bool(found.all()):
+            self._used[number] = self._now
+            yield self._not_empty(rows, number)
             return
-        rank, n_missing = dense_ranks(key[rows])
-        keys = torch.zeros_like(key[:n_missing]).scatter_(0, rank, key[rows])
+        if bool(found.any()):
+            self._used[number[found]] = self._now
+            yield self._not_empty(rows[found], number[found])
+        rows, cell = rows[~found], cell[~found]
+        rank, n_missing = dense_ranks(key[~found])
+        cells = cell.new_zeros(n_missing, self.dim)
+        cells[rank] = cell
         for first in range(0, n_missing, _BUCKETS_AT_ONCE):
-            part = keys[first : first + _BUCKETS_AT_ONCE]
-            made = self._lists_of(self.hulls, self._unpack(part))
+            chosen = rank // _BUCKETS_AT_ONCE == first // _BUCKETS_AT_ONCE
+            chosen = chosen.nonzero().squeeze(1) if n_missing > _BUCKETS_AT_ONCE else slice(None)
             if bounded:
-                self._make_room(len(made.entries) + _PER_LIST * len(part))
-            n_before = len(self._used)
-            self._add(part, made)
-            chosen = ((rank >= first) & (rank < first + len(part))).nonzero().squeeze(1)
-            number = rank[chosen] - first
-            yield rows[chosen], torch.where(made.lengths()[number] > 0, number + n_before, -1)
+                self._make_room()
+            number = self._serving(cells[first : first + _BUCKETS_AT_ONCE], rank[chosen] - first)
+            yield self._not_empty(rows[chosen], number)
+
+    def _not_empty(self, rows: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
+        some = (self.lists.lengths()[number] > 0).nonzero().squeeze(1)
+        return rows[some], number[some]
+
+    def _serving(self, cells: Tensor, rank: Tensor) -> Tensor:
+        """The list (R,) that serves each point, in the bucket with number `rank` (R,) among `cells` (B, D).
+
+        Lists are made from those of the largest buckets on, as long as there are enough points.
+        """
+        groups, owners = [cells], []
+        n_points = [torch.bincount(rank, minlength=len(cells))]
+        enough = [torch.zeros_like(cells[:, 0], dtype=torch.bool)]  # points to divide the bucket
+        for _ in range(1, self._n_levels):
+            cell = groups[-1] >> _SHIFT
+            owner, n_groups = dense_ranks(self._pack(cell))
+            groups.append(cell.new_zeros(n_groups, self.dim).index_copy_(0, owner, cell))
+            owners.append(owner)
+            n_points.append(torch.zeros_like(groups[-1][:, 0]).index_add_(0, owner, n_points[-1]))
+            n_children = torch.bincount(owner, minlength=n_groups)
+            enough.append(n_points[-1] >= self._points_per_list * n_children)
+        number = self._numbered(self._n_levels - 1, groups[-1])
+        divided = torch.ones_like(number, dtype=torch.bool)
+        for level in reversed(range(self._n_levels - 1)):
+            owner = owners[level]
+            divided = (divided & enough[level + 1])[owner]
+            number = number[owner]
+            asked = divided.nonzero().squeeze(1)
+            number[asked] = self._numbered(level, groups[level][asked])
+        return number[rank]
 
     def buckets(self, points: Tensor) -> Tensor:
         """The list (M,) in `lists` of all cones that can give evidence to each point (M, D); −1 where there
@@ -341,11 +380,12 @@ class ConeIndex:
         return found
 
     def in_space_order(self, points: Tensor, bucket: Tensor) -> Tensor:
-        """An order (M,) of points (M, D), finite where they have a bucket (M,), in which neighbours follow.
+        """An order (M,) of points (M, D) with lists `bucket` (M,) in which neighbours follow each other.
 
-        Points are sorted by bucket, and by the parts of their bucket.
+        Points are sorted by list, and by the parts of their bucket.
         """
-        part = ((points.detach() - self.origin) / self.side % 1 * _SUBCELLS).long()
+        side = self.side * torch.pow(float(1 << _SHIFT), self._levels[bucket])[:, None]
+        part = ((points.detach() - self.origin) / side % 1 * _SUBCELLS).long()
         fine = bucket
         for axis in range(self.dim):
             fine = fine * _SUBCELLS + part[:, axis]
@@ -354,7 +394,7 @@ class ConeIndex:
     def candidates(self, low: Tensor, high: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
         """Chunks of pairs, box (P,) and cone (P,): all cones whose hull meets a box [low, high], (M, D) each.
 
-        Each pair occurs once; in a chunk boxes ascend, and all pairs of a box are in the same chunk.
+        Each pair occurs once, and all pairs of a box follow each other in one chunk.
 
         Raises `InvalidArgumentError` for boxes larger than `extent`.
         """
@@ -366,10 +406,13 @@ class ConeIndex:
             )
         center = 0.5 * (low + high)
         for rows, bucket in self.parts(center):
-            box, bucket = rows[bucket >= 0], bucket[bucket >= 0]
+            order = self.in_space_order(center[rows], bucket)
+            rows, bucket = rows[order], bucket[order]
             for part in chunks_of(self.lists.lengths()[bucket], _PAIRS_AT_ONCE):
-                boxes = box[part]
-                found = self.hulls.near(self.lists, bucket[part], center[boxes], torch.zeros_like(center[boxes, 0]))
+                boxes = rows[part]
+                found = self.hulls.near(
+                    self.lists, bucket[part], center[boxes], torch.zeros_like(center[boxes, 0])
+                )
                 place, cone = found.taken(torch.arange(len(boxes), device=boxes.device))
                 yield boxes[place], cone
 

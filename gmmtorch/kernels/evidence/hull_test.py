@@ -12,61 +12,89 @@ from torch import Tensor
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.compiler import FusedKernel
 from gmmtorch.kernels.evidence.point_evidence import sum_of
+from gmmtorch.kernels.simd import CPU_LANES, SIMD
 from gmmtorch.linalg import ragged_index
 
 _BODY = """
-    const int64_t child = item / parts, list = lists[child];
-    const double *center = centers + child * DIM, ball = radii[child];
-    const double reach = spread > 0.0 ? ball : ball + cube_reach;
-    double n_near = 0.0;  // a type that CUDA adds
-    for (int64_t at = starts[list] + item % parts; at < starts[list + 1]; at += parts) {
-        const double* row = rows + entries[at] * WIDTH;
-        const double *mean = row + DIM * DIM, *origin = mean + DIM, *squares = origin + DIM;
-        double y[DIM], z[DIM], distance = 0.0;
-        for (int j = 0; j < DIM; ++j) distance += (center[j] - origin[j]) * (center[j] - origin[j]);
-        distance = sqrt(distance);
-        const double clear = GMM_MAX(distance - reach, 1e-12);
-        double widened = spread > 0.0 ? spread * GMM_MAX(squares[DIM] / clear, 1.0) : 0.0;
-        const double far = squares[DIM + 1] + widened;
-        bool close = distance <= far + reach;
-        if (close) {
+    const int64_t begin = item / parts * LANES, stop = GMM_MIN(begin + LANES, n_balls), part = item % parts;
+    vec x[DIM], ball, number = (vec)(-1.0);
+    double n_near[LANES];
+    for (int l = 0; l < LANES; ++l) {
+        const int64_t i = GMM_MIN(begin + l, stop - 1);
+        for (int a = 0; a < DIM; ++a) set(x[a], l, centers[i * DIM + a]);
+        set(ball, l, radii[i]);
+        if (begin + l < stop) set(number, l, (double)lists[i]);
+        n_near[l] = 0.0;
+    }
+    const vec reach = spread > 0.0 ? ball : ball + cube_reach;
+    for (int first = 0; first < LANES; ++first) {  // each list of these balls once
+        const double mine = get(number, first);
+        if (mine < 0.0 || (first > 0 && get(number, first - 1) == mine)) continue;
+        const mask active = number == mine;
+        int last = first;
+        while (last + 1 < LANES && get(number, last + 1) == mine) ++last;
+        const int64_t list = (int64_t)mine, from = starts[list];
+        for (int64_t at = from + part; at < starts[list + 1]; at += parts) {
+            const double* row = rows + entries[at] * WIDTH;
+            const double *mean = row + DIM * DIM, *origin = mean + DIM, *squares = origin + DIM;
+            vec ray[DIM], y[DIM], z[DIM], distance = (vec)(0.0);
             for (int j = 0; j < DIM; ++j) {
-                y[j] = z[j] = 0.0;
-                for (int i = 0; i < DIM; ++i) {
-                    y[j] += row[i * DIM + j] * (center[i] - mean[i]);
-                    z[j] += row[i * DIM + j] * (center[i] - origin[i]);
+                ray[j] = x[j] - origin[j];
+                distance += ray[j] * ray[j];
+            }
+            distance = root(distance);
+            vec clear = distance - reach;
+            clear = clear < 1e-12 ? (vec)(1e-12) : clear;
+            const vec closeness = 1.0 / clear;
+            vec widened = squares[DIM] * closeness;
+            widened = spread * (widened < 1.0 ? (vec)(1.0) : widened);
+            const vec far = squares[DIM + 1] + widened, beta = far * reach * closeness;
+            widened *= widened;
+            mask close = distance <= far + reach;
+            if (any(active & close)) {
+                for (int j = 0; j < DIM; ++j) {
+                    y[j] = z[j] = (vec)(0.0);
+                    for (int i = 0; i < DIM; ++i) {
+                        y[j] += row[i * DIM + j] * (x[i] - mean[i]);
+                        z[j] += row[i * DIM + j] * ray[i];
+                    }
                 }
             }
-        }
-        widened *= widened;
-        const double beta = far * reach / clear;
-        for (int axis = DIM - 1; close && axis >= DIM - 2; --axis) {
-            double ratio = beta / GMM_MAX(sqrt(squares[axis] + widened), 1e-12);
-            ratio = GMM_MIN(GMM_MAX(ratio, 1e-6), 1e6);
-            const double added = (1.0 + ratio) * widened + (1.0 + 1.0 / ratio) * beta * beta;
-            double aa = 0.0, bb = 0.0, cc = 0.0;
-            for (int j = 0; j < DIM; ++j) {
-                const double weight = 1.0 / ((1.0 + ratio) * squares[j] + added);
-                aa += weight * z[j] * z[j];
-                bb += weight * y[j] * z[j];
-                cc += weight * y[j] * y[j];
+            for (int axis = DIM - 1; axis >= DIM - 2 && any(active & close); --axis) {
+                vec ratio = root(squares[axis] + widened);
+                ratio = beta / (ratio < 1e-12 ? (vec)(1e-12) : ratio);
+                ratio = ratio < 1e-6 ? (vec)(1e-6) : ratio > 1e6 ? (vec)(1e6) : ratio;
+                const vec more = 1.0 + ratio, added = more * widened + (1.0 + 1.0 / ratio) * beta * beta;
+                vec aa = (vec)(0.0), bb = (vec)(0.0), cc = (vec)(0.0);
+                for (int j = 0; j < DIM; ++j) {
+                    const vec weight = 1.0 / (more * squares[j] + added);
+                    aa += weight * z[j] * z[j];
+                    bb += weight * y[j] * z[j];
+                    cc += weight * y[j] * y[j];
+                }
+                bb = bb > 0.0 ? (vec)(0.0) : bb;
+                aa = aa < 1e-300 ? (vec)(1e-300) : aa;
+                close &= cc - bb * bb / aa < 1.0 + 1e-6;
             }
-            bb = GMM_MIN(bb, 0.0);
-            close = cc - bb * bb / GMM_MAX(aa, 1e-300) < 1.0 + 1e-6;
+            close |= distance <= (reach + cube_reach) * (1.0 + 1e-9);
+            const vec found = close ? (vec)(1.0) : (vec)(0.0);
+            for (int l = first; l <= last; ++l) {
+                const double is_near = get(found, l);
+                near[firsts[begin + l] + at - from] = is_near > 0.0;
+                n_near[l] += is_near;
+            }
         }
-        close = close || distance <= (reach + cube_reach) * (1.0 + 1e-9);
-        near[firsts[child] + at - starts[list]] = close;
-        n_near += close;
     }
-    if (n_near) GMM_ADD(counts + child, n_near);
+    for (int l = 0; l < LANES && begin + l < stop; ++l)
+        if (n_near[l] > 0.0) GMM_ADD(counts + begin + l, n_near[l]);
 """
 _KERNELS = {
     dim: FusedKernel(
         f"near_lists_{dim}d",
         "const double* rows, const int64* starts, const int32* entries, const int64* lists,"
-        " const int64* firsts, const double* centers, const double* radii, double cube_reach, double spread,"
-        " int64 parts, bool* near, double* counts",
-        _BODY.replace("WIDTH", str(dim * dim + 3 * dim + 2)).replace("DIM", str(dim)),
+        " const int64* firsts, const double* centers, const double* radii, int64 n_balls, double cube_reach,"
+        " double spread, int64 parts, bool* near, double* counts",
+        SIMD + _BODY.replace("WIDTH", str(dim * dim + 3 * dim + 2)).replace("DIM", str(dim)),
     )
     for dim in (2, 3)
 }
@@ -109,7 +137,7 @@ def near_lists(
     Args:
         table: (C, n) float64, a row for each cone: its axes (D²), mean, sensor origin and squared half axes
             at the cutoff (D each), the distance between mean and origin, and that to the farthest point.
-        lists: (T,) a list of `given` for each ball.
+        lists: (T,) a list of `given` for each ball. Balls of one list that follow each other share its cost.
         centers, radii: (T, D), (T,) of the balls, float64.
         cube_reach: from the centre of a cube to its corners; spread: see `Hulls`; metres.
         compiled: torch.compile for the twin.
@@ -119,10 +147,11 @@ def near_lists(
         ends = lengths.cumsum(0)
         firsts, counts = ends - lengths, torch.zeros_like(lengths, dtype=torch.float64)
         near = torch.empty(int(ends[-1]) if len(ends) else 0, dtype=torch.bool, device=table.device)
-        parts = 1 if table.device.type == "cpu" else _PARTS
-        arguments = (table, *given, lists, firsts, centers.contiguous(), radii.contiguous())
+        lanes, parts = (CPU_LANES, 1) if table.device.type == "cpu" else (1, _PARTS)
+        arguments = (table, *given, lists, firsts, centers.contiguous(), radii.contiguous(), len(lists))
         sizes = (cube_reach, spread, parts)
-        _KERNELS[centers.shape[1]](len(lists) * parts, *arguments, *sizes, near, counts, device=table.device)
+        n_items = (len(lists) + lanes - 1) // lanes * parts
+        _KERNELS[centers.shape[1]](n_items, *arguments, *sizes, near, counts, device=table.device)
         counts = counts.long()
         shift = torch.repeat_interleave(given.starts[lists] - firsts, counts)
         return Lists.of(counts, given.entries[near.nonzero().squeeze(1) + shift])

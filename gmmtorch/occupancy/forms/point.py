@@ -45,9 +45,8 @@ class PointBlocks(NamedTuple):
 
     @classmethod
     def of(cls, points: Tensor, bucket: Tensor, index: ConeIndex) -> PointBlocks:
-        """Blocks of the points (M, D) that have a bucket (M,); points with bucket −1 are left out."""
-        point = (bucket >= 0).nonzero().squeeze(1)
-        point = point[index.in_space_order(points[point], bucket[point])]
+        """Blocks of points (M, D), at least one, in buckets (M,)."""
+        point = index.in_space_order(points, bucket)
         touched, count = torch.unique_consecutive(bucket[point], return_counts=True)
         n_points, n_touched = point.shape[0], touched.shape[0]
         size = 16 if n_points > 24 * n_touched else 4 if n_points > 4 * n_touched else 1
@@ -220,7 +219,7 @@ class PointForm:
             return PointEvidence(*found)
         hits, misses = torch.zeros_like(points[:, 0]), torch.zeros_like(points[:, 0])
         for rows, number in parts:
-            if not bool((number >= 0).any()):
+            if not len(rows):
                 continue
             blocks = PointBlocks.of(points[rows], number, self.index)
             chunks = chunks_of(self.index.lists.lengths()[blocks.bucket], CHUNK_PAIRS)
@@ -255,7 +254,7 @@ class PointForm:
         query = check_queries(points, self.dim)
         n_rows = 0
         for rows, number in self.index.parts(query):
-            if bool((number >= 0).any()):
+            if len(rows):
                 blocks = PointBlocks.of(query[rows], number, self.index)
                 for part in chunks_of(self.index.lists.lengths()[blocks.bucket], CHUNK_PAIRS):
                     n_rows += len(self._near_cones(blocks, part)[0]) * blocks.points.shape[1]

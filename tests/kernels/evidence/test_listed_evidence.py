@@ -8,6 +8,7 @@ from kernels.cones_for_kernels import cones_of
 from scipy.special import erfcx
 
 from gmmtorch.kernels import kernels
+from gmmtorch.kernels.evidence.hull_test import Lists
 from gmmtorch.kernels.simd import MILLS
 from gmmtorch.occupancy.cone_index import Hulls
 from gmmtorch.occupancy.cones import Cones
