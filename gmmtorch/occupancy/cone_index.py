@@ -17,7 +17,6 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels.evidence.hull_test import Lists, near_lists
-from gmmtorch.kernels.simd import CPU_LANES
 from gmmtorch.linalg import argsort, dense_ranks
 from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.grid import check_resolution
@@ -95,6 +94,7 @@ _KEY_BITS = {2: 31, 3: 21}  # bits of one bucket coordinate in a packed key
 _SAMPLE = 128  # cones, and places around each, by which the side is chosen
 _SHIFT = 2  # buckets of the next level are 2^_SHIFT times as large
 _PER_LIST = 8  # entries that take as much memory as what else is kept of a list
+_POINTS_PER_LIST = 4
 _BUCKETS_AT_ONCE = 1 << 12
 _PAIRS_AT_ONCE = 1 << 20
 _TESTS_AT_ONCE = 1 << 22
@@ -131,7 +131,7 @@ class ConeIndex:
         cutoff: float = CUTOFF,
         smoothed: bool = False,
         entries_per_cone: int | None = None,
-        points_per_list: int = CPU_LANES,
+        points_per_list: int = _POINTS_PER_LIST,
     ) -> None:
         self.extent = check_resolution(extent)
         cones = cones.checked()

@@ -36,6 +36,7 @@ _BODY = """
         const int64_t list = (int64_t)mine, from = starts[list];
         for (int64_t at = from + part; at < starts[list + 1]; at += parts) {
             const double* row = rows + entries[at] * WIDTH;
+            GMM_FETCH(rows + entries[GMM_MIN(at + AHEAD * parts, starts[list + 1] - 1)] * WIDTH, WIDTH);
             const double *mean = row + DIM * DIM, *origin = mean + DIM, *squares = origin + DIM;
             vec ray[DIM], y[DIM], z[DIM], distance = (vec)(0.0);
             for (int j = 0; j < DIM; ++j) {
@@ -49,8 +50,18 @@ _BODY = """
             vec widened = squares[DIM] * closeness;
             widened = spread * (widened < 1.0 ? (vec)(1.0) : widened);
             const vec far = squares[DIM + 1] + widened, beta = far * reach * closeness;
-            widened *= widened;
+            // All of the ellipsoid lies within its longest half axis of the mean: a quick test.
+            double mm = 0.0;
+            vec along = (vec)(0.0);
+            for (int j = 0; j < DIM; ++j) {
+                const double seen = mean[j] - origin[j];
+                mm += seen * seen;
+                along += seen * ray[j];
+            }
+            const vec within = squares[DIM + 1] - squares[DIM] + widened + beta, square = distance * distance;
             mask close = distance <= far + reach;
+            close &= (mm * (1.0 - 1e-14) - within * within) * square <= along * along;
+            widened *= widened;
             if (any(active & close)) {
                 for (int j = 0; j < DIM; ++j) {
                     y[j] = z[j] = (vec)(0.0);
@@ -94,7 +105,7 @@ _KERNELS = {
         "const double* rows, const int64* starts, const int32* entries, const int64* lists,"
         " const int64* firsts, const double* centers, const double* radii, int64 n_balls, double cube_reach,"
         " double spread, int64 parts, bool* near, double* counts",
-        SIMD + _BODY.replace("WIDTH", str(dim * dim + 3 * dim + 2)).replace("DIM", str(dim)),
+        SIMD + _BODY.replace("AHEAD", "6").replace("WIDTH", str(dim * dim + 3 * dim + 2)).replace("DIM", str(dim)),
     )
     for dim in (2, 3)
 }

@@ -50,16 +50,27 @@ _BODY = """
         const int64_t list = (int64_t)mine;
         for (int64_t entry = starts[list]; entry < starts[list + 1]; ++entry) {
             const double* cone = table + entries[entry] * WIDTH;
+            GMM_FETCH(table + entries[GMM_MIN(entry + 6, starts[list + 1] - 1)] * WIDTH, WIDTH);
             const double *mean = cone + DIM * DIM, *origin = mean + DIM, *seen = origin + DIM;
             const double *variance = seen + DIM, *fixed = variance + DIM, *rest = fixed + DIM;
             vec y[DIM], z[DIM], ray[DIM];
-            vec squared_distance = (vec)(0.0), squared = (vec)(0.0);
+            vec squared_distance = (vec)(0.0), squared = (vec)(0.0), turn = (vec)(0.0);
+            double seen_squared = 0.0;
+            for (int j = 0; j < DIM; ++j) {
+                const double toward = mean[j] - origin[j];
+                ray[j] = x[j] - origin[j];
+                squared_distance += ray[j] * ray[j];
+                turn += toward * ray[j];
+                seen_squared += toward * toward;
+            }
+            // The mean is farther from the ray than the cutoff for the largest variance: a quick test.
+            const double widest = seen_squared * (1.0 - 1e-14) - limit * (variance[DIM - 1] + h * h / 12.0);
+            const mask near = widest * squared_distance - turn * turn <= GMM_MAX(limit, 9.0) * rest[0];
+            if (!any(active & near)) continue;
             for (int j = 0; j < DIM; ++j) {
                 y[j] = (vec)(0.0);
                 for (int i = 0; i < DIM; ++i) y[j] += cone[i * DIM + j] * (x[i] - mean[i]);
                 z[j] = y[j] + seen[j];
-                ray[j] = x[j] - origin[j];
-                squared_distance += ray[j] * ray[j];
                 squared += fixed[j] * y[j] * y[j];
             }
             const vec kappa = rest[0] / squared_distance;
