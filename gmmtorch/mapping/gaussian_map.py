@@ -301,8 +301,10 @@ class GaussianMap(MapState):
         return self._answers().evidence(grid, method)
 
     def _answers(self) -> Query:
-        if self._query is None:
-            self._query = Query(self.components().cones(), self.query_options)
+        if self._query is None or self._is_stale:
+            cones, options = self.components().cones(), self.query_options
+            self._query = self._query.replaced(cones, options) if self._query else Query(cones, options)
+            self._is_stale = False
         return self._query
 
     # -- files and state ------------------------------------------------------------------------------

@@ -78,6 +78,7 @@ class MapState(nn.Module):
         self._learned: tuple[Components, int] | None = None  # what follows from buffers and pending scans
         self._rounded: Components | None = None
         self._query: Query | None = None
+        self._is_stale = False  # the query is of earlier components
 
     def __getattr__(self, name: str) -> Any:
         if name in _BUFFERS:
@@ -227,8 +228,8 @@ class MapState(nn.Module):
         self._forget()
 
     def _forget(self) -> None:
-        """Drops what was computed from the components."""
-        self._learned, self._rounded, self._query = None, None, None
+        """Drops what was computed from the components. The query keeps what the next one can use."""
+        self._learned, self._rounded, self._is_stale = None, None, True
 
     # -- torch ----------------------------------------------------------------------------------------
 
@@ -237,6 +238,7 @@ class MapState(nn.Module):
         super()._apply(lambda tensor: tensor.to(fn(tensor.new_empty(0)).device), recurse)
         if self.dim is not None:
             self._pending = [scan.to(self._device) for scan in self._pending]
+        self._query = None  # is on the former device
         self._forget()
         return self
 

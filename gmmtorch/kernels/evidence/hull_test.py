@@ -105,7 +105,8 @@ _KERNELS = {
         "const double* rows, const int64* starts, const int32* entries, const int64* lists,"
         " const int64* firsts, const double* centers, const double* radii, int64 n_balls, double cube_reach,"
         " double spread, int64 parts, bool* near, double* counts",
-        SIMD + _BODY.replace("AHEAD", "6").replace("WIDTH", str(dim * dim + 3 * dim + 2)).replace("DIM", str(dim)),
+        SIMD
+        + _BODY.replace("AHEAD", "6").replace("WIDTH", str(dim * dim + 3 * dim + 2)).replace("DIM", str(dim)),
     )
     for dim in (2, 3)
 }
