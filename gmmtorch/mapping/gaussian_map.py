@@ -302,8 +302,10 @@ class GaussianMap(MapState):
 
     def _answers(self) -> Query:
         if self._query is None or self._is_stale:
-            cones, options = self.components().cones(), self.query_options
-            self._query = self._query.replaced(cones, options) if self._query else Query(cones, options)
+            found = self.components()
+            is_final = (found.ids[:, 0] != self.robot) | (found.ids[:, 1] < self._next_number)
+            asked = found.cones(), self.query_options, is_final[found.seen_by]
+            self._query = Query(*asked) if self._query is None else self._query.replaced(*asked)
             self._is_stale = False
         return self._query
 

@@ -70,10 +70,6 @@ class _Part(NamedTuple):
     forms: dict[float, PointForm]
     indices: dict[float, ConeIndex]
 
-    @classmethod
-    def of(cls, cones: Cones) -> _Part:
-        return cls(cones, {}, {})
-
     def replaced(self, cones: Cones, former: Tensor) -> _Part:
         """The part with other cones, which keeps what it can; `former` as for `ConeIndex.replaced`."""
         forms = {side: form.replaced(cones, former) for side, form in self.forms.items()}
@@ -83,40 +79,38 @@ class _Part(NamedTuple):
 class Query:
     """Answers queries about fixed cones. Indices and Monte Carlo rays are made at the first query.
 
-    After a change, `replaced` answers about other cones. Cones that are new are kept apart, and join the
-    others if they are still there after the next change: those of an unfinished window change with every
-    scan, and the lists of the others stay.
+    Args:
+        cones: of components.
+        options: how queries are answered.
+        settled: (C,) False for cones that the next change will probably replace, such as those of an
+            unfinished window. They have an index of their own. None: all are settled.
     """
 
-    def __init__(self, cones: Cones, options: QueryOptions) -> None:
+    def __init__(self, cones: Cones, options: QueryOptions, settled: Tensor | None = None) -> None:
         self.cones = cones
         self.options, self.rule = options, rule_of(options, [cones])
         self.cutoff = cutoff_by_support(cones) if options.cutoff is None else options.cutoff
         self._lattices: dict[float, SparseEvidence] = {}
-        self._parts = [_Part.of(cones)]  # those that stayed, and those that are new
+        if settled is None or bool(settled.all()):
+            self._parts = [_Part(cones, {}, {})]
+        else:
+            self._parts = [_Part(cones.taken(rows), {}, {}) for rows in (settled, ~settled)]
 
-    def replaced(self, cones: Cones, options: QueryOptions) -> Query:
-        """The answers about other cones. This query must not be used afterwards."""
-        made, old = Query(cones, options), self._parts[0]
+    def replaced(self, cones: Cones, options: QueryOptions, settled: Tensor | None = None) -> Query:
+        """The answers about other cones; arguments as for `Query`. Lists of settled cones stay."""
+        made, old = Query(cones, options, settled), self._parts[0]
         if made.cutoff != self.cutoff or cones.dim != self.cones.dim or not len(old.cones.counts):
             return made
-        former = former_rows(old.cones, cones)
-        rest = (former < 0).nonzero().squeeze(1)
-        if 2 * len(rest) > len(former):
+        first, *rest = made._parts
+        former = former_rows(old.cones, first.cones)
+        if 2 * int((former < 0).sum()) > len(former):
             return made
-        stays, is_rest = former >= 0, torch.zeros_like(rest, dtype=torch.bool)
-        if len(self._parts) > 1:
-            is_rest = former_rows(self._parts[1].cones, cones.taken(rest)) >= 0
-            stays[rest[is_rest]] = True
-        n_stay = int(stays.sum())
-        changed = n_stay != len(old.cones.counts) or bool(is_rest.any())
-        if changed or n_stay < len(former):
-            chosen = cones.taken(stays)
-            made._parts = [old.replaced(chosen, former[stays]) if changed else old._replace(cones=chosen)]
-        else:
-            made._parts = [old._replace(cones=cones)]
-        if n_stay < len(former):
-            made._parts.append(_Part.of(cones.taken(~stays)))
+        if len(former) != len(old.cones.counts) or bool((former < 0).any()):
+            old = old.replaced(first.cones, former)
+        made._parts = [old._replace(cones=first.cones)]
+        for part in rest:
+            none = torch.full_like(part.cones.max_range, -1, dtype=torch.int64)
+            made._parts.append(old.replaced(part.cones, none))
         return made
 
     def occupancy(self, points: Tensor, resolution: float, method: str) -> Tensor:

@@ -91,7 +91,7 @@ def replaced_rows(rows: Tensor, former: Tensor, new: Tensor) -> Tensor:
 _ENTRIES_PER_CONE = {2: 64, 3: 512}  # of all buckets, which decides their side
 _KEPT_PER_CONE, _KEPT = 64, 1 << 22  # entries of the lists that are kept, for each cone, and at least
 _KEY_BITS = {2: 31, 3: 21}  # bits of one bucket coordinate in a packed key
-_SAMPLE = 128  # cones, and places around each, by which the side is chosen
+_SAMPLE = 64  # cones, and places around each, by which the side is chosen
 _SHIFT = 2  # buckets of the next level are 2^_SHIFT times as large
 _PER_LIST = 8  # entries that take as much memory as what else is kept of a list
 _POINTS_PER_LIST = 4
@@ -172,20 +172,17 @@ class ConeIndex:
         cones, made = cones.checked(), copy.copy(self)
         is_new, stays = former < 0, torch.zeros_like(self.hulls.low[:, 0], dtype=torch.bool)
         stays[former[~is_new]] = True
-        new = Hulls(Cones(*(part[is_new] for part in cones)), *self._options[:3])
-        gone = self.hulls.taken(~stays)
+        new = Hulls(cones.taken(is_new), *self._options[:3])
         made.hulls = self.hulls.replaced(former, new)
         corners = (torch.cat([new.low, new.high]) - self.origin) / self.side
-        if (
-            self._options[3] == 0
-            or len(former) > 2 * self._n_chosen
-            or bool((corners.abs() > self._limit).any())
-        ):
+        is_far = bool((corners.abs() > self._limit).any())
+        if self._options[3] == 0 or is_far or len(former) > 2 * self._n_chosen:
             made._set_lattice()
             return made
-        if not bool(stays.any()):
+        if bool(is_new.all()):
             made._drop_all()
             return made
+        gone = self.hulls.taken(~stays)
         kept = torch.ones_like(self._used, dtype=torch.bool)
         for hulls in (new, gone):
             probe = copy.copy(self)
