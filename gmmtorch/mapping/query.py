@@ -171,12 +171,15 @@ class Query:
         return Evidence(grid, hits, misses, self.rule)
 
     def _at_points(self, points: Tensor, resolution: float) -> PointEvidence:
-        """Evidence of the point form."""
+        """Evidence of the point form. The sum over all cones has one order, however they are kept."""
+        found = None
         for part in self._parts:
             if resolution not in part.forms:
                 compiled = self.options.compiled
                 part.forms[resolution] = PointForm(part.cones, resolution, self.cutoff, compiled=compiled)
-        return _sum(part.forms[resolution](points) for part in self._parts)
+            found = part.forms[resolution](points, found)
+        assert found is not None
+        return found
 
     def _candidates(
         self, low: Tensor, high: Tensor, resolution: float

@@ -95,6 +95,7 @@ _SAMPLE = 64  # cones, and places around each, by which the side is chosen
 _SHIFT = 2  # buckets of the next level are 2^_SHIFT times as large
 _PER_LIST = 8  # entries that take as much memory as what else is kept of a list
 _POINTS_PER_LIST = 4
+_FEW_PAIRS = 1 << 17  # of a point and a cone: for at most so many smaller buckets do not pay
 _BUCKETS_AT_ONCE = 1 << 12
 _PAIRS_AT_ONCE = 1 << 20
 _TESTS_AT_ONCE = 1 << 22
@@ -115,7 +116,7 @@ class ConeIndex:
         smoothed: True for the point form, which widens cones by the spread of the cube (see `PointForm`);
             False for boxes that meet the cones themselves.
         entries_per_cone: the buckets are halved while at most about this many entries per cone list all of
-            them; 0 makes a single bucket that lists all cones.
+            them.
         points_per_list: a larger bucket's list serves its points if, on average, fewer of one query lie in
             the buckets within it.
 
@@ -131,35 +132,28 @@ class ConeIndex:
         cutoff: float = CUTOFF,
         smoothed: bool = False,
         entries_per_cone: int | None = None,
-        points_per_list: int = _POINTS_PER_LIST,
+        points_per_list: int | None = None,
     ) -> None:
         self.extent = check_resolution(extent)
         cones = cones.checked()
         self.dim = cones.dim
         self._options = self.extent, cutoff, smoothed, entries_per_cone
-        self._points_per_list = points_per_list
+        self._points_per_list = points_per_list or _POINTS_PER_LIST
         self.hulls = Hulls(cones, self.extent, cutoff, smoothed)
         self._set_lattice()
 
     def _set_lattice(self) -> None:
         """Chooses the buckets for the present hulls, and drops all lists."""
         hulls, per_cone = self.hulls, self._options[3]
-        n_cones, device = len(hulls.table), hulls.table.device
+        n_cones = len(hulls.table)
         self._n_chosen = n_cones  # the side is chosen for so many
         self.origin = hulls.low.amin(0) if n_cones else hulls.low.new_zeros(self.dim)
         span = float((hulls.high.amax(0) - self.origin).amax()) * (1 + 1e-9) if n_cones else 0.0
         # The finest buckets whose coordinates fit the bits of the key, with room to grow.
         finest = max(self.extent, span / (self._limit - 1))
-        if per_cone == 0:
-            self.side, self._n_levels = max(span, finest), 1
-            self._drop_all()
-            cell = torch.zeros(min(n_cones, 1), self.dim, dtype=torch.int64, device=device)
-            every = torch.arange(n_cones, dtype=torch.int32, device=device)
-            self._add(0, cell, Lists.of(cell.new_full((len(cell),), n_cones), every))
-        else:
-            self.side = _chosen_side(hulls, finest, span, per_cone or _ENTRIES_PER_CONE[self.dim])
-            self._n_levels = 1 + math.ceil(math.log2(max(span / self.side, 1.0)) / _SHIFT)
-            self._drop_all()
+        self.side = _chosen_side(hulls, finest, span, per_cone or _ENTRIES_PER_CONE[self.dim])
+        self._n_levels = 1 + math.ceil(math.log2(max(span / self.side, 1.0)) / _SHIFT)
+        self._drop_all()
 
     def replaced(self, cones: Cones, former: Tensor) -> ConeIndex:
         """The index of other cones. It keeps the lists of buckets that no new cone, and none that is gone,
@@ -176,7 +170,7 @@ class ConeIndex:
         made.hulls = self.hulls.replaced(former, new)
         corners = (torch.cat([new.low, new.high]) - self.origin) / self.side
         is_far = bool((corners.abs() > self._limit).any())
-        if self._options[3] == 0 or is_far or len(former) > 2 * self._n_chosen:
+        if is_far or len(former) > 2 * self._n_chosen:
             made._set_lattice()
             return made
         if bool(is_new.all()):
@@ -331,8 +325,7 @@ class ConeIndex:
         cells = cell.new_zeros(n_missing, self.dim)
         cells[rank] = cell
         for first in range(0, n_missing, _BUCKETS_AT_ONCE):
-            chosen = rank // _BUCKETS_AT_ONCE == first // _BUCKETS_AT_ONCE
-            chosen = chosen.nonzero().squeeze(1) if n_missing > _BUCKETS_AT_ONCE else slice(None)
+            chosen = (rank // _BUCKETS_AT_ONCE == first // _BUCKETS_AT_ONCE).nonzero().squeeze(1)
             if bounded:
                 self._make_room()
             number = self._serving(cells[first : first + _BUCKETS_AT_ONCE], rank[chosen] - first)
@@ -361,6 +354,11 @@ class ConeIndex:
         number = self._numbered(self._n_levels - 1, groups[-1])
         divided = torch.ones_like(number, dtype=torch.bool)
         for level in reversed(range(self._n_levels - 1)):
+            n_pairs = self.lists.lengths()[number] * n_points[level + 1]
+            if int((n_pairs * divided).sum()) <= _FEW_PAIRS:
+                for owner in reversed(owners[: level + 1]):
+                    number = number[owner]
+                break
             owner = owners[level]
             divided = (divided & enough[level + 1])[owner]
             number = number[owner]

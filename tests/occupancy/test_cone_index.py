@@ -58,12 +58,19 @@ def test_boxes_far_from_all_rays_have_no_candidates():
     assert pairs_of(index, low, low + 0.1) == []
 
 
-def test_lists_contain_few_unneeded_cones():
+@pytest.fixture
+def smallest(monkeypatch):
+    """Each point is served by the smallest bucket."""
+    monkeypatch.setattr(cone_index, "_FEW_PAIRS", 0)
+    monkeypatch.setattr(cone_index, "_POINTS_PER_LIST", 1)
+
+
+def test_lists_contain_few_unneeded_cones(smallest):
     """Mean list length at points on the rays."""
     cones = random_cones(3, 300, 1, room=True)
     index = ConeIndex(cones, 0.05)
     places, _ = places_on_rays(cones, 500, CUTOFF, 0)
-    numbers = index.buckets(places.repeat(8, 1))  # enough points for the smallest buckets
+    numbers = index.buckets(places)
     assert float(index.lists.lengths()[numbers].double().mean()) < 0.45 * 300
 
 
@@ -80,13 +87,12 @@ def test_pairs_occur_once_for_any_chunk_size(monkeypatch):
     assert sum(map(len, portions)) == len(set().union(*portions))
 
 
-def test_cost_and_memory_do_not_depend_on_the_size_of_the_world():
+def test_cost_and_memory_do_not_depend_on_the_size_of_the_world(smallest):
     small, step = random_cones(3, 60, 4, room=True), 30.0
     large = tiled(small, 16, step)
     one, many = ConeIndex(small, 0.1), ConeIndex(large, 0.1)
     assert many.side == one.side
     places, _ = places_on_rays(small, 500, CUTOFF, 0)
-    places = places.repeat(8, 1)
     shift = torch.tensor([5 * step, 0, 0], dtype=torch.float64)
     here, there = one.buckets(places), many.buckets(places + shift)
     means = [index.lists.lengths()[n].double().mean() for index, n in ((one, here), (many, there))]

@@ -37,10 +37,12 @@ class PointTable(NamedTuple):
 _BODY = """
     const double h = resolution, limit = cutoff * cutoff;
     const int64_t begin = item * LANES, stop = GMM_MIN(begin + LANES, n_points);
-    vec x[DIM], hits = (vec)(0.0), misses = (vec)(0.0), number = (vec)(-1.0);
+    vec x[DIM], hits, misses, number = (vec)(-1.0);
     for (int l = 0; l < LANES; ++l) {
         const int64_t point = order[GMM_MIN(begin + l, stop - 1)];
         for (int a = 0; a < DIM; ++a) set(x[a], l, points[point * DIM + a]);
+        set(hits, l, hits_out[point]);
+        set(misses, l, misses_out[point]);
         if (begin + l < stop) set(number, l, (double)bucket[point]);
     }
     for (int first = 0; first < LANES; ++first) {  // each bucket of these points once
@@ -183,7 +185,9 @@ def listed_evidence(
     cutoff: float,
     found: Tensor,
 ) -> None:
-    """Hits and misses of the points in `order`, written to `found` (2, M), float64, by the fused kernel.
+    """Adds hits and misses of the points in `order` to `found` (2, M), float64, by the fused kernel.
+
+    Cones are added one after the other, so that two calls with parts of the lists equal one with both.
 
     Args:
         points: (M, D) float64.

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import copy
+import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -69,7 +70,8 @@ CHUNK_PAIRS = 1 << 16
 """Pairs of a point and a cone evaluated in one pass. It bounds the memory and does not change the result."""
 
 _CHUNK_POINTS = 1 << 20  # points sorted in one pass
-_FEW = 1 << 11  # for at most this many points an index does not pay
+_FARTHEST = 1e15  # metres: products of larger positions are infinite
+_FEW_PAIRS = 1 << 19  # of a point and a cone: for at most so many an index does not pay
 
 
 class PointEvidence(NamedTuple):
@@ -91,8 +93,7 @@ def point_evidence(
 
     For several calls with the same cones use a `PointForm`.
     """
-    form = PointForm(cones, resolution, cutoff, compiled=compiled, indexed=len(points) > _FEW)
-    return form(points)
+    return PointForm(cones, resolution, cutoff, compiled=compiled)(points)
 
 
 def listed_points(
@@ -119,7 +120,7 @@ def listed_points(
         return [PointEvidence(*(zeros.index_add(0, point, v[0]) for v in pairs)) for pairs in each]
     order = torch.arange(len(points), device=points.device)
     lists = Lists.of(torch.bincount(point, minlength=len(points)), cone.int())
-    found = points.new_empty(len(tables), 2, len(points))
+    found = points.new_zeros(len(tables), 2, len(points))
     for table, side, values in zip(tables, resolutions, found, strict=True):
         listed_evidence(points, order, order, lists, table.rows, side, cutoff, values)
     return [PointEvidence(*values) for values in found]
@@ -149,11 +150,6 @@ class PointForm:
         resolution: h (m).
         cutoff: Mahalanobis distance beyond which a component gives no evidence.
         compiled: use torch.compile. It needs a C++ compiler, and tens of seconds for the first call.
-        indexed: True evaluates only cones near a point, found by a `ConeIndex`; False evaluates all cones,
-            which is faster for a few points.
-
-    Attributes:
-        index: lists the cones near a point.
     """
 
     def __init__(
@@ -163,7 +159,6 @@ class PointForm:
         cutoff: float = CUTOFF,
         *,
         compiled: bool = False,
-        indexed: bool = True,
     ) -> None:
         self.resolution = check_resolution(resolution)
         cones = cones.checked()
@@ -172,8 +167,15 @@ class PointForm:
         self.dim, self.cutoff, self.compiled = cones.dim, float(cutoff), compiled
         safe_cholesky(cones.covariances.double().detach())  # raises if one is not positive definite
         self._table = _table_of(cones, axes_of(cones.covariances), self.resolution)
-        entries = None if indexed else 0  # per cone
-        self.index = ConeIndex(cones, self.resolution, cutoff, smoothed=True, entries_per_cone=entries)
+        self._index: ConeIndex | Callable[[], ConeIndex]
+        self._index = functools.partial(ConeIndex, cones, self.resolution, cutoff, smoothed=True)
+
+    @property
+    def index(self) -> ConeIndex:
+        """Lists the cones near a point. Made when it is needed first."""
+        if not isinstance(self._index, ConeIndex):
+            self._index = self._index()
+        return self._index
 
     @property
     def rows(self) -> Tensor:
@@ -182,51 +184,64 @@ class PointForm:
 
     def replaced(self, cones: Cones, former: Tensor) -> PointForm:
         """The form of other cones, which keeps what it can; arguments as for `ConeIndex.replaced`."""
-        made, is_new = copy.copy(self), former < 0
-        new = Cones(*(part[is_new] for part in cones.checked()))
+        made, is_new, cones = copy.copy(self), former < 0, cones.checked()
+        new = cones.taken(is_new)
         safe_cholesky(new.covariances.double().detach())
         table = _table_of(new, axes_of(new.covariances), self.resolution)
         made._table = PointTable(
             *(replaced_rows(rows, former, rest) for rows, rest in zip(self._table, table, strict=True))
         )
-        made.index = self.index.replaced(cones, former)
+        if isinstance(self._index, ConeIndex):
+            made._index = functools.partial(self._index.replaced, cones, former)
+        else:
+            made._index = functools.partial(ConeIndex, cones, self.resolution, self.cutoff, smoothed=True)
         return made
 
-    def __call__(self, points: ArrayLike) -> PointEvidence:
-        """Hits and misses at points (M, D), world metres; zero at infinite points.
+    def __call__(self, points: ArrayLike, before: PointEvidence | None = None) -> PointEvidence:
+        """Hits and misses at points (M, D), world metres; zero at infinite points. `before`: of other cones,
+        to which these are added.
 
         Raises `InvalidArgumentError` for another shape, or NaN.
         """
         query = check_queries(points, self.dim)
+        zeros = torch.zeros_like(query[:, 0])
+        before = before or PointEvidence(zeros, zeros)
 
         def evaluated(part: slice) -> PointEvidence:
-            return self._evaluate(query[part])
+            return self._evaluate(query[part], before.hits[part], before.misses[part])
 
-        parts = list(chunked(len(query), _CHUNK_POINTS, evaluated)) or [evaluated(slice(0))]
+        parts = list(chunked(len(query), _CHUNK_POINTS, evaluated)) or [before]
         hits, misses = parts[0] if len(parts) == 1 else map(torch.cat, zip(*parts, strict=True))
         return PointEvidence(hits, misses)
 
-    def _evaluate(self, points: Tensor) -> PointEvidence:
-        parts = self.index.parts(points)
+    def _evaluate(self, points: Tensor, hits: Tensor, misses: Tensor) -> PointEvidence:
         if is_fused(points, self.rows):
-            found = torch.zeros(2, len(points), dtype=torch.float64, device=points.device)
-            bucket = torch.empty_like(points[:, 0], dtype=torch.int64)
-            for rows, number in parts:
-                bucket[rows] = number
-                order = rows[self.index.in_space_order(points[rows], number)]
-                evidence = self.rows, self.resolution, self.cutoff, found
-                listed_evidence(points, order, bucket, self.index.lists, *evidence)
-            return PointEvidence(*found)
-        hits, misses = torch.zeros_like(points[:, 0]), torch.zeros_like(points[:, 0])
-        for rows, number in parts:
+            return PointEvidence(*self._fused(points, torch.stack([hits, misses])))
+        for rows, number in self.index.parts(points):
             if not len(rows):
                 continue
             blocks = PointBlocks.of(points[rows], number, self.index)
             chunks = chunks_of(self.index.lists.lengths()[blocks.bucket], CHUNK_PAIRS)
             evidence = torch.cat([self._of_blocks(blocks, part) for part in chunks], 1)
             place, (hit, miss) = rows[blocks.point], evidence.flatten(1)[:, blocks.slot]
-            hits, misses = hits.index_copy(0, place, hit), misses.index_copy(0, place, miss)
+            hits, misses = hits.index_add(0, place, hit), misses.index_add(0, place, miss)
         return PointEvidence(hits, misses)
+
+    def _fused(self, points: Tensor, found: Tensor) -> Tensor:
+        """Adds hits and misses to `found` (2, M) by the fused kernel."""
+        settings = self.rows, self.resolution, self.cutoff, found
+        bucket = torch.zeros_like(points[:, 0], dtype=torch.int64)
+        if len(points) * len(self.rows) <= _FEW_PAIRS:
+            every = torch.arange(len(self.rows), dtype=torch.int32, device=points.device)
+            order = torch.arange(len(points), device=points.device)
+            bucket[(points.abs() > _FARTHEST).any(1)] = -1
+            listed_evidence(points, order, bucket, Lists.of(order.new_tensor([len(every)]), every), *settings)
+            return found
+        for rows, number in self.index.parts(points):
+            bucket[rows] = number
+            order = rows[self.index.in_space_order(points[rows], number)]
+            listed_evidence(points, order, bucket, self.index.lists, *settings)
+        return found
 
     def _near_cones(self, blocks: PointBlocks, part: slice) -> tuple[Tensor, Tensor]:
         """Pairs of a block (R,), counted from the start of `part`, and a cone (R,) near it."""
