@@ -21,6 +21,15 @@ from gmmtorch.linalg import argsort, dense_ranks
 from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.grid import check_resolution
 
+Spectrum = tuple[Tensor, Tensor]
+"""Variances (C, D), ascending, and axes V (C, D, D) of components."""
+
+
+def spectrum_of(covariances: Tensor) -> Spectrum:
+    """The spectrum of components with covariances (C, D, D), without gradients, float64."""
+    variances, axes = torch.linalg.eigh(covariances.detach().double())
+    return variances, axes
+
 
 class Hulls:
     """Hulls of C cones: all segments from the sensor origin to the component's ellipsoid at `cutoff`.
@@ -33,10 +42,12 @@ class Hulls:
         low, high: (C, D) corners of the box outside which a cone gives no evidence.
     """
 
-    def __init__(self, cones: Cones, extent: float, cutoff: float, smoothed: bool) -> None:
+    def __init__(
+        self, cones: Cones, extent: float, cutoff: float, smoothed: bool, spectrum: Spectrum | None = None
+    ) -> None:
         dim = self.dim = cones.dim
         means, origins = cones.means.detach().double(), cones.origins.detach().double()
-        variances, axes = torch.linalg.eigh(cones.covariances.detach().double())
+        variances, axes = spectrum or spectrum_of(cones.covariances)
         squares = cutoff**2 * variances.clamp_min(0)  # (C, D) squared half axes, ascending
         distance = (means - origins).norm(dim=1, keepdim=True)
         far = distance + squares[:, -1:].sqrt()
@@ -119,6 +130,7 @@ class ConeIndex:
             them.
         points_per_list: a larger bucket's list serves its points if, on average, fewer of one query lie in
             the buckets within it.
+        spectrum: of the components of the cones, if it is known.
 
     Attributes:
         lists: the kept lists; queries append to them, or drop the oldest.
@@ -133,13 +145,14 @@ class ConeIndex:
         smoothed: bool = False,
         entries_per_cone: int | None = None,
         points_per_list: int | None = None,
+        spectrum: Spectrum | None = None,
     ) -> None:
         self.extent = check_resolution(extent)
         cones = cones.checked()
         self.dim = cones.dim
         self._options = self.extent, cutoff, smoothed, entries_per_cone
         self._points_per_list = points_per_list or _POINTS_PER_LIST
-        self.hulls = Hulls(cones, self.extent, cutoff, smoothed)
+        self.hulls = Hulls(cones, self.extent, cutoff, smoothed, spectrum)
         self._set_lattice()
 
     def _set_lattice(self) -> None:
@@ -155,18 +168,19 @@ class ConeIndex:
         self._n_levels = 1 + math.ceil(math.log2(max(span / self.side, 1.0)) / _SHIFT)
         self._drop_all()
 
-    def replaced(self, cones: Cones, former: Tensor) -> ConeIndex:
+    def replaced(self, cones: Cones, former: Tensor, spectrum: Spectrum | None = None) -> ConeIndex:
         """The index of other cones. It keeps the lists of buckets that no new cone, and none that is gone,
         can reach; none if there are too many new cones for the size of the buckets.
 
         Args:
             cones: C cones; must not change afterwards.
             former: (C,) the number of each cone in this index, −1 for a new one. The other numbers ascend.
+            spectrum: of the components of the new cones, if it is known.
         """
         cones, made = cones.checked(), copy.copy(self)
         is_new, stays = former < 0, torch.zeros_like(self.hulls.low[:, 0], dtype=torch.bool)
         stays[former[~is_new]] = True
-        new = Hulls(cones.taken(is_new), *self._options[:3])
+        new = Hulls(cones.taken(is_new), *self._options[:3], spectrum)
         made.hulls = self.hulls.replaced(former, new)
         corners = (torch.cat([new.low, new.high]) - self.origin) / self.side
         is_far = bool((corners.abs() > self._limit).any())
@@ -308,8 +322,11 @@ class ConeIndex:
             return
         self._now += 1
         cell = ((points.detach().double() - self.origin) / self.side).floor()
-        rows = (cell.abs() <= self._limit).all(1).nonzero().squeeze(1)
-        cell = cell[rows].long()
+        rows = torch.arange(len(points), device=points.device)
+        inside = (cell.abs() <= self._limit).all(1)
+        if not bool(inside.all()):
+            rows, cell = rows[inside], cell[inside]
+        cell = cell.long()
         key = self._pack(cell)
         number = self._find(0, key)
         found = number >= 0
@@ -332,8 +349,8 @@ class ConeIndex:
             yield self._not_empty(rows[chosen], number)
 
     def _not_empty(self, rows: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
-        some = (self.lists.lengths()[number] > 0).nonzero().squeeze(1)
-        return rows[some], number[some]
+        some = self.lists.lengths()[number] > 0
+        return (rows, number) if bool(some.all()) else (rows[some], number[some])
 
     def _serving(self, cells: Tensor, rank: Tensor) -> Tensor:
         """The list (R,) that serves each point, in the bucket with number `rank` (R,) among `cells` (B, D).
@@ -379,8 +396,8 @@ class ConeIndex:
 
         Points are sorted by list, and by the parts of their bucket.
         """
-        side = self.side * torch.pow(float(1 << _SHIFT), self._levels[bucket])[:, None]
-        part = ((points.detach() - self.origin) / side % 1 * _SUBCELLS).long()
+        part = ((points.detach().double() - self.origin) * (_SUBCELLS / self.side)).floor().long()
+        part = part >> (self._levels * _SHIFT)[bucket][:, None] & (_SUBCELLS - 1)
         fine = bucket
         for axis in range(self.dim):
             fine = fine * _SUBCELLS + part[:, axis]

@@ -23,7 +23,7 @@ from gmmtorch.kernels.evidence.point_evidence import (
     pair_evidence,
 )
 from gmmtorch.linalg import safe_cholesky
-from gmmtorch.occupancy.cone_index import ConeIndex, chunks_of, replaced_rows
+from gmmtorch.occupancy.cone_index import ConeIndex, chunks_of, replaced_rows, spectrum_of
 from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.occupancy.protocol import check_queries
@@ -107,7 +107,7 @@ def listed_points(
     """Evidence (M,) of a few points (M, D), float64, each from the cones listed for it; for cubes of several
     sides (m). Needs no index.
 
-    axes: (C, D, D), see `axes_of`. lists: point (P,) and cone (P,) of each entry; points ascend.
+    axes: (C, D, D), see `spectrum_of`. lists: point (P,) and cone (P,) of each entry; points ascend.
     """
     point, cone = lists
     tables = [_table_of(cones, axes, side) for side in resolutions]
@@ -166,9 +166,12 @@ class PointForm:
             raise InvalidArgumentError(f"cutoff={cutoff} must be finite and above zero.")
         self.dim, self.cutoff, self.compiled = cones.dim, float(cutoff), compiled
         safe_cholesky(cones.covariances.double().detach())  # raises if one is not positive definite
-        self._table = _table_of(cones, axes_of(cones.covariances), self.resolution)
+        spectrum = spectrum_of(cones.covariances)
+        self._table = _table_of(cones, spectrum[1], self.resolution)
         self._index: ConeIndex | Callable[[], ConeIndex]
-        self._index = functools.partial(ConeIndex, cones, self.resolution, cutoff, smoothed=True)
+        self._index = functools.partial(
+            ConeIndex, cones, self.resolution, cutoff, smoothed=True, spectrum=spectrum
+        )
 
     @property
     def index(self) -> ConeIndex:
@@ -187,12 +190,13 @@ class PointForm:
         made, is_new, cones = copy.copy(self), former < 0, cones.checked()
         new = cones.taken(is_new)
         safe_cholesky(new.covariances.double().detach())
-        table = _table_of(new, axes_of(new.covariances), self.resolution)
+        spectrum = spectrum_of(new.covariances)
+        table = _table_of(new, spectrum[1], self.resolution)
         made._table = PointTable(
             *(replaced_rows(rows, former, rest) for rows, rest in zip(self._table, table, strict=True))
         )
         if isinstance(self._index, ConeIndex):
-            made._index = functools.partial(self._index.replaced, cones, former)
+            made._index = functools.partial(self._index.replaced, cones, former, spectrum)
         else:
             made._index = functools.partial(ConeIndex, cones, self.resolution, self.cutoff, smoothed=True)
         return made
@@ -276,16 +280,11 @@ class PointForm:
         return n_rows / query.shape[0]
 
 
-def axes_of(covariances: Tensor) -> Tensor:
-    """The axes V (C, D, D) of components with covariances (C, D, D).
+def _table_of(cones: Cones, axes: Tensor, resolution: float) -> PointTable:
+    """The table of cones with the axes V (C, D, D), for cubes of side `resolution` (m).
 
     V has no gradient where variances are equal. It is held constant, which is exact to first order in Σ.
     """
-    return torch.linalg.eigh(covariances.detach().double())[1]
-
-
-def _table_of(cones: Cones, axes: Tensor, resolution: float) -> PointTable:
-    """The table of cones with the axes V (C, D, D), for cubes of side `resolution` (m)."""
     dim, covariances = cones.dim, cones.covariances.double()
     turned = axes.transpose(1, 2) @ covariances @ axes
     variances = turned.diagonal(dim1=1, dim2=2)
