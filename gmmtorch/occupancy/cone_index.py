@@ -312,15 +312,17 @@ class ConeIndex:
         return torch.where(keys[place] == key, numbers[place], -1)
 
     def parts(self, points: Tensor, bounded: bool = True) -> Iterator[tuple[Tensor, Tensor]]:
-        """Parts of points (M, D): their rows (R,), and the list (R,) in `lists` of all cones that can give
-        evidence to each. Later parts change `lists`: use it part by part. Points that are in no part have no
-        evidence.
+        """Parts of points (M, D): their rows (R,), ascending, and the list (R,) in `lists` of all cones that
+        can give evidence to each. Later parts change `lists`: use it part by part. Points that are in no part
+        have no evidence.
 
         bounded: False keeps the lists of all these points, beyond the bound.
         """
         if not len(self.hulls.table):
             return
         self._now += 1
+        if bounded:
+            self._make_room()
         cell = ((points.detach().double() - self.origin) / self.side).floor()
         rows = torch.arange(len(points), device=points.device)
         inside = (cell.abs() <= self._limit).all(1)
@@ -329,28 +331,25 @@ class ConeIndex:
         cell = cell.long()
         key = self._pack(cell)
         number = self._find(0, key)
-        found = number >= 0
-        if bool(found.all()):
-            self._used[number] = self._now
-            yield self._not_empty(rows, number)
-            return
-        if bool(found.any()):
-            self._used[number[found]] = self._now
-            yield self._not_empty(rows[found], number[found])
-        rows, cell = rows[~found], cell[~found]
-        rank, n_missing = dense_ranks(key[~found])
+        missing = (number < 0).nonzero().squeeze(1)
+        rank, n_missing = dense_ranks(key[missing])
         cells = cell.new_zeros(n_missing, self.dim)
-        cells[rank] = cell
+        cells[rank] = cell[missing]
+        if n_missing <= _BUCKETS_AT_ONCE:
+            self._used[number[number >= 0] if n_missing else number] = self._now
+            if n_missing:
+                number[missing] = self._serving(cells, rank)
+            yield rows, number
+            return
+        found = number >= 0
+        self._used[number[found]] = self._now
+        yield rows[found], number[found]
         for first in range(0, n_missing, _BUCKETS_AT_ONCE):
             chosen = (rank // _BUCKETS_AT_ONCE == first // _BUCKETS_AT_ONCE).nonzero().squeeze(1)
             if bounded:
                 self._make_room()
             number = self._serving(cells[first : first + _BUCKETS_AT_ONCE], rank[chosen] - first)
-            yield self._not_empty(rows[chosen], number)
-
-    def _not_empty(self, rows: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
-        some = self.lists.lengths()[number] > 0
-        return (rows, number) if bool(some.all()) else (rows[some], number[some])
+            yield rows[missing[chosen]], number
 
     def _serving(self, cells: Tensor, rank: Tensor) -> Tensor:
         """The list (R,) that serves each point, in the bucket with number `rank` (R,) among `cells` (B, D).
@@ -388,7 +387,7 @@ class ConeIndex:
         is none. Valid until the next query."""
         found = torch.full(points.shape[:1], -1, dtype=torch.int64, device=points.device)
         for rows, number in self.parts(points, bounded=False):
-            found[rows] = number
+            found[rows] = torch.where(self.lists.lengths()[number] > 0, number, -1)
         return found
 
     def in_space_order(self, points: Tensor, bucket: Tensor) -> Tensor:
@@ -396,8 +395,7 @@ class ConeIndex:
 
         Points are sorted by list, and by the parts of their bucket.
         """
-        part = ((points.detach().double() - self.origin) * (_SUBCELLS / self.side)).floor().long()
-        part = part >> (self._levels * _SHIFT)[bucket][:, None] & (_SUBCELLS - 1)
+        part = ((points.detach() - self.origin) / self.side % 1 * _SUBCELLS).long()
         fine = bucket
         for axis in range(self.dim):
             fine = fine * _SUBCELLS + part[:, axis]

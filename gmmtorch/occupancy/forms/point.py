@@ -242,8 +242,11 @@ class PointForm:
             listed_evidence(points, order, bucket, Lists.of(order.new_tensor([len(every)]), every), *settings)
             return found
         for rows, number in self.index.parts(points):
-            bucket[rows] = number
-            order = rows[self.index.in_space_order(points[rows], number)]
+            if len(rows) == len(points):
+                bucket, order = number, self.index.in_space_order(points, number)
+            else:
+                bucket[rows] = number
+                order = rows[self.index.in_space_order(points[rows], number)]
             listed_evidence(points, order, bucket, self.index.lists, *settings)
         return found
 
