@@ -17,7 +17,7 @@ from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check
 from gmmtorch.files import write_bytes
 from gmmtorch.linalg import check_rigid
 from gmmtorch.mapping.codec import map_file
-from gmmtorch.mapping.codec.quantization import quantized
+from gmmtorch.mapping.codec.quantization import quantized, quantized_after
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.depth_frame import DepthFrame, depth_and_pose
 from gmmtorch.mapping.learning.forgetting import Doubts
@@ -235,8 +235,13 @@ class GaussianMap(MapState):
     def components(self) -> Components:
         """All components as the codec rounds them, with those of the unfinished window."""
         if self._rounded is None:
-            learned = self._with_pending()
-            self._rounded = learned if self.codec == "float" else quantized(learned)
+            learned, final = self._with_pending(), self._final()
+            if self.codec == "float":
+                return learned
+            known = self._final_rounded or (final, quantized(final))
+            if known[0].means is not final.means:
+                known = final, quantized_after(*known, final)
+            self._final_rounded, self._rounded = known, quantized_after(*known, learned)
         return self._rounded
 
     def transform(self, transform: ArrayLike, ids: ArrayLike | None = None) -> None:

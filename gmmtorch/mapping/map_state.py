@@ -77,6 +77,7 @@ class MapState(nn.Module):
         self._doubts = self._next_doubts = Doubts.none()  # of the final components; after the pending scans
         self._learned: tuple[Components, int] | None = None  # what follows from buffers and pending scans
         self._rounded: Components | None = None
+        self._final_rounded: tuple[Components, Components] | None = None  # final components, and rounded
         self._query: Query | None = None
         self._is_stale = False  # the query is of earlier components
 
@@ -238,7 +239,7 @@ class MapState(nn.Module):
         super()._apply(lambda tensor: tensor.to(fn(tensor.new_empty(0)).device), recurse)
         if self.dim is not None:
             self._pending = [scan.to(self._device) for scan in self._pending]
-        self._query = None  # is on the former device
+        self._query = self._final_rounded = None  # are on the former device
         self._forget()
         return self
 
