@@ -2,14 +2,17 @@
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from occupancy.cone_cases import random_cones, tiled
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.kernels.evidence.point_evidence import pair_evidence
 from gmmtorch.occupancy import cone_index
 from gmmtorch.occupancy.cone_index import ConeIndex
 from gmmtorch.occupancy.cones import CUTOFF, Cones
+from gmmtorch.occupancy.forms import point as point_form
+from gmmtorch.occupancy.forms.point import PointEvidence, PointForm
 
 
 def places_on_rays(cones: Cones, n: int, cutoff: float, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -132,3 +135,102 @@ def test_a_box_larger_than_the_extent_is_refused():
 def test_an_invalid_extent_is_refused(extent):
     with pytest.raises(InvalidArgumentError):
         ConeIndex(random_cones(3, 3, 0), extent)
+
+
+# -- cones that change, and what is kept -------------------------------------------------------------------
+
+
+def brute(cones: Cones, points: torch.Tensor, resolution: float, cutoff: float = CUTOFF) -> torch.Tensor:
+    """Hits and misses (2, M) of every cone at every point, without lists."""
+    form = PointForm(cones, resolution, cutoff)
+    point, cone = torch.cartesian_prod(torch.arange(len(points)), torch.arange(len(form.rows))).unbind(1)
+    shares = pair_evidence(points.T[:, None], point, *form._table, cone, resolution, cutoff)
+    return torch.stack([share.view(len(points), -1).sum(1) for share in shares])
+
+
+def same_evidence(found: PointEvidence, expected: torch.Tensor) -> None:
+    torch.testing.assert_close(torch.stack(list(found)), expected, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@settings(max_examples=15)
+@given(seed=st.integers(0, 10_000), n_points=st.sampled_from([3, 100, 400]))
+def test_evidence_of_cones_that_come_and_go_is_that_of_all(dim, seed, n_points):
+    generator = torch.Generator().manual_seed(seed)
+    cones = random_cones(dim, 30, seed, room=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(point_form, "_FEW_PAIRS", 0)
+        patch.setattr(cone_index, "_FEW_PAIRS", 0)
+        form = PointForm(cones, 0.1)
+        for step in range(4):
+            places, _ = places_on_rays(cones, n_points, CUTOFF, seed + step)
+            same_evidence(form(places), brute(cones, places, 0.1))
+            kept = (torch.rand(len(cones.counts), generator=generator) < 0.9).nonzero().squeeze(1)
+            new = random_cones(dim, 4, seed + 100 + step, room=True)
+            new = new._replace(means=new.means - 3.0 * step)  # also beyond the box of the first ones
+            former = torch.cat([kept, torch.full((4,), -1)])
+            cones = Cones(*(torch.cat(pair) for pair in zip(cones.taken(kept), new, strict=True)))
+            form = form.replaced(cones, former)
+
+
+def test_only_lists_near_changed_cones_are_made_again(smallest):
+    near = random_cones(3, 60, 0, room=True)
+    shift = torch.tensor([40.0, 0, 0], dtype=torch.float64)
+    far = near._replace(means=near.means + shift, origins=near.origins + shift)
+    both = Cones(*(torch.cat(pair) for pair in zip(near, far, strict=True)))
+    index = ConeIndex(both, 0.1)
+    here, _ = places_on_rays(near, 300, CUTOFF, 0)
+    index.buckets(torch.cat([here, here + shift]))
+    former = torch.cat([torch.arange(119), torch.tensor([-1])])  # the last cone changes
+    changed = both._replace(counts=both.counts + (torch.arange(120) == 119))
+    made = index.replaced(changed, former)
+    n_lists = len(made.lists.lengths())
+    assert 0 < n_lists < len(index.lists.lengths())
+    made.buckets(here)
+    largest = made._n_levels - 1
+    assert int((made._levels[n_lists:] < largest).sum()) == 0  # those that the change can reach
+    made.buckets(here + shift)
+    assert int((made._levels[n_lists:] < largest).sum()) > 0
+
+
+def test_lists_that_are_kept_are_bounded(monkeypatch, smallest):
+    monkeypatch.setattr(cone_index, "_KEPT", 1 << 12)
+    monkeypatch.setattr(cone_index, "_BUCKETS_AT_ONCE", 16)
+    monkeypatch.setattr(point_form, "_FEW_PAIRS", 0)
+    cones = random_cones(3, 50, 2, room=True)
+    form, most = PointForm(cones, 0.1), 0
+    for step in range(6):
+        places, _ = places_on_rays(cones, 300, CUTOFF, step)
+        same_evidence(form(places), brute(cones, places, 0.1))
+        index = form.index
+        one_part = 16 * index._n_levels * (len(cones.counts) + cone_index._PER_LIST)
+        assert len(index.lists.entries) <= max(1 << 12, cone_index._KEPT_PER_CONE * 50) + one_part
+        most = max(most, len(index.lists.entries))
+    assert most > 1 << 10
+
+
+@pytest.mark.parametrize("case", ["clusters", "hundred metres", "needles", "one component", "one place"])
+def test_strange_cones_give_the_evidence_of_all(case, monkeypatch):
+    monkeypatch.setattr(point_form, "_FEW_PAIRS", 0)
+    cones = random_cones(3, 40, 7, room=True)
+    if case == "clusters":
+        far = (torch.arange(40) % 2 * 1e6)[:, None].double()
+        cones = cones._replace(means=cones.means + far, origins=cones.origins + far)
+    elif case == "hundred metres":
+        large = torch.diag(torch.tensor([100.0**2, 50.0**2, 1e-4], dtype=torch.float64))
+        cones = cones._replace(covariances=torch.cat([large[None], cones.covariances[1:]]))
+    elif case == "needles":
+        needle = torch.diag(torch.tensor([25.0, 1e-8, 1e-8], dtype=torch.float64))
+        cones = cones._replace(covariances=needle.repeat(40, 1, 1))
+    else:
+        first = torch.zeros(3000, dtype=torch.int64)
+        origins = torch.rand(3000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 6
+        if case == "one place":
+            first, origins = torch.arange(3000) % 40, origins[:1].repeat(3000, 1)
+        cones = cones.taken(first)._replace(origins=origins)
+    places, _ = places_on_rays(cones, 60, CUTOFF, 0)
+    outside = torch.tensor([[torch.inf, 0, 0], [0, -torch.inf, 1], [1e300, 0, 0], [-1e9, 5, 5]]).double()
+    found = PointForm(cones, 0.1)(torch.cat([places, outside]))
+    assert float(found.hits[-4:].abs().max() + found.misses[-4:].abs().max()) == 0
+    expected = brute(cones, places, 0.1)
+    torch.testing.assert_close(torch.stack(list(found))[:, :60], expected, rtol=1e-6, atol=1e-9)
