@@ -69,9 +69,10 @@ class GaussianMap(MapState):
             model, for the ranges of the map's beams.
 
     Queries do not change the map: the scans of an unfinished window are learned for the answer, and learned
-    again when the window is full. The first query after an insertion builds an index of the components;
-    method "monte_carlo" draws its rays (about a second for a million). `save` and `load` keep a map with its
-    settings. `state_dict` holds everything that learning continues from, and loads into any map.
+    again when the window is full. Lists of the components near the points that were asked about are kept
+    while the map grows; method "monte_carlo" draws its rays anew (about a second for a million). `save` and
+    `load` keep a map with its settings. `state_dict` holds everything that learning continues from, and loads
+    into any map.
     """
 
     any_resolution = True
