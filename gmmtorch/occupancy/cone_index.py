@@ -128,8 +128,8 @@ class ConeIndex:
             False for boxes that meet the cones themselves.
         entries_per_cone: the buckets are halved while at most about this many entries per cone list all of
             them.
-        points_per_list: a larger bucket's list serves its points if, on average, fewer of one query lie in
-            the buckets within it.
+        smallest: the lists of the smallest buckets serve always, which pays for many queries about the same
+            places. False: a larger bucket's list serves its points if there are few.
         spectrum: of the components of the cones, if it is known.
 
     Attributes:
@@ -144,14 +144,14 @@ class ConeIndex:
         cutoff: float = CUTOFF,
         smoothed: bool = False,
         entries_per_cone: int | None = None,
-        points_per_list: int | None = None,
+        smallest: bool = False,
         spectrum: Spectrum | None = None,
     ) -> None:
         self.extent = check_resolution(extent)
         cones = cones.checked()
         self.dim = cones.dim
         self._options = self.extent, cutoff, smoothed, entries_per_cone
-        self._points_per_list = points_per_list or _POINTS_PER_LIST
+        self._smallest = smallest
         self.hulls = Hulls(cones, self.extent, cutoff, smoothed, spectrum)
         self._set_lattice()
 
@@ -288,20 +288,21 @@ class ConeIndex:
 
     @property
     def _limit(self) -> int:
-        """Largest coordinate of a bucket, or of its negative."""
-        return (1 << (_KEY_BITS[self.dim] - 1)) - 1
+        """Largest coordinate of a bucket that is asked about, or of its negative. Its neighbours have keys."""
+        return (1 << (_KEY_BITS[self.dim] - 1)) - (2 << _SHIFT)
 
     def _pack(self, cell: Tensor) -> Tensor:
         bits = _KEY_BITS[self.dim]
-        key = cell[:, 0] + self._limit
+        cell = cell + (1 << (bits - 1))
+        key = cell[:, 0]
         for axis in range(1, self.dim):
-            key = key << bits | (cell[:, axis] + self._limit)
+            key = key << bits | cell[:, axis]
         return key
 
     def _unpack(self, keys: Tensor) -> Tensor:
         bits = _KEY_BITS[self.dim]
         parts = [keys >> bits * axis & ((1 << bits) - 1) for axis in reversed(range(self.dim))]
-        return torch.stack(parts, 1) - self._limit
+        return torch.stack(parts, 1) - (1 << (bits - 1))
 
     def _find(self, level: int, key: Tensor) -> Tensor:
         """The list (B,) of each bucket with these keys (B,), −1 if there is none yet."""
@@ -356,6 +357,11 @@ class ConeIndex:
 
         Lists are made from those of the largest buckets on, as long as there are enough points.
         """
+        if self._smallest:  # with their neighbours, where the next points will be
+            parents = torch.unique(cells >> _SHIFT, dim=0) << _SHIFT
+            steps = torch.cartesian_prod(*[torch.arange(1 << _SHIFT, device=cells.device)] * self.dim)
+            self._numbered(0, (parents[:, None] + steps).flatten(0, 1))
+            return self._numbered(0, cells)[rank]
         groups, owners = [cells], []
         n_points = [torch.bincount(rank, minlength=len(cells))]
         enough = [torch.zeros_like(cells[:, 0], dtype=torch.bool)]  # points to divide the bucket
@@ -366,7 +372,7 @@ class ConeIndex:
             owners.append(owner)
             n_points.append(torch.zeros_like(groups[-1][:, 0]).index_add_(0, owner, n_points[-1]))
             n_children = torch.bincount(owner, minlength=n_groups)
-            enough.append(n_points[-1] >= self._points_per_list * n_children)
+            enough.append(n_points[-1] >= _POINTS_PER_LIST * n_children)
         number = self._numbered(self._n_levels - 1, groups[-1])
         divided = torch.ones_like(number, dtype=torch.bool)
         for level in reversed(range(self._n_levels - 1)):

@@ -73,9 +73,7 @@ class AlignmentTarget:
         nothing = torch.zeros(len(means), dtype=torch.bool, device=means.device)
         # A cone whose sensor is at the component's mean is the component's ellipsoid.
         ellipsoids = Cones(means, covariances, means, surfaces.weights, nothing)
-        self.index = ConeIndex(
-            ellipsoids, 1e-3 * blur, CUTOFF, entries_per_cone=_ENTRIES[dim], points_per_list=1
-        )
+        self.index = ConeIndex(ellipsoids, 1e-3 * blur, CUTOFF, entries_per_cone=_ENTRIES[dim], smallest=True)
 
     def sums(self, points: Tensor, motions: Motions) -> AlignmentSums:
         """ℓ of points (N, D) under each motion, and its derivatives."""

@@ -50,7 +50,7 @@ class KeptEvidence:
         if self._form is not None:
             new, old = _overlap(first, grid.shape, self._first, self._hits.shape)
             hits[new], misses[new], is_asked[new] = self._hits[old], self._misses[old], False
-            index = ConeIndex(changed, self.resolution, cutoff, smoothed=True, points_per_list=1)
+            index = ConeIndex(changed, self.resolution, cutoff, smoothed=True, smallest=True)
             is_asked |= (index.buckets(points) >= 0).view(grid.shape)
         asked = is_asked.flatten().nonzero().squeeze(1)
         found = form(points[asked])
