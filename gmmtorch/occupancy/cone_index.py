@@ -288,7 +288,7 @@ class ConeIndex:
 
     @property
     def _limit(self) -> int:
-        """Largest coordinate of a bucket that is asked about, or of its negative. Its neighbours have keys."""
+        """Largest coordinate of a bucket that is asked, or of its negative; its neighbours have keys."""
         return (1 << (_KEY_BITS[self.dim] - 1)) - (2 << _SHIFT)
 
     def _pack(self, cell: Tensor) -> Tensor:
