@@ -17,7 +17,7 @@ from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check
 from gmmtorch.files import write_bytes
 from gmmtorch.linalg import check_rigid
 from gmmtorch.mapping.codec import map_file
-from gmmtorch.mapping.codec.quantization import quantized, quantized_after
+from gmmtorch.mapping.codec.quantization import quantized_after
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.depth_frame import DepthFrame, depth_and_pose
 from gmmtorch.mapping.learning.forgetting import Doubts
@@ -239,10 +239,11 @@ class GaussianMap(MapState):
             learned, final = self._with_pending(), self._final()
             if self.codec == "float":
                 return learned
-            known = self._final_rounded or (final, quantized(final))
-            if known[0].means is not final.means:
-                known = final, quantized_after(*known, final)
-            self._final_rounded, self._rounded = known, quantized_after(*known, learned)
+            none = Components.empty(final.dim, final.means.device)
+            known, rounded = self._final_rounded or (none, none)
+            if any(value is not getattr(final, name) for name, value in vars(known).items()):
+                known, rounded = self._final_rounded = final, quantized_after(known, rounded, final)
+            self._rounded = quantized_after(known, rounded, learned) if self.n_pending else rounded
         return self._rounded
 
     def transform(self, transform: ArrayLike, ids: ArrayLike | None = None) -> None:

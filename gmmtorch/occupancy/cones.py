@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gmmtorch.arrays import as_tensor
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.linalg import inverse_factor, safe_cholesky
+from gmmtorch.linalg import all_equal, inverse_factor, safe_cholesky
 
 CUTOFF = 5.0
 """Default cutoff in standard deviations: beyond it a component gives no evidence."""
@@ -72,7 +72,7 @@ def former_rows(old: Cones, new: Cones) -> Tensor:
     """For each of `new` the number (C,) of an equal cone among `old`, in rising order; −1: there is none."""
     n_old, n_new = len(old.counts), len(new.counts)
     n = min(n_old, n_new)
-    if all(torch.equal(a[:n], b[:n]) for a, b in zip(old, new, strict=True)):  # cones were added at the end
+    if all_equal((a[:n], b[:n]) for a, b in zip(old, new, strict=True)):  # cones were added at the end
         number = torch.arange(n_new, device=new.means.device)
         return torch.where(number < n, number, -1)
     tables = [

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.linalg import on_cpu
+from gmmtorch.linalg import all_equal, on_cpu
 from gmmtorch.mapping.codec import lattice
 from gmmtorch.mapping.codec.bitstream import Ints, fewest_bits
 from gmmtorch.mapping.codec.lattice import PER_OCTAVE, Lattice
@@ -210,10 +210,12 @@ def quantized_after(known: Components, rounded: Components, components: Componen
 
     If the components do not begin with the known ones, all of them are rounded.
     """
+    if not len(components.origins):
+        return components
     k, e, s = len(known), len(known.seen_by), len(known.origins)
     sizes = {"origins": s, "seen_by": e, "seen_from": e, "seen_count": e}
     old = {name: values[: sizes.get(name, k)] for name, values in vars(components).items()}
-    if not all(torch.equal(old[name], values) for name, values in vars(known).items()):
+    if not k or not all_equal((old[name], values) for name, values in vars(known).items()):
         return quantized(components)
     if len(components) == k:
         return rounded
@@ -246,9 +248,9 @@ def numbered(components: Components, robot: int, first: int) -> tuple[Components
 
     New components come last, in their spatial order.
     """
-    new = (components.ids[:, 1] < 0).nonzero().squeeze(1)
-    ids, *shapes = on_cpu(components.ids, components.means[new], components.covariances[new])
-    ids, order = _numbering(ids, _order(*shapes), robot, first)
+    ids, *shapes = on_cpu(components.ids, components.means, components.covariances)
+    new = (ids[:, 1] < 0).nonzero().squeeze(1)
+    ids, order = _numbering(ids, _order(*(part[new] for part in shapes)), robot, first)
     device = components.ids.device
     arranged = replace(components.rearranged(order.to(device)), ids=ids.to(device))
     return arranged, number_after(ids, first)
