@@ -263,7 +263,7 @@ def test_components_that_are_replaced_give_no_evidence(dim, monkeypatch):
     after = made.occupancy(query)
     assert not torch.equal(after, before)
     torch.testing.assert_close(after, made.snapshot().occupancy(query), rtol=1e-9, atol=1e-9)
-    made.revise(lambda components: replace(components, max_range=~components.max_range))
+    made.revise(lambda components: replace(components, max_range=components.max_range | True))
     assert float(made.evidence(VoxelGrid.covering([0.0] * dim, [4.0] * dim, 0.5)).hits.max()) == 0
     made.revise(lambda components: components.selected(torch.arange(0)))
     assert (made.occupancy(query) == 0.5).all()
