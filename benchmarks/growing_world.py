@@ -1,6 +1,10 @@
-"""What a scan costs to learn as the world grows: embedded halls side by side.
+"""What a scan costs to learn as the world grows, and what a query after each scan costs.
 
-python benchmarks/growing_world.py [--halls 1 4 16]
+    python benchmarks/growing_world.py [--halls 1 4 16]
+    OMP_NUM_THREADS=1 python benchmarks/growing_world.py --data $GMMTORCH_DATA
+
+Without data, embedded halls side by side. With data, the scans of the folder `street`: after each one the map
+is asked about 500 points on its beams. Writes the table `growing-map` of BENCHMARKS.md.
 """
 
 from __future__ import annotations
@@ -8,13 +12,18 @@ from __future__ import annotations
 import argparse
 import math
 import time
+from pathlib import Path
 
 import torch
-from tables import hardware, markdown
+from tables import hardware, markdown, publish
 
 from gmmtorch import GaussianMap, IncrementalRule, Scan, datasets
+from gmmtorch.datasets.base import Dataset
+from gmmtorch.kernels import kernels
+from gmmtorch.mapping.map_builder import resident_bytes
 
 N_SCANS, APART = 24, 40.0  # scans of a hall; metres from one hall to the next
+N_POINTS = 500  # of a query after a scan
 PER_HALL = 1000  # components, where there is a budget
 
 
@@ -31,11 +40,59 @@ def milliseconds(scans: list[Scan], n_halls: int, rule: IncrementalRule) -> tupl
     return 1e3 * (time.process_time() - begin) / (n_halls * len(scans)), built.n_components
 
 
+def asked_after_each_scan(scans: Dataset, choice: str) -> list[list[object]]:
+    """Rows of the table, for every sixth of the scans."""
+    built, rows, spent = GaussianMap(), [], []
+    generator = torch.Generator().manual_seed(0)
+    before = resident_bytes()
+    with kernels(choice):
+        for number, scan in enumerate(scans, 1):
+            chosen = torch.randint(len(scan.points), (N_POINTS,), generator=generator)
+            share = torch.rand(N_POINTS, 1, generator=generator, dtype=torch.float64)
+            points = scan.origin + share * (scan.points[chosen] - scan.origin)
+            begin = time.process_time()
+            built.insert(scan)
+            built.finish()
+            learned = time.process_time()
+            built.occupancy(points)
+            spent.append((learned - begin, time.process_time() - learned))
+            if number % -(-len(scans) // 6) == 0 or number == len(scans):
+                part = 1e3 * torch.tensor(spent)
+                memory = (resident_bytes() - before) / 1e6
+                worst = [f"{value:.0f}" for value in (*part.mean(0).tolist(), float(part[:, 1].max()))]
+                rows.append([choice, number, built.n_components, *worst, f"{memory:.0f}"])
+                spent = []
+    return rows
+
+
+def growing_map(data: Path) -> str:
+    scans = datasets.load("scan_folder", data / "street")
+    rows = [row for choice in ("fused", "torch") for row in asked_after_each_scan(scans, choice)]
+    built = GaussianMap()
+    for scan in scans:
+        built.insert(scan)
+    built.finish()
+    points = torch.cat([0.5 * (s.origin + s.points[:: len(s.points) // 88][:88]) for s in scans])[:20_000]
+    times = []
+    for _ in range(2):
+        begin = time.process_time()
+        built.occupancy(points)
+        times.append(f"{time.process_time() - begin:.2f}")
+    header = ["kernels", "scans", "components", "learning, ms a scan", "query, ms", "longest query, ms", "MB"]
+    about = f"First query of {len(points):,} points over the whole map: {times[0]} s; again: {times[1]} s."
+    return f"{hardware()}\n\n{markdown(header, rows)}\n\n{about}"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--halls", type=int, nargs="+", default=[1, 4, 16], help="square numbers")
-    halls = parser.parse_args().halls
+    parser.add_argument("--data", type=Path, help="folder with the folder street")
+    options = parser.parse_args()
+    halls = options.halls
     torch.set_num_threads(1)
+    if options.data:
+        publish("growing-map", growing_map(options.data))
+        return
     scans = list(datasets.load("synthetic_building", n_scans=N_SCANS))
     milliseconds(scans, 1, IncrementalRule())  # what is loaded but once
     rows = []

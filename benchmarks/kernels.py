@@ -99,15 +99,15 @@ def map_work(data: Path, n_points: int, device: str) -> Iterator[Work]:
         cones, points = map_and_points(data / folder, name, n_bytes, resolution, n_points, device)
         form = PointForm(cones, resolution, 3.0)
 
-        def build(cones: Cones = cones, h: float = resolution) -> PointForm:
-            return PointForm(cones, h, 3.0)
+        def ask_first(cones: Cones = cones, h: float = resolution, points: Tensor = points) -> object:
+            return PointForm(cones, h, 3.0)(points)
 
         def ask(form: PointForm = form, points: Tensor = points) -> object:
             return form(points)
 
         size = f"{label}, {len(cones.counts)} cones"
         yield f"point queries, {size}, cutoff 3", ask, len(points) / 1e6, "M points/s"
-        yield f"spatial index, {size}", build, 0, "s"
+        yield f"the first of these queries, {size}", ask_first, 0, "s"
         if folder == "kinect":
             low, high = (points.quantile(q, 0, interpolation="nearest") for q in (0.01, 0.99))
             grid = VoxelGrid.covering(low, high, 0.05)

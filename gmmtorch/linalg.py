@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -144,6 +146,14 @@ def on_cpu(*tensors: Tensor) -> tuple[Tensor, ...]:
     data = torch.cat([tensors[i].contiguous().view(-1).view(torch.uint8) for i in order]).cpu()
     parts = dict(zip(order, data.split([sizes[i] for i in order]), strict=True))
     return tuple(parts[i].view(tensor.dtype).view(tensor.shape) for i, tensor in enumerate(tensors))
+
+
+def all_equal(pairs: Iterable[tuple[Tensor, Tensor]]) -> bool:
+    """Whether the tensors of every pair are equal; waits once for another device."""
+    pairs = list(pairs)
+    if any(one.shape != other.shape for one, other in pairs):
+        return False
+    return bool(torch.stack([(one == other).all() for one, other in pairs]).all())
 
 
 # -- sorting: NumPy's vectorised sorts on the CPU, torch's elsewhere ------------------------------

@@ -193,7 +193,7 @@ CASES = {
     "cone_evidence.high": Case(lambda x: torch.stack(cone_evidence(cones(), LOW, x)), HIGH),
     "point_evidence": Case(lambda x: torch.stack(point_evidence(cones(), x, 0.5)), QUERIES),
     "sample_rays": Case(lambda x: sample_rays(cones(covariances=x), 20).ends, COVARIANCES),
-    "ConeIndex": Case(lambda x: ConeIndex(cones(origins=x), 1.0).entries, ORIGINS),
+    "ConeIndex": Case(lambda x: ConeIndex(cones(origins=x), 1.0).hulls.table, ORIGINS),
     "Boundary.of_polygon": Case(lambda x: Boundary.of_polygon(x).edges, POLYGON),
     "noise_covariances": Case(lambda x: deconvolved(x).means, COVARIANCES[0]),
     "expected_range": Case(lambda x: expected_range(cones(), x, MEANS + 1, 9.0, 0.5).mean, ORIGINS),

@@ -44,8 +44,11 @@ _lock = threading.RLock()
 _PRELUDE = """
 #if defined(__CUDA_ARCH__)
 #define GMM_ADD(place, value) atomicAdd(place, value)
+#define GMM_FETCH(place, n)
 #else
 #define GMM_ADD(place, value) (*(place) += (value))
+#define GMM_FETCH(place, n) \\
+    for (int byte = 0; byte < (n) * 8; byte += 64) __builtin_prefetch((const char*)(place) + byte)
 #endif
 #define GMM_MIN(a, b) ((a) < (b) ? (a) : (b))
 #define GMM_MAX(a, b) ((a) > (b) ? (a) : (b))

@@ -17,7 +17,7 @@ from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check
 from gmmtorch.files import write_bytes
 from gmmtorch.linalg import check_rigid
 from gmmtorch.mapping.codec import map_file
-from gmmtorch.mapping.codec.quantization import quantized
+from gmmtorch.mapping.codec.quantization import quantized_after
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.depth_frame import DepthFrame, depth_and_pose
 from gmmtorch.mapping.learning.forgetting import Doubts
@@ -69,9 +69,10 @@ class GaussianMap(MapState):
             model, for the ranges of the map's beams.
 
     Queries do not change the map: the scans of an unfinished window are learned for the answer, and learned
-    again when the window is full. The first query after an insertion builds an index of the components;
-    method "monte_carlo" draws its rays (about a second for a million). `save` and `load` keep a map with its
-    settings. `state_dict` holds everything that learning continues from, and loads into any map.
+    again when the window is full. Lists of the components near the points that were asked about are kept
+    while the map grows; method "monte_carlo" draws its rays anew (about a second for a million). `save` and
+    `load` keep a map with its settings. `state_dict` holds everything that learning continues from, and loads
+    into any map.
     """
 
     any_resolution = True
@@ -235,8 +236,14 @@ class GaussianMap(MapState):
     def components(self) -> Components:
         """All components as the codec rounds them, with those of the unfinished window."""
         if self._rounded is None:
-            learned = self._with_pending()
-            self._rounded = learned if self.codec == "float" else quantized(learned)
+            learned, final = self._with_pending(), self._final()
+            if self.codec == "float":
+                return learned
+            none = Components.empty(final.dim, final.means.device)
+            known, rounded = self._final_rounded or (none, none)
+            if any(value is not getattr(final, name) for name, value in vars(known).items()):
+                known, rounded = self._final_rounded = final, quantized_after(known, rounded, final)
+            self._rounded = quantized_after(known, rounded, learned) if self.n_pending else rounded
         return self._rounded
 
     def transform(self, transform: ArrayLike, ids: ArrayLike | None = None) -> None:
@@ -301,8 +308,12 @@ class GaussianMap(MapState):
         return self._answers().evidence(grid, method)
 
     def _answers(self) -> Query:
-        if self._query is None:
-            self._query = Query(self.components().cones(), self.query_options)
+        if self._query is None or self._is_stale:
+            found = self.components()
+            is_final = (found.ids[:, 0] != self.robot) | (found.ids[:, 1] < self._next_number)
+            asked = found.cones(), self.query_options, is_final[found.seen_by]
+            self._query = Query(*asked) if self._query is None else self._query.replaced(*asked)
+            self._is_stale = False
         return self._query
 
     # -- files and state ------------------------------------------------------------------------------

@@ -78,7 +78,9 @@ class MapState(DeviceModule):
         self._doubts = self._next_doubts = Doubts.none()  # of the final components; after the pending scans
         self._learned: tuple[Components, int] | None = None  # what follows from buffers and pending scans
         self._rounded: Components | None = None
+        self._final_rounded: tuple[Components, Components] | None = None  # final components, and rounded
         self._query: Query | None = None
+        self._is_stale = False  # the query is of earlier components
 
     def __getattr__(self, name: str) -> Any:
         if name in _BUFFERS:
@@ -228,8 +230,8 @@ class MapState(DeviceModule):
         self._forget()
 
     def _forget(self) -> None:
-        """Drops what was computed from the components."""
-        self._learned, self._rounded, self._query = None, None, None
+        """Drops what was computed from the components. The query keeps what the next one can use."""
+        self._learned, self._rounded, self._is_stale = None, None, True
 
     # -- torch ----------------------------------------------------------------------------------------
 
@@ -238,6 +240,7 @@ class MapState(DeviceModule):
         super()._apply(fn, recurse)
         if self.dim is not None:
             self._pending = [scan.to(self._device) for scan in self._pending]
+        self._query = self._final_rounded = None  # are on the former device
         self._forget()
         return self
 

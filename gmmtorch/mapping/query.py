@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import functools
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,7 +13,8 @@ from torch import Tensor
 from gmmtorch.mapping.query_options import QueryOptions, check_method
 from gmmtorch.occupancy.calibration import Calibration
 from gmmtorch.occupancy.cone_index import ConeIndex
-from gmmtorch.occupancy.cones import CUTOFF, Cones
+from gmmtorch.occupancy.cones import CUTOFF, Cones, former_rows
+from gmmtorch.occupancy.culling import Pairs
 from gmmtorch.occupancy.evidence import Evidence, Rule, probability
 from gmmtorch.occupancy.forms.cone.cone_evidence import cone_evidence
 from gmmtorch.occupancy.forms.flux.box_flux import cell_flux, flux_evidence
@@ -60,16 +63,55 @@ def rule_of(options: QueryOptions, parts: Iterable[Cones]) -> Rule:
     return options.calibration or Calibration.prior(mean_range(parts))
 
 
-class Query:
-    """Answers queries about fixed cones. Indices and Monte Carlo rays are made at the first query."""
+class _Part(NamedTuple):
+    """Some of the cones, and the forms and indices of them for each resolution that was asked for."""
 
-    def __init__(self, cones: Cones, options: QueryOptions) -> None:
+    cones: Cones
+    forms: dict[float, PointForm]
+    indices: dict[float, ConeIndex]
+
+    def replaced(self, cones: Cones, former: Tensor) -> _Part:
+        """The part with other cones, which keeps what it can; `former` as for `ConeIndex.replaced`."""
+        forms = {side: form.replaced(cones, former) for side, form in self.forms.items()}
+        return _Part(cones, forms, {s: index.replaced(cones, former) for s, index in self.indices.items()})
+
+
+class Query:
+    """Answers queries about fixed cones. Indices and Monte Carlo rays are made at the first query.
+
+    Args:
+        cones: of components.
+        options: how queries are answered.
+        settled: (C,) False for cones that the next change will probably replace, such as those of an
+            unfinished window. They have an index of their own. None: all are settled.
+    """
+
+    def __init__(self, cones: Cones, options: QueryOptions, settled: Tensor | None = None) -> None:
         self.cones = cones
         self.options, self.rule = options, rule_of(options, [cones])
         self.cutoff = cutoff_by_support(cones) if options.cutoff is None else options.cutoff
         self._lattices: dict[float, SparseEvidence] = {}
-        self._forms: dict[float, PointForm] = {}
-        self._indices: dict[float, ConeIndex] = {}
+        if settled is None or bool(settled.all()):
+            self._parts = [_Part(cones, {}, {})]
+        else:
+            self._parts = [_Part(cones.taken(rows), {}, {}) for rows in (settled, ~settled)]
+
+    def replaced(self, cones: Cones, options: QueryOptions, settled: Tensor | None = None) -> Query:
+        """The answers about other cones; arguments as for `Query`. Lists of settled cones stay."""
+        made, old = Query(cones, options, settled), self._parts[0]
+        if made.cutoff != self.cutoff or cones.dim != self.cones.dim or not len(old.cones.counts):
+            return made
+        first, *rest = made._parts
+        former = former_rows(old.cones, first.cones)
+        if 2 * int((former < 0).sum()) > len(former):
+            return made
+        if len(former) != len(old.cones.counts) or bool((former < 0).any()):
+            old = old.replaced(first.cones, former)
+        made._parts = [old._replace(cones=first.cones)]
+        for part in rest:
+            none = torch.full_like(part.cones.max_range, -1, dtype=torch.int64)
+            made._parts.append(old.replaced(part.cones, none))
+        return made
 
     def occupancy(self, points: Tensor, resolution: float, method: str) -> Tensor:
         """Probability (M,) that the cube of side `resolution` (m) of each point (M, D) is occupied.
@@ -87,15 +129,17 @@ class Query:
         if len(self.cones.counts) == 0:
             return PointEvidence(zeros, zeros.clone())
         if method == "point":
-            return self._form(resolution)(points)
+            return self._at_points(points, resolution)
         if method == "monte_carlo":
             return PointEvidence(*self._lattice(resolution).at_points(points))
         finite = torch.isfinite(points).all(1)
         cells, cell = torch.unique(torch.floor(points[finite] / resolution), dim=0, return_inverse=True)
         low, high = cells * resolution, (cells + 1) * resolution
         if method == "flux":
-            pairs = self._index(resolution).candidates(low, high)
-            found = PointEvidence(*cell_flux(self.cones, cells, resolution, pairs, self.cutoff))
+            found = _sum(
+                PointEvidence(*cell_flux(part.cones, cells, resolution, pairs, self.cutoff))
+                for part, pairs in self._candidates(low, high, resolution)
+            )
         else:
             found = self._in_boxes(low, high, resolution)
         place = finite.nonzero().squeeze(1)
@@ -120,28 +164,37 @@ class Query:
         for first in range(0, grid.n_cells, _CELLS_AT_ONCE):  # centres of all cells take more than evidence
             centers = grid.centers(self.cones.means.device, range(first, first + _CELLS_AT_ONCE))
             if method == "point":
-                parts.append(self._form(grid.resolution)(centers))
+                parts.append(self._at_points(centers, grid.resolution))
             else:
                 parts.append(self._in_boxes(centers - half, centers + half, grid.resolution))
         hits, misses = (torch.cat(values).view(grid.shape) for values in zip(*parts, strict=True))
         return Evidence(grid, hits, misses, self.rule)
 
-    def _form(self, resolution: float) -> PointForm:
-        if resolution not in self._forms:
-            self._forms[resolution] = PointForm(
-                self.cones, resolution, self.cutoff, compiled=self.options.compiled
-            )
-        return self._forms[resolution]
+    def _at_points(self, points: Tensor, resolution: float) -> PointEvidence:
+        """Evidence of the point form. The sum over all cones has one order, however they are kept."""
+        found = None
+        for part in self._parts:
+            if resolution not in part.forms:
+                compiled = self.options.compiled
+                part.forms[resolution] = PointForm(part.cones, resolution, self.cutoff, compiled=compiled)
+            found = part.forms[resolution](points, found)
+        assert found is not None
+        return found
 
-    def _index(self, resolution: float) -> ConeIndex:
-        if resolution not in self._indices:
-            self._indices[resolution] = ConeIndex(self.cones, resolution, self.cutoff)
-        return self._indices[resolution]
+    def _candidates(
+        self, low: Tensor, high: Tensor, resolution: float
+    ) -> Iterator[tuple[_Part, Iterator[Pairs]]]:
+        for part in self._parts:
+            if resolution not in part.indices:
+                part.indices[resolution] = ConeIndex(part.cones, resolution, self.cutoff)
+            yield part, part.indices[resolution].candidates(low, high)
 
     def _in_boxes(self, low: Tensor, high: Tensor, resolution: float) -> PointEvidence:
         """Evidence of the thesis's cones."""
-        pairs = self._index(resolution).candidates(low, high)
-        return PointEvidence(*cone_evidence(self.cones, low, high, pairs, cutoff=self.cutoff))
+        return _sum(
+            PointEvidence(*cone_evidence(part.cones, low, high, pairs, cutoff=self.cutoff))
+            for part, pairs in self._candidates(low, high, resolution)
+        )
 
     def _lattice(self, resolution: float) -> SparseEvidence:
         """Monte Carlo evidence of the whole map on the world's lattice of this resolution."""
@@ -165,3 +218,9 @@ class Query:
                 evidence.add_rays(origins, ends, weights, is_hit, compiled=options.compiled)
             else:
                 evidence.add_rays(origins, ends, weights, is_hit)
+
+
+def _sum(parts: Iterable[PointEvidence]) -> PointEvidence:
+    """The evidence of disjoint sets of cones, which adds up."""
+    hits, misses = (functools.reduce(torch.add, values) for values in zip(*parts, strict=True))
+    return PointEvidence(hits, misses)

@@ -2,7 +2,8 @@
 
 A bucket lists every cone whose hull (`Hulls`) meets a cube of side `extent` around any point of the
 bucket. Lists are conservative: they can contain a cone that gives no evidence, and never miss one that
-does.
+does. They are made when a point of the bucket is asked about: from the list of a larger bucket around it,
+and those of the largest buckets from all cones. Where there are few points, a larger bucket's list serves.
 """
 
 from __future__ import annotations
@@ -10,16 +11,24 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.kernels.evidence.hull_test import near_hulls
-from gmmtorch.linalg import argsort, dense_ranks, ragged_index
+from gmmtorch.kernels.evidence.hull_test import Lists, near_lists
+from gmmtorch.linalg import argsort, dense_ranks
 from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.grid import check_resolution
+
+Spectrum = tuple[Tensor, Tensor]
+"""Variances (C, D), ascending, and axes V (C, D, D) of components."""
+
+
+def spectrum_of(covariances: Tensor) -> Spectrum:
+    """The spectrum of components with covariances (C, D, D), without gradients, float64."""
+    variances, axes = torch.linalg.eigh(covariances.detach().double())
+    return variances, axes
 
 
 class Hulls:
@@ -27,49 +36,89 @@ class Hulls:
 
     A cone can give evidence to a cube of side `extent` (m) if its hull meets the cube. With `smoothed`, as
     in the point form, the cone is widened instead by a Gaussian with the variance of the cube.
+
+    Attributes:
+        table: (C, n), see `near_lists`.
+        low, high: (C, D) corners of the box outside which a cone gives no evidence.
     """
 
-    def __init__(self, cones: Cones, extent: float, cutoff: float, smoothed: bool) -> None:
+    def __init__(
+        self, cones: Cones, extent: float, cutoff: float, smoothed: bool, spectrum: Spectrum | None = None
+    ) -> None:
         dim = self.dim = cones.dim
         means, origins = cones.means.detach().double(), cones.origins.detach().double()
-        variances, axes = torch.linalg.eigh(cones.covariances.detach().double())
+        variances, axes = spectrum or spectrum_of(cones.covariances)
         squares = cutoff**2 * variances.clamp_min(0)  # (C, D) squared half axes, ascending
         distance = (means - origins).norm(dim=1, keepdim=True)
         far = distance + squares[:, -1:].sqrt()
-        self.means, self.origins, self.distance = means, origins, distance[:, 0]
-        self.half = (axes**2 @ squares[:, :, None]).squeeze(2).sqrt()
         self.reach = 0.5 * extent * dim**0.5  # from the centre of the cube to its corners
         self.spread = cutoff * extent / 12**0.5 if smoothed else 0.0  # cutoff radius of the cube's Gaussian
         self.table = torch.cat([axes.flatten(1), means, origins, squares, distance, far], 1)
-
-    def bounds(self) -> tuple[Tensor, Tensor]:
-        """Boxes, lowest and highest corner (C, D), outside which a cone gives no evidence."""
         # The spread as seen from the sensor origin at range r is spread · distance / r, and at most r.
         widest = max(self.reach, self.spread)
-        pad = torch.maximum((widest * self.distance).sqrt(), torch.full_like(self.distance, widest))
-        low = torch.minimum(self.means - self.half, self.origins) - pad[:, None]
-        high = torch.maximum(self.means + self.half, self.origins) + pad[:, None]
-        return low, high
+        pad = (widest * distance).sqrt().clamp_min(widest)
+        half = (axes**2 @ squares[:, :, None]).squeeze(2).sqrt()
+        self.low = torch.minimum(means - half, origins) - pad
+        self.high = torch.maximum(means + half, origins) + pad
 
-    def near(self, cone: Tensor, centers: Tensor, radius: Tensor | float, compiled: bool = False) -> Tensor:
-        """Whether (T,) cone (T,) can give evidence to a cube centred in the ball around `centers` (T, D)."""
-        return near_hulls(self.table, cone, centers, radius, self.reach, self.spread, compiled)
+    def taken(self, rows: Tensor) -> Hulls:
+        """The hulls of some rows."""
+        made = copy.copy(self)
+        made.table, made.low, made.high = self.table[rows], self.low[rows], self.high[rows]
+        return made
+
+    def replaced(self, former: Tensor, new: Hulls) -> Hulls:
+        """The hulls with numbers `former` (C,), and the `new` ones, in order, where it is −1."""
+        made = copy.copy(self)
+        made.table = replaced_rows(self.table, former, new.table)
+        made.low, made.high = (
+            replaced_rows(*rows) for rows in ((self.low, former, new.low), (self.high, former, new.high))
+        )
+        return made
+
+    def near(
+        self, given: Lists, lists: Tensor, centers: Tensor, radii: Tensor, compiled: bool = False
+    ) -> Lists:
+        """For each ball (T,), those cones of its list that can give evidence to a cube centred in the ball;
+        arguments as for `near_lists`."""
+        chunks = chunks_of(given.lengths()[lists], _TESTS_AT_ONCE)
+        parts = [
+            near_lists(self.table, given, lists[t], centers[t], radii[t], self.reach, self.spread, compiled)
+            for t in chunks
+        ]
+        if len(parts) == 1:
+            return parts[0]
+        lengths = [part.lengths() for part in parts] or [lists]
+        return Lists.of(torch.cat(lengths), torch.cat([given.entries[:0], *(part.entries for part in parts)]))
 
 
-_ENTRIES_PER_CONE = {2: 64, 3: 512}  # limits memory and build time to a multiple of the number of cones
-_SPAN = 4  # the search for a cone's buckets starts with at most this many along an axis
+def replaced_rows(rows: Tensor, former: Tensor, new: Tensor) -> Tensor:
+    """Rows with numbers `former` (C,), and the `new` ones, in order, where it is −1."""
+    made = rows.new_empty(len(former), *rows.shape[1:])
+    made[former >= 0], made[former < 0] = rows[former[former >= 0]], new
+    return made
+
+
+_ENTRIES_PER_CONE = {2: 64, 3: 512}  # of all buckets, which decides their side
+_KEPT_PER_CONE, _KEPT = 64, 1 << 22  # entries of the lists that are kept, for each cone, and at least
 _KEY_BITS = {2: 31, 3: 21}  # bits of one bucket coordinate in a packed key
-_TESTS_AT_ONCE = 1 << 13
-_CHUNK_PAIRS = 1 << 20  # about as many candidates are listed at once, or those of a single box
+_SAMPLE = 64  # cones, and places around each, by which the side is chosen
+_SHIFT = 2  # buckets of the next level are 2^_SHIFT times as large
+_PER_LIST = 8  # entries that take as much memory as what else is kept of a list
+_POINTS_PER_LIST = 4
+_FEW_PAIRS = 1 << 17  # of a point and a cone: for at most so many smaller buckets do not pay
+_BUCKETS_AT_ONCE = 1 << 12
+_PAIRS_AT_ONCE = 1 << 20
+_TESTS_AT_ONCE = 1 << 22
 _SUBCELLS = 4  # points are sorted into this many parts of a bucket along each axis
 
 
 class ConeIndex:
-    """Lists of cones, one for each bucket: bucket b, with packed coordinates keys[b], lists the cones
-    `entries[starts[b] : starts[b + 1]]` in ascending order.
+    """Lists of cones, one for each bucket, made for the buckets that are asked about, and kept.
 
-    Empty buckets are not stored. So memory is proportional to the number of cones, and the cost of a query
-    depends on the cones near it, not on the size of the world.
+    What is kept is bounded in proportion to the number of cones; lists that were not used for the longest
+    time go first. The cost of a query depends on the cones near its points; only the largest buckets, whose
+    lists are kept like the others, are compared with the boxes of all cones.
 
     Args:
         cones: must not change afterwards; gradients do not pass through the index.
@@ -77,8 +126,15 @@ class ConeIndex:
         cutoff: Mahalanobis distance beyond which a component gives no evidence.
         smoothed: True for the point form, which widens cones by the spread of the cube (see `PointForm`);
             False for boxes that meet the cones themselves.
-        entries_per_cone: the buckets are halved while at most this many entries per cone suffice; 0 makes a
-            single bucket that lists all cones.
+        entries_per_cone: the buckets are halved while at most about this many entries per cone list all of
+            them.
+        smallest: the lists of the smallest buckets serve always, which pays for many queries about the same
+            places. False: a larger bucket's list serves its points if there are few.
+        spectrum: of the components of the cones, if it is known.
+
+    Attributes:
+        lists: the kept lists; queries append to them, or drop the oldest.
+        side: of the smallest buckets, metres. At level k, buckets are 4^k times as large.
     """
 
     def __init__(
@@ -88,97 +144,262 @@ class ConeIndex:
         cutoff: float = CUTOFF,
         smoothed: bool = False,
         entries_per_cone: int | None = None,
+        smallest: bool = False,
+        spectrum: Spectrum | None = None,
     ) -> None:
         self.extent = check_resolution(extent)
         cones = cones.checked()
         self.dim = cones.dim
-        self._options = self.extent, cutoff, smoothed
-        self._most_buckets = 1 << (_KEY_BITS[self.dim] - 1)  # along an axis
-        hulls = self.hulls = Hulls(cones, *self._options)
-        low, high = hulls.bounds()
-        not_empty = len(cones.counts) > 0
-        self.origin = low.amin(0) if not_empty else low.new_zeros(self.dim)
-        self._top = high.amax(0) if not_empty else self.origin
-        # The finest buckets whose coordinates fit the bits of the key.
-        span = float((self._top - self.origin).amax()) * (1 + 1e-9)
-        finest = max(self.extent, span / self._most_buckets)
-        if entries_per_cone == 0:
-            every = torch.arange(len(cones.counts), device=low.device)
-            cone, cell, self.side = every, torch.zeros(len(every), self.dim).to(every), max(span, finest)
-        else:
-            budget = (entries_per_cone or _ENTRIES_PER_CONE[self.dim]) * len(cones.counts)
-            lattice = _Lattice(low - self.origin, high - self.origin, self.origin, finest)
-            cone, cell, self.side = _search(hulls, lattice, budget)
-        self._list(self._pack(cell), cone)
+        self._options = self.extent, cutoff, smoothed, entries_per_cone
+        self._smallest = smallest
+        self.hulls = Hulls(cones, self.extent, cutoff, smoothed, spectrum)
+        self._set_lattice()
 
-    def _list(self, key: Tensor, cone: Tensor) -> None:
-        """Makes the lists of pairs of a bucket's key (P,) and a cone (P,)."""
-        order = argsort(cone)
-        order = order[argsort(key[order])]
-        bucket, n_buckets = dense_ranks(key[order])
-        self.entries = cone[order]
-        self.starts = torch.zeros(n_buckets + 1, dtype=torch.int64, device=key.device)
-        self.starts[1:] = torch.cumsum(torch.bincount(bucket, minlength=n_buckets), 0)
-        self.keys = key[order][self.starts[:-1]]
+    def _set_lattice(self) -> None:
+        """Chooses the buckets for the present hulls, and drops all lists."""
+        hulls, per_cone = self.hulls, self._options[3]
+        n_cones = len(hulls.table)
+        self._n_chosen = n_cones  # the side is chosen for so many
+        self.origin = hulls.low.amin(0) if n_cones else hulls.low.new_zeros(self.dim)
+        span = float((hulls.high.amax(0) - self.origin).amax()) * (1 + 1e-9) if n_cones else 0.0
+        # The finest buckets whose coordinates fit the bits of the key, with room to grow.
+        finest = max(self.extent, span / (self._limit - 1))
+        self.side = _chosen_side(hulls, finest, span, per_cone or _ENTRIES_PER_CONE[self.dim])
+        self._n_levels = 1 + math.ceil(math.log2(max(span / self.side, 1.0)) / _SHIFT)
+        self._drop_all()
 
-    def replaced(self, cones: Cones, former: Tensor) -> tuple[ConeIndex, Tensor]:
-        """The index of other cones, and the buckets (n_buckets,) of it whose lists changed.
-
-        Only the buckets of new cones are searched. They have the size of those of this index, unless the
-        cones lie too far apart for it.
+    def replaced(self, cones: Cones, former: Tensor, spectrum: Spectrum | None = None) -> ConeIndex:
+        """The index of other cones. It keeps the lists of buckets that no new cone, and none that is gone,
+        can reach; none if there are too many new cones for the size of the buckets.
 
         Args:
             cones: C cones; must not change afterwards.
             former: (C,) the number of each cone in this index, −1 for a new one. The other numbers ascend.
+            spectrum: of the components of the new cones, if it is known.
         """
-        cones = cones.checked()
-        made = copy.copy(self)
-        made.hulls = Hulls(cones, *self._options)
-        added, kept = (former < 0).nonzero().squeeze(1), (former >= 0).nonzero().squeeze(1)
-        hulls = Hulls(Cones(*(part[added] for part in cones)), *self._options)
-        low, high = hulls.bounds()
-        shift = ((self.origin - torch.cat([low, self.origin[None]]).amin(0)) / self.side).ceil().long()
-        made.origin = self.origin - shift * self.side
-        made._top = torch.cat([high, self._top[None]]).amax(0)
-        if float((made._top - made.origin).amax()) > self.side * self._most_buckets:
-            made = ConeIndex(cones, *self._options)
-            return made, torch.ones_like(made.keys, dtype=torch.bool)
-        lattice = _Lattice(low - made.origin, high - made.origin, made.origin, self.side)
-        new, cell, _ = _search(hulls, lattice, math.inf)
-        number = torch.full_like(self.hulls.distance, -1, dtype=torch.int64)
-        number[former[kept]] = kept
-        key = torch.repeat_interleave(self.keys + self._pack(shift[None]), self.list_lengths())
-        cone = number[self.entries]
-        stays, found = cone >= 0, self._pack(cell)
-        made._list(torch.cat([key[stays], found]), torch.cat([cone[stays], added[new]]))
-        return made, torch.isin(made.keys, torch.cat([key[~stays], found]))
+        cones, made = cones.checked(), copy.copy(self)
+        is_new, stays = former < 0, torch.zeros_like(self.hulls.low[:, 0], dtype=torch.bool)
+        stays[former[~is_new]] = True
+        new = Hulls(cones.taken(is_new), *self._options[:3], spectrum)
+        made.hulls = self.hulls.replaced(former, new)
+        corners = (torch.cat([new.low, new.high]) - self.origin) / self.side
+        is_far = bool((corners.abs() > self._limit).any())
+        if is_far or len(former) > 2 * self._n_chosen:
+            made._set_lattice()
+            return made
+        if bool(is_new.all()):
+            made._drop_all()
+            return made
+        gone = self.hulls.taken(~stays)
+        kept = torch.ones_like(self._used, dtype=torch.bool)
+        for hulls in (new, gone):
+            probe = copy.copy(self)
+            probe.hulls = hulls
+            probe._drop_all()
+            for level in reversed(range(self._n_levels)):
+                keys, numbers = self._buckets[level]
+                found = probe._numbered(level, self._unpack(keys))
+                kept[numbers[probe.lists.lengths()[found] > 0]] = False
+        made._keep(kept)
+        if len(gone.low) and len(made.lists.entries):
+            number = torch.full_like(stays, -1, dtype=torch.int32)
+            number[former[~is_new]] = (~is_new).nonzero().squeeze(1).int()
+            made.lists.entries.copy_(number[made.lists.entries])
+        return made
+
+    # -- lists that are kept --------------------------------------------------------------------------
+
+    def _drop_all(self) -> None:
+        none = torch.zeros(0, dtype=torch.int64, device=self.hulls.table.device)
+        self._buckets = [(none, none)] * self._n_levels  # of each level, sorted keys and the buckets' lists
+        self._used, self._now = none, 0  # when each list was used last
+        self._levels = none  # of the bucket of each list
+        self._buffer = none.int()  # begins with the entries of the lists
+        self.lists = Lists.of(none, self._buffer)
+
+    def _keep(self, kept: Tensor) -> None:
+        """Drops the lists (n,) that are not kept."""
+        lengths = self.lists.lengths()
+        self._buffer = self.lists.entries[torch.repeat_interleave(kept, lengths)]
+        self.lists = Lists.of(lengths[kept], self._buffer)
+        self._used, self._levels = self._used[kept], self._levels[kept]
+        rank, buckets = kept.cumsum(0) - 1, []
+        for keys, numbers in self._buckets:
+            stays = kept[numbers]
+            buckets.append((keys[stays], rank[numbers[stays]]))
+        self._buckets = buckets
+
+    def _make_room(self) -> None:
+        """Drops lists that were not used for the longest time, if there are more than the bound."""
+        most = max(_KEPT, _KEPT_PER_CONE * len(self.hulls.table))
+        sizes = self.lists.lengths() + _PER_LIST
+        if int(sizes.sum()) <= most:
+            return
+        newest = argsort(-self._used)
+        kept = torch.zeros_like(self._used, dtype=torch.bool)
+        kept[newest[sizes[newest].cumsum(0) <= most // 2]] = True
+        self._keep(kept)
+
+    def _add(self, level: int, cells: Tensor, lists: Lists) -> Tensor:
+        """Keeps the lists (n,) of new buckets with these coordinates (n, D), and returns their numbers."""
+        n_lists, n_entries, n_added = len(self._used), len(self.lists.entries), len(lists.entries)
+        if n_entries + n_added > len(self._buffer):
+            self._buffer = torch.cat([self.lists.entries, lists.entries.new_empty(n_entries // 2 + n_added)])
+        self._buffer[n_entries : n_entries + n_added] = lists.entries
+        starts = torch.cat([self.lists.starts, n_entries + lists.starts[1:]])
+        self.lists = Lists(starts, self._buffer[: n_entries + n_added])
+        self._used = torch.cat([self._used, torch.full_like(cells[:, 0], self._now)])
+        self._levels = torch.cat([self._levels, torch.full_like(cells[:, 0], level)])
+        added = torch.arange(n_lists, n_lists + len(cells), device=cells.device)
+        keys, numbers = self._buckets[level]
+        keys, numbers = torch.cat([keys, self._pack(cells)]), torch.cat([numbers, added])
+        order = argsort(keys)
+        self._buckets[level] = keys[order], numbers[order]
+        return added
+
+    def _numbered(self, level: int, cells: Tensor) -> Tensor:
+        """The lists (B,) of distinct buckets with these coordinates (B, D); makes those that are missing."""
+        number = self._find(level, self._pack(cells))
+        missing = (number < 0).nonzero().squeeze(1)
+        self._used[number[number >= 0]] = self._now
+        if not len(missing):
+            return number
+        hulls, side = self.hulls, self.side * (1 << _SHIFT * level)
+        if level + 1 == self._n_levels:
+            low = self.origin + cells[missing] * side
+            boxes = zip(low, low + side, strict=True)
+            met = [((hulls.low <= b) & (hulls.high >= a)).all(1).nonzero().squeeze(1).int() for a, b in boxes]
+            lengths = cells.new_tensor([len(cones) for cones in met])
+            number[missing] = self._add(level, cells[missing], Lists.of(lengths, torch.cat(met)))
+            return number
+        owner, n_owners = dense_ranks(self._pack(cells[missing] >> _SHIFT))
+        order = argsort(owner)
+        missing, owner = missing[order], owner[order]
+        parents = cells.new_zeros(n_owners, self.dim)
+        parents[owner] = cells[missing] >> _SHIFT
+        lists = self._numbered(level + 1, parents)[owner]
+        centers = self.origin + (cells[missing] + 0.5) * side
+        radii = torch.full_like(centers[:, 0], 0.5 * side * self.dim**0.5)
+        made = hulls.near(self.lists, lists, centers, radii)
+        number[missing] = self._add(level, cells[missing], made)
+        return number
+
+    # -- queries --------------------------------------------------------------------------------------
 
     @property
-    def n_buckets(self) -> int:
-        """Number of cells of the index that list a cone."""
-        return self.keys.shape[0]
+    def _limit(self) -> int:
+        """Largest coordinate of a bucket that is asked, or of its negative; its neighbours have keys."""
+        return (1 << (_KEY_BITS[self.dim] - 1)) - (2 << _SHIFT)
 
     def _pack(self, cell: Tensor) -> Tensor:
         bits = _KEY_BITS[self.dim]
+        cell = cell + (1 << (bits - 1))
         key = cell[:, 0]
         for axis in range(1, self.dim):
             key = key << bits | cell[:, axis]
         return key
 
-    def buckets(self, points: Tensor) -> Tensor:
-        """Bucket (M,) that contains each point (M, D); −1 where no cone gives evidence."""
-        if self.n_buckets == 0:
-            return torch.full(points.shape[:1], -1, dtype=torch.int64, device=points.device)
+    def _unpack(self, keys: Tensor) -> Tensor:
+        bits = _KEY_BITS[self.dim]
+        parts = [keys >> bits * axis & ((1 << bits) - 1) for axis in reversed(range(self.dim))]
+        return torch.stack(parts, 1) - (1 << (bits - 1))
+
+    def _find(self, level: int, key: Tensor) -> Tensor:
+        """The list (B,) of each bucket with these keys (B,), −1 if there is none yet."""
+        keys, numbers = self._buckets[level]
+        if not len(keys):
+            return torch.full_like(key, -1)
+        place = torch.searchsorted(keys, key).clamp_max_(len(keys) - 1)
+        return torch.where(keys[place] == key, numbers[place], -1)
+
+    def parts(self, points: Tensor, bounded: bool = True) -> Iterator[tuple[Tensor, Tensor]]:
+        """Parts of points (M, D): their rows (R,), ascending, and the list (R,) in `lists` of all cones that
+        can give evidence to each. Later parts change `lists`: use it part by part. Points that are in no part
+        have no evidence.
+
+        bounded: False keeps the lists of all these points, beyond the bound.
+        """
+        if not len(self.hulls.table):
+            return
+        self._now += 1
+        if bounded:
+            self._make_room()
         cell = ((points.detach().double() - self.origin) / self.side).floor()
-        inside = ((cell >= 0) & (cell < 1 << _KEY_BITS[self.dim])).all(1)
-        key = self._pack(torch.where(inside[:, None], cell, 0.0).long())
-        place = torch.searchsorted(self.keys, key).clamp_max_(self.n_buckets - 1)
-        return torch.where(inside & (self.keys[place] == key), place, -1)
+        rows = torch.arange(len(points), device=points.device)
+        inside = (cell.abs() <= self._limit).all(1)
+        if not bool(inside.all()):
+            rows, cell = rows[inside], cell[inside]
+        cell = cell.long()
+        key = self._pack(cell)
+        number = self._find(0, key)
+        missing = (number < 0).nonzero().squeeze(1)
+        rank, n_missing = dense_ranks(key[missing])
+        cells = cell.new_zeros(n_missing, self.dim)
+        cells[rank] = cell[missing]
+        if n_missing <= _BUCKETS_AT_ONCE:
+            self._used[number[number >= 0] if n_missing else number] = self._now
+            if n_missing:
+                number[missing] = self._serving(cells, rank)
+            yield rows, number
+            return
+        found = number >= 0
+        self._used[number[found]] = self._now
+        yield rows[found], number[found]
+        for first in range(0, n_missing, _BUCKETS_AT_ONCE):
+            chosen = (rank // _BUCKETS_AT_ONCE == first // _BUCKETS_AT_ONCE).nonzero().squeeze(1)
+            if bounded:
+                self._make_room()
+            number = self._serving(cells[first : first + _BUCKETS_AT_ONCE], rank[chosen] - first)
+            yield rows[missing[chosen]], number
+
+    def _serving(self, cells: Tensor, rank: Tensor) -> Tensor:
+        """The list (R,) that serves each point, in the bucket with number `rank` (R,) among `cells` (B, D).
+
+        Lists are made from those of the largest buckets on, as long as there are enough points.
+        """
+        if self._smallest:  # with their neighbours, where the next points will be
+            parents = torch.unique(cells >> _SHIFT, dim=0) << _SHIFT
+            steps = torch.cartesian_prod(*[torch.arange(1 << _SHIFT, device=cells.device)] * self.dim)
+            self._numbered(0, (parents[:, None] + steps).flatten(0, 1))
+            return self._numbered(0, cells)[rank]
+        groups, owners = [cells], []
+        n_points = [torch.bincount(rank, minlength=len(cells))]
+        enough = [torch.zeros_like(cells[:, 0], dtype=torch.bool)]  # points to divide the bucket
+        for _ in range(1, self._n_levels):
+            cell = groups[-1] >> _SHIFT
+            owner, n_groups = dense_ranks(self._pack(cell))
+            groups.append(cell.new_zeros(n_groups, self.dim).index_copy_(0, owner, cell))
+            owners.append(owner)
+            n_points.append(torch.zeros_like(groups[-1][:, 0]).index_add_(0, owner, n_points[-1]))
+            n_children = torch.bincount(owner, minlength=n_groups)
+            enough.append(n_points[-1] >= _POINTS_PER_LIST * n_children)
+        number = self._numbered(self._n_levels - 1, groups[-1])
+        divided = torch.ones_like(number, dtype=torch.bool)
+        for level in reversed(range(self._n_levels - 1)):
+            n_pairs = self.lists.lengths()[number] * n_points[level + 1]
+            if int((n_pairs * divided).sum()) <= _FEW_PAIRS:
+                for owner in reversed(owners[: level + 1]):
+                    number = number[owner]
+                break
+            owner = owners[level]
+            divided = (divided & enough[level + 1])[owner]
+            number = number[owner]
+            asked = divided.nonzero().squeeze(1)
+            number[asked] = self._numbered(level, groups[level][asked])
+        return number[rank]
+
+    def buckets(self, points: Tensor) -> Tensor:
+        """The list (M,) in `lists` of all cones that can give evidence to each point (M, D); −1 where there
+        is none. Valid until the next query."""
+        found = torch.full(points.shape[:1], -1, dtype=torch.int64, device=points.device)
+        for rows, number in self.parts(points, bounded=False):
+            found[rows] = torch.where(self.lists.lengths()[number] > 0, number, -1)
+        return found
 
     def in_space_order(self, points: Tensor, bucket: Tensor) -> Tensor:
-        """An order (M,) of points (M, D), finite where they have a bucket (M,), in which neighbours follow.
+        """An order (M,) of points (M, D) with lists `bucket` (M,) in which neighbours follow each other.
 
-        Points are sorted by bucket, and by the parts of their bucket.
+        Points are sorted by list, and by the parts of their bucket.
         """
         part = ((points.detach() - self.origin) / self.side % 1 * _SUBCELLS).long()
         fine = bucket
@@ -186,19 +407,10 @@ class ConeIndex:
             fine = fine * _SUBCELLS + part[:, axis]
         return argsort(fine)
 
-    def list_lengths(self) -> Tensor:
-        """Number of cones (n_buckets,) in each list."""
-        return self.starts[1:] - self.starts[:-1]
-
-    def listed(self, buckets: Tensor) -> tuple[Tensor, Tensor]:
-        """All entries of the lists of `buckets` (B,), in order: position in `buckets` (P,) and cone (P,)."""
-        place, within = ragged_index(self.list_lengths()[buckets])
-        return place, self.entries[self.starts[buckets][place] + within]
-
     def candidates(self, low: Tensor, high: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
         """Chunks of pairs, box (P,) and cone (P,): all cones whose hull meets a box [low, high], (M, D) each.
 
-        Each pair occurs once, boxes ascend, and all pairs of a box are in the same chunk.
+        Each pair occurs once, and all pairs of a box follow each other in one chunk.
 
         Raises `InvalidArgumentError` for boxes larger than `extent`.
         """
@@ -209,79 +421,45 @@ class ConeIndex:
                 f"extent={self.extent:.4g} m; make the index with the extent of the largest box."
             )
         center = 0.5 * (low + high)
-        bucket = self.buckets(center)
-        box = (bucket >= 0).nonzero().squeeze(1)
-        bucket = bucket[box]
-        chunk = torch.cumsum(self.list_lengths()[bucket], 0) // _CHUNK_PAIRS
-        sizes = torch.unique_consecutive(chunk, return_counts=True)[1].tolist()
-        for boxes, buckets in zip(box.split(sizes), bucket.split(sizes), strict=True):
-            place, cone = self.listed(buckets)
-            pair = boxes[place]
-            near = self.hulls.near(cone, center[pair], 0.0).nonzero().squeeze(1)
-            yield pair[near], cone[near]
+        for rows, bucket in self.parts(center):
+            order = self.in_space_order(center[rows], bucket)
+            rows, bucket = rows[order], bucket[order]
+            for part in chunks_of(self.lists.lengths()[bucket], _PAIRS_AT_ONCE):
+                boxes = rows[part]
+                found = self.hulls.near(
+                    self.lists, bucket[part], center[boxes], torch.zeros_like(center[boxes, 0])
+                )
+                place, cone = found.taken(torch.arange(len(boxes), device=boxes.device))
+                yield boxes[place], cone
 
 
-class _Lattice(NamedTuple):
-    """Boxes around the hulls of cones, low and high (C, D), relative to `origin` (D,) of the world frame;
-    and the side (m) of the finest buckets."""
-
-    low: Tensor
-    high: Tensor
-    origin: Tensor
-    finest: float
-
-    def covering(self, cone: Tensor, side: float) -> tuple[Tensor, Tensor]:
-        """All pairs of a cone (C,) and a bucket (P, D) of its box, for buckets of `side` (m)."""
-        first, last = ((x[cone] / side).floor().long() for x in (self.low, self.high))
-        size = last - first + 1
-        row, rest = ragged_index(size.prod(1))
-        cells = []
-        for axis in range(size.shape[1]):
-            cells.append(first[row, axis] + rest % size[row, axis])
-            rest = rest // size[row, axis]
-        return cone[row], torch.stack(cells, 1)
+def chunks_of(lengths: Tensor, size: int) -> Iterator[slice]:
+    """Runs of lists (T,) of these lengths that together have about `size` entries, or a single list."""
+    begin, chunk = 0, lengths.cumsum(0) // size
+    for count in torch.unique_consecutive(chunk, return_counts=True)[1].tolist():
+        yield slice(begin, begin + count)
+        begin += count
 
 
-def _search(hulls: Hulls, lattice: _Lattice, budget: float) -> tuple[Tensor, Tensor, float]:
-    """Entries of the lists, cone (P,) and bucket (P, D), and the side (m) of the buckets.
-
-    The search starts with a few large buckets for each cone and halves those that its hull meets. It stops
-    before there are more than `budget` entries, if the largest buckets allow that.
-    """
-    extent = (lattice.high - lattice.low).amax(1)
-    cone = torch.zeros(0, dtype=torch.int64, device=extent.device)
-    cell = cone.new_zeros(0, hulls.dim)
-    if extent.numel() == 0:
-        return cone, cell, lattice.finest
-    level = (extent / (lattice.finest * (_SPAN - 1))).clamp_min(1).log2().ceil().long()
-    corners = torch.cartesian_prod(*[torch.arange(2, device=extent.device)] * hulls.dim)
-    for now in range(int(level.amax()), -1, -1):
-        side = lattice.finest * 2**now
-        halves = (2 * cell[:, None] + corners).flatten(0, 1)
-        new_cone, new_cell = lattice.covering((level == now).nonzero().squeeze(1), side)
-        pairs = torch.cat([cone.repeat_interleave(len(corners)), new_cone]), torch.cat([halves, new_cell])
-        finer = _near(hulls, lattice, *pairs, side, budget if cone.numel() else math.inf)
-        if finer is None:
-            # All buckets have one size: cones whose search starts at this level or below use the larger one.
-            pairs = lattice.covering((level <= now).nonzero().squeeze(1), 2 * side)
-            rest = _near(hulls, lattice, *pairs, 2 * side, math.inf)
-            assert rest is not None
-            return torch.cat([cone, rest[0]]), torch.cat([cell, rest[1]]), 2 * side
-        cone, cell = finer
-    return cone, cell, lattice.finest
-
-
-def _near(
-    hulls: Hulls, lattice: _Lattice, cone: Tensor, cell: Tensor, side: float, budget: float
-) -> tuple[Tensor, Tensor] | None:
-    """The pairs of a cone (P,) and a bucket (P, D) that its hull meets; None if they exceed `budget`."""
-    radius = 0.5 * side * hulls.dim**0.5
-    found, n_found = [(cone[:0], cell[:0])], 0
-    for cones, cells in zip(cone.split(_TESTS_AT_ONCE), cell.split(_TESTS_AT_ONCE), strict=True):
-        near = hulls.near(cones, (cells.double() + 0.5) * side + lattice.origin, radius)
-        found.append((cones[near], cells[near]))
-        n_found += found[-1][0].shape[0]
-        if n_found > budget:
-            return None
-    near_cones, near_cells = zip(*found, strict=True)
-    return torch.cat(near_cones), torch.cat(near_cells)
+def _chosen_side(hulls: Hulls, finest: float, span: float, per_cone: int) -> float:
+    """The side (m) of the smallest buckets, `finest` times a power of two, for which a sample of the cones
+    would have on average at most `per_cone` entries in the lists of all buckets."""
+    n_cones, dim, device = len(hulls.table), hulls.dim, hulls.table.device
+    if n_cones == 0:
+        return finest
+    sample = torch.linspace(0, n_cones - 1, min(n_cones, _SAMPLE), device=device).long()
+    given = Lists.of(torch.ones_like(sample), sample.int())
+    cone = torch.arange(len(sample), device=device).repeat_interleave(_SAMPLE)
+    share = torch.rand(len(cone), dim, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    share, side = share.to(device), finest * 2.0 ** math.ceil(math.log2(max(span / finest, 1.0)))
+    while side > finest:
+        radius = 0.25 * side * dim**0.5
+        low, size = hulls.low[sample] - radius, (hulls.high - hulls.low)[sample] + 2 * radius
+        centers = low[cone] + share * size[cone]
+        met = hulls.near(given, cone, centers, torch.full_like(share[:, 0], radius)).lengths()
+        # Buckets on a lattice in any place: their centres lie in the volume that the cone reaches.
+        n_entries = (size.prod(1)[cone] * met).mean() / (side / 2) ** dim
+        if float(n_entries) > per_cone:
+            break
+        side /= 2
+    return side

@@ -15,10 +15,12 @@ from torch import Tensor
 
 from gmmtorch.arrays import as_tensor
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.linalg import inverse_factor, safe_cholesky
+from gmmtorch.linalg import all_equal, inverse_factor, safe_cholesky
 
 CUTOFF = 5.0
 """Default cutoff in standard deviations: beyond it a component gives no evidence."""
+
+_MIXER = 0x1E3779B97F4A7C15
 
 
 class Cones(NamedTuple):
@@ -38,6 +40,10 @@ class Cones(NamedTuple):
     def dim(self) -> int:
         """2 or 3."""
         return self.means.shape[1]
+
+    def taken(self, rows: Tensor) -> Cones:
+        """The cones of some rows: numbers (J,), or flags (C,)."""
+        return Cones(*(part[rows] for part in self))
 
     def checked(self) -> Cones:
         """These cones as tensors on the device of the means.
@@ -60,6 +66,30 @@ class Cones(NamedTuple):
             if tuple(value.shape) != shape:
                 raise InvalidArgumentError(f"{name} has shape {tuple(value.shape)}; expected {shape}.")
         return found
+
+
+def former_rows(old: Cones, new: Cones) -> Tensor:
+    """For each of `new` the number (C,) of an equal cone among `old`, in rising order; −1: there is none."""
+    n_old, n_new = len(old.counts), len(new.counts)
+    n = min(n_old, n_new)
+    if all_equal((a[:n], b[:n]) for a, b in zip(old, new, strict=True)):  # cones were added at the end
+        number = torch.arange(n_new, device=new.means.device)
+        return torch.where(number < n, number, -1)
+    tables = [
+        torch.cat([part.detach().double().view(len(part), -1) for part in cones], 1) for cones in (old, new)
+    ]
+    mixer = torch.arange(1, tables[1].shape[1] + 1, device=new.means.device) * _MIXER
+    keys = []
+    for rows in tables:
+        bits = rows.view(torch.int64)
+        keys.append((((bits >> 29) ^ bits) * mixer).sum(1))
+    order = keys[0].argsort(stable=True)
+    if not n_old:
+        return torch.full_like(keys[1], -1)
+    place = order[torch.searchsorted(keys[0][order], keys[1]).clamp_max(n_old - 1)]
+    place = torch.where((tables[0][place] == tables[1]).all(1), place, -1)
+    before = torch.cat([place.new_full((1,), -1), place.cummax(0).values[:-1]])
+    return torch.where(place > before, place, -1)
 
 
 def cone_bounds(cones: Cones, cutoff: float = CUTOFF) -> tuple[Tensor, Tensor]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import pytest
@@ -11,12 +12,16 @@ from mapping.map_cases import FINE, built, drive, given_parts, open_drive
 from occupancy.protocol_contract import RESOLUTION, SENSOR, WALL, dims, lattice, points, shifted, wall_scan
 
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
+from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.query import Query, cutoff_by_support
 from gmmtorch.mapping.query_options import METHODS, QueryOptions
+from gmmtorch.occupancy import cone_index
 from gmmtorch.occupancy.calibration import Calibration
 from gmmtorch.occupancy.cones import CUTOFF, Cones
+from gmmtorch.occupancy.forms import point as point_form
 from gmmtorch.occupancy.grid import VoxelGrid
+from gmmtorch.scan import Scan
 
 methods = pytest.mark.parametrize("method", METHODS)
 
@@ -203,3 +208,64 @@ def test_the_default_cutoff_follows_the_support_of_the_components():
     assert cutoff_by_support(cones()) == CUTOFF
     fixed = Query(cones(1000.0), QueryOptions(cutoff=4.0))
     assert (fixed.cutoff, Query(cones(1000.0), QueryOptions(cutoff=None)).cutoff) == (4, 3)
+
+
+# -- a map that is asked while it grows ------------------------------------------------------------------
+
+
+def corridor(n: int, dim: int) -> list[Scan]:
+    """Scans of walls every 4 m, each from another place."""
+    shift = torch.tensor([4.0, 0, 0][:dim], dtype=torch.float64)
+    near = open_drive(3, dim)
+    return [
+        Scan(
+            s.points + number // 3 * shift, s.origin + number // 3 * shift, s.no_return + number // 3 * shift
+        )
+        for number in range(n)
+        for s in [near[number % 3]]
+    ]
+
+
+@dims
+@pytest.mark.parametrize("method", ["point", "flux", "cone"])
+@pytest.mark.parametrize("codec", ["quantized", "float"])
+def test_a_map_asked_after_each_scan_answers_like_a_new_one(dim, method, codec, monkeypatch):
+    for module in (point_form, cone_index):
+        monkeypatch.setattr(module, "_FEW_PAIRS", 0)
+    grown = GaussianMap(replace(FINE, window=3), codec=codec, method=method)
+    grid = VoxelGrid.covering([-1.0] * dim, [10.0] + [2.0] * (dim - 1), 0.5)
+    for number, scan in enumerate(corridor(8, dim)):
+        grown.insert(scan)
+        query = torch.cat([lattice(dim)[::7], lattice(dim)[::11] + scan.origin])
+        theta = grown.occupancy(query)
+        new = grown.snapshot()
+        torch.testing.assert_close(theta, new.occupancy(query), rtol=1e-9, atol=1e-9)
+        if number % 4 == 3:
+            found, expected = grown.evidence(grid), new.evidence(grid)
+            for name in ("hits", "misses"):
+                torch.testing.assert_close(
+                    getattr(found, name), getattr(expected, name), rtol=1e-9, atol=1e-9
+                )
+    expected = quantized(grown._with_pending()) if codec == "quantized" else grown._with_pending()
+    for name, values in vars(grown.components()).items():
+        assert torch.equal(values, getattr(expected, name)), name
+
+
+@dims
+def test_components_that_are_replaced_give_no_evidence(dim, monkeypatch):
+    for module in (point_form, cone_index):
+        monkeypatch.setattr(module, "_FEW_PAIRS", 0)
+    made = built(corridor(6, dim), FINE, codec="quantized")
+    query = torch.cat([lattice(dim), lattice(dim) + torch.tensor([4.0, 0, 0][:dim])])
+    before = made.occupancy(query)
+    n = made.n_components
+    made.revise(lambda components: components.selected(torch.arange(n // 10, n)))
+    after = made.occupancy(query)
+    assert not torch.equal(after, before)
+    torch.testing.assert_close(after, made.snapshot().occupancy(query), rtol=1e-9, atol=1e-9)
+    made.revise(lambda components: replace(components, max_range=components.max_range | True))
+    assert float(made.evidence(VoxelGrid.covering([0.0] * dim, [4.0] * dim, 0.5)).hits.max()) == 0
+    made.revise(lambda components: components.selected(torch.arange(0)))
+    assert (made.occupancy(query) == 0.5).all()
+    made.insert(corridor(1, dim)[0])
+    torch.testing.assert_close(made.occupancy(query), made.snapshot().occupancy(query), rtol=1e-9, atol=1e-9)

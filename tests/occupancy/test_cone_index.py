@@ -2,14 +2,17 @@
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from occupancy.cone_cases import random_cones, tiled
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.kernels.evidence.point_evidence import pair_evidence
 from gmmtorch.occupancy import cone_index
 from gmmtorch.occupancy.cone_index import ConeIndex
 from gmmtorch.occupancy.cones import CUTOFF, Cones
+from gmmtorch.occupancy.forms import point as point_form
+from gmmtorch.occupancy.forms.point import PointEvidence, PointForm
 
 
 def places_on_rays(cones: Cones, n: int, cutoff: float, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -58,39 +61,46 @@ def test_boxes_far_from_all_rays_have_no_candidates():
     assert pairs_of(index, low, low + 0.1) == []
 
 
-def test_lists_contain_few_unneeded_cones():
+@pytest.fixture
+def smallest(monkeypatch):
+    """Each point is served by the smallest bucket."""
+    monkeypatch.setattr(cone_index, "_FEW_PAIRS", 0)
+    monkeypatch.setattr(cone_index, "_POINTS_PER_LIST", 1)
+
+
+def test_lists_contain_few_unneeded_cones(smallest):
     """Mean list length at points on the rays."""
     cones = random_cones(3, 300, 1, room=True)
     index = ConeIndex(cones, 0.05)
     places, _ = places_on_rays(cones, 500, CUTOFF, 0)
-    length = index.list_lengths()[index.buckets(places)].double().mean()
-    assert float(length) < 0.45 * 300
+    numbers = index.buckets(places)
+    assert float(index.lists.lengths()[numbers].double().mean()) < 0.45 * 300
 
 
-def test_pairs_occur_once_and_ascend_for_any_chunk_size(monkeypatch):
+def test_pairs_occur_once_for_any_chunk_size(monkeypatch):
     cones = random_cones(2, 20, 3)
     index = ConeIndex(cones, 0.1)
     places, _ = places_on_rays(cones, 200, CUTOFF, 0)
     whole = pairs_of(index, places, places)
     assert len(set(whole)) == len(whole) > 200
-    assert [box for box, _ in whole] == sorted(box for box, _ in whole)
-    monkeypatch.setattr(cone_index, "_CHUNK_PAIRS", 7)
-    assert pairs_of(index, places, places) == whole
+    monkeypatch.setattr(cone_index, "_PAIRS_AT_ONCE", 7)
+    monkeypatch.setattr(cone_index, "_TESTS_AT_ONCE", 11)
+    assert sorted(pairs_of(index, places, places)) == sorted(whole)
     portions = [set(box.tolist()) for box, _ in index.candidates(places, places)]
     assert sum(map(len, portions)) == len(set().union(*portions))
 
 
-def test_cost_and_memory_do_not_depend_on_the_size_of_the_world():
+def test_cost_and_memory_do_not_depend_on_the_size_of_the_world(smallest):
     small, step = random_cones(3, 60, 4, room=True), 30.0
     large = tiled(small, 16, step)
     one, many = ConeIndex(small, 0.1), ConeIndex(large, 0.1)
     assert many.side == one.side
-    assert many.entries.numel() < 20 * one.entries.numel()
     places, _ = places_on_rays(small, 500, CUTOFF, 0)
     shift = torch.tensor([5 * step, 0, 0], dtype=torch.float64)
-    here = one.list_lengths()[one.buckets(places)].double().mean()
-    there = many.list_lengths()[many.buckets(places + shift)].double().mean()
-    assert float(there) < 1.5 * float(here)
+    here, there = one.buckets(places), many.buckets(places + shift)
+    means = [index.lists.lengths()[n].double().mean() for index, n in ((one, here), (many, there))]
+    assert float(means[1]) < 1.5 * float(means[0])
+    assert many.lists.entries.numel() < 2 * one.lists.entries.numel()
 
 
 def test_two_distant_maps_share_an_index():
@@ -102,7 +112,6 @@ def test_two_distant_maps_share_an_index():
     places, which = places_on_rays(both, 200, CUTOFF - 0.01, 0)
     pairs = set(pairs_of(index, places, places))
     assert all((box, int(cone)) in pairs for box, cone in enumerate(which))
-    assert index.entries.numel() < 600 * 20
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -110,7 +119,6 @@ def test_an_index_without_cones_lists_nothing(dim):
     empty = Cones(*(field[:0] for field in random_cones(dim, 1, 0)))
     index = ConeIndex(empty, 0.1)
     places = torch.zeros(4, dim, dtype=torch.float64)
-    assert index.n_buckets == 0
     assert pairs_of(index, places, places) == []
     full = ConeIndex(random_cones(dim, 3, 0), 0.1)
     assert pairs_of(full, places[:0], places[:0]) == []
@@ -127,3 +135,102 @@ def test_a_box_larger_than_the_extent_is_refused():
 def test_an_invalid_extent_is_refused(extent):
     with pytest.raises(InvalidArgumentError):
         ConeIndex(random_cones(3, 3, 0), extent)
+
+
+# -- cones that change, and what is kept -------------------------------------------------------------------
+
+
+def brute(cones: Cones, points: torch.Tensor, resolution: float, cutoff: float = CUTOFF) -> torch.Tensor:
+    """Hits and misses (2, M) of every cone at every point, without lists."""
+    form = PointForm(cones, resolution, cutoff)
+    point, cone = torch.cartesian_prod(torch.arange(len(points)), torch.arange(len(form.rows))).unbind(1)
+    shares = pair_evidence(points.T[:, None], point, *form._table, cone, resolution, cutoff)
+    return torch.stack([share.view(len(points), -1).sum(1) for share in shares])
+
+
+def same_evidence(found: PointEvidence, expected: torch.Tensor) -> None:
+    torch.testing.assert_close(torch.stack(list(found)), expected, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@settings(max_examples=15)
+@given(seed=st.integers(0, 10_000), n_points=st.sampled_from([3, 100, 400]))
+def test_evidence_of_cones_that_come_and_go_is_that_of_all(dim, seed, n_points):
+    generator = torch.Generator().manual_seed(seed)
+    cones = random_cones(dim, 30, seed, room=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(point_form, "_FEW_PAIRS", 0)
+        patch.setattr(cone_index, "_FEW_PAIRS", 0)
+        form = PointForm(cones, 0.1)
+        for step in range(4):
+            places, _ = places_on_rays(cones, n_points, CUTOFF, seed + step)
+            same_evidence(form(places), brute(cones, places, 0.1))
+            kept = (torch.rand(len(cones.counts), generator=generator) < 0.9).nonzero().squeeze(1)
+            new = random_cones(dim, 4, seed + 100 + step, room=True)
+            new = new._replace(means=new.means - 3.0 * step)  # also beyond the box of the first ones
+            former = torch.cat([kept, torch.full((4,), -1)])
+            cones = Cones(*(torch.cat(pair) for pair in zip(cones.taken(kept), new, strict=True)))
+            form = form.replaced(cones, former)
+
+
+def test_only_lists_near_changed_cones_are_made_again(smallest):
+    near = random_cones(3, 60, 0, room=True)
+    shift = torch.tensor([40.0, 0, 0], dtype=torch.float64)
+    far = near._replace(means=near.means + shift, origins=near.origins + shift)
+    both = Cones(*(torch.cat(pair) for pair in zip(near, far, strict=True)))
+    index = ConeIndex(both, 0.1)
+    here, _ = places_on_rays(near, 300, CUTOFF, 0)
+    index.buckets(torch.cat([here, here + shift]))
+    former = torch.cat([torch.arange(119), torch.tensor([-1])])  # the last cone changes
+    changed = both._replace(counts=both.counts + (torch.arange(120) == 119))
+    made = index.replaced(changed, former)
+    n_lists = len(made.lists.lengths())
+    assert 0 < n_lists < len(index.lists.lengths())
+    made.buckets(here)
+    largest = made._n_levels - 1
+    assert int((made._levels[n_lists:] < largest).sum()) == 0  # those that the change can reach
+    made.buckets(here + shift)
+    assert int((made._levels[n_lists:] < largest).sum()) > 0
+
+
+def test_lists_that_are_kept_are_bounded(monkeypatch, smallest):
+    monkeypatch.setattr(cone_index, "_KEPT", 1 << 12)
+    monkeypatch.setattr(cone_index, "_BUCKETS_AT_ONCE", 16)
+    monkeypatch.setattr(point_form, "_FEW_PAIRS", 0)
+    cones = random_cones(3, 50, 2, room=True)
+    form, most = PointForm(cones, 0.1), 0
+    for step in range(6):
+        places, _ = places_on_rays(cones, 300, CUTOFF, step)
+        same_evidence(form(places), brute(cones, places, 0.1))
+        index = form.index
+        one_part = 16 * index._n_levels * (len(cones.counts) + cone_index._PER_LIST)
+        assert len(index.lists.entries) <= max(1 << 12, cone_index._KEPT_PER_CONE * 50) + one_part
+        most = max(most, len(index.lists.entries))
+    assert most > 1 << 10
+
+
+@pytest.mark.parametrize("case", ["clusters", "hundred metres", "needles", "one component", "one place"])
+def test_strange_cones_give_the_evidence_of_all(case, monkeypatch):
+    monkeypatch.setattr(point_form, "_FEW_PAIRS", 0)
+    cones = random_cones(3, 40, 7, room=True)
+    if case == "clusters":
+        far = (torch.arange(40) % 2 * 1e6)[:, None].double()
+        cones = cones._replace(means=cones.means + far, origins=cones.origins + far)
+    elif case == "hundred metres":
+        large = torch.diag(torch.tensor([100.0**2, 50.0**2, 1e-4], dtype=torch.float64))
+        cones = cones._replace(covariances=torch.cat([large[None], cones.covariances[1:]]))
+    elif case == "needles":
+        needle = torch.diag(torch.tensor([25.0, 1e-8, 1e-8], dtype=torch.float64))
+        cones = cones._replace(covariances=needle.repeat(40, 1, 1))
+    else:
+        first = torch.zeros(3000, dtype=torch.int64)
+        origins = torch.rand(3000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 6
+        if case == "one place":
+            first, origins = torch.arange(3000) % 40, origins[:1].repeat(3000, 1)
+        cones = cones.taken(first)._replace(origins=origins)
+    places, _ = places_on_rays(cones, 60, CUTOFF, 0)
+    outside = torch.tensor([[torch.inf, 0, 0], [0, -torch.inf, 1], [1e300, 0, 0], [-1e9, 5, 5]]).double()
+    found = PointForm(cones, 0.1)(torch.cat([places, outside]))
+    assert float(found.hits[-4:].abs().max() + found.misses[-4:].abs().max()) == 0
+    expected = brute(cones, places, 0.1)
+    torch.testing.assert_close(torch.stack(list(found))[:, :60], expected, rtol=1e-6, atol=1e-9)

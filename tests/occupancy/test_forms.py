@@ -21,8 +21,8 @@ Hits = Misses = torch.Tensor
 Form = Callable[[Cones, VoxelGrid], tuple[Hits, Misses]]
 
 
-def by_points(indexed: bool) -> Form:
-    return lambda cones, grid: PointForm(cones, grid.resolution, indexed=indexed)(grid.centers())
+def by_points(cones: Cones, grid: VoxelGrid) -> tuple[Hits, Misses]:
+    return PointForm(cones, grid.resolution)(grid.centers())
 
 
 def by_boxes(form: Callable[..., tuple[Hits, Misses]], **options: bool) -> Form:
@@ -48,8 +48,7 @@ def by_rays(sampling: str) -> Form:
 
 
 FORMS: dict[str, Form] = {
-    "point": by_points(indexed=True),
-    "point without index": by_points(indexed=False),
+    "point": by_points,
     "flux": by_boxes(box_flux),
     "flux, grid": by_grid,
     "cone": by_boxes(cone_evidence),
@@ -97,9 +96,8 @@ def test_no_cones_and_cones_without_rays_give_no_evidence(form, dim):
 
 
 @dims
-@pytest.mark.parametrize("form", ["point", "point without index"])
-def test_no_points_have_no_evidence(form, dim):
-    found = PointForm(random_cones(dim, 3, 0), 0.1, indexed=form == "point")(torch.zeros(0, dim))
+def test_no_points_have_no_evidence(dim):
+    found = PointForm(random_cones(dim, 3, 0), 0.1)(torch.zeros(0, dim))
     assert found.hits.shape == found.misses.shape == (0,)
 
 

@@ -1,6 +1,8 @@
 """Point form: formulas by quadrature, rays by simulation, invariances and gradients."""
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -14,8 +16,10 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
 from gmmtorch.kernels.evidence.point_evidence import pair_evidence
+from gmmtorch.occupancy import cone_index
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.evidence import occupancy_probability
+from gmmtorch.occupancy.forms import point
 from gmmtorch.occupancy.forms.point import PointEvidence, PointForm, point_evidence
 
 
@@ -126,11 +130,20 @@ def same(one, other) -> None:
     torch.testing.assert_close(one.misses, other.misses, rtol=1e-10, atol=1e-13)
 
 
+@contextmanager
+def indexed_from(n_pairs: int) -> Iterator[None]:
+    """Indices are used, down to their smallest buckets, from so many pairs of a point and a cone on."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(point, "_FEW_PAIRS", n_pairs)
+        patch.setattr(cone_index, "_FEW_PAIRS", n_pairs)
+        patch.setattr(cone_index, "_POINTS_PER_LIST", 1)
+        yield
+
+
 def every_pair(form: PointForm, points: Tensor) -> PointEvidence:
     """Every cone at every point, without any list or test of nearness."""
-    columns = form._table.columns
-    point, cone = torch.cartesian_prod(torch.arange(len(points)), torch.arange(columns.shape[1])).unbind(1)
-    shares = pair_evidence(points.T[:, None], point, columns, cone, form.resolution, form.cutoff, False)
+    point, cone = torch.cartesian_prod(torch.arange(len(points)), torch.arange(len(form.rows))).unbind(1)
+    shares = pair_evidence(points.T[:, None], point, *form._table, cone, form.resolution, form.cutoff)
     return PointEvidence(*(share.view(len(points), -1).sum(1) for share in shares))
 
 
@@ -145,12 +158,10 @@ def test_evidence_does_not_depend_on_the_index(dim, seed, resolution, cutoff):
     cones = random_cones(dim, 10, seed)
     points = near_rays(cones, 150, seed, spread=3.0)
     points = torch.cat([points, cones.origins, cones.origins + 0.6 * resolution, cones.means])
-    indexed = PointForm(cones, resolution, cutoff)
-    dense = PointForm(cones, resolution, cutoff, indexed=False)
-    assert dense.index.n_buckets == 1
-    expected = every_pair(indexed, points)
-    same(indexed(points), expected)
-    same(dense(points), expected)
+    expected = every_pair(PointForm(cones, resolution, cutoff), points)
+    for few in (0, 1 << 19):
+        with indexed_from(few):
+            same(PointForm(cones, resolution, cutoff)(points), expected)
 
 
 def test_point_evidence_does_not_depend_on_order_and_chunks(monkeypatch):
@@ -233,8 +244,9 @@ def test_evidence_is_zero_beyond_the_cutoff():
     inf = float("inf")
     places = [[-1, 0, 0], [0, 1, 0], [4, 0, 0], [1.5, 0.5, 0], [1e300, 1, 1], [inf, 0, 0], [0, -inf, inf]]
     points = torch.tensor(places, dtype=torch.float64)
-    for indexed in (True, False):
-        evidence = PointForm(cones, 0.05, indexed=indexed)(points)
+    for few in (0, 1 << 19):
+        with indexed_from(few):
+            evidence = PointForm(cones, 0.05)(points)
         assert occupancy_probability(*evidence).tolist() == [0.5] * len(places)
 
 
@@ -267,10 +279,8 @@ def test_invalid_point_queries_are_refused():
 # -- gradients -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("dim", "indexed", "round_component"), [(2, True, True), (2, False, False), (3, True, False)]
-)
-def test_gradients_of_occupancy_equal_finite_differences(dim, indexed, round_component):
+@pytest.mark.parametrize(("dim", "round_component"), [(2, True), (2, False), (3, False)])
+def test_gradients_of_occupancy_equal_finite_differences(dim, round_component):
     cones = random_cones(dim, 2, 2)
     if round_component:  # eigenvectors of equal eigenvalues have no gradient
         cones = cones._replace(covariances=0.04 * torch.eye(dim, dtype=torch.float64).repeat(2, 1, 1))
@@ -279,7 +289,7 @@ def test_gradients_of_occupancy_equal_finite_differences(dim, indexed, round_com
     def theta(x, means, factors, origins, counts):
         covariances = factors @ factors.transpose(1, 2)
         given_cones = Cones(means, covariances, origins, counts, cones.max_range)
-        return occupancy_probability(*PointForm(given_cones, 0.1, indexed=indexed)(x))
+        return occupancy_probability(*PointForm(given_cones, 0.1)(x))
 
     inputs = (points, cones.means, torch.linalg.cholesky(cones.covariances), cones.origins, cones.counts)
     inputs = tuple(value.clone().requires_grad_() for value in inputs)
@@ -298,7 +308,6 @@ def test_gradients_are_finite(dim, resolution):
     )
     points = torch.cat([points, torch.full((1, dim), 1e9, dtype=torch.float64)]).requires_grad_()
     fields = [field.clone().requires_grad_() for field in cones[:4]]
-    for indexed in (True, False):
-        evidence = PointForm(Cones(*fields, cones.max_range), resolution, indexed=indexed)(points)
-        gradients = torch.autograd.grad(occupancy_probability(*evidence).sum(), [points, *fields])
-        assert all(bool(torch.isfinite(gradient).all()) for gradient in gradients)
+    evidence = PointForm(Cones(*fields, cones.max_range), resolution)(points)
+    gradients = torch.autograd.grad(occupancy_probability(*evidence).sum(), [points, *fields])
+    assert all(bool(torch.isfinite(gradient).all()) for gradient in gradients)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -24,33 +24,25 @@ _SQRT_HALF_PI = math.sqrt(math.pi / 2)
 class PointTable(NamedTuple):
     """The quantities that pairs of a point and a cone need, in the axes V of the component, float64.
 
-    Blocks of columns, one column of each block for each axis or entry:
-        axes (D²), mean, origin, seen, variances (D each): V row by row, μ, s, Vᵀ(μ − s), and the diagonal of
-        VᵀΣV; widening, log_scale, counts, surface (1 each): h²/12 |μ − s|², the logarithm of the largest hit,
-        N, and N without no-return beams; tilts: the off-diagonal entries of VᵀΣV if `oblique`. These are
-        zero, but gradients with respect to the covariance pass through them.
-
-    columns: (n, C).
+    rows: (C, D² + 5D + 4), for each cone V row by row, μ, s, Vᵀ(μ − s), the diagonal of VᵀΣV, 1/(that +
+        h²/12), and h²/12 |μ − s|², the logarithm of the largest hit, N, and N without no-return beams.
+    tilts: (C, D(D − 1)/2), the off-diagonal entries of VᵀΣV if gradients pass through them, otherwise (C, 0).
+        They are zero.
     """
 
-    columns: Tensor
-    dim: int
-    oblique: bool
-
-    def rows(self, resolution: float) -> Tensor:
-        """Rows (C, D² + 5D + 4) for the fused kernel; 1/(variance + h²/12) stands after the variances."""
-        dim, end = self.dim, self.dim**2 + 4 * self.dim
-        sharp = 1 / (self.columns[dim * dim + 3 * dim : end] + resolution**2 / 12)
-        return torch.cat([self.columns[:end], sharp, self.columns[end : end + 4]]).T.contiguous()
+    rows: Tensor
+    tilts: Tensor
 
 
 _BODY = """
     const double h = resolution, limit = cutoff * cutoff;
     const int64_t begin = item * LANES, stop = GMM_MIN(begin + LANES, n_points);
-    vec x[DIM], hits = (vec)(0.0), misses = (vec)(0.0), number = (vec)(-1.0);
+    vec x[DIM], hits, misses, number = (vec)(-1.0);
     for (int l = 0; l < LANES; ++l) {
         const int64_t point = order[GMM_MIN(begin + l, stop - 1)];
         for (int a = 0; a < DIM; ++a) set(x[a], l, points[point * DIM + a]);
+        set(hits, l, hits_out[point]);
+        set(misses, l, misses_out[point]);
         if (begin + l < stop) set(number, l, (double)bucket[point]);
     }
     for (int first = 0; first < LANES; ++first) {  // each bucket of these points once
@@ -60,16 +52,27 @@ _BODY = """
         const int64_t list = (int64_t)mine;
         for (int64_t entry = starts[list]; entry < starts[list + 1]; ++entry) {
             const double* cone = table + entries[entry] * WIDTH;
+            GMM_FETCH(table + entries[GMM_MIN(entry + 6, starts[list + 1] - 1)] * WIDTH, WIDTH);
             const double *mean = cone + DIM * DIM, *origin = mean + DIM, *seen = origin + DIM;
             const double *variance = seen + DIM, *fixed = variance + DIM, *rest = fixed + DIM;
             vec y[DIM], z[DIM], ray[DIM];
-            vec squared_distance = (vec)(0.0), squared = (vec)(0.0);
+            vec squared_distance = (vec)(0.0), squared = (vec)(0.0), turn = (vec)(0.0);
+            double seen_squared = 0.0;
+            for (int j = 0; j < DIM; ++j) {
+                const double toward = mean[j] - origin[j];
+                ray[j] = x[j] - origin[j];
+                squared_distance += ray[j] * ray[j];
+                turn += toward * ray[j];
+                seen_squared += toward * toward;
+            }
+            // The mean is farther from the ray than the cutoff for the largest variance: a quick test.
+            const double widest = seen_squared * (1.0 - 1e-14) - limit * (variance[DIM - 1] + h * h / 12.0);
+            const mask near = widest * squared_distance - turn * turn <= GMM_MAX(limit, 9.0) * rest[0];
+            if (!any(active & near)) continue;
             for (int j = 0; j < DIM; ++j) {
                 y[j] = (vec)(0.0);
                 for (int i = 0; i < DIM; ++i) y[j] += cone[i * DIM + j] * (x[i] - mean[i]);
                 z[j] = y[j] + seen[j];
-                ray[j] = x[j] - origin[j];
-                squared_distance += ray[j] * ray[j];
                 squared += fixed[j] * y[j] * y[j];
             }
             const vec kappa = rest[0] / squared_distance;
@@ -163,7 +166,7 @@ def _kernel(dim: int) -> FusedKernel:
     return FusedKernel(
         f"point_evidence_{dim}d",
         "const double* points, const int64* order, const int64* bucket, int64 n_points, const int64* starts,"
-        " const int64* entries, const double* table, double resolution, double cutoff, double* hits_out,"
+        " const int32* entries, const double* table, double resolution, double cutoff, double* hits_out,"
         " double* misses_out",
         SIMD + body,
     )
@@ -180,24 +183,26 @@ def listed_evidence(
     rows: Tensor,
     resolution: float,
     cutoff: float,
-) -> Tensor:
-    """Hits and misses (2, M), float64, by the fused kernel.
+    found: Tensor,
+) -> None:
+    """Adds hits and misses of the points in `order` to `found` (2, M), float64, by the fused kernel.
+
+    Cones are added one after the other, so that two calls with parts of the lists equal one with both.
 
     Args:
         points: (M, D) float64.
-        order: (M,) int64, an order in which neighbours follow each other.
+        order: (R,) int64, rows of points, of which neighbours follow each other.
         bucket: (M,) int64, the list of each point; −1 for points without evidence.
-        lists: starts (B + 1,) and entries of the lists of cones, int64.
+        lists: starts (B + 1,), int64, and entries, int32, of the lists of cones.
         rows: see `PointTable.rows`.
     """
-    found = torch.empty(2, points.shape[0], dtype=torch.float64, device=points.device)
     lanes = CPU_LANES if points.device.type == "cpu" else 1
     _KERNELS[points.shape[1]](
-        (points.shape[0] + lanes - 1) // lanes,
+        (order.shape[0] + lanes - 1) // lanes,
         points.contiguous(),
         order,
         bucket,
-        points.shape[0],
+        order.shape[0],
         *lists,
         rows,
         resolution,
@@ -205,26 +210,25 @@ def listed_evidence(
         *found,
         device=points.device,
     )
-    return found
 
 
 def pair_evidence(
     points: Tensor,
     block: Tensor,
-    table: Tensor,
+    rows: Tensor,
+    tilts: Tensor,
     cone: Tensor,
     resolution: float,
     cutoff: float,
-    oblique: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Hits and misses (B, R) of R pairs of a block (R,) of points (D, B, b) and a cone (R,) of the table."""
+    """Hits and misses (B, R) of R pairs of a block (R,) of points (D, B, b) and a cone (R,) of a table."""
     dim = points.shape[0]
     h = resolution
-    columns = [column[cone] for column in table]
+    columns = rows[cone].T.contiguous().unbind()
     axes = [columns[i * dim : (i + 1) * dim] for i in range(dim)]  # axes[i][j]: entry i of axis j
     mean, origin, seen, variances = (columns[dim * dim + i * dim :][:dim] for i in range(4))
-    widening, log_scale, counts, surface = columns[dim * dim + 4 * dim :][:4]
-    tilts = columns[dim * dim + 4 * dim + 4 :] if oblique else []
+    widening, log_scale, counts, surface = columns[-4:]
+    oblique = tilts[cone].unbind(1)
 
     x = [axis[:, block] for axis in points]
     offset = [a - m for a, m in zip(x, mean, strict=True)]
@@ -238,14 +242,14 @@ def pair_evidence(
     breadth = torch.where(at_sensor, 1.0, sum_of(size))
 
     sharp = [1 / (v + h * h / 12) for v in variances]
-    squared = _product(y, y, sharp, tilts)
+    squared = _product(y, y, sharp, oblique)
     hit = (torch.exp(log_scale - 0.5 * squared) * (cutoff**2 - squared).clamp(0, 1)).clamp_max(1)
 
     kappa = widening / squared_distance
     sharp = [1 / (v + kappa) for v in variances]
-    aa, bb = _product(z, z, sharp, tilts), _product(y, z, sharp, tilts)
+    aa, bb = _product(z, z, sharp, oblique), _product(y, z, sharp, oblique)
     across = [a - bb / aa * b for a, b in zip(y, z, strict=True)]
-    squared = _product(across, across, sharp, tilts)
+    squared = _product(across, across, sharp, oblique)
     length = aa.sqrt()
     along = bb / length
     leaving = along + 0.5 * h * length / breadth
@@ -257,7 +261,7 @@ def pair_evidence(
     return hit * surface, miss * counts
 
 
-def _product(v: list[Tensor], w: list[Tensor], sharp: list[Tensor], tilts: list[Tensor]) -> Tensor:
+def _product(v: list[Tensor], w: list[Tensor], sharp: list[Tensor], tilts: Sequence[Tensor]) -> Tensor:
     """vᵀ(VᵀΣV + κI)⁻¹w, to first order in the off-diagonal entries `tilts`, which are zero."""
     dim = len(v)
     product = sum_of(g * a * b for g, a, b in zip(sharp, v, w, strict=True))

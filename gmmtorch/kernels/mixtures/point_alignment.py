@@ -102,7 +102,7 @@ def _kernel(dim: int) -> FusedKernel:
     return FusedKernel(
         f"point_alignment_{dim}d",
         "const double* points, int64 n_points, int64 n_parts, const double* rotations,"
-        " const double* translations, const int64* bucket, const int64* starts, const int64* entries,"
+        " const double* translations, const int64* bucket, const int64* starts, const int32* entries,"
         " const double* means, const double* precisions, const double* normals,"
         " double behind, double farthest, double outliers, double explained, double* sums",
         body.replace("TURNS", str(free - dim)).replace("DIM", str(dim)),
@@ -213,7 +213,7 @@ def _listed(bucket: Tensor, starts: Tensor, entries: Tensor) -> tuple[Tensor, Te
     length = starts[bucket[known] + 1] - begin
     row = torch.repeat_interleave(length)
     within = torch.arange(len(row), device=row.device) - (length.cumsum(0) - length)[row]
-    return known[row], entries[begin[row] + within]
+    return known[row], entries[begin[row] + within].long()
 
 
 def _arms(lever: Tensor) -> Tensor:

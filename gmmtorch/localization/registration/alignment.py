@@ -73,12 +73,12 @@ class AlignmentTarget:
         nothing = torch.zeros(len(means), dtype=torch.bool, device=means.device)
         # A cone whose sensor is at the component's mean is the component's ellipsoid.
         ellipsoids = Cones(means, covariances, means, surfaces.weights, nothing)
-        self.index = ConeIndex(ellipsoids, 1e-3 * blur, CUTOFF, entries_per_cone=_ENTRIES[dim])
+        self.index = ConeIndex(ellipsoids, 1e-3 * blur, CUTOFF, entries_per_cone=_ENTRIES[dim], smallest=True)
 
     def sums(self, points: Tensor, motions: Motions) -> AlignmentSums:
         """ℓ of points (N, D) under each motion, and its derivatives."""
         moved = points @ motions.rotations.mT + motions.translations[:, None]
-        lists = self.index.buckets(moved.flatten(0, 1)), self.index.starts, self.index.entries
+        lists = self.index.buckets(moved.flatten(0, 1)), *self.index.lists
         target = self.means, self.precisions, self.normals
         limits = self.blur, CUTOFF**2, _OUTLIERS, _EXPLAINED
         return alignment_sums(points, motions, lists, target, limits)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.linalg import argsort, on_cpu
+from gmmtorch.linalg import all_equal, on_cpu
 from gmmtorch.mapping.codec import lattice
 from gmmtorch.mapping.codec.bitstream import Ints, fewest_bits
 from gmmtorch.mapping.codec.lattice import PER_OCTAVE, Lattice
@@ -205,6 +205,27 @@ def _first_uses(rows: Ints) -> tuple[Ints, Ints]:
     return first[order], rank[which.reshape(-1)]
 
 
+def quantized_after(known: Components, rounded: Components, components: Components) -> Components:
+    """`quantized(components)`, which rounds only those after `known`, whose `rounded` values are given.
+
+    If the components do not begin with the known ones, all of them are rounded.
+    """
+    if not len(components.origins):
+        return components
+    k, e, s = len(known), len(known.seen_by), len(known.origins)
+    sizes = {"origins": s, "seen_by": e, "seen_from": e, "seen_count": e}
+    old = {name: values[: sizes.get(name, k)] for name, values in vars(components).items()}
+    if not k or not all_equal((old[name], values) for name, values in vars(known).items()):
+        return quantized(components)
+    if len(components) == k:
+        return rounded
+    rows = torch.arange(k, len(components), device=components.means.device)
+    both = Components.concatenate([rounded, quantized(components.selected(rows))])
+    origins = both.origins.cpu().numpy()
+    distinct, place = (torch.from_numpy(v).to(both.means.device) for v in _first_uses(origins))
+    return replace(both, origins=both.origins[distinct], seen_from=place[both.seen_from])
+
+
 # -- order and numbers -----------------------------------------------------------------------------------
 
 
@@ -228,7 +249,8 @@ def numbered(components: Components, robot: int, first: int) -> tuple[Components
     New components come last, in their spatial order.
     """
     ids, *shapes = on_cpu(components.ids, components.means, components.covariances)
-    ids, order = _numbering(ids, _order(*shapes), robot, first)
+    new = (ids[:, 1] < 0).nonzero().squeeze(1)
+    ids, order = _numbering(ids, _order(*(part[new] for part in shapes)), robot, first)
     device = components.ids.device
     arranged = replace(components.rearranged(order.to(device)), ids=ids.to(device))
     return arranged, number_after(ids, first)
@@ -242,20 +264,19 @@ def number_after(ids: Tensor, next_number: int) -> int:
 def quantize_numbered(components: Components, robot: int, first: int) -> Quantized:
     """The same as `quantize(numbered(components, robot, first)[0])`, rounding every component once."""
     values = quantize(components)
-    ids, order = _numbering(values.ids, order_of(values.places), robot, first)
+    new = (values.ids[:, 1] < 0).nonzero().squeeze(1)
+    ids, order = _numbering(values.ids, order_of(values.places.taken(new)), robot, first)
     return replace(values.reordered(order), ids=ids)
 
 
 def _numbering(ids: Tensor, by_place: Tensor, robot: int, first: int) -> tuple[Tensor, Tensor]:
-    """Ids (K, 2) after numbering, and the order (K,) of the components: numbered ones, then new ones. On the
-    CPU.
+    """Ids (K, 2) after numbering, and the order (K,) of the components: numbered ones, then new ones in the
+    order `by_place` (J,) of these. On the CPU.
     """
     is_new = ids[:, 1] < 0
-    rank = torch.zeros_like(ids[:, 0])
-    rank[by_place] = torch.arange(len(ids))
-    order = argsort(torch.where(is_new, len(ids) + rank, 0))
+    order = torch.cat([(~is_new).nonzero().squeeze(1), is_new.nonzero().squeeze(1)[by_place]])
     ids = ids[order].clone()
-    numbers = first + torch.arange(int(is_new.sum()))
+    numbers = first + torch.arange(len(by_place))
     ids[len(ids) - len(numbers) :] = torch.stack([torch.full_like(numbers, robot), numbers], 1)
     return ids, order
 

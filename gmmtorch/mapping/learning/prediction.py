@@ -16,8 +16,9 @@ from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.depth_frame import DepthFrame
 from gmmtorch.mapping.query import MANY_POINTS, cutoff_of
 from gmmtorch.occupancy.calibration import Calibrator, Prediction
+from gmmtorch.occupancy.cone_index import spectrum_of
 from gmmtorch.occupancy.cones import Cones
-from gmmtorch.occupancy.forms.point import PointEvidence, axes_of, listed_points
+from gmmtorch.occupancy.forms.point import PointEvidence, listed_points
 from gmmtorch.scan import Scan
 
 SIDES = (0.02, 0.1, 0.4)
@@ -105,7 +106,7 @@ def few_points(known: Components, points: Tensor, sides: Sequence[float]) -> tup
     cones = Cones(
         known.means[by], known.covariances[by], origins, known.seen_count[used], known.max_range[by]
     )
-    axes = axes_of(known.covariances[component])[number]
+    axes = spectrum_of(known.covariances[component])[1][number]
     return listed_points(cones, axes, points, (point, cone), sides, cutoff), len(point)
 
 

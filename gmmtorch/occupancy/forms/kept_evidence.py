@@ -7,13 +7,9 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.occupancy.cone_index import ConeIndex
-from gmmtorch.occupancy.cones import CUTOFF, Cones
+from gmmtorch.occupancy.cones import CUTOFF, Cones, former_rows
 from gmmtorch.occupancy.forms.point import PointEvidence, PointForm
 from gmmtorch.occupancy.grid import VoxelGrid, check_resolution
-
-_ENTRIES_PER_CONE = {2: 16, 3: 64}  # fewer than for one map: its lists are made again and again
-_DENSE = 4  # times as many entries, after which the index is made anew
-_MIXER = 0x1E3779B97F4A7C15
 
 
 class KeptEvidence:
@@ -29,9 +25,8 @@ class KeptEvidence:
 
     def __init__(self, resolution: float) -> None:
         self.resolution = check_resolution(resolution)
-        self._rows: Tensor | None = None
-        self._cutoff = 0.0
-        self._index: ConeIndex
+        self._form: PointForm | None = None
+        self._cones: Cones
         self._first: Tensor
         self._hits: Tensor
         self._misses: Tensor
@@ -46,25 +41,23 @@ class KeptEvidence:
             grid: cells at multiples of the resolution.
             cutoff: Mahalanobis distance beyond which a component gives no evidence.
         """
-        form = PointForm(cones, self.resolution, cutoff, indexed=False)
-        form.index, changed = self._next_index(form, cones, cutoff)
-        first = self._first_cell(grid, form.rows.device)
-        points = self.centers(grid, form.rows.device)
-        bucket = form.index.buckets(points)
+        cones = cones.checked()
+        form, changed = self._next_form(cones, cutoff)
+        first = self._first_cell(grid, cones.means.device)
+        points = self.centers(grid, cones.means.device)
         hits, misses = torch.zeros(2, *grid.shape, dtype=torch.float64, device=points.device)
-        is_known = torch.zeros(grid.shape, dtype=torch.bool, device=points.device)
-        if self._rows is not None:
+        is_asked = torch.ones(grid.shape, dtype=torch.bool, device=points.device)
+        if self._form is not None:
             new, old = _overlap(first, grid.shape, self._first, self._hits.shape)
-            hits[new], misses[new], is_known[new] = self._hits[old], self._misses[old], True
-        is_empty = bucket < 0
-        is_changed = torch.cat([changed, changed.new_zeros(1)])[bucket]  # of no bucket, −1: the last one
-        asked = (~is_empty & (is_changed | ~is_known.flatten())).nonzero().squeeze(1)
+            hits[new], misses[new], is_asked[new] = self._hits[old], self._misses[old], False
+            index = ConeIndex(changed, self.resolution, cutoff, smoothed=True, smallest=True)
+            is_asked |= (index.buckets(points) >= 0).view(grid.shape)
+        asked = is_asked.flatten().nonzero().squeeze(1)
         found = form(points[asked])
         for values, new_values in zip((hits, misses), found, strict=True):
             values.view(-1)[asked] = new_values
-            values.view(-1)[is_empty] = 0
         self.n_evaluated = len(asked)
-        self._rows, self._cutoff, self._index = form.rows, cutoff, form.index
+        self._form, self._cones = form, cones
         self._first, self._hits, self._misses = first, hits, misses
         return PointEvidence(hits, misses)
 
@@ -85,34 +78,16 @@ class KeptEvidence:
             )
         return first.long()
 
-    def _next_index(self, form: PointForm, cones: Cones, cutoff: float) -> tuple[ConeIndex, Tensor]:
-        """The index of the cones, and which of its buckets (n_buckets,) have changed."""
-        entries = _ENTRIES_PER_CONE[form.dim]
-        if self._rows is not None and self._cutoff == cutoff and self._rows.shape[1] == form.rows.shape[1]:
-            former = _former(self._rows, form.rows)
-            index, changed = self._index.replaced(cones, former)
-            if len(index.entries) <= _DENSE * entries * len(cones.counts):
-                return index, changed
-        self._rows = None
-        index = ConeIndex(cones, self.resolution, cutoff, smoothed=True, entries_per_cone=entries)
-        return index, torch.ones_like(index.keys, dtype=torch.bool)
-
-
-def _former(old: Tensor, new: Tensor) -> Tensor:
-    """For each row of `new` the number (C,) of an equal row of `old`, in rising order; −1: there is none."""
-    mixer = torch.arange(1, new.shape[1] + 1, device=new.device) * _MIXER
-    keys = []
-    for rows in (old, new):
-        bits = rows.view(torch.int64)
-        keys.append((((bits >> 29) ^ bits) * mixer).sum(1))
-    order = keys[0].argsort(stable=True)
-    if not len(order):
-        return torch.full_like(keys[1], -1)
-    place = order[torch.searchsorted(keys[0][order], keys[1]).clamp_max(len(order) - 1)]
-    is_same = (old.view(torch.int64)[place] == new.view(torch.int64)).all(1)
-    place = torch.where(is_same, place, -1)
-    before = torch.cat([place.new_full((1,), -1), place.cummax(0).values[:-1]])
-    return torch.where(place > before, place, -1)
+    def _next_form(self, cones: Cones, cutoff: float) -> tuple[PointForm, Cones]:
+        """The form of the cones, and those that are new or gone."""
+        if self._form is None or self._form.cutoff != cutoff or self._cones.dim != cones.dim:
+            self._form = None
+            return PointForm(cones, self.resolution, cutoff), cones
+        former = former_rows(self._cones, cones)
+        gone = torch.ones_like(self._cones.max_range)
+        gone[former[former >= 0]] = False
+        parts = zip(self._cones.taken(gone), cones.taken(former < 0), strict=True)
+        return self._form.replaced(cones, former), Cones(*map(torch.cat, parts))
 
 
 def _overlap(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
+import functools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -13,6 +15,7 @@ from gmmtorch.arrays import ArrayLike
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.chunks import chunked
+from gmmtorch.kernels.evidence.hull_test import Lists
 from gmmtorch.kernels.evidence.point_evidence import (
     PointTable,
     compiled_pair_evidence,
@@ -20,7 +23,7 @@ from gmmtorch.kernels.evidence.point_evidence import (
     pair_evidence,
 )
 from gmmtorch.linalg import safe_cholesky
-from gmmtorch.occupancy.cone_index import ConeIndex
+from gmmtorch.occupancy.cone_index import ConeIndex, chunks_of, replaced_rows, spectrum_of
 from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.occupancy.protocol import check_queries
@@ -43,9 +46,8 @@ class PointBlocks(NamedTuple):
 
     @classmethod
     def of(cls, points: Tensor, bucket: Tensor, index: ConeIndex) -> PointBlocks:
-        """Blocks of the points (M, D) that have a bucket (M,); points with bucket −1 are left out."""
-        point = (bucket >= 0).nonzero().squeeze(1)
-        point = point[index.in_space_order(points[point], bucket[point])]
+        """Blocks of points (M, D), at least one, in buckets (M,)."""
+        point = index.in_space_order(points, bucket)
         touched, count = torch.unique_consecutive(bucket[point], return_counts=True)
         n_points, n_touched = point.shape[0], touched.shape[0]
         size = 16 if n_points > 24 * n_touched else 4 if n_points > 4 * n_touched else 1
@@ -63,20 +65,13 @@ class PointBlocks(NamedTuple):
         owner = torch.repeat_interleave(touched, n_blocks)
         return cls(gathered.permute(2, 1, 0).contiguous(), owner, centers, radius, point, slot)
 
-    def chunks(self, index: ConeIndex) -> Iterator[slice]:
-        """Runs of blocks whose lists together have about `CHUNK_PAIRS` entries, or a single block."""
-        chunk = torch.cumsum(index.list_lengths()[self.bucket], 0) // CHUNK_PAIRS
-        begin = 0
-        for count in torch.unique_consecutive(chunk, return_counts=True)[1].tolist():
-            yield slice(begin, begin + count)
-            begin += count
-
 
 CHUNK_PAIRS = 1 << 16
 """Pairs of a point and a cone evaluated in one pass. It bounds the memory and does not change the result."""
 
 _CHUNK_POINTS = 1 << 20  # points sorted in one pass
-_FEW = 1 << 11  # for at most this many points an index does not pay
+_FARTHEST = 1e15  # metres: products of larger positions are infinite
+_FEW_PAIRS = 1 << 19  # of a point and a cone: for at most so many an index does not pay
 
 
 class PointEvidence(NamedTuple):
@@ -98,8 +93,7 @@ def point_evidence(
 
     For several calls with the same cones use a `PointForm`.
     """
-    form = PointForm(cones, resolution, cutoff, compiled=compiled, indexed=len(points) > _FEW)
-    return form(points)
+    return PointForm(cones, resolution, cutoff, compiled=compiled)(points)
 
 
 def listed_points(
@@ -113,24 +107,23 @@ def listed_points(
     """Evidence (M,) of a few points (M, D), float64, each from the cones listed for it; for cubes of several
     sides (m). Needs no index.
 
-    axes: (C, D, D), see `axes_of`. lists: point (P,) and cone (P,) of each entry; points ascend.
+    axes: (C, D, D), see `spectrum_of`. lists: point (P,) and cone (P,) of each entry; points ascend.
     """
     point, cone = lists
     tables = [_table_of(cones, axes, side) for side in resolutions]
     if not is_fused(points, axes):
         blocks, zeros = points.T[:, None].contiguous(), torch.zeros_like(points[:, 0])
         each = [
-            pair_evidence(blocks, point, table.columns, cone, side, cutoff, table.oblique)
+            pair_evidence(blocks, point, *table, cone, side, cutoff)
             for table, side in zip(tables, resolutions, strict=True)
         ]
         return [PointEvidence(*(zeros.index_add(0, point, v[0]) for v in pairs)) for pairs in each]
     order = torch.arange(len(points), device=points.device)
-    ends = torch.cumsum(torch.bincount(point, minlength=len(points)), 0)
-    starts = torch.cat([ends.new_zeros(1), ends])
-    return [
-        PointEvidence(*listed_evidence(points, order, order, (starts, cone), t.rows(side), side, cutoff))
-        for t, side in zip(tables, resolutions, strict=True)
-    ]
+    lists = Lists.of(torch.bincount(point, minlength=len(points)), cone.int())
+    found = points.new_zeros(len(tables), 2, len(points))
+    for table, side, values in zip(tables, resolutions, found, strict=True):
+        listed_evidence(points, order, order, lists, table.rows, side, cutoff, values)
+    return [PointEvidence(*values) for values in found]
 
 
 class PointForm:
@@ -157,12 +150,6 @@ class PointForm:
         resolution: h (m).
         cutoff: Mahalanobis distance beyond which a component gives no evidence.
         compiled: use torch.compile. It needs a C++ compiler, and tens of seconds for the first call.
-        indexed: True evaluates only cones near a point, found by a `ConeIndex`; False evaluates all cones,
-            which is faster for a few points.
-
-    Attributes:
-        rows: (C, n) what the evidence depends on, a row for each cone. Equal rows give equal evidence.
-        index: lists the cones near a point.
     """
 
     def __init__(
@@ -172,7 +159,6 @@ class PointForm:
         cutoff: float = CUTOFF,
         *,
         compiled: bool = False,
-        indexed: bool = True,
     ) -> None:
         self.resolution = check_resolution(resolution)
         cones = cones.checked()
@@ -180,47 +166,97 @@ class PointForm:
             raise InvalidArgumentError(f"cutoff={cutoff} must be finite and above zero.")
         self.dim, self.cutoff, self.compiled = cones.dim, float(cutoff), compiled
         safe_cholesky(cones.covariances.double().detach())  # raises if one is not positive definite
-        self._table = _table_of(cones, axes_of(cones.covariances), self.resolution)
-        self.rows = self._table.rows(self.resolution)
-        entries = None if indexed else 0
-        self.index = ConeIndex(cones, self.resolution, cutoff, smoothed=True, entries_per_cone=entries)
+        spectrum = spectrum_of(cones.covariances)
+        self._table = _table_of(cones, spectrum[1], self.resolution)
+        self._index: ConeIndex | Callable[[], ConeIndex]
+        self._index = functools.partial(
+            ConeIndex, cones, self.resolution, cutoff, smoothed=True, spectrum=spectrum
+        )
 
-    def __call__(self, points: ArrayLike) -> PointEvidence:
-        """Hits and misses at points (M, D), world metres; zero at infinite points.
+    @property
+    def index(self) -> ConeIndex:
+        """Lists the cones near a point. Made when it is needed first."""
+        if not isinstance(self._index, ConeIndex):
+            self._index = self._index()
+        return self._index
+
+    @property
+    def rows(self) -> Tensor:
+        """(C, n) what the evidence depends on, a row for each cone. Equal rows give equal evidence."""
+        return self._table.rows
+
+    def replaced(self, cones: Cones, former: Tensor) -> PointForm:
+        """The form of other cones, which keeps what it can; arguments as for `ConeIndex.replaced`."""
+        made, is_new, cones = copy.copy(self), former < 0, cones.checked()
+        new = cones.taken(is_new)
+        safe_cholesky(new.covariances.double().detach())
+        spectrum = spectrum_of(new.covariances)
+        table = _table_of(new, spectrum[1], self.resolution)
+        made._table = PointTable(
+            *(replaced_rows(rows, former, rest) for rows, rest in zip(self._table, table, strict=True))
+        )
+        if isinstance(self._index, ConeIndex):
+            made._index = functools.partial(self._index.replaced, cones, former, spectrum)
+        else:
+            made._index = functools.partial(ConeIndex, cones, self.resolution, self.cutoff, smoothed=True)
+        return made
+
+    def __call__(self, points: ArrayLike, before: PointEvidence | None = None) -> PointEvidence:
+        """Hits and misses at points (M, D), world metres; zero at infinite points. `before`: of other cones,
+        to which these are added.
 
         Raises `InvalidArgumentError` for another shape, or NaN.
         """
         query = check_queries(points, self.dim)
+        zeros = torch.zeros_like(query[:, 0])
+        before = before or PointEvidence(zeros, zeros)
 
         def evaluated(part: slice) -> PointEvidence:
-            return self._evaluate(query[part])
+            return self._evaluate(query[part], before.hits[part], before.misses[part])
 
-        parts = list(chunked(len(query), _CHUNK_POINTS, evaluated)) or [evaluated(slice(0))]
+        parts = list(chunked(len(query), _CHUNK_POINTS, evaluated)) or [before]
         hits, misses = parts[0] if len(parts) == 1 else map(torch.cat, zip(*parts, strict=True))
         return PointEvidence(hits, misses)
 
-    def _evaluate(self, points: Tensor) -> PointEvidence:
-        bucket = self.index.buckets(points)
+    def _evaluate(self, points: Tensor, hits: Tensor, misses: Tensor) -> PointEvidence:
         if is_fused(points, self.rows):
-            lists = self.index.starts, self.index.entries
-            order = self.index.in_space_order(points, bucket)
-            found = listed_evidence(points, order, bucket, lists, self.rows, self.resolution, self.cutoff)
-            return PointEvidence(*found)
-        zeros = torch.zeros_like(points[:, 0])
-        if not bool((bucket >= 0).any()):
-            return PointEvidence(zeros, zeros.clone())
-        blocks = PointBlocks.of(points, bucket, self.index)
-        parts = [self._of_blocks(blocks, part) for part in blocks.chunks(self.index)]
-        evidence = torch.cat(parts, 1).flatten(1)[:, blocks.slot]
-        hits, misses = (zeros.index_copy(0, blocks.point, values) for values in evidence)
+            return PointEvidence(*self._fused(points, torch.stack([hits, misses])))
+        for rows, number in self.index.parts(points):
+            if not len(rows):
+                continue
+            blocks = PointBlocks.of(points[rows], number, self.index)
+            chunks = chunks_of(self.index.lists.lengths()[blocks.bucket], CHUNK_PAIRS)
+            evidence = torch.cat([self._of_blocks(blocks, part) for part in chunks], 1)
+            place, (hit, miss) = rows[blocks.point], evidence.flatten(1)[:, blocks.slot]
+            hits, misses = hits.index_add(0, place, hit), misses.index_add(0, place, miss)
         return PointEvidence(hits, misses)
+
+    def _fused(self, points: Tensor, found: Tensor) -> Tensor:
+        """Adds hits and misses to `found` (2, M) by the fused kernel."""
+        settings = self.rows, self.resolution, self.cutoff, found
+        bucket = torch.zeros_like(points[:, 0], dtype=torch.int64)
+        if len(points) * len(self.rows) <= _FEW_PAIRS:
+            every = torch.arange(len(self.rows), dtype=torch.int32, device=points.device)
+            order = torch.arange(len(points), device=points.device)
+            bucket[(points.abs() > _FARTHEST).any(1)] = -1
+            listed_evidence(points, order, bucket, Lists.of(order.new_tensor([len(every)]), every), *settings)
+            return found
+        for rows, number in self.index.parts(points):
+            if len(rows) == len(points):
+                bucket, order = number, self.index.in_space_order(points, number)
+            else:
+                bucket[rows] = number
+                order = rows[self.index.in_space_order(points[rows], number)]
+            listed_evidence(points, order, bucket, self.index.lists, *settings)
+        return found
 
     def _near_cones(self, blocks: PointBlocks, part: slice) -> tuple[Tensor, Tensor]:
         """Pairs of a block (R,), counted from the start of `part`, and a cone (R,) near it."""
-        block, cone = self.index.listed(blocks.bucket[part])
-        centers, radius = blocks.centers[part], blocks.radius[part]
-        near = self.index.hulls.near(cone, centers[block], radius[block], self.compiled)
-        return block[near], cone[near]
+        bucket, index = blocks.bucket[part], self.index
+        found = index.hulls.near(
+            index.lists, bucket, blocks.centers[part], blocks.radius[part], self.compiled
+        )
+        return found.taken(torch.arange(len(bucket), device=bucket.device))
 
     def _of_blocks(self, blocks: PointBlocks, part: slice) -> Tensor:
         """Hits and misses (2, b, B) of the blocks in `part`."""
@@ -229,35 +265,30 @@ class PointForm:
         hits = points.new_zeros(points.shape[2], points.shape[1])
         misses = hits.clone()
         evaluate = compiled_pair_evidence() if self.compiled else pair_evidence
-        settings = (self.resolution, self.cutoff, self._table.oblique)
         n_rows = max(1, CHUNK_PAIRS // points.shape[1])
         for rows, cones in zip(block.split(n_rows), cone.split(n_rows), strict=True):
-            hit, miss = evaluate(points, rows, self._table.columns, cones, *settings)
+            hit, miss = evaluate(points, rows, *self._table, cones, self.resolution, self.cutoff)
             hits, misses = hits.index_add(0, rows, hit.T), misses.index_add(0, rows, miss.T)
         return torch.stack([hits, misses])
 
     def visited(self, points: Tensor) -> float:
         """Average number of cones evaluated for each of the points (M, D)."""
         query = check_queries(points, self.dim)
-        bucket = self.index.buckets(query)
-        if not bool((bucket >= 0).any()):
-            return 0.0
-        blocks = PointBlocks.of(query, bucket, self.index)
-        n_rows = sum(self._near_cones(blocks, part)[0].shape[0] for part in blocks.chunks(self.index))
-        return n_rows * blocks.points.shape[1] / query.shape[0]
-
-
-def axes_of(covariances: Tensor) -> Tensor:
-    """The axes V (C, D, D) of components with covariances (C, D, D).
-
-    V has no gradient where variances are equal. It is held constant, which is exact to first order in Σ.
-    """
-    return torch.linalg.eigh(covariances.detach().double())[1]
+        n_rows = 0
+        for rows, number in self.index.parts(query):
+            if len(rows):
+                blocks = PointBlocks.of(query[rows], number, self.index)
+                for part in chunks_of(self.index.lists.lengths()[blocks.bucket], CHUNK_PAIRS):
+                    n_rows += len(self._near_cones(blocks, part)[0]) * blocks.points.shape[1]
+        return n_rows / query.shape[0]
 
 
 def _table_of(cones: Cones, axes: Tensor, resolution: float) -> PointTable:
-    dim = cones.dim
-    covariances = cones.covariances.double()
+    """The table of cones with the axes V (C, D, D), for cubes of side `resolution` (m).
+
+    V has no gradient where variances are equal. It is held constant, which is exact to first order in Σ.
+    """
+    dim, covariances = cones.dim, cones.covariances.double()
     turned = axes.transpose(1, 2) @ covariances @ axes
     variances = turned.diagonal(dim1=1, dim2=2)
     variances = variances.clamp_min(1e-12 * float(resolution) ** 2)
@@ -266,15 +297,13 @@ def _table_of(cones: Cones, axes: Tensor, resolution: float) -> PointTable:
     seen = (axes.transpose(1, 2) @ toward[:, :, None]).squeeze(2)
     spread = resolution**2 / 12
     log_scale = -0.5 * (2 * math.pi * (variances + spread)).log().sum(1) + dim * math.log(resolution)
-    columns = [axes.flatten(1), means, origins, seen, variances]
-    columns += [
+    rows = [axes.flatten(1), means, origins, seen, variances, 1 / (variances + spread)]
+    rows += [
         spread * (toward * toward).sum(1, keepdim=True),
         log_scale[:, None],
         counts[:, None],
         (counts * ~cones.max_range)[:, None],
     ]
-    oblique = covariances.requires_grad
-    if oblique:
-        above = torch.triu_indices(dim, dim, 1, device=covariances.device)
-        columns.append(turned[:, above[0], above[1]])
-    return PointTable(torch.cat(columns, 1).T.contiguous(), dim, oblique)
+    above = torch.triu_indices(dim, dim, 1, device=covariances.device)
+    tilts = turned[:, above[0], above[1]] if covariances.requires_grad else turned.new_zeros(len(means), 0)
+    return PointTable(torch.cat(rows, 1), tilts)

@@ -8,6 +8,7 @@ from kernels.cones_for_kernels import cones_of
 from scipy.special import erfcx
 
 from gmmtorch.kernels import kernels
+from gmmtorch.kernels.evidence.hull_test import Lists
 from gmmtorch.kernels.simd import MILLS
 from gmmtorch.occupancy.cone_index import Hulls
 from gmmtorch.occupancy.cones import Cones
@@ -75,11 +76,14 @@ def test_fused_hull_tests_equal_the_twin(dim, kind, smoothed):
     cones = cones_of(dim, kind)
     points = points_of(cones)
     points = points[torch.isfinite(points).all(1)]
-    hulls, cone = Hulls(cones, 0.1, 3.0, smoothed), torch.arange(len(points)) % len(cones.means)
-    radius, found = torch.rand(len(points), generator=torch.Generator().manual_seed(0)).double(), []
+    generator = torch.Generator().manual_seed(0)
+    n_cones = len(cones.means)
+    given = Lists.of(torch.tensor([n_cones, 0, 3]), torch.randint(n_cones, (n_cones + 3,)).int())
+    lists = torch.randint(3, (len(points),), generator=generator)
+    hulls, radius, found = Hulls(cones, 0.1, 3.0, smoothed), torch.rand(len(points)).double(), []
     for choice in ("torch", "fused"):
         with kernels(choice):
-            found.append((hulls.near(cone, points, radius), hulls.near(cone, points, 0.2)))
+            found.append(hulls.near(given, lists, points, radius))
+    assert 0 < len(found[0].entries) < int(given.lengths()[lists].sum())
     for one, other in zip(*found, strict=True):
-        assert 0 < one.sum() < len(one)
         assert torch.equal(one, other)
