@@ -29,6 +29,7 @@ METHODS = ("point", "occupancy_grid", "occupancy_log_odds", "octomap")
 PLANAR = ("intel", "aces", "freiburg-101", "freiburg-campus", "orebro", "seattle")
 SOLID = ("hall", "courtyard", "street", "kinect")
 SIDES = (0.05, 0.1, 0.2, 0.4)
+SMALLEST = {"courtyard": 0.2, "street": 0.4}  # cells (m) of OctoMap, else 0.1: smaller ones take minutes
 MAX_BEAMS = 50_000
 
 
@@ -59,7 +60,7 @@ def main() -> None:
         data, test_every, sides = opened(options.data, name)
         scans = list(data)
         for side in sides:
-            names = METHODS if side >= 0.1 else METHODS[:-1]  # OctoMap takes minutes with smaller cells
+            names = METHODS if side >= SMALLEST.get(name, 0.1) else METHODS[:-1]
             protocol = Protocol(test_every, (1.0,), "beams", (side,), max_beams=MAX_BEAMS)
             try:
                 outcome = evaluate(name, scans, choose(names, methods(GaussianMap)), protocol)

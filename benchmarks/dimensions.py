@@ -192,9 +192,9 @@ def table(every: list[Cell], kept: dict[tuple[str, str], dict[str, Any]]) -> str
     for cell in every:
         size = (cell.table or "blobs", f"{cell.n:,} × {cell.dim}", cell.k)
         row = rows.setdefault(size, [""] * len(COVARIANCE_TYPES))
-        pair = [kept.get((cell.name(), method), {}) for method in ("gmmtorch", "scikit-learn")]
-        if all("seconds" in found for found in pair):
-            row[COVARIANCE_TYPES.index(cell.kind)] = comparison(*pair, bool(cell.table))
+        ours, peer = (kept.get((cell.name(), method), {}) for method in ("gmmtorch", "scikit-learn"))
+        if "seconds" in ours and "seconds" in peer:
+            row[COVARIANCE_TYPES.index(cell.kind)] = comparison(ours, peer, bool(cell.table))
     lines = [[*size, *row] for size, row in rows.items() if any(row)]
     return markdown(["cloud", "points", "K", *COVARIANCE_TYPES], lines)
 
