@@ -5,7 +5,6 @@ The predictions calibrate the map, see `occupancy.calibration`.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -24,10 +23,10 @@ from gmmtorch.scan import Scan
 SIDES = (0.02, 0.1, 0.4)
 """Sides (m) of the cubes for which a map predicts."""
 
-_BEAMS = 24  # of a window, from one scan, whose neighbourhood few components reach
-_PREDICTING = 5.0, 1.2e-3  # ms of a prediction, and of each pair of a point and a cone, on one core
+_BEAMS = 12  # of a window, from one scan, whose neighbourhood few components reach
+_PREDICTING = 3.5, 8e-4  # ms of a prediction, and of each pair of a point and a cone, on one core
 _LEARNING, _MOST = (20.0, 5e-4), 200_000  # ms of a window, and of each of its points, at most so many
-_SHARE = 0.045  # of the time of learning that predictions take
+_SHARE = 0.04  # of the time of learning that predictions take
 
 
 def predicted(
@@ -71,7 +70,7 @@ def _windows_between(n_pairs: int, n_points: int) -> int:
     """Windows from one prediction to the next, so that predictions take a small share of the time."""
     predicting = _PREDICTING[0] + _PREDICTING[1] * n_pairs
     learning = _LEARNING[0] + _LEARNING[1] * min(n_points, _MOST)
-    return math.ceil(predicting / (_SHARE * learning))
+    return max(1, round(predicting / (_SHARE * learning)))
 
 
 def _size(scan: Scan | DepthFrame) -> int:
