@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from gmmtorch.datasets import load
@@ -121,7 +121,6 @@ cloud_changes = st.one_of(
 )  # fmt: skip
 
 
-@settings(max_examples=25, deadline=None)
 @given(
     st.integers(0, 99),
     st.sampled_from(range(len(LAYOUTS))),
@@ -151,7 +150,6 @@ image_changes = st.one_of(
 )  # fmt: skip
 
 
-@settings(max_examples=25, deadline=None)
 @given(
     st.integers(0, 99),
     st.sampled_from(["16UC1", "32FC1"]),
