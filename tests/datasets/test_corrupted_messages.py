@@ -160,6 +160,7 @@ image_changes = st.one_of(
 )
 @example(0, "32FC1", (6, 8), 0, 0, ("encoding", "16UC1"))
 @example(0, "16UC1", (6, 8), 0, 0, ("width", 7))
+@example(0, "16UC1", (6, 8), 4, 0, ("data", lambda data: data[24:]))
 def test_a_depth_image_with_one_wrong_field_has_the_right_points_or_none(
     seed, encoding, shape, padding, number, change
 ):

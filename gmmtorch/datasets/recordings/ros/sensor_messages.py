@@ -95,10 +95,10 @@ def _row_bytes(shape: tuple[int, int], item: int, step: int, most_padding: int, 
     Raises `DataError` otherwise: if one of the sizes is wrong, the items would be others.
     """
     height, width = shape
-    if 0 < height * width * item == n_bytes:
+    is_padded = height > 1 and 0 < step - width * item < most_padding
+    if 0 < height * width * item == n_bytes and not is_padded:
         return width * item
-    padding = step - width * item
-    if height > 1 and height * step == n_bytes and 0 <= padding < most_padding:
+    if is_padded and height * step == n_bytes:
         return step
     raise DataError(
         f"{height} × {width} items of {item} bytes, in rows of {step} bytes, do not fit the {n_bytes} bytes "
