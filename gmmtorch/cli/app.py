@@ -189,8 +189,12 @@ def _raising() -> Iterator[None]:
             os.environ[_FULL_ERROR] = before
 
 
-def _with_memory(run: Callable[[DictConfig], Any], config: DictConfig) -> Any:
-    """The result of a command. Raises `MemoryLimitError` if the memory of the device is too small."""
+def _result_of(run: Callable[[DictConfig], Any], config: DictConfig) -> Any:
+    """The result of a command.
+
+    Raises `MissingDataError` for an input that does not exist, before the imports that take seconds, and
+    `MemoryLimitError` if the memory of the device is too small.
+    """
     common.check_inputs(config)
     try:
         return run(config)
@@ -209,13 +213,13 @@ def _guarded(run: Callable[[DictConfig], Any], config: DictConfig) -> Any:
     end_with_parent()  # a job of a sweep in its own process ends if the sweep's process ends
     if not common.is_job_of_sweep():
         try:
-            return _with_memory(run, config)
+            return _result_of(run, config)
         except GmmTorchError as error:
             sys.exit(f"gmmtorch: error: {error}")
     note = common.run_dir() / ERROR_FILE
     note.unlink(missing_ok=True)  # of an earlier sweep in this folder
     try:
-        return _with_memory(run, config)
+        return _result_of(run, config)
     except GmmTorchError as error:
         text = str(error)
     except Exception as error:

@@ -154,8 +154,7 @@ class Dataset(Sequence[Scan]):
     @property
     def skipped(self) -> dict[str, int]:
         """Reason → number of scans that are left out for it, returned without points because their
-        data is unusable, or not deskewed, or that lack points whose times or
-        coordinates are wrong.
+        data is unusable, or not deskewed, or that lack points whose times or coordinates are wrong.
 
         Empty if nothing is wrong. Damage inside a scan is counted when that scan is read, so the counts are
         final after the last scan.

@@ -19,7 +19,7 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation import queries
 from gmmtorch.evaluation.queries import OCCUPIED
-from gmmtorch.occupancy.calibration import N_BINS, Calibrator, Prediction
+from gmmtorch.occupancy.calibrator import N_BINS, Calibrator, Prediction
 from gmmtorch.occupancy.evidence import CellClass, classify
 from gmmtorch.scan import Scan
 
@@ -101,7 +101,7 @@ def scores(theta: Tensor, labels: Tensor) -> dict[str, float]:
 
 
 def reliability_of(tally: Tensor) -> Reliability:
-    """Reliability curve of a tally (15, 6) of predictions, see `occupancy.calibration.Calibrator`.
+    """Reliability curve of a tally (15, 6) of predictions, see `occupancy.calibrator.Calibrator`.
 
     Neighbouring bins are pooled until they hold 20 predictions; the last one may have fewer.
     """

@@ -30,7 +30,7 @@ from gmmtorch.mapping.query_options import (
     Sampling,
     check_method,
 )
-from gmmtorch.occupancy.calibration import Calibration
+from gmmtorch.occupancy.calibrator import Calibration
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import VoxelGrid, check_resolution
 from gmmtorch.occupancy.protocol import check_queries, check_scan
@@ -58,7 +58,7 @@ class GaussianMap(MapState):
         codec: rounding of components in files and queries: "quantized", about 10 bytes a component, or
             "float", every number as it is.
         prior: None: probabilities are calibrated: the map predicts each window before it learns from it, see
-            `occupancy.calibration`. A number N_p: they follow from counts, as in the thesis (3.9).
+            `occupancy.calibrator`. A number N_p: they follow from counts, as in the thesis (3.9).
         cutoff: Mahalanobis distance at which a component ends. None: 3 if components have many points (a
             median of at least 50 for each viewpoint), otherwise 5.
         n_samples: number of rays of method "monte_carlo", drawn from the whole map.

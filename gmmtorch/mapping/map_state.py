@@ -22,7 +22,7 @@ from gmmtorch.mapping.learning.rules import LearningRule, WindowedRule, read_rul
 from gmmtorch.mapping.learning.windows import BeforeWindow, absorb, learn_window, no_prediction
 from gmmtorch.mapping.query import Query
 from gmmtorch.mapping.query_options import QueryOptions
-from gmmtorch.occupancy.calibration import Calibrator
+from gmmtorch.occupancy.calibrator import Calibrator
 from gmmtorch.scan import Scan
 
 _LONGEST_WINDOW = 40  # scans, if no scan yet shows how many points it holds
@@ -118,7 +118,7 @@ class MapState(DeviceModule):
     @property
     def predictions(self) -> dict[float, Tensor]:
         """What the map predicted and then saw: a tally (15, 6) for each side (m) of cubes that it predicted,
-        as in `occupancy.calibration.Calibrator`."""
+        as in `occupancy.calibrator.Calibrator`."""
         if self._calibrator is None:
             return {}
         return {

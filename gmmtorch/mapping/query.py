@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.mapping.query_options import QueryOptions, check_method
-from gmmtorch.occupancy.calibration import Calibration
+from gmmtorch.occupancy.calibrator import Calibration
 from gmmtorch.occupancy.cone_index import ConeIndex
 from gmmtorch.occupancy.cones import CUTOFF, Cones, former_rows
 from gmmtorch.occupancy.culling import Pairs

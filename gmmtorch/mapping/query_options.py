@@ -9,7 +9,7 @@ from gmmtorch.errors import InvalidArgumentError, check_choice, check_prior, che
 from gmmtorch.mapping.learning.rules import LearningRule
 
 if TYPE_CHECKING:
-    from gmmtorch.occupancy.calibration import Calibration
+    from gmmtorch.occupancy.calibrator import Calibration
 else:
     Calibration = Any  # its module loads torch
 
@@ -26,7 +26,7 @@ SAMPLINGS: tuple[str, ...] = get_args(Sampling)
 class QueryOptions:
     """How a map answers queries. No option changes what the map stores.
 
-    prior: None: probabilities are calibrated, see `occupancy.calibration`. A number N_p: they follow from
+    prior: None: probabilities are calibrated, see `occupancy.calibrator`. A number N_p: they follow from
         counts, with N_p added to each outcome, as in the thesis (3.9).
     cutoff: Mahalanobis distance at which a component ends. None: 3 if components have many points (the
         median support is at least 50), so that tails do not claim unseen space; otherwise 5, because few

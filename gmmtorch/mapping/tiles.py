@@ -32,7 +32,7 @@ from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.query import Query, mean_range, rule_of
 from gmmtorch.mapping.query_options import check_method
 from gmmtorch.mapping.tile_index import INDEX, read_index, tile_name
-from gmmtorch.occupancy.calibration import Calibration
+from gmmtorch.occupancy.calibrator import Calibration
 from gmmtorch.occupancy.evidence import Rule, probability
 from gmmtorch.occupancy.forms.point import PointEvidence
 from gmmtorch.occupancy.grid import check_resolution

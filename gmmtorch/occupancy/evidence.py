@@ -20,7 +20,7 @@ from gmmtorch.kernels.rays.cell_entropy import bernoulli_entropy as bernoulli_en
 from gmmtorch.kernels.rays.cell_entropy import occupancy_probability as occupancy_probability
 from gmmtorch.kernels.rays.ray_counting import count_in_grid
 from gmmtorch.kernels.rays.ray_traversal import CHUNK_VISITS
-from gmmtorch.occupancy.calibration import Calibration
+from gmmtorch.occupancy.calibrator import Calibration
 from gmmtorch.occupancy.grid import VoxelGrid
 from gmmtorch.occupancy.voxels.boxes import flat_index
 

@@ -23,7 +23,7 @@ from gmmtorch.errors import MissingDataError
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.tiles import TiledMap
-from gmmtorch.occupancy.calibration import Calibration
+from gmmtorch.occupancy.calibrator import Calibration
 
 Run = Callable[..., Finished]
 OPTIONS = ["dataset=carmen", "map.window=3", "tile=4", *QUIET]

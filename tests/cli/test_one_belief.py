@@ -19,7 +19,7 @@ from gmmtorch.live.mapper.map_publisher import MapPublisher
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.tile_merging import tile_files
 from gmmtorch.mapping.tiles import TiledMap
-from gmmtorch.occupancy.calibration import Calibration
+from gmmtorch.occupancy.calibrator import Calibration
 from gmmtorch.occupancy.evidence import Thresholds
 from gmmtorch.occupancy.grid import VoxelGrid
 from gmmtorch.report.maps import map_images
@@ -55,7 +55,7 @@ def file(built: GaussianMap, tmp_path: Path) -> Path:
 
 
 def believed(built: GaussianMap, grid: VoxelGrid) -> Tensor:
-    """The probabilities of a grid, from its hits and misses by the formula of `occupancy.calibration`."""
+    """The probabilities of a grid, from its hits and misses by the formula of `occupancy.calibrator`."""
     evidence = GaussianMap.of(built.components(), prior=1.0).evidence(grid)
     return UNUSUAL.probability(evidence.hits, evidence.misses, grid.resolution, grid.dim)
 

@@ -24,7 +24,7 @@ from gmmtorch.evaluation.calibration import (
     scores_of,
 )
 from gmmtorch.evaluation.queries import hit_and_free
-from gmmtorch.occupancy.calibration import N_BINS, Calibrator
+from gmmtorch.occupancy.calibrator import N_BINS, Calibrator
 from gmmtorch.occupancy.evidence import occupancy_probability
 from gmmtorch.scan import Scan
 

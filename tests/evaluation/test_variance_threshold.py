@@ -16,7 +16,7 @@ from gmmtorch.evaluation.studies.variance_threshold import (
 )
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule
-from gmmtorch.occupancy.calibration import Calibration
+from gmmtorch.occupancy.calibrator import Calibration
 from gmmtorch.occupancy.evidence import probability
 from gmmtorch.occupancy.forms.point import PointEvidence
 from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence

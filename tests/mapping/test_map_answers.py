@@ -17,7 +17,7 @@ from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.query import Query, cutoff_by_support
 from gmmtorch.mapping.query_options import METHODS, QueryOptions
 from gmmtorch.occupancy import cone_index
-from gmmtorch.occupancy.calibration import Calibration
+from gmmtorch.occupancy.calibrator import Calibration
 from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.forms import point as point_form
 from gmmtorch.occupancy.grid import VoxelGrid

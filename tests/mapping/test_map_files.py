@@ -27,7 +27,7 @@ from gmmtorch.mapping.components import UNNUMBERED
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
 from gmmtorch.mapping.query_options import QueryOptions
-from gmmtorch.occupancy.calibration import Calibration
+from gmmtorch.occupancy.calibrator import Calibration
 
 # -- saved and loaded ------------------------------------------------------------------------------------
 

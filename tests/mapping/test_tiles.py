@@ -21,7 +21,7 @@ from gmmtorch.mapping.query_options import QueryOptions
 from gmmtorch.mapping.tile_index import INDEX
 from gmmtorch.mapping.tile_merging import canonical, merge, tile_files
 from gmmtorch.mapping.tiles import TiledMap
-from gmmtorch.occupancy.calibration import Calibration
+from gmmtorch.occupancy.calibrator import Calibration
 
 SIDE = 10.0
 KNOWN = Calibration.prior(8.0)

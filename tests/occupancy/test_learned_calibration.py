@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.occupancy import calibration as module
-from gmmtorch.occupancy.calibration import Calibration, Calibrator, Prediction
+from gmmtorch.occupancy import calibrator as module
+from gmmtorch.occupancy.calibrator import Calibration, Calibrator, Prediction
 from gmmtorch.occupancy.evidence import Evidence, probability
 from gmmtorch.occupancy.grid import VoxelGrid
 

@@ -13,7 +13,7 @@ from mapping.random_components import random_components
 
 from gmmtorch.mapping.codec.quantization import spatial_order
 from gmmtorch.mapping.components import Components
-from gmmtorch.occupancy.calibration import Calibration, Calibrator
+from gmmtorch.occupancy.calibrator import Calibration, Calibrator
 from gmmtorch.sharing.messages.fields import pose_of
 from gmmtorch.sharing.messages.message_registry import (
     CODECS,

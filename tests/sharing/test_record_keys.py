@@ -14,7 +14,7 @@ from sharing.message_examples import examples
 from sharing.schedules import act
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.occupancy.calibration import Calibrator
+from gmmtorch.occupancy.calibrator import Calibrator
 from gmmtorch.sharing.messages.count_messages import counts_of
 from gmmtorch.sharing.messages.message_registry import ComponentsMessage, decode, encode_components
 from gmmtorch.sharing.messages.record_messages import CountersMessage

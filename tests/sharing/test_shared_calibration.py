@@ -14,7 +14,7 @@ from mapping.random_components import random_components
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.occupancy.calibration import Calibration, Calibrator
+from gmmtorch.occupancy.calibrator import Calibration, Calibrator
 from gmmtorch.sharing.messages.message_registry import CalibrationMessage, decode
 from gmmtorch.sharing.messages.record_messages import encode_record
 from gmmtorch.sharing.replica.record_keys import first_key

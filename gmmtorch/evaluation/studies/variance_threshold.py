@@ -19,7 +19,7 @@ from gmmtorch.evaluation.queries import FREE, OCCUPIED
 from gmmtorch.evaluation.studies.study_options import COUNTS, VarianceThresholdStudy
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.query import Query
-from gmmtorch.occupancy.calibration import Calibration
+from gmmtorch.occupancy.calibrator import Calibration
 from gmmtorch.occupancy.evidence import CellClass, classify, probability
 from gmmtorch.occupancy.forms.point import PointEvidence
 from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence

@@ -18,7 +18,7 @@ from torch import Tensor
 from gmmtorch.datasets.base import Dataset, Ranges
 from gmmtorch.datasets.recordings.ros.bag_poses import Record
 from gmmtorch.datasets.recordings.ros.bag_topics import Sensor
-from gmmtorch.datasets.recordings.ros.depth_camera import DepthCamera
+from gmmtorch.datasets.recordings.ros.image_camera import ImageCamera
 from gmmtorch.datasets.recordings.ros.point_times import Rate
 from gmmtorch.datasets.recordings.ros.pose_sources import PoseSource, Standing, TfPoses
 from gmmtorch.datasets.recordings.ros.scan_conversion import ScanConversion
@@ -121,7 +121,7 @@ class LiveScans(Dataset):
         self.newest: LiveScan | None = None
         self.n_dropped = 0
         camera = options.pixel_stride, options.depth_scale, options.intrinsics
-        self._camera = DepthCamera(sensor, None, *camera) if sensor.is_camera else None
+        self._camera = ImageCamera(sensor, None, *camera) if sensor.is_camera else None
         self._sensor, self._tree, self._options = sensor, tree, options
         self._waiting: deque[_Waiting] = deque()
         self._waiting_bytes = 0

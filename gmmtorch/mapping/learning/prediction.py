@@ -1,6 +1,6 @@
 """Predict, then learn: what a map says about a window's beams before it learns from them.
 
-The predictions calibrate the map, see `occupancy.calibration`.
+The predictions calibrate the map, see `occupancy.calibrator`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torch import Tensor
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.depth_frame import DepthFrame
 from gmmtorch.mapping.query import MANY_POINTS, cutoff_of
-from gmmtorch.occupancy.calibration import Calibrator, Prediction
+from gmmtorch.occupancy.calibrator import Calibrator, Prediction
 from gmmtorch.occupancy.cone_index import spectrum_of
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.forms.point import PointEvidence, listed_points

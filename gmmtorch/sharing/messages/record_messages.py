@@ -16,7 +16,7 @@ from torch import Tensor
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter
 from gmmtorch.mapping.codec.quantization import LARGEST_COUNT, NO_COUNT, count_steps
-from gmmtorch.occupancy.calibration import N_BYTES, Calibration
+from gmmtorch.occupancy.calibrator import N_BYTES, Calibration
 from gmmtorch.sharing.messages.count_messages import counts_of
 from gmmtorch.sharing.messages.envelope import FARTHEST, MAX_BYTES, Kind, make_datagram, split
 from gmmtorch.sharing.messages.fields import (

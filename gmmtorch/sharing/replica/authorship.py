@@ -13,7 +13,7 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.codec.quantization import NO_COUNT, order_of, quantize, quantized
 from gmmtorch.mapping.components import Components
-from gmmtorch.occupancy.calibration import Calibration
+from gmmtorch.occupancy.calibrator import Calibration
 from gmmtorch.sharing.messages.component_messages import fitted
 from gmmtorch.sharing.messages.envelope import split
 from gmmtorch.sharing.messages.fields import pose_of

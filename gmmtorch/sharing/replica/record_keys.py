@@ -198,16 +198,8 @@ END = 1 << (ROBOT_BITS + SEQUENCE_BITS)
 WORLD = -1
 """The frame of records of authors that have no frame of their own; other frames have the number of their
 author."""
-RECORD_KINDS = frozenset(
-    {
-        Kind.COMPONENTS,
-        Kind.SUPERSESSION,
-        Kind.COUNTERS,
-        Kind.CORRECTION,
-        Kind.FRAME,
-        Kind.CALIBRATION,
-    }
-)
+_OTHER_RECORDS = {Kind.SUPERSESSION, Kind.COUNTERS, Kind.CORRECTION, Kind.FRAME, Kind.CALIBRATION}
+RECORD_KINDS = frozenset({Kind.COMPONENTS} | _OTHER_RECORDS)
 """Kinds of datagrams that contain records."""
 
 

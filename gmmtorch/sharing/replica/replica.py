@@ -14,7 +14,7 @@ from torch import Tensor
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.occupancy.calibration import Calibration
+from gmmtorch.occupancy.calibrator import Calibration
 from gmmtorch.scan import ArrayLike
 from gmmtorch.sharing.messages.envelope import MAX_BYTES
 from gmmtorch.sharing.messages.message_registry import ComponentsMessage, Message, decode

@@ -14,8 +14,8 @@ from gmmtorch.datasets.base import Dataset, Ranges, require_path
 from gmmtorch.datasets.recordings.ros import bag_topics
 from gmmtorch.datasets.recordings.ros.bag_poses import BagSurvey, Record
 from gmmtorch.datasets.recordings.ros.bag_reader import BagReader, RawMessage
-from gmmtorch.datasets.recordings.ros.depth_camera import DepthCamera
 from gmmtorch.datasets.recordings.ros.gyroscope import read_gyroscope, sensor_turns
+from gmmtorch.datasets.recordings.ros.image_camera import ImageCamera
 from gmmtorch.datasets.recordings.ros.point_times import Rate
 from gmmtorch.datasets.recordings.ros.pose_sources import RegisteredPoses
 from gmmtorch.datasets.recordings.ros.scan_conversion import ScanConversion
@@ -77,7 +77,7 @@ def open_rosbag(
     if sensor.is_camera and intrinsics is None:
         info = bag_topics.choose_camera_info(reader, sensor.topic.name, camera_info)
     survey = BagSurvey(reader, sensor, info, poses, frame, extrinsic, max_gap)
-    camera = DepthCamera(sensor, survey.camera_info(), pixel_stride, depth_scale, intrinsics)
+    camera = ImageCamera(sensor, survey.camera_info(), pixel_stride, depth_scale, intrinsics)
     options = sensor_frame, clock, deskew, imu_topic
     if sensor.is_camera:
         return DepthBag(reader, sensor, survey, ranges, stride, *options, camera)
@@ -106,7 +106,7 @@ class RosBag(Dataset):
         clock: str,
         deskew: bool,
         imu_topic: str | None,
-        camera: DepthCamera | None = None,
+        camera: ImageCamera | None = None,
     ) -> None:
         super().__init__(reader.path.stem, ranges, stride)
         self._reader, self._camera, self._clock = reader, camera, clock
@@ -259,7 +259,7 @@ class DepthBag(RosBag):
     `image` returns the full depth image of a scan, without lens distortion.
     """
 
-    _camera: DepthCamera
+    _camera: ImageCamera
 
     @property
     def intrinsics(self) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor
 from gmmtorch.datasets.base import Ranges
 from gmmtorch.datasets.recordings.ros import bag_topics, sensor_messages
 from gmmtorch.datasets.recordings.ros.bag_topics import Sensor
-from gmmtorch.datasets.recordings.ros.depth_camera import DepthCamera
+from gmmtorch.datasets.recordings.ros.image_camera import ImageCamera
 from gmmtorch.datasets.recordings.ros.point_times import N_SAMPLES, PointTimes, Rate
 from gmmtorch.datasets.recordings.ros.pose_sources import PoseSource, RegisteredPoses
 from gmmtorch.datasets.recordings.ros.sensor_messages import Reading
@@ -46,7 +46,7 @@ class ScanConversion:
         ranges: Ranges,
         source: PoseSource,
         deskew: bool = True,
-        camera: DepthCamera | None = None,
+        camera: ImageCamera | None = None,
     ) -> None:
         self.source, self._camera = source, camera
         self._sensor, self._ranges = sensor, ranges

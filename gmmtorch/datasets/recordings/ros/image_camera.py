@@ -1,4 +1,4 @@
-"""DepthCamera: depth images as points, by the CameraInfo of their camera.
+"""ImageCamera: depth images as points, by the CameraInfo of their camera.
 
 K and P of a CameraInfo are those of the whole image at full resolution (REP 104): K of raw images, with lens
 distortion D, and P of rectified ones.
@@ -46,7 +46,7 @@ class _Model(NamedTuple):
     raw: Tensor | None = None
 
 
-class DepthCamera:
+class ImageCamera:
     """Points of the depth images of a topic.
 
     Args:
