@@ -26,6 +26,8 @@ from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 _RAYS_AT_ONCE = 1 << 20
 _CELLS_AT_ONCE = 1 << 20
 _SHARP_CUTOFF = 3.0
+_MANY_ASKED = 1 << 18
+"""Points after which a map probably does not change soon, so that all its cones get one index."""
 MANY_POINTS = 50
 """A viewpoint with this count shows where a surface ends."""
 
@@ -95,6 +97,7 @@ class Query:
             self._parts = [_Part(cones, {}, {})]
         else:
             self._parts = [_Part(cones.taken(rows), {}, {}) for rows in (settled, ~settled)]
+        self._n_asked = 0
 
     def replaced(self, cones: Cones, options: QueryOptions, settled: Tensor | None = None) -> Query:
         """The answers about other cones; arguments as for `Query`. Lists of settled cones stay."""
@@ -172,6 +175,9 @@ class Query:
 
     def _at_points(self, points: Tensor, resolution: float) -> PointEvidence:
         """Evidence of the point form. The sum over all cones has one order, however they are kept."""
+        if len(self._parts) > 1 and self._n_asked > _MANY_ASKED:  # one index is faster for more points
+            self._parts = [_Part(self.cones, {}, {})]
+        self._n_asked += len(points)
         found = None
         for part in self._parts:
             if resolution not in part.forms:
