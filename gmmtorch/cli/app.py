@@ -51,6 +51,8 @@ def start(name: str, run: Callable[[DictConfig], Any]) -> None:
     except KeyboardInterrupt:
         print("gmmtorch: interrupted; all files that were written are complete.", file=sys.stderr)
         sys.exit(130)
+    finally:
+        common.drop_unwritable()
 
 
 def _print_any_text() -> None:

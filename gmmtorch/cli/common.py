@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -69,6 +71,19 @@ def is_job_of_sweep() -> bool:
         return False
     config = HydraConfig.get()
     return config.mode == RunMode.MULTIRUN and config.output_subdir is not None
+
+
+def drop_unwritable() -> None:
+    """Drops text that standard error does not take, as on a full disk, and all later text.
+
+    It would stay in a buffer, so that each later write fails, and Python exits with status 120.
+    """
+    try:
+        sys.stderr.flush()
+    except OSError:
+        if sys.__stderr__ is not None and sys.stderr is sys.__stderr__:
+            with Path(os.devnull).open("wb") as nothing:
+                os.dup2(nothing.fileno(), sys.__stderr__.fileno())
 
 
 def check_inputs(config: DictConfig) -> None:

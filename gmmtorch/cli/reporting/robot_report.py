@@ -141,6 +141,9 @@ class _StatusLine(logging.Handler):
             else:
                 sys.stderr.write(line + "\n")
             sys.stderr.flush()
+        except OSError:
+            common.drop_unwritable()
+            raise
         finally:
             self.release()
 
