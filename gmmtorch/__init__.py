@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from gmmtorch import datasets as datasets
     from gmmtorch import mixture as mixture
     from gmmtorch import sharing as sharing
-    from gmmtorch.baselines.occupancy_grid import OccupancyGrid as OccupancyGrid
     from gmmtorch.errors import GmmTorchError as GmmTorchError
     from gmmtorch.localization.registration.registration import register as register
     from gmmtorch.mapping.components import Components as Components
@@ -41,6 +40,7 @@ if TYPE_CHECKING:
     from gmmtorch.mixture.streaming.stream_fit import fit_stream as fit_stream
     from gmmtorch.occupancy.evidence import Evidence as Evidence
     from gmmtorch.occupancy.grid import VoxelGrid as VoxelGrid
+    from gmmtorch.occupancy.occupancy_grid import OccupancyGrid as OccupancyGrid
     from gmmtorch.scan import Scan as Scan
 
 try:
@@ -60,7 +60,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "HierarchicalGaussianMixture": "mixture.estimators.trees.hierarchical",
         "IncrementalRule": "mapping.learning.rules",
         "NoveltyRule": "mapping.learning.rules",
-        "OccupancyGrid": "baselines.occupancy_grid",
+        "OccupancyGrid": "occupancy.occupancy_grid",
         "RiemannianGaussianMixture": "mixture.estimators.riemannian",
         "Scan": "scan",
         "SlicedWassersteinGaussianMixture": "mixture.estimators.sliced_wasserstein",

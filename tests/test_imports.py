@@ -147,7 +147,7 @@ def test_the_package_a_replica_and_the_public_names_load_only_what_they_use():
 import sys
 import gmmtorch
 print(*sys.modules)
-from gmmtorch.sharing import Replica
+from gmmtorch.team.sharing import Replica
 print(*sys.modules)
 for name in gmmtorch.__all__:
     getattr(gmmtorch, name)
@@ -156,7 +156,7 @@ print(*sys.modules)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     package, replica, public = (set(line.split()) for line in done.stdout.splitlines())
     assert not {"torch", "sklearn", "open3d", "scipy", "matplotlib", "numpy", "hydra"} & package
-    assert "gmmtorch.sharing.replica" in replica
+    assert "gmmtorch.team.sharing.replica" in replica
     assert not {"sklearn", "scipy", "matplotlib", "open3d", "hydra", "tensorboard"} & replica
     assert "torch" in public
     assert not {"open3d", "hydra", "matplotlib"} & public

@@ -16,7 +16,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError, MissingDataError, check_whole
-from gmmtorch.evaluation.events import Row
+from gmmtorch.events import Row
 from gmmtorch.report.table import format_table
 
 if TYPE_CHECKING:

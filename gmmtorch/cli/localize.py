@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from omegaconf import DictConfig
 
 from gmmtorch.cli import app, common
+from gmmtorch.cli.options import schema
 from gmmtorch.errors import InvalidArgumentError, check_choice
 from gmmtorch.report.progress import ProgressBars
 
@@ -25,7 +26,7 @@ TABLE = "dataset n_scans n_found n_lost_runs ate rpe ate_degrees deviation scans
 def main() -> None:
     """Entry point of the command."""
     sys.argv[1:] = overrides(sys.argv[1:])
-    app.start("localize", run)
+    app.start("localize", run, schema.register)
 
 
 def overrides(words: Sequence[str]) -> list[str]:
@@ -38,9 +39,9 @@ def run(config: DictConfig) -> None:
     from gmmtorch.cli.from_options import maps
     from gmmtorch.cli.from_options.scans import open_dataset
     from gmmtorch.cli.reporting import localization_outputs
-    from gmmtorch.evaluation.trajectories import ALIGNMENTS
     from gmmtorch.localization import Tracker
     from gmmtorch.localization.odometry.recorded_poses import MOTIONS
+    from gmmtorch.localization.trajectories import ALIGNMENTS
 
     if not config.map.path:
         raise InvalidArgumentError("map is not set; give map=FILE, a map file or a run directory.")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from omegaconf import DictConfig
 
 from gmmtorch.cli import app, common
+from gmmtorch.cli.options import schema
 from gmmtorch.cli.view import open_live_view, serve
 from gmmtorch.errors import check_resolution
 from gmmtorch.report.progress import ProgressBars
@@ -26,7 +27,7 @@ TABLE = (
 
 def main() -> None:
     """Entry point of the command."""
-    app.start("map", run)
+    app.start("map", run, schema.register)
 
 
 def run(config: DictConfig) -> None:

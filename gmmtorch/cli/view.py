@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from omegaconf import DictConfig
 
 from gmmtorch.cli import app, common
+from gmmtorch.cli.options import schema
 from gmmtorch.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ _FLAGS_WITH_A_VALUE |= {"--config-name", "-cn", "--config-dir", "-cd"}
 def main() -> None:
     """Entry point of the command."""
     sys.argv[1:] = overrides(sys.argv[1:])
-    app.start("view", run)
+    app.start("view", run, schema.register)
 
 
 def overrides(words: Sequence[str]) -> list[str]:

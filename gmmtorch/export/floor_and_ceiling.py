@@ -15,7 +15,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.components import Components
 
 if TYPE_CHECKING:
-    from gmmtorch.baselines.occupancy_grid import OccupancyGrid
+    from gmmtorch.occupancy.occupancy_grid import OccupancyGrid
 
 _UPRIGHT = 0.9
 """Least |n_z| of the normal of a horizontal surface: 26 degrees."""

@@ -11,10 +11,10 @@ import torch
 from pillar_room import timeless
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.studies.approximation_error import map_rows, run, sweep_rows
-from gmmtorch.evaluation.studies.error_scenes import Scene, cast_rays, methods, random_scene
-from gmmtorch.evaluation.studies.study_options import ApproximationErrorStudy
-from gmmtorch.report.studies.approximation_error_figures import figures
+from gmmtorch.experiments.report.approximation_error_figures import figures
+from gmmtorch.experiments.studies.approximation_error import map_rows, run, sweep_rows
+from gmmtorch.experiments.studies.error_scenes import Scene, cast_rays, methods, random_scene
+from gmmtorch.experiments.studies.study_options import ApproximationErrorStudy
 
 SMALL = ApproximationErrorStudy(
     dims=(2,),

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from evaluation.pillar_room import room_scans
 
-from gmmtorch.evaluation.held_out import Protocol, evaluate
-from gmmtorch.evaluation.methods import Form, MapFactory, methods
-from gmmtorch.evaluation.studies import auc_memory
-from gmmtorch.evaluation.studies.auc_memory import Sized
+from gmmtorch.experiments.evaluation.held_out import Protocol, evaluate
+from gmmtorch.experiments.evaluation.methods import Form, MapFactory, methods
+from gmmtorch.experiments.studies import auc_memory
+from gmmtorch.experiments.studies.auc_memory import Sized
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import WindowedRule
 

@@ -12,17 +12,17 @@ from sklearn.cluster import MeanShift
 
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.fits.fit_comparison import FitData, Row, split
-from gmmtorch.evaluation.protocol_options import FitOptions
-from gmmtorch.evaluation.studies import component_count
-from gmmtorch.evaluation.studies.component_count import (
+from gmmtorch.experiments.evaluation.fits.fit_comparison import FitData, Row, split
+from gmmtorch.experiments.evaluation.protocol_options import FitOptions
+from gmmtorch.experiments.studies import component_count
+from gmmtorch.experiments.studies.component_count import (
     RULES,
     component_bytes,
     count_modes,
     middle,
     run,
 )
-from gmmtorch.evaluation.studies.study_options import ComponentCountStudy
+from gmmtorch.experiments.studies.study_options import ComponentCountStudy
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mixture import GaussianMixture
 from gmmtorch.scan import Scan

@@ -10,12 +10,12 @@ import torch
 from pillar_room import timeless
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.events import ignore
-from gmmtorch.evaluation.fits.fit_comparison import FitData, Row, compare, split
-from gmmtorch.evaluation.protocol_options import FitOptions
-from gmmtorch.evaluation.studies import initialization_study as initialization
-from gmmtorch.evaluation.studies.initialization_study import box_covariances, fit_timed, run
-from gmmtorch.evaluation.studies.study_options import InitializationStudy
+from gmmtorch.events import ignore
+from gmmtorch.experiments.evaluation.fits.fit_comparison import FitData, Row, compare, split
+from gmmtorch.experiments.evaluation.protocol_options import FitOptions
+from gmmtorch.experiments.studies import initialization_study as initialization
+from gmmtorch.experiments.studies.initialization_study import box_covariances, fit_timed, run
+from gmmtorch.experiments.studies.study_options import InitializationStudy
 from gmmtorch.mixture.em.initialization import INITIALIZATIONS
 
 EM = FitOptions(max_iter=20, algorithm="exact")

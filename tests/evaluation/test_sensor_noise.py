@@ -15,9 +15,9 @@ from scipy.stats import multivariate_normal
 
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation import queries
-from gmmtorch.evaluation.studies.sensor_noise import SENSORS, VARIANTS, run, sensor_model
-from gmmtorch.evaluation.studies.study_options import SensorModelStudy
+from gmmtorch.experiments.evaluation import queries
+from gmmtorch.experiments.studies.sensor_noise import SENSORS, VARIANTS, run, sensor_model
+from gmmtorch.experiments.studies.study_options import SensorModelStudy
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mixture.estimators.sensor_model import LaserModel, LidarModel
 from gmmtorch.scan import Scan

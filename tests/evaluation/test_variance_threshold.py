@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.studies.railing import Railing
-from gmmtorch.evaluation.studies.study_options import COUNTS, VarianceThresholdStudy
-from gmmtorch.evaluation.studies.variance_threshold import (
+from gmmtorch.experiments.studies.railing import Railing
+from gmmtorch.experiments.studies.study_options import COUNTS, VarianceThresholdStudy
+from gmmtorch.experiments.studies.variance_threshold import (
     cells_by_setting,
     decided,
     run,

@@ -9,11 +9,10 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.cli.from_options import maps
 from gmmtorch.datasets.recordings.trajectory import read_trajectory
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
-from gmmtorch.evaluation.events import Event
+from gmmtorch.events import Event
 from gmmtorch.export import distance_field, floor_and_ceiling, map_server, mixture_formats
 from gmmtorch.export.mesh import surface_mesh
 from gmmtorch.export.mesh_formats import write_mesh
@@ -24,6 +23,7 @@ from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mixture import GaussianMixture
 from gmmtorch.occupancy.evidence import Thresholds
 from gmmtorch.occupancy.grid import VoxelGrid, check_resolution, rasterize
+from gmmtorch.occupancy.occupancy_grid import OccupancyGrid
 
 _EXTENT = 3.0  # standard deviations around each component that the cells cover
 

@@ -18,10 +18,10 @@ from gmmtorch.cli.reporting import map_outputs
 from gmmtorch.datasets import Dataset
 from gmmtorch.datasets.recordings.trajectory import in_plane, pose_matrix, read_trajectory, to_nanoseconds
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.events import Row
-from gmmtorch.evaluation.trajectories import UNSCORED, absolute_trajectory_error, relative_pose_error
+from gmmtorch.events import Row
 from gmmtorch.export.trajectory_files import write_pose_table, write_tum
 from gmmtorch.localization.scan_locations import ScanLocation, clock_faults, scan_times
+from gmmtorch.localization.trajectories import UNSCORED, absolute_trajectory_error, relative_pose_error
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.report.maps.map_figures import map_figure
 from gmmtorch.report.tensorboard_writer import Board

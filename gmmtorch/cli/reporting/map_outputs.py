@@ -18,14 +18,14 @@ from gmmtorch.cli.reporting import exported_files
 from gmmtorch.datasets import Dataset
 from gmmtorch.datasets.recordings.trajectory import read_trajectory
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError, MissingDataError, check_number
-from gmmtorch.evaluation.calibration import reliability_of, scores_of
-from gmmtorch.evaluation.events import Event, Row
+from gmmtorch.events import Event, Row
 from gmmtorch.export import trajectory_files
 from gmmtorch.localization.odometry.odometry import Trajectory
 from gmmtorch.localization.scan_locations import scan_times
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.map_builder import MapBuilder
+from gmmtorch.occupancy.reliability import reliability_of, scores_of
 from gmmtorch.optional_packages import load_pyoctomap
 from gmmtorch.report.maps.accuracy_figures import reliability_figure
 from gmmtorch.report.maps.map_figures import map_figure

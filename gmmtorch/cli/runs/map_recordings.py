@@ -21,7 +21,7 @@ from gmmtorch.cli.reporting import map_outputs
 from gmmtorch.cli.runs.inputs import find_recordings, local_copy
 from gmmtorch.cli.runs.tasks import Outcome, run_tasks
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MemoryLimitError
-from gmmtorch.evaluation.events import Row
+from gmmtorch.events import Row
 from gmmtorch.files import write_bytes, write_json
 from gmmtorch.mapping.map_builder import MapBuilder, check_same_run, resident_bytes
 from gmmtorch.mapping.tile_merging import merge, tile_files

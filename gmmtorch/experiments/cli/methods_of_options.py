@@ -1,0 +1,37 @@
+"""The methods of a run, and the test of their maps, from the options."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from omegaconf import DictConfig
+
+from gmmtorch.cli import common
+from gmmtorch.cli.from_options import maps
+from gmmtorch.cli.options.structured import build
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.experiments.evaluation import methods
+from gmmtorch.experiments.evaluation.methods import MapFactory
+from gmmtorch.experiments.evaluation.protocol_options import Protocol
+
+
+def known_methods(config: DictConfig) -> dict[str, MapFactory]:
+    """Every method by name."""
+    options = common.as_options(config.method_options)
+    return methods.methods(maps.map_factory(config), options, **maps.limits(config))
+
+
+def protocol_of(config: DictConfig) -> Protocol:
+    """The held-out test from `evaluation.*`."""
+    return build(Protocol, common.as_options(config.evaluation), "evaluation")
+
+
+def check_factories(factories: Mapping[str, MapFactory], resolution: float) -> None:
+    """Make an empty map with each factory, so that an invalid option fails before any map is built."""
+    for name, factory in factories.items():
+        try:
+            factory(resolution)
+        except TypeError as error:  # for example text, where a baseline compares numbers
+            raise InvalidArgumentError(
+                f"method_options.{name} has a value of the wrong type: {error}."
+            ) from error

@@ -1,0 +1,69 @@
+"""gmmtorch-occupancy: learns maps from scans, scores them on held-out scans and draws them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from gmmtorch.cli import app, common
+from gmmtorch.errors import check_whole
+from gmmtorch.events import Event, Row
+from gmmtorch.experiments.cli import schema
+from gmmtorch.report.progress import ProgressBars
+
+TABLE = (
+    "method resolution kept auc auc_low auc_high ece log_loss_bits accuracy n_components nbytes "
+    "build_seconds query_seconds"
+)
+
+
+def main() -> None:
+    """Entry point of the command."""
+    app.start("occupancy", run, schema.register)
+
+
+def run(config: DictConfig) -> float | None:
+    """Run the command; returns the AUC of the last row, which a sweep can optimize."""
+    from gmmtorch.experiments.cli.studies import occupancy_studies, study
+
+    device = common.set_up(config)
+    folder = common.run_dir()
+    with ProgressBars(enabled=config.report.progress) as bars:
+        if config.study is None:
+            rows = _compare(config, device, folder, bars)
+        else:
+            rows = study.run("occupancy", occupancy_studies.STUDIES, config, device, folder, bars)
+    common.print_files(folder)
+    return rows[-1].get("auc")
+
+
+def _compare(config: DictConfig, device: str, folder: Path, on_event: Event) -> list[Row]:
+    """A row for each method, share kept and resolution."""
+    from gmmtorch.cli.from_options.scans import all_scans
+    from gmmtorch.experiments.cli import methods_of_options, occupancy_outputs
+    from gmmtorch.experiments.evaluation import methods
+    from gmmtorch.experiments.evaluation.held_out import evaluate
+
+    check_whole("report.magnify", config.report.magnify, 0)
+    factories = methods.choose(list(config.method), methods_of_options.known_methods(config))
+    protocol = methods_of_options.protocol_of(config)
+    methods_of_options.check_factories(factories, protocol.resolution[0])
+    name, scans = all_scans(config, device, on_event)
+    outcome = evaluate(
+        name,
+        scans,
+        factories,
+        protocol,
+        config.seed,
+        on_event,
+        # Rows are written one by one, so that a run that fails late keeps them.
+        lambda rows: common.write_results("occupancy", config, rows, folder),
+    )
+    occupancy_outputs.draw(config, scans, outcome, folder)
+    common.print_table(outcome.rows, TABLE.split(), f"{name}: {len(scans)} scans")
+    return outcome.rows
+
+
+if __name__ == "__main__":
+    main()
