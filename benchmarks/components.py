@@ -17,7 +17,7 @@ from tables import hardware, markdown, publish
 
 from gmmtorch import GaussianMap, WindowedRule, datasets
 from gmmtorch.experiments.evaluation.held_out import Protocol, evaluate
-from gmmtorch.experiments.evaluation.methods import methods
+from gmmtorch.experiments.evaluation.mapping_methods import methods
 from gmmtorch.scan import Scan
 
 RULES: dict[str, dict[str, float]] = {

@@ -24,7 +24,7 @@ from tables import OUTPUTS, hardware, markdown, publish
 import gmmtorch as gt
 from gmmtorch.datasets import Dataset
 from gmmtorch.experiments.evaluation.held_out import Protocol, evaluate
-from gmmtorch.experiments.evaluation.methods import choose, methods
+from gmmtorch.experiments.evaluation.mapping_methods import choose, methods
 from gmmtorch.localization.odometry.recorded_poses import METHODS, with_odometry
 from gmmtorch.localization.trajectories import absolute_trajectory_error, relative_pose_error
 

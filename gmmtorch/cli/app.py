@@ -204,7 +204,7 @@ def _result_of(run: Callable[[DictConfig], Any], config: DictConfig) -> Any:
     except RuntimeError as error:
         import torch  # takes a second, which errors of options need not wait for
 
-        from gmmtorch.kernels.chunks import memory_error
+        from gmmtorch.kernels import memory_error
 
         if isinstance(error, torch.OutOfMemoryError):
             raise memory_error(error) from error

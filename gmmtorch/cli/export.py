@@ -10,7 +10,7 @@ from gmmtorch.cli import app, common
 from gmmtorch.cli.options import schema
 from gmmtorch.errors import InvalidArgumentError, check_choice
 from gmmtorch.optional_packages import load_pyoctomap
-from gmmtorch.report.progress import ProgressBars
+from gmmtorch.report import ProgressBars
 
 _OF_SPACE = ("map_server", "octomap", "ply", "pcd", "mesh", "distance_field")
 _OF_COMPONENTS = ("csv", "npz", "mixture")

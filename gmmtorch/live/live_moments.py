@@ -8,10 +8,7 @@ from typing import Protocol
 import torch
 
 from gmmtorch.live.live_view import Moment, ViewedRobot
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.map_builder import MapBuilder
-from gmmtorch.mapping.window_motions import MotionAt, WindowMotions
+from gmmtorch.mapping import Components, GaussianMap, MapBuilder, MotionAt, WindowMotions
 from gmmtorch.scan import Scan
 
 SIZE, COMPONENTS = "map [kB]", "components"

@@ -22,10 +22,9 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
 
 from gmmtorch.cli import common, export, localize, map, view
-from gmmtorch.experiments.cli import fit, occupancy
-from gmmtorch.experiments.cli import schema as experiment_schema
+from gmmtorch.experiments.cli import experiment_schema, fit, occupancy
 from gmmtorch.team.cli import explore, robot, ros, team
-from gmmtorch.team.cli.options import schema as team_schema
+from gmmtorch.team.cli.options import team_schema
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 CONF = Path(common.conf_dir())

@@ -61,7 +61,7 @@ def all_methods(tmp_path_factory: pytest.TempPathFactory) -> Finished:
 
 
 def test_all_methods_are_tested():
-    assert set(methods.methods(GaussianMap)) == {*OURS, *BASELINES}
+    assert set(methods(GaussianMap)) == {*OURS, *BASELINES}
 
 
 @pytest.mark.parametrize("method", [*OURS, *BASELINES])

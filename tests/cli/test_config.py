@@ -25,8 +25,8 @@ from gmmtorch.cli.from_options import maps
 from gmmtorch.cli.from_options.scans import open_dataset
 from gmmtorch.errors import InvalidArgumentError, MissingDataError
 from gmmtorch.experiments.cli import methods_of_options
+from gmmtorch.experiments.cli.experiment_schema import STUDIES
 from gmmtorch.experiments.cli.fits_of_options import fit_options
-from gmmtorch.experiments.cli.schema import STUDIES
 from gmmtorch.experiments.cli.studies import fit_studies, occupancy_studies
 from gmmtorch.experiments.evaluation import methods
 from gmmtorch.experiments.evaluation.fits.fit_comparison import ESTIMATORS
@@ -101,7 +101,7 @@ def test_every_experiment_composes_and_its_methods_and_study_exist(command, name
     assert config.seed == 77
     assert not OmegaConf.missing_keys(config)
     if config.study is None:
-        known = ESTIMATORS if command == "fit" else methods.methods(GaussianMap)
+        known = ESTIMATORS if command == "fit" else methods(GaussianMap)
         assert set(config.method) <= set(known)
         return
     studies = fit_studies.STUDIES if command == "fit" else occupancy_studies.STUDIES

@@ -17,7 +17,7 @@ from gmmtorch.experiments.evaluation import (
     queries as query_points,  # pytest would collect the name `test_beams`
 )
 from gmmtorch.experiments.evaluation.held_out import Protocol, evaluate
-from gmmtorch.experiments.evaluation.methods import choose, methods
+from gmmtorch.experiments.evaluation.mapping_methods import choose, methods
 from gmmtorch.experiments.evaluation.queries import (
     FREE,
     OCCUPIED,

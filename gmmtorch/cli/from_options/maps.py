@@ -12,11 +12,16 @@ from omegaconf import DictConfig
 from gmmtorch.cli import common
 from gmmtorch.cli.options.structured import build
 from gmmtorch.errors import InvalidArgumentError, check_choice
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.rules import SOFTMAX_DTYPES, IncrementalRule, LearningRule, WindowedRule
-from gmmtorch.mapping.query_options import QueryOptions
-from gmmtorch.mapping.tile_index import INDEX
-from gmmtorch.mapping.tiles import TiledMap
+from gmmtorch.mapping import (
+    INDEX,
+    SOFTMAX_DTYPES,
+    GaussianMap,
+    IncrementalRule,
+    LearningRule,
+    QueryOptions,
+    TiledMap,
+    WindowedRule,
+)
 
 
 def limits(config: DictConfig) -> dict[str, Any]:

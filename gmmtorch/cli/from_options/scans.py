@@ -10,13 +10,18 @@ from omegaconf import DictConfig, OmegaConf
 
 from gmmtorch import datasets
 from gmmtorch.cli import common
-from gmmtorch.datasets import Dataset
-from gmmtorch.datasets.recordings.reposed import Reposed
+from gmmtorch.datasets import Dataset, Reposed
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice
 from gmmtorch.events import Event, Row
-from gmmtorch.localization.odometry.odometry import Trajectory
-from gmmtorch.localization.odometry.recorded_poses import METHODS, MOTIONS, with_odometry
-from gmmtorch.localization.trajectories import UNSCORED, absolute_trajectory_error, relative_pose_error
+from gmmtorch.localization import (
+    METHODS,
+    MOTIONS,
+    UNSCORED,
+    Trajectory,
+    absolute_trajectory_error,
+    relative_pose_error,
+    with_odometry,
+)
 from gmmtorch.scan import Scan
 
 _WITHOUT_POSES = ("scan_folder", "rosbag")  # data sets that `dataset.poses=standing` reads without poses

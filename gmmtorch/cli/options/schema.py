@@ -12,9 +12,8 @@ from hydra.core.config_store import ConfigStore
 
 from gmmtorch.cli.options import dataset_schema, map_schema
 from gmmtorch.cli.options.structured import schema_of
-from gmmtorch.mapping.learning.rules import IncrementalRule, MixtureRule, WindowedRule
-from gmmtorch.mapping.query_options import QueryOptions
-from gmmtorch.mixture.reduction.prune_options import PruneOptions
+from gmmtorch.mapping import IncrementalRule, MixtureRule, QueryOptions, WindowedRule
+from gmmtorch.mixture import PruneOptions
 
 
 def _map_schema(rule: type) -> type:

@@ -41,7 +41,7 @@ class SweepTable(Callback):
         self._begin = time.time()
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
-        from gmmtorch.report.table import format_table
+        from gmmtorch.report import format_table
 
         folder = Path(config.hydra.sweep.dir)
         jobs = read_jobs(folder, self._begin - _CLOCK_STEP)

@@ -11,9 +11,14 @@ from torch import Tensor
 from gmmtorch.errors import DataError, MemoryLimitError, check_number
 from gmmtorch.experiments.baselines.samples import thinned_samples
 from gmmtorch.files import require
-from gmmtorch.occupancy.grid import MEMORY_LIMIT, check_resolution
-from gmmtorch.occupancy.protocol import TensorFileMap, check_length, optional_length
-from gmmtorch.occupancy.voxels.cell_table import CellTable
+from gmmtorch.occupancy import (
+    MEMORY_LIMIT,
+    CellTable,
+    TensorFileMap,
+    check_length,
+    check_resolution,
+    optional_length,
+)
 from gmmtorch.scan import Scan
 
 _CHUNK_PAIRS = 1 << 21

@@ -11,11 +11,16 @@ from torch import Tensor
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, check_whole
 from gmmtorch.experiments.baselines.samples import cut_beams
 from gmmtorch.files import require
-from gmmtorch.kernels.rays.ray_traversal import traverse
+from gmmtorch.kernels import traverse
 from gmmtorch.linalg import pack_symmetric, unpack_symmetric
-from gmmtorch.occupancy.grid import MEMORY_LIMIT, check_resolution
-from gmmtorch.occupancy.protocol import TensorFileMap, check_length, optional_length
-from gmmtorch.occupancy.voxels.cell_table import CellTable
+from gmmtorch.occupancy import (
+    MEMORY_LIMIT,
+    CellTable,
+    TensorFileMap,
+    check_length,
+    check_resolution,
+    optional_length,
+)
 from gmmtorch.scan import Scan
 
 _LOG_ODDS_HIT = math.log(0.6 / 0.4)  # per return, as in perception_oru

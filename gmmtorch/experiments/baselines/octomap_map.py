@@ -13,9 +13,8 @@ from torch import Tensor
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.experiments.baselines.octree_files import parsed_octree, read_octree_file
 from gmmtorch.experiments.baselines.samples import cut_beams
-from gmmtorch.kernels.rays.ray_traversal import traverse
-from gmmtorch.occupancy.grid import check_resolution
-from gmmtorch.occupancy.protocol import BaselineMap, optional_length
+from gmmtorch.kernels import traverse
+from gmmtorch.occupancy import BaselineMap, check_resolution, optional_length
 from gmmtorch.optional_packages import load_pyoctomap
 from gmmtorch.scan import Scan
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
-from gmmtorch.occupancy.grid import check_resolution
+from gmmtorch.occupancy import check_resolution
 from gmmtorch.optional_packages import load_pyoctomap
 
 _BINARY, _FULL = b"# Octomap OcTree binary file", b"# Octomap OcTree file"

@@ -11,12 +11,11 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from gmmtorch.cli import app, common
-from gmmtorch.cli.options.structured import build
+from gmmtorch.cli import as_options, build, print_files, print_table, run_dir, set_up, start, write_results
 from gmmtorch.events import Event, Row
-from gmmtorch.experiments.cli import schema
-from gmmtorch.mixture.reduction.prune_options import PruneOptions
-from gmmtorch.report.progress import ProgressBars
+from gmmtorch.experiments.cli import experiment_schema
+from gmmtorch.mixture import PruneOptions
+from gmmtorch.report import ProgressBars
 
 TABLE = (
     "method n_components n_components_used seconds n_iterations log_likelihood held_out_log_likelihood "
@@ -27,7 +26,7 @@ TABLE = (
 def main() -> None:
     """Entry point of the command."""
     with _quiet_worker():
-        app.start("fit", run, schema.register)
+        start("fit", run, experiment_schema.register)
 
 
 @contextmanager
@@ -50,19 +49,19 @@ def run(config: DictConfig) -> float | None:
     from gmmtorch.experiments.cli import fit_outputs, fit_stream
     from gmmtorch.experiments.cli.studies import fit_studies, study
 
-    folder = common.run_dir()
+    folder = run_dir()
     if fit_stream.is_wanted(config):
         row = fit_stream.run(config, TABLE.split(), folder)
         if row is None:
             return None
     else:
-        device = common.set_up(config)
+        device = set_up(config)
         with ProgressBars(enabled=config.report.progress) as bars:
             if config.study is None:
                 row = _compare(config, device, folder, bars)[-1]
             else:
                 row = study.run("fit", fit_studies.STUDIES, config, device, folder, bars)[-1]
-    common.print_files(folder)
+    print_files(folder)
     return fit_outputs.log_likelihood(row)
 
 
@@ -70,7 +69,7 @@ def _compare(config: DictConfig, device: str, folder: Path, on_event: Event) -> 
     """A row for each method; saves and draws every mixture."""
     from gmmtorch.experiments.cli import fit_outputs
     from gmmtorch.experiments.cli.fits_of_options import fit_data, fit_options
-    from gmmtorch.experiments.evaluation.fits.fit_comparison import compare
+    from gmmtorch.experiments.evaluation import compare
 
     data = fit_data(config, device, on_event)
     outcome = compare(
@@ -79,14 +78,14 @@ def _compare(config: DictConfig, device: str, folder: Path, on_event: Event) -> 
         fit_options(config),
         config.seed,
         on_event,
-        lambda rows: common.write_results("fit", config, rows, folder),
-        common.as_options(config.method_options),
-        build(PruneOptions, common.as_options(config.mixture), "mixture"),
+        lambda rows: write_results("fit", config, rows, folder),
+        as_options(config.method_options),
+        build(PruneOptions, as_options(config.mixture), "mixture"),
     )
     for method, mixture in outcome.mixtures.items():
         mixture.save(folder / f"{method}.safetensors")
     fit_outputs.draw(config, data.train, outcome, folder)
-    common.print_table(outcome.rows, TABLE.split(), fit_outputs.headline(outcome.rows))
+    print_table(outcome.rows, TABLE.split(), fit_outputs.headline(outcome.rows))
     return outcome.rows
 
 

@@ -9,13 +9,10 @@ from typing import Any
 from omegaconf import DictConfig
 from torch import Tensor
 
-from gmmtorch.cli import common
+from gmmtorch.cli import chosen_options, show
 from gmmtorch.events import Row
-from gmmtorch.experiments.evaluation.fits.fit_comparison import NO_LIKELIHOODS, FitOutcome, in_use
-from gmmtorch.report.maps.accuracy_figures import comparison_figure, convergence_figure
-from gmmtorch.report.scenes.mixture_figures import mixture_figure
-from gmmtorch.report.style import label_of
-from gmmtorch.report.tensorboard_writer import Board
+from gmmtorch.experiments.evaluation import NO_LIKELIHOODS, FitOutcome, in_use
+from gmmtorch.report import Board, comparison_figure, convergence_figure, label_of, mixture_figure
 
 
 def headline(rows: Sequence[Row]) -> str:
@@ -62,6 +59,6 @@ def draw(config: DictConfig, points: Tensor, outcome: FitOutcome, folder: Path) 
             used = in_use(mixture, points)
             board.ellipsoids(f"mixture_{method}", mixture.means[used], mixture.covariances[used])
         metrics = {f"log_likelihood_{row['method']}": row["log_likelihood"] for row in outcome.rows}
-        board.hparams(common.chosen_options(config), metrics)
+        board.hparams(chosen_options(config), metrics)
 
-    common.show(config, folder, figures, write)
+    show(config, folder, figures, write)

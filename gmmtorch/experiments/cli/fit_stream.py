@@ -8,17 +8,15 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from gmmtorch.cli import common
-from gmmtorch.datasets.point_files.point_chunks import open_points
+from gmmtorch.cli import logger, print_table, set_up, write_results
+from gmmtorch.datasets import open_points
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.events import Event, Row
 from gmmtorch.experiments.cli import fit_outputs
 from gmmtorch.experiments.cli.fits_of_options import fit_data, fit_options
-from gmmtorch.experiments.evaluation.fits.fit_comparison import FitOutcome
-from gmmtorch.experiments.evaluation.fits.streamed_fit import Split, fit_streamed, split_data, split_source
-from gmmtorch.mixture.streaming.checkpoints import Checkpoint
-from gmmtorch.mixture.streaming.distributed import is_launched, joined
-from gmmtorch.report.progress import ProgressBars
+from gmmtorch.experiments.evaluation import FitOutcome, Split, fit_streamed, split_data, split_source
+from gmmtorch.mixture import Checkpoint, is_launched, joined
+from gmmtorch.report import ProgressBars
 
 
 def is_wanted(config: DictConfig) -> bool:
@@ -31,7 +29,7 @@ def run(config: DictConfig, columns: Sequence[str], folder: Path) -> Row | None:
 
     columns: of the printed table.
     """
-    device = common.set_up(config)
+    device = set_up(config)
     if device == "cuda":
         device = f"cuda:{os.environ.get('LOCAL_RANK', '0')}"
     _check(config)
@@ -51,10 +49,10 @@ def run(config: DictConfig, columns: Sequence[str], folder: Path) -> Row | None:
     if processes.rank != 0:
         return None
     mixture.save(folder / "em.safetensors")
-    common.write_results("fit", config, [row], folder)
+    write_results("fit", config, [row], folder)
     outcome = FitOutcome([row], {"em": mixture}, {"em": mixture.lower_bounds_})
     fit_outputs.draw(config, sample.train, outcome, folder)
-    common.print_table([row], columns, fit_outputs.headline([row]))
+    print_table([row], columns, fit_outputs.headline([row]))
     return row
 
 
@@ -90,7 +88,7 @@ def _check(config: DictConfig) -> None:
                 f"checkpoint={path}: the folder {path.parent} does not exist, so there is nothing to resume; "
                 "correct the path, or remove resume=true."
             )
-        common.logger.warning("checkpoint=%s does not exist: the fit starts from the beginning.", path)
+        logger.warning("checkpoint=%s does not exist: the fit starts from the beginning.", path)
 
 
 def _checkpoint(config: DictConfig) -> Checkpoint | None:

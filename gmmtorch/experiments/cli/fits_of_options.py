@@ -8,20 +8,16 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from gmmtorch.cli import common
-from gmmtorch.cli.from_options.scans import open_dataset, read_scans
-from gmmtorch.cli.options.structured import build
+from gmmtorch.cli import as_options, build, open_dataset, read_scans
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.events import Event
-from gmmtorch.experiments.evaluation.fits.fit_comparison import FitData, split
-from gmmtorch.experiments.evaluation.fits.fit_pruning import Views
-from gmmtorch.experiments.evaluation.protocol_options import FitOptions
+from gmmtorch.experiments.evaluation import FitData, FitOptions, Views, split
 from gmmtorch.scan import Scan
 
 
 def fit_options(config: DictConfig) -> FitOptions:
     """The options of a fit from `mixture.*` and `runtime.*`."""
-    runtime, mixture = config.runtime, common.as_options(config.mixture)
+    runtime, mixture = config.runtime, as_options(config.mixture)
     return build(FitOptions, mixture, "mixture", dtype=runtime.dtype, compiled=runtime.compile)
 
 

@@ -6,24 +6,20 @@ from collections.abc import Mapping
 
 from omegaconf import DictConfig
 
-from gmmtorch.cli import common
-from gmmtorch.cli.from_options import maps
-from gmmtorch.cli.options.structured import build
+from gmmtorch.cli import as_options, build, limits, map_factory
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.experiments.evaluation import methods
-from gmmtorch.experiments.evaluation.methods import MapFactory
-from gmmtorch.experiments.evaluation.protocol_options import Protocol
+from gmmtorch.experiments.evaluation import MapFactory, Protocol, methods
 
 
 def known_methods(config: DictConfig) -> dict[str, MapFactory]:
     """Every method by name."""
-    options = common.as_options(config.method_options)
-    return methods.methods(maps.map_factory(config), options, **maps.limits(config))
+    options = as_options(config.method_options)
+    return methods(map_factory(config), options, **limits(config))
 
 
 def protocol_of(config: DictConfig) -> Protocol:
     """The held-out test from `evaluation.*`."""
-    return build(Protocol, common.as_options(config.evaluation), "evaluation")
+    return build(Protocol, as_options(config.evaluation), "evaluation")
 
 
 def check_factories(factories: Mapping[str, MapFactory], resolution: float) -> None:

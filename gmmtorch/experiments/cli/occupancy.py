@@ -6,11 +6,11 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from gmmtorch.cli import app, common
+from gmmtorch.cli import print_files, print_table, run_dir, set_up, start, write_results
 from gmmtorch.errors import check_whole
 from gmmtorch.events import Event, Row
-from gmmtorch.experiments.cli import schema
-from gmmtorch.report.progress import ProgressBars
+from gmmtorch.experiments.cli import experiment_schema
+from gmmtorch.report import ProgressBars
 
 TABLE = (
     "method resolution kept auc auc_low auc_high ece log_loss_bits accuracy n_components nbytes "
@@ -20,33 +20,32 @@ TABLE = (
 
 def main() -> None:
     """Entry point of the command."""
-    app.start("occupancy", run, schema.register)
+    start("occupancy", run, experiment_schema.register)
 
 
 def run(config: DictConfig) -> float | None:
     """Run the command; returns the AUC of the last row, which a sweep can optimize."""
     from gmmtorch.experiments.cli.studies import occupancy_studies, study
 
-    device = common.set_up(config)
-    folder = common.run_dir()
+    device = set_up(config)
+    folder = run_dir()
     with ProgressBars(enabled=config.report.progress) as bars:
         if config.study is None:
             rows = _compare(config, device, folder, bars)
         else:
             rows = study.run("occupancy", occupancy_studies.STUDIES, config, device, folder, bars)
-    common.print_files(folder)
+    print_files(folder)
     return rows[-1].get("auc")
 
 
 def _compare(config: DictConfig, device: str, folder: Path, on_event: Event) -> list[Row]:
     """A row for each method, share kept and resolution."""
-    from gmmtorch.cli.from_options.scans import all_scans
+    from gmmtorch.cli import all_scans
     from gmmtorch.experiments.cli import methods_of_options, occupancy_outputs
-    from gmmtorch.experiments.evaluation import methods
-    from gmmtorch.experiments.evaluation.held_out import evaluate
+    from gmmtorch.experiments.evaluation import choose, evaluate
 
     check_whole("report.magnify", config.report.magnify, 0)
-    factories = methods.choose(list(config.method), methods_of_options.known_methods(config))
+    factories = choose(list(config.method), methods_of_options.known_methods(config))
     protocol = methods_of_options.protocol_of(config)
     methods_of_options.check_factories(factories, protocol.resolution[0])
     name, scans = all_scans(config, device, on_event)
@@ -58,10 +57,10 @@ def _compare(config: DictConfig, device: str, folder: Path, on_event: Event) -> 
         config.seed,
         on_event,
         # Rows are written one by one, so that a run that fails late keeps them.
-        lambda rows: common.write_results("occupancy", config, rows, folder),
+        lambda rows: write_results("occupancy", config, rows, folder),
     )
     occupancy_outputs.draw(config, scans, outcome, folder)
-    common.print_table(outcome.rows, TABLE.split(), f"{name}: {len(scans)} scans")
+    print_table(outcome.rows, TABLE.split(), f"{name}: {len(scans)} scans")
     return outcome.rows
 
 

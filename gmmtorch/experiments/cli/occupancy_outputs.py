@@ -11,31 +11,32 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from gmmtorch.cli import common
-from gmmtorch.cli.reporting.map_outputs import surfaces_of
-from gmmtorch.experiments.evaluation.calibration import reliability
-from gmmtorch.experiments.evaluation.held_out import Built, Outcome
-from gmmtorch.experiments.evaluation.metrics import separating_threshold
-from gmmtorch.experiments.evaluation.queries import OCCUPIED
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.report.maps.accuracy_figures import auc_against_kept_figure, reliability_figure, roc_figure
-from gmmtorch.report.maps.map_figures import map_figure
-from gmmtorch.report.maps.map_images import MapPanel
-from gmmtorch.report.maps.map_regions import busiest_regions, robust_bounds
-from gmmtorch.report.scenes.ellipsoids import first_viewpoints
-from gmmtorch.report.scenes.map_scenes import OccupancyPanel, map_scene_figure
-from gmmtorch.report.scenes.mixture_figures import mixture_figure
-from gmmtorch.report.style import label_of
-from gmmtorch.report.table import byte_text
-from gmmtorch.report.tensorboard_writer import Board
+from gmmtorch.cli import chosen_options, show, surfaces_of
+from gmmtorch.experiments.evaluation import OCCUPIED, Built, Outcome, reliability, separating_threshold
+from gmmtorch.mapping import Components, GaussianMap
+from gmmtorch.report import (
+    Board,
+    MapPanel,
+    OccupancyPanel,
+    auc_against_kept_figure,
+    busiest_regions,
+    byte_text,
+    first_viewpoints,
+    label_of,
+    map_figure,
+    map_scene_figure,
+    mixture_figure,
+    reliability_figure,
+    robust_bounds,
+    roc_figure,
+)
 from gmmtorch.scan import Scan
 
 
 def draw(config: DictConfig, scans: Sequence[Scan], outcome: Outcome, folder: Path) -> None:
     """Write the figures as PNG, and figures and numbers to TensorBoard."""
     figures = partial(_figures, config, scans, outcome)
-    common.show(config, folder, figures, partial(_write_board, config, scans, outcome))
+    show(config, folder, figures, partial(_write_board, config, scans, outcome))
 
 
 def _figures(config: DictConfig, scans: Sequence[Scan], outcome: Outcome) -> dict[str, Any]:
@@ -130,4 +131,4 @@ def _write_board(config: DictConfig, scans: Sequence[Scan], outcome: Outcome, bo
     board.cloud("points", torch.cat([scan.points.double().cpu() for scan in scans]))
     if (surfaces := _surfaces(outcome)) is not None:
         board.ellipsoids("mixture", surfaces.means, surfaces.covariances)
-    board.hparams(common.chosen_options(config), scores)
+    board.hparams(chosen_options(config), scores)

@@ -19,9 +19,7 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.evaluation import queries
 from gmmtorch.experiments.evaluation.queries import OCCUPIED
-from gmmtorch.occupancy.calibrator import N_BINS, Calibrator, Prediction
-from gmmtorch.occupancy.evidence import CellClass, classify
-from gmmtorch.occupancy.reliability import Reliability
+from gmmtorch.occupancy import N_BINS, Calibrator, CellClass, Prediction, Reliability, classify
 from gmmtorch.scan import Scan
 
 PRIORS = (0.1, 0.5, 1.0, 2.0, 5.0)

@@ -15,12 +15,12 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.events import Event, OnRows, Row, ignore
 from gmmtorch.experiments.evaluation import calibration, metrics, queries
 from gmmtorch.experiments.evaluation.calibration import SeenPredictions
-from gmmtorch.experiments.evaluation.methods import Form, MapFactory
+from gmmtorch.experiments.evaluation.mapping_methods import Form, MapFactory
 from gmmtorch.experiments.evaluation.protocol_options import Protocol
 from gmmtorch.experiments.evaluation.queries import UNKNOWN, Queries
 from gmmtorch.files import check_writable
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.occupancy.protocol import OccupancyMap
+from gmmtorch.mapping import GaussianMap
+from gmmtorch.occupancy import OccupancyMap
 from gmmtorch.scan import Scan
 
 _PREDICTED_SCANS = 50  # of which a map without a calibration predicts some beams

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.team.exploration.mission.paired_statistics import Interval
+from gmmtorch.team.exploration import Interval
 
 _BINS = 4096
 _N_RESAMPLES = 1000

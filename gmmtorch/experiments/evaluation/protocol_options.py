@@ -111,6 +111,6 @@ class FitOptions:
 
     def check(self, n_points: int, seed: int) -> None:
         """Raises `InvalidArgumentError` for an invalid option, or one that does not fit `n_points`."""
-        from gmmtorch.mixture.gaussian_mixture import GaussianMixture
+        from gmmtorch.mixture import GaussianMixture
 
         GaussianMixture(**vars(self), random_state=seed).check_parameters(n_points)

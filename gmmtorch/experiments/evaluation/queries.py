@@ -15,7 +15,7 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.evaluation.protocol_options import FreePoints, Removal
 from gmmtorch.files import write_bytes
-from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
+from gmmtorch.occupancy import SparseEvidence
 from gmmtorch.scan import Scan
 
 

@@ -11,8 +11,21 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from gmmtorch.report import style
-from gmmtorch.report.labels import Label, place_labels
+from gmmtorch.report import (
+    TICK_SIZE,
+    Label,
+    Rows,
+    colour,
+    draw_grid,
+    figure_title,
+    label_axes,
+    label_of,
+    legend_below,
+    line_look,
+    log_axis,
+    new_figure,
+    place_labels,
+)
 
 _AXES = {"n_components": "components", "nbytes": "map size [bytes]"}
 _LABELS = {
@@ -35,7 +48,7 @@ class Panel(NamedTuple):
 
 
 def panels_figure(
-    rows: style.Rows, panels: Sequence[Panel], line: str, title: str, x: str = "n_components"
+    rows: Rows, panels: Sequence[Panel], line: str, title: str, x: str = "n_components"
 ) -> Figure:
     """Draws one panel per quantity, two in a row, against `x` on a logarithmic axis.
 
@@ -50,7 +63,7 @@ def panels_figure(
         x: integer field on the x axis: `n_components` or `nbytes`.
     """
     n_rows = math.ceil(len(panels) / 2)
-    figure = style.new_figure(11.0, 4.1 * n_rows + 0.9)
+    figure = new_figure(11.0, 4.1 * n_rows + 0.9)
     grid = figure.subplots(n_rows, 2, squeeze=False)
     names = list(dict.fromkeys(str(row[line]) for row in rows))
     ticks = sorted({int(row[x]) for row in rows})
@@ -61,41 +74,41 @@ def panels_figure(
             base = {k: float(np.mean(v)) for k, v in values[names[0]].items()}
         for index, name in enumerate(names):
             _draw_line(axes, {k: v - base[k] for k, v in values[name].items() if k in base}, name, index)
-        style.label_axes(axes, panel.title, _AXES[x], panel.unit)
+        label_axes(axes, panel.title, _AXES[x], panel.unit)
         _scale(axes, x, ticks)
         if panel.log:
-            style.log_axis(axes, "y", [row[panel.field] for row in rows if row[panel.field] is not None])
-        style.draw_grid(axes)
+            log_axis(axes, "y", [row[panel.field] for row in rows if row[panel.field] is not None])
+        draw_grid(axes)
     for axes in list(grid.flat)[len(panels) :]:
         axes.set_visible(False)
-    style.legend_below(figure, max_columns=5)
-    style.figure_title(figure, title)
+    legend_below(figure, max_columns=5)
+    figure_title(figure, title)
     return figure
 
 
-def subject(rows: style.Rows) -> str:
+def subject(rows: Rows) -> str:
     """Returns the end of a title: data set, number of points, and number of seeds if more than one."""
     n_seeds = len({row.get("seed") for row in rows})
     over = f"\nmean and range of {n_seeds} seeds" if n_seeds > 1 else ""
-    return f"{style.label_of(str(rows[0]['dataset']))}, {rows[0]['n_points']:,} points{over}"
+    return f"{label_of(str(rows[0]['dataset']))}, {rows[0]['n_points']:,} points{over}"
 
 
 def line_label(name: str) -> str:
     """Returns the name of a line as shown in legends."""
-    return _LABELS.get(name, style.label_of(name))
+    return _LABELS.get(name, label_of(name))
 
 
 def _scale(axes: Axes, x: str, values: Sequence[int]) -> None:
     """Makes the x axis logarithmic; numbers of components have a tick each."""
     if x != "n_components":
-        style.log_axis(axes, "x", values)
+        log_axis(axes, "x", values)
         return
     axes.set_xscale("log", base=2)
-    axes.set_xticks(values, [str(value) for value in values], fontsize=style.TICK_SIZE)
+    axes.set_xticks(values, [str(value) for value in values], fontsize=TICK_SIZE)
     axes.xaxis.set_minor_locator(NullLocator())
 
 
-def _values(rows: style.Rows, x: str, field: str) -> dict[int, np.ndarray]:
+def _values(rows: Rows, x: str, field: str) -> dict[int, np.ndarray]:
     """Returns the numbers of all rows with the same `x`, by `x` in ascending order."""
     found: dict[int, list[float]] = {}
     for row in rows:
@@ -106,8 +119,8 @@ def _values(rows: style.Rows, x: str, field: str) -> dict[int, np.ndarray]:
 
 def _draw_line(axes: Axes, values: Mapping[int, np.ndarray], name: str, index: int) -> None:
     low, mean, high = ([function(v) for v in values.values()] for function in (np.min, np.mean, np.max))
-    axes.fill_between(list(values), low, high, color=style.colour(index), alpha=0.15, linewidth=0)
-    axes.plot(list(values), mean, label=line_label(name), **style.line_look(index))
+    axes.fill_between(list(values), low, high, color=colour(index), alpha=0.15, linewidth=0)
+    axes.plot(list(values), mean, label=line_label(name), **line_look(index))
 
 
 _COST = (
@@ -124,7 +137,7 @@ _QUALITY = (
 )
 
 
-def initialization_figures(rows: style.Rows) -> dict[str, Figure]:
+def initialization_figures(rows: Rows) -> dict[str, Figure]:
     """Draws `initialization`: initialization time, iterations, total time and PSNR2, as in Fig 2.1; and
     `initialization_quality`: the gain over the first initialization in both terms of PSNR2, and in PSNR2 and
     log-likelihood of held-out points.
@@ -146,7 +159,7 @@ _SENSOR_PANELS = (
 )
 
 
-def sensor_model_figures(rows: style.Rows) -> dict[str, Figure]:
+def sensor_model_figures(rows: Rows) -> dict[str, Figure]:
     """Draws `sensor_model`: log-likelihood, thickness and AUC of each variant against the bytes of its map.
 
     Args:
@@ -174,7 +187,7 @@ _SHOWN_NATS = 2.0
 """Range of log-likelihoods below the best that is shown: those of overfitted mixtures have no limit."""
 
 
-def component_count_figures(rows: style.Rows) -> dict[str, Figure]:
+def component_count_figures(rows: Rows) -> dict[str, Figure]:
     """Draws `component_count`: PSNR2 and log-likelihood of held-out points, time, and the AUC of maps,
     against bytes.
 
@@ -183,7 +196,7 @@ def component_count_figures(rows: style.Rows) -> dict[str, Figure]:
     Args:
         rows: of `gmmtorch.experiments.studies.component_count`.
     """
-    figure = style.new_figure(12.0, 9.4)
+    figure = new_figure(12.0, 9.4)
     grid = figure.subplots(2, 2)
     fits = [row for row in rows if not str(row["rule"]).startswith(_MAP_PREFIX)]
     maps = [
@@ -200,13 +213,13 @@ def component_count_figures(rows: style.Rows) -> dict[str, Figure]:
     if maps:
         labels += _draw_rules(grid.flat[3], maps, _AUC)
     grid.flat[3].set_visible(bool(maps))
-    style.legend_below(figure, max_columns=5)
-    style.figure_title(figure, f"Number of components: {subject(fits)}")
+    legend_below(figure, max_columns=5)
+    figure_title(figure, f"Number of components: {subject(fits)}")
     place_labels(figure, labels)
     return {"component_count": figure}
 
 
-def _draw_rules(axes: Axes, rows: style.Rows, panel: Panel) -> list[Label]:
+def _draw_rules(axes: Axes, rows: Rows, panel: Panel) -> list[Label]:
     """Draws a panel, and returns the labels of its marks."""
     labels: list[Label] = []
     measured = [row for row in rows if row[panel.field] is not None]
@@ -214,25 +227,25 @@ def _draw_rules(axes: Axes, rows: style.Rows, panel: Panel) -> list[Label]:
         own = sorted((row for row in measured if row["rule"] == name), key=lambda row: row["component_bytes"])
         if own:
             labels += _draw_rule(axes, own, panel.field, name, index)
-    style.label_axes(axes, panel.title, "size of the components [bytes, float32]", panel.unit)
-    style.log_axis(axes, "x", [row["component_bytes"] for row in measured])
+    label_axes(axes, panel.title, "size of the components [bytes, float32]", panel.unit)
+    log_axis(axes, "x", [row["component_bytes"] for row in measured])
     if panel.log:
-        style.log_axis(axes, "y", [row[panel.field] for row in measured])
-    style.draw_grid(axes)
+        log_axis(axes, "y", [row[panel.field] for row in measured])
+    draw_grid(axes)
     return labels
 
 
-def _draw_rule(axes: Axes, rows: style.Rows, field: str, name: str, index: int) -> list[Label]:
+def _draw_rule(axes: Axes, rows: Rows, field: str, name: str, index: int) -> list[Label]:
     """Draws the line of fixed numbers, or the marks of a rule with a label for the setting of each."""
     sizes, values = [row["component_bytes"] for row in rows], [row[field] for row in rows]
     if name == "fixed":
         axes.plot(sizes, values, ".-", color="#333333", linewidth=1.6, label=_RULE_NAMES[name], zorder=2)
         return []
-    look = style.line_look(index - 1) | {"linestyle": ":", "linewidth": 1.0, "markersize": 8}
+    look = line_look(index - 1) | {"linestyle": ":", "linewidth": 1.0, "markersize": 8}
     axes.plot(sizes, values, label=_RULE_NAMES[name], zorder=3, **look)
     if name == "bic":
         return []
-    text = {"fontsize": style.TICK_SIZE, "color": look["color"], "zorder": 5}
+    text = {"fontsize": TICK_SIZE, "color": look["color"], "zorder": 5}
     return [
         Label(axes, f"{row['setting']:g}", x, y, text) for row, x, y in zip(rows, sizes, values, strict=True)
     ]

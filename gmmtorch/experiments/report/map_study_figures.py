@@ -12,16 +12,39 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 from torch import Tensor
 
-from gmmtorch.report import style
-from gmmtorch.report.labels import Label, place_labels
-from gmmtorch.report.maps.map_regions import Corners, busiest_regions, inside
-from gmmtorch.report.scenes.ellipsoids import height_colours
-from gmmtorch.report.scenes.scene import balls, canvas_around, draw_scene, height_bar
-from gmmtorch.report.scenes.scene_renderer import Camera
-from gmmtorch.report.table import byte_text
+from gmmtorch.report import (
+    LABEL_SIZE,
+    SAVED_DPI,
+    TICK_SIZE,
+    TITLE_SIZE,
+    Camera,
+    Corners,
+    Label,
+    Rows,
+    balls,
+    busiest_regions,
+    byte_text,
+    canvas_around,
+    colour,
+    draw_grid,
+    draw_intervals,
+    draw_scene,
+    figure_title,
+    height_bar,
+    height_colours,
+    inside,
+    label_axes,
+    label_of,
+    legend_below,
+    line_look,
+    metres,
+    new_figure,
+    place_labels,
+    tick_text,
+)
 
 
-def auc_memory_figures(rows: style.Rows) -> dict[str, Figure]:
+def auc_memory_figures(rows: Rows) -> dict[str, Figure]:
     """Draws `auc_memory`: one panel per resolution, one line per method, one point per size of its map.
 
     Args:
@@ -29,7 +52,7 @@ def auc_memory_figures(rows: style.Rows) -> dict[str, Figure]:
     """
     resolutions = list(dict.fromkeys(float(row["resolution"]) for row in rows))
     methods = list(dict.fromkeys(str(row["method"]) for row in rows))
-    figure = style.new_figure(1.2 + 6.2 * len(resolutions), 5.2)
+    figure = new_figure(1.2 + 6.2 * len(resolutions), 5.2)
     grid = figure.subplots(1, len(resolutions), squeeze=False, sharey=True)
     labels: list[Label] = []
     for axes, resolution in zip(grid[0], resolutions, strict=True):
@@ -38,9 +61,9 @@ def auc_memory_figures(rows: style.Rows) -> dict[str, Figure]:
             own.sort(key=lambda row: row["nbytes"])
             sizes = [row["nbytes"] for row in own]
             areas = [row["auc"] for row in own]
-            axes.plot(sizes, areas, label=style.label_of(method), **style.line_look(index))
-            style.draw_intervals(axes, sizes, own, style.colour(index))
-            look = {"fontsize": style.TICK_SIZE - 1, "color": style.colour(index)}
+            axes.plot(sizes, areas, label=label_of(method), **line_look(index))
+            draw_intervals(axes, sizes, own, colour(index))
+            look = {"fontsize": TICK_SIZE - 1, "color": colour(index)}
             labels += [
                 Label(axes, f"{row['size']:,}", row["nbytes"], row["auc"], look)
                 for row in own
@@ -48,12 +71,12 @@ def auc_memory_figures(rows: style.Rows) -> dict[str, Figure]:
             ]
         axes.set_xscale("log")
         axes.xaxis.set_major_locator(LogLocator())
-        style.tick_text(axes.xaxis, lambda value: byte_text(value, digits=1))
-        style.label_axes(axes, f"cells of {style.metres(resolution)}", "map size", "")
-        style.draw_grid(axes)
-    grid[0][0].set_ylabel("area under the ROC curve", fontsize=style.LABEL_SIZE)
-    style.legend_below(figure, max_columns=4)
-    style.figure_title(figure, f"AUC against map size: {rows[0]['dataset']}")
+        tick_text(axes.xaxis, lambda value: byte_text(value, digits=1))
+        label_axes(axes, f"cells of {metres(resolution)}", "map size", "")
+        draw_grid(axes)
+    grid[0][0].set_ylabel("area under the ROC curve", fontsize=LABEL_SIZE)
+    legend_below(figure, max_columns=4)
+    figure_title(figure, f"AUC against map size: {rows[0]['dataset']}")
     place_labels(figure, labels)
     return {"auc_memory": figure}
 
@@ -61,7 +84,7 @@ def auc_memory_figures(rows: style.Rows) -> dict[str, Figure]:
 _BARS = (("auc", "noisy poses"), ("auc_corrected", "noisy poses, corrected"), ("auc_clean", "true poses"))
 
 
-def pose_correction_figures(rows: style.Rows) -> dict[str, Figure]:
+def pose_correction_figures(rows: Rows) -> dict[str, Figure]:
     """Draws `pose_correction`, three bars per row: AUC with noisy poses, after correction, and with true
     poses.
 
@@ -69,21 +92,21 @@ def pose_correction_figures(rows: style.Rows) -> dict[str, Figure]:
         rows: dataset, method, kept, resolution (m), pose_noise_m, pose_noise_rad, auc, auc_corrected,
             auc_clean.
     """
-    figure = style.new_figure(2.4 + 2.4 * len(rows), 4.6)
+    figure = new_figure(2.4 + 2.4 * len(rows), 4.6)
     axes = figure.subplots()
     for number, (field, label) in enumerate(_BARS):
         places = [i + 0.27 * (number - 1) for i in range(len(rows))]
-        bars = axes.bar(places, [row[field] for row in rows], 0.25, label=label, color=style.colour(number))
-        axes.bar_label(bars, fmt="%.4f", padding=3, fontsize=style.TICK_SIZE - 1)
-    names = [f"{style.label_of(row['method'])}, {style.metres(row['resolution'])}" for row in rows]
+        bars = axes.bar(places, [row[field] for row in rows], 0.25, label=label, color=colour(number))
+        axes.bar_label(bars, fmt="%.4f", padding=3, fontsize=TICK_SIZE - 1)
+    names = [f"{label_of(row['method'])}, {metres(row['resolution'])}" for row in rows]
     kept = [f"{row['kept']:.0%} of the data" for row in rows]
     axes.set_xticks(range(len(rows)), [f"{a}\n{b}" for a, b in zip(names, kept, strict=True)])
-    style.label_axes(axes, "", "", "area under the ROC curve")
+    label_axes(axes, "", "", "area under the ROC curve")
     lowest = min(row[field] for row in rows for field, _ in _BARS)
     axes.set_ylim(max(0.0, lowest - 0.5 * (1 - lowest)), 1.0)
-    style.legend_below(figure)
-    noise = f"{style.metres(rows[0]['pose_noise_m'])}, {rows[0]['pose_noise_rad']:g} rad"
-    style.figure_title(figure, f"Maps with pose noise of {noise}: {rows[0]['dataset']}")
+    legend_below(figure)
+    noise = f"{metres(rows[0]['pose_noise_m'])}, {rows[0]['pose_noise_rad']:g} rad"
+    figure_title(figure, f"Maps with pose noise of {noise}: {rows[0]['dataset']}")
     return {"pose_correction": figure}
 
 
@@ -100,7 +123,7 @@ _POINT_PIXELS = 2.5  # radius of a measured point
 _CAMERA = Camera(-60.0, 24.0)
 
 
-def variance_threshold_figures(rows: style.Rows) -> dict[str, Figure]:
+def variance_threshold_figures(rows: Rows) -> dict[str, Figure]:
     """Draws `variance_threshold`: the decisions with each prior, a group of bars for each form and size.
 
     Shown are the rows with the first resolution and threshold.
@@ -109,7 +132,7 @@ def variance_threshold_figures(rows: style.Rows) -> dict[str, Figure]:
     shown = [row for row in rows if all(row[name] == value for name, value in fixed.items())]
     groups = list(dict.fromkeys((row["method"], row["n_components"]) for row in shown))
     priors = list(dict.fromkeys(row["prior"] for row in shown))
-    figure = style.new_figure(15.5, 4.8)
+    figure = new_figure(15.5, 4.8)
     width = 0.8 / len(priors)
     for axes, (field, title) in zip(
         figure.subplots(1, len(_PANELS), sharey=True), _PANELS.items(), strict=True
@@ -118,22 +141,16 @@ def variance_threshold_figures(rows: style.Rows) -> dict[str, Figure]:
             own = {(r["method"], r["n_components"]): r[field] for r in shown if r["prior"] == prior}
             bars = [(place, own[group]) for place, group in enumerate(groups) if own.get(group) is not None]
             places = [place + width * (index - 0.5 * (len(priors) - 1)) for place, _ in bars]
-            axes.bar(
-                places, [value for _, value in bars], width, label=_label(prior), color=style.colour(index)
-            )
-        names = [
-            "counted rays" if n is None else f"{style.label_of(m)},\n{n:,} components" for m, n in groups
-        ]
-        axes.set_xticks(range(len(groups)), names, rotation=60, fontsize=style.TICK_SIZE - 1)
-        style.label_axes(axes, title, "", "")
+            axes.bar(places, [value for _, value in bars], width, label=_label(prior), color=colour(index))
+        names = ["counted rays" if n is None else f"{label_of(m)},\n{n:,} components" for m, n in groups]
+        axes.set_xticks(range(len(groups)), names, rotation=60, fontsize=TICK_SIZE - 1)
+        label_axes(axes, title, "", "")
         axes.set_ylim(0, 1.02)
-        style.draw_grid(axes)
-    figure.axes[0].set_ylabel("share of the points", fontsize=style.LABEL_SIZE)
-    style.legend_below(figure)
-    subject = f"{rows[0]['dataset']}, cells of {style.metres(fixed['resolution'])}"
-    style.figure_title(
-        figure, f"Decisions with the variance threshold {fixed['variance_threshold']:g}: {subject}"
-    )
+        draw_grid(axes)
+    figure.axes[0].set_ylabel("share of the points", fontsize=LABEL_SIZE)
+    legend_below(figure)
+    subject = f"{rows[0]['dataset']}, cells of {metres(fixed['resolution'])}"
+    figure_title(figure, f"Decisions with the variance threshold {fixed['variance_threshold']:g}: {subject}")
     return {"variance_threshold": figure}
 
 
@@ -174,10 +191,10 @@ def cells_figure(
     centres = torch.cartesian_prod(*steps)
     scale = Normalize(low[2], high[2], clip=True)
     drawn = {n: masks(centres) for n, masks in maps.items()}
-    canvas = canvas_around(low, high, _CAMERA, int(_SIDE * style.SAVED_DPI))
+    canvas = canvas_around(low, high, _CAMERA, int(_SIDE * SAVED_DPI))
     side = _SIDE * (canvas.top - canvas.bottom) / (canvas.right - canvas.left) + _TEXT_HEIGHT
     n_rows = 1 + max(len(masks) for masks in drawn.values())
-    figure = style.new_figure(_SIDE * len(maps) + 1.0, side * n_rows + 0.6)
+    figure = new_figure(_SIDE * len(maps) + 1.0, side * n_rows + 0.6)
     grid = figure.subplots(n_rows, len(maps), squeeze=False)
     for column, (n_components, masks) in zip(grid.T, drawn.items(), strict=True):
         shown = [
@@ -191,13 +208,13 @@ def cells_figure(
         for axes, (places, radius, title) in zip(column, shown, strict=True):
             part = balls(places, radius, height_colours(places[:, 2], scale))
             draw_scene(axes, [part], low, high, _CAMERA, canvas, n_ticks=3)
-            axes.set_title(title, fontsize=style.TITLE_SIZE)
+            axes.set_title(title, fontsize=TITLE_SIZE)
     height_bar(figure, grid.ravel().tolist(), scale)
-    style.figure_title(figure, f"Cells of {style.metres(size)} with the dead band of a variance threshold")
+    figure_title(figure, f"Cells of {metres(size)} with the dead band of a variance threshold")
     return figure
 
 
-def map_variants_figures(rows: style.Rows) -> dict[str, Figure]:
+def map_variants_figures(rows: Rows) -> dict[str, Figure]:
     """Draws `map_variants`: the AUC of each variant minus that of the first, with components and bytes.
 
     Args:
@@ -206,7 +223,7 @@ def map_variants_figures(rows: style.Rows) -> dict[str, Figure]:
     """
     resolutions = list(dict.fromkeys(float(row["resolution"]) for row in rows))
     variants = list(dict.fromkeys(str(row["variant"]) for row in rows))
-    figure = style.new_figure(3.0 + 6.4 * len(resolutions), 1.9 + 0.42 * len(variants))
+    figure = new_figure(3.0 + 6.4 * len(resolutions), 1.9 + 0.42 * len(variants))
     grid = figure.subplots(1, len(resolutions), squeeze=False, sharey=True)
     for axes, resolution in zip(grid[0], resolutions, strict=True):
         own = [row for row in rows if float(row["resolution"]) == resolution]
@@ -214,17 +231,17 @@ def map_variants_figures(rows: style.Rows) -> dict[str, Figure]:
         gains = [row["auc_gain"] for row in own]
         below = [row["auc_gain"] - row["auc_gain_low"] for row in own]
         above = [row["auc_gain_high"] - row["auc_gain"] for row in own]
-        axes.axvline(0, color=style.colour(0), linewidth=1, alpha=0.5)
-        axes.errorbar(gains, places, xerr=[below, above], fmt="o", color=style.colour(0), capsize=3)
+        axes.axvline(0, color=colour(0), linewidth=1, alpha=0.5)
+        axes.errorbar(gains, places, xerr=[below, above], fmt="o", color=colour(0), capsize=3)
         for row, place in zip(own, places, strict=True):
             text = f"{row['n_components']:,} components, {byte_text(row['nbytes'])}"
-            at = {"xycoords": ("axes fraction", "data"), "va": "center", "fontsize": style.TICK_SIZE}
+            at = {"xycoords": ("axes fraction", "data"), "va": "center", "fontsize": TICK_SIZE}
             axes.annotate(text, (1.02, place), annotation_clip=False, **at)
-        title = f"cells of {style.metres(resolution)}, {own[0]['variant']}: AUC {own[0]['auc']:.4f}"
-        style.label_axes(axes, style.label_of(title), "difference of AUC, 95 % interval", "")
+        title = f"cells of {metres(resolution)}, {own[0]['variant']}: AUC {own[0]['auc']:.4f}"
+        label_axes(axes, label_of(title), "difference of AUC, 95 % interval", "")
         axes.margins(y=0.08)
-        style.draw_grid(axes)
-    grid[0][0].set_yticks(range(len(variants)), [style.label_of(name) for name in variants])
+        draw_grid(axes)
+    grid[0][0].set_yticks(range(len(variants)), [label_of(name) for name in variants])
     grid[0][0].invert_yaxis()
-    style.figure_title(figure, f"Variants of a map: {rows[0]['dataset']}")
+    figure_title(figure, f"Variants of a map: {rows[0]['dataset']}")
     return {"map_variants": figure}

@@ -12,8 +12,18 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.report import style
-from gmmtorch.report.table import byte_text
+from gmmtorch.report import (
+    PALETTE,
+    TICK_SIZE,
+    Rows,
+    byte_text,
+    draw_grid,
+    figure_title,
+    label_axes,
+    legend_below,
+    new_figure,
+    tick_text,
+)
 
 QUALITIES = {"psnr2_db": "PSNR2", "psnr_lesser_db": "lesser term of PSNR2", "auc": "AUC"}
 OURS = "ours"
@@ -22,14 +32,14 @@ MIXTURES = (OURS, "ours_without_counts", "float")
 
 _N_SIZES = 400  # sizes on a curve at which `leads` compares
 _LINES: dict[str, tuple[str, str, str, str]] = {  # label, colour, marker, line style
-    "ours": ("mixture (gmmtorch)", style.PALETTE[0], "o", "-"),
-    "thesis": ("mixture, 57 B per component", style.PALETTE[5], "P", "-"),
-    "octree": ("octree, zstd", style.PALETTE[1], "s", "-"),
-    "draco": ("Draco", style.PALETTE[2], "^", "-"),
-    "quantized": ("quantized points, zstd", style.PALETTE[3], "D", "-"),
-    "depth_image": ("depth image, zstd", style.PALETTE[4], "v", "-"),
-    "depth_image_thinned": ("depth image with fewer pixels, zstd", style.PALETTE[4], "v", ":"),
-    "raw": ("raw points, 12 B each", style.PALETTE[6], "X", "-"),
+    "ours": ("mixture (gmmtorch)", PALETTE[0], "o", "-"),
+    "thesis": ("mixture, 57 B per component", PALETTE[5], "P", "-"),
+    "octree": ("octree, zstd", PALETTE[1], "s", "-"),
+    "draco": ("Draco", PALETTE[2], "^", "-"),
+    "quantized": ("quantized points, zstd", PALETTE[3], "D", "-"),
+    "depth_image": ("depth image, zstd", PALETTE[4], "v", "-"),
+    "depth_image_thinned": ("depth image with fewer pixels, zstd", PALETTE[4], "v", ":"),
+    "raw": ("raw points, 12 B each", PALETTE[6], "X", "-"),
 }
 _TITLES = {
     "kinect": "kinect: depth camera in a room",
@@ -68,7 +78,7 @@ class _Curve(NamedTuple):
         return np.where(quality > self.quality[-1], math.inf, needed)
 
 
-def leads(rows: style.Rows, quality: str, left_out: Sequence[str] = ()) -> Lead:
+def leads(rows: Rows, quality: str, left_out: Sequence[str] = ()) -> Lead:
     """Returns the range of sizes in which ours needs no more bytes than every other codec.
 
     Args:
@@ -104,13 +114,13 @@ def leads(rows: style.Rows, quality: str, left_out: Sequence[str] = ()) -> Lead:
     )
 
 
-def bytes_for(rows: style.Rows, codec: str, quality: str, value: float) -> float:
+def bytes_for(rows: Rows, codec: str, quality: str, value: float) -> float:
     """Returns the fewest bytes with which a codec reaches `value`; ∞ if it never does or has no rows."""
     curve = _curve(rows, codec, quality)
     return float(2 ** curve.bytes_for(np.array(value))) if len(curve.quality) else math.inf
 
 
-def _curve(rows: style.Rows, codec: str, quality: str) -> _Curve:
+def _curve(rows: Rows, codec: str, quality: str) -> _Curve:
     own = sorted((row for row in rows if row["codec"] == codec), key=lambda row: row["nbytes"])
     kept: list[tuple[float, float]] = []
     for row in own:
@@ -120,7 +130,7 @@ def _curve(rows: style.Rows, codec: str, quality: str) -> _Curve:
     return _Curve(table[:, 0], np.minimum(table[:, 1], 1e6))  # ∞ − ∞ is undefined
 
 
-def figures(rows: style.Rows) -> dict[str, Figure]:
+def figures(rows: Rows) -> dict[str, Figure]:
     """Draws `rate_distortion`: PSNR2 (top) and AUC (bottom) against bytes per frame, a column per data set.
 
     There is a line for each codec; qualities above the best octree are not shown. The range in which the
@@ -131,7 +141,7 @@ def figures(rows: style.Rows) -> dict[str, Figure]:
         rows: dataset, codec, nbytes, psnr2_db, auc.
     """
     names = list(dict.fromkeys(str(row["dataset"]) for row in rows))
-    figure = style.new_figure(1.0 + 4.4 * len(names), 8.6)
+    figure = new_figure(1.0 + 4.4 * len(names), 8.6)
     grid = figure.subplots(2, len(names), squeeze=False)
     for column, name in enumerate(names):
         own = [row for row in rows if row["dataset"] == name]
@@ -139,13 +149,13 @@ def figures(rows: style.Rows) -> dict[str, Figure]:
             _scale(axes, [float(row["nbytes"]) for row in own if row["codec"] in _LINES])
             _draw(axes, own, quality)
             heading = _TITLES.get(name, name) if quality == "psnr2_db" else ""
-            style.label_axes(axes, heading, "bytes per frame", y_label if column == 0 else "")
-    style.legend_below(figure, max_columns=4)
-    style.figure_title(figure, "Quality of one frame against its bytes")
+            label_axes(axes, heading, "bytes per frame", y_label if column == 0 else "")
+    legend_below(figure, max_columns=4)
+    figure_title(figure, "Quality of one frame against its bytes")
     return {"rate_distortion": figure}
 
 
-def _draw(axes: Axes, rows: style.Rows, quality: str) -> None:
+def _draw(axes: Axes, rows: Rows, quality: str) -> None:
     finite = [row for row in rows if math.isfinite(row[quality])]
     for codec, (label, hue, mark, line_style) in _LINES.items():
         own = sorted((row for row in finite if row["codec"] == codec), key=lambda row: row["nbytes"])
@@ -166,16 +176,16 @@ def _draw(axes: Axes, rows: style.Rows, quality: str) -> None:
     low = min(row[quality] for row in finite if row["codec"] in (OURS, "octree"))
     high = max(row[quality] for row in finite if row["codec"] in ((OURS, "octree") if left_out else _LINES))
     axes.set_ylim(low - 0.04 * (high - low), high + 0.22 * (high - low))
-    style.draw_grid(axes)
+    draw_grid(axes)
     if lead.octaves:
-        axes.axvspan(lead.low, lead.high, color=style.PALETTE[0], alpha=0.09, linewidth=0, zorder=0)
+        axes.axvspan(lead.low, lead.high, color=PALETTE[0], alpha=0.09, linewidth=0, zorder=0)
         axes.text(
             0.02,
             0.98,
             f"shaded: gmmtorch best{' of solid lines' if left_out else ''}, {lead.octaves:.1f} octaves",
             transform=axes.transAxes,
             va="top",
-            fontsize=style.TICK_SIZE,
+            fontsize=TICK_SIZE,
             color="#00507f",
         )
 
@@ -184,5 +194,5 @@ def _scale(axes: Axes, values: Sequence[float]) -> None:
     axes.set_xscale("log")
     axes.set_xlim(min(values) / 1.4, max(values) * 1.6)
     axes.xaxis.set_major_locator(LogLocator())
-    style.tick_text(axes.xaxis, lambda value: byte_text(value, digits=1))
+    tick_text(axes.xaxis, lambda value: byte_text(value, digits=1))
     axes.xaxis.set_minor_formatter(NullFormatter())

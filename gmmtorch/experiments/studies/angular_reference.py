@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.occupancy.cones import Cones
+from gmmtorch.occupancy import Cones
 
 TOLERANCE = 1e-9
 """Largest difference of two rules on one interval of directions, in rays per ray of the cone."""

@@ -30,13 +30,17 @@ from gmmtorch.experiments.studies.error_scenes import (
     random_scene,
 )
 from gmmtorch.experiments.studies.study_options import ApproximationErrorStudy
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.occupancy.cones import Cones
-from gmmtorch.occupancy.evidence import Evidence, occupancy_probability
-from gmmtorch.occupancy.forms.cone.cone_evidence import cone_evidence
-from gmmtorch.occupancy.forms.flux.box_flux import flux_evidence
-from gmmtorch.occupancy.forms.monte_carlo import Sampling, sample_rays
-from gmmtorch.occupancy.grid import VoxelGrid
+from gmmtorch.mapping import GaussianMap
+from gmmtorch.occupancy import (
+    Cones,
+    Evidence,
+    Sampling,
+    VoxelGrid,
+    cone_evidence,
+    flux_evidence,
+    occupancy_probability,
+    sample_rays,
+)
 
 _DATASETS = {2: "synthetic_building_2d", 3: "synthetic_building"}
 _REFERENCE_TOLERANCE = 1e-6  # of the flux that is the reference of the curve
@@ -46,7 +50,7 @@ MAPPED = ("cone", "cone_exact", "point", "monte_carlo_sobol", "flux")
 """The methods of the study "map"."""
 
 
-def run(
+def run_approximation_error(
     options: ApproximationErrorStudy, seed: int, on_event: Event = ignore, on_rows: OnRows = lambda _: None
 ) -> list[Row]:
     """The rows of all three studies for each dimension; the seed determines all fields but `seconds`.

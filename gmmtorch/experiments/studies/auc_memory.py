@@ -6,9 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from gmmtorch.events import Event, OnRows, Row, ignore
-from gmmtorch.experiments.evaluation import held_out
-from gmmtorch.experiments.evaluation.methods import MapFactory
-from gmmtorch.experiments.evaluation.protocol_options import Protocol
+from gmmtorch.experiments.evaluation import MapFactory, Protocol, evaluate
 from gmmtorch.scan import Scan
 
 
@@ -20,7 +18,7 @@ class Sized(NamedTuple):
     factory: MapFactory
 
 
-def run(
+def run_auc_memory(
     name: str,
     scans: Sequence[Scan],
     methods: Sequence[Sized],
@@ -39,7 +37,7 @@ def run(
         ]
 
     factories = {label: sized.factory for label, sized in by_label.items()}
-    outcome = held_out.evaluate(
+    outcome = evaluate(
         name, scans, factories, protocol, seed, on_event, lambda rows: on_rows(with_size(rows))
     )
     return with_size(outcome.rows)

@@ -29,18 +29,11 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.events import Event, OnRows, Row, ignore
-from gmmtorch.experiments.evaluation import held_out
-from gmmtorch.experiments.evaluation.fits.fit_comparison import FitData, row_of
-from gmmtorch.experiments.evaluation.methods import MapFactory
-from gmmtorch.experiments.evaluation.protocol_options import FitOptions, Protocol
+from gmmtorch.experiments.evaluation import FitData, FitOptions, MapFactory, Protocol, evaluate, row_of
 from gmmtorch.experiments.studies.map_variants import held_out_points, surface_score
 from gmmtorch.experiments.studies.study_options import ComponentCountStudy
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.rules import WindowedRule
-from gmmtorch.mixture.em.initialization import surface_pieces
-from gmmtorch.mixture.estimator import MixtureEstimator
-from gmmtorch.mixture.estimators.trees.hierarchical import HierarchicalGaussianMixture
-from gmmtorch.mixture.gaussian_mixture import GaussianMixture
+from gmmtorch.mapping import GaussianMap, WindowedRule
+from gmmtorch.mixture import GaussianMixture, HierarchicalGaussianMixture, MixtureEstimator, surface_pieces
 from gmmtorch.scan import Scan
 
 RULES = ("fixed", "flat_pieces", "bic", "mean_shift", "hierarchical", "map_fixed", "map_flat_pieces")
@@ -54,7 +47,7 @@ def middle(scans: Sequence[Scan], window: int) -> Sequence[Scan]:
     return scans[first : first + window]
 
 
-def run(
+def run_component_count(
     data: FitData,
     scans: Sequence[Scan],
     study: ComponentCountStudy | None = None,
@@ -231,7 +224,7 @@ def map_rows(
 
     factories = {f"{name} {setting:g}": factory(learning) for name, setting, learning in cases}
     protocol = Protocol(study.test_every, resolution=(study.resolution,), max_beams=study.max_beams)
-    outcome = held_out.evaluate(dataset, scans, factories, protocol, seed, on_event)
+    outcome = evaluate(dataset, scans, factories, protocol, seed, on_event)
     test = held_out_points(scans, study.test_every)
     return [
         {

@@ -9,11 +9,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.experiments.studies.angular_reference import angular_evidence
-from gmmtorch.occupancy.cones import Cones
-from gmmtorch.occupancy.forms.cone.cone_evidence import cone_evidence
-from gmmtorch.occupancy.forms.flux.box_flux import box_flux
-from gmmtorch.occupancy.forms.monte_carlo import Sampling, sample_rays
-from gmmtorch.occupancy.forms.point import point_evidence
+from gmmtorch.occupancy import Cones, Sampling, box_flux, cone_evidence, point_evidence, sample_rays
 
 OFFSETS = (0.0, 0.5, 1.0, 2.0)
 """Offsets of the cells of `cells_before` from the line of sight, in standard deviations."""

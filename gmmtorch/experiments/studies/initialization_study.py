@@ -9,19 +9,22 @@ import torch
 from torch import Tensor
 
 from gmmtorch.events import Event, OnRows, Row
-from gmmtorch.experiments.evaluation.fits.fit_comparison import FitData, row_of
-from gmmtorch.experiments.evaluation.protocol_options import FitOptions
+from gmmtorch.experiments.evaluation import FitData, FitOptions, row_of
 from gmmtorch.experiments.studies.study_options import InitializationStudy
-from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em import loop
-from gmmtorch.mixture.em.initialization import initialize
-from gmmtorch.mixture.gaussian_mixture import GaussianMixture
+from gmmtorch.mixture import (
+    SOFTMAX_DTYPES,
+    GaussianMixture,
+    initialize,
+    natural_step,
+    quadratic_features,
+    run_em,
+)
 
 MEANS_ONLY = ("random_points", "bounding_box")
 """Initializations that choose means; all covariances are the same multiple of the identity."""
 
 
-def run(
+def run_initialization(
     data: FitData,
     study: InitializationStudy,
     options: FitOptions,
@@ -78,10 +81,10 @@ def fit_timed(
     if covariance == "box":
         first = first._replace(covariances=box_covariances(points, n_components))
     between = time.perf_counter()
-    step = loop.natural_step(
-        em.quadratic_features(points), weight, options.reg_covar, em.SOFTMAX_DTYPES[options.dtype], points
+    step = natural_step(
+        quadratic_features(points), weight, options.reg_covar, SOFTMAX_DTYPES[options.dtype], points
     )
-    found = loop.run_em(step, first, tol=options.tol, max_iter=options.max_iter)
+    found = run_em(step, first, tol=options.tol, max_iter=options.max_iter)
     end = time.perf_counter()
     weights, means, covariances = found.parameters
     mixture = GaussianMixture.from_parameters(

@@ -12,19 +12,15 @@ import torch
 from torch import Tensor
 
 from gmmtorch.events import Event, OnRows, Row, ignore
-from gmmtorch.experiments.evaluation import held_out, queries
-from gmmtorch.experiments.evaluation.held_out import Built
-from gmmtorch.experiments.evaluation.methods import Form
-from gmmtorch.experiments.evaluation.metrics import auc_gain
-from gmmtorch.experiments.evaluation.protocol_options import Protocol
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mixture.gaussian_mixture import GaussianMixture
+from gmmtorch.experiments.evaluation import Built, Form, Protocol, auc_gain, evaluate, split_indices
+from gmmtorch.mapping import GaussianMap
+from gmmtorch.mixture import GaussianMixture
 from gmmtorch.scan import Scan
 
 _SCORED_POINTS = 5000
 
 
-def run(
+def run_map_variants(
     name: str,
     scans: Sequence[Scan],
     variants: Mapping[str, Form],
@@ -43,7 +39,7 @@ def run(
     rows: list[Row] = []
     first: dict[float, Built] = {}
     for variant, factory in variants.items():
-        outcome = held_out.evaluate(name, scans, {variant: factory}, protocol, seed, on_event)
+        outcome = evaluate(name, scans, {variant: factory}, protocol, seed, on_event)
         for built in outcome.shown:
             assert isinstance(built.map, GaussianMap)
             base = first.setdefault(built.row["resolution"], built)
@@ -65,7 +61,7 @@ def run(
 
 def held_out_points(scans: Sequence[Scan], test_every: int) -> Tensor:
     """About 5000 points (N, D) of the held-out scans."""
-    points = torch.cat([scans[i].points for i in queries.split_indices(len(scans), test_every)[1]])
+    points = torch.cat([scans[i].points for i in split_indices(len(scans), test_every)[1]])
     return points[:: max(1, len(points) // _SCORED_POINTS)].double()
 
 

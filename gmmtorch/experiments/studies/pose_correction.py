@@ -13,10 +13,17 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.events import Event, OnRows, Row, ignore
-from gmmtorch.experiments.evaluation import metrics, queries
-from gmmtorch.experiments.evaluation.protocol_options import Protocol
-from gmmtorch.experiments.evaluation.queries import Queries
-from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.experiments.evaluation import (
+    Protocol,
+    Queries,
+    hit_and_free,
+    keep_share,
+    pose_perturbations,
+    roc,
+    split_indices,
+    test_beams,
+)
+from gmmtorch.mapping import GaussianMap
 from gmmtorch.scan import Scan
 
 
@@ -86,15 +93,15 @@ def evaluate_correction(
     pose_noise_m, pose_noise_rad, n_components, nbytes`, and the AUCs `auc` (map from the perturbed poses),
     `auc_corrected` (the same map after correction) and `auc_clean` (map from the true poses).
     """
-    train_index, test_index = queries.split_indices(len(scans), protocol.test_every)
+    train_index, test_index = split_indices(len(scans), protocol.test_every)
     train = [scans[i] for i in train_index]
-    origins, ends = queries.test_beams([scans[i] for i in test_index], protocol.max_beams, seed)
-    asked = {r: queries.hit_and_free(origins, ends, protocol.free, r, seed) for r in protocol.resolution}
+    origins, ends = test_beams([scans[i] for i in test_index], protocol.max_beams, seed)
+    asked = {r: hit_and_free(origins, ends, protocol.free, r, seed) for r in protocol.resolution}
     rows: list[Row] = []
     for kept in protocol.kept:
         on_event("pose correction", 0, 3)
-        shown = queries.keep_share(train, kept, protocol.removal, seed)
-        motions = queries.pose_perturbations(shown, protocol.pose_noise, seed)
+        shown = keep_share(train, kept, protocol.removal, seed)
+        motions = pose_perturbations(shown, protocol.pose_noise, seed)
         moved = [scan.transformed(motion) for scan, motion in zip(shown, motions, strict=True)]
         true_map, perturbed_map = new_map(), new_map()
         build_by_scan(true_map, shown)
@@ -134,5 +141,5 @@ def _aucs(
     for method in methods:
         for resolution, ask in asked.items():
             theta = torch.as_tensor(built.occupancy(ask.points, resolution, method)).cpu()
-            found[method, resolution] = metrics.roc(*ask.split(theta)).auc
+            found[method, resolution] = roc(*ask.split(theta)).auc
     return found

@@ -9,9 +9,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.scan import Scan
-from gmmtorch.simulation import sense, spinning_lidar
-from gmmtorch.simulation.sensors.mesh_raycasting import ray_triangles
-from gmmtorch.simulation.worlds.furniture import box
+from gmmtorch.simulation import box, ray_triangles, sense, spinning_lidar
 
 _HALF, _HEIGHT = 3.0, 1.1  # half the length and the height (m) of the railing, which lies in the plane y = 0
 _POSTS = (-3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0)

@@ -26,11 +26,18 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_choice
 from gmmtorch.events import Event, Row, ignore
-from gmmtorch.experiments.evaluation import metrics, queries
+from gmmtorch.experiments.evaluation import (
+    Queries,
+    auc_interval,
+    hit_and_free,
+    roc,
+    split_indices,
+    test_beams,
+)
 from gmmtorch.experiments.studies.study_options import SensorModelStudy
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mixture.estimators.deconvolved import DeconvolvedGaussianMixture
-from gmmtorch.mixture.estimators.sensor_model import (
+from gmmtorch.mapping import GaussianMap
+from gmmtorch.mixture import (
+    DeconvolvedGaussianMixture,
     DepthCameraModel,
     LaserModel,
     LidarModel,
@@ -71,7 +78,7 @@ def sensor_model(study: SensorModelStudy) -> SensorModel:
     return model(**study.sensor_options)
 
 
-def run(
+def run_sensor_noise(
     name: str,
     scans: Sequence[Scan],
     study: SensorModelStudy | None = None,
@@ -96,14 +103,14 @@ def run(
     """
     study = study or SensorModelStudy()
     sensor = sensor_model(study)
-    train_index, test_index = queries.split_indices(len(scans), study.test_every)
+    train_index, test_index = split_indices(len(scans), study.test_every)
     train = [scans[i] for i in train_index]
     cloud = _training_cloud(train, sensor, study, seed)
-    origins, ends = queries.test_beams([scans[i] for i in test_index], study.max_beams, seed)
+    origins, ends = test_beams([scans[i] for i in test_index], study.max_beams, seed)
     test_noise = sensor.noise_covariances(ends, origins, _normals(ends, study.n_neighbors))
     asked = {
-        "auc": queries.hit_and_free(origins, ends, "uniform", study.resolution, seed),
-        "auc_near_surface": queries.hit_and_free(origins, ends, "near_surface", study.resolution, seed),
+        "auc": hit_and_free(origins, ends, "uniform", study.resolution, seed),
+        "auc_near_surface": hit_and_free(origins, ends, "near_surface", study.resolution, seed),
     }
     n_total = sum(scan.points.shape[0] for scan in train)
     typical = float(torch.linalg.eigvalsh(cloud.noise)[:, -1].median().sqrt())
@@ -145,15 +152,15 @@ def _scores(mixture: DeconvolvedGaussianMixture, variant: str, ends: Tensor, noi
     }
 
 
-def _areas(built: GaussianMap, asked: dict[str, queries.Queries], resolution: float, seed: int) -> Row:
+def _areas(built: GaussianMap, asked: dict[str, Queries], resolution: float, seed: int) -> Row:
     """The areas under the ROC curve of a map's answers, and the interval of `auc`."""
     row: Row = {}
     for field, ask in asked.items():
         theta = torch.as_tensor(built.occupancy(ask.points, resolution))
         occupied, empty = ask.split(theta)
-        row[field] = area = metrics.roc(occupied, empty).auc
+        row[field] = area = roc(occupied, empty).auc
         if field == "auc":
-            row["auc_low"], row["auc_high"] = metrics.auc_interval(occupied, empty, area, seed)
+            row["auc_low"], row["auc_high"] = auc_interval(occupied, empty, area, seed)
     return row
 
 

@@ -18,8 +18,8 @@ from gmmtorch.errors import (
     check_resolution,
     check_whole,
 )
-from gmmtorch.experiments.evaluation.protocol_options import check_not_empty, check_test_every
-from gmmtorch.mapping.query_options import METHODS, QueryOptions, check_method
+from gmmtorch.experiments.evaluation import check_not_empty, check_test_every
+from gmmtorch.mapping import METHODS, QueryOptions, check_method
 
 
 def _check_whole_numbers(options: object, *names: str) -> None:
@@ -63,7 +63,7 @@ class ApproximationErrorStudy:
     tolerance: Sequence[float] = (0.1, 1e-2, 1e-3, 1e-4)
 
     def __post_init__(self) -> None:
-        from gmmtorch.occupancy.forms.flux.adaptive_quadrature import check_tolerance
+        from gmmtorch.occupancy import check_tolerance
 
         _check_whole_numbers(
             self, "n_pixels", "n_components", "n_cells", "n_samples", "n_large_samples", "n_scans"
@@ -178,7 +178,7 @@ class VarianceThresholdStudy:
     def __post_init__(self) -> None:
         import torch
 
-        from gmmtorch.occupancy.evidence import classify
+        from gmmtorch.occupancy import classify
 
         check_not_empty(self, "method", "n_components", "resolution", "prior")
         check_not_empty(self, "variance_threshold")
@@ -223,7 +223,7 @@ class InitializationStudy:
     n_seeds: int = 3
 
     def __post_init__(self) -> None:
-        from gmmtorch.mixture.em.initialization import INITIALIZATIONS
+        from gmmtorch.mixture import INITIALIZATIONS
 
         check_whole("n_seeds", self.n_seeds, 1)
         check_not_empty(self, "n_components", "init_params", "initial_covariance")

@@ -14,15 +14,10 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gmmtorch.events import Event, OnRows, Row, ignore
-from gmmtorch.experiments.evaluation import metrics, queries
-from gmmtorch.experiments.evaluation.queries import FREE, OCCUPIED
+from gmmtorch.experiments.evaluation import FREE, OCCUPIED, hit_and_free, roc, split_indices, test_beams
 from gmmtorch.experiments.studies.study_options import COUNTS, VarianceThresholdStudy
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.query import Query
-from gmmtorch.occupancy.calibrator import Calibration
-from gmmtorch.occupancy.evidence import CellClass, classify, probability
-from gmmtorch.occupancy.forms.point import PointEvidence
-from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
+from gmmtorch.mapping import GaussianMap, Query
+from gmmtorch.occupancy import Calibration, CellClass, PointEvidence, SparseEvidence, classify, probability
 from gmmtorch.scan import Scan
 
 _BEHIND = 0.5  # a beam passes a structure if it ends this far behind (m)
@@ -59,7 +54,7 @@ class Source(NamedTuple):
         return probability(found.hits, found.misses, resolution, dim, rule).cpu()
 
 
-def run(
+def run_variance_threshold(
     name: str,
     scans: Sequence[Scan],
     new_map: Callable[[int], GaussianMap],
@@ -75,10 +70,10 @@ def run(
     `decided`, `auc`, `auc_thin`, `brier`. `thin_share`: share of the hits that lie on thin structures, by
     `is_thin` (default: `seen_past` with `study.thin_width`).
     """
-    train_index, test_index = queries.split_indices(len(scans), study.test_every)
+    train_index, test_index = split_indices(len(scans), study.test_every)
     train, test = [scans[i] for i in train_index], [scans[i] for i in test_index]
-    origins, ends = queries.test_beams(test, study.max_beams, seed)
-    asked = queries.hit_and_free(origins, ends, "uniform", 0.0, seed)
+    origins, ends = test_beams(test, study.max_beams, seed)
+    asked = hit_and_free(origins, ends, "uniform", 0.0, seed)
     thin = [s.points[(is_thin or (lambda one: seen_past(one, study.thin_width)))(s)].double() for s in test]
     on_thin = torch.cat(thin).cpu()
     share = len(on_thin) / sum(len(scan.points) for scan in test)
@@ -191,8 +186,8 @@ def _rows(
         asked, thin, truth = theta[:n_asked], theta[n_asked:], labels[:n_asked]
         occupied, free = asked[truth == OCCUPIED], asked[truth == FREE]
         scores = {
-            "auc": metrics.roc(occupied, free).auc,
-            "auc_thin": metrics.roc(thin, free).auc if len(thin) else None,
+            "auc": roc(occupied, free).auc,
+            "auc_thin": roc(thin, free).auc if len(thin) else None,
             "brier": float((asked - (truth == OCCUPIED).double()).square().mean()),
         }
         for threshold in study.variance_threshold:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from omegaconf import DictConfig
 
-from gmmtorch.cli import app, common
-from gmmtorch.cli.view import open_live_view, serve
+from gmmtorch.cli import open_live_view, print_files, run_dir, serve, set_up, start
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.report.progress import ProgressBars
-from gmmtorch.team.cli.options import schema
+from gmmtorch.report import ProgressBars
+from gmmtorch.team.cli.options import team_schema
 
 TABLE = (
     "framework seed planner t50 t90 entropy_reduction_bits bytes_sent bytes_raw_points auc "
@@ -18,13 +17,13 @@ TABLE = (
 
 def main() -> None:
     """Entry point of the command."""
-    app.start("explore", run, schema.register)
+    start("explore", run, team_schema.register)
 
 
 def run(config: DictConfig) -> float | None:
     """Runs a mission or a study; returns the entropy reduction (bits) of the last mission, for optimizers."""
     from gmmtorch.team.cli.runs import explorations
-    from gmmtorch.team.report.rerun_recording import load_rerun
+    from gmmtorch.team.report import load_rerun
 
     _check_options(config)
     if config.report.recording:
@@ -36,14 +35,14 @@ def run(config: DictConfig) -> float | None:
         else:
             rows = explorations.compare(config, bars)
     explorations.print_rows(rows, TABLE.split())
-    common.print_files(common.run_dir())
+    print_files(run_dir())
     if view is not None:
         serve(view)
     return float(rows[-1]["entropy_reduction_bits"])
 
 
 def _check_options(config: DictConfig) -> None:
-    common.set_up(config)
+    set_up(config)
     if config.transport != "in_process":
         raise InvalidArgumentError(
             f"transport={config.transport!r} is not in_process, the only transport of gmmtorch-explore; "

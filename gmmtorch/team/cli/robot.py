@@ -11,17 +11,26 @@ from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
-from gmmtorch.cli import app, common
-from gmmtorch.cli.view import open_live_view, serve
+from gmmtorch.cli import (
+    naming,
+    open_live_view,
+    print_files,
+    print_table,
+    run_dir,
+    serve,
+    set_up,
+    start,
+    stop_requests,
+    write_results,
+)
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, check_whole
 from gmmtorch.processes import has_lost_parent
-from gmmtorch.team.cli.options import schema
+from gmmtorch.team.cli.options import team_schema
 from gmmtorch.team.cli.reporting.robot_report import Outputs, RobotReport, print_refusals, terse
 
 if TYPE_CHECKING:
-    from gmmtorch.live.live_view import LiveView
-    from gmmtorch.team.exploration.mission.driver import Drivable
-    from gmmtorch.team.exploration.mission.robot_view import RobotView
+    from gmmtorch.live import LiveView
+    from gmmtorch.team.exploration import Drivable, RobotView
 
 TEAM_VARIABLE = "GMMTORCH_TEAM_PROCESS"
 """Environment variable with the id of the process that started this robot, which ends with that process."""
@@ -30,16 +39,16 @@ TABLE = "robot n_components n_records bytes_sent wire_bytes datagrams digest"
 
 def main() -> None:
     """Entry point of the command."""
-    app.start("robot", terse()(run), schema.register)
+    start("robot", terse()(run), team_schema.register)
 
 
 def run(config: DictConfig) -> None:
     """Runs a robot until its work is done and the team is quiet, or until it is stopped."""
     from gmmtorch.team.cli.from_options import links, robots
 
-    with common.naming(_option_names(config)):
+    with naming(_option_names(config)):
         check_options(config)
-        folder = common.run_dir()
+        folder = run_dir()
         with ExitStack() as stack:
             transport = links.open_link(config, config.id, is_alone=config.team.size == 1)
             stack.callback(transport.close)
@@ -69,7 +78,7 @@ def check_options(config: DictConfig) -> None:
     """Raises `InvalidArgumentError` for bad options of a robot or a team, before anything is opened."""
     from gmmtorch.team.cli.from_options import links
 
-    if common.set_up(config) != "cpu" and config.source == "log":
+    if set_up(config) != "cpu" and config.source == "log":
         raise InvalidArgumentError(
             f"runtime.device={config.runtime.device} is not available for source=log; use cpu."
         )
@@ -93,7 +102,7 @@ def check_options(config: DictConfig) -> None:
     if not config.evaluation.every > 0:
         raise InvalidArgumentError(f"evaluation.every={config.evaluation.every} must be above zero seconds.")
     rate = config.sensor.rate if config.source == "world" else config.log.rate
-    with common.naming({"rate": "sensor.rate" if config.source == "world" else "log.rate"}):
+    with naming({"rate": "sensor.rate" if config.source == "world" else "log.rate"}):
         check_number("rate", rate, above=True)
     check_number("speed", config.speed, above=True)
     check_number("settle", config.settle)
@@ -105,13 +114,13 @@ def check_options(config: DictConfig) -> None:
 
 def _drive(config: DictConfig, mission: Drivable, view: RobotView, folder: Path) -> None:
     """Runs the mission, waits until the team is quiet, and writes the results."""
-    from gmmtorch.team.exploration.mission.driver import WallClock, drive, settle
+    from gmmtorch.team.exploration import WallClock, drive, settle
 
     outputs, page = Outputs(folder), open_live_view(config)
     show = _shower(page, mission, view)
     team = os.environ.get(TEAM_VARIABLE)
     # Ctrl-C may reach the robot twice: from the terminal, and from the process of its team.
-    with RobotReport(config, view, folder) as report, app.stop_requests(by_force=False) as is_asked:
+    with RobotReport(config, view, folder) as report, stop_requests(by_force=False) as is_asked:
         clock = WallClock(config.speed)
 
         def is_stopped() -> bool:
@@ -132,16 +141,16 @@ def _drive(config: DictConfig, mission: Drivable, view: RobotView, folder: Path)
         path = outputs.written(file, write)
         if path is not None:
             row[f"{name}_path"] = str(path)
-    outputs.written("results.json", lambda _: common.write_results("robot", config, [row], folder))
+    outputs.written("results.json", lambda _: write_results("robot", config, [row], folder))
     if config.report.figures:
-        from gmmtorch.report.style import save_figure
-        from gmmtorch.team.report.network_figures import team_run_figure
+        from gmmtorch.report import save_figure
+        from gmmtorch.team.report import team_run_figure
 
         outputs.written("run.png", functools.partial(save_figure, team_run_figure([row])))
-    common.print_table([row], TABLE.split(), f"robot {config.id}")
+    print_table([row], TABLE.split(), f"robot {config.id}")
     print_refusals([row])
     outputs.check()
-    common.print_files(folder)
+    print_files(folder)
     if page is not None and not row["stopped"]:
         serve(page)
 
@@ -150,9 +159,7 @@ def _shower(page: LiveView | None, mission: Drivable, view: RobotView) -> Callab
     """What shows a robot and its teammates at a time (s), the last one or not; nothing without a page."""
     if page is None:
         return lambda now, is_last: None
-    from gmmtorch.team.exploration.mission.mission import Mission
-    from gmmtorch.team.exploration.mission.moments import SENT, AgentMoments, ReplayMoments
-    from gmmtorch.team.exploration.mission.replay import ReplayMission
+    from gmmtorch.team.exploration import SENT, AgentMoments, Mission, ReplayMission, ReplayMoments
 
     def sent() -> tuple[str, float]:
         return SENT, view.scalars()["wire_bytes_sent"] / 1e3

@@ -6,14 +6,14 @@ from contextlib import ExitStack
 
 from omegaconf import DictConfig
 
-from gmmtorch.cli import app, common
+from gmmtorch.cli import set_up, start
 from gmmtorch.errors import check_number
-from gmmtorch.team.cli.options import schema
+from gmmtorch.team.cli.options import team_schema
 
 
 def main() -> None:
     """Entry point of the command."""
-    app.start("ros", run, schema.register)
+    start("ros", run, team_schema.register)
 
 
 def run(config: DictConfig) -> None:
@@ -21,7 +21,7 @@ def run(config: DictConfig) -> None:
     from gmmtorch.team.cli.from_options.robots import shared_map
     from gmmtorch.team.cli.runs import live_topics
 
-    device = common.set_up(config)
+    device = set_up(config)
     check_number("wait", config.wait)
     check_number("period", config.period)
     with live_topics.open_node(config) as node, ExitStack() as stack:

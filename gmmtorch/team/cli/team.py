@@ -19,11 +19,10 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from gmmtorch.cli import app, common
-from gmmtorch.cli.view import open_live_view, serve
+from gmmtorch.cli import open_live_view, print_files, print_table, run_dir, serve, start, write_results
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
-from gmmtorch.report.progress import ProgressBars
-from gmmtorch.team.cli.options import schema
+from gmmtorch.report import ProgressBars
+from gmmtorch.team.cli.options import team_schema
 from gmmtorch.team.cli.reporting.robot_report import Outputs, print_refusals, terse
 from gmmtorch.team.cli.robot import TEAM_VARIABLE, check_options
 
@@ -128,7 +127,7 @@ _TURN = 2.0
 
 def main() -> None:
     """Entry point of the command."""
-    app.start("team", terse()(run), schema.register)
+    start("team", terse()(run), team_schema.register)
 
 
 def run(config: DictConfig) -> None:
@@ -137,7 +136,7 @@ def run(config: DictConfig) -> None:
 
     config.clock = config.clock or "wall"
     check_options(config)
-    folder = common.run_dir()
+    folder = run_dir()
     with ProgressBars(enabled=config.report.progress) as bars, ExitStack() as stack:
         _prepare(config, bars)
         view = open_live_view(config)
@@ -148,12 +147,12 @@ def run(config: DictConfig) -> None:
         rows = [robot.row() for robot in robots]
     summary = _summary(rows)
     outputs = Outputs(folder)
-    outputs.written("results.json", lambda _: common.write_results("team", config, [summary, *rows], folder))
+    outputs.written("results.json", lambda _: write_results("team", config, [summary, *rows], folder))
     _show(config, rows, outputs)
-    common.print_table(rows, TABLE.split(), f"{len(rows)} robots: {_COMPARED[summary['same_map']]}")
+    print_table(rows, TABLE.split(), f"{len(rows)} robots: {_COMPARED[summary['same_map']]}")
     print_refusals(rows)
     outputs.check()
-    common.print_files(folder)
+    print_files(folder)
     if config.report.tensorboard:
         print(f"browse    tensorboard --logdir {folder}")
     if view is not None:
@@ -163,7 +162,7 @@ def run(config: DictConfig) -> None:
 def _prepare(config: DictConfig, bars: ProgressBars) -> None:
     """Computes the world's properties once for all robots, and raises errors of the options once."""
     from gmmtorch.team.cli.from_options import missions
-    from gmmtorch.team.exploration.mission.team_setup import start_poses
+    from gmmtorch.team.exploration import start_poses
 
     if config.source == "world":
         options = missions.team_options(config, config.seed, {})
@@ -258,9 +257,8 @@ def _show(config: DictConfig, rows: list[dict[str, Any]], outputs: Outputs) -> N
     """Writes the figure of the run, as a file and for TensorBoard."""
     if not (config.report.figures or config.report.tensorboard):
         return
-    from gmmtorch.report.style import save_figure
-    from gmmtorch.report.tensorboard_writer import Board
-    from gmmtorch.team.report.network_figures import team_run_figure
+    from gmmtorch.report import Board, save_figure
+    from gmmtorch.team.report import team_run_figure
 
     figure = team_run_figure(rows)
 

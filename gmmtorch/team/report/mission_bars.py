@@ -14,9 +14,23 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.report import style
-from gmmtorch.report.table import byte_text
-from gmmtorch.team.exploration.mission.paired_statistics import Interval, mean_band
+from gmmtorch.report import (
+    LABEL_SIZE,
+    PALETTE,
+    TICK_SIZE,
+    Rows,
+    byte_text,
+    colour,
+    draw_grid,
+    figure_title,
+    label_axes,
+    label_of,
+    legend_below,
+    new_figure,
+    stacked_bars,
+    tick_text,
+)
+from gmmtorch.team.exploration import Interval, mean_band
 from gmmtorch.team.report.trial_groups import (
     about,
     by_framework,
@@ -48,7 +62,7 @@ _MEASURES = (
 )
 
 
-def summary_bars(rows: style.Rows) -> Figure:
+def summary_bars(rows: Rows) -> Figure:
     """Draws bytes sent, t90, AUC and coverage per metre of each framework, and below them the differences.
 
     Above: a dot per seed, and the mean with its 95 % interval. If a seed has no value (it never reached t90),
@@ -67,7 +81,7 @@ def summary_bars(rows: style.Rows) -> Figure:
     pairs = list(itertools.combinations(groups, 2))
     if len(groups) > _MOST_ALL_PAIRS:
         pairs = [pair for pair in pairs if pair[0] == next(iter(groups))]
-    figure = style.new_figure(3.2 * len(_MEASURES) + 1.0, 5.9 if pairs else 3.9)
+    figure = new_figure(3.2 * len(_MEASURES) + 1.0, 5.9 if pairs else 3.9)
     grid = figure.subplots(
         2 if pairs else 1, len(_MEASURES), squeeze=False, height_ratios=[1.25, 1] if pairs else [1]
     )
@@ -78,17 +92,17 @@ def summary_bars(rows: style.Rows) -> Figure:
         if measure.by_ratio:
             _log_ticks(column[0], lambda value: byte_text(value, digits=1))
         _name_places(column[0], [short_name(name) for name in groups])
-        style.label_axes(column[0], measure.title, "", measure.unit)
+        label_axes(column[0], measure.title, "", measure.unit)
         if pairs:
             _draw_differences(column[1], values, pairs, measure)
     for axes in grid.flat:
-        style.draw_grid(axes, "y")
+        draw_grid(axes, "y")
     names = ", ".join(framework_name(name) for name in groups)
-    style.figure_title(figure, f"{about(rows)}: {names}\n{seeds_note(rows, '95 % interval')}")
+    figure_title(figure, f"{about(rows)}: {names}\n{seeds_note(rows, '95 % interval')}")
     return figure
 
 
-def deviations_figure(rows: style.Rows) -> Figure:
+def deviations_figure(rows: Rows) -> Figure:
     """Draws, for each variant, its mean difference to the first one, over common seeds with the paired 95 %
     interval: entropy removed (ratio), t90 (t50 unless all missions reach t90), AUC, and bytes sent (ratio).
 
@@ -108,7 +122,7 @@ def deviations_figure(rows: style.Rows) -> Figure:
         _Measure("auc", "AUC"),
         _Measure("bytes_sent", "bytes sent", by_ratio=True),
     )
-    figure = style.new_figure(2.9 * len(measures) + 2.4, 1.9 + 0.36 * len(others))
+    figure = new_figure(2.9 * len(measures) + 2.4, 1.9 + 0.36 * len(others))
     columns = figure.subplots(1, len(measures), sharey=True)
     for axes, measure in zip(columns, measures, strict=True):
         none = 1.0 if measure.by_ratio else 0.0
@@ -126,18 +140,18 @@ def deviations_figure(rows: style.Rows) -> Figure:
         if measure.field == "bytes_sent":
             axes.set_xscale("log")
             axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-            style.tick_text(axes.xaxis, lambda value: f"{value:g}×")
+            tick_text(axes.xaxis, lambda value: f"{value:g}×")
             axes.xaxis.set_minor_formatter(NullFormatter())
         kind = "ratio" if measure.by_ratio else f"difference{f' [{measure.unit}]' if measure.unit else ''}"
-        style.label_axes(axes, measure.title, kind, "")
-        style.draw_grid(axes, "x")
-    columns[0].set_yticks(range(len(others)), [name for name, _ in others], fontsize=style.LABEL_SIZE)
+        label_axes(axes, measure.title, kind, "")
+        draw_grid(axes, "x")
+    columns[0].set_yticks(range(len(others)), [name for name, _ in others], fontsize=LABEL_SIZE)
     columns[0].set_ylim(len(others) - 0.5, -0.5)
-    style.figure_title(figure, f"{about(rows)}: variants beside {usual}\n{seeds_note(rows, '95 % interval')}")
+    figure_title(figure, f"{about(rows)}: variants beside {usual}\n{seeds_note(rows, '95 % interval')}")
     return figure
 
 
-def profile_figure(rows: style.Rows) -> Figure:
+def profile_figure(rows: Rows) -> Figure:
     """Draws the milliseconds of computing per simulated second by stage, one bar per framework.
 
     The end of a bar gives the ratio of simulated to computing time.
@@ -150,28 +164,28 @@ def profile_figure(rows: style.Rows) -> Figure:
     """
     costs = {framework: _milliseconds(trials) for framework, trials in by_framework(rows).items()}
     names = list(dict.fromkeys(stage for cost in costs.values() for stage in cost))
-    sizes = {style.label_of(n): np.array([cost.get(n, 0.0) for cost in costs.values()]) for n in names}
-    hues = [style.colour(index + 3) for index in range(len(names))]
-    figure = style.new_figure(9.6, 1.9 + 0.62 * len(costs))
+    sizes = {label_of(n): np.array([cost.get(n, 0.0) for cost in costs.values()]) for n in names}
+    hues = [colour(index + 3) for index in range(len(names))]
+    figure = new_figure(9.6, 1.9 + 0.62 * len(costs))
     axes = figure.subplots()
-    totals = style.stacked_bars(axes, sizes, hues)
+    totals = stacked_bars(axes, sizes, hues)
     longest = float(totals.max(initial=0.0)) or 1.0
     for bars, hue in zip(cast(list[BarContainer], axes.containers), hues, strict=True):
         texts = [f"{bar.get_width():.0f}" if bar.get_width() > 0.05 * longest else "" for bar in bars]
-        ink = "white" if hue in (style.PALETTE[0], style.PALETTE[6]) else "#111111"  # on dark bars
-        axes.bar_label(bars, texts, label_type="center", fontsize=style.TICK_SIZE, color=ink)
+        ink = "white" if hue in (PALETTE[0], PALETTE[6]) else "#111111"  # on dark bars
+        axes.bar_label(bars, texts, label_type="center", fontsize=TICK_SIZE, color=ink)
     for place, total in enumerate(totals):
         pace = f", {1000 / total:.1f}× real time" if total > 0 else ""
-        axes.text(total, place, f"  {total:.0f} ms{pace}", va="center", fontsize=style.LABEL_SIZE)
-    style.label_axes(axes, "", "computing time [ms per simulated second]", "")
-    axes.set_yticks(range(len(costs)), [framework_name(f) for f in costs], fontsize=style.LABEL_SIZE)
+        axes.text(total, place, f"  {total:.0f} ms{pace}", va="center", fontsize=LABEL_SIZE)
+    label_axes(axes, "", "computing time [ms per simulated second]", "")
+    axes.set_yticks(range(len(costs)), [framework_name(f) for f in costs], fontsize=LABEL_SIZE)
     axes.set_xlim(0, 1.3 * longest)
-    style.legend_below(figure, max_columns=7)
-    style.figure_title(figure, "Computing time per simulated second")
+    legend_below(figure, max_columns=7)
+    figure_title(figure, "Computing time per simulated second")
     return figure
 
 
-def _by_seed(trials: style.Rows, measure: _Measure) -> dict[Any, float | None]:
+def _by_seed(trials: Rows, measure: _Measure) -> dict[Any, float | None]:
     """Returns the value of each seed; None if there is none, or none to take a ratio of."""
     values: dict[Any, float | None] = {}
     for row in trials:
@@ -225,7 +239,7 @@ def _draw_differences(
     sign = "/" if measure.by_ratio else "\N{MINUS SIGN}"
     _name_places(axes, [f"{short_name(a)} {sign} {short_name(b)}" for a, b in pairs])
     kind = "ratio" if measure.by_ratio else "difference"
-    style.label_axes(axes, "", "", f"{kind} [{measure.unit}]" if measure.unit else kind)
+    label_axes(axes, "", "", f"{kind} [{measure.unit}]" if measure.unit else kind)
 
 
 def _say_none(axes: Axes, place: float, hue: str) -> None:
@@ -235,15 +249,15 @@ def _say_none(axes: Axes, place: float, hue: str) -> None:
 
 def _log_ticks(axes: Axes, text: Callable[[float], str]) -> None:
     axes.set_yscale("log")
-    style.tick_text(axes.yaxis, text)
+    tick_text(axes.yaxis, text)
 
 
 def _name_places(axes: Axes, names: Sequence[str]) -> None:
-    axes.set_xticks(range(len(names)), names, fontsize=style.TICK_SIZE)
+    axes.set_xticks(range(len(names)), names, fontsize=TICK_SIZE)
     axes.set_xlim(-0.6, len(names) - 0.4)
 
 
-def _milliseconds(trials: style.Rows) -> dict[str, float]:
+def _milliseconds(trials: Rows) -> dict[str, float]:
     """Returns the computing time of each stage per simulated second."""
     seconds = sum(row["times"][-1] for row in trials)
     names = dict.fromkeys(name for row in trials for name in row["stage_seconds"])

@@ -11,10 +11,26 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.report import style
-from gmmtorch.report.labels import LineEnd, label_ends
-from gmmtorch.report.table import byte_text, ratio_text
-from gmmtorch.team.exploration.mission.paired_statistics import time_to_share
+from gmmtorch.report import (
+    EDGE,
+    LABEL_SIZE,
+    PALETTE,
+    LineEnd,
+    Rows,
+    byte_text,
+    colour,
+    draw_grid,
+    figure_title,
+    label_axes,
+    label_ends,
+    legend_below,
+    line_style,
+    log_axis,
+    new_figure,
+    ratio_text,
+    tick_text,
+)
+from gmmtorch.team.exploration import time_to_share
 from gmmtorch.team.report.trial_groups import (
     REMAINING,
     TIME,
@@ -40,13 +56,13 @@ _BYTE_LINES = (
     ("gmm_shared", "bytes_over_time", "E0, as sent", framework_colour("gmm_shared"), "-"),
     ("grid_shared", "bytes_over_time", "E1, as sent", framework_colour("grid_shared"), "-"),
     ("gmm_thesis", "bytes_over_time", "E0 of the thesis, as sent", framework_colour("gmm_thesis"), "-"),
-    ("gmm_shared", "raw_points_bytes_over_time", "E0's novel points, raw", style.PALETTE[6], "--"),
-    ("gmm_shared", "draco_bytes_over_time", "same points, Draco", style.PALETTE[3], "-."),
-    ("gmm_shared", "octree_bytes_over_time", "same points, zstd octree", style.PALETTE[4], ":"),
+    ("gmm_shared", "raw_points_bytes_over_time", "E0's novel points, raw", PALETTE[6], "--"),
+    ("gmm_shared", "draco_bytes_over_time", "same points, Draco", PALETTE[3], "-."),
+    ("gmm_shared", "octree_bytes_over_time", "same points, zstd octree", PALETTE[4], ":"),
 )
 
 
-def entropy_figure(rows: style.Rows) -> Figure:
+def entropy_figure(rows: Rows) -> Figure:
     """Draws the share of the observable entropy that remains in the team's union of maps (Fig 4.4).
 
     There is a line for each framework: the mean over seeds in its 95 % band. Marks show the mean t50 and
@@ -69,12 +85,12 @@ def entropy_figure(rows: style.Rows) -> Figure:
         if len(trials) == 1:
             robots_drawn |= _draw_robots(axes, trials[0], hue)
     if robots_drawn:
-        handles.append(Line2D([], [], color=style.EDGE, linewidth=0.8, label="map of one robot"))
+        handles.append(Line2D([], [], color=EDGE, linewidth=0.8, label="map of one robot"))
     title = f"Entropy of the team's map: {about(rows)}\n{seeds_note(rows)}"
     return _finished(figure, axes, ends, rows, handles, title)
 
 
-def planner_comparison_figure(rows: style.Rows) -> Figure:
+def planner_comparison_figure(rows: Rows) -> Figure:
     """Draws the share of the observable entropy that remains, one line per variant of the planner.
 
     Variants differ in any option; a label lists those in which they do. Lines are means over seeds in 95 %
@@ -90,13 +106,13 @@ def planner_comparison_figure(rows: style.Rows) -> Figure:
     figure, axes, handles = _entropy_axes(reference, "the best reduction")
     ends = []
     for index, (name, trials) in enumerate(variants.items()):
-        look = {"color": style.colour(index), "linestyle": style.line_style(index)}
+        look = {"color": colour(index), "linestyle": line_style(index)}
         ends.append(_draw_trials(axes, name, [_timed(row, reference) for row in trials], look))
     title = f"Planners: {about(rows)}\n{seeds_note(rows)}"
     return _finished(figure, axes, ends, rows, handles, title)
 
 
-def bandwidth_figure(rows: style.Rows, draco_error: float = 0.03) -> Figure:
+def bandwidth_figure(rows: Rows, draco_error: float = 0.03) -> Figure:
     """Draws the cumulative bytes that the team shared over time, on a logarithmic axis (Fig 4.5).
 
     Lines are what E0, E1 and the thesis's E0 sent, and the novel points of the frames that E0 learned from in
@@ -121,13 +137,13 @@ def bandwidth_figure(rows: style.Rows, draco_error: float = 0.03) -> Figure:
             "rows contain no byte that was sent; give trials of teams that share maps."
         )
     base = found.get(("gmm_shared", "bytes_over_time"))
-    figure = style.new_figure(*_SIZE)
+    figure = new_figure(*_SIZE)
     axes = figure.subplots()
     ends = []
-    for framework, field, text, hue, line_style in _BYTE_LINES:
+    for framework, field, text, hue, dashes in _BYTE_LINES:
         if (curves := found.get((framework, field))) is None:
             continue
-        curves.draw(axes, color=hue, linestyle=line_style)
+        curves.draw(axes, color=hue, linestyle=dashes)
         total = float(curves.band.mean[-1])
         note = byte_text(total)
         if base is not None and curves is not base:
@@ -135,7 +151,7 @@ def bandwidth_figure(rows: style.Rows, draco_error: float = 0.03) -> Figure:
         if field == "draco_bytes_over_time":
             text += f", {100 * draco_error:g} cm RMS"
         ends.append(LineEnd(total, f"{text}\n{note}", hue))
-    style.label_axes(axes, "", TIME, "cumulative bytes")
+    label_axes(axes, "", TIME, "cumulative bytes")
     _byte_axis(axes, list(found.values()))
     title = f"Data shared by the team: {about(rows)}\n{seeds_note(rows)}"
     return _finished(figure, axes, ends, rows, [], title)
@@ -147,11 +163,11 @@ def _entropy_axes(reference: float | None, whose: str) -> tuple[Figure, Axes, li
     `reference` is the reduction, as a share of the observable entropy, that milestones are shares of; `whose`
     is its name.
     """
-    figure = style.new_figure(*_SIZE)
+    figure = new_figure(*_SIZE)
     axes = figure.subplots()
-    style.label_axes(axes, "", TIME, REMAINING)
+    label_axes(axes, "", TIME, REMAINING)
     handles = [
-        Line2D([], [], color=style.EDGE, marker=shape, linestyle="", markersize=7, label=name)
+        Line2D([], [], color=EDGE, marker=shape, linestyle="", markersize=7, label=name)
         for name, _, shape in _MILESTONES
     ]
     if reference is not None:
@@ -162,7 +178,7 @@ def _entropy_axes(reference: float | None, whose: str) -> tuple[Figure, Axes, li
     return figure, axes, handles
 
 
-def _draw_trials(axes: Axes, name: str, trials: style.Rows, look: dict[str, Any]) -> LineEnd:
+def _draw_trials(axes: Axes, name: str, trials: Rows, look: dict[str, Any]) -> LineEnd:
     """Draws the mean of trials with marks at their milestones, and returns the label of the line."""
     curves = curves_of(trials, [percent_left(row) for row in trials])
     curves.draw(axes, **look)
@@ -191,7 +207,7 @@ def _finished(
     figure: Figure,
     axes: Axes,
     ends: Sequence[LineEnd],
-    rows: style.Rows,
+    rows: Rows,
     handles: Sequence[Line2D],
     title: str,
 ) -> Figure:
@@ -199,14 +215,14 @@ def _finished(
     axes.set_xlim(0, max(float(row["times"][-1]) for row in rows) or 1.0)
     if handles:
         axes.set_ylim(0, max(100.0, axes.dataLim.y1) * 1.015)
-    style.draw_grid(axes)
-    label_ends(axes, ends, style.LABEL_SIZE - 0.5)
-    style.legend_below(figure, handles)
-    style.figure_title(figure, title)
+    draw_grid(axes)
+    label_ends(axes, ends, LABEL_SIZE - 0.5)
+    legend_below(figure, handles)
+    figure_title(figure, title)
     return figure
 
 
-def _reference(rows: style.Rows) -> float | None:
+def _reference(rows: Rows) -> float | None:
     """Returns the stated reference reduction as a share of the observable entropy, or None if rows disagree;
     without a stated one, the mean reduction."""
     stated = {float(row["reference_bits"]) / observable(row) for row in rows if row.get("reference_bits")}
@@ -215,7 +231,7 @@ def _reference(rows: style.Rows) -> float | None:
     return stated.pop() if len(stated) == 1 else None
 
 
-def _mean_reduction(rows: style.Rows) -> float:
+def _mean_reduction(rows: Rows) -> float:
     return float(np.mean([row["entropy_reduction_bits"] / observable(row) for row in rows]))
 
 
@@ -231,6 +247,6 @@ def _byte_axis(axes: Axes, curves: Sequence[Curves]) -> None:
     highest = max(float(c.band.mean[-1]) for c in curves)
     lowest = max(min(float(c.band.mean[c.band.mean > 0][0]) for c in curves), highest / 1e5)
     low, high = lowest / 1.3, 1.3 * highest
-    style.log_axis(axes, "y", (low, high))
+    log_axis(axes, "y", (low, high))
     axes.set_ylim(low, high)
-    style.tick_text(axes.yaxis, lambda value: byte_text(value, 2).replace(".0 ", " "))
+    tick_text(axes.yaxis, lambda value: byte_text(value, 2).replace(".0 ", " "))

@@ -19,14 +19,27 @@ from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.occupancy.evidence import CellClass
-from gmmtorch.report import style
-from gmmtorch.report.maps.map_images import MapImage
-from gmmtorch.report.scenes.ellipsoids import checked_components, ellipse_outlines
-from gmmtorch.report.scenes.paths import draw_paths, path_handles
-from gmmtorch.report.table import count_text
+from gmmtorch.occupancy import CellClass
+from gmmtorch.report import (
+    EDGE,
+    UNKNOWN,
+    MapImage,
+    as_array,
+    checked_components,
+    colour,
+    count_text,
+    draw_paths,
+    ellipse_outlines,
+    even_sample,
+    figure_title,
+    label_axes,
+    legend_below,
+    metres,
+    new_figure,
+    path_handles,
+)
 from gmmtorch.scan import ArrayLike
-from gmmtorch.team.exploration.world.scoring import BeliefRule
+from gmmtorch.team.exploration import BeliefRule
 
 MAX_ELLIPSES = 20_000
 
@@ -73,7 +86,7 @@ def trajectories_figure(
     colours = np.tile(np.array(to_rgb(_FREE)), (*occupied.shape, 1))
     handles = [_patch(_SURFACE, "surface")]
     if coverage is not None:
-        counts = style.as_array(coverage)
+        counts = as_array(coverage)
         if counts.shape != tuple(occupied.shape):
             raise InvalidArgumentError(
                 f"coverage has shape {counts.shape}; expected {tuple(occupied.shape)}, a count for each cell "
@@ -85,11 +98,11 @@ def trajectories_figure(
     figure, (axes, *_) = _sheet(world, 1, 9.0)
     _draw(axes, world, colours)
     draw_paths(axes, trajectories, world.band, ends=True)
-    style.label_axes(axes, "", "x [m]", "y [m]")
-    style.legend_below(figure, [*handles, *path_handles(trajectories, world.band, ends=True)])
+    label_axes(axes, "", "x [m]", "y [m]")
+    legend_below(figure, [*handles, *path_handles(trajectories, world.band, ends=True)])
     heights = _heights(world)
     shown = "surfaces" if coverage is None else "surfaces and coverage"
-    style.figure_title(figure, f"Robot paths\n{shown}{heights}" if heights else "Robot paths")
+    figure_title(figure, f"Robot paths\n{shown}{heights}" if heights else "Robot paths")
     return figure
 
 
@@ -116,33 +129,33 @@ def team_map_figure(snapshots: Sequence[TeamSnapshot], belief: BeliefRule | None
         has_components |= _draw_ellipses(axes, snapshot) > 0
         draw_paths(axes, snapshot.trajectories, snapshot.view.band, ends=False, width=1.7)
         caption = f", {snapshot.caption}" if snapshot.caption else ""
-        style.label_axes(axes, f"t = {snapshot.time:.0f} s{caption}", "x [m]", "y [m]")
+        label_axes(axes, f"t = {snapshot.time:.0f} s{caption}", "x [m]", "y [m]")
         axes.label_outer()
     for axes in grid[len(snapshots) :]:
         axes.set_visible(False)
     handles = [
         _patch(_FREE, "free"),
         _patch(_SURFACE, "occupied"),
-        _patch(style.UNKNOWN, "unknown"),
+        _patch(UNKNOWN, "unknown"),
     ]
     if has_components:
-        ring = Line2D([], [], color=style.EDGE, marker="o", fillstyle="none", markersize=9, linestyle="")
+        ring = Line2D([], [], color=EDGE, marker="o", fillstyle="none", markersize=9, linestyle="")
         ring.set_label("component, 2σ")
         handles.append(ring)
     paths = max((s.trajectories for s in snapshots), key=lambda paths: (len(paths), sum(map(len, paths))))
-    style.legend_below(figure, [*handles, *path_handles(paths, snapshots[0].view.band, ends=False)])
-    style.figure_title(figure, f"Team map{_heights(snapshots[0].view)}")
+    legend_below(figure, [*handles, *path_handles(paths, snapshots[0].view.band, ends=False)])
+    figure_title(figure, f"Team map{_heights(snapshots[0].view)}")
     return figure
 
 
 def _patch(face: str, label: str) -> Artist:
-    return Patch(facecolor=face, edgecolor=style.EDGE, label=label)
+    return Patch(facecolor=face, edgecolor=EDGE, label=label)
 
 
 def _heights(view: MapImage) -> str:
     """Returns the heights that an image shows as the end of a title; "" if they have no bounds."""
     low, high = view.band
-    return f" between z = {style.metres(low)} and {style.metres(high)}" if math.isfinite(low + high) else ""
+    return f" between z = {metres(low)} and {metres(high)}" if math.isfinite(low + high) else ""
 
 
 def _sheet(view: MapImage, n: int, width: float) -> tuple[Figure, list[Axes]]:
@@ -153,7 +166,7 @@ def _sheet(view: MapImage, n: int, width: float) -> tuple[Figure, list[Axes]]:
     n_columns = 1 if n <= 3 and shape < 0.45 else n_columns
     n_rows = math.ceil(n / n_columns)
     side = width / max(1.0, shape**0.5)
-    figure = style.new_figure(max(side * n_columns + 0.8, 6.8), (side * shape + 0.35) * n_rows + 1.5)
+    figure = new_figure(max(side * n_columns + 0.8, 6.8), (side * shape + 0.35) * n_rows + 1.5)
     return figure, list(np.asarray(figure.subplots(n_rows, n_columns, squeeze=False)).flat)
 
 
@@ -167,7 +180,7 @@ def _classes(image: Tensor, belief: BeliefRule) -> np.ndarray:
     """Returns the colours (nx, ny, 3) of free, occupied and unknown cells."""
     label = belief.classes(image.detach().cpu().double()).numpy()[..., None]
     colours = np.where(label == CellClass.OCCUPIED, to_rgb(_SURFACE), to_rgb(_FREE))
-    return np.where(label == CellClass.UNKNOWN, to_rgb(style.UNKNOWN), colours)
+    return np.where(label == CellClass.UNKNOWN, to_rgb(UNKNOWN), colours)
 
 
 def _shaded(counts: np.ndarray, n_robots: int) -> tuple[np.ndarray, list[Artist]]:
@@ -175,9 +188,9 @@ def _shaded(counts: np.ndarray, n_robots: int) -> tuple[np.ndarray, list[Artist]
     entries."""
     levels = max(1, min(len(_SEEN), n_robots))
     seen = np.clip(counts, 0, levels).astype(np.int64)
-    colours = np.array([to_rgb(c) for c in (style.UNKNOWN, *_SEEN)])[seen]
+    colours = np.array([to_rgb(c) for c in (UNKNOWN, *_SEEN)])[seen]
     total = max(int((seen > 0).sum()), 1)
-    handles = [_patch(style.UNKNOWN, "not seen")]
+    handles = [_patch(UNKNOWN, "not seen")]
     for level in range(1, levels + 1):
         robots = f"{level} or more robots" if level == levels < n_robots else count_text(level, "robot")
         share = 100 * (seen == level).sum() / total
@@ -195,9 +208,9 @@ def _draw_ellipses(axes: Axes, snapshot: TeamSnapshot) -> int:
         )
     low, high = snapshot.view.band
     kept = ((means[:, 2] >= low) & (means[:, 2] <= high)).nonzero()[:, 0]
-    kept = kept[style.even_sample(len(kept), MAX_ELLIPSES)]
+    kept = kept[even_sample(len(kept), MAX_ELLIPSES)]
     outlines = ellipse_outlines(means[kept, :2], covariances[kept, :2, :2], n_corners=24)
-    edges = np.array([to_rgb(style.colour(int(robot))) for robot in owners[kept]]).reshape(-1, 3)
+    edges = np.array([to_rgb(colour(int(robot))) for robot in owners[kept]]).reshape(-1, 3)
     faces = np.hstack([edges, np.full((len(edges), 1), 0.15)])
     patches = PolyCollection(list(outlines), facecolors=faces, edgecolors=edges, linewidths=0.5, zorder=2)
     axes.add_collection(patches, autolim=False)

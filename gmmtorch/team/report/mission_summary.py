@@ -7,9 +7,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from gmmtorch.report.style import Rows
-from gmmtorch.report.tensorboard_writer import Board
-from gmmtorch.team.exploration.mission.results import NETWORK, differing
+from gmmtorch.report import Board, Rows
+from gmmtorch.team.exploration import NETWORK, differing
 from gmmtorch.team.report.trial_groups import by_variant, check_rows, named_fields, paired_difference
 
 _EMPTY = "\N{EN DASH}"

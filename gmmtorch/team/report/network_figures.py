@@ -12,10 +12,28 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.report import style
-from gmmtorch.report.labels import LineEnd, label_ends
-from gmmtorch.report.table import byte_text, ratio_text
-from gmmtorch.team.exploration.mission.paired_statistics import Band
+from gmmtorch.report import (
+    LABEL_SIZE,
+    PALETTE,
+    TICK_SIZE,
+    TITLE_SIZE,
+    LineEnd,
+    Rows,
+    byte_text,
+    colour,
+    draw_grid,
+    figure_title,
+    label_axes,
+    label_ends,
+    legend_below,
+    line_look,
+    line_style,
+    new_figure,
+    ratio_text,
+    stacked_bars,
+    tick_text,
+)
+from gmmtorch.team.exploration import Band
 from gmmtorch.team.report.trial_groups import (
     REMAINING,
     TIME,
@@ -36,7 +54,7 @@ _PERCENT_TICKS = (0.0, 0.1, 1.0, 10.0, 100.0)
 _SERIES = ("entropy_bits", "wire_bytes_over_time", "missing_share")
 
 
-def loss_figure(rows: style.Rows) -> Figure:
+def loss_figure(rows: Rows) -> Figure:
     """Draws remaining entropy and bytes with headers over simulated time, and below them one panel per
     variant with the share of all records that the robot with the most gaps is missing.
 
@@ -60,38 +78,38 @@ def loss_figure(rows: style.Rows) -> Figure:
     figure, left, sent, multiples = _panels(len(variants), window)
     entropy_ends, byte_ends = [], []
     for index, (axes, (name, trials)) in enumerate(zip(multiples, variants.items(), strict=True)):
-        look: dict[str, Any] = {"color": style.colour(index), "linestyle": style.line_style(index)}
+        look: dict[str, Any] = {"color": colour(index), "linestyle": line_style(index)}
         entropy = curves_of(trials, [percent_left(row) for row in trials])
         n_bytes = curves_of(trials, [row["wire_bytes_over_time"] for row in trials])
         entropy.draw(left, **look)
         n_bytes.draw(sent, **look)
         lines, total = name.replace(", ", ",\n"), float(n_bytes.band.mean[-1])
         note = f"{milestone_text(trials, 't90')}{_ratio_note(trials, 't90_ratio')}"
-        entropy_ends.append(LineEnd(float(entropy.band.mean[-1]), f"{lines}\n{note}", style.colour(index)))
+        entropy_ends.append(LineEnd(float(entropy.band.mean[-1]), f"{lines}\n{note}", colour(index)))
         note = f"{byte_text(total)}{_ratio_note(trials, 'wire_ratio')}"
-        byte_ends.append(LineEnd(total, f"{lines}\n{note}", style.colour(index)))
+        byte_ends.append(LineEnd(total, f"{lines}\n{note}", colour(index)))
         _draw_missing(axes, trials, window, look)
-        style.label_axes(axes, "", TIME, "% of all records")
+        label_axes(axes, "", TIME, "% of all records")
         axes.label_outer()
         heading = "\n".join([name, *_map_texts(trials)])
-        axes.set_title(heading, fontsize=style.LABEL_SIZE - 1, color=style.colour(index))
+        axes.set_title(heading, fontsize=LABEL_SIZE - 1, color=colour(index))
         _shade(axes, trials)
-    style.label_axes(left, "remaining entropy", TIME, "% of observable")
+    label_axes(left, "remaining entropy", TIME, "% of observable")
     left.set_ylim(0, max(100.0, left.dataLim.y1) * 1.015)
-    style.label_axes(sent, "bytes sent, with headers", TIME, "cumulative bytes")
+    label_axes(sent, "bytes sent, with headers", TIME, "cumulative bytes")
     sent.set_ylim(0, max(sent.dataLim.y1, 1.0) * 1.03)
-    style.tick_text(sent.yaxis, lambda value: byte_text(value, digits=2))
+    tick_text(sent.yaxis, lambda value: byte_text(value, digits=2))
     for axes in (left, sent, *multiples):
         axes.set_xlim(0, last)
-        style.draw_grid(axes)
+        draw_grid(axes)
     for axes, ends in ((left, entropy_ends), (sent, byte_ends)):
         _shade(axes, rows, "partition")
-        label_ends(axes, ends, style.LABEL_SIZE - 1)
-    style.figure_title(figure, f"Sharing over unreliable networks: {about(rows)}\n{seeds_note(rows)}")
+        label_ends(axes, ends, LABEL_SIZE - 1)
+    figure_title(figure, f"Sharing over unreliable networks: {about(rows)}\n{seeds_note(rows)}")
     return figure
 
 
-def _check(rows: style.Rows) -> None:
+def _check(rows: Rows) -> None:
     check_rows(rows)
     for row in rows:
         missing = [name for name in _SERIES if not row.get(name)]
@@ -107,18 +125,18 @@ def _panels(n: int, window: float) -> tuple[Figure, Axes, Axes, list[Axes]]:
     n_columns = min(n, _MAX_COLUMNS)
     n_rows = math.ceil(n / n_columns)
     heights = (4.2, 3.2 * n_rows)
-    figure = style.new_figure(13.0, 0.8 + sum(heights))
+    figure = new_figure(13.0, 0.8 + sum(heights))
     above, below = np.asarray(figure.subfigures(2, 1, height_ratios=heights))
     left, sent = above.subplots(1, 2)
     places = below.subplots(n_rows, n_columns, sharex=True, sharey=True, squeeze=False).ravel()
     text = f"missing records of the robot with the most gaps, median over {window:.3g} s"
-    below.suptitle(text, fontsize=style.TITLE_SIZE)
+    below.suptitle(text, fontsize=TITLE_SIZE)
     for spare in places[n:]:
         spare.set_visible(False)
     return figure, left, sent, list(places[:n])
 
 
-def _draw_missing(axes: Axes, trials: style.Rows, window: float, look: Mapping[str, Any]) -> None:
+def _draw_missing(axes: Axes, trials: Rows, window: float, look: Mapping[str, Any]) -> None:
     curves = curves_of(trials, [_percent_missing(row, window) for row in trials])
     mean, low, high = curves.band
     # Student's interval may exceed the bounds of a share.
@@ -140,14 +158,14 @@ def _percent_missing(row: Mapping[str, Any], window: float) -> np.ndarray:
     return 100 * np.array([np.median(share[a:b]) for a, b in zip(first, end, strict=True)])
 
 
-def _ratio_note(trials: style.Rows, field: str) -> str:
+def _ratio_note(trials: Rows, field: str) -> str:
     """Returns the mean ratio to lossless missions, if every seed has one and these trials have faults."""
     ratios = known(trials, field)
     has_faults = any(row.get("loss") or row.get("partitions") for row in trials)
     return f", {ratio_text(float(np.mean(ratios)))}" if has_faults and len(ratios) == len(trials) else ""
 
 
-def _map_texts(trials: style.Rows) -> list[str]:
+def _map_texts(trials: Rows) -> list[str]:
     notes = []
     if len(differ := known(trials, "map_disagreement")) == len(trials):
         notes.append(f"{100 * np.mean(differ):.2g} % of cells differ")
@@ -156,7 +174,7 @@ def _map_texts(trials: style.Rows) -> list[str]:
     return notes
 
 
-def _shade(axes: Axes, rows: style.Rows, name: str = "") -> None:
+def _shade(axes: Axes, rows: Rows, name: str = "") -> None:
     """Shades the times at which robots are cut off."""
     spans = {(float(cut["begin"]), float(cut["end"])) for row in rows for cut in row.get("partitions") or []}
     for begin, end in sorted(spans):
@@ -169,27 +187,27 @@ def _shade(axes: Axes, rows: style.Rows, name: str = "") -> None:
             textcoords="offset points",
             ha="center",
             va="top",
-            fontsize=style.TICK_SIZE - 1,
+            fontsize=TICK_SIZE - 1,
             color="#555555",
         )
 
 
 _HUES = {
-    "components": style.PALETTE[0],
-    "counts": style.PALETTE[5],
-    "supersessions": style.PALETTE[4],
-    "corrections": style.PALETTE[1],
+    "components": PALETTE[0],
+    "counts": PALETTE[5],
+    "supersessions": PALETTE[4],
+    "corrections": PALETTE[1],
     "frames": "#8a6d3b",
-    "points": style.PALETTE[6],
-    "views": style.PALETTE[2],
-    "plans": style.PALETTE[3],
+    "points": PALETTE[6],
+    "views": PALETTE[2],
+    "plans": PALETTE[3],
     "announcements": "#9a9a9a",
 }
 """Colours of the kinds of datagrams, in the order of the bars."""
 _MAX_LABELS = 10
 
 
-def team_run_figure(rows: style.Rows) -> Figure:
+def team_run_figure(rows: Rows) -> Figure:
     """Draws the map of each robot over time (left), and the bytes it sent by kind, each datagram once
     (right).
 
@@ -203,48 +221,48 @@ def team_run_figure(rows: style.Rows) -> Figure:
         InvalidArgumentError: no row.
     """
     check_rows(rows)
-    figure = style.new_figure(11.6, max(4.2, 2.4 + 0.3 * len(rows)))
+    figure = new_figure(11.6, max(4.2, 2.4 + 0.3 * len(rows)))
     left, right = figure.subplots(1, 2)
     _draw_maps(left, rows)
     _draw_bytes(right, rows)
-    style.legend_below(figure, max_columns=8)
-    style.figure_title(figure, _title(rows))
+    legend_below(figure, max_columns=8)
+    figure_title(figure, _title(rows))
     return figure
 
 
-def _title(rows: style.Rows) -> str:
+def _title(rows: Rows) -> str:
     if len(rows) == 1:
         return f"Robot {rows[0]['robot']}"
     same = len({row["digest"] for row in rows}) == 1
     return f"{len(rows)} robots with {'the same map' if same else 'different maps'}"
 
 
-def _draw_maps(axes: Axes, rows: style.Rows) -> None:
+def _draw_maps(axes: Axes, rows: Rows) -> None:
     explores = all(row.get("entropy_bits") and row.get("observable_bits") for row in rows)
     ends = []
     for index, row in enumerate(rows):
         values = percent_left(row) if explores else np.asarray(row["records_over_time"], dtype=np.float64)
-        look = style.line_look(index, with_marker=False)
+        look = line_look(index, with_marker=False)
         axes.plot(np.asarray(row["times"], dtype=np.float64), values, **look)
-        ends.append(LineEnd(float(values[-1]), f"{row['robot']}", style.colour(index)))
-    style.label_axes(axes, "", "time of the robot [s]", REMAINING if explores else "number of records")
+        ends.append(LineEnd(float(values[-1]), f"{row['robot']}", colour(index)))
+    label_axes(axes, "", "time of the robot [s]", REMAINING if explores else "number of records")
     begin, end = axes.dataLim.intervalx
     axes.set(xlim=(begin, end if end > begin else begin + 1), ylim=(0, axes.get_ylim()[1]))
-    style.draw_grid(axes)
+    draw_grid(axes)
     if 1 < len(rows) <= _MAX_LABELS:
         label_ends(axes, ends)
 
 
-def _draw_bytes(axes: Axes, rows: style.Rows) -> None:
+def _draw_bytes(axes: Axes, rows: Rows) -> None:
     sizes = {kind: np.array([row["bytes_by_kind"].get(kind, 0.0) for row in rows]) for kind in _HUES}
     sizes = {kind: size for kind, size in sizes.items() if size.any()}
-    totals = style.stacked_bars(axes, sizes, [_HUES[kind] for kind in sizes])
+    totals = stacked_bars(axes, sizes, [_HUES[kind] for kind in sizes])
     for place, total in enumerate(totals):
-        axes.text(total, place, f" {byte_text(float(total))}", va="center", fontsize=style.TICK_SIZE)
-    style.label_axes(axes, "", "bytes sent, without headers", "")
-    axes.set_yticks(range(len(rows)), [f"robot {row['robot']}" for row in rows], fontsize=style.LABEL_SIZE)
+        axes.text(total, place, f" {byte_text(float(total))}", va="center", fontsize=TICK_SIZE)
+    label_axes(axes, "", "bytes sent, without headers", "")
+    axes.set_yticks(range(len(rows)), [f"robot {row['robot']}" for row in rows], fontsize=LABEL_SIZE)
     for index, label in enumerate(axes.get_yticklabels()):
-        label.set_color(style.colour(index))
+        label.set_color(colour(index))
     axes.set_xlim(0, 1.2 * max(float(totals.max(initial=0.0)), 1.0))
     axes.xaxis.set_major_locator(MaxNLocator(4))
-    style.tick_text(axes.xaxis, byte_text)
+    tick_text(axes.xaxis, byte_text)

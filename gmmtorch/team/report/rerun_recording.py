@@ -14,11 +14,9 @@ from matplotlib.colors import to_rgb
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.files import write_atomically
-from gmmtorch.occupancy.grid import check_resolution
+from gmmtorch.occupancy import check_resolution
 from gmmtorch.optional_packages import needs_extra
-from gmmtorch.report.scenes.ellipsoids import checked_components, height_colours, principal_axes
-from gmmtorch.report.scenes.scene_renderer import N_SIGMA
-from gmmtorch.report.style import as_array, colour
+from gmmtorch.report import N_SIGMA, as_array, checked_components, colour, height_colours, principal_axes
 from gmmtorch.scan import ArrayLike
 
 TIMELINE = "simulated_time"

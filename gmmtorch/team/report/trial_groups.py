@@ -9,18 +9,19 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.report import style
-from gmmtorch.report.table import byte_text, count_text
+from gmmtorch.report import PALETTE, Rows, as_array, byte_text, count_text, label_of
 from gmmtorch.scan import ArrayLike
-from gmmtorch.team.exploration.mission.options import THESIS
-from gmmtorch.team.exploration.mission.paired_statistics import (
+from gmmtorch.team.exploration import (
+    NETWORK,
+    THESIS,
     Band,
     Interval,
+    differing,
     mean_band,
     on_common_times,
     paired_interval,
+    variant_of,
 )
-from gmmtorch.team.exploration.mission.results import NETWORK, differing, variant_of
 
 FRAMEWORKS = {
     "gmm_shared": "E0 shared mixtures",
@@ -29,7 +30,7 @@ FRAMEWORKS = {
     "gmm_thesis": "E0 of the thesis",
 }
 """Names of the thesis's frameworks, in the order of figures."""
-_COLOURS = dict(zip(FRAMEWORKS, (*style.PALETTE[:3], style.PALETTE[5]), strict=True))
+_COLOURS = dict(zip(FRAMEWORKS, (*PALETTE[:3], PALETTE[5]), strict=True))
 
 TIME = "simulated time [s]"
 REMAINING = "remaining entropy [% of observable]"
@@ -40,7 +41,7 @@ _UNLIMITED = {"bandwidth": "no limit", "reach": "any reach", "budget": "no budge
 
 def framework_name(framework: str) -> str:
     """Returns the name of a framework as shown in figures."""
-    return FRAMEWORKS.get(framework, style.label_of(framework))
+    return FRAMEWORKS.get(framework, label_of(framework))
 
 
 def short_name(framework: str) -> str:
@@ -53,10 +54,10 @@ def short_name(framework: str) -> str:
 
 def framework_colour(framework: str) -> str:
     """Returns the colour of a framework; the same in every figure."""
-    return _COLOURS.get(framework, style.PALETTE[-1])
+    return _COLOURS.get(framework, PALETTE[-1])
 
 
-def by_framework(rows: style.Rows) -> dict[str, list[Mapping[str, Any]]]:
+def by_framework(rows: Rows) -> dict[str, list[Mapping[str, Any]]]:
     """Groups rows by framework: E0, E1, E2, E0 of the thesis, then others in order of occurrence.
 
     Raises `InvalidArgumentError` if there is no row.
@@ -68,13 +69,13 @@ def by_framework(rows: style.Rows) -> dict[str, list[Mapping[str, Any]]]:
     return {name: [row for row in rows if row["framework"] == name] for name in order}
 
 
-def check_rows(rows: style.Rows) -> None:
+def check_rows(rows: Rows) -> None:
     """Raises `InvalidArgumentError` if there is no row."""
     if not rows:
         raise InvalidArgumentError("rows is empty; give the rows of one trial at least.")
 
 
-def by_variant(rows: style.Rows, otherwise: str = "planner") -> dict[str, list[Mapping[str, Any]]]:
+def by_variant(rows: Rows, otherwise: str = "planner") -> dict[str, list[Mapping[str, Any]]]:
     """Groups rows by the options in which they differ, in order of occurrence; the names list these options.
 
     If rows differ in none, the name is the value of the field `otherwise`. A variant whose name would be
@@ -132,7 +133,7 @@ def _option_text(field: str, value: Any) -> str:
             text = f"{value:g}" if isinstance(value, float) else str(value).lower()
             return f"{field}={'null' if value is None else text}"
         case _:
-            return _NAMES.get(str(value), style.label_of(str(value)))
+            return _NAMES.get(str(value), label_of(str(value)))
 
 
 def _partition_text(partition: Mapping[str, Any]) -> str:
@@ -157,7 +158,7 @@ class Curves(NamedTuple):
             axes.fill_between(self.times, low, high, **area)
 
 
-def curves_of(rows: style.Rows, values: Sequence[Any]) -> Curves:
+def curves_of(rows: Rows, values: Sequence[Any]) -> Curves:
     """Returns mean and 95 % band of one series (T,) per row, at the times that all rows cover."""
     times, curves = on_common_times([row["times"] for row in rows], values)
     return Curves(times, mean_band(curves), len(curves))
@@ -177,16 +178,16 @@ def observable(row: Mapping[str, Any]) -> float:
 def percent_left(row: Mapping[str, Any], entropy_bits: ArrayLike | None = None) -> np.ndarray:
     """Returns the remaining entropy (T,) in percent of the observable: of the team's union of maps, or of
     `entropy_bits` (T,) if given."""
-    bits = style.as_array(row["entropy_bits"] if entropy_bits is None else entropy_bits)
+    bits = as_array(row["entropy_bits"] if entropy_bits is None else entropy_bits)
     return 100 * bits / observable(row)
 
 
-def known(rows: style.Rows, field: str) -> list[float]:
+def known(rows: Rows, field: str) -> list[float]:
     """Returns the values of a field in the rows that have one."""
     return [float(row[field]) for row in rows if row.get(field) is not None]
 
 
-def milestone_text(rows: style.Rows, field: str) -> str:
+def milestone_text(rows: Rows, field: str) -> str:
     """Returns the mean of a milestone such as t90 (s), or in how many rows it was reached if not in all."""
     times = known(rows, field)
     if len(times) < len(rows):
@@ -211,7 +212,7 @@ def paired_difference(
     return paired_interval(*complete.T)
 
 
-def seeds_note(rows: style.Rows, confidence: str = "95 % confidence band") -> str:
+def seeds_note(rows: Rows, confidence: str = "95 % confidence band") -> str:
     """Returns what lines and bands show: mean of 5 seeds with 95 % confidence band; or one mission of E0,
     seed 0."""
     sizes = sorted({len(group) for group in _same_but_seed(rows)})
@@ -223,16 +224,16 @@ def seeds_note(rows: style.Rows, confidence: str = "95 % confidence band") -> st
     return f"one mission {which}" + (f", seed {seeds.pop()}" if len(seeds) == 1 else "")
 
 
-def about(rows: style.Rows) -> str:
+def about(rows: Rows) -> str:
     """Returns the world and the number of robots that all rows share."""
     worlds = {str(row.get("world", "")) for row in rows}
     numbers = {int(row["n_robots"]) for row in rows}
-    parts = [style.label_of(world) for world in worlds if world and len(worlds) == 1]
+    parts = [label_of(world) for world in worlds if world and len(worlds) == 1]
     parts += [count_text(n, "robot") for n in numbers if len(numbers) == 1]
     return ", ".join(parts)
 
 
-def _same_but_seed(rows: style.Rows) -> list[list[Mapping[str, Any]]]:
+def _same_but_seed(rows: Rows) -> list[list[Mapping[str, Any]]]:
     groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
     for row in rows:
         groups.setdefault((row.get("world"), *variant_of(row)), []).append(row)

@@ -11,9 +11,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import check_whole
-from gmmtorch.mapping.codec.quantization import spatial_order
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.association import summed
+from gmmtorch.mapping import Components, spatial_order, summed
 from gmmtorch.team.sharing.messages.envelope import check_codec, within
 from gmmtorch.team.sharing.messages.message_registry import (
     ComponentsMessage,

@@ -10,10 +10,8 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import check_number, check_whole
-from gmmtorch.localization.registration.registration import register
-from gmmtorch.localization.tracker import Tracker
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.localization import Tracker, register
+from gmmtorch.mapping import Components, GaussianMap
 from gmmtorch.scan import Scan
 from gmmtorch.team.sharing.replica.replica import Replica
 

@@ -7,9 +7,7 @@ import time
 
 import torch
 
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.window_motions import MotionAt, WindowMotions
+from gmmtorch.mapping import Components, GaussianMap, MotionAt, WindowMotions
 from gmmtorch.scan import Scan
 from gmmtorch.team.sharing.frame_joiner import FrameJoiner
 from gmmtorch.team.sharing.radio import Radio, RecordStore

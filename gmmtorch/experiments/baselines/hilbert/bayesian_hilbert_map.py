@@ -20,7 +20,7 @@ from gmmtorch.experiments.baselines.hilbert.logistic_regression import (
 )
 from gmmtorch.experiments.baselines.samples import beam_samples
 from gmmtorch.files import require
-from gmmtorch.occupancy.protocol import TensorFileMap, check_length, optional_length
+from gmmtorch.occupancy import TensorFileMap, check_length, optional_length
 from gmmtorch.scan import Scan
 
 _MAX_FULL = 4096  # most hinges with a full covariance

@@ -14,7 +14,7 @@ from gmmtorch.experiments.baselines.hilbert.lattice_features import LatticeFeatu
 from gmmtorch.experiments.baselines.hilbert.logistic_regression import logistic_regression
 from gmmtorch.experiments.baselines.samples import beam_samples
 from gmmtorch.files import require
-from gmmtorch.occupancy.protocol import TensorFileMap, check_length, optional_length
+from gmmtorch.occupancy import TensorFileMap, check_length, optional_length
 from gmmtorch.scan import Scan
 
 Features = FourierFeatures | NystroemFeatures | LatticeFeatures

@@ -7,32 +7,31 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gmmtorch.cli import common
-from gmmtorch.cli.options.structured import build
+from gmmtorch.cli import as_options, build, naming
 from gmmtorch.events import Event, OnRows, Row
 from gmmtorch.experiments.cli import fit_outputs
 from gmmtorch.experiments.cli.fits_of_options import fit_data, fit_data_of, fit_options, selected_scans
 from gmmtorch.experiments.cli.studies.study import Found, Study
-from gmmtorch.experiments.evaluation.fits.fit_comparison import means
-from gmmtorch.experiments.report.fit_study_figures import (
-    component_count_figures,
-    initialization_figures,
-    sensor_model_figures,
-)
-from gmmtorch.experiments.studies import component_count, initialization_study, sensor_noise
-from gmmtorch.experiments.studies.study_options import (
+from gmmtorch.experiments.evaluation import means
+from gmmtorch.experiments.report import component_count_figures, initialization_figures, sensor_model_figures
+from gmmtorch.experiments.studies import (
     ComponentCountStudy,
     InitializationStudy,
     SensorModelStudy,
+    middle,
+    run_component_count,
+    run_initialization,
+    run_sensor_noise,
+    sensor_model,
 )
 
 Figures = Callable[[list[Row]], Mapping[str, Any]]
 
 
 def _initialization(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
-    study = build(InitializationStudy, common.as_options(config.study), "study")
+    study = build(InitializationStudy, as_options(config.study), "study")
     data = fit_data(config, device, on_event)
-    rows = initialization_study.run(data, study, fit_options(config), config.seed, on_event, on_rows)
+    rows = run_initialization(data, study, fit_options(config), config.seed, on_event, on_rows)
     return _found(
         rows,
         initialization_figures,
@@ -43,9 +42,9 @@ def _initialization(config: DictConfig, device: str, on_event: Event, on_rows: O
 
 def _sensor_model(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
     """Fields of a fit that this study does not measure are None."""
-    study = build(SensorModelStudy, common.as_options(config.study), "study")
-    with common.naming({name: f"study.{name}" for name in ("sensor", "sensor_options")}):
-        sensor_noise.sensor_model(study)  # an invalid option fails before the scans are read
+    study = build(SensorModelStudy, as_options(config.study), "study")
+    with naming({name: f"study.{name}" for name in ("sensor", "sensor_options")}):
+        sensor_model(study)  # an invalid option fails before the scans are read
     dataset, scans = selected_scans(config, device, on_event)
     rows = [
         {
@@ -55,7 +54,7 @@ def _sensor_model(config: DictConfig, device: str, on_event: Event, on_rows: OnR
             "psnr2_db": None,
             **row,
         }
-        for row in sensor_noise.run(dataset, scans, study, config.seed, on_event)
+        for row in run_sensor_noise(dataset, scans, study, config.seed, on_event)
     ]
     return _found(
         rows,
@@ -66,11 +65,11 @@ def _sensor_model(config: DictConfig, device: str, on_event: Event, on_rows: OnR
 
 
 def _component_count(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
-    study = build(ComponentCountStudy, common.as_options(config.study), "study")
+    study = build(ComponentCountStudy, as_options(config.study), "study")
     dataset, scans = selected_scans(config, device, on_event)
-    data = fit_data_of(config, dataset, component_count.middle(scans, study.window))
+    data = fit_data_of(config, dataset, middle(scans, study.window))
     options = fit_options(config)
-    rows = component_count.run(data, scans, study, options, config.seed, on_event, on_rows)
+    rows = run_component_count(data, scans, study, options, config.seed, on_event, on_rows)
     return _found(
         rows,
         component_count_figures,

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 
 from omegaconf import DictConfig
 
-from gmmtorch.cli import common
+from gmmtorch.cli import chosen_options, print_table, show, write_results
 from gmmtorch.errors import check_choice
 from gmmtorch.events import Event, OnRows, Row
-from gmmtorch.report.tensorboard_writer import Board
+from gmmtorch.report import Board
 
 
 class Found(NamedTuple):
@@ -60,7 +60,7 @@ def run(
     check_choice("study.name", config.study.name, studies)
 
     def on_rows(rows: list[Row]) -> None:
-        common.write_results(command, config, rows, folder)
+        write_results(command, config, rows, folder)
 
     found = studies[config.study.name](config, device, on_event, on_rows)
     on_rows(found.rows)
@@ -72,8 +72,8 @@ def run(
         for index, row in enumerate(rows):
             board.scalars(row, str(row[found.line]), step=index if step is None else int(row[step]))
         if found.scores:
-            board.hparams(common.chosen_options(config), dict(found.scores))
+            board.hparams(chosen_options(config), dict(found.scores))
 
-    common.show(config, folder, lambda: found.figures(found.rows), write)
-    common.print_table(shown, found.table.split(), found.about)
+    show(config, folder, lambda: found.figures(found.rows), write)
+    print_table(shown, found.table.split(), found.about)
     return found.rows

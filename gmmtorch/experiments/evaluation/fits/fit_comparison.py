@@ -23,13 +23,15 @@ from gmmtorch.events import Event, OnRows, Row
 from gmmtorch.experiments.evaluation.fits.fit_pruning import Views, pruned, tree_options
 from gmmtorch.experiments.evaluation.metrics import psnr2, psnr_terms
 from gmmtorch.experiments.evaluation.protocol_options import FitOptions
-from gmmtorch.mixture.estimator import MixtureEstimator
-from gmmtorch.mixture.estimators.riemannian import RiemannianGaussianMixture
-from gmmtorch.mixture.estimators.sliced_wasserstein import SlicedWassersteinGaussianMixture
-from gmmtorch.mixture.estimators.trees.hierarchical import HierarchicalGaussianMixture
-from gmmtorch.mixture.estimators.variational import VariationalGaussianMixture
-from gmmtorch.mixture.gaussian_mixture import GaussianMixture
-from gmmtorch.mixture.reduction.prune_options import PruneOptions
+from gmmtorch.mixture import (
+    GaussianMixture,
+    HierarchicalGaussianMixture,
+    MixtureEstimator,
+    PruneOptions,
+    RiemannianGaussianMixture,
+    SlicedWassersteinGaussianMixture,
+    VariationalGaussianMixture,
+)
 
 ESTIMATORS: dict[str, type] = {
     "em": GaussianMixture,

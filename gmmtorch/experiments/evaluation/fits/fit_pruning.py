@@ -8,10 +8,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mixture.estimator import MixtureEstimator
-from gmmtorch.mixture.estimators.sensor_model import SensorModel, measured_sensor
-from gmmtorch.mixture.reduction.prune_options import PruneOptions
-from gmmtorch.mixture.reduction.pruning import prune
+from gmmtorch.mixture import MixtureEstimator, PruneOptions, SensorModel, measured_sensor, prune
 
 
 class Views(NamedTuple):

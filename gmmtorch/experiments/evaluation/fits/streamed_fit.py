@@ -6,16 +6,20 @@ import time
 import warnings
 from typing import NamedTuple
 
-from gmmtorch.datasets.point_files.point_chunks import PointChunks, in_memory
+from gmmtorch.datasets import PointChunks, in_memory
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.events import Event, Row
 from gmmtorch.experiments.evaluation.fits.fit_comparison import FitData, row_of
 from gmmtorch.experiments.evaluation.protocol_options import FitOptions
-from gmmtorch.mixture.gaussian_mixture import GaussianMixture
-from gmmtorch.mixture.streaming.checkpoints import Checkpoint
-from gmmtorch.mixture.streaming.distributed import SINGLE_PROCESS, Processes
-from gmmtorch.mixture.streaming.stream_fit import fit_stream, score_stream
-from gmmtorch.mixture.streaming.stream_start import survey_all
+from gmmtorch.mixture import (
+    SINGLE_PROCESS,
+    Checkpoint,
+    GaussianMixture,
+    Processes,
+    fit_stream,
+    score_stream,
+    survey_all,
+)
 
 _SPLIT_SALT = 0x5EED  # makes the split independent of the sample
 

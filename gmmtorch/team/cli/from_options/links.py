@@ -9,13 +9,9 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gmmtorch.cli import common
+from gmmtorch.cli import as_options, logger, naming
 from gmmtorch.errors import InvalidArgumentError, check_choice
-from gmmtorch.team.sharing.transport.frames import FramedTransport
-from gmmtorch.team.sharing.transport.security import TeamKey
-from gmmtorch.team.sharing.transport.team_key import KEY_VARIABLE
-from gmmtorch.team.sharing.transport.udp import UdpTransport
-from gmmtorch.team.sharing.transport.zenoh_transport import ZenohTransport
+from gmmtorch.team.sharing import KEY_VARIABLE, FramedTransport, TeamKey, UdpTransport, ZenohTransport
 
 TRANSPORTS = ("udp", "zenoh")
 _NAMES = {"key": "link.key_file", "insecure": "link.insecure"}
@@ -45,20 +41,20 @@ def open_link(config: DictConfig, robot: int, is_alone: bool = False) -> FramedT
     """
     link = _opened(config, robot, is_alone)
     # Other robots name this session if they meet two robots with this id.
-    common.logger.info("Robot %d uses %s in session %s.", robot, config.transport, link.session.hex())
+    logger.info("Robot %d uses %s in session %s.", robot, config.transport, link.session.hex())
     return link
 
 
 def _opened(config: DictConfig, robot: int, is_alone: bool) -> FramedTransport:
     check_choice("transport", config.transport, TRANSPORTS)
-    link = common.as_options(config.link)
+    link = as_options(config.link)
     key = team_key(link.pop("key_file"))
     if config.transport == "zenoh":
-        with common.naming(_ZENOH_NAMES):
+        with naming(_ZENOH_NAMES):
             return _zenoh(robot, link, key)
-    with common.naming(_UDP_NAMES):
+    with naming(_UDP_NAMES):
         if link["group"] is None and not link["peers"] and not is_alone:
-            common.logger.warning(
+            logger.warning(
                 "link.peers=[]: robot %d sends to no other robot. List the addresses of the others, or give "
                 "all the same link.group.",
                 robot,

@@ -10,20 +10,24 @@ from typing import Any, TypeVar
 
 from omegaconf import DictConfig, OmegaConf
 
-from gmmtorch.cli import common
+from gmmtorch.cli import as_options, naming
 from gmmtorch.errors import InvalidArgumentError, check_choice
 from gmmtorch.events import Event, ignore
-from gmmtorch.mapping.learning.rules import NoveltyRule
-from gmmtorch.simulation.sensors.depth_camera import DepthCamera
-from gmmtorch.team.exploration.mission.options import THESIS, TeamOptions
-from gmmtorch.team.exploration.mission.results import PLANNING
-from gmmtorch.team.exploration.mission.trials import Trial, WorldOptions
-from gmmtorch.team.exploration.planning.primitives import Dynamics
-from gmmtorch.team.exploration.robot.gmm_mapper import FrameRule
-from gmmtorch.team.exploration.robot.robot_state import StoppingRule
-from gmmtorch.team.exploration.world.scoring import BeliefRule
-from gmmtorch.team.exploration.world.world import World
-from gmmtorch.team.sharing.transport.link_conditions import LinkConditions
+from gmmtorch.mapping import NoveltyRule
+from gmmtorch.simulation import DepthCamera
+from gmmtorch.team.exploration import (
+    PLANNING,
+    THESIS,
+    BeliefRule,
+    Dynamics,
+    FrameRule,
+    StoppingRule,
+    TeamOptions,
+    Trial,
+    World,
+    WorldOptions,
+)
+from gmmtorch.team.sharing import LinkConditions
 
 T = TypeVar("T")
 OF_ROBOTS = {"announce": "announce_every", "budget": "budget"}
@@ -47,7 +51,7 @@ NAMES = {
 def variants_of(config: DictConfig) -> list[dict[str, Any]]:
     """The variants of a study. Raises `InvalidArgumentError` for options that a variant cannot set."""
     check_choice("study.name", config.study.name, ("trials",))
-    variants: list[dict[str, Any]] = list(common.as_options(config.study)["variants"])
+    variants: list[dict[str, Any]] = list(as_options(config.study)["variants"])
     known = {"team", *PLANNING, *THESIS, *config.network}
     for variant in variants:
         if not set(variant) <= known:
@@ -93,7 +97,7 @@ def world_options(config: DictConfig) -> WorldOptions:
         )
     options: dict[str, Any] = {
         key: tuple(value) if isinstance(value, list) else value
-        for key, value in common.as_options(config.world).items()
+        for key, value in as_options(config.world).items()
     }
     return WorldOptions(**options, cache=config.runtime.cache)
 
@@ -101,13 +105,13 @@ def world_options(config: DictConfig) -> WorldOptions:
 def open_world(world: WorldOptions, team: TeamOptions, on_event: Event | None = None) -> World:
     """The world for this team; errors name options."""
     names = {name: f"world.{name}" for name in ("path", "bounds", "size", "seed")}
-    with common.naming({**NAMES, **names}):
+    with naming({**NAMES, **names}):
         return world.open(team, on_event or ignore)
 
 
 def team_options(config: DictConfig, seed: int, variant: dict[str, Any]) -> TeamOptions:
     """The team that the options describe, with the changes of a variant."""
-    sensor, mapping = common.as_options(config.sensor), common.as_options(config.map)
+    sensor, mapping = as_options(config.sensor), as_options(config.map)
     mapping |= {name: variant[name] for name in mapping if name in variant and name in THESIS}
     rate, window = sensor.pop("rate"), mapping.pop("window")
     novelty = {name: mapping.pop(name) for name in ("threshold", "observed", "distance", "distance_for")}
@@ -115,7 +119,7 @@ def team_options(config: DictConfig, seed: int, variant: dict[str, Any]) -> Team
     start: Any = config.team.start
     start = OmegaConf.to_container(start) if OmegaConf.is_config(start) else start
     names = {name: f"study.variants: {option}" for option, name in OF_ROBOTS.items() if option in variant}
-    with common.naming({**NAMES, **names}):
+    with naming({**NAMES, **names}):
         options = TeamOptions(
             framework=variant.get("team", config.team.name),
             size=config.team.size,
@@ -123,8 +127,8 @@ def team_options(config: DictConfig, seed: int, variant: dict[str, Any]) -> Team
             seed=seed,
             rate=rate,
             camera=_of("sensor", DepthCamera, sensor),
-            dynamics=_of("robot", Dynamics, common.as_options(config.robot)),
-            belief=_of("belief", BeliefRule, common.as_options(config.belief)),
+            dynamics=_of("robot", Dynamics, as_options(config.robot)),
+            belief=_of("belief", BeliefRule, as_options(config.belief)),
             novelty=_of(
                 "map", NoveltyRule, novelty, resolution=config.world.resolution, prior=config.belief.prior
             ),
@@ -168,13 +172,13 @@ def log_map_options(config: DictConfig) -> DictConfig:
 
 def _of(group: str, make: Callable[..., T], options: dict[str, Any], **others: Any) -> T:
     """The value that `make` builds from the options of a group, and from others; errors name options."""
-    with common.naming({name: f"{group}.{name}" for name in options}):
+    with naming({name: f"{group}.{name}" for name in options}):
         return make(**options, **others)
 
 
 def _network(config: DictConfig, variant: dict[str, Any]) -> dict[str, Any]:
     """The fields of `TeamOptions` for the network; errors name options."""
-    given = {key: value for key, value in common.as_options(config.network).items() if key not in OF_ROBOTS}
+    given = {key: value for key, value in as_options(config.network).items() if key not in OF_ROBOTS}
     names = {key: f"study.variants: {key}" if key in variant else f"network.{key}" for key in given}
     given |= {key: variant[key] for key in given if key in variant}
     if "delay" in given:  # a real network has its own

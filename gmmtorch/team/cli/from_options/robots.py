@@ -10,23 +10,22 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from gmmtorch.cli import common
-from gmmtorch.cli.from_options import maps
-from gmmtorch.cli.from_options.scans import open_dataset
-from gmmtorch.datasets.base import DatasetShard, shard_indices, start_frame
+from gmmtorch.cli import as_options, logger, map_factory, naming, open_dataset, run_dir
+from gmmtorch.datasets import DatasetShard, shard_indices, start_frame
 from gmmtorch.errors import check_choice, check_number, check_whole
 from gmmtorch.team.cli.from_options import links, missions
-from gmmtorch.team.exploration.mission.driver import Drivable, Stopwatch
-from gmmtorch.team.exploration.mission.mission import Mission
-from gmmtorch.team.exploration.mission.replay import ReplayMission
-from gmmtorch.team.exploration.mission.robot_view import FlyingRobotView, ReplayingRobotView, RobotView
-from gmmtorch.team.exploration.mission.team_setup import make_agent, start_poses
-from gmmtorch.team.sharing.frame_joiner import FrameJoiner
-from gmmtorch.team.sharing.replica.record_keys import drawn_incarnation
-from gmmtorch.team.sharing.replica.replica import Replica
-from gmmtorch.team.sharing.shared_map import SharedMap
-from gmmtorch.team.sharing.store import Store
-from gmmtorch.team.sharing.transport.frames import FramedTransport
+from gmmtorch.team.exploration import (
+    Drivable,
+    FlyingRobotView,
+    Mission,
+    ReplayingRobotView,
+    ReplayMission,
+    RobotView,
+    Stopwatch,
+    make_agent,
+    start_poses,
+)
+from gmmtorch.team.sharing import FramedTransport, FrameJoiner, Replica, SharedMap, Store, drawn_incarnation
 
 _NO_RESTART = (
     "A robot with team=%s codec=%s cannot be restarted while its team runs: it would number its messages "
@@ -50,7 +49,7 @@ def flying(config: DictConfig, transport: FramedTransport, stack: ExitStack) -> 
             store.restore(shared)
             agent.keep_in(store)
     elif options.shares:
-        common.logger.warning(_NO_RESTART, config.team.name, config.codec)
+        logger.warning(_NO_RESTART, config.team.name, config.codec)
     mission = Mission(world, [agent], options, watch)
     return mission, FlyingRobotView(mission, transport)
 
@@ -73,7 +72,7 @@ def replaying(config: DictConfig, transport: FramedTransport, stack: ExitStack) 
         replica,
         DatasetShard(scans, chosen, None if frame is None else torch.linalg.inv(frame)),
         transport,
-        maps.map_factory(missions.log_map_options(config)),
+        map_factory(missions.log_map_options(config)),
         rate=config.log.rate,
         store=store,
         announce_every=config.network.announce,
@@ -91,10 +90,10 @@ def _opened_store(config: DictConfig, transport: FramedTransport, stack: ExitSta
     if not config.journal.enabled:
         return None
     given = config.journal.folder
-    path = Path(common.run_dir() if given is None else given) / f"robot_{config.id}.sqlite"
+    path = Path(run_dir() if given is None else given) / f"robot_{config.id}.sqlite"
     if given is not None and not path.exists():  # a mistyped folder would lose the map without a word
-        common.logger.warning("journal.folder=%s holds no %s: the map starts empty.", given, path.name)
-    with common.naming({"path": "hydra.run.dir" if given is None else "journal.folder"}):
+        logger.warning("journal.folder=%s holds no %s: the map starts empty.", given, path.name)
+    with naming({"path": "hydra.run.dir" if given is None else "journal.folder"}):
         store = stack.enter_context(Store(path, config.id, facts_of(config)))
     transport.disown(store.begin_session(transport.session))
     return store
@@ -108,7 +107,7 @@ def facts_of(config: DictConfig) -> dict[str, Any]:
 def _facts_of_world(config: DictConfig) -> dict[str, Any]:
     """What defines the surfaces of the world. Bounds, cells, and how the team senses, plans and flies may
     change: components remain valid."""
-    world = common.as_options(config.world)
+    world = as_options(config.world)
     facts = {"source": "world", "world": world["name"]}
     facts |= {f"world.{name}": world[name] for name in ("size", "seed") if name in world}
     path = None if OmegaConf.is_missing(config.world, "path") else world.get("path")
@@ -120,7 +119,7 @@ def _facts_of_world(config: DictConfig) -> dict[str, Any]:
 
 def _facts_of_log(config: DictConfig) -> dict[str, Any]:
     """Which log it is, and which part of it."""
-    dataset = common.as_options(config.log.dataset)
+    dataset = as_options(config.log.dataset)
     if dataset.get("path") is not None:
         dataset["path"] = str(Path(dataset["path"]).resolve())
     return {
@@ -144,17 +143,17 @@ def shared_map(config: DictConfig, stack: ExitStack) -> SharedMap | None:
         return None
     transport = links.open_link(config, robot)
     stack.callback(transport.close)
-    with common.naming({"share": "network.loss"}):
+    with naming({"share": "network.loss"}):
         transport.lose(config.network.loss, config.seed + robot)
     facts = {"source": "ros", "start": config.start, "frame": config.sensor.frame}
-    store = stack.enter_context(Store(common.run_dir() / f"robot_{robot}.sqlite", robot, facts))
+    store = stack.enter_context(Store(run_dir() / f"robot_{robot}.sqlite", robot, facts))
     transport.disown(store.begin_session(transport.session))
     is_free = config.start == "unknown"
     replica = Replica(robot, own_frame=is_free)
     store.restore(replica)
     if is_free and replica.earlier_frames and replica.n_components:  # the fixed frame is where it was before
         replica.join(replica.earlier_frames[0], torch.eye(replica.components().dim + 1))
-    with common.naming({argument: f"network.{option}" for option, argument in missions.OF_ROBOTS.items()}):
+    with naming({argument: f"network.{option}" for option, argument in missions.OF_ROBOTS.items()}):
         return SharedMap(
             replica,
             transport,

@@ -7,9 +7,8 @@ from typing import Any
 
 from omegaconf import MISSING
 
-from gmmtorch.cli.options.runtime_schema import Report
-from gmmtorch.cli.options.structured import read_dataclass, read_defaults, schema_of
-from gmmtorch.mapping.learning.rules import NoveltyRule
+from gmmtorch.cli import Report, read_dataclass, read_defaults, schema_of
+from gmmtorch.mapping import NoveltyRule
 
 _TEAM = read_defaults("team.exploration.mission.options", "TeamOptions")
 """Default values of a team. Its options have their own names and descriptions, because they are in groups."""

@@ -7,7 +7,7 @@ from typing import Any
 
 from omegaconf import MISSING
 
-from gmmtorch.cli.options.runtime_schema import ExportReport, Report, Runtime
+from gmmtorch.cli import ExportReport, Report, Runtime
 from gmmtorch.team.cli.options.exploration_schema import (
     Exploration,
     RobotEvaluation,

@@ -10,34 +10,37 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from gmmtorch.cli import common
-from gmmtorch.cli.reporting.map_outputs import surfaces_of
+from gmmtorch.cli import chosen_options, save_figures, show, surfaces_of
 from gmmtorch.files import write_bytes
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.occupancy.voxels.boxes import Box
-from gmmtorch.report.maps.map_images import MapImage, highest_occupancy
-from gmmtorch.report.scenes.ellipsoids import first_viewpoints
-from gmmtorch.report.scenes.scene import mixture_scene_figure
-from gmmtorch.report.tensorboard_writer import Board
-from gmmtorch.team.exploration.mission.mission import Mission
-from gmmtorch.team.exploration.mission.options import THESIS
-from gmmtorch.team.exploration.mission.results import NETWORK, Snapshot, Snapshots, differing, variant_of
-from gmmtorch.team.exploration.mission.trials import TRAJECTORIES, save_trajectories
-from gmmtorch.team.exploration.world.world import World
-from gmmtorch.team.report.mission_bars import (
-    deviations_figure,
-    profile_figure,
-    summary_bars,
+from gmmtorch.mapping import Components, GaussianMap
+from gmmtorch.occupancy import Box
+from gmmtorch.report import Board, MapImage, first_viewpoints, highest_occupancy, mixture_scene_figure
+from gmmtorch.team.exploration import (
+    NETWORK,
+    THESIS,
+    TRAJECTORIES,
+    Mission,
+    Snapshot,
+    Snapshots,
+    World,
+    differing,
+    save_trajectories,
+    variant_of,
 )
-from gmmtorch.team.report.mission_curves import (
+from gmmtorch.team.report import (
+    TeamSnapshot,
     bandwidth_figure,
+    deviations_figure,
     entropy_figure,
+    loss_figure,
     planner_comparison_figure,
+    profile_figure,
+    study_summary,
+    summary_bars,
+    team_map_figure,
+    trajectories_figure,
+    write_exploration_board,
 )
-from gmmtorch.team.report.mission_maps import TeamSnapshot, team_map_figure, trajectories_figure
-from gmmtorch.team.report.mission_summary import study_summary, write_exploration_board
-from gmmtorch.team.report.network_figures import loss_figure
 
 _HALF_BAND = 0.6  # metres above and below the first robot's start that maps from above show
 
@@ -83,7 +86,7 @@ class MissionRecorder:
             made = GaussianMap.of(components, resolution=self._world.resolution, codec="quantized")
             made.save(self._folder / "map.safetensors")
         figures = self._figures(mission, row, paths, components)
-        common.save_figures(self._config, figures, self._folder)
+        save_figures(self._config, figures, self._folder)
         if self._board is not None:
             for snapshot in self.snapshots.chosen():
                 seconds = int(snapshot.tick * mission.tick_seconds)
@@ -97,10 +100,10 @@ class MissionRecorder:
             for name, figure in figures.items():
                 self._board.figure(f"figures/{name}", figure)
             numbers = {name: row[name] for name in ("entropy_reduction_bits", "auc", "bytes_sent")}
-            self._board.hparams(common.chosen_options(self._config), numbers)
+            self._board.hparams(chosen_options(self._config), numbers)
             self._board.close()
         if self._config.report.recording:
-            from gmmtorch.team.report.rerun_recording import RecordedMap, record_rerun
+            from gmmtorch.team.report import RecordedMap, record_rerun
 
             record_rerun(
                 self._folder / "mission.rrd",
@@ -203,7 +206,7 @@ def save_comparison(config: DictConfig, rows: list[dict[str, Any]], folder: Path
             found["planners"] = planner_comparison_figure(on_first)
         return found
 
-    common.show(config, folder, figures, lambda board: write_exploration_board(board, rows))
+    show(config, folder, figures, lambda board: write_exploration_board(board, rows))
 
 
 def _by_first(

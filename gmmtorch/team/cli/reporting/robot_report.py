@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from omegaconf import DictConfig
 
-from gmmtorch.cli import common
+from gmmtorch.cli import drop_unwritable, logger
 from gmmtorch.errors import OutputError
 
 if TYPE_CHECKING:
-    from gmmtorch.team.exploration.mission.robot_view import RobotView
+    from gmmtorch.team.exploration import RobotView
 
 _PERIOD = 1.0
 """Seconds of the robot's time between two updates of the displays."""
@@ -128,7 +128,7 @@ class _StatusLine(logging.Handler):
         super().__init__()
         self._view = view
         self._width = 0  # of the line that the terminal's cursor is on
-        common.logger.addHandler(self)  # runs before the handlers of the root logger
+        logger.addHandler(self)  # runs before the handlers of the root logger
 
     def show(self, now: float, scalars: dict[str, float]) -> None:
         refused = f", {scalars['refused']:,.0f} refused" if scalars["refused"] else ""
@@ -142,7 +142,7 @@ class _StatusLine(logging.Handler):
                 sys.stderr.write(line + "\n")
             sys.stderr.flush()
         except OSError:
-            common.drop_unwritable()
+            drop_unwritable()
             raise
         finally:
             self.release()
@@ -154,7 +154,7 @@ class _StatusLine(logging.Handler):
             self.handleError(record)
 
     def close(self) -> None:
-        common.logger.removeHandler(self)
+        logger.removeHandler(self)
         super().close()
         self._end()
 
@@ -172,7 +172,7 @@ class _BoardDisplay:
     option = "report.tensorboard"
 
     def __init__(self, folder: Path) -> None:
-        from gmmtorch.report.tensorboard_writer import Board
+        from gmmtorch.report import Board
 
         self._board = Board(folder)
 
@@ -185,7 +185,7 @@ class _BoardDisplay:
 
 
 def _log_failure(option: str, error: OSError) -> None:
-    common.logger.warning("%s is switched off, and the robot continues: %s", option, error)
+    logger.warning("%s is switched off, and the robot continues: %s", option, error)
 
 
 def print_refusals(rows: Sequence[dict[str, Any]]) -> None:

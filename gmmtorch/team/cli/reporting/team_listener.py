@@ -10,16 +10,20 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from gmmtorch.cli.from_options import maps
-from gmmtorch.live.live_view import LiveView
+from gmmtorch.cli import map_factory
+from gmmtorch.live import LiveView
 from gmmtorch.team.cli.from_options import links, missions
-from gmmtorch.team.exploration.mission.driver import WallClock
-from gmmtorch.team.exploration.mission.moments import RECEIVED, AgentMoments, ReplayMoments
-from gmmtorch.team.exploration.mission.replay import ReplayMission
-from gmmtorch.team.exploration.mission.team_setup import make_agent, start_poses
-from gmmtorch.team.exploration.robot.agent import Agent
-from gmmtorch.team.sharing.replica.replica import Replica
-from gmmtorch.team.sharing.transport.frames import FramedTransport
+from gmmtorch.team.exploration import (
+    RECEIVED,
+    Agent,
+    AgentMoments,
+    ReplayMission,
+    ReplayMoments,
+    WallClock,
+    make_agent,
+    start_poses,
+)
+from gmmtorch.team.sharing import FramedTransport, Replica
 
 
 def listener(
@@ -76,6 +80,6 @@ def _of_log(
     config: DictConfig, number: int, transport: FramedTransport, traffic: _Traffic
 ) -> tuple[Callable[[float], object], ReplayMoments]:
     """A listener that holds the team's map."""
-    make_map = maps.map_factory(missions.log_map_options(config))
+    make_map = map_factory(missions.log_map_options(config))
     mission = ReplayMission(Replica(number), [], transport, make_map, announce_every=config.network.announce)
     return mission.exchange, ReplayMoments(mission, traffic)

@@ -6,18 +6,26 @@ from collections.abc import Sequence
 
 from omegaconf import DictConfig
 
-from gmmtorch.cli import common
+from gmmtorch.cli import as_options, logger, naming, print_table, run_dir, write_results
 from gmmtorch.errors import check_whole
 from gmmtorch.events import Row
-from gmmtorch.live.live_view import LiveView
-from gmmtorch.report.progress import ProgressBars
+from gmmtorch.live import LiveView
+from gmmtorch.report import ProgressBars
 from gmmtorch.team.cli.from_options import missions
 from gmmtorch.team.cli.reporting.explore_pictures import MissionRecorder, save_comparison
-from gmmtorch.team.exploration.mission.mission import Mission
-from gmmtorch.team.exploration.mission.moments import MissionMoments
-from gmmtorch.team.exploration.mission.results import NETWORK, compared, differing
-from gmmtorch.team.exploration.mission.trials import STAGE, keep_row, kept_row, run_mission, run_trials
-from gmmtorch.team.report.trial_groups import by_variant
+from gmmtorch.team.exploration import (
+    NETWORK,
+    STAGE,
+    Mission,
+    MissionMoments,
+    compared,
+    differing,
+    keep_row,
+    kept_row,
+    run_mission,
+    run_trials,
+)
+from gmmtorch.team.report import by_variant
 
 _NETWORK_TABLE = "wire_bytes bits_per_byte wire_ratio t90_ratio healed_after converged_after"
 _TIME_TO_LEAVE = 30.0
@@ -26,12 +34,12 @@ _TIME_TO_LEAVE = 30.0
 
 def explore(config: DictConfig, bars: ProgressBars, view: LiveView | None) -> Row:
     """Runs one mission, with pictures; returns its row. In the folder of an equal mission nothing is run."""
-    folder = common.run_dir()
+    folder = run_dir()
     trial = missions.trial_of(config, folder)
-    report = common.as_options(config.report)
+    report = as_options(config.report)
     if (row := kept_row(trial, report=report)) is not None:
-        common.logger.info("%s has this mission already; nothing is run.", folder)
-        common.write_results("explore", config, [row], folder)
+        logger.info("%s has this mission already; nothing is run.", folder)
+        write_results("explore", config, [row], folder)
         return row
     world = missions.open_world(trial.world, trial.team, bars)
     recorder = MissionRecorder(config, folder, world)
@@ -51,10 +59,10 @@ def explore(config: DictConfig, bars: ProgressBars, view: LiveView | None) -> Ro
                 moments.note()
             (view.finish if mission.is_over else view.offer)(moments)
 
-    with common.naming(missions.NAMES):
+    with naming(missions.NAMES):
         mission, row = run_mission(trial, world, on_tick)
     (row,) = compared([row])
-    common.write_results("explore", config, [row], folder)
+    write_results("explore", config, [row], folder)
     recorder.finish(mission, row)
     keep_row(trial, row, report=report)
     warn_of_robots_at_their_start(mission)
@@ -65,7 +73,7 @@ def warn_of_robots_at_their_start(mission: Mission) -> None:
     """Warns of robots that never left their start though they had the time: nothing else shows it."""
     stayed = [str(robot.number) for robot in mission.robots if robot.path_length == 0]
     if stayed and mission.elapsed >= _TIME_TO_LEAVE:
-        common.logger.warning(
+        logger.warning(
             "Robots that never left their start: %s. No path away from there is safe. Move them by "
             "team.start, or use smaller cells (world.resolution) or a smaller robot.radius.",
             ", ".join(stayed),
@@ -82,7 +90,7 @@ def _status(mission: Mission) -> str:
 
 def compare(config: DictConfig, bars: ProgressBars) -> list[Row]:
     """Runs a study, every variant with every seed; returns its rows."""
-    folder = common.run_dir()
+    folder = run_dir()
     check_whole("runtime.workers", config.runtime.workers, 1)
     variants = missions.variants_of(config)
     trials = [
@@ -96,14 +104,14 @@ def compare(config: DictConfig, bars: ProgressBars) -> list[Row]:
 
     def on_row(row: Row) -> None:
         done.append(row)
-        common.write_results("explore", config, compared(done), folder)
+        write_results("explore", config, compared(done), folder)
 
     def on_sample(mission: Mission) -> None:
         bars.note(STAGE, _status(mission))
 
-    with common.naming(missions.NAMES):
+    with naming(missions.NAMES):
         rows = compared(run_trials(trials, config.runtime.workers, on_row, bars, on_sample))
-    common.write_results("explore", config, rows, folder)
+    write_results("explore", config, rows, folder)
     save_comparison(config, rows, folder)
     return rows
 
@@ -116,4 +124,4 @@ def print_rows(rows: Sequence[Row], columns: Sequence[str]) -> None:
         rows = [{"variant": name, **row} for name, group in by_variant(rows).items() for row in group]
         named = [name for name in columns if name not in ("framework", "planner")]
         columns = ["variant", *named, *(_NETWORK_TABLE.split() if {*fields} & {*NETWORK} else ())]
-    common.print_table(rows, columns, title)
+    print_table(rows, columns, title)

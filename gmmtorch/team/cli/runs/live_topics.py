@@ -9,42 +9,59 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig
 
-from gmmtorch.cli import app, common
-from gmmtorch.cli.from_options import maps
-from gmmtorch.cli.options.structured import build
-from gmmtorch.cli.reporting import map_outputs
-from gmmtorch.cli.view import open_live_view
-from gmmtorch.datasets.base import Ranges
+from gmmtorch.cli import (
+    TRAJECTORY,
+    Checkpoint,
+    as_options,
+    build,
+    map_factory,
+    naming,
+    open_live_view,
+    open_map,
+    print_files,
+    print_skipped,
+    print_table,
+    run_dir,
+    stop_requests,
+    write_results,
+    write_trajectory,
+)
+from gmmtorch.datasets import Ranges
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.events import Row
-from gmmtorch.export.trajectory_files import write_tum
-from gmmtorch.live.live_moments import BuildMoments
-from gmmtorch.live.mapper.bag_player import BagPlayer
-from gmmtorch.live.mapper.live_localizer import MAP, LiveLocalizer
-from gmmtorch.live.mapper.live_mapper import LiveMapper, warm_up
-from gmmtorch.live.mapper.live_scans import LiveOptions, LiveScans
-from gmmtorch.live.mapper.map_publisher import MapPublisher
-from gmmtorch.live.mapper.sensor_topics import find_sensor, open_scans
-from gmmtorch.live.ros import Node
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.report.progress import ProgressBars
-from gmmtorch.team.exploration.mission.driver import WallClock, settle
-from gmmtorch.team.exploration.mission.robot_view import sharing_row
-from gmmtorch.team.sharing.shared_map import SharedMap
+from gmmtorch.export import write_tum
+from gmmtorch.live import (
+    MAP,
+    BagPlayer,
+    BuildMoments,
+    LiveLocalizer,
+    LiveMapper,
+    LiveOptions,
+    LiveScans,
+    MapPublisher,
+    Node,
+    find_sensor,
+    open_scans,
+    warm_up,
+)
+from gmmtorch.mapping import GaussianMap
+from gmmtorch.report import ProgressBars
+from gmmtorch.team.exploration import WallClock, settle, sharing_row
+from gmmtorch.team.sharing import SharedMap
 
 _TABLE = "topic n_scans n_dropped n_malformed latency_median latency_p99 n_components nbytes"
 
 
 def open_node(config: DictConfig) -> Node:
     """The node of the options `node.*` and `remap`."""
-    options = common.as_options(config.node)
+    options = as_options(config.node)
     if config.play:  # the player makes the time
         options["use_sim_time"] = False
     remap = {} if config.remap is None else config.remap
     if not isinstance(remap, Mapping):
         raise InvalidArgumentError(f"remap={remap} must be {{/topic: /other_topic}}.")
     remap = {str(topic): str(other) for topic, other in remap.items()}
-    with common.naming({name: f"node.{name}" for name in options}):
+    with naming({name: f"node.{name}" for name in options}):
         return Node("gmmtorch_player" if config.play else "gmmtorch", **options, remap=remap)
 
 
@@ -58,7 +75,7 @@ def play(config: DictConfig, node: Node) -> None:
         print(f"skipped   {topic.name}: {topic.type} is not a type of ROS 2 Jazzy")
     if not player.wait_for_subscriber(config.wait):
         print(f"no node subscribes to the recording after {config.wait:g} s; it is played anyway")
-    with ProgressBars(enabled=config.report.progress) as bars, app.stop_requests() as is_stopped:
+    with ProgressBars(enabled=config.report.progress) as bars, stop_requests() as is_stopped:
         for _ in player.play():
             bars("playing", player.n_played, player.n_messages)
             if is_stopped():
@@ -71,15 +88,15 @@ def play(config: DictConfig, node: Node) -> None:
 
 def build_map(config: DictConfig, node: Node, device: str, shared: SharedMap | None) -> None:
     """Build a map of the sensor's topic, and write it at the end."""
-    make_map = maps.map_factory(config, resolution=config.resolution)
+    make_map = map_factory(config, resolution=config.resolution)
     warm_up(make_map(), device)
     target = make_map()
     scans = _scans(config, node)
     mapper = LiveMapper(node, scans, target, _publisher(config, node), config.period, device, shared)
-    folder = common.run_dir()
+    folder = run_dir()
     view = open_live_view(config)
     moments = BuildMoments(mapper.builder, lambda: mapper.nbytes, shared)
-    checkpoint = map_outputs.Checkpoint(config, mapper.builder, "sensor", time.monotonic)
+    checkpoint = Checkpoint(config, mapper.builder, "sensor", time.monotonic)
     if checkpoint.is_continued:
         scans.continue_in(mapper.builder.map)
     n_saved_corrections = 0
@@ -123,7 +140,7 @@ def localize(config: DictConfig, node: Node, device: str) -> None:
             f"sensor.poses={config.sensor.poses} does not go with localize, which finds the poses itself. "
             "Use sensor.poses=tf, whose motion predicts them, or standing."
         )
-    known = maps.open_map(Path(config.localize).expanduser(), config.runtime)
+    known = open_map(Path(config.localize).expanduser(), config.runtime)
     scans = _scans(config, node)
     localizer = LiveLocalizer(node, scans, known, config.sensor.poses == "tf", device)
     _publisher(config, node).publish(known, MAP, node.now())
@@ -134,10 +151,10 @@ def localize(config: DictConfig, node: Node, device: str) -> None:
             bars.note("localising", f"{localizer.n_lost:,} lost, {scans.n_dropped:,} dropped")
 
         _until_stopped(config, node, scans, localizer, after_scan)
-    folder = common.run_dir()
+    folder = run_dir()
     if localizer.poses:
         times = torch.tensor(localizer.times, dtype=torch.float64)
-        write_tum(folder / map_outputs.TRAJECTORY, times, torch.stack(localizer.poses))
+        write_tum(folder / TRAJECTORY, times, torch.stack(localizer.poses))
     numbers = localizer.diagnostics.numbers(localizer.n_scans, known.n_components)
     row = {"topic": scans.name, **numbers, "n_lost": localizer.n_lost, "nbytes": known.nbytes}
     _write_results(config, row, scans, folder, _TABLE.replace("n_dropped", "n_lost n_dropped"))
@@ -145,9 +162,9 @@ def localize(config: DictConfig, node: Node, device: str) -> None:
 
 def _scans(config: DictConfig, node: Node) -> LiveScans:
     """The scans of the sensor's topic, which is found by itself if it is not given."""
-    options = common.as_options(config.sensor)
+    options = as_options(config.sensor)
     live = build(LiveOptions, options, "sensor")
-    with common.naming({name: f"sensor.{name}" for name in ("max_range", "no_return_range")}):
+    with naming({name: f"sensor.{name}" for name in ("max_range", "no_return_range")}):
         ranges = Ranges(config.sensor.max_range, config.sensor.no_return_range)
     sensor = find_sensor(node, config.sensor.topic, config.wait)
     print(f"topic     {sensor.topic.name} ({sensor.topic.type})", flush=True)
@@ -168,7 +185,7 @@ def _until_stopped(
 ) -> None:
     """Handles scans until Ctrl-C; says why there are none."""
     begin = time.monotonic()
-    with app.stop_requests() as is_stopped:
+    with stop_requests() as is_stopped:
         while not is_stopped():
             if worker.step():
                 after_scan()
@@ -195,7 +212,7 @@ def _write(
     made: dict[str, GaussianMap] = {}
     if n_scans:
         made["map"] = builder.map
-        map_outputs.write_trajectory(builder, folder)
+        write_trajectory(builder, folder)
         row |= {"n_components": builder.map.n_components, "nbytes": builder.map.nbytes}
     if shared is not None:
         row["team"] = sharing_row(shared)
@@ -212,7 +229,7 @@ def _write_results(config: DictConfig, row: Row, scans: LiveScans, folder: Path,
     """Write results.json, and print its row and what was left out."""
     row["skipped"] = [{"reason": reason, "n_scans": n} for reason, n in scans.skipped.items()]
     row = {key: None if value != value else value for key, value in row.items()}  # JSON has no NaN
-    common.write_results("ros", config, [row], folder)
-    common.print_table([row], columns.split(), f"{scans.name}: {row['n_scans']} scans")
-    map_outputs.print_skipped(scans.skipped)
-    common.print_files(folder)
+    write_results("ros", config, [row], folder)
+    print_table([row], columns.split(), f"{scans.name}: {row['n_scans']} scans")
+    print_skipped(scans.skipped)
+    print_files(folder)

@@ -27,8 +27,8 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_whole
-from gmmtorch.kernels.rays.beam_information import Beams, Cells, information_by_block
-from gmmtorch.occupancy.grid import check_resolution
+from gmmtorch.kernels import Beams, Cells, information_by_block
+from gmmtorch.occupancy import check_resolution
 from gmmtorch.team.exploration.information.beam_templates import beam_templates, depth_kernel, needed_band
 from gmmtorch.team.exploration.robot.mapper import LocalMap
 

@@ -14,16 +14,19 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.team.exploration.robot.mapper import LocalMap
-from gmmtorch.team.sharing.messages.message_registry import ViewsMessage, encode_views, quantized_poses
-from gmmtorch.team.sharing.messages.view_messages import LATEST, TICKS
-from gmmtorch.team.sharing.replica.record_keys import (
+from gmmtorch.team.sharing import (
     LARGEST_INCARNATION,
     LARGEST_ROBOT,
+    LATEST,
     MOST_RECORDS,
+    TICKS,
     Intervals,
+    ViewsMessage,
+    encode_views,
     first_key,
     ids_of,
     keys_of,
+    quantized_poses,
     robot_of,
 )
 

@@ -11,9 +11,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels.rays.ray_marks import mark_cells_of_rays
-from gmmtorch.occupancy.voxels.boxes import Box, to_lattice
-from gmmtorch.simulation.sensors.depth_camera import DepthFrame
+from gmmtorch.kernels import mark_cells_of_rays
+from gmmtorch.occupancy import Box, to_lattice
+from gmmtorch.simulation import DepthFrame
 from gmmtorch.team.exploration.mission.driver import Stopwatch
 from gmmtorch.team.exploration.mission.options import TeamOptions
 from gmmtorch.team.exploration.mission.planning_round import plan_alone, plan_together
@@ -24,8 +24,7 @@ from gmmtorch.team.exploration.robot.robot_state import Robot
 from gmmtorch.team.exploration.world.navigable import collides, finely, meets_others
 from gmmtorch.team.exploration.world.scoring import BeliefMap
 from gmmtorch.team.exploration.world.world import World
-from gmmtorch.team.sharing.codecs.point_codecs import bytes_of_points
-from gmmtorch.team.sharing.transport.simulated_network import Network
+from gmmtorch.team.sharing import Network, bytes_of_points
 
 _SEEN_STRIDE = 4
 """Pixels between the beams, along rows and columns, that mark cells as seen."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, check_whole
-from gmmtorch.mapping.learning.rules import NoveltyRule
-from gmmtorch.simulation.sensors.depth_camera import DepthCamera
+from gmmtorch.mapping import NoveltyRule
+from gmmtorch.simulation import DepthCamera
 from gmmtorch.team.exploration.information.view_evaluator import INFORMATION
 from gmmtorch.team.exploration.planning.coordination import Coordination
 from gmmtorch.team.exploration.planning.planners import PLANNERS
@@ -16,10 +16,14 @@ from gmmtorch.team.exploration.planning.primitives import Dynamics
 from gmmtorch.team.exploration.robot.gmm_mapper import FrameRule
 from gmmtorch.team.exploration.robot.robot_state import StoppingRule
 from gmmtorch.team.exploration.world.scoring import BeliefRule
-from gmmtorch.team.sharing.codecs.point_codecs import POINT_CODECS
-from gmmtorch.team.sharing.messages.envelope import check_codec
-from gmmtorch.team.sharing.radio import AnnouncementSchedule, TokenBucket
-from gmmtorch.team.sharing.transport.link_conditions import LinkConditions, Partition
+from gmmtorch.team.sharing import (
+    POINT_CODECS,
+    AnnouncementSchedule,
+    LinkConditions,
+    Partition,
+    TokenBucket,
+    check_codec,
+)
 
 _MOST_ROBOTS = 31
 """Bits of the integer that stores which robots saw a cell."""

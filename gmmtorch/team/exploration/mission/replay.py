@@ -9,14 +9,10 @@ from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from typing import Any
 
 from gmmtorch.errors import DataError, check_number, check_whole
-from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping import GaussianMap
 from gmmtorch.scan import Scan
 from gmmtorch.team.exploration.mission.driver import Stopwatch
-from gmmtorch.team.sharing.frame_joiner import FrameJoiner
-from gmmtorch.team.sharing.replica.replica import Replica
-from gmmtorch.team.sharing.shared_map import SharedMap
-from gmmtorch.team.sharing.store import Store
-from gmmtorch.team.sharing.transport.simulated_network import Transport
+from gmmtorch.team.sharing import FrameJoiner, Replica, SharedMap, Store, Transport
 
 _log = logging.getLogger(__name__)
 

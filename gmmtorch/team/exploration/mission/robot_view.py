@@ -12,16 +12,11 @@ import torch
 
 from gmmtorch.errors import GmmTorchError
 from gmmtorch.files import write_npz
-from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping import GaussianMap
 from gmmtorch.team.exploration.mission.mission import Mission
 from gmmtorch.team.exploration.mission.replay import ReplayMission
 from gmmtorch.team.exploration.robot.gmm_mapper import GmmMapper
-from gmmtorch.team.sharing.radio import Radio
-from gmmtorch.team.sharing.replica.materialized_view import robot_of_frame
-from gmmtorch.team.sharing.replica.replica import Replica
-from gmmtorch.team.sharing.shared_map import SharedMap
-from gmmtorch.team.sharing.transport.frames import FramedTransport
-from gmmtorch.team.sharing.transport.simulated_network import Network
+from gmmtorch.team.sharing import FramedTransport, Network, Radio, Replica, SharedMap, robot_of_frame
 
 Files = Mapping[str, tuple[str, Callable[[Path], object]]]
 """By name: the file name, and what writes the file to a path."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
+from gmmtorch.occupancy import RollingWindow
 from gmmtorch.team.exploration.information.view_evaluator import ViewEvaluator
 from gmmtorch.team.exploration.information.view_library import ViewLibrary
 from gmmtorch.team.exploration.mission.driver import Stopwatch
@@ -25,9 +25,7 @@ from gmmtorch.team.exploration.robot.robot_state import Robot
 from gmmtorch.team.exploration.world import starts
 from gmmtorch.team.exploration.world.scoring import BeliefMap
 from gmmtorch.team.exploration.world.world import World
-from gmmtorch.team.sharing.broadcast import Broadcast
-from gmmtorch.team.sharing.replica.replica import Replica
-from gmmtorch.team.sharing.transport.simulated_network import Network, Transport
+from gmmtorch.team.sharing import Broadcast, Network, Replica, Transport
 
 _SLACK = 24
 """Cells by which the sliding map moves, once the robot is so far from its centre. Rays are long: a map that

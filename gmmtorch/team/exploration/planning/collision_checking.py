@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.kernels.rays.path_clearance import Motions, motions_are_clear
+from gmmtorch.kernels import Motions, motions_are_clear
 from gmmtorch.team.exploration.planning.coordination import PeerTrajectories, clear_of
 from gmmtorch.team.exploration.robot.mapper import LocalMap
 from gmmtorch.team.exploration.world.navigable import widened

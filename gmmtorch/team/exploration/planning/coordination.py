@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, check_whole
-from gmmtorch.team.sharing.messages.message_registry import PlanMessage
+from gmmtorch.team.sharing import PlanMessage
 
 if TYPE_CHECKING:
     from gmmtorch.team.exploration.planning.planner_interface import Plan

@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels.choice import is_fused
+from gmmtorch.kernels import is_fused
 from gmmtorch.team.exploration.information.view_library import ViewLibrary
 from gmmtorch.team.exploration.planning.collision_checking import feasible, feasible_motions
 from gmmtorch.team.exploration.planning.coordination import PeerTrajectories

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_number
-from gmmtorch.kernels.rays.path_clearance import Motions
+from gmmtorch.kernels import Motions
 
 _ROUNDING = 1e-9
 

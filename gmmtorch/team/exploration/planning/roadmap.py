@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy import Box
 from gmmtorch.team.exploration.robot.mapper import LocalMap
 
 _FACTOR = 4  # cells along each side of a node

@@ -8,8 +8,7 @@ from collections.abc import Collection
 import torch
 from torch import Tensor
 
-from gmmtorch.simulation.sensors.depth_camera import DepthFrame
-from gmmtorch.simulation.worlds.mesh_world import MeshWorld
+from gmmtorch.simulation import DepthFrame, MeshWorld
 from gmmtorch.team.exploration.information.view_evaluator import ViewEvaluator
 from gmmtorch.team.exploration.mission.driver import Stopwatch
 from gmmtorch.team.exploration.mission.options import TeamOptions
@@ -19,14 +18,15 @@ from gmmtorch.team.exploration.planning.primitives import Primitives
 from gmmtorch.team.exploration.planning.recovery import Waiting, retreat
 from gmmtorch.team.exploration.robot.mapper import FrameUpdate, LocalMap, Memo
 from gmmtorch.team.exploration.robot.robot_state import Robot
-from gmmtorch.team.sharing.messages.message_registry import (
+from gmmtorch.team.sharing import (
     MAX_BYTES,
     PlanMessage,
+    Radio,
+    RecordStore,
+    Transport,
     ViewsMessage,
     encode_plan,
 )
-from gmmtorch.team.sharing.radio import Radio, RecordStore
-from gmmtorch.team.sharing.transport.simulated_network import Transport
 
 _SEEDS_PER_MISSION = 1 << 10
 """Robot ids for which the random draws differ."""

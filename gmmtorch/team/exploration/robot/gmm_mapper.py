@@ -18,24 +18,27 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.association import box_around, count_explained, explained_within, summed
-from gmmtorch.mapping.learning.fitting import SurfaceFit, fit_window
-from gmmtorch.mapping.learning.rules import NoveltyRule
-from gmmtorch.mapping.learning.viewpoints import all_origins
-from gmmtorch.mapping.learning.windows import cell_fit
-from gmmtorch.mapping.rays.component_evidence import component_evidence
-from gmmtorch.mapping.rays.mixture_tiles import MixtureTiles, regenerate
-from gmmtorch.occupancy.voxels.boxes import Box, intersection
-from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
-from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
+from gmmtorch.mapping import (
+    Components,
+    MixtureTiles,
+    NoveltyRule,
+    SurfaceFit,
+    all_origins,
+    box_around,
+    cell_fit,
+    component_evidence,
+    count_explained,
+    explained_within,
+    fit_window,
+    regenerate,
+    summed,
+)
+from gmmtorch.occupancy import Box, CellEvidence, RollingWindow, intersection
 from gmmtorch.scan import Scan
-from gmmtorch.simulation.sensors.depth_camera import DepthFrame
+from gmmtorch.simulation import DepthFrame
 from gmmtorch.team.exploration.robot.mapper import FrameUpdate, Mapper, Memo, novel_beams
 from gmmtorch.team.exploration.world.scoring import BeliefMap
-from gmmtorch.team.sharing.broadcast import Broadcast
-from gmmtorch.team.sharing.radio import ReceivedMessage
-from gmmtorch.team.sharing.replica.replica import Replica
+from gmmtorch.team.sharing import Broadcast, ReceivedMessage, Replica
 
 _LEEWAY = 0.5  # cells
 _EMPTY_LENGTH = 0.75  # of the length of components of surfaces

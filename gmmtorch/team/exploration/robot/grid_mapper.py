@@ -9,18 +9,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.mapping.learning.rules import NoveltyRule
-from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
-from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
-from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
-from gmmtorch.simulation.sensors.depth_camera import DepthFrame
+from gmmtorch.mapping import NoveltyRule
+from gmmtorch.occupancy import CellEvidence, RollingWindow, cast_evidence
+from gmmtorch.simulation import DepthFrame
 from gmmtorch.team.exploration.robot.mapper import FrameUpdate, Mapper, Memo, novel_beams
 from gmmtorch.team.exploration.world.scoring import BeliefMap
-from gmmtorch.team.sharing.broadcast import SendOnce
-from gmmtorch.team.sharing.messages.message_registry import Message, PointsMessage, decode, encode_points
-from gmmtorch.team.sharing.messages.point_messages import MOST_PARTS
-from gmmtorch.team.sharing.radio import ReceivedMessage
-from gmmtorch.team.sharing.replica.record_keys import Intervals
+from gmmtorch.team.sharing import (
+    MOST_PARTS,
+    Intervals,
+    Message,
+    PointsMessage,
+    ReceivedMessage,
+    SendOnce,
+    decode,
+    encode_points,
+)
 
 MOST_INTERVALS = 1 << 14
 """Intervals of received parts kept for a teammate; beyond, the oldest gaps count as received."""

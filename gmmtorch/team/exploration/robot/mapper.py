@@ -13,18 +13,11 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import check_whole
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.novelty import beam_novelty
-from gmmtorch.mapping.learning.rules import NoveltyRule
-from gmmtorch.occupancy.voxels.boxes import Box
-from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
-from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
-from gmmtorch.simulation.sensors.depth_camera import DepthFrame
+from gmmtorch.mapping import Components, NoveltyRule, beam_novelty
+from gmmtorch.occupancy import Box, CellEvidence, RollingWindow
+from gmmtorch.simulation import DepthFrame
 from gmmtorch.team.exploration.world.scoring import BeliefMap
-from gmmtorch.team.sharing.broadcast import Broadcast
-from gmmtorch.team.sharing.messages.message_registry import Message, decode
-from gmmtorch.team.sharing.radio import ReceivedMessage
-from gmmtorch.team.sharing.replica.replica import Replica
+from gmmtorch.team.sharing import Broadcast, Message, ReceivedMessage, Replica, decode
 
 if TYPE_CHECKING:
     from gmmtorch.team.exploration.robot.grid_mapper import SharedPoints

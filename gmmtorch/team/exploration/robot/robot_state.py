@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_number
-from gmmtorch.simulation.sensors.depth_camera import DepthFrame
+from gmmtorch.simulation import DepthFrame
 from gmmtorch.team.exploration.information.view_library import ViewLibrary
 from gmmtorch.team.exploration.planning.collision_checking import local_map_of
 from gmmtorch.team.exploration.planning.planner_interface import Plan, Planner
@@ -17,7 +17,7 @@ from gmmtorch.team.exploration.planning.recovery import shortened
 from gmmtorch.team.exploration.planning.roadmap import Roadmap
 from gmmtorch.team.exploration.robot.mapper import FrameUpdate, LocalMap, Mapper
 from gmmtorch.team.exploration.world.starts import InitialFreeSpace
-from gmmtorch.team.sharing.messages.message_registry import PlanMessage
+from gmmtorch.team.sharing import PlanMessage
 
 _NEWS_SHARE = 0.25
 """Share of the best window that teammates must learn before a resting robot explores again."""

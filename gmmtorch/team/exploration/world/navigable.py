@@ -9,10 +9,9 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.events import Event, ignore
-from gmmtorch.kernels.rays.ray_traversal import row_major_strides
-from gmmtorch.occupancy.voxels.boxes import Box
-from gmmtorch.occupancy.voxels.voxelize import occupied_cells
-from gmmtorch.simulation.worlds.mesh_world import MeshWorld
+from gmmtorch.kernels import row_major_strides
+from gmmtorch.occupancy import Box, occupied_cells
+from gmmtorch.simulation import MeshWorld
 
 ON_PLANE = 1e-6
 """Tolerance, as a share of a cell, for a length to lie on a plane of the lattice; larger than rounding."""

@@ -9,12 +9,15 @@ from sklearn.metrics import roc_auc_score
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.kernels.rays.cell_counts import flags_of_cells
-from gmmtorch.kernels.rays.cell_entropy import entropy_removed
-from gmmtorch.occupancy.evidence import Thresholds, check_prior, occupancy_probability
-from gmmtorch.occupancy.voxels.boxes import Box
-from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
-from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
+from gmmtorch.kernels import entropy_removed, flags_of_cells
+from gmmtorch.occupancy import (
+    Box,
+    CellEvidence,
+    SparseEvidence,
+    Thresholds,
+    check_prior,
+    occupancy_probability,
+)
 
 
 @dataclass(frozen=True)

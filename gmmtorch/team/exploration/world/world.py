@@ -11,14 +11,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets.point_files.mesh_files import read_triangles
+from gmmtorch.datasets import read_triangles
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError, MissingDataError, check_choice
 from gmmtorch.events import Event, ignore
-from gmmtorch.occupancy.grid import check_resolution
-from gmmtorch.occupancy.voxels.boxes import Box
-from gmmtorch.simulation.worlds.mesh_world import MeshWorld, checked_triangles
-from gmmtorch.simulation.worlds.tunnels import tunnels
-from gmmtorch.simulation.worlds.warehouse import warehouse, warehouse_start
+from gmmtorch.occupancy import Box, check_resolution
+from gmmtorch.simulation import MeshWorld, checked_triangles, tunnels, warehouse, warehouse_start
 from gmmtorch.team.exploration.world.navigable import (
     ON_PLANE,
     above_floor,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Ints
+from gmmtorch.mapping import BitReader, BitWriter, Ints
 from gmmtorch.optional_packages import needs_extra
 
 MOST_BITS = 21

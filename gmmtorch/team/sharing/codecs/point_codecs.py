@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.mapping.codec.bitstream import unzigzag, zigzag
-from gmmtorch.occupancy.grid import check_resolution
+from gmmtorch.mapping import unzigzag, zigzag
+from gmmtorch.occupancy import check_resolution
 from gmmtorch.team.sharing.codecs.point_bytes import (
     MOST_BITS,
     centers,

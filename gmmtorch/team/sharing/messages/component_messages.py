@@ -12,12 +12,20 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.linalg import pack_symmetric, unpack_symmetric
-from gmmtorch.mapping.codec import component_batch as batches
-from gmmtorch.mapping.codec.lattice import LARGEST_VARIANCE, scaled
-from gmmtorch.mapping.codec.quantization import MOST_POINTS, ORIGIN_STEP, Quantized, quantize
-from gmmtorch.mapping.codec.thesis_message import FARTHEST as THESIS_FARTHEST
-from gmmtorch.mapping.codec.thesis_message import decode_thesis, encode_thesis
-from gmmtorch.mapping.components import Components
+from gmmtorch.mapping import FARTHEST as THESIS_FARTHEST
+from gmmtorch.mapping import (
+    LARGEST_VARIANCE,
+    MOST_POINTS,
+    ORIGIN_STEP,
+    Components,
+    Quantized,
+    decode,
+    decode_thesis,
+    encode_quantized,
+    encode_thesis,
+    quantize,
+    scaled,
+)
 from gmmtorch.team.sharing.messages.envelope import (
     FARTHEST,
     LARGEST_NUMBER,
@@ -88,7 +96,7 @@ def fitted(values: Quantized, max_bytes: int = MAX_BYTES) -> Iterator[tuple[byte
         n = min(n, MOST_COMPONENTS_SENT, n_allowed)
         whole = begin == 0 and n >= len(values)
         part = values if whole else values.arranged(torch.arange(begin, min(begin + n, len(values))))
-        datagram = make_datagram(Kind.COMPONENTS, batches.encode_quantized(part))
+        datagram = make_datagram(Kind.COMPONENTS, encode_quantized(part))
         room = int(_FILL * len(part) * max_bytes / len(datagram))
         if len(datagram) <= max_bytes:
             yield datagram, part
@@ -105,7 +113,7 @@ def fitted(values: Quantized, max_bytes: int = MAX_BYTES) -> Iterator[tuple[byte
 def _quantized(components: Components) -> bytes:
     values = quantize(components)
     _check_quantized(values)
-    return make_datagram(Kind.COMPONENTS, batches.encode_quantized(values))
+    return make_datagram(Kind.COMPONENTS, encode_quantized(values))
 
 
 def read_quantized(body: bytes) -> ComponentsMessage:
@@ -114,7 +122,7 @@ def read_quantized(body: bytes) -> ComponentsMessage:
 
 def read_batch(data: bytes) -> Components:
     """The components of a codec batch of any size. Raises `DataError` if they are damaged or out of range."""
-    components = batches.decode(data)
+    components = decode(data)
     try:
         _check_range(components.means, components.origins, components.ids)
     except InvalidArgumentError as error:

@@ -10,15 +10,18 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Ints
-from gmmtorch.mapping.codec.quantization import (
+from gmmtorch.mapping import (
     LARGEST_COUNT,
     MOST_POINTS,
     NO_COUNT,
+    BitReader,
+    BitWriter,
+    Ints,
     count_steps,
+    decode_thesis_updates,
+    encode_thesis_updates,
     points_of,
 )
-from gmmtorch.mapping.codec.thesis_message import decode_thesis_updates, encode_thesis_updates
 from gmmtorch.team.sharing.messages.envelope import LARGEST_NUMBER, Kind, check_codec, make_datagram, split
 from gmmtorch.team.sharing.messages.fields import (
     check_ids,

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.linalg import check_rigid
-from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Ints
+from gmmtorch.mapping import BitReader, BitWriter, Ints
 from gmmtorch.team.sharing.messages.envelope import FARTHEST, LARGEST_NUMBER
 from gmmtorch.team.sharing.replica.record_keys import END, MOST_RECORDS, NUMBER_BITS, Intervals, authors
 

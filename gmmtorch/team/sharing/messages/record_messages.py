@@ -14,9 +14,8 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
-from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter
-from gmmtorch.mapping.codec.quantization import LARGEST_COUNT, NO_COUNT, count_steps
-from gmmtorch.occupancy.calibrator import N_BYTES, Calibration
+from gmmtorch.mapping import LARGEST_COUNT, NO_COUNT, BitReader, BitWriter, count_steps
+from gmmtorch.occupancy import N_BYTES, Calibration
 from gmmtorch.team.sharing.messages.count_messages import counts_of
 from gmmtorch.team.sharing.messages.envelope import FARTHEST, MAX_BYTES, Kind, make_datagram, split
 from gmmtorch.team.sharing.messages.fields import (

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Ints
+from gmmtorch.mapping import BitReader, BitWriter, Ints
 from gmmtorch.team.sharing.messages.envelope import FARTHEST, MAX_BYTES, Kind, make_datagram, split
 from gmmtorch.team.sharing.messages.fields import (
     check_ids,

@@ -9,8 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.mapping.codec.quantization import quantize
-from gmmtorch.mapping.components import Components
+from gmmtorch.mapping import Components, quantize
 from gmmtorch.team.sharing.messages.component_messages import fitted
 from gmmtorch.team.sharing.messages.record_messages import AnnouncementMessage, CountersMessage
 from gmmtorch.team.sharing.replica.record_keys import Intervals, Ints, authors, evict, keys_of, keys_of_robot

@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mapping.codec.quantization import NO_COUNT, order_of, quantize, quantized
-from gmmtorch.mapping.components import Components
-from gmmtorch.occupancy.calibrator import Calibration
+from gmmtorch.mapping import NO_COUNT, Components, order_of, quantize, quantized
+from gmmtorch.occupancy import Calibration
 from gmmtorch.team.sharing.messages.component_messages import fitted
 from gmmtorch.team.sharing.messages.envelope import split
 from gmmtorch.team.sharing.messages.fields import pose_of

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gmmtorch.linalg import pack_symmetric
-from gmmtorch.mapping.components import Components
+from gmmtorch.mapping import Components
 from gmmtorch.team.sharing.messages.count_messages import counts_of
 from gmmtorch.team.sharing.messages.record_messages import CountersMessage
 from gmmtorch.team.sharing.replica.record_keys import Ints, author_of

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gmmtorch.mapping.components import Components
+from gmmtorch.mapping import Components
 from gmmtorch.team.sharing.messages.fields import matrix_of
 from gmmtorch.team.sharing.messages.record_messages import CorrectionMessage, FrameMessage
 from gmmtorch.team.sharing.replica.component_table import ComponentTable, Counters

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.mapping.components import Components
+from gmmtorch.mapping import Components
 from gmmtorch.team.sharing.replica.record_keys import Intervals, Ints, authors
 
 _MOST_RUNS = 128

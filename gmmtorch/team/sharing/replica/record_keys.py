@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.mapping.codec.bitstream import BitReader
-from gmmtorch.mapping.codec.lattice import AXIS_ORDERS
+from gmmtorch.mapping import AXIS_ORDERS, BitReader
 from gmmtorch.team.sharing.messages.envelope import Kind, parse_datagram
 
 Ints = NDArray[np.int64]

@@ -9,8 +9,7 @@ import numpy as np
 import torch
 
 from gmmtorch.errors import DataError
-from gmmtorch.mapping.codec.component_batch import encode
-from gmmtorch.mapping.components import Components
+from gmmtorch.mapping import Components, encode
 from gmmtorch.team.sharing.messages.component_messages import read_batch
 from gmmtorch.team.sharing.messages.record_messages import (
     RECORD_BYTES,

@@ -12,9 +12,8 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.occupancy.calibrator import Calibration
+from gmmtorch.mapping import Components, GaussianMap
+from gmmtorch.occupancy import Calibration
 from gmmtorch.scan import ArrayLike
 from gmmtorch.team.sharing.messages.envelope import MAX_BYTES
 from gmmtorch.team.sharing.messages.message_registry import ComponentsMessage, Message, decode

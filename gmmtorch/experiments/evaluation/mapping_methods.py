@@ -9,17 +9,17 @@ from functools import partial
 from typing import Any
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.experiments.baselines.bgk_map import BGKMap
-from gmmtorch.experiments.baselines.bgk_points_map import BGKPointsMap
-from gmmtorch.experiments.baselines.gp_map import GPMap
-from gmmtorch.experiments.baselines.hilbert.bayesian_hilbert_map import BayesianHilbertMap
-from gmmtorch.experiments.baselines.hilbert.hilbert_map import HilbertMap
-from gmmtorch.experiments.baselines.ndt_map import NDTMap
-from gmmtorch.experiments.baselines.octomap_map import OctoMapMap
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.query_options import METHODS
-from gmmtorch.occupancy.occupancy_grid import LogOdds, OccupancyGrid
-from gmmtorch.occupancy.protocol import OccupancyMap
+from gmmtorch.experiments.baselines import (
+    BayesianHilbertMap,
+    BGKMap,
+    BGKPointsMap,
+    GPMap,
+    HilbertMap,
+    NDTMap,
+    OctoMapMap,
+)
+from gmmtorch.mapping import METHODS, GaussianMap
+from gmmtorch.occupancy import LogOdds, OccupancyGrid, OccupancyMap
 
 MapFactory = Callable[[float], OccupancyMap]
 """resolution (m) → an empty map."""

@@ -8,16 +8,15 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from gmmtorch.live.live_moments import COMPONENTS, CurveRecord, Curves, seen_paths
-from gmmtorch.live.live_view import Moment, ViewedCells, ViewedRobot
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.simulation.sensors.depth_camera import DepthCamera
+from gmmtorch.live import COMPONENTS, CurveRecord, Curves, Moment, ViewedCells, ViewedRobot, seen_paths
+from gmmtorch.mapping import GaussianMap
+from gmmtorch.simulation import DepthCamera
 from gmmtorch.team.exploration.mission.mission import Mission
 from gmmtorch.team.exploration.mission.replay import ReplayMission
 from gmmtorch.team.exploration.robot.agent import Agent
 from gmmtorch.team.exploration.robot.mapper import Mapper
 from gmmtorch.team.exploration.world.scoring import BeliefMap
-from gmmtorch.team.sharing.messages.message_registry import PlanMessage
+from gmmtorch.team.sharing import PlanMessage
 
 ENTROPY, SENT, RECEIVED = "entropy left [%]", "sent [kB]", "received [kB]"
 _STANDING = 0.05  # m: shorter motions do not lengthen a path

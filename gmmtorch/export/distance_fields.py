@@ -10,8 +10,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.files import write_npz
-from gmmtorch.occupancy.evidence import CellClass, Thresholds
-from gmmtorch.occupancy.grid import VoxelGrid
+from gmmtorch.occupancy import CellClass, Thresholds, VoxelGrid
 
 
 class DistanceField(NamedTuple):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import functools
 
-from gmmtorch.cli.options import schema
-from gmmtorch.cli.options.structured import read_dataclass, schema_of
+from gmmtorch.cli import read_dataclass, schema_of, store
+from gmmtorch.cli import register as register_maps
 from gmmtorch.team.cli.options import exploration_schema, robot_schema
 
 
@@ -17,7 +17,7 @@ def _sensor_schema() -> type:
 @functools.cache
 def register() -> None:
     """Stores the options of teams, and those of maps and data sets."""
-    schema.register()
+    register_maps()
     commands = {
         "ros": schema_of(robot_schema.Ros, sensor=_sensor_schema()),
         "explore": exploration_schema.Explore,
@@ -35,4 +35,4 @@ def register() -> None:
             "tree": exploration_schema.TreePlannerOptions,
         },
     }
-    schema.store(commands, groups)
+    store(commands, groups)

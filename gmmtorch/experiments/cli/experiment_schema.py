@@ -8,11 +8,10 @@ from typing import Any
 
 from omegaconf import MISSING
 
-from gmmtorch.cli.options import schema
-from gmmtorch.cli.options.runtime_schema import Report, Runtime
-from gmmtorch.cli.options.structured import schema_of
-from gmmtorch.experiments.evaluation.protocol_options import FitOptions, Protocol
-from gmmtorch.experiments.studies.study_options import (
+from gmmtorch.cli import Report, Runtime, schema_of, store
+from gmmtorch.cli import register as register_maps
+from gmmtorch.experiments.evaluation import FitOptions, Protocol
+from gmmtorch.experiments.studies import (
     ApproximationErrorStudy,
     AucMemoryStudy,
     ComponentCountStudy,
@@ -22,7 +21,7 @@ from gmmtorch.experiments.studies.study_options import (
     SensorModelStudy,
     VarianceThresholdStudy,
 )
-from gmmtorch.mixture.reduction.prune_options import PruneOptions
+from gmmtorch.mixture import PruneOptions
 
 STUDIES: dict[str, type] = {
     "approximation_error": ApproximationErrorStudy,
@@ -122,10 +121,10 @@ class Fit:
 @functools.cache
 def register() -> None:
     """Stores the options of fits, held-out tests and studies, and those of maps and data sets."""
-    schema.register()
+    register_maps()
     mixture = schema_of(FitOptions, PruneOptions, without=("dtype", "compiled"))
     commands = {
         "fit": schema_of(Fit, mixture=mixture),
         "occupancy": schema_of(Occupancy, evaluation=schema_of(Protocol)),
     }
-    schema.store(commands, {"study": {name: schema_of(study, name=name) for name, study in STUDIES.items()}})
+    store(commands, {"study": {name: schema_of(study, name=name) for name, study in STUDIES.items()}})
