@@ -4,11 +4,11 @@ from .mission.driver import WallClock as WallClock
 from .mission.driver import drive as drive
 from .mission.driver import settle as settle
 from .mission.mission import Mission as Mission
-from .mission.moments import RECEIVED as RECEIVED
-from .mission.moments import SENT as SENT
-from .mission.moments import AgentMoments as AgentMoments
-from .mission.moments import MissionMoments as MissionMoments
-from .mission.moments import ReplayMoments as ReplayMoments
+from .mission.mission_moments import RECEIVED as RECEIVED
+from .mission.mission_moments import SENT as SENT
+from .mission.mission_moments import AgentMoments as AgentMoments
+from .mission.mission_moments import MissionMoments as MissionMoments
+from .mission.mission_moments import ReplayMoments as ReplayMoments
 from .mission.options import THESIS as THESIS
 from .mission.options import TeamOptions as TeamOptions
 from .mission.paired_statistics import Band as Band
