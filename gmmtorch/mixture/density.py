@@ -21,8 +21,7 @@ from gmmtorch.kernels import chunk_elements
 from gmmtorch.linalg import inverse_factor, safe_cholesky
 from gmmtorch.mixture.em import by_type
 from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em.covariance_types import compact, count_free_entries, expand
-from gmmtorch.mixture.em.exact import Parameters
+from gmmtorch.mixture.em.exact import Parameters, compact, count_free_entries, expand
 from gmmtorch.mixture.validation import Array, RandomState, as_generator, checked_tensor
 
 _FAR = 1e4  # distance from the centre (m) beyond which products of features lose digits

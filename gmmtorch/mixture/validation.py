@@ -11,7 +11,7 @@ from torch import Tensor
 from gmmtorch.arrays import as_tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.linalg import inverse_factor
-from gmmtorch.mixture.em.covariance_types import type_shape
+from gmmtorch.mixture.em.exact import type_shape
 
 _LEAST_MEAN_WEIGHT, _LARGEST_MEAN_WEIGHT = 1e-6, 1e12
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.reduction.moments import COSTS
+from gmmtorch.mixture.reduction import COSTS
 
 dims = pytest.mark.parametrize("dim", [1, 2, 3, 5])
 costs = pytest.mark.parametrize("cost", list(COSTS))

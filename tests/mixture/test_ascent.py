@@ -20,8 +20,16 @@ from gmmtorch.kernels import kernels
 from gmmtorch.mixture import GaussianMixture
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.estimators.ascent import LBFGS, SOLVERS, ascend, search
-from gmmtorch.mixture.estimators.riemannian import Iterate, Likelihood, pack_tangent, unpack_tangent
+from gmmtorch.mixture.estimators.riemannian import (
+    LBFGS,
+    SOLVERS,
+    Iterate,
+    Likelihood,
+    ascend,
+    pack_tangent,
+    search,
+    unpack_tangent,
+)
 
 solvers = pytest.mark.parametrize("solver", list(SOLVERS))
 

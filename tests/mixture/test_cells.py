@@ -15,8 +15,8 @@ from gmmtorch.kernels import kernels
 from gmmtorch.mixture import GaussianMixture
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em import loop
-from gmmtorch.mixture.em.cells import pool_into_cells
 from gmmtorch.mixture.em.exact import quadratic_features
+from gmmtorch.mixture.em.partition import pool_into_cells
 
 
 @given(

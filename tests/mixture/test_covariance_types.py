@@ -15,7 +15,7 @@ from sklearn.utils._param_validation import InvalidParameterError
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.mixture import GaussianMixture, VariationalGaussianMixture
-from gmmtorch.mixture.em.covariance_types import COVARIANCE_TYPES, compact, constrain, type_shape
+from gmmtorch.mixture.em.exact import COVARIANCE_TYPES, compact, constrain, type_shape
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 types = pytest.mark.parametrize("kind", COVARIANCE_TYPES)

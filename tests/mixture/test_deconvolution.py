@@ -17,8 +17,8 @@ from scipy.stats import multivariate_normal
 
 from gmmtorch.mixture import DeconvolvedGaussianMixture
 from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.estimators import deconvolution
-from gmmtorch.mixture.estimators.deconvolution import (
+from gmmtorch.mixture.estimators import deconvolved
+from gmmtorch.mixture.estimators.deconvolved import (
     Block,
     bound_variances,
     expectation,
@@ -135,7 +135,7 @@ def test_chunks_do_not_change_the_iteration(monkeypatch):
     rng = np.random.default_rng(0)
     block, parameters = noisy_cloud(rng, 50, 3), random_mixture(rng, 4, 3)
     whole = step(block, parameters)
-    monkeypatch.setattr(deconvolution, "_CHUNK_ELEMENTS", 12)
+    monkeypatch.setattr(deconvolved, "_CHUNK_ELEMENTS", 12)
     chunked = step(block, parameters)
     assert whole[1] == pytest.approx(chunked[1], rel=1e-12)
     torch.testing.assert_close(whole[0].covariances, chunked[0].covariances)
@@ -160,7 +160,7 @@ def test_excluded_pairs_have_no_share(monkeypatch):
     block = Block(points, torch.ones(400, dtype=torch.float64), noise)
     few, value = expectation(block, parameters)
     n_few = sum(len(pairs.row) for _, pairs in pair_chunks(points, noise, parameters))
-    monkeypatch.setattr(deconvolution, "_NEGLIGIBLE", 1e300)
+    monkeypatch.setattr(deconvolved, "_NEGLIGIBLE", 1e300)
     every, expected = expectation(block, parameters)
     assert n_few < 0.5 * 400 * 30
     assert float(value) == pytest.approx(float(expected), rel=1e-13)
@@ -185,8 +185,8 @@ def test_points_with_equal_covariances_are_grouped():
     parts = group_by_noise(block.points, block.weight, noise)
     assert [part.noise.ndim for part in parts] == [2, 2, 2]
     assert sum(len(part.points) for part in parts) == 3000
-    together = deconvolution.deconvolution_step(parts)(parameters)
-    apart = deconvolution.deconvolution_step([block._replace(noise=noise)])(parameters)
+    together = deconvolved.deconvolution_step(parts)(parameters)
+    apart = deconvolved.deconvolution_step([block._replace(noise=noise)])(parameters)
     assert together[1] == pytest.approx(apart[1], rel=1e-10)
     torch.testing.assert_close(together[0].covariances, apart[0].covariances, rtol=1e-9, atol=1e-9)
     assert len(group_by_noise(*block)) == 1  # all covariances differ

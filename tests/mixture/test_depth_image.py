@@ -14,8 +14,8 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mixture import GaussianMixture
-from gmmtorch.mixture.depth_image import fit_depth_image, pool_depth_image
 from gmmtorch.mixture.em.exact import quadratic_features
+from gmmtorch.mixture.estimators.depth_image import fit_depth_image, pool_depth_image
 from gmmtorch.pinhole import back_project
 
 INTRINSICS = torch.tensor([[80.0, 0.0, 47.3], [0.0, 75.0, 30.9], [0.0, 0.0, 1.0]], dtype=torch.float64)

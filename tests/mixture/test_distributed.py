@@ -15,10 +15,9 @@ import torch
 
 from gmmtorch.datasets.point_files.point_chunks import open_points
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.mixture.em.distributed import SINGLE_PROCESS, LostProcessError, is_launched, joined
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
-from gmmtorch.mixture.streaming.checkpoints import Checkpoint, read_state
-from gmmtorch.mixture.streaming.distributed import SINGLE_PROCESS, LostProcessError, is_launched, joined
-from gmmtorch.mixture.streaming.stream_fit import fit_stream
+from gmmtorch.mixture.streaming import Checkpoint, fit_stream, read_state
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:EM did not converge"),
@@ -68,10 +67,10 @@ from pathlib import Path
 import torch
 torch.set_num_threads(1)
 from gmmtorch.datasets.point_files.point_chunks import open_points
-from gmmtorch.mixture.streaming.checkpoints import Checkpoint
-from gmmtorch.mixture.streaming.distributed import LostProcessError, joined
+from gmmtorch.mixture.streaming import Checkpoint
+from gmmtorch.mixture.em.distributed import LostProcessError, joined
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
-from gmmtorch.mixture.streaming.stream_fit import fit_stream
+from gmmtorch.mixture.streaming import fit_stream
 
 cloud, checkpoint, how = sys.argv[1:]
 ready = [Path(f"{checkpoint}.{rank}") for rank in (0, 1)]

@@ -17,8 +17,8 @@ from torch import Tensor
 from gmmtorch.kernels import chunks
 from gmmtorch.mixture.em import by_type, loop
 from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em.cells import pool_into_cells
 from gmmtorch.mixture.em.exact import Parameters, quadratic_features
+from gmmtorch.mixture.em.partition import pool_into_cells
 
 
 def brute_force_statistics(

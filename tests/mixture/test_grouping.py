@@ -12,9 +12,9 @@ from scipy.special import logsumexp
 
 from gmmtorch.kernels import chunks
 from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em import grouping
+from gmmtorch.mixture.em import truncated
 from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.em.grouping import choose_candidates, group_rows, nearest, truncated_expectation
+from gmmtorch.mixture.em.truncated import choose_candidates, group_rows, nearest, truncated_expectation
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 dims = pytest.mark.parametrize("dim", [1, 2, 3, 5])
@@ -40,7 +40,7 @@ def test_group_rows_puts_each_row_into_one_slot_of_its_owner(
     owner = torch.randint(0, k, (n,), generator=torch.Generator().manual_seed(seed))
     owner = owner // 2 * 2 if not one_group else torch.full_like(owner, k - 1)  # with empty groups
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(grouping, "_BUILD_ROWS", build_rows)
+        patch.setattr(truncated, "_BUILD_ROWS", build_rows)
         groups = group_rows(rows_of(points, weight, are_points), owner, centers, torch.float64)
     block = groups.weight.shape[1]
     assert sorted(groups.row.tolist()) == list(range(n))

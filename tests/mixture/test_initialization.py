@@ -9,7 +9,6 @@ from mixture.mixture_cases import cloud, thin_wall
 from torch import Tensor
 
 from gmmtorch.mixture.em import initialization
-from gmmtorch.mixture.em.cells import pool_into_cells
 from gmmtorch.mixture.em.exact import Parameters, quadratic_features
 from gmmtorch.mixture.em.initialization import (
     INITIALIZATIONS,
@@ -19,6 +18,7 @@ from gmmtorch.mixture.em.initialization import (
     moments_of,
     replicated,
 )
+from gmmtorch.mixture.em.partition import pool_into_cells
 
 METHODS = sorted(INITIALIZATIONS)
 SEEDED = [method for method in METHODS if method != "flat_pieces"]

@@ -15,7 +15,7 @@ from scipy.stats import norm
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.reduction.moments import COSTS, Gaussians, merge_components, merge_pairs
+from gmmtorch.mixture.reduction import COSTS, Gaussians, merge_components, merge_pairs
 
 # -- moments ---------------------------------------------------------------------------------------
 

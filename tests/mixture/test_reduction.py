@@ -17,7 +17,7 @@ from gmmtorch.errors import InvalidArgumentError, NumericalError
 from gmmtorch.mixture import GaussianMixture, merge, simplify
 from gmmtorch.mixture.density import NotFittedError
 from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.reduction.moments import COSTS, Gaussians, merge_components
+from gmmtorch.mixture.reduction import COSTS, Gaussians, merge_components
 
 paths = pytest.mark.parametrize("path", ["exact", "rounds"])
 MOST_EXACT = {"exact": 10**6, "rounds": 0}

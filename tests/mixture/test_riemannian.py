@@ -18,8 +18,7 @@ from gmmtorch.mixture import GaussianMixture
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em import loop
 from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.estimators.ascent import SOLVERS
-from gmmtorch.mixture.estimators.riemannian import Likelihood, RiemannianGaussianMixture
+from gmmtorch.mixture.estimators.riemannian import SOLVERS, Likelihood, RiemannianGaussianMixture
 
 solvers = pytest.mark.parametrize("solver", list(SOLVERS))
 

@@ -21,19 +21,17 @@ from gmmtorch.errors import NumericalError
 from gmmtorch.mixture import GaussianMixture
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.initialization import initialize
-from gmmtorch.mixture.estimators import optimal_transport as lines
-from gmmtorch.mixture.estimators.optimal_transport import (
+from gmmtorch.mixture.estimators import sliced_wasserstein as lines
+from gmmtorch.mixture.estimators.sliced_wasserstein import (
     LEVELS,
+    Shape,
+    SlicedWassersteinGaussianMixture,
     Slices,
+    differentiate,
     mixture_quantiles,
     random_directions,
     slice_cloud,
     transport,
-)
-from gmmtorch.mixture.estimators.sliced_wasserstein import (
-    Shape,
-    SlicedWassersteinGaussianMixture,
-    differentiate,
 )
 
 UP = torch.ones(1, 1).double()

@@ -18,7 +18,7 @@ from scipy.stats import multivariate_normal
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.files import pack_tensors
 from gmmtorch.mixture import GaussianMixture
-from gmmtorch.mixture.em import stepwise
+from gmmtorch.mixture.em import loop
 from gmmtorch.mixture.em.exact import Parameters
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
@@ -115,7 +115,7 @@ def test_statistics_follow_their_recursion(dim, kappa):
 
 @pytest.mark.parametrize("kappa", [0.55, 0.7, 1.0])
 def test_step_sizes_of_equal_batches_equal_liang_and_klein(kappa):
-    steps = [stepwise.step_size(50.0, 50.0 * t, kappa) for t in range(6)]
+    steps = [loop.step_size(50.0, 50.0 * t, kappa) for t in range(6)]
     np.testing.assert_allclose(steps, [1.0, *((t + 2) ** -kappa for t in range(5))], rtol=1e-14)
 
 
@@ -132,9 +132,7 @@ def test_blend_has_the_blended_moments(seed, dim, step, offset):
         return Parameters(*map(torch.from_numpy, (weights, means, root @ root.transpose(0, 2, 1))))
 
     old, new = random(), random()
-    found = stepwise.blend(
-        old._replace(means=old.means + offset), new._replace(means=new.means + offset), step
-    )
+    found = loop.blend(old._replace(means=old.means + offset), new._replace(means=new.means + offset), step)
 
     def raw(p: Parameters) -> torch.Tensor:
         second = p.covariances + p.means[:, :, None] * p.means[:, None, :]

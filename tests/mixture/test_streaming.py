@@ -17,11 +17,19 @@ from torch import Tensor
 
 from gmmtorch.datasets.point_files.point_chunks import PointChunks, in_memory, open_points
 from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.mixture.em.distributed import Processes
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
-from gmmtorch.mixture.streaming.checkpoints import Checkpoint, State, read_state, write_state
-from gmmtorch.mixture.streaming.distributed import Processes
-from gmmtorch.mixture.streaming.stream_fit import Accumulate, ExactEStep, fit_stream, score_stream
+from gmmtorch.mixture.streaming import (
+    Accumulate,
+    Checkpoint,
+    ExactEStep,
+    State,
+    fit_stream,
+    read_state,
+    score_stream,
+    write_state,
+)
 
 pytestmark = pytest.mark.filterwarnings("ignore:EM did not converge")
 
@@ -331,9 +339,9 @@ from pathlib import Path
 import torch
 torch.set_num_threads(1)
 from gmmtorch.datasets.point_files.point_chunks import open_points
-from gmmtorch.mixture.streaming.checkpoints import Checkpoint
+from gmmtorch.mixture.streaming import Checkpoint
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
-from gmmtorch.mixture.streaming.stream_fit import fit_stream
+from gmmtorch.mixture.streaming import fit_stream
 
 def kill(iteration, bound):
     if iteration == 6:

@@ -17,13 +17,13 @@ from scipy.stats import multivariate_normal
 from torch import Tensor
 
 from gmmtorch.mixture import GaussianMixture
-from gmmtorch.mixture.estimators.trees.nested import (
+from gmmtorch.mixture.estimators.tree_growth import (
     Children,
     Members,
     assign_members,
+    fit_children,
     pack,
     principal_axes_start,
-    run_em,
 )
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
@@ -203,14 +203,11 @@ def test_nodes_of_a_batch_are_fitted_independently():
     node = torch.repeat_interleave(torch.arange(5), torch.tensor([30, 30, 40, 250, 50]))
     shuffle = torch.randperm(400, generator=torch.Generator().manual_seed(0))
     members = Members(shuffle, node[shuffle], 0.5 + torch.arange(400).double() % 7)
-    options: dict[str, Any] = {"reg_covar": 1e-4, "tol": 1e-4, "max_iter": 40, "worst_error": math.inf}
+    rule = exact(reg_covar=1e-4, tol=1e-4, max_iter=40)
 
     def learn(members: Members, centers: Tensor) -> tuple[Children, list[Tensor]]:
-        packed = pack(points, members, centers, torch.float64)
-        start, values = principal_axes_start(packed, len(centers), 6, 1e-4), []
-        mass = members.mass(len(centers))
-        found = run_em(packed, start, mass, on_values=lambda v: values.append(v.clone()), **options)
-        return found.children, values
+        values: list[Tensor] = []
+        return fit_children(points, members, centers, 6, rule, lambda v: values.append(v.clone()))[1], values
 
     centers = torch.stack([points[node == i].mean(0) for i in range(5)])
     together, values = learn(members, centers)

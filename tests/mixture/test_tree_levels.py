@@ -13,8 +13,8 @@ from mixture.tree_cases import exact, room, split_nodes
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.files import pack_tensors, read_tensors
 from gmmtorch.mixture import GaussianMixture, HierarchicalGaussianMixture, prune
-from gmmtorch.mixture.estimators.trees.growth import Tree
-from gmmtorch.mixture.estimators.trees.hierarchical import check_tree
+from gmmtorch.mixture.estimators.hierarchical import check_tree
+from gmmtorch.mixture.estimators.tree_growth import Tree
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 

@@ -12,7 +12,7 @@ from mixture.tree_cases import exact, room, split_nodes
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mixture import LaserModel
-from gmmtorch.mixture.estimators.trees.nested import Children, keep_children
+from gmmtorch.mixture.estimators.tree_growth import Children, keep_children
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 

@@ -19,12 +19,10 @@ from gmmtorch.datasets.point_files.point_chunks import in_memory
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mixture import GaussianMixture, gaussian_mixture
 from gmmtorch.mixture.em import loop
-from gmmtorch.mixture.em.grouping import Rows
+from gmmtorch.mixture.em.distributed import Processes
 from gmmtorch.mixture.em.initialization import flat_pieces
-from gmmtorch.mixture.em.truncated import Settings, fit_truncated
-from gmmtorch.mixture.streaming.checkpoints import Checkpoint
-from gmmtorch.mixture.streaming.distributed import Processes
-from gmmtorch.mixture.streaming.stream_fit import fit_stream
+from gmmtorch.mixture.em.truncated import Rows, Settings, fit_truncated
+from gmmtorch.mixture.streaming import Checkpoint, fit_stream
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 
@@ -145,15 +143,6 @@ class TestGaussianMixtureOnCells(FitContract):
     def make(self, n_components: int = 3, **options: Any) -> GaussianMixture:
         usual = {"random_state": 0, "max_cells": 50, "init_params": "flat_pieces"}
         return GaussianMixture(n_components, **{**usual, **options})
-
-
-@pytest.mark.slow
-def test_compiled_fit_equals_the_uncompiled_fit():
-    points = torch.from_numpy(beads(3000, 60)[0])
-    options = {"algorithm": "truncated", "init_params": "flat_pieces", "tol": 1e-4}
-    plain, compiled = (GaussianMixture(60, compiled=value, **options).fit(points) for value in (False, True))
-    torch.testing.assert_close(compiled.means, plain.means, rtol=1e-3, atol=1e-3)
-    assert compiled.lower_bound_ == pytest.approx(plain.lower_bound_, abs=1e-4)
 
 
 class Halves(Processes):

@@ -17,16 +17,18 @@ from gmmtorch.mixture import GaussianMixture
 from gmmtorch.mixture.em import by_type, loop, truncated
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.em.grouping import (
+from gmmtorch.mixture.em.initialization import flat_pieces, moments_of
+from gmmtorch.mixture.em.truncated import (
     Rows,
+    Settings,
     centered_parameters,
+    fit_truncated,
     group_rows,
     nearest,
     rounding,
+    run_truncated,
     truncated_expectation,
 )
-from gmmtorch.mixture.em.initialization import flat_pieces, moments_of
-from gmmtorch.mixture.em.truncated import Settings, fit_truncated, run_truncated
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 

@@ -25,8 +25,16 @@ from torch import Tensor
 from gmmtorch.errors import NumericalError
 from gmmtorch.kernels import chunk_elements, chunked, softmax
 from gmmtorch.linalg import safe_cholesky, unpack_symmetric
-from gmmtorch.mixture.em.covariance_types import compact, constrain, type_shape
-from gmmtorch.mixture.em.exact import LOG_2PI, MIN_LOG_WEIGHT, Parameters, natural_of_precisions, products
+from gmmtorch.mixture.em.exact import (
+    LOG_2PI,
+    MIN_LOG_WEIGHT,
+    Parameters,
+    compact,
+    constrain,
+    natural_of_precisions,
+    products,
+    type_shape,
+)
 
 _MOST_LOST = 1e-6  # nats a dimension that the log-density of the linear form may lose
 _MOST_LOST_VARIANCE = 1e-5  # share of a variance that the moments of the linear form may lose

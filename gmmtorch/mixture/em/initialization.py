@@ -16,16 +16,15 @@ from torch import Tensor
 
 from gmmtorch.linalg import argsort
 from gmmtorch.mixture.em import by_type
-from gmmtorch.mixture.em.cells import pool_into_cells
-from gmmtorch.mixture.em.covariance_types import type_shape
 from gmmtorch.mixture.em.exact import (
     Parameters,
     feature_dimension,
     maximization,
     quadratic_features,
     shift_features,
+    type_shape,
 )
-from gmmtorch.mixture.em.partition import FlatnessRule, partition, pool, surface_rule
+from gmmtorch.mixture.em.partition import FlatnessRule, partition, pool, pool_into_cells, surface_rule
 
 _FEWEST_CELLS, _CELLS_OF_A_COMPONENT = 4096, 8  # lower limits of the cells for flat pieces
 _FINEST_CELLS = 1 << 14  # along the longest side

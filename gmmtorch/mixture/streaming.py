@@ -7,28 +7,30 @@ that of `GaussianMixture.fit` on the whole cloud, to rounding.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import hashlib
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol, cast
 
 import torch
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike
-from gmmtorch.datasets import PointChunks, Survey, in_memory
-from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.datasets import PointChunks, Survey, in_memory, merge_surveys
+from gmmtorch.datasets import survey as survey_source
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
+from gmmtorch.files import pack_tensors, read_tensors, require, write_bytes
 from gmmtorch.mixture.em import by_type, loop
 from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em.covariance_types import expand
-from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.em.grouping import Rows, nearest
-from gmmtorch.mixture.em.truncated import fit_truncated
+from gmmtorch.mixture.em.distributed import SINGLE_PROCESS, LostProcessError, Processes
+from gmmtorch.mixture.em.exact import Parameters, expand
+from gmmtorch.mixture.em.truncated import Rows, fit_truncated, nearest
 from gmmtorch.mixture.estimator import MixtureEstimator
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
-from gmmtorch.mixture.streaming.checkpoints import Checkpoint, CheckpointWriter
-from gmmtorch.mixture.streaming.distributed import SINGLE_PROCESS, LostProcessError, Processes
-from gmmtorch.mixture.streaming.stream_start import draw_seed, first_state, run_facts, survey_all
 from gmmtorch.mixture.validation import as_generator
 
 SAMPLE_POINTS = 100_000
@@ -304,3 +306,212 @@ def _stream_step(run: _Run, e_step: EStep, n_points: int) -> loop.Step[Parameter
         return new, float(value) / n_points
 
     return step
+
+
+# -- the start ------------------------------------------------------------------------------------
+def survey_all(
+    source: PointChunks, sample_points: int | None, seed: int, processes: Processes = SINGLE_PROCESS
+) -> Survey:
+    """Result of one pass over the sources of all processes, see `survey`. The seed of rank 0 is used."""
+    if sample_points is not None:
+        check_whole("sample_points", sample_points, 1)
+    seed = int(processes.broadcast(torch.tensor([seed], dtype=torch.float64)))
+    part = survey_source(source, sample_points, seed)
+    if processes.size == 1:
+        return part
+    counts = part.total.new_tensor([part.n_points, part.n_dropped, part.checksum])  # whole numbers below 2⁵³
+    facts = processes.gather(torch.cat([counts, part.total, part.low, part.high])[None])
+    samples = processes.gather(part.sample)
+    dim = source.dim
+    parts = []
+    for row, sample in zip(torch.cat(facts), samples, strict=True):
+        n_points, n_dropped, checksum = (int(value) for value in row[:3])
+        total, low, high = row[3:].split(dim)
+        parts.append(Survey(n_points, n_dropped, total, low, high, checksum, sample))
+    return merge_surveys(parts, sample_points)
+
+
+def draw_seed(generator: torch.Generator) -> int:
+    """A seed below 2⁴⁸, drawn from a copy of the generator, so that the generator stays unchanged."""
+    copy = torch.Generator()
+    copy.set_state(generator.get_state())
+    return int(torch.randint(2**48, (), generator=copy))
+
+
+def first_state(
+    mixture: GaussianMixture,
+    survey: Survey,
+    run: RunFacts,
+    generator: torch.Generator,
+    checkpoint: Checkpoint | None,
+    processes: Processes,
+) -> State:
+    """Start or continuation of EM: the state of rank 0, the same in all processes."""
+    packed = None
+    if processes.rank == 0:
+        state = None if checkpoint is None else checkpoint.read(run)
+        if state is None:
+            center = survey.center
+            points = survey.points - center
+            rows = Rows(points, points.new_ones(points.shape[0]))
+            parameters, _ = mixture._start(rows, center, generator)
+            covariances = expand(parameters.covariances, mixture.covariance_type, *parameters.means.shape)
+            parameters = parameters._replace(covariances=covariances)
+            state = State(parameters, center, [])
+        packed = state.pack()
+    return State.unpack(processes.broadcast(packed), cast(int, mixture.n_components), survey.low.shape[0])
+
+
+def run_facts(mixture: GaussianMixture, survey: Survey, e_step: str) -> RunFacts:
+    """Description of the run, with the `repr` of its E-step.
+
+    Excludes `tol` and `max_iter`, which only determine when the run ends.
+    """
+    seed = mixture.random_state
+    given: tuple[Any, ...] = (mixture.weights_init, mixture.means_init, mixture.precisions_init)
+    if mixture._continues():
+        given = (mixture.weights, mixture.means, mixture.covariances)
+    return {
+        "n_components": int(cast(int, mixture.n_components)),
+        "covariance_type": mixture.covariance_type,
+        "reg_covar": float(mixture.reg_covar),
+        "init_params": mixture.init_params,
+        "random_state": None if seed is None or not hasattr(seed, "__index__") else int(seed),
+        "n_sampled": survey.sample.shape[0],
+        "e_step": e_step,
+        "given_start": _digest(given),
+        "dimensions": survey.low.shape[0],
+        "n_points": survey.n_points,
+        "checksum": survey.checksum,
+    }
+
+
+def _digest(values: tuple[Any, ...]) -> str:
+    """Hash of the numbers of arrays or tensors; items may be None."""
+    digest = hashlib.sha256()
+    for value in values:
+        digest.update(b"-" if value is None else torch.as_tensor(value).double().cpu().numpy().tobytes())
+    return digest.hexdigest()[:16]
+
+
+# -- checkpoints ----------------------------------------------------------------------------------
+_FILE_KIND, _FILE_VERSION = "gmmtorch.checkpoint", 1
+
+RunFacts = Mapping[str, Any]
+"""Description of a run, in JSON types: settings and cloud, including n_components and dimensions."""
+
+
+class State(NamedTuple):
+    """Parameters relative to `center` (D,), and the lower bounds (nats) of the iterations so far."""
+
+    parameters: Parameters
+    center: Tensor
+    lower_bounds: list[float]
+
+    def pack(self) -> Tensor:
+        """The state as one vector (n,), float64."""
+        bounds = self.center.new_tensor(self.lower_bounds)
+        return torch.cat([part.flatten() for part in (*self.parameters, self.center, bounds)])
+
+    @staticmethod
+    def unpack(vector: Tensor, n_components: int, dim: int) -> State:
+        """The inverse of `pack`."""
+        k = n_components
+        sizes = [k, k * dim, k * dim * dim, dim]
+        weights, means, covariances, center, bounds = vector.split([*sizes, vector.numel() - sum(sizes)])
+        parameters = Parameters(weights, means.view(k, dim), covariances.view(k, dim, dim))
+        return State(parameters, center, bounds.tolist())
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A file in which a fit stores its state.
+
+    Args:
+        path: the safetensors file, written atomically.
+        every: iterations between two writes.
+        seconds: also write after this time since the last write; None: no time limit.
+        resume: continue from the file if it exists. Without it, an existing file is an error.
+    """
+
+    path: Path
+    every: int = 10
+    seconds: float | None = None
+    resume: bool = False
+
+    def __post_init__(self) -> None:
+        check_whole("every", self.every, 1)
+        if self.seconds is not None and not (math.isfinite(self.seconds) and self.seconds > 0):
+            raise InvalidArgumentError(f"seconds={self.seconds} must be above zero and finite, or None.")
+
+    def read(self, run: RunFacts) -> State | None:
+        """The state to continue from; None if there is none.
+
+        Raises `InvalidArgumentError` if the file is of another run, or exists without `resume`, and
+        `DataError` if the file is damaged.
+        """
+        if not self.path.exists():
+            return None
+        if not self.resume:
+            raise InvalidArgumentError(
+                f"checkpoint={self.path} already exists; continue from it with resume=true, or delete it."
+            )
+        state, facts = read_state(self.path)
+        for name in dict.fromkeys([*run, *facts]):
+            if facts.get(name) != run.get(name):
+                raise InvalidArgumentError(
+                    f"checkpoint={self.path} is of another run: it has {name}={facts.get(name)!r}, this run "
+                    f"has {name}={run.get(name)!r}. Use the same value, or another checkpoint."
+                )
+        if tuple(state.parameters.means.shape) != (run["n_components"], run["dimensions"]):
+            raise DataError(f"{self.path} does not match its own description; the file is damaged.")
+        return state
+
+    def resume_hint(self) -> str:
+        """A sentence that says how to continue."""
+        try:
+            state, _ = read_state(self.path)
+        except GmmTorchError:
+            return f"There is no checkpoint at {self.path} yet; start the run again."
+        return (
+            f"The last checkpoint, {self.path}, is of iteration {len(state.lower_bounds)}; start the run "
+            "again with resume=true to continue from it."
+        )
+
+
+class CheckpointWriter:
+    """Writes the state of one run when it is due."""
+
+    def __init__(self, checkpoint: Checkpoint, run: RunFacts, center: Tensor) -> None:
+        self._checkpoint, self._run, self._center = checkpoint, run, center
+        self._last = time.monotonic()
+
+    def write_if_due(self, parameters: Parameters, lower_bounds: list[float], final: bool = False) -> None:
+        """Write the state after an iteration if it is due, or if it is `final`."""
+        seconds, now = self._checkpoint.seconds, time.monotonic()
+        is_late = seconds is not None and now - self._last >= seconds
+        if final or is_late or len(lower_bounds) % self._checkpoint.every == 0:
+            write_state(self._checkpoint.path, State(parameters, self._center, lower_bounds), self._run)
+            self._last = now
+
+
+def write_state(path: Path, state: State, run: RunFacts) -> None:
+    """Write a state and a description of its run, atomically."""
+    tensors = {**state.parameters._asdict(), "center": state.center}
+    tensors["lower_bounds"] = torch.tensor(state.lower_bounds, dtype=torch.float64)
+    write_bytes(path, pack_tensors(tensors, _FILE_KIND, _FILE_VERSION, run=dict(run)))
+
+
+def read_state(path: Path) -> tuple[State, dict[str, Any]]:
+    """The state and the description of its run. Raises `DataError` if the file is not a checkpoint."""
+    tensors, facts = read_tensors(path, _FILE_KIND, _FILE_VERSION)
+    means = require(tensors, "means", (None, None), torch.float64, path)
+    k, dim = means.shape
+    weights = require(tensors, "weights", (k,), torch.float64, path)
+    covariances = require(tensors, "covariances", (k, dim, dim), torch.float64, path)
+    center = require(tensors, "center", (dim,), torch.float64, path)
+    bounds = require(tensors, "lower_bounds", (None,), torch.float64, path)
+    run = facts.get("run")
+    if not isinstance(run, dict):
+        raise DataError(f"{path} lacks the description of its run; the file is damaged.")
+    return State(Parameters(weights, means, covariances), center, bounds.tolist()), run

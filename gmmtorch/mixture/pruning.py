@@ -17,7 +17,7 @@ from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, check_number
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.estimators.sensor_model import SensorModel, cos_incidence
-from gmmtorch.mixture.reduction.merge import parameters_of
+from gmmtorch.mixture.reduction import parameters_of
 
 if TYPE_CHECKING:
     from gmmtorch.mixture.estimator import MixtureEstimator
