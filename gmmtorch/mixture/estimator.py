@@ -64,10 +64,9 @@ class Report:
         if not self._verbose:
             return
         seconds = time.monotonic() - self._begin
-        details = (
-            f" time lapse {seconds:.5f}s\t lower bound {found.lower_bound:.5f}." if self._verbose > 1 else ""
-        )
-        print(f"Initialization {'converged' if found.converged else 'did not converge'}.{details}")
+        state = "converged" if found.converged else "did not converge"
+        details = f" time lapse {seconds:.5f}s\t lower bound {found.lower_bound:.5f}."
+        print(f"Initialization {state}.{details if self._verbose > 1 else ''}")
 
 
 _FILE_KIND, _FILE_VERSION = "gmmtorch.mixture", 1

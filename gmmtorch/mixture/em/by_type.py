@@ -153,9 +153,8 @@ class Factors:
             if self.kind == "tied":
                 z = points - middle[part, None, :]
             else:
-                z = (points - self.means[part, None, :]) * self.whiten[part].view(
-                    -1, 1, self.whiten[0].numel()
-                )
+                scale = self.whiten[part].view(-1, 1, self.whiten[0].numel())
+                z = (points - self.means[part, None, :]) * scale
             return (z * z).sum(2)
 
         def joint(points: Tensor, square: Tensor | None = None) -> Tensor:
@@ -278,7 +277,8 @@ class Sums:
             if self._kind == "spherical":
                 second, square = second / dim, square.mean(1, keepdim=True)
             covariances = (second - square).clamp_min_(0)
-            return Parameters(self._count, means, covariances.view(self._type_shape())), second
+            shape = type_shape(self._kind, *means.shape)
+            return Parameters(self._count, means, covariances.view(shape)), second
         # In place, because the matrices may be most of the memory.
         covariances = self._second
         if self._kind == "tied":
@@ -292,9 +292,6 @@ class Sums:
             covariances.baddbmm_(shift[:, :, None], shift[:, None, :], alpha=-1)
         covariances.diagonal(dim1=-2, dim2=-1).clamp_min_(0)
         return Parameters(self._count, means, covariances), second
-
-    def _type_shape(self) -> tuple[int, ...]:
-        return type_shape(self._kind, *self._first.shape)
 
 
 def have_cancelled(second: Tensor, covariances: Tensor, kind: str, linear: bool) -> Tensor:
@@ -422,11 +419,19 @@ def exact_step(
     softmax_dtype: torch.dtype,
     reg_covar: float,
     previous: Parameters | None,
+    linear: bool = False,
 ) -> Moved:
-    """`em_step` in the direct form; if a component moves far, once more with moments about its new mean."""
-    given = (points, sample_weight, factors, softmax_dtype, reg_covar, previous, False)
-    found = em_step(*given)
-    return em_step(*given, about=found.parameters.means) if bool(found.lost) else found
+    """`em_step` in the direct form; if a component moves far, once more with moments about its new mean.
+
+    With `linear`, the linear form is tried first, if that is the fastest.
+    """
+    given = (points, sample_weight, factors, softmax_dtype, reg_covar, previous)
+    if linear and has_linear_form(len(factors.means), factors.dim, factors.kind):
+        found = em_step(*given, linear=True)
+        if not bool(found.lost):
+            return found
+    found = em_step(*given, linear=False)
+    return em_step(*given, False, found.parameters.means) if bool(found.lost) else found
 
 
 def direct_step(

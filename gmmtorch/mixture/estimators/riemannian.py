@@ -25,12 +25,10 @@ from __future__ import annotations
 import functools
 import math
 from collections import deque
-from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
-from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
+from typing import NamedTuple
 
 import torch
-from sklearn.utils._param_validation import StrOptions
 from torch import Tensor, nn
 
 from gmmtorch.errors import NumericalError
@@ -40,17 +38,21 @@ from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.initialization import initialize
 from gmmtorch.mixture.em.loop import EMResult, OnIteration
-from gmmtorch.mixture.estimator import COUNT, Cloud, MixtureEstimator
+from gmmtorch.mixture.estimator import Cloud, MixtureEstimator
 from gmmtorch.mixture.validation import RandomState, as_generator
 
 _LONGEST_GUESS = 2.0  # limit of ‖Ξ‖ for steps by the first guess of the Hessian
 _LEAST_SHARE = 0.1  # smallest share of a component in that guess, relative to 1/K
 _LONGEST_STEP = 4.0  # limit of ‖Ξ‖ for any step: a variance changes by e⁴ at most
+_MEMORY = 10  # steps that L-BFGS stores
+_ARMIJO = 1e-4  # share of the predicted gain that a step must reach
+_SLOPE_LEFT = 0.9  # largest remaining share of the slope (the curvature condition)
+_TRIALS = 30  # lengths tried along one direction
 
 
 @dataclass(eq=False, repr=False)
 class RiemannianGaussianMixture(MixtureEstimator):
-    """Gaussian mixture fitted by L-BFGS or conjugate gradients on the manifold of covariances.
+    """Gaussian mixture fitted by L-BFGS on the manifold of covariances.
 
     Suitable for overlapping components and a small tolerance: five clusters that hide one another
     (20 000 points, tol=1e-6) take 55 iterations and 0.30 s to the likelihood that takes EM 294
@@ -66,19 +68,11 @@ class RiemannianGaussianMixture(MixtureEstimator):
         max_iter: largest number of iterations of each start.
         n_init: number of starts; the one with the best likelihood is kept.
         init_params: as in `GaussianMixture`, without "auto".
-        solver: "lbfgs", or "cg" for conjugate gradients.
-        memory: number of steps that L-BFGS stores.
         random_state: a seed, a `RandomState`, a `torch.Generator`, or None for a random seed.
         dtype: of the exponentials. With "float32" the ascent stops when gains are below 1e-8 nats.
 
     `lower_bounds_` contains the mean log-likelihood of the blurred points after each iteration.
     """
-
-    _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
-        **MixtureEstimator._parameter_constraints,
-        "solver": [StrOptions({"lbfgs", "cg"})],
-        "memory": [COUNT],
-    }
 
     n_components: int = 1
     _: KW_ONLY
@@ -87,8 +81,6 @@ class RiemannianGaussianMixture(MixtureEstimator):
     max_iter: int = 100
     n_init: int = 1
     init_params: str = "kmeans"
-    solver: str = "lbfgs"
-    memory: int = 10
     random_state: RandomState = None
     dtype: str = "float64"
 
@@ -100,11 +92,8 @@ class RiemannianGaussianMixture(MixtureEstimator):
 
         def run(report: OnIteration | None) -> EMResult[Iterate]:
             first = initialize(self.init_params, points, weight, self.n_components, blur, generator)
-            solver = SOLVERS[self.solver](self.memory)
-            start = likelihood.at(first)
-            return EMResult(
-                *ascend(start, solver, tol=float(self.tol), max_iter=self.max_iter, on_iteration=report)
-            )
+            start, tol = likelihood.at(first), float(self.tol)
+            return EMResult(*ascend(start, tol=tol, max_iter=self.max_iter, on_iteration=report))
 
         best = self._best_start(run, on_iteration)
         mixture = best.parameters.parameters()
@@ -264,44 +253,15 @@ def check_thickness(parameters: Parameters, points: Tensor) -> None:
 
 
 # -- the ascent -----------------------------------------------------------------------------------
-_ARMIJO = 1e-4  # share of the predicted gain that a step must reach
-_TRIALS = 30  # lengths tried along one direction
-
-
-class Point(Protocol):
-    """A point of the manifold, with the function value and the map along geodesics."""
-
-    @property
-    def value(self) -> float: ...
-
-    @property
-    def gradient(self) -> Tensor: ...
-
-    @property
-    def inverse_hessian(self) -> Tensor:
-        """First guess of the inverse Hessian: diagonal and positive, so that it times the gradient is an
-        ascent.
-        """
-
-    def bounded(self, direction: Tensor) -> Tensor:
-        """The direction, shortened where it exceeds the longest allowed step."""
-
-    def move(self: P, tangent: Tensor) -> P:
-        """The point that the exponential map gives for a tangent vector."""
-
-
-P = TypeVar("P", bound=Point)
 
 
 class LBFGS:
-    """L-BFGS: the inverse Hessian implied by the last `memory` steps and gradient changes."""
+    """The inverse Hessian implied by the last `memory` steps and gradient changes."""
 
-    slope_left = 0.9  # largest remaining share of the slope (the curvature condition)
-
-    def __init__(self, memory: int) -> None:
+    def __init__(self, memory: int = _MEMORY) -> None:
         self._pairs: deque[tuple[Tensor, Tensor, float]] = deque(maxlen=memory)
 
-    def direction(self, point: Point) -> Tensor:
+    def direction(self, point: Iterate) -> Tensor:
         """Inverse Hessian times gradient, by the two-loop recursion."""
         vector = point.gradient
         shares = []
@@ -313,7 +273,7 @@ class LBFGS:
             vector = vector + (share - _dot(fall, vector) / product) * step
         return vector
 
-    def update(self, before: Point, direction: Tensor, length: float, after: Point) -> None:
+    def update(self, before: Iterate, direction: Tensor, length: float, after: Iterate) -> None:
         step, fall = length * direction, before.gradient - after.gradient
         product = _dot(step, fall)
         if product > 1e-12 * math.sqrt(_dot(step, step) * _dot(fall, fall)):
@@ -326,49 +286,15 @@ class LBFGS:
         return had_memory
 
 
-class ConjugateGradients:
-    """Preconditioned conjugate gradients by Polak & Ribière, with β ≥ 0."""
-
-    slope_left = 0.1
-
-    def __init__(self, memory: int = 1) -> None:
-        self._last: tuple[Point, Tensor] | None = None
-
-    def direction(self, point: Point) -> Tensor:
-        uphill = point.inverse_hessian * point.gradient
-        if self._last is None:
-            return uphill
-        before, direction = self._last
-        size = _dot(before.gradient, before.inverse_hessian * before.gradient)
-        beta = _dot(point.gradient - before.gradient, uphill) / size
-        return uphill + max(0.0, beta) * direction
-
-    def update(self, before: Point, direction: Tensor, length: float, after: Point) -> None:
-        self._last = before, direction
-
-    def reset(self) -> bool:
-        had_memory, self._last = self._last is not None, None
-        return had_memory
-
-
-SOLVERS: dict[str, Callable[[int], LBFGS | ConjugateGradients]] = {"lbfgs": LBFGS, "cg": ConjugateGradients}
-"""Solvers by name; the argument is the number of steps to store."""
-
-
 def ascend(
-    point: P,
-    solver: LBFGS | ConjugateGradients,
-    *,
-    tol: float,
-    max_iter: int,
-    on_iteration: Callable[[int, float], None] | None = None,
-) -> tuple[P, list[float], bool]:
+    point: Iterate, *, tol: float, max_iter: int, on_iteration: OnIteration | None = None
+) -> tuple[Iterate, list[float], bool]:
     """Climb from a point. Returns the final point, the value after each iteration, and whether it converged.
 
     Converged: an iteration gained less than `tol`, and a step by the first guess of the Hessian would also
     gain less, to second order; or no higher point was found, to rounding. Values never decrease.
     """
-    values: list[float] = []
+    solver, values = LBFGS(), list[float]()
     for iteration in range(max_iter):
         found = _climb(point, solver)
         gain = found.value - point.value
@@ -382,14 +308,14 @@ def ascend(
     return point, values, False
 
 
-def _climb(point: P, solver: LBFGS | ConjugateGradients) -> P:
+def _climb(point: Iterate, solver: LBFGS) -> Iterate:
     """A higher point, or the same point if there is none.
 
     Resets the solver if its direction does not ascend.
     """
     while True:
         direction = point.bounded(solver.direction(point))
-        length, found = search(point, direction, solver.slope_left)
+        length, found = search(point, direction)
         if length > 0:
             solver.update(point, direction, length, found)
             return found
@@ -397,14 +323,14 @@ def _climb(point: P, solver: LBFGS | ConjugateGradients) -> P:
             return point
 
 
-def search(point: P, direction: Tensor, slope_left: float) -> tuple[float, P]:
+def search(point: Iterate, direction: Tensor) -> tuple[float, Iterate]:
     """Step length along a direction, and the point there; 0 and `point` if the direction does not ascend.
 
     Steps that gain too little are halved, and steps that leave too steep a slope are doubled, until the
     weak Wolfe conditions hold (Nocedal & Wright, 3.6).
     """
     slope = _dot(point.gradient, direction)
-    best: tuple[float, P] = (0.0, point)
+    best = (0.0, point)
     if not slope > 1e-16 * abs(point.value):
         return best
     low, high, length = 0.0, math.inf, 1.0
@@ -417,7 +343,7 @@ def search(point: P, direction: Tensor, slope_left: float) -> tuple[float, P]:
             high = length
         else:
             best, low = (length, found), length
-            if _dot(found.gradient, direction) <= slope_left * slope:
+            if _dot(found.gradient, direction) <= _SLOPE_LEFT * slope:
                 break
         length = (low + high) / 2 if high < math.inf else 2 * low
     return best

@@ -201,9 +201,8 @@ class VariationalGaussianMixture(MixtureEstimator):
 
         best = self._best_start(run, on_iteration)
         posterior = best.parameters
-        mixture = Parameters(
-            expected_weights(posterior.concentration), posterior.means, posterior.covariances
-        )
+        weights = expected_weights(posterior.concentration)
+        mixture = Parameters(weights, posterior.means, posterior.covariances)
         extra = {name: getattr(posterior, name) for name in self._extra_names[:3]}
         extra |= {f"prior_{name}": value for name, value in prior._asdict().items()}
         extra["prior_mean"] = prior.mean + cloud.center
@@ -322,12 +321,8 @@ class VariationalGaussianMixture(MixtureEstimator):
 
     def _set_extra(self, tensors: Mapping[str, Tensor]) -> None:
         k, dim = self.means.shape
-        shapes = {
-            "mean_precision": (k,),
-            "degrees_of_freedom": (k,),
-            "prior_mean": (dim,),
-            "prior_covariance": (dim, dim),
-        }
+        shapes: dict[str, tuple[int, ...]] = {"mean_precision": (k,), "degrees_of_freedom": (k,)}
+        shapes |= {"prior_mean": (dim,), "prior_covariance": (dim, dim)}
         for name in self._extra_names if tensors else ():
             if name not in tensors:
                 raise InvalidArgumentError(f"The posterior lacks {name}; pass all of its tensors, or none.")
@@ -449,9 +444,9 @@ def assigned_log_density(moments: Parameters, log_weight: Tensor, gaussians: Par
 def log_evidence(prior: Prior, posterior: Posterior, n_points: float) -> Tensor:
     """log p(X | assignments) + log p(assignments), nats, of the points that `posterior` includes.
 
-    This is the ratio of the normalisers of posterior and prior, times (2π)^(−ND/2). Plus the entropy of the
-    responsibilities, it is the lower bound of log p(X) once q(θ) is optimal for them. For sticks it is
-    the value of the whole process: components beyond the K-th have no points and equal the prior.
+    The ratio of the normalisers of posterior and prior, times (2π)^(−ND/2). Plus the entropy of the
+    responsibilities, it is the lower bound of log p(X) once q(θ) is optimal for them. For sticks it is that
+    of the whole process: components beyond the K-th have no points and equal the prior.
     """
     dim = prior.mean.shape[0]
     scatter = posterior.covariances * posterior.degrees_of_freedom[:, None, None]
@@ -521,19 +516,18 @@ def variational_step(
     """
     features = em.quadratic_features(points) if points.shape[1] <= 3 else None
     total = float(sample_weight.sum())
+    eye = torch.eye(points.shape[1], dtype=points.dtype, device=points.device)
 
     def step(posterior: Posterior) -> tuple[Posterior, float]:
         log_weight, gaussians = expected_log_density(posterior)
+        given = (points, sample_weight, log_weight, gaussians, reg_covar, softmax_dtype)
         if features is None:
-            found, value = _typed_moments(
-                points, sample_weight, log_weight, gaussians, reg_covar, softmax_dtype, covariance_type
-            )
+            found, value = _typed_moments(*given, covariance_type)
         else:
-            found, value = _expected_moments(
-                features, points, sample_weight, log_weight, gaussians, reg_covar, softmax_dtype
-            )
+            found, value = _expected_moments(features, *given)
         new = update(prior, found, process, covariance_type)
-        entropy = value - assigned_log_density(_unregularized(found, reg_covar), log_weight, gaussians)
+        plain = found._replace(covariances=found.covariances - reg_covar * eye)
+        entropy = value - assigned_log_density(plain, log_weight, gaussians)
         return new, float(entropy + log_evidence(prior, new, total)) / total
 
     return step
@@ -579,16 +573,6 @@ def _typed_moments(
     k, dim = gaussians.means.shape
     factors = by_type.Factors(by_type.compacted(gaussians, kind), kind)
     factors.constant = factors.constant + log_weight
-    given = (points, sample_weight, factors, softmax_dtype, reg_covar, None)
-    found = None
-    if by_type.has_linear_form(k, dim, kind):
-        found = by_type.em_step(*given, linear=True)
-    if found is None or bool(found.lost):
-        found = by_type.exact_step(*given)
+    found = by_type.exact_step(points, sample_weight, factors, softmax_dtype, reg_covar, None, linear=True)
     covariances = expand(found.parameters.covariances, kind, k, dim)
     return Parameters(found.points, found.parameters.means, covariances), found.value
-
-
-def _unregularized(moments: Parameters, reg_covar: float) -> Parameters:
-    eye = torch.eye(moments.means.shape[1], dtype=moments.means.dtype, device=moments.means.device)
-    return moments._replace(covariances=moments.covariances - reg_covar * eye)
