@@ -139,13 +139,8 @@ def prune(
             f"{len(weights)} components: {largest}; lower these limits."
         )
     remaining = Parameters(weights[kept] / weights[kept].sum(), means[kept], covariances[kept])
-    return _as_given_type(mixture, remaining), kept
-
-
-def _as_given_type(mixture: Mixture, remaining: Parameters) -> Mixture:
-    """The remaining components, in the type of the given mixture."""
     if isinstance(mixture, Parameters):
-        return cast(Mixture, remaining)
+        return cast(Mixture, remaining), kept
     # The scalar options only: initial parameters for K components do not fit fewer.
     options = mixture._scalar_options()
     options.pop("n_components")
@@ -153,7 +148,7 @@ def _as_given_type(mixture: Mixture, remaining: Parameters) -> Mixture:
         *remaining, lower_bounds=mixture.lower_bounds_, converged=mixture.converged_, **options
     )
     pruned._tensors = mixture._tensors
-    return cast(Mixture, pruned)
+    return cast(Mixture, pruned), kept
 
 
 def checked_origins(origins: ArrayLike, like: Tensor) -> Tensor:

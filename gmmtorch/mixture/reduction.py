@@ -78,16 +78,20 @@ def simplify(
     if n_components is None and max_cost is None:
         raise InvalidArgumentError("n_components=None and max_cost=None: give at least one as the limit.")
     min_components = 1 if n_components is None else check_whole("n_components", n_components, 1)
-    limit = math.inf if max_cost is None else _checked_cost(max_cost)
+    limit: object = math.inf if max_cost is None else max_cost
+    if not isinstance(limit, numbers.Real) or not float(limit) >= 0:
+        raise InvalidArgumentError(f"max_cost={max_cost!r} must be a number of at least 0.")
     check_choice("cost", cost, COSTS)
     check_whole("neighbors", neighbors, 1)
     exact = check_whole("most_exact", _MOST_EXACT if most_exact is None else most_exact, 0)
 
-    order = _canonical_order(weights, means, covariances)
+    # Sorted by their values, so that the given order has no effect.
+    columns = torch.cat([means, pack_symmetric(covariances), weights[:, None]], 1).cpu().numpy()
+    order = torch.from_numpy(np.lexsort(columns.T[::-1])).to(means.device)
     given = Gaussians.of(Parameters(weights[order], means[order], covariances[order]))
-    left, labels = _merge_in_rounds(given, max(min_components, exact), limit, COSTS[cost], neighbors)
+    left, labels = _merge_in_rounds(given, max(min_components, exact), float(limit), COSTS[cost], neighbors)
     if left.weights.shape[0] <= exact:
-        left, merged = _merge_greedily(left, min_components, limit, COSTS[cost])
+        left, merged = _merge_greedily(left, min_components, float(limit), COSTS[cost])
         labels = merged[labels]
     bound = given.weights @ (left.half_log_dets[labels] - given.half_log_dets)
     labels, kept = _in_order_given(torch.empty_like(labels).scatter_(0, order, labels), left.weights.shape[0])
@@ -216,30 +220,13 @@ def _checked(parameters: Parameters | MixtureEstimator) -> Parameters:
     if means.ndim != 2 or means.shape[1] == 0:
         raise InvalidArgumentError(f"means has shape {tuple(means.shape)}; expected (K, D).")
     k, dim = means.shape
-    shapes = {"weights": (k,), "means": (k, dim), "covariances": (k, dim, dim)}
-    checked = Parameters(
-        *(
-            checked_parameter(value, shape, name, means.device)
-            for value, (name, shape) in zip(parameters, shapes.items(), strict=True)
-        )
-    )
+    given = zip(parameters, ((k,), (k, dim), (k, dim, dim)), Parameters._fields, strict=True)
+    checked = Parameters(*(checked_parameter(*values, means.device) for values in given))
     if bool((checked.weights < 0).any()):
         first = int((checked.weights < 0).nonzero()[0])
         raise InvalidArgumentError(f"weights[{first}]={float(checked.weights[first])} must be at least 0.")
     check_symmetric(checked.covariances, "covariances")
     return checked
-
-
-def _checked_cost(max_cost: object) -> float:
-    if not isinstance(max_cost, numbers.Real) or not float(max_cost) >= 0:
-        raise InvalidArgumentError(f"max_cost={max_cost!r} must be a number of at least 0.")
-    return float(max_cost)
-
-
-def _canonical_order(weights: Tensor, means: Tensor, covariances: Tensor) -> Tensor:
-    """Order (K,) that sorts components by their values, so that the given order has no effect."""
-    columns = torch.cat([means, pack_symmetric(covariances), weights[:, None]], 1).cpu().numpy()
-    return torch.from_numpy(np.lexsort(columns.T[::-1])).to(means.device)
 
 
 def _in_order_given(labels: Tensor, n: int) -> tuple[Tensor, Tensor]:

@@ -11,10 +11,9 @@ import hashlib
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -38,13 +37,13 @@ SAMPLE_POINTS = 100_000
 
 Accumulate = Callable[[Tensor], tuple[Tensor, Tensor]]
 """From centred points (n, D), float64, to S (K, F) and Σ_n log p(x_n)."""
-
-
-class EStep(Protocol):
-    """Computes the sufficient statistics of a chunk. Its `repr` states its name and settings."""
-
-    def __call__(self, parameters: Parameters) -> Accumulate:
-        """Prepare one iteration with these parameters."""
+EStep = Callable[[Parameters], Accumulate]
+"""Prepares one iteration with these parameters. Its `repr` states its name and settings."""
+_FILE_KIND, _FILE_VERSION = "gmmtorch.checkpoint", 1
+RunFacts = Mapping[str, Any]
+"""Description of a run, in JSON types: settings and cloud, including n_components and dimensions."""
+Write = Callable[[Parameters, list[float], bool], None]
+"""Called with the parameters and the lower bounds after an iteration, and whether it is the last."""
 
 
 @dataclass(frozen=True)
@@ -108,11 +107,13 @@ def fit_stream(
     _check_options(mixture, checkpoint)
     source = _in_chunks(source)
     done: list[float] = []
-    with _add_iteration_to_errors(done, checkpoint):
+    try:
         generator = as_generator(mixture.random_state)
         if survey is None:
             at_least = None if sample_points is None else max(sample_points, int(mixture.n_components or 0))
-            survey = survey_all(source, at_least, draw_seed(generator), processes)
+            # From a copy of the generator, so that the start does not depend on it.
+            seed = int(torch.randint(2**48, (), generator=generator.clone_state()))
+            survey = survey_all(source, at_least, seed, processes)
         if survey.n_points == 0:
             raise DataError(f"{source.name} has no valid points, only {survey.n_dropped} invalid ones.")
         mixture.check_parameters(survey.n_points)
@@ -120,21 +121,18 @@ def fit_stream(
         facts = run_facts(mixture, survey, repr(e_step))
         first = first_state(mixture, survey, facts, generator, checkpoint, processes)
         done += first.lower_bounds
-        run = _Run(
-            mixture,
-            source,
-            processes,
-            first.center.to(device),
-            Parameters(*(value.to(device) for value in first.parameters)),
-            on_iteration,
-        )
+        parameters = Parameters(*(value.to(device) for value in first.parameters))
+        run = _Run(mixture, source, processes, first.center.to(device), parameters, on_iteration)
         if mixture.algorithm == "truncated":
             result = _truncated(run)
         else:
-            writer = None
+            write = None
             if checkpoint is not None and processes.rank == 0:
-                writer = CheckpointWriter(checkpoint, facts, first.center)
-            result = _exact(run, e_step, survey.n_points, done, writer)
+                write = checkpoint.writer(facts, first.center)
+            result = _exact(run, e_step, survey.n_points, done, write)
+    except LostProcessError as error:
+        resume_hint = "" if checkpoint is None else " " + checkpoint.resume_hint()
+        raise LostProcessError(f"{error} It was in iteration {len(done) + 1}.{resume_hint}") from error
     mixture._tensors, mixture.n_features_in_ = True, source.dim
     mixture.__dict__.pop("feature_names_in_", None)
     seen = {"n_samples_seen": run.center.new_tensor(survey.n_points)}
@@ -163,16 +161,6 @@ def _check_options(mixture: GaussianMixture, checkpoint: Checkpoint | None) -> N
         )
 
 
-@contextmanager
-def _add_iteration_to_errors(done: list[float], checkpoint: Checkpoint | None) -> Iterator[None]:
-    """Adds the iteration and the way to continue to the message of a `LostProcessError`."""
-    try:
-        yield
-    except LostProcessError as error:
-        resume_hint = "" if checkpoint is None else " " + checkpoint.resume_hint()
-        raise LostProcessError(f"{error} It was in iteration {len(done) + 1}.{resume_hint}") from error
-
-
 def score_stream(
     mixture: MixtureEstimator, source: PointChunks | ArrayLike, processes: Processes = SINGLE_PROCESS
 ) -> tuple[float, int]:
@@ -193,7 +181,7 @@ def _in_chunks(source: PointChunks | ArrayLike) -> PointChunks:
 
 
 class _Run(NamedTuple):
-    """One process's part of a fit. `first` is relative to `center` (D,), on the device of the computation."""
+    """One process's part of a fit. `first` is relative to `center` (D,)."""
 
     mixture: GaussianMixture
     source: PointChunks
@@ -204,7 +192,7 @@ class _Run(NamedTuple):
 
 
 def _exact(
-    run: _Run, e_step: EStep, n_points: int, done: list[float], writer: CheckpointWriter | None
+    run: _Run, e_step: EStep, n_points: int, done: list[float], write: Write | None
 ) -> loop.EMResult[Parameters]:
     """Exact EM. `done` has the lower bounds of earlier iterations, and gets those of the new ones."""
     one_step, earlier = _stream_step(run, e_step, n_points), tuple(done)
@@ -212,8 +200,8 @@ def _exact(
     def step(parameters: Parameters) -> tuple[Parameters, float]:
         new, bound = one_step(parameters)
         done.append(bound)
-        if writer is not None:
-            writer.write_if_due(new, done)
+        if write is not None:
+            write(new, done, False)
         return new, bound
 
     result = loop.run_em(
@@ -225,8 +213,8 @@ def _exact(
         lower_bounds=earlier,
         previous_bound=run.mixture._previous_bound(),
     )
-    if writer is not None:
-        writer.write_if_due(result.parameters, result.lower_bounds, final=True)
+    if write is not None:
+        write(result.parameters, result.lower_bounds, True)
     return result
 
 
@@ -331,13 +319,6 @@ def survey_all(
     return merge_surveys(parts, sample_points)
 
 
-def draw_seed(generator: torch.Generator) -> int:
-    """A seed below 2⁴⁸, drawn from a copy of the generator, so that the generator stays unchanged."""
-    copy = torch.Generator()
-    copy.set_state(generator.get_state())
-    return int(torch.randint(2**48, (), generator=copy))
-
-
 def first_state(
     mixture: GaussianMixture,
     survey: Survey,
@@ -371,6 +352,9 @@ def run_facts(mixture: GaussianMixture, survey: Survey, e_step: str) -> RunFacts
     given: tuple[Any, ...] = (mixture.weights_init, mixture.means_init, mixture.precisions_init)
     if mixture._continues():
         given = (mixture.weights, mixture.means, mixture.covariances)
+    digest = hashlib.sha256()
+    for value in given:
+        digest.update(b"-" if value is None else torch.as_tensor(value).double().cpu().numpy().tobytes())
     return {
         "n_components": int(cast(int, mixture.n_components)),
         "covariance_type": mixture.covariance_type,
@@ -379,26 +363,14 @@ def run_facts(mixture: GaussianMixture, survey: Survey, e_step: str) -> RunFacts
         "random_state": None if seed is None or not hasattr(seed, "__index__") else int(seed),
         "n_sampled": survey.sample.shape[0],
         "e_step": e_step,
-        "given_start": _digest(given),
+        "given_start": digest.hexdigest()[:16],
         "dimensions": survey.low.shape[0],
         "n_points": survey.n_points,
         "checksum": survey.checksum,
     }
 
 
-def _digest(values: tuple[Any, ...]) -> str:
-    """Hash of the numbers of arrays or tensors; items may be None."""
-    digest = hashlib.sha256()
-    for value in values:
-        digest.update(b"-" if value is None else torch.as_tensor(value).double().cpu().numpy().tobytes())
-    return digest.hexdigest()[:16]
-
-
 # -- checkpoints ----------------------------------------------------------------------------------
-_FILE_KIND, _FILE_VERSION = "gmmtorch.checkpoint", 1
-
-RunFacts = Mapping[str, Any]
-"""Description of a run, in JSON types: settings and cloud, including n_components and dimensions."""
 
 
 class State(NamedTuple):
@@ -467,6 +439,18 @@ class Checkpoint:
             raise DataError(f"{self.path} does not match its own description; the file is damaged.")
         return state
 
+    def writer(self, run: RunFacts, center: Tensor) -> Write:
+        """Writes the state after an iteration if that is due, or the iteration is the last."""
+        written = [time.monotonic()]
+
+        def write(parameters: Parameters, lower_bounds: list[float], is_last: bool) -> None:
+            is_late = self.seconds is not None and time.monotonic() - written[0] >= self.seconds
+            if is_last or is_late or len(lower_bounds) % self.every == 0:
+                write_state(self.path, State(parameters, center, lower_bounds), run)
+                written[0] = time.monotonic()
+
+        return write
+
     def resume_hint(self) -> str:
         """A sentence that says how to continue."""
         try:
@@ -477,22 +461,6 @@ class Checkpoint:
             f"The last checkpoint, {self.path}, is of iteration {len(state.lower_bounds)}; start the run "
             "again with resume=true to continue from it."
         )
-
-
-class CheckpointWriter:
-    """Writes the state of one run when it is due."""
-
-    def __init__(self, checkpoint: Checkpoint, run: RunFacts, center: Tensor) -> None:
-        self._checkpoint, self._run, self._center = checkpoint, run, center
-        self._last = time.monotonic()
-
-    def write_if_due(self, parameters: Parameters, lower_bounds: list[float], final: bool = False) -> None:
-        """Write the state after an iteration if it is due, or if it is `final`."""
-        seconds, now = self._checkpoint.seconds, time.monotonic()
-        is_late = seconds is not None and now - self._last >= seconds
-        if final or is_late or len(lower_bounds) % self._checkpoint.every == 0:
-            write_state(self._checkpoint.path, State(parameters, self._center, lower_bounds), self._run)
-            self._last = now
 
 
 def write_state(path: Path, state: State, run: RunFacts) -> None:

@@ -25,16 +25,8 @@ from torch import Tensor
 from gmmtorch.errors import NumericalError
 from gmmtorch.kernels import chunk_elements, chunked, softmax
 from gmmtorch.linalg import safe_cholesky, unpack_symmetric
-from gmmtorch.mixture.em.exact import (
-    LOG_2PI,
-    MIN_LOG_WEIGHT,
-    Parameters,
-    compact,
-    constrain,
-    natural_of_precisions,
-    products,
-    type_shape,
-)
+from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em.exact import Parameters
 
 _MOST_LOST = 1e-6  # nats a dimension that the log-density of the linear form may lose
 _MOST_LOST_VARIANCE = 1e-5  # share of a variance that the moments of the linear form may lose
@@ -59,8 +51,8 @@ def has_linear_form(n_components: int, dim: int, kind: str) -> bool:
 
 def compacted(parameters: Parameters, kind: str) -> Parameters:
     """The nearest covariances of the type, in its shape, to those (K, D, D)."""
-    covariances = constrain(parameters.covariances, kind, parameters.weights)
-    return parameters._replace(covariances=compact(covariances, kind))
+    covariances = em.constrain(parameters.covariances, kind, parameters.weights)
+    return parameters._replace(covariances=em.compact(covariances, kind))
 
 
 # -- log-densities --------------------------------------------------------------------------------
@@ -95,8 +87,8 @@ class Factors:
             self.whiten = covariances.rsqrt()
             half_log_det = 0.5 * covariances.log() * (self.dim if kind == "spherical" else 1)
             half_log_det = half_log_det.sum(-1) if kind == "diag" else half_log_det
-        log_weight = self.weights.log().clamp_min(MIN_LOG_WEIGHT)
-        self.constant = log_weight - half_log_det - 0.5 * self.dim * LOG_2PI
+        log_weight = self.weights.log().clamp_min(em.MIN_LOG_WEIGHT)
+        self.constant = log_weight - half_log_det - 0.5 * self.dim * em.LOG_2PI
 
     def whitened_means(self) -> Tensor:
         """L⁻¹ μ (K, D)."""
@@ -115,7 +107,7 @@ class Factors:
         """The linear form."""
         kind, means, dim = self.kind, self.means, self.dim
         if kind == "full":
-            weights = natural_of_precisions(self.whiten.mT @ self.whiten, means, self.constant)
+            weights = em.natural_of_precisions(self.whiten.mT @ self.whiten, means, self.constant)
             constant, slope, curve = weights[:, 0], weights[:, 1 : 1 + dim], weights[:, 1 + dim :]
         elif kind == "tied":
             slope = self.whitened_means()
@@ -185,7 +177,7 @@ def squares(points: Tensor, kind: str) -> Tensor:
     """The quadratic features of a type: |x|² (n, 1), x² (n, D), or x_i x_j (i ≤ j)."""
     if kind == "spherical":
         return (points * points).sum(1, keepdim=True)
-    return points * points if kind == "diag" else products(points, points)
+    return points * points if kind == "diag" else em.products(points, points)
 
 
 def log_joint(parameters: Parameters, kind: str) -> Joint:
@@ -277,7 +269,7 @@ class Sums:
             if self._kind == "spherical":
                 second, square = second / dim, square.mean(1, keepdim=True)
             covariances = (second - square).clamp_min_(0)
-            shape = type_shape(self._kind, *means.shape)
+            shape = em.type_shape(self._kind, *means.shape)
             return Parameters(self._count, means, covariances.view(shape)), second
         # In place, because the matrices may be most of the memory.
         covariances = self._second

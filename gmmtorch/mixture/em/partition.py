@@ -27,17 +27,15 @@ from gmmtorch.linalg import dense_ranks, on_cpu, unpack_symmetric
 from gmmtorch.mixture.em.exact import quadratic_features
 
 _MAX_LEVELS = 64
-_MOST_ON_CPU = 1 << 17
-"""Cells of another device that are cut on the CPU: each level of cuts waits for the one before it."""
+_MOST_ON_CPU = 1 << 17  # cells of another device: each level of cuts waits for the one before it
 _THICKNESS_PRIORITY = 30.0
 """Weight of a piece's smallest variance, relative to its largest, in the priority of halving it. Thick
 pieces span several surfaces, and so put matter into free space (BENCHMARKS.md, "Where EM starts")."""
-
-_FLAT = 2.0
-"""Largest thickness of a flat piece, in standard deviations of the noise."""
-
-_OUTLIER_GAP = 100.0
-"""Distance from which on a few stray points form a piece, in standard deviations of the noise."""
+_FLAT = 2.0  # largest thickness of a flat piece, in standard deviations of the noise
+_OUTLIER_GAP = 100.0  # from which on a few stray points form a piece, in standard deviations
+_MAX_CELLS_ALONG = (1 << KEY_BITS) - 2  # along the longest side
+_CHUNK_POINTS = 1 << 17
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -48,7 +46,7 @@ class FlatnessRule:
     largest standard deviation is larger is too long. min_weight: smallest weight of a half.
     min_weight_thick: smallest weight of a half of a piece of over twice the thickness, which spans several
     surfaces. max_components: largest number of pieces; then at most half of the pieces are halved per
-    level, in the order of `_split_priority`. outlier_gap: a half may have any weight if it is farther
+    level, heavy, long and above all thick ones first. outlier_gap: a half may have any weight if farther
     than this from the other half (m), as outliers are.
     """
 
@@ -108,7 +106,10 @@ def partition(
         found = partition(points_cpu, weight_cpu, rule, features_cpu)
         return found._replace(labels=found.labels.to(points.device))
     if are_piece_cuts_fused(points, weight, features):
-        return Partition(*piece_cuts(points, weight, features, _cut_rule(rule)))
+        limit = -1 if rule.max_components is None else rule.max_components
+        given = vars(rule) | {"n_levels": _MAX_LEVELS, "max_components": limit}
+        cuts = CutRule(**given, thickness_priority=_THICKNESS_PRIORITY)
+        return Partition(*piece_cuts(points, weight, features, cuts))
     labels = torch.zeros(n, dtype=torch.int64, device=points.device)
     n_pieces = 1
     for _ in range(_MAX_LEVELS):
@@ -128,7 +129,8 @@ def partition(
         beyond = along > 0
         supported = _is_supported(along, labels, weight, n_pieces, least, rule.outlier_gap)
         cut = wanted & supported & (count >= 2 * least) & (deviation[:, -1] > 0)
-        cut = _limit_splits(cut, _split_priority(count, variances), n_pieces, rule.max_components)
+        priority = count * (variances[:, -1] + _THICKNESS_PRIORITY * variances[:, 0].clamp_min(0))
+        cut = _limit_splits(cut, priority, n_pieces, rule.max_components)
         n_new = int(cut.sum())
         if n_new == 0:
             break
@@ -136,24 +138,6 @@ def partition(
         labels = torch.where(cut[labels] & beyond, new_label[labels], labels)
         n_pieces += n_new
     return Partition(labels, n_pieces)
-
-
-def _cut_rule(rule: FlatnessRule) -> CutRule:
-    return CutRule(
-        n_levels=_MAX_LEVELS,
-        max_components=-1 if rule.max_components is None else rule.max_components,
-        thickness=rule.thickness,
-        length=rule.length,
-        min_weight=rule.min_weight,
-        min_weight_thick=rule.min_weight_thick,
-        outlier_gap=rule.outlier_gap,
-        thickness_priority=_THICKNESS_PRIORITY,
-    )
-
-
-def _split_priority(count: Tensor, variances: Tensor) -> Tensor:
-    """Priority (n,) of halving pieces with weights (n,) and ascending variances (n, D)."""
-    return count * (variances[:, -1] + _THICKNESS_PRIORITY * variances[:, 0].clamp_min(0))
 
 
 def _limit_splits(cut: Tensor, priority: Tensor, n_pieces: int, limit: int | None) -> Tensor:
@@ -193,9 +177,6 @@ def _is_supported(
 
 
 # -- cells ----------------------------------------------------------------------------------------
-_MAX_CELLS_ALONG = (1 << KEY_BITS) - 2  # along the longest side
-_CHUNK_POINTS = 1 << 17
-T = TypeVar("T")
 
 
 class Cells(NamedTuple):

@@ -33,16 +33,9 @@ from gmmtorch.kernels import (
     is_truncated_e_step_fused,
 )
 from gmmtorch.linalg import argsort, largest_indices, pack_symmetric, unpack_symmetric
+from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.distributed import SINGLE_PROCESS, Processes
-from gmmtorch.mixture.em.exact import (
-    Parameters,
-    exponent_floor,
-    feature_dimension,
-    maximization,
-    natural_parameters,
-    quadratic_features,
-    shift_features,
-)
+from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.loop import EMResult, has_converged
 from gmmtorch.mixture.em.partition import pool_into_cells
 
@@ -51,6 +44,8 @@ _AVERAGE_ROUNDING, _WORST_ROUNDING = 0.02, 0.2  # nats of float32 error above wh
 _SAMPLED_OF_A_COMPONENT = 400  # points a component in the random sample that EM starts on
 _MANY_POINTS = 1 << 19  # from this number of points on, EM starts on cells
 _POINTS_OF_A_CELL, _CELLS_OF_A_COMPONENT = 16, 32
+_SAMPLES = 64  # most rows of a group that are compared with all components
+_BUILD_ROWS = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -78,10 +73,9 @@ class Settings:
 
 
 class Momentum:
-    """M-steps that extrapolate the change of the statistics (Nesterov's schedule).
+    """M-steps on the statistics of the E-step plus a share of their last change (Nesterov's schedule).
 
-    The extrapolated statistics are those of the E-step plus a share of their last change. A component
-    takes EM's own step instead if extrapolation reduces its mass or its smallest thickness too much.
+    A component takes EM's own step instead if that reduces its mass or its smallest thickness too much.
     """
 
     def __init__(self, reg_covar: float) -> None:
@@ -123,13 +117,13 @@ def _steps(
     centered = parameters._replace(means=torch.zeros_like(parameters.means))
 
     def maximized(sums: Tensor) -> Parameters:
-        found = maximization(sums, reg_covar, centered)
+        found = em.maximization(sums, reg_covar, centered)
         return found._replace(means=found.means + parameters.means)
 
     em_step = maximized(statistics)
     if last is None:
         return em_step, None
-    before = shift_features(last[0], last[1] - parameters.means)
+    before = em.shift_features(last[0], last[1] - parameters.means)
     ahead = statistics + share * (statistics - before)
     trusted = ahead[:, 0] > 0.2 * statistics[:, 0]
     ahead = torch.where(trusted[:, None], ahead, statistics)
@@ -169,8 +163,9 @@ def run_truncated(
         groups = _with_enough_digits(rows, new_sets[0], parameters.means, own)
         last_of_set = left == 1 and not frozen
         found = truncated_expectation(groups, new_sets[1], parameters, last_of_set, own)
-        statistics, value = _summed(found, settings.processes)
-        bound = value / total
+        packed = torch.cat([found.statistics.flatten(), found.statistics.new_tensor([found.value])])
+        packed = settings.processes.sum(packed)
+        bound = float(packed[-1]) / total
         if bounds and bound < bounds[-1]:
             if momentum.is_extrapolated:
                 parameters = momentum.undo()  # the next pass tries the new sets once more from there
@@ -185,7 +180,7 @@ def run_truncated(
         if settings.on_iteration is not None:
             settings.on_iteration(len(bounds), bound)
         was_extrapolated = momentum.is_extrapolated
-        parameters = momentum.step(statistics, parameters)
+        parameters = momentum.step(packed[:-1].view_as(found.statistics), parameters)
         if has_converged(bounds, settings.tol, settings.previous_bound):
             if not was_extrapolated:
                 converged = True
@@ -196,13 +191,6 @@ def run_truncated(
     # EM's own parameters are certainly not worse than the last bound; extrapolated ones may be.
     parameters = momentum.undo() if momentum.is_extrapolated else parameters
     return EMResult(parameters, bounds, converged), owners_of(sets[0]), sets[1]
-
-
-def _summed(found: Expectation, processes: Processes) -> tuple[Tensor, float]:
-    """Statistics (K, F) and value, summed over all processes."""
-    statistics = found.statistics
-    packed = processes.sum(torch.cat([statistics.flatten(), statistics.new_tensor([found.value])]))
-    return packed[:-1].view_as(statistics), float(packed[-1])
 
 
 def _candidate_sets(
@@ -261,16 +249,9 @@ def fit_truncated(
         replace(settings, max_iter=settings.max_iter // 2, previous_bound=-math.inf),
     )
 
-    def on_fine_iteration(iteration: int, bound: float) -> None:
-        if settings.on_iteration is not None:
-            settings.on_iteration(coarse.n_iter + iteration, bound)
-
-    left = replace(
-        settings,
-        max_iter=settings.max_iter - coarse.n_iter,
-        on_iteration=on_fine_iteration,
-        previous_bound=-math.inf,
-    )
+    report, n_left = settings.on_iteration, settings.max_iter - coarse.n_iter
+    later = None if report is None else lambda iteration, bound: report(coarse.n_iter + iteration, bound)
+    left = replace(settings, max_iter=n_left, on_iteration=later, previous_bound=-math.inf)
     fine, *_ = run_truncated(rows, owner[cells.member], coarse.parameters, left, candidates)
     return EMResult(fine.parameters, coarse.lower_bounds + fine.lower_bounds, fine.converged)
 
@@ -283,8 +264,6 @@ def _sample(rows: Rows, n: int) -> Tensor:
 
 
 # -- rows, grouped by their owner -----------------------------------------------------------------
-_SAMPLES = 64  # most rows of a group that are compared with all components
-_BUILD_ROWS = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -303,18 +282,11 @@ class Rows:
         """The points (N, D), or the means of the cells."""
         if self.are_points:
             return self.values
-        return self.values[:, 1 : 1 + feature_dimension(self.values.shape[1])].contiguous()
+        return self.values[:, 1 : 1 + em.feature_dimension(self.values.shape[1])].contiguous()
 
     def features(self) -> Tensor:
         """Features (N, F)."""
-        return quadratic_features(self.values) if self.are_points else self.values
-
-    def local_features(self, index: Tensor, center: Tensor, dtype: torch.dtype) -> Tensor:
-        """Features (n, F) of the rows `index` (n,), each relative to its own center (n, D)."""
-        values = self.values.index_select(0, index)
-        if self.are_points:
-            return quadratic_features((values - center).to(dtype))
-        return shift_features(values, -center).to(dtype)
+        return em.quadratic_features(self.values) if self.are_points else self.values
 
 
 class Groups(NamedTuple):
@@ -352,10 +324,10 @@ def group_rows(rows: Rows, owner: Tensor, centers: Tensor, dtype: torch.dtype) -
     block = 16 if n < 48 * k else 32 if n < 200 * k else 64
     row = argsort(owner)
     count = torch.bincount(owner, minlength=k)
-    blocks = (count + block - 1) // block
-    gap = (torch.cumsum(blocks, 0) - blocks) * block - (torch.cumsum(count, 0) - count)
-    n_slots = int(blocks.sum()) * block
-    n_features = quadratic_features(centers[:1]).shape[1]
+    n_blocks = (count + block - 1) // block
+    gap = (torch.cumsum(n_blocks, 0) - n_blocks) * block - (torch.cumsum(count, 0) - count)
+    n_slots = int(n_blocks.sum()) * block
+    n_features = em.quadratic_features(centers[:1]).shape[1]
     features = torch.zeros(n_slots, n_features, dtype=dtype, device=owner.device)
     weight = torch.zeros(n_slots, dtype=dtype, device=owner.device)
     slot = torch.empty_like(row)
@@ -363,18 +335,20 @@ def group_rows(rows: Rows, owner: Tensor, centers: Tensor, dtype: torch.dtype) -
         part = slice(begin, min(begin + _BUILD_ROWS, n))
         group = owner.index_select(0, row[part])
         slot[part] = torch.arange(part.start, part.stop, device=owner.device) + gap.index_select(0, group)
-        local = rows.local_features(row[part], centers.index_select(0, group), dtype)
+        values, own = rows.values.index_select(0, row[part]), centers.index_select(0, group)
+        if rows.are_points:
+            local = em.quadratic_features((values - own).to(dtype))
+        else:
+            local = em.shift_features(values, -own).to(dtype)
         features.index_copy_(0, slot[part], local)
         weight.index_copy_(0, slot[part], rows.weight.index_select(0, row[part]).to(dtype))
     trace = pack_symmetric(torch.eye(centers.shape[1], dtype=dtype, device=owner.device))
     squared = features[:, -trace.shape[0] :] @ trace
     sums = torch.stack([weight, weight * squared]).view(2, -1, block).sum(2).double()
-    owner_of_block = torch.repeat_interleave(torch.arange(k, device=owner.device), blocks)
+    owner_of_block = torch.repeat_interleave(torch.arange(k, device=owner.device), n_blocks)
     mass, spread = sums.new_zeros(2, k).index_add_(1, owner_of_block, sums)
-    blocks_of_features, blocks_of_weights = features.view(-1, block, n_features), weight.view(-1, block)
-    return Groups(
-        blocks_of_features, blocks_of_weights, owner_of_block, centers, count, mass, spread, row, slot
-    )
+    blocks = features.view(-1, block, n_features), weight.view(-1, block), owner_of_block
+    return Groups(*blocks, centers, count, mass, spread, row, slot)
 
 
 def owners_of(groups: Groups) -> Tensor:
@@ -403,14 +377,14 @@ def choose_candidates(groups: Groups, parameters: Parameters, n_candidates: int)
     count, steps = groups.n_rows[:, None], torch.arange(n_samples, device=groups.n_rows.device)
     place = torch.cumsum(count, 0) - count + (2 * steps + 1) * count // (2 * n_samples)
     place = place.clamp_max_(groups.slot.shape[0] - 1)  # of empty groups, whose candidates are unused
-    natural, rows = natural_parameters(parameters), groups.rows()
+    natural, rows = em.natural_parameters(parameters), groups.rows()
     if is_truncated_e_step_fused(rows, natural):
         bounds = _logit_bounds(parameters, natural)
         return fused_candidates(rows, groups.slot[place], natural, bounds, n_candidates)
     natural, samples = natural.T.contiguous(), rows.features[groups.slot[place]]
 
     def chosen(part: slice) -> Tensor:
-        moved = shift_features(samples[part].double(), groups.centers[part, None])
+        moved = em.shift_features(samples[part].double(), groups.centers[part, None])
         joint = (moved.flatten(0, 1) @ natural).to(samples.dtype).view(-1, n_samples, k)
         joint -= joint.amax(2, keepdim=True)
         score = joint.amax(1)
@@ -483,7 +457,7 @@ def truncated_expectation(
         if likeliest is not None and best is not None:
             likeliest[part] = best
     by_pair = sums.view(n_groups, n_features, m).transpose(1, 2).double()
-    about_means = shift_features(by_pair, groups.centers[:, None] - parameters.means[candidates])
+    about_means = em.shift_features(by_pair, groups.centers[:, None] - parameters.means[candidates])
     statistics = about_means.new_zeros(parameters.weights.shape[0], n_features)
     statistics.index_add_(0, candidates.flatten(), about_means.flatten(0, 1))
     return Expectation(statistics, float(value), _owner_of_rows(groups, likeliest))
@@ -505,7 +479,7 @@ def centered_parameters(parameters: Parameters) -> Tensor:
         found, failed = fused_natural_parameters(weights, None, covariances)
         if not bool(failed):
             return found
-    return natural_parameters(parameters._replace(means=torch.zeros_like(means)))
+    return em.natural_parameters(parameters._replace(means=torch.zeros_like(means)))
 
 
 def _local_parameters(own: Tensor, means: Tensor, centers: Tensor, candidates: Tensor) -> Tensor:
@@ -525,7 +499,7 @@ def _local_parameters(own: Tensor, means: Tensor, centers: Tensor, candidates: T
 
 def _block_sums(natural: Tensor, features: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Σγφ (b, F·m) and Σ p log Σ exp of blocks: natural (b, m, F), features (b, B, F), weight (b, B)."""
-    floor = exponent_floor(features.dtype)
+    floor = em.exponent_floor(features.dtype)
     # Candidates are the rows, so that reductions over candidates run along contiguous memory.
     gamma = torch.bmm(natural, features.transpose(1, 2))  # (b, m, B)
     peak = gamma.amax(1, keepdim=True)

@@ -36,6 +36,13 @@ from gmmtorch.mixture.em.initialization import initialize
 from gmmtorch.mixture.estimator import MixtureEstimator
 from gmmtorch.mixture.validation import Array, RandomState, as_generator
 
+_WORTH_SHARING = 256  # points a distinct covariance from which on points are grouped by covariance
+_ROUNDING = 1e-13  # of a component's largest variance: a smaller one is rounding error
+_CHUNK_ELEMENTS = 1 << 16  # of an N×K block, small enough for the cache of a core
+_NEGLIGIBLE = 40.0  # nats below a point's likeliest component: no share in double precision
+Entries = list[list[Tensor]]
+"""A batch of small matrices, as one tensor per entry."""
+
 
 @dataclass(eq=False, repr=False)
 class DeconvolvedGaussianMixture(MixtureEstimator):
@@ -167,21 +174,6 @@ def checked_noise(noise: Array | None, n: int, points: Tensor) -> Tensor:
 
 
 # -- extreme deconvolution ------------------------------------------------------------------------
-_WORTH_SHARING = 256
-"""Average number of points per distinct covariance from which on points are grouped by covariance."""
-
-_ROUNDING = 1e-13
-"""Smallest variance of a component relative to its largest: a smaller one is rounding error."""
-
-
-_CHUNK_ELEMENTS = 1 << 16
-"""Entries of an N×K block, small enough for the cache of a core."""
-
-_NEGLIGIBLE = 40.0
-"""Nats below a point's most likely component at which another has no share in double precision."""
-
-Entries = list[list[Tensor]]
-"""A batch of small matrices, as one tensor per entry."""
 
 
 class Block(NamedTuple):
@@ -190,17 +182,6 @@ class Block(NamedTuple):
     points: Tensor
     weight: Tensor
     noise: Tensor
-
-
-class Moments(NamedTuple):
-    """Moments of the noise-free positions relative to the components' means.
-
-    mass: Σγ (K,). first: Σγ(b−μ) (K, D). second: Σγ[(b−μ)(b−μ)ᵀ + B] (K, D, D).
-    """
-
-    mass: Tensor
-    first: Tensor
-    second: Tensor
 
 
 def group_by_noise(points: Tensor, weight: Tensor, noise: Tensor) -> list[Block]:
@@ -214,15 +195,17 @@ def group_by_noise(points: Tensor, weight: Tensor, noise: Tensor) -> list[Block]
     return [Block(points[rows], weight[rows], noise[rows[0]]) for rows in members]
 
 
-def expectation(block: Block, parameters: Parameters) -> tuple[Moments, Tensor]:
-    """One E-step: moments of the block, and Σ_n p_n log p(x_n) (a scalar)."""
+def expectation(block: Block, parameters: Parameters) -> tuple[Tensor, Tensor]:
+    """One E-step: moments of the block relative to the components' means, and Σ_n p_n log p(x_n), ().
+
+    The moments (K, 1 + D + D²) are Σγ, Σγ(b−μ) and Σγ[(b−μ)(b−μ)ᵀ + B].
+    """
     if block.noise.ndim == 3:
         return _expectation_each(block, parameters)
     noisy = parameters._replace(covariances=parameters.covariances + block.noise)
     if em.is_ill_conditioned(noisy):
-        return _expectation_each(
-            block._replace(noise=block.noise.expand(len(block.points), -1, -1)), parameters
-        )
+        each = block.noise.expand(len(block.points), -1, -1)
+        return _expectation_each(block._replace(noise=each), parameters)
     return _expectation_shared(block, parameters, noisy)
 
 
@@ -233,19 +216,21 @@ def log_likelihood(points: Tensor, noise: Tensor, parameters: Parameters) -> Ten
 
 
 def maximization(
-    moments: Moments, parameters: Parameters, min_variance: float = 0.0, thickness: float | None = None
+    moments: Tensor, parameters: Parameters, min_variance: float = 0.0, thickness: float | None = None
 ) -> Parameters:
     """M-step from moments about the means of `parameters`, with the limits of `bound_variances`.
 
     A component that lost all its points keeps its mean and covariance, with weight 0.
     """
-    alive = moments.mass > 10 * torch.finfo(moments.mass.dtype).eps
-    count = torch.where(alive, moments.mass, 1.0)
-    shift = moments.first / count[:, None]
-    covariances = moments.second / count[:, None, None] - shift[:, :, None] * shift[:, None, :]
+    k, dim = parameters.means.shape
+    mass, first, second = moments[:, 0], moments[:, 1 : 1 + dim], moments[:, 1 + dim :].view(k, dim, dim)
+    alive = mass > 10 * torch.finfo(mass.dtype).eps
+    count = torch.where(alive, mass, 1.0)
+    shift = first / count[:, None]
+    covariances = second / count[:, None, None] - shift[:, :, None] * shift[:, None, :]
     covariances = torch.where(alive[:, None, None], covariances, parameters.covariances)
     return Parameters(
-        torch.where(alive, moments.mass, 0.0) / moments.mass.sum(),
+        torch.where(alive, mass, 0.0) / mass.sum(),
         parameters.means + torch.where(alive[:, None], shift, 0.0),
         bound_variances(covariances, min_variance, thickness),
     )
@@ -260,10 +245,9 @@ def bound_variances(covariances: Tensor, min_variance: float = 0.0, thickness: f
     The M-step maximises −½N(log|Σ| + tr Σ⁻¹S), with S the unconstrained covariance. For given eigenvalues
     λ₁ ≤ … ≤ λ_D of Σ, tr Σ⁻¹S ≥ Σ s_i/λ_i (von Neumann), with equality if Σ has the eigenvectors of S in
     the same order. The remaining term Σ (log λ_i + s_i/λ_i) decreases up to λ_i = s_i and increases
-    beyond it, so every λ_i is s_i clamped to its interval. An upper limit on another eigenvalue than the
-    smallest would cost log(t²/s) + s/t² − 1 at a larger s, which is more. Therefore EM with these limits,
-    from parameters that satisfy them, never decreases the likelihood. Adding a constant to Σ in each
-    iteration would decrease it, and would accumulate because Σ is part of B.
+    beyond it, so every λ_i is s_i clamped to its interval. The upper limit is on the smallest one, where it
+    costs least. Therefore EM with these limits never decreases the likelihood. Adding a constant to Σ in
+    each iteration would decrease it, and would accumulate because Σ is part of B.
     """
     variances, directions = torch.linalg.eigh(covariances)
     variances = variances.clone()
@@ -282,7 +266,7 @@ def deconvolution_step(
 
     def step(parameters: Parameters) -> tuple[Parameters, float]:
         found = [expectation(block, parameters) for block in blocks]
-        sums = Moments(*(torch.stack(values).sum(0) for values in zip(*(m for m, _ in found), strict=True)))
+        sums = torch.stack([moments for moments, _ in found]).sum(0)
         value = sum(float(likelihood) for _, likelihood in found)
         return maximization(sums, parameters, min_variance, thickness), value / total
 
@@ -292,7 +276,7 @@ def deconvolution_step(
 # -- one covariance for all points of a block -------------------------------------------------------
 
 
-def _expectation_shared(block: Block, parameters: Parameters, noisy: Parameters) -> tuple[Moments, Tensor]:
+def _expectation_shared(block: Block, parameters: Parameters, noisy: Parameters) -> tuple[Tensor, Tensor]:
     """Sums of plain EM with covariances T = Σ + R; b and B are linear functions of them."""
     dim = block.points.shape[1]
     features = em.quadratic_features(block.points)
@@ -307,7 +291,8 @@ def _expectation_shared(block: Block, parameters: Parameters, noisy: Parameters)
     gain = torch.eye(dim, dtype=lost.dtype, device=lost.device) - lost
     remaining = count[:, None, None] * (lost @ parameters.covariances)
     moved = (gain @ first[:, :, None]).squeeze(-1)
-    return Moments(count, moved, gain @ second @ gain.transpose(-2, -1) + _symmetric(remaining)), value
+    second = gain @ second @ gain.transpose(-2, -1) + _symmetric(remaining)
+    return torch.cat([count[:, None], moved, second.flatten(1)], 1), value
 
 
 def _symmetric(matrices: Tensor) -> Tensor:
@@ -317,7 +302,7 @@ def _symmetric(matrices: Tensor) -> Tensor:
 # -- a covariance for every point -------------------------------------------------------------------
 
 
-def _expectation_each(block: Block, parameters: Parameters) -> tuple[Moments, Tensor]:
+def _expectation_each(block: Block, parameters: Parameters) -> tuple[Tensor, Tensor]:
     """b and B of every pair with a share, summed by component; Σγ B = (Σγ R T⁻¹) Σ."""
     k, dim = parameters.means.shape
     axes = range(dim)
@@ -337,9 +322,9 @@ def _expectation_each(block: Block, parameters: Parameters) -> tuple[Moments, Te
         columns += [moved[i] * moved[j] for i in axes for j in axes]
         columns += [dot(noise[i], precision[j]) for i in axes for j in axes]  # R T⁻¹
         sums.index_add_(0, pairs.component, torch.stack(columns, 1) * share[:, None])
-    mass, first, second, lost = sums.split([1, dim, dim * dim, dim * dim], 1)
-    remaining = lost.reshape(k, dim, dim) @ parameters.covariances
-    return Moments(mass[:, 0], first, second.reshape(k, dim, dim) + _symmetric(remaining)), value
+    found, lost = sums.split([1 + dim + dim * dim, dim * dim], 1)
+    remaining = _symmetric(lost.reshape(k, dim, dim) @ parameters.covariances)
+    return torch.cat([found[:, : 1 + dim], found[:, 1 + dim :] + remaining.flatten(1)], 1), value
 
 
 # -- pairs of a noisy point and a component ---------------------------------------------------------

@@ -39,6 +39,11 @@ _STEPS = 8  # fewest steps of a pass; if there are few directions, a pass visits
 _HALVINGS = 6  # halvings of the learning rate before the descent ends
 _THINNEST = 1e-6  # least variance at the start and least deviation, for a cloud of spread 1
 _MOMENTS = (0.9, 0.99)  # of Adam; short memory, because a pass has few steps
+LEVELS = 256
+"""J: number of values that summarise a cloud along a direction."""
+_BLOCK_ELEMENTS = 1 << 21  # entries of one chunk of (directions, points) or (directions, J, K)
+_NODES = (-2.0, -1.2, -0.6, 0.0, 0.6, 1.2, 2.0)  # points of each component, in standard deviations
+_NEWTON_STEPS = 2
 
 
 @dataclass(eq=False, repr=False)
@@ -208,12 +213,6 @@ def differentiate(shape: Shape, slices: Slices, dtype: torch.dtype = torch.float
 
 
 # -- optimal transport along lines ----------------------------------------------------------------
-LEVELS = 256
-"""J: number of values that summarise a cloud along a direction."""
-
-_BLOCK_ELEMENTS = 1 << 21  # entries of one chunk of (directions, points) or (directions, J, K)
-_NODES = (-2.0, -1.2, -0.6, 0.0, 0.6, 1.2, 2.0)  # points of each component, in standard deviations
-_NEWTON_STEPS = 2
 
 
 class Slices(NamedTuple):

@@ -137,7 +137,11 @@ def grow(
         if free < 1:
             break
         m = int(min(rule.branching, free + 1))
-        chosen = _splittable(nodes, members.mass(nodes.n), rule)
+        variance = torch.linalg.eigvalsh(nodes.parameters.covariances)
+        flat = variance[:, 0] < rule.planarity_threshold * variance.sum(1)  # (2.9)
+        flat |= variance[:, 0] < rule.thickness**2
+        heavy = members.mass(nodes.n) >= 2 * rule.min_support
+        chosen = (~flat & heavy).nonzero().squeeze(1)
         members, nodes = members.select(chosen, nodes.n), nodes.select(chosen)
         if nodes.n * (m - 1) > free:
             chosen = _shortlist(points, members, nodes, m, free, rule)
@@ -171,14 +175,6 @@ def _root(points: Tensor, weight: Tensor, reg_covar: float) -> tuple[Nodes, Memb
     own = (weight * Factors(root, "full").direct()(points)[0]).sum()[None]
     index = torch.arange(points.shape[0], device=points.device)
     return Nodes(index.new_tensor([-1]), root, own, own), Members(index, torch.zeros_like(index), weight)
-
-
-def _splittable(nodes: Nodes, mass: Tensor, rule: Rule) -> Tensor:
-    """The nodes with enough points for two children that are not flat (2.9)."""
-    variance = torch.linalg.eigvalsh(nodes.parameters.covariances)
-    is_flat = variance[:, 0] < rule.planarity_threshold * variance.sum(1)
-    is_flat |= variance[:, 0] < rule.thickness**2
-    return (~is_flat & (mass >= 2 * rule.min_support)).nonzero().squeeze(1)
 
 
 def _shortlist(points: Tensor, members: Members, nodes: Nodes, m: int, free: float, rule: Rule) -> Tensor:

@@ -380,19 +380,18 @@ def update(prior: Prior, moments: Parameters, process: bool, covariance_type: st
     scatter = constrain(scatter, covariance_type)
     if covariance_type == "tied":
         degrees_of_freedom = degrees_of_freedom.mean().expand_as(degrees_of_freedom).clone()
+    if process:  # 1 + N_k for taking stick k, and γ₀ + Σ_{j>k} N_j for passing it
+        later = torch.cat([count.flip(0).cumsum(0).flip(0)[1:], count.new_zeros(1)])
+        concentration = torch.stack([1 + count, prior.concentration + later])
+    else:
+        concentration = (prior.concentration + count)[None]
     return Posterior(
-        _sticks(prior.concentration, count) if process else (prior.concentration + count)[None],
+        concentration,
         mean_precision,
         (prior.mean_precision * prior.mean + count[:, None] * mean) / mean_precision[:, None],
         degrees_of_freedom,
         scatter / degrees_of_freedom[:, None, None],
     )
-
-
-def _sticks(concentration: Tensor, count: Tensor) -> Tensor:
-    """Beta parameters (2, K): 1 + N_k for taking stick k, and γ₀ + Σ_{j>k} N_j for passing it."""
-    later = torch.cat([count.flip(0).cumsum(0).flip(0)[1:], count.new_zeros(1)])
-    return torch.stack([1 + count, concentration + later])
 
 
 def expected_weights(concentration: Tensor) -> Tensor:
