@@ -292,8 +292,3 @@ def test_a_component_of_one_point_without_regularisation_is_an_error(kind):
     x = np.r_[PAIR, np.full((1, 6), 500.0)]
     with pytest.raises(NumericalError, match="reg_covar"):
         GaussianMixture(3, covariance_type=kind, reg_covar=0, random_state=0).fit(x)
-
-
-def test_more_components_than_points_is_an_error():
-    with pytest.raises(GmmTorchError, match="n_components"):
-        GaussianMixture(30).fit(PAIR[:20])
