@@ -28,7 +28,6 @@ from gmmtorch.mixture.em.initialization import INITIALIZATIONS
 from gmmtorch.mixture.em.loop import EMResult, OnIteration, State
 from gmmtorch.mixture.validation import (
     Array,
-    check_component_count,
     check_weight_scale,
     checked_parameter,
     checked_weight,
@@ -147,8 +146,13 @@ class MixtureEstimator(MixtureDensity):
         self._check_component_count(n_points)
 
     def _check_component_count(self, n_points: int | None) -> None:
-        if self.n_components is not None and not self._finds_n_components:
-            check_component_count(self.n_components, n_points)
+        k = self.n_components
+        if k is not None and not self._finds_n_components and n_points is not None and n_points < k:
+            raise InvalidArgumentError(
+                f"n_components={k} is more than the n_samples={n_points} points of non-zero weight; use "
+                "fewer components or more points. Expected n_samples >= n_components but got "
+                f"n_components = {k}, n_samples = {n_points}."
+            )
 
     def fit(
         self: Self,

@@ -303,6 +303,8 @@ def merge(
 
 
 # -- moments and costs of merges ------------------------------------------------------------------
+
+
 def merge_components(
     weights: Tensor, means: Tensor, covariances: Tensor, labels: Tensor, n: int
 ) -> Parameters:

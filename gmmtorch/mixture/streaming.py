@@ -266,23 +266,21 @@ def _stream_step(run: _Run, e_step: EStep, n_points: int) -> loop.Step[Parameter
         parameters, (k, dim) = by_type.compacted(given, kind), given.means.shape
         factors = by_type.Factors(parameters, kind)
 
-        def moved(linear: bool, about: Tensor | None) -> by_type.Moved:
+        def gather_typed(linear: bool, about: Tensor | None) -> tuple[by_type.Sums, Tensor]:
+            about = None if linear else factors.means if about is None else about
+
             def terms() -> Iterator[tuple[Tensor, ...]]:
                 for chunk in centered():
                     sums, value = by_type.expected_moments(*chunk, factors, dtype, linear, about)
                     yield *sums.tensors(), value
 
             *parts, value = summed(terms())
-            whole = by_type.Sums(k, center[None], kind, None if linear else about)
+            whole = by_type.Sums(k, center[None], kind, about)
             for own, part in zip(whole.tensors(), parts, strict=True):
                 own += part
-            return by_type.moved(whole, value, factors, reg_covar, parameters, linear)
+            return whole, value
 
-        found = moved(True, None) if typed and by_type.has_linear_form(k, dim, kind) else None
-        if found is None or bool(found.lost):
-            found = moved(False, factors.means)
-        if bool(found.lost):
-            found = moved(False, found.parameters.means)
+        found = by_type.exact_step(gather_typed, factors, reg_covar, parameters, typed is not None)
         covariances = expand(found.parameters.covariances, kind, k, dim)
         return found.parameters._replace(covariances=covariances), found.value
 
@@ -297,6 +295,8 @@ def _stream_step(run: _Run, e_step: EStep, n_points: int) -> loop.Step[Parameter
 
 
 # -- the start ------------------------------------------------------------------------------------
+
+
 def survey_all(
     source: PointChunks, sample_points: int | None, seed: int, processes: Processes = SINGLE_PROCESS
 ) -> Survey:

@@ -41,16 +41,6 @@ def as_generator(random_state: RandomState) -> torch.Generator:
     return generator
 
 
-def check_component_count(n_components: int, n_points: int | None) -> None:
-    """Raise `InvalidArgumentError` if there are more components than points, if that number is known."""
-    if n_points is not None and n_points < n_components:
-        raise InvalidArgumentError(
-            f"n_components={n_components} is more than the n_samples={n_points} points of non-zero weight; "
-            "use fewer components or more points. Expected n_samples >= n_components but got n_components = "
-            f"{n_components}, n_samples = {n_points}."
-        )
-
-
 def warn_if_coarse(X: Array, points: Tensor) -> None:
     """Warn if X is float32 and so far from the origin that rounding exceeds 1 % of its spread."""
     if getattr(X, "dtype", None) not in (torch.float32, np.float32):

@@ -17,6 +17,8 @@ again in the direct form, ‖L⁻¹x − L⁻¹μ‖² for every type.
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 import torch
@@ -378,25 +380,20 @@ class Moved(NamedTuple):
     lost: Tensor
 
 
+Gather = Callable[[bool, Tensor | None], tuple[Sums, Tensor]]
+"""An E-step, linear or not, with second moments about given points (K, D): see `expected_moments`."""
+
+
 def em_step(
-    points: Tensor,
-    sample_weight: Tensor,
+    gather: Gather,
     factors: Factors,
-    softmax_dtype: torch.dtype,
     reg_covar: float,
     previous: Parameters | None,
     linear: bool,
     about: Tensor | None = None,
 ) -> Moved:
-    """E- and M-step in one of the forms: `expected_moments`, `moved`. Does not wait for the device."""
-    sums, value = expected_moments(points, sample_weight, factors, softmax_dtype, linear, about)
-    return moved(sums, value, factors, reg_covar, previous, linear)
-
-
-def moved(
-    sums: Sums, value: Tensor, factors: Factors, reg_covar: float, previous: Parameters | None, linear: bool
-) -> Moved:
-    """The M-step from the sums of an E-step, see `maximized`."""
+    """E- and M-step in one of the forms: `gather`, `maximized`. Does not wait for the device."""
+    sums, value = gather(linear, about)
     moments, second = sums.moments()
     new = maximized(moments, reg_covar, previous, factors.kind)
     lost = have_cancelled(second, new.covariances, factors.kind, linear)
@@ -405,19 +402,13 @@ def moved(
 
 
 def exact_step(
-    points: Tensor,
-    sample_weight: Tensor,
-    factors: Factors,
-    softmax_dtype: torch.dtype,
-    reg_covar: float,
-    previous: Parameters | None,
-    linear: bool = False,
+    gather: Gather, factors: Factors, reg_covar: float, previous: Parameters | None, linear: bool = False
 ) -> Moved:
     """`em_step` in the direct form; if a component moves far, once more with moments about its new mean.
 
     With `linear`, the linear form is tried first, if that is the fastest.
     """
-    given = (points, sample_weight, factors, softmax_dtype, reg_covar, previous)
+    given = (gather, factors, reg_covar, previous)
     if linear and has_linear_form(len(factors.means), factors.dim, factors.kind):
         found = em_step(*given, linear=True)
         if not bool(found.lost):
@@ -431,5 +422,6 @@ def direct_step(
 ) -> tuple[Parameters, Tensor]:
     """`exact_step` of full covariances in float64: new parameters and Σ_n p_n log p(x_n)."""
     factors = Factors(parameters, "full")
-    found = exact_step(points, sample_weight, factors, torch.float64, reg_covar, parameters)
+    gather = functools.partial(expected_moments, points, sample_weight, factors, torch.float64)
+    found = exact_step(gather, factors, reg_covar, parameters)
     return found.parameters, found.value

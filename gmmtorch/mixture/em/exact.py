@@ -168,6 +168,8 @@ def has_cancelled(statistics: Tensor, parameters: Parameters) -> bool:
 
 
 # -- covariance types -----------------------------------------------------------------------------
+
+
 COVARIANCE_TYPES = ("full", "tied", "diag", "spherical")
 """Those of scikit-learn: which covariances a mixture may have."""
 

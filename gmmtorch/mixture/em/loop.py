@@ -109,19 +109,22 @@ def _typed_step(
     points: Tensor, sample_weight: Tensor, reg_covar: float, softmax_dtype: torch.dtype, kind: str
 ) -> Step[Parameters]:
     """EM steps with the arithmetic of the covariance type; direct ones from the first that loses digits."""
-    total, given, direct = sample_weight.sum(), (points, sample_weight), [False]
+    total, direct = sample_weight.sum(), [False]
+
+    def gather(factors: by_type.Factors) -> by_type.Gather:
+        return functools.partial(by_type.expected_moments, points, sample_weight, factors, softmax_dtype)
 
     def step(parameters: Parameters) -> tuple[Parameters, Tensor]:
         k, dim = parameters.means.shape
         linear = by_type.has_linear_form(k, dim, kind) and not direct[0]
         factors = by_type.Factors(parameters, kind, check=False)
-        found = by_type.em_step(*given, factors, softmax_dtype, reg_covar, parameters, linear)
+        found = by_type.em_step(gather(factors), factors, reg_covar, parameters, linear)
         return found.parameters, (found.value / total).masked_fill(found.lost, math.nan)
 
     def checked(parameters: Parameters) -> tuple[Parameters, float]:
         direct[0] = True
         factors = by_type.Factors(parameters, kind)
-        found = by_type.exact_step(*given, factors, softmax_dtype, reg_covar, parameters)
+        found = by_type.exact_step(gather(factors), factors, reg_covar, parameters)
         bound = float(found.value / total)
         if not math.isfinite(bound):
             raise NumericalError(
@@ -228,6 +231,8 @@ def of_type(parameters: Parameters, covariance_type: str) -> Parameters:
 
 
 # -- stepwise EM ----------------------------------------------------------------------------------
+
+
 def step_size(batch: float, seen: float, kappa: float) -> float:
     """η = (n / (m + n))^κ, for a batch of weight n after points of weight m.
 

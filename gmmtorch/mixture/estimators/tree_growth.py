@@ -20,12 +20,7 @@ from gmmtorch.kernels import chunk_elements
 from gmmtorch.linalg import unpack_symmetric
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.by_type import Factors
-from gmmtorch.mixture.em.exact import (
-    SOFTMAX_DTYPES,
-    Parameters,
-    feature_dimension,
-    natural_parameters,
-)
+from gmmtorch.mixture.em.exact import SOFTMAX_DTYPES, Parameters, feature_dimension, natural_parameters
 from gmmtorch.mixture.em.truncated import Rows, group_rows
 
 if TYPE_CHECKING:
@@ -433,12 +428,7 @@ def _pool(packed: Packed, label: Tensor, n_nodes: int, n_pieces: int) -> Tensor:
 
 
 def fit_children(
-    points: Tensor,
-    members: Members,
-    centers: Tensor,
-    m: int,
-    rule: Rule,
-    on_values: Callable[[Tensor], None],
+    points: Tensor, members: Members, centers: Tensor, m: int, rule: Rule, on_values: Callable[[Tensor], None]
 ) -> tuple[Packed, Children, bool]:
     """EM of m children in each node until its mean log-likelihood increases by less than `rule.tol` nats.
 

@@ -11,6 +11,7 @@ uses the E-step of EM, see `variational_step` (Bishop, 2006, section 10.2; Blei 
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass
@@ -572,6 +573,7 @@ def _typed_moments(
     k, dim = gaussians.means.shape
     factors = by_type.Factors(by_type.compacted(gaussians, kind), kind)
     factors.constant = factors.constant + log_weight
-    found = by_type.exact_step(points, sample_weight, factors, softmax_dtype, reg_covar, None, linear=True)
+    gather = functools.partial(by_type.expected_moments, points, sample_weight, factors, softmax_dtype)
+    found = by_type.exact_step(gather, factors, reg_covar, None, linear=True)
     covariances = expand(found.parameters.covariances, kind, k, dim)
     return Parameters(found.points, found.parameters.means, covariances), found.value
