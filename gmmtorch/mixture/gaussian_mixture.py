@@ -150,15 +150,13 @@ class GaussianMixture(MixtureEstimator):
         `max_cells` apply to `fit` only.
 
         Args:
-            X, y, sample_weight: as in `fit`.
             kappa: above 0.5, at most 1. With 1 all points count equally. Smaller values forget early batches,
                 whose responsibilities were poor, and suit small batches and many passes.
             memory: upper limit of m, so that the mixture follows a changing scene. Required if m is unknown:
                 for a mixture of given parameters.
 
-        Raises:
-            InvalidArgumentError: as in `fit`; another dimension or n_components than the mixture; an
-                invalid kappa or memory. NumericalError: as in `fit`.
+        Raises `InvalidArgumentError` and `NumericalError` as in `fit`; also for another dimension or
+        n_components than the mixture, and an invalid kappa or memory.
         """
         loop.check_kappa(kappa)
         started = hasattr(self, "means")

@@ -101,9 +101,8 @@ def prune(
         mixture: parameters or a fitted estimator; it is not modified.
         n_points: Σ p, the (weighted) number of points of the fit; component j has N_j = π_j Σ p points.
         min_support: smallest number of points N_j of a component that is kept.
-        min_density_share: smallest ratio of `support_density` to `expected_density` of a component that
-            is kept. If above zero, needs `sensor` and `origins`, and a mixture in 2D or 3D.
-        sensor: see `sensor_model`.
+        min_density_share: smallest `density_share` of a component that is kept. If above zero, needs
+            `sensor` (see `sensor_model`) and `origins`, and a mixture in 2D or 3D.
         origins: (D,) or (S, D), sensor origins, world frame.
         counts: (K, S) points of each component seen from each origin, if known. Components without
             any are kept at any density.

@@ -61,18 +61,16 @@ def simplify(
     Args:
         parameters: a fitted mixture; or weights (K,), not negative, which need not add up to one (supports
             in points are allowed); means (K, D); covariances (K, D, D). K may be 0.
-        n_components: stop at this number of components.
-        max_cost: stop if every merge costs more; see `cost` for the unit.
+        n_components, max_cost: stop at this number of components, and if every merge costs more.
         cost: "kullback_leibler" (`kullback_leibler_bound`: nats times the unit of the weights) or
             "hellinger" (`squared_hellinger`: 0 to 1), which merges similar components of any weight.
         neighbors: nearest components, by distance of the means, that a component may merge with in a
             round. Used above `most_exact` components only.
-        most_exact: up to this number of components, all pairs are considered and merged one at a time;
-            512 if None. With 0 all merges are in rounds: many times faster, with nearly the same result.
+        most_exact: up to this number of components (None: 512), all pairs are considered and merged one at
+            a time. With 0 all merges are in rounds: many times faster, with nearly the same result.
 
-    Raises:
-        InvalidArgumentError: neither n_components nor max_cost, or an invalid one; parameters that are
-            not a mixture. NumericalError: a covariance that is not positive definite.
+    Raises `InvalidArgumentError` for neither n_components nor max_cost, an invalid option, or parameters that
+    are not a mixture; `NumericalError` for a covariance that is not positive definite.
     """
     weights, means, covariances = _checked(parameters)
     if n_components is None and max_cost is None:
@@ -252,21 +250,18 @@ def merge(
     neighbors: int = 8,
     **options: Any,
 ) -> GaussianMixture:
-    """Merge two fitted mixtures into one mixture of the points that both were fitted to.
+    """Merge two fitted mixtures of equal dimension into one mixture of the points that both were fitted to.
 
     The result is on the device, and has the array kind, of `a`.
 
     Args:
-        a, b: mixtures of equal dimension.
         weight_a, weight_b: number of points that each mixture stands for.
         n_components, max_cost, cost, neighbors: how the union is simplified, see `simplify`. The weights
-            add up to one, so max_cost is in nats per point. The union is not simplified without
-            n_components and max_cost.
+            add up to one, so max_cost is in nats per point. Without n_components and max_cost, it is not.
         options: constructor options of the resulting `GaussianMixture`.
 
-    Raises:
-        NotFittedError: a mixture without parameters. InvalidArgumentError: different dimensions;
-            weights that are negative or both zero; arguments that `simplify` rejects.
+    Raises `NotFittedError` for a mixture without parameters, and `InvalidArgumentError` for different
+    dimensions, weights that are negative or both zero, and arguments that `simplify` rejects.
     """
     from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 
@@ -313,15 +308,9 @@ def merge_components(
     w = Σ w_i, μ = Σ w_i μ_i / w and Σ = Σ (w_i/w)(Σ_i + (μ_i − μ)(μ_i − μ)ᵀ). The mean and covariance
     of the whole mixture do not change.
 
-    Args:
-        weights: (K,), not negative; they need not add up to one, so supports (points) are allowed.
-            If all weights of a group are zero, its members count equally.
-        means, covariances: (K, D), (K, D, D).
-        labels: (K,) whole numbers, the group of each component.
-        n: number of groups.
-
-    Raises:
-        InvalidArgumentError: labels outside 0 … n − 1, or an empty group.
+    weights: (K,), not negative; they need not add up to one, so supports (points) are allowed. If all weights
+    of a group are zero, its members count equally. labels: (K,) whole numbers, the group of each component.
+    n: number of groups. Raises `InvalidArgumentError` for labels outside 0 … n − 1, or an empty group.
     """
     if labels.shape != weights.shape or (
         labels.numel() and not 0 <= int(labels.min()) <= int(labels.max()) < n

@@ -78,8 +78,7 @@ def fit_stream(
     """Fit a mixture to the points of a source: `GaussianMixture.fit` with memory bounded by a chunk.
 
     One pass over the source counts, centres and samples the points. Each EM iteration is one further
-    pass, or two if the parameters are too ill-conditioned for natural parameters (see
-    `loop.guarded_step`).
+    pass, or two if the parameters are too ill-conditioned for natural parameters.
 
     With `algorithm="truncated"`, which stores the owner of each point, every process keeps its points in
     memory (about 130 bytes per point in total), and the result depends slightly on how the points are
@@ -97,12 +96,9 @@ def fit_stream(
         checkpoint: where rank 0 stores the state, and what the fit continues from.
         on_iteration: called with the iteration (from 1) and the mean log-likelihood.
 
-    Raises:
-        InvalidArgumentError: an invalid argument; K above the number of points; a checkpoint of another
-            run.
-        DataError: a damaged file, or a source without points.
-        LostProcessError: another process ended; names the iteration, and how to continue.
-        NumericalError: a component collapsed, which happens with reg_covar = 0.
+    Raises `InvalidArgumentError` for an invalid argument, K above the number of points, or a checkpoint of
+    another run; `DataError` for a damaged file, or a source without points; `LostProcessError` if another
+    process ended (it names the iteration, and how to continue); `NumericalError` if a component collapsed.
     """
     _check_options(mixture, checkpoint)
     source = _in_chunks(source)

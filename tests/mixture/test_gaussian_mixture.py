@@ -241,9 +241,6 @@ def test_mixture_works_as_a_module_of_a_network():
     assert torch.equal(other(points), out)
 
 
-# -- scikit-learn's tools --------------------------------------------------------------------------
-
-
 # -- files -----------------------------------------------------------------------------------------
 
 

@@ -14,8 +14,6 @@ from torch import Tensor
 
 from gmmtorch.kernels import kernels
 from gmmtorch.mixture import GaussianMixture
-from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em import loop
 from gmmtorch.mixture.em.exact import quadratic_features
 from gmmtorch.mixture.em.partition import FlatnessRule, Partition, partition, pool_into_cells
 
@@ -240,27 +238,6 @@ def test_equal_points_share_one_cell():
     assert cells.weight.tolist() == [50.0]
     assert cells.member.tolist() == [0] * 50
     assert cells.features.tolist() == [[1.0] + [0.0] * 9]
-
-
-@given(seed=st.integers(0, 10**6), dim=st.integers(1, 3), k=st.integers(1, 5), limit=st.integers(5, 80))
-def test_em_on_cells_keeps_the_moments_of_the_cloud(seed, dim, k, limit):
-    points = cloud(300, dim, seed)
-    points = points - points.mean(0)
-    cells = pool_into_cells(points, limit, 1e-3)
-    generator = torch.Generator().manual_seed(seed)
-    first = em.Parameters(
-        torch.full((k,), 1 / k, dtype=torch.float64),
-        torch.randn(k, dim, generator=generator, dtype=torch.float64),
-        torch.eye(dim, dtype=torch.float64).repeat(k, 1, 1),
-    )
-    step = loop.natural_step(cells.features, cells.weight, 0.0, torch.float64)
-    found = loop.run_em(step, first, tol=0.0, max_iter=8)
-    assert (np.diff(found.lower_bounds) >= -1e-10).all()
-    weights, means, covariances = found.parameters
-    torch.testing.assert_close(weights @ means, points.mean(0), rtol=0, atol=1e-9)
-    second = covariances + means[:, :, None] * means[:, None, :]
-    expected = points.T @ points / 300
-    torch.testing.assert_close(torch.einsum("k,kij->ij", weights, second), expected, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("algorithm", ["exact", "truncated"])

@@ -10,8 +10,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mixture.fit_contract import blobs
-from scipy.integrate import quad
-from scipy.stats import norm
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
@@ -468,42 +466,6 @@ def test_invalid_labels_are_rejected(labels):
 def pair_cost(parameters: Parameters, cost: str) -> float:
     given = Gaussians.of(parameters)
     return float(COSTS[cost](given.at(slice(0, 1)), given.at(slice(1, 2))))
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_kullback_leibler_bound_equals_quadrature(seed):
-    parameters = mixture(2, 1, seed)
-    (w,), (mean,), (variance,) = (
-        value.flatten().tolist()
-        for value in merge_components(*parameters, torch.zeros(2, dtype=torch.int64), 1)
-    )
-    merged, expected, truth = norm(mean, math.sqrt(variance)), 0.0, 0.0
-    parts = [norm(float(m), float(c) ** 0.5) for m, c in zip(*parameters[1:], strict=True)]
-    low = min(part.ppf(1e-12) for part in parts)
-    high = max(part.ppf(1 - 1e-12) for part in parts)
-    for weight, part in zip(parameters.weights.tolist(), parts, strict=True):
-        divergence = quad(
-            lambda x, g=part: g.pdf(x) * (g.logpdf(x) - merged.logpdf(x)), low, high, limit=200
-        )[0]
-        expected += weight * divergence
-
-    def density(x: float) -> float:
-        return sum(a / w * g.pdf(x) for a, g in zip(parameters.weights.tolist(), parts, strict=True))
-
-    truth = (
-        w * quad(lambda x: density(x) * (math.log(density(x)) - merged.logpdf(x)), low, high, limit=200)[0]
-    )
-    bound = pair_cost(parameters, "kullback_leibler")
-    assert bound == pytest.approx(expected, rel=1e-6)
-    assert 0 < truth < bound
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_squared_hellinger_equals_quadrature_in_1d(seed):
-    parameters = mixture(2, 1, seed, spread=1.0)
-    a, b = (norm(float(m), float(c) ** 0.5) for m, c in zip(*parameters[1:], strict=True))
-    overlap = quad(lambda x: math.sqrt(a.pdf(x) * b.pdf(x)), -30, 30, limit=400)[0]
-    assert pair_cost(parameters, "hellinger") == pytest.approx(1 - overlap, abs=1e-7)
 
 
 @costs

@@ -14,8 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from torch import Tensor
 
 from gmmtorch.datasets.point_files.point_chunks import PointChunks, in_memory, open_points
@@ -175,31 +173,6 @@ def test_processes_exchange_k_by_f_numbers_per_iteration():
 
 
 # -- degenerate clouds ----------------------------------------------------------------------------
-
-
-@given(
-    n=st.integers(1, 12),
-    k=st.integers(1, 5),
-    kind=st.sampled_from(["one place", "line", "plane", "few places"]),
-    chunk_points=st.integers(1, 13),
-)
-def test_degenerate_clouds_equal_fit(n, k, kind, chunk_points):
-    points = torch.from_numpy(np.random.default_rng(n).normal(size=(n, 3)))
-    if kind == "one place":
-        points[:] = points[0]
-    elif kind == "few places":
-        points = points[torch.arange(n) % 2]
-    else:
-        points[:, 1 if kind == "line" else 2 :] = 1.0
-    source = in_memory(points, chunk_points=chunk_points)
-    if k > n:
-        with pytest.raises(InvalidArgumentError, match="n_components"):
-            fit_stream(exact(k), source)
-        return
-    found = fit_stream(exact(k), source)
-    assert all(bool(torch.isfinite(value).all()) for value in found.state_dict().values())
-    expected = exact(k).fit(points)
-    assert found.score(points) == pytest.approx(expected.score(points), rel=1e-6)
 
 
 @pytest.mark.parametrize("points", [np.empty((0, 3)), np.full((5, 3), np.nan)])

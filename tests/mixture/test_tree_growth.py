@@ -190,6 +190,3 @@ def test_nodes_of_a_batch_are_fitted_independently():
     rises = torch.stack(values).diff(dim=0)
     assert bool((rises > -1e-3).all())
     assert int((rises[-1] == 0).sum()) >= 3  # the nodes converge independently
-
-
-# -- assignment of points to children --------------------------------------------------------------

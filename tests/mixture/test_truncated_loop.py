@@ -10,7 +10,7 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from mixture.fit_contract import check_mixture
-from mixture.mixture_cases import beads, cloud, random_parameters, random_weight, room, rows_of, thin_wall
+from mixture.mixture_cases import beads, cloud, random_parameters, random_weight, rows_of, thin_wall
 from torch import Tensor
 
 from gmmtorch.mixture import GaussianMixture
@@ -314,16 +314,6 @@ def test_few_points_or_many_dimensions_are_not_pooled(monkeypatch):
         )
     cells = Rows(em.quadratic_features(cloud(1200, 2)), torch.ones(1200, dtype=torch.float64), False)
     fit_truncated(cells, torch.zeros(1200, dtype=torch.int64), random_parameters(2, 2), Settings())
-
-
-def test_fit_through_cells_is_as_good(monkeypatch):
-    x = room(6000)
-    options: dict[str, Any] = {"algorithm": "truncated", "init_params": "flat_pieces", "tol": 1e-4}
-    direct = GaussianMixture(30, **options).fit(x)
-    monkeypatch.setattr(truncated, "_MANY_POINTS", 1000)
-    pooled = GaussianMixture(30, **options).fit(x)
-    assert pooled.lower_bounds_ != direct.lower_bounds_
-    assert pooled.score(x) == pytest.approx(direct.score(x), abs=0.05)
 
 
 def test_many_points_start_on_a_sample_without_its_bounds(monkeypatch):

@@ -275,8 +275,7 @@ def blend(previous: Parameters, update: Parameters, step: float, kind: str = "fu
 def weight_of_past(seen: float | None, memory: float | None) -> float:
     """Number of points that the current mixture counts as: `seen` (None: unknown), at most `memory`.
 
-    Raises:
-        InvalidArgumentError: an invalid memory, or memory=None if `seen` is unknown.
+    Raises `InvalidArgumentError` for an invalid memory, or memory=None if `seen` is unknown.
     """
     if memory is None:
         if seen is None:
@@ -289,11 +288,7 @@ def weight_of_past(seen: float | None, memory: float | None) -> float:
     return float(memory) if seen is None else min(seen, float(memory))
 
 
-def check_kappa(kappa: object) -> float:
-    """Returns κ of `step_size`.
-
-    Raises `InvalidArgumentError` unless 0.5 < κ ≤ 1, for which steps converge.
-    """
+def check_kappa(kappa: object) -> None:
+    """Raise `InvalidArgumentError` unless 0.5 < κ ≤ 1, for which the steps of `step_size` converge."""
     if not isinstance(kappa, numbers.Real) or not 0.5 < float(kappa) <= 1:
         raise InvalidArgumentError(f"kappa={kappa!r} must be above 0.5 and at most 1.")
-    return float(kappa)

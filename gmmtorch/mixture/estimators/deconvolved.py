@@ -86,14 +86,10 @@ class DeconvolvedGaussianMixture(MixtureEstimator):
         noise_covariances: Array | None = None,
         on_iteration: Callable[[int, float], None] | None = None,
     ) -> DeconvolvedGaussianMixture:
-        """Fit the mixture of the noise-free positions of points X (N, D).
+        """Fit the mixture of the noise-free positions of points X (N, D), see `MixtureEstimator.fit`.
 
-        Arguments and errors: see `MixtureEstimator.fit`, and in addition
-
-        Args:
-            noise_covariances: (N, D, D), or (D, D) for all points, m², positive semi-definite; see
-                `sensor_model`. None: no noise. If far fewer covariances than points are distinct, the fit
-                is faster.
+        noise_covariances: (N, D, D), or (D, D) for all points, m², positive semi-definite; see
+        `sensor_model`. None: no noise. The fit is faster if far fewer covariances than points are distinct.
         """
         points, weight, center = self._prepare(X, sample_weight)
         used = None if sample_weight is None else torch.as_tensor(sample_weight) > 0

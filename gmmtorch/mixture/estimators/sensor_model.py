@@ -75,12 +75,10 @@ class SensorModel(ABC):
     def noise_covariances(
         self, points: ArrayLike, origin: ArrayLike, normals: ArrayLike | None = None
     ) -> Tensor:
-        """Covariances (N, D, D), m², positive definite, of the errors of the points, world frame.
+        """Covariances (N, D, D), m², positive definite, of the errors of readings (N, D), world frame.
 
-        Args:
-            points: (N, D) readings, world frame, metres.
-            origin: (D,) or (N, D) sensor origins, world frame, metres.
-            normals: (N, D) unit normals of the surfaces, of either sign. None: incidence 0.
+        origin: (D,) or (N, D) sensor origins. normals: (N, D) unit normals of the surfaces, of either sign;
+        None: incidence 0.
         """
         points = as_tensor(points, "points", torch.float64)
         origin = as_tensor(origin, "origin", torch.float64, points.device)
