@@ -22,7 +22,7 @@ from gmmtorch.team.cli.from_options.robots import facts_of
 from gmmtorch.team.cli.team import RobotProcess
 from gmmtorch.team.sharing.replica.replica import Replica
 from gmmtorch.team.sharing.store import Store
-from gmmtorch.team.sharing.transport.team_key import KEY_VARIABLE
+from gmmtorch.team.sharing.transport.security import KEY_VARIABLE
 
 Run = Callable[..., Finished]
 

@@ -8,8 +8,7 @@ import math
 import torch
 from exploration.voxel_worlds import EVALUATOR, PRIMITIVES, RESOLUTION, Explorer, explore, two_rooms
 
-from gmmtorch.team.exploration.planning.frontier import find_frontiers, frontier_cells
-from gmmtorch.team.exploration.planning.planners import make_planner
+from gmmtorch.team.exploration.planning.planners import find_frontiers, frontier_cells, make_planner
 from gmmtorch.team.exploration.robot.mapper import LocalMap
 
 NONE = torch.zeros(0, 3, dtype=torch.float64)

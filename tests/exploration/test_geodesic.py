@@ -11,7 +11,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmmtorch.team.exploration.planning.geodesic import DistanceField, coarsened, geodesic
+from gmmtorch.team.exploration.planning.journeys import DistanceField, coarsened, geodesic
 from gmmtorch.team.exploration.robot.mapper import LocalMap
 
 STEPS = [step for step in itertools.product((-1, 0, 1), repeat=3) if any(step)]

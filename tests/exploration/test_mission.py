@@ -20,10 +20,10 @@ from gmmtorch.team.exploration.mission.driver import SimulatedClock, drive
 from gmmtorch.team.exploration.mission.mission import Mission
 from gmmtorch.team.exploration.mission.options import FRAMEWORKS, THESIS, TeamOptions
 from gmmtorch.team.exploration.mission.results import mission_row, with_times
-from gmmtorch.team.exploration.mission.team_setup import assemble
-from gmmtorch.team.exploration.robot.robot_state import StoppingRule
+from gmmtorch.team.exploration.mission.trials import assemble
+from gmmtorch.team.exploration.robot.agent import StoppingRule
 from gmmtorch.team.exploration.world.world import World
-from gmmtorch.team.sharing.transport.link_conditions import Partition
+from gmmtorch.team.sharing.transport.simulated_network import Partition
 
 CONTRACT = """
 framework seed world n_robots duration times entropy_bits entropy_bits_per_robot observable_bits

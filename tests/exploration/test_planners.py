@@ -19,7 +19,7 @@ from exploration.voxel_worlds import (
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.team.exploration.planning.collision_checking import feasible
 from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
-from gmmtorch.team.exploration.planning.global_planner import Journey
+from gmmtorch.team.exploration.planning.journeys import Journey
 from gmmtorch.team.exploration.planning.planner_interface import Plan
 from gmmtorch.team.exploration.planning.planners import PLANNERS, make_planner
 

@@ -11,8 +11,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from gmmtorch.team.exploration.mission.mission import plan_together
 from gmmtorch.team.exploration.mission.options import TeamOptions
-from gmmtorch.team.exploration.mission.planning_round import plan_together
 from gmmtorch.team.exploration.planning.coordination import COORDINATIONS, Coordination, PeerTrajectories
 from gmmtorch.team.exploration.planning.planner_interface import Plan
 

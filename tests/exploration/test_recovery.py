@@ -14,12 +14,17 @@ from exploration.voxel_worlds import PRIMITIVES, Explorer, hollow, surroundings_
 from torch import Tensor
 
 from gmmtorch.team.exploration.mission.mission import Mission
-from gmmtorch.team.exploration.mission.team_setup import assemble
+from gmmtorch.team.exploration.mission.trials import assemble
 from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
-from gmmtorch.team.exploration.planning.planner_interface import Plan, PlanningTask
-from gmmtorch.team.exploration.planning.recovery import Waiting, is_boxed_in, retreat, shortened
-from gmmtorch.team.exploration.robot.agent import Agent
-from gmmtorch.team.exploration.robot.robot_state import StoppingRule
+from gmmtorch.team.exploration.planning.planner_interface import (
+    Plan,
+    PlanningTask,
+    Waiting,
+    is_boxed_in,
+    retreat,
+    shortened,
+)
+from gmmtorch.team.exploration.robot.agent import Agent, StoppingRule
 from gmmtorch.team.exploration.world.world import World
 
 SHAPE = (40, 40, 20)

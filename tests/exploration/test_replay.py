@@ -20,10 +20,9 @@ from gmmtorch.mapping.learning.rules import IncrementalRule
 from gmmtorch.scan import Scan
 from gmmtorch.team.exploration.mission.replay import ReplayMission
 from gmmtorch.team.exploration.mission.robot_view import ReplayingRobotView
-from gmmtorch.team.sharing.frame_joiner import FrameJoiner
 from gmmtorch.team.sharing.replica.replica import Replica
-from gmmtorch.team.sharing.transport.link_conditions import LinkConditions
-from gmmtorch.team.sharing.transport.simulated_network import Network
+from gmmtorch.team.sharing.shared_map import FrameJoiner
+from gmmtorch.team.sharing.transport.simulated_network import LinkConditions, Network
 
 
 def n_missing(mission: ReplayMission) -> int:

@@ -79,7 +79,7 @@ def has_duplicate(view: ReplayingRobotView) -> bool:
 
 
 def test_duplicate_ids_are_detected_over_udp(monkeypatch):
-    monkeypatch.setattr("gmmtorch.team.sharing.transport.sessions.FRESH_SECONDS", 0.1)
+    monkeypatch.setattr("gmmtorch.team.sharing.transport.security.FRESH_SECONDS", 0.1)
     transports = [UdpTransport.unicast(5) for _ in range(2)]
     team = [robot(5, part(k, 2, 8), transports[k], announce_every=0.05, rate=200.0) for k in range(2)]
     views = [ReplayingRobotView(*pair) for pair in zip(team, transports, strict=True)]

@@ -10,7 +10,7 @@ from exploration.voxel_worlds import RESOLUTION, surroundings_from
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmmtorch.team.exploration.planning.geodesic import geodesic
+from gmmtorch.team.exploration.planning.journeys import geodesic
 from gmmtorch.team.exploration.planning.roadmap import Roadmap, at_the_rim
 from gmmtorch.team.exploration.robot.mapper import LocalMap
 

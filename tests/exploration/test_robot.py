@@ -16,13 +16,12 @@ from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
-from gmmtorch.team.exploration.information.view_library import ViewLibrary
 from gmmtorch.team.exploration.planning.collision_checking import cells_in_sphere
 from gmmtorch.team.exploration.planning.planner_interface import Plan
 from gmmtorch.team.exploration.planning.roadmap import Roadmap
-from gmmtorch.team.exploration.robot.grid_mapper import GridMapper
-from gmmtorch.team.exploration.robot.mapper import Memo
-from gmmtorch.team.exploration.robot.robot_state import Robot, StoppingCriterion, StoppingRule
+from gmmtorch.team.exploration.planning.view_library import ViewLibrary
+from gmmtorch.team.exploration.robot.agent import Robot, StoppingCriterion, StoppingRule
+from gmmtorch.team.exploration.robot.mapper import GridMapper, Memo
 from gmmtorch.team.exploration.world.scoring import BeliefMap, BeliefRule
 from gmmtorch.team.exploration.world.starts import InitialFreeSpace
 

@@ -14,7 +14,7 @@ from mapping.random_components import random_components
 from gmmtorch.mapping.codec.quantization import spatial_order
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.calibrator import Calibration, Calibrator
-from gmmtorch.team.sharing.messages.fields import pose_of
+from gmmtorch.team.sharing.messages.datagrams import pose_of
 from gmmtorch.team.sharing.messages.message_registry import (
     CODECS,
     ViewsMessage,

@@ -15,7 +15,7 @@ from sharing.message_examples import sealed
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.codec.bitstream import BitWriter
 from gmmtorch.mapping.codec.quantization import COUNT_ERROR
-from gmmtorch.team.sharing.messages.fields import pose_of, write_intervals, write_keys
+from gmmtorch.team.sharing.messages.datagrams import pose_of, write_intervals, write_keys
 from gmmtorch.team.sharing.messages.message_registry import MAX_BYTES, decode
 from gmmtorch.team.sharing.messages.record_messages import (
     AnnouncementMessage,
@@ -25,9 +25,10 @@ from gmmtorch.team.sharing.messages.record_messages import (
     counters_message,
     encode_announcements,
     encode_record,
+    keys_in,
 )
 from gmmtorch.team.sharing.replica.anti_entropy import MOST_PEERS, Backlog
-from gmmtorch.team.sharing.replica.record_keys import END, Intervals, first_key, keys_in, keys_of
+from gmmtorch.team.sharing.replica.record_keys import END, Intervals, first_key, keys_of
 from gmmtorch.team.sharing.replica.replica import Replica
 
 robots = st.integers(0, 1023)

@@ -24,10 +24,10 @@ from gmmtorch.mapping.codec.bitstream import BitWriter
 from gmmtorch.mapping.codec.lattice import LARGEST_VARIANCE
 from gmmtorch.mapping.codec.quantization import MOST_POINTS
 from gmmtorch.mapping.components import Components
-from gmmtorch.team.exploration.information.view_library import ViewLibrary
+from gmmtorch.team.exploration.planning.view_library import ViewLibrary
 from gmmtorch.team.sharing.messages import message_registry as messages
 from gmmtorch.team.sharing.messages.component_messages import MOST_COMPONENTS_SENT
-from gmmtorch.team.sharing.messages.envelope import FARTHEST, Kind
+from gmmtorch.team.sharing.messages.datagrams import FARTHEST, Kind
 from gmmtorch.team.sharing.messages.message_registry import (
     AnnouncementMessage,
     CalibrationMessage,

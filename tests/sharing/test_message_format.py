@@ -14,7 +14,7 @@ from invalid_values import each_value
 from sharing.message_examples import examples, numbers, places, sealed, views
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.team.sharing.messages.envelope import FARTHEST, VERSION, Kind
+from gmmtorch.team.sharing.messages.datagrams import FARTHEST, VERSION, Kind
 from gmmtorch.team.sharing.messages.message_registry import (
     MAX_BYTES,
     PlanMessage,

@@ -18,7 +18,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.codec.quantization import COUNT_ERROR, MOST_POINTS, quantize, quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.team.sharing.messages.component_messages import MOST_COMPONENTS_SENT, fitted
-from gmmtorch.team.sharing.messages.envelope import FARTHEST
+from gmmtorch.team.sharing.messages.datagrams import FARTHEST
 from gmmtorch.team.sharing.messages.message_registry import (
     MAX_BYTES,
     CountsMessage,
@@ -28,7 +28,7 @@ from gmmtorch.team.sharing.messages.message_registry import (
     encode_counts,
     encode_points,
 )
-from gmmtorch.team.sharing.messages.point_messages import POINTS_PER_DATAGRAM
+from gmmtorch.team.sharing.messages.mission_messages import POINTS_PER_DATAGRAM
 
 # -- components ------------------------------------------------------------------------------------
 

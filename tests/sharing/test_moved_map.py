@@ -15,8 +15,8 @@ from torch import Tensor
 
 from gmmtorch.mapping.components import Components
 from gmmtorch.team.sharing.messages.record_messages import CorrectionMessage
-from gmmtorch.team.sharing.replica import moved_map
-from gmmtorch.team.sharing.replica.moved_map import MovedMap
+from gmmtorch.team.sharing.replica import authorship
+from gmmtorch.team.sharing.replica.authorship import MovedMap
 from gmmtorch.team.sharing.replica.replica import Replica
 
 N_SCANS = 3
@@ -123,7 +123,7 @@ def test_any_order_of_changes_corrections_and_restarts_gives_the_moved_map(seed)
 
 @pytest.mark.parametrize("most", [1, 2])
 def test_components_of_too_many_intervals_are_sent_again(monkeypatch, most):
-    monkeypatch.setattr(moved_map, "_MOST_RUNS", most)
+    monkeypatch.setattr(authorship, "_MOST_RUNS", most)
     robot = Robot(random.Random(1), Replica(0))
     robot.publish()
     n_held = robot.replica.held.size

@@ -15,16 +15,14 @@ from sharing.schedules import act
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.occupancy.calibrator import Calibrator
-from gmmtorch.team.sharing.messages.count_messages import counts_of
+from gmmtorch.team.sharing.messages.component_messages import counts_of
 from gmmtorch.team.sharing.messages.message_registry import ComponentsMessage, decode, encode_components
-from gmmtorch.team.sharing.messages.record_messages import CountersMessage
-from gmmtorch.team.sharing.replica.component_table import Counters
+from gmmtorch.team.sharing.messages.record_messages import RECORD_KINDS, CountersMessage, keys_in
+from gmmtorch.team.sharing.replica.materialized_view import Counters
 from gmmtorch.team.sharing.replica.record_keys import (
-    RECORD_KINDS,
     Intervals,
     evict,
     first_key,
-    keys_in,
     keys_of,
 )
 from gmmtorch.team.sharing.replica.replica import Replica

@@ -10,8 +10,7 @@ from exploration.replays import content, log, mapped
 from gmmtorch.mapping.components import Components
 from gmmtorch.team.sharing import Replica
 from gmmtorch.team.sharing.shared_map import SharedMap
-from gmmtorch.team.sharing.transport.link_conditions import LinkConditions
-from gmmtorch.team.sharing.transport.simulated_network import Network
+from gmmtorch.team.sharing.transport.simulated_network import LinkConditions, Network
 
 
 def of_robot(components: Components, robot: int) -> Components:

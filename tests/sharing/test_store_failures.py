@@ -20,7 +20,7 @@ from sharing.schedules import components
 from sharing.store_cases import altered, filled, killed, recorded, reopened, rows, state
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.team.sharing import store_file
+from gmmtorch.team.sharing import store as store_module
 from gmmtorch.team.sharing.replica.replica import Replica
 from gmmtorch.team.sharing.store import Restored, Store
 
@@ -238,7 +238,7 @@ def test_a_read_only_disk_is_read(tmp_path, monkeypatch, caplog, code):
     datagrams = recorded(1, 5)
     path = filled(tmp_path, datagrams)
     before = {file.name: file.read_bytes() for file in path.parent.iterdir()}
-    connect, replica = store_file.connect, Replica(0)
+    connect, replica = store_module.connect, Replica(0)
 
     def fails(place: str) -> sqlite3.Connection:
         if place == str(path):
@@ -247,7 +247,7 @@ def test_a_read_only_disk_is_read(tmp_path, monkeypatch, caplog, code):
             raise error
         return connect(place)
 
-    monkeypatch.setattr(store_file, "connect", fails)
+    monkeypatch.setattr(store_module, "connect", fails)
     with Store(path, 0) as store:
         assert not store.is_writable
         store.restore(replica)
@@ -265,7 +265,7 @@ def test_an_unusable_path_gives_an_empty_store(tmp_path, monkeypatch):
     for full in (False, True):
         with monkeypatch.context() as patch, Store(tmp_path / "file" / "below" / "s", 0) as store:
             if full:  # no room for a copy either
-                patch.setattr(store_file.tempfile, "mkdtemp", _raise_full)
+                patch.setattr(store_module.tempfile, "mkdtemp", _raise_full)
             assert not store.is_writable
             assert store.restore(Replica(0)) == Restored(0, 0)
 

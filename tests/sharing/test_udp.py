@@ -17,9 +17,8 @@ import pytest
 from sharing.transport_cases import KEY, heard, hostile_frames, until
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
-from gmmtorch.team.sharing.transport.security import Sealer
+from gmmtorch.team.sharing.transport.security import Sealer, TeamKey
 from gmmtorch.team.sharing.transport.simulated_network import Network, Traffic, Transport
-from gmmtorch.team.sharing.transport.team_key import TeamKey
 from gmmtorch.team.sharing.transport.udp import UdpTransport
 
 GROUP = "239.71.77.7"
@@ -240,7 +239,7 @@ def heard_any(transport: UdpTransport) -> bool:
 
 
 def test_duplicate_robot_ids_are_detected_by_all(opening, caplog, monkeypatch):
-    monkeypatch.setattr("gmmtorch.team.sharing.transport.sessions.FRESH_SECONDS", 0.0)
+    monkeypatch.setattr("gmmtorch.team.sharing.transport.security.FRESH_SECONDS", 0.0)
     a, first, second = opening(0, key=KEY), opening(3, key=KEY), opening(3, key=KEY)
     everybody = [each.address for each in (a, first, second)]
     for each in (a, first, second):

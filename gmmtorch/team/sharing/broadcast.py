@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gmmtorch.errors import check_whole
 from gmmtorch.mapping import Components, spatial_order, summed
-from gmmtorch.team.sharing.messages.envelope import check_codec, within
+from gmmtorch.team.sharing.messages.datagrams import check_codec, within
 from gmmtorch.team.sharing.messages.message_registry import (
     ComponentsMessage,
     CountsMessage,

@@ -9,12 +9,12 @@ from typing import Any
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, check_whole
 from gmmtorch.mapping import NoveltyRule
 from gmmtorch.simulation import DepthCamera
-from gmmtorch.team.exploration.information.view_evaluator import INFORMATION
 from gmmtorch.team.exploration.planning.coordination import Coordination
 from gmmtorch.team.exploration.planning.planners import PLANNERS
 from gmmtorch.team.exploration.planning.primitives import Dynamics
+from gmmtorch.team.exploration.planning.view_evaluator import INFORMATION
+from gmmtorch.team.exploration.robot.agent import StoppingRule
 from gmmtorch.team.exploration.robot.gmm_mapper import FrameRule
-from gmmtorch.team.exploration.robot.robot_state import StoppingRule
 from gmmtorch.team.exploration.world.scoring import BeliefRule
 from gmmtorch.team.sharing import (
     POINT_CODECS,

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from gmmtorch.team.exploration.information.view_cache import ViewCache
-from gmmtorch.team.exploration.planning.global_planner import Goal
+from gmmtorch.team.exploration.planning.journeys import Goal
 from gmmtorch.team.exploration.planning.planner_interface import PlanningTask, continuations, options
 from gmmtorch.team.exploration.planning.primitives import Primitives
+from gmmtorch.team.exploration.planning.view_evaluator import ViewCache
 
 _FAR = 1e4  # metres, where there is no way to the goal
 _WIDENING = 1.5  # a node tries about `_WIDENING` √visits primitives; the root tries all

@@ -9,17 +9,23 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from gmmtorch.errors import DataError, GmmTorchError
-from gmmtorch.team.sharing.messages import (
-    component_messages,
-    count_messages,
-    point_messages,
-    record_messages,
-    view_messages,
+from gmmtorch.team.sharing.messages import component_messages, mission_messages, record_messages
+from gmmtorch.team.sharing.messages.component_messages import (
+    ComponentsMessage,
+    CountsMessage,
+    encode_components,
+    encode_counts,
 )
-from gmmtorch.team.sharing.messages.component_messages import ComponentsMessage, encode_components
-from gmmtorch.team.sharing.messages.count_messages import CountsMessage, encode_counts
-from gmmtorch.team.sharing.messages.envelope import CODECS, MAX_BYTES, Kind, parse_datagram
-from gmmtorch.team.sharing.messages.point_messages import PointsMessage, encode_points
+from gmmtorch.team.sharing.messages.datagrams import CODECS, MAX_BYTES, Kind, parse_datagram
+from gmmtorch.team.sharing.messages.mission_messages import (
+    PlanMessage,
+    PointsMessage,
+    ViewsMessage,
+    encode_plan,
+    encode_points,
+    encode_views,
+    quantized_poses,
+)
 from gmmtorch.team.sharing.messages.record_messages import (
     AnnouncementMessage,
     CalibrationMessage,
@@ -27,13 +33,6 @@ from gmmtorch.team.sharing.messages.record_messages import (
     CountersMessage,
     FrameMessage,
     SupersessionMessage,
-)
-from gmmtorch.team.sharing.messages.view_messages import (
-    PlanMessage,
-    ViewsMessage,
-    encode_plan,
-    encode_views,
-    quantized_poses,
 )
 
 __all__ = [
@@ -79,12 +78,12 @@ _KINDS: dict[Kind, tuple[str, Callable[[bytes], Message]]] = {
     Kind.COMPONENTS: ("components", component_messages.read_quantized),
     Kind.FLOAT_COMPONENTS: ("components", component_messages.read_float),
     Kind.THESIS_COMPONENTS: ("components", component_messages.read_thesis),
-    Kind.COUNTS: ("counts", count_messages.read_quantized_counts),
-    Kind.FLOAT_COUNTS: ("counts", count_messages.read_float_counts),
-    Kind.THESIS_COUNTS: ("counts", count_messages.read_thesis_counts),
-    Kind.POINTS: ("points", point_messages.read_points),
-    Kind.VIEWS: ("views", view_messages.read_views),
-    Kind.PLAN: ("plans", view_messages.read_plan),
+    Kind.COUNTS: ("counts", component_messages.read_quantized_counts),
+    Kind.FLOAT_COUNTS: ("counts", component_messages.read_float_counts),
+    Kind.THESIS_COUNTS: ("counts", component_messages.read_thesis_counts),
+    Kind.POINTS: ("points", mission_messages.read_points),
+    Kind.VIEWS: ("views", mission_messages.read_views),
+    Kind.PLAN: ("plans", mission_messages.read_plan),
     Kind.ANNOUNCEMENT: ("announcements", record_messages.read_announcement),
     Kind.SUPERSESSION: ("supersessions", record_messages.read_supersession),
     Kind.COUNTERS: ("counts", record_messages.read_counters),

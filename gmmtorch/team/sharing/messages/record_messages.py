@@ -14,18 +14,23 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
-from gmmtorch.mapping import LARGEST_COUNT, NO_COUNT, BitReader, BitWriter, count_steps
+from gmmtorch.mapping import AXIS_ORDERS, LARGEST_COUNT, NO_COUNT, BitReader, BitWriter, count_steps
 from gmmtorch.occupancy import N_BYTES, Calibration
-from gmmtorch.team.sharing.messages.count_messages import counts_of
-from gmmtorch.team.sharing.messages.envelope import FARTHEST, MAX_BYTES, Kind, make_datagram, split
-from gmmtorch.team.sharing.messages.fields import (
+from gmmtorch.team.sharing.messages.component_messages import counts_of
+from gmmtorch.team.sharing.messages.datagrams import (
+    FARTHEST,
+    MAX_BYTES,
+    Kind,
     is_motion,
+    make_datagram,
     matrix_of,
     motion_dim,
+    parse_datagram,
     read_intervals,
     read_keys,
     read_motion,
     read_number,
+    split,
     write_intervals,
     write_keys,
     write_motion,
@@ -41,10 +46,14 @@ from gmmtorch.team.sharing.replica.record_keys import (
     Ints,
     author_of,
     first_key,
+    keys_of,
     keys_of_robot,
     robot_of,
 )
 
+_OTHER_RECORDS = {Kind.SUPERSESSION, Kind.COUNTERS, Kind.CORRECTION, Kind.FRAME, Kind.CALIBRATION}
+RECORD_KINDS = frozenset({Kind.COMPONENTS} | _OTHER_RECORDS)
+"""Kinds of datagrams that contain records."""
 RECORD_BYTES = 1000
 """Longest record. A datagram of 1200 bytes has room for it and for encryption."""
 
@@ -366,3 +375,29 @@ def _check_sender(sender: int, incarnation: int) -> None:
             f"sender={sender}, incarnation={incarnation}: robots go up to {LARGEST_ROBOT}, incarnations "
             f"up to {LARGEST_INCARNATION}."
         )
+
+
+def keys_in(datagram: bytes) -> Intervals:
+    """The keys of the records in a datagram that a replica has sent or merged, without decoding the rest.
+
+    Raises `DataError` if it is no datagram of `RECORD_KINDS`.
+    """
+    kind, body = parse_datagram(datagram)
+    if kind is Kind.COMPONENTS:
+        return Intervals.of(_component_keys(BitReader(body[1:])))
+    if kind not in RECORD_KINDS:
+        raise DataError(f"A datagram of kind {int(kind)} has no records.")
+    key = BitReader(body).number()
+    return Intervals.span(key, key + 1)
+
+
+def _component_keys(batch: BitReader) -> Ints:
+    """The keys of a codec batch (docs/formats.md): three numbers and the axis orders precede its ids."""
+    dim, k, _ = batch.number(), batch.number(), batch.number()
+    if dim not in AXIS_ORDERS or k < 0:
+        raise DataError(f"{k} components in {dim}D: it is damaged.")
+    n_bits = (len(AXIS_ORDERS[dim]) - 1).bit_length()
+    batch.require(k * n_bits)
+    batch.fixed(k, n_bits)
+    robots, numbers = batch.column(k), batch.column(k) + np.arange(k)
+    return keys_of(torch.from_numpy(np.stack([robots, numbers], 1)))

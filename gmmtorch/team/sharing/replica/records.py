@@ -20,13 +20,17 @@ from gmmtorch.team.sharing.messages.record_messages import (
     SupersessionMessage,
     encode_record,
 )
-from gmmtorch.team.sharing.replica.component_table import (
+from gmmtorch.team.sharing.replica.materialized_view import (
+    ChangeLog,
+    Changes,
     ComponentTable,
     Counters,
+    Frames,
+    corrected,
     fingerprints,
     most_viewpoints,
+    with_gains,
 )
-from gmmtorch.team.sharing.replica.materialized_view import ChangeLog, Changes, Frames, corrected, with_gains
 from gmmtorch.team.sharing.replica.record_keys import WORLD, Intervals, Ints, authors, keys_of, robot_of
 
 MOST_VIEWPOINTS = 48

@@ -15,7 +15,7 @@ from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, chec
 from gmmtorch.mapping import Components, GaussianMap
 from gmmtorch.occupancy import Calibration
 from gmmtorch.scan import ArrayLike
-from gmmtorch.team.sharing.messages.envelope import MAX_BYTES
+from gmmtorch.team.sharing.messages.datagrams import MAX_BYTES
 from gmmtorch.team.sharing.messages.message_registry import ComponentsMessage, Message, decode
 from gmmtorch.team.sharing.messages.record_messages import (
     AnnouncementMessage,
@@ -28,9 +28,8 @@ from gmmtorch.team.sharing.messages.record_messages import (
     encode_announcements,
 )
 from gmmtorch.team.sharing.replica.anti_entropy import Backlog, packets
-from gmmtorch.team.sharing.replica.authorship import Author, Published
+from gmmtorch.team.sharing.replica.authorship import Author, MovedMap, Published
 from gmmtorch.team.sharing.replica.materialized_view import Changes, Placement, robot_of_frame
-from gmmtorch.team.sharing.replica.moved_map import MovedMap
 from gmmtorch.team.sharing.replica.record_keys import (
     LARGEST_INCARNATION,
     LARGEST_ROBOT,
