@@ -47,7 +47,8 @@ from gmmtorch.occupancy.occupancy_grid import OccupancyGrid
 from gmmtorch.occupancy.protocol import OccupancyMap
 from gmmtorch.report.style import label_of, save_figure
 from gmmtorch.scan import Scan
-from gmmtorch.team.sharing.messages.message_registry import ComponentsMessage, decode, encode_components
+from gmmtorch.team.sharing.messages.component_messages import ComponentsMessage, encode_components
+from gmmtorch.team.sharing.messages.message_registry import decode
 from gmmtorch.team.sharing.point_codecs import (
     DepthImage,
     Draco,

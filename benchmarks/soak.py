@@ -43,7 +43,8 @@ from gmmtorch.processes import end_with_parent
 from gmmtorch.report.table import format_table
 from gmmtorch.team.exploration.planning.view_library import ViewLibrary
 from gmmtorch.team.sharing.messages.datagrams import Kind
-from gmmtorch.team.sharing.messages.message_registry import ViewsMessage, decode
+from gmmtorch.team.sharing.messages.message_registry import decode
+from gmmtorch.team.sharing.messages.mission_messages import ViewsMessage
 from gmmtorch.team.sharing.replica.replica import Replica
 from gmmtorch.team.sharing.transport.security import Opener, Sealer, TeamKey
 

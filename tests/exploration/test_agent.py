@@ -29,13 +29,9 @@ from gmmtorch.team.exploration.planning.view_library import ViewLibrary
 from gmmtorch.team.exploration.robot.agent import Agent, Robot, StoppingRule
 from gmmtorch.team.exploration.robot.mapper import GridMapper, Mapper, Memo
 from gmmtorch.team.exploration.world.starts import InitialFreeSpace
-from gmmtorch.team.sharing.messages.message_registry import (
-    PlanMessage,
-    decode,
-    encode_components,
-    encode_plan,
-    kind_of,
-)
+from gmmtorch.team.sharing.messages.component_messages import encode_components
+from gmmtorch.team.sharing.messages.message_registry import decode, kind_of
+from gmmtorch.team.sharing.messages.mission_messages import PlanMessage, encode_plan
 from gmmtorch.team.sharing.replica.replica import Replica
 
 START = torch.tensor([*PLACES[0][0], PLACES[0][1]], dtype=torch.float64)

@@ -20,7 +20,7 @@ from gmmtorch.team.exploration.planning.coordination import (
     clear_of,
     predicted_path,
 )
-from gmmtorch.team.sharing.messages.message_registry import PlanMessage
+from gmmtorch.team.sharing.messages.mission_messages import PlanMessage
 
 Choices = list[list[frozenset[int]]]
 """Of each robot, the sets that it may cover."""

@@ -35,14 +35,13 @@ from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 from gmmtorch.team.exploration.robot.gmm_mapper import FrameRule, GmmMapper
 from gmmtorch.team.exploration.robot.mapper import FrameUpdate
-from gmmtorch.team.sharing.messages.message_registry import (
+from gmmtorch.team.sharing.messages.component_messages import (
     ComponentsMessage,
     CountsMessage,
-    decode,
     encode_components,
-    encode_plan,
-    encode_points,
 )
+from gmmtorch.team.sharing.messages.message_registry import decode
+from gmmtorch.team.sharing.messages.mission_messages import encode_plan, encode_points
 
 Flight = tuple[GmmMapper, list[FrameUpdate], list[bytes]]
 

@@ -29,11 +29,8 @@ from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 from gmmtorch.team.exploration.robot.gmm_mapper import GmmMapper
 from gmmtorch.team.exploration.robot.mapper import Memo
-from gmmtorch.team.sharing.messages.message_registry import (
-    CountsMessage,
-    decode,
-    encode_counts,
-)
+from gmmtorch.team.sharing.messages.component_messages import CountsMessage, encode_counts
+from gmmtorch.team.sharing.messages.message_registry import decode
 from gmmtorch.team.sharing.replica.replica import Replica
 
 

@@ -15,8 +15,8 @@ from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 from gmmtorch.team.exploration.robot.mapper import MOST_INTERVALS, GridMapper, Memo
 from gmmtorch.team.exploration.world.scoring import BeliefMap, BeliefRule
-from gmmtorch.team.sharing.messages.message_registry import PointsMessage, decode, encode_points
-from gmmtorch.team.sharing.messages.mission_messages import POINTS_PER_DATAGRAM
+from gmmtorch.team.sharing.messages.message_registry import decode
+from gmmtorch.team.sharing.messages.mission_messages import POINTS_PER_DATAGRAM, PointsMessage, encode_points
 from gmmtorch.team.sharing.radio import ReceivedMessage
 
 WIDTH = 24

@@ -22,7 +22,7 @@ from gmmtorch.team.exploration.mission.robot_view import DuplicateIdError, Flyin
 from gmmtorch.team.exploration.mission.trials import make_agent, start_poses
 from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
 from gmmtorch.team.exploration.world.world import World
-from gmmtorch.team.sharing.messages.message_registry import PlanMessage, encode_plan
+from gmmtorch.team.sharing.messages.mission_messages import PlanMessage, encode_plan
 from gmmtorch.team.sharing.replica.replica import Replica
 from gmmtorch.team.sharing.store import Store
 from gmmtorch.team.sharing.transport.udp import UdpTransport

@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.team.exploration.planning import view_library
 from gmmtorch.team.exploration.planning.view_library import ViewLibrary
-from gmmtorch.team.sharing.messages.message_registry import ViewsMessage, decode
+from gmmtorch.team.sharing.messages.message_registry import decode
+from gmmtorch.team.sharing.messages.mission_messages import ViewsMessage
 from gmmtorch.team.sharing.replica.record_keys import Intervals, first_key, robot_of
 
 

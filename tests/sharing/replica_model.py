@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from gmmtorch.mapping.components import Components
-from gmmtorch.team.sharing.messages.message_registry import (
-    ComponentsMessage,
+from gmmtorch.team.sharing.messages.component_messages import ComponentsMessage
+from gmmtorch.team.sharing.messages.message_registry import decode
+from gmmtorch.team.sharing.messages.record_messages import (
     CorrectionMessage,
     CountersMessage,
     SupersessionMessage,
-    decode,
 )
 
 

@@ -15,8 +15,8 @@ from sharing.message_examples import sealed
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.codec.bitstream import BitWriter
 from gmmtorch.mapping.codec.quantization import COUNT_ERROR
-from gmmtorch.team.sharing.messages.datagrams import pose_of, write_intervals, write_keys
-from gmmtorch.team.sharing.messages.message_registry import MAX_BYTES, decode
+from gmmtorch.team.sharing.messages.datagrams import MAX_BYTES, pose_of, write_intervals, write_keys
+from gmmtorch.team.sharing.messages.message_registry import decode
 from gmmtorch.team.sharing.messages.record_messages import (
     AnnouncementMessage,
     CorrectionMessage,

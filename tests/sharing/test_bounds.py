@@ -11,7 +11,8 @@ import pytest
 import torch
 from mapping.random_components import random_components
 
-from gmmtorch.team.sharing.messages.message_registry import decode, encode_components
+from gmmtorch.team.sharing.messages.component_messages import encode_components
+from gmmtorch.team.sharing.messages.message_registry import decode
 from gmmtorch.team.sharing.messages.record_messages import (
     RECORD_BYTES,
     AnnouncementMessage,

@@ -20,8 +20,8 @@ from sharing.test_changes import Follower
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.team.sharing.messages.datagrams import pose_of
-from gmmtorch.team.sharing.messages.message_registry import FrameMessage, decode, kind_of
-from gmmtorch.team.sharing.messages.record_messages import encode_record
+from gmmtorch.team.sharing.messages.message_registry import decode, kind_of
+from gmmtorch.team.sharing.messages.record_messages import FrameMessage, encode_record
 from gmmtorch.team.sharing.replica.record_keys import WORLD, first_key
 from gmmtorch.team.sharing.replica.replica import Replica
 from gmmtorch.team.sharing.store import Store

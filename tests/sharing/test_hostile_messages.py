@@ -26,29 +26,33 @@ from gmmtorch.mapping.codec.quantization import MOST_POINTS
 from gmmtorch.mapping.components import Components
 from gmmtorch.team.exploration.planning.view_library import ViewLibrary
 from gmmtorch.team.sharing.messages import message_registry as messages
-from gmmtorch.team.sharing.messages.component_messages import MOST_COMPONENTS_SENT
-from gmmtorch.team.sharing.messages.datagrams import FARTHEST, Kind
-from gmmtorch.team.sharing.messages.message_registry import (
-    AnnouncementMessage,
-    CalibrationMessage,
+from gmmtorch.team.sharing.messages.component_messages import (
+    MOST_COMPONENTS_SENT,
     ComponentsMessage,
-    CorrectionMessage,
-    CountersMessage,
     CountsMessage,
-    FrameMessage,
-    Message,
-    PlanMessage,
-    PointsMessage,
-    SupersessionMessage,
-    ViewsMessage,
-    decode,
     encode_components,
     encode_counts,
+)
+from gmmtorch.team.sharing.messages.datagrams import FARTHEST, Kind
+from gmmtorch.team.sharing.messages.message_registry import Message, decode
+from gmmtorch.team.sharing.messages.mission_messages import (
+    PlanMessage,
+    PointsMessage,
+    ViewsMessage,
     encode_plan,
     encode_points,
     encode_views,
 )
-from gmmtorch.team.sharing.messages.record_messages import encode_announcements, encode_record
+from gmmtorch.team.sharing.messages.record_messages import (
+    AnnouncementMessage,
+    CalibrationMessage,
+    CorrectionMessage,
+    CountersMessage,
+    FrameMessage,
+    SupersessionMessage,
+    encode_announcements,
+    encode_record,
+)
 from gmmtorch.team.sharing.replica.replica import Replica
 
 

@@ -14,15 +14,13 @@ from invalid_values import each_value
 from sharing.message_examples import examples, numbers, places, sealed, views
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.team.sharing.messages.datagrams import FARTHEST, VERSION, Kind
-from gmmtorch.team.sharing.messages.message_registry import (
-    MAX_BYTES,
+from gmmtorch.team.sharing.messages.component_messages import encode_counts
+from gmmtorch.team.sharing.messages.datagrams import FARTHEST, MAX_BYTES, VERSION, Kind
+from gmmtorch.team.sharing.messages.message_registry import decode, kind_of
+from gmmtorch.team.sharing.messages.mission_messages import (
     PlanMessage,
-    decode,
-    encode_counts,
     encode_plan,
     encode_views,
-    kind_of,
     quantized_poses,
 )
 from gmmtorch.team.sharing.replica.record_keys import Intervals

@@ -17,18 +17,16 @@ from sharing.message_examples import codecs, frame_of_components, numbers, place
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.codec.quantization import COUNT_ERROR, MOST_POINTS, quantize, quantized
 from gmmtorch.mapping.components import Components
-from gmmtorch.team.sharing.messages.component_messages import MOST_COMPONENTS_SENT, fitted
-from gmmtorch.team.sharing.messages.datagrams import FARTHEST
-from gmmtorch.team.sharing.messages.message_registry import (
-    MAX_BYTES,
+from gmmtorch.team.sharing.messages.component_messages import (
+    MOST_COMPONENTS_SENT,
     CountsMessage,
-    PointsMessage,
-    decode,
     encode_components,
     encode_counts,
-    encode_points,
+    fitted,
 )
-from gmmtorch.team.sharing.messages.mission_messages import POINTS_PER_DATAGRAM
+from gmmtorch.team.sharing.messages.datagrams import FARTHEST, MAX_BYTES
+from gmmtorch.team.sharing.messages.message_registry import decode
+from gmmtorch.team.sharing.messages.mission_messages import POINTS_PER_DATAGRAM, PointsMessage, encode_points
 
 # -- components ------------------------------------------------------------------------------------
 

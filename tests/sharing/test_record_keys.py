@@ -15,8 +15,8 @@ from sharing.schedules import act
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.occupancy.calibrator import Calibrator
-from gmmtorch.team.sharing.messages.component_messages import counts_of
-from gmmtorch.team.sharing.messages.message_registry import ComponentsMessage, decode, encode_components
+from gmmtorch.team.sharing.messages.component_messages import ComponentsMessage, counts_of, encode_components
+from gmmtorch.team.sharing.messages.message_registry import decode
 from gmmtorch.team.sharing.messages.record_messages import RECORD_KINDS, CountersMessage, keys_in
 from gmmtorch.team.sharing.replica.materialized_view import Counters
 from gmmtorch.team.sharing.replica.record_keys import (

@@ -13,12 +13,9 @@ from sharing.replica_histories import everything, exchange, history, replica_of
 
 import gmmtorch as gt
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.team.sharing.messages.message_registry import (
-    MAX_BYTES,
-    decode,
-    encode_components,
-    encode_counts,
-)
+from gmmtorch.team.sharing.messages.component_messages import encode_components, encode_counts
+from gmmtorch.team.sharing.messages.datagrams import MAX_BYTES
+from gmmtorch.team.sharing.messages.message_registry import decode
 from gmmtorch.team.sharing.replica.records import MOST_VIEWPOINTS
 from gmmtorch.team.sharing.replica.replica import Replica
 

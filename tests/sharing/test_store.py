@@ -15,7 +15,7 @@ from sharing.schedules import act, components, run_schedule
 from sharing.store_cases import altered, filled, killed, recorded, reopened, rows, state
 
 from gmmtorch.team.sharing import store as store_module
-from gmmtorch.team.sharing.messages.message_registry import encode_components
+from gmmtorch.team.sharing.messages.component_messages import encode_components
 from gmmtorch.team.sharing.replica.replica import Replica
 from gmmtorch.team.sharing.store import Store
 

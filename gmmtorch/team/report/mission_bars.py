@@ -71,11 +71,9 @@ def summary_bars(rows: Rows) -> Figure:
     geometric mean of the ratio, and a line at one. "none" if a seed has no value. With more than three
     frameworks, only the first is compared with the others.
 
-    Args:
-        rows: explore rows of `results.json`.
+    rows: explore rows of `results.json`.
 
-    Raises:
-        InvalidArgumentError: no row.
+    Raises `InvalidArgumentError`: no row.
     """
     groups = by_framework(rows)
     pairs = list(itertools.combinations(groups, 2))
@@ -109,8 +107,7 @@ def deviations_figure(rows: Rows) -> Figure:
     An interval that does not contain the line of no difference has the variant's colour, others are grey. A
     variant without a value for some seed has none.
 
-    Raises:
-        InvalidArgumentError: no row, or only one variant.
+    Raises `InvalidArgumentError`: no row, or only one variant.
     """
     (usual, first), *others = by_variant(rows, otherwise="framework").items()
     if not others:
@@ -156,11 +153,9 @@ def profile_figure(rows: Rows) -> Figure:
 
     The end of a bar gives the ratio of simulated to computing time.
 
-    Args:
-        rows: explore rows with `stage_seconds`.
+    rows: explore rows with `stage_seconds`.
 
-    Raises:
-        InvalidArgumentError: no row.
+    Raises `InvalidArgumentError`: no row.
     """
     costs = {framework: _milliseconds(trials) for framework, trials in by_framework(rows).items()}
     names = list(dict.fromkeys(stage for cost in costs.values() for stage in cost))

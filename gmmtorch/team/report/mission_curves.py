@@ -75,11 +75,9 @@ def entropy_figure(rows: Rows) -> Figure:
     t90 if every seed has one; dotted lines show the levels at which they are taken. A framework with one
     trial has no band, but thin lines for the maps of its robots, unless all are within 2 % of the team's.
 
-    Args:
-        rows: explore rows of `results.json`.
+    rows: explore rows of `results.json`.
 
-    Raises:
-        InvalidArgumentError: no row, or one without observable entropy.
+    Raises `InvalidArgumentError`: no row, or one without observable entropy.
     """
     groups = by_framework(rows)
     whose = "E1's final reduction" if "grid_shared" in groups else "the final reduction"
@@ -103,8 +101,7 @@ def planner_comparison_figure(rows: Rows) -> Figure:
     bands. t50 and t90 are times to 50 and 90 % of the largest mean reduction of any variant, so all variants
     are measured alike; marks show their means if every seed has one.
 
-    Raises:
-        InvalidArgumentError: no row, or one without observable entropy.
+    Raises `InvalidArgumentError`: no row, or one without observable entropy.
     """
     check_rows(rows)
     variants = by_variant(rows)
@@ -124,12 +121,10 @@ def bandwidth_figure(rows: Rows, draco_error: float = 0.03) -> Figure:
     Lines are what E0, E1 and the thesis's E0 sent, and the novel points of the frames that E0 learned from in
     other codecs: means over seeds in 95 % bands. Labels give the mean total, and its ratio to that of E0.
 
-    Args:
-        rows: explore rows; E2 sends nothing and has no line. Series that are null are left out.
-        draco_error: RMS error (m) of Draco's points: `map.noise` of the missions.
+    rows: explore rows; E2 sends nothing and has no line. Series that are null are left out. draco_error: RMS
+    error (m) of Draco's points: `map.noise` of the missions.
 
-    Raises:
-        InvalidArgumentError: nothing was sent in any row.
+    Raises `InvalidArgumentError`: nothing was sent in any row.
     """
     groups = by_framework(rows)
     found = {}
@@ -164,11 +159,8 @@ def bandwidth_figure(rows: Rows, draco_error: float = 0.03) -> Figure:
 
 
 def _entropy_axes(reference: float | None, whose: str) -> tuple[Figure, Axes, list[Line2D]]:
-    """Returns a figure with the levels of the milestones, and its legend entries.
-
-    `reference` is the reduction, as a share of the observable entropy, that milestones are shares of; `whose`
-    is its name.
-    """
+    """Returns a figure with the levels of the milestones, and its legend entries. `reference` is the
+    reduction, as a share of the observable entropy, that milestones are shares of; `whose` is its name."""
     figure = new_figure(*_SIZE)
     axes = figure.subplots()
     label_axes(axes, "", TIME, REMAINING)
@@ -276,11 +268,9 @@ def loss_figure(rows: Rows) -> Figure:
     give the share of cells that two robots classify differently at the end, and the time after a partition
     until all records are complete.
 
-    Args:
-        rows: explore rows of `results.json`, with the fields that `with_network_costs` adds.
+    rows: explore rows of `results.json`, with the fields that `with_network_costs` adds.
 
-    Raises:
-        InvalidArgumentError: no row, or one without the series drawn or without observable entropy.
+    Raises `InvalidArgumentError`: no row, or one without the series drawn or without observable entropy.
     """
     _check(rows)
     variants = by_variant(rows, otherwise="loss")
@@ -425,11 +415,9 @@ def team_run_figure(rows: Rows) -> Figure:
     The left panel shows the remaining observable entropy of robots in a simulated world, and the number of
     records of other robots. Names on the right have the colours of the lines.
 
-    Args:
-        rows: rows of robots in `results.json`.
+    rows: rows of robots in `results.json`.
 
-    Raises:
-        InvalidArgumentError: no row.
+    Raises `InvalidArgumentError`: no row.
     """
     check_rows(rows)
     figure = new_figure(11.6, max(4.2, 2.4 + 0.3 * len(rows)))

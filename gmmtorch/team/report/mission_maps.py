@@ -80,15 +80,11 @@ def trajectories_figure(
 ) -> Figure:
     """Draws the paths of the robots over the world from above, and how many robots saw each place (Fig 1.1).
 
-    Args:
-        world: occupancy; cells above ½ are drawn dark.
-        trajectories: poses (T, ≥ 2) of each robot, world metres; parts outside the heights of the world image
-            have a white core.
-        coverage: (nx, ny), number of robots that saw each cell of the world image; shaded, with the shares of
-            the seen cells in the legend.
+    world: occupancy; cells above ½ are drawn dark. trajectories: poses (T, ≥ 2) of each robot, world metres;
+    parts outside the heights of the world image have a white core. coverage: (nx, ny), number of robots that
+    saw each cell of the world image; shaded, with the shares of the seen cells in the legend.
 
-    Raises:
-        InvalidArgumentError: coverage has another shape than the image.
+    Raises `InvalidArgumentError`: coverage has another shape than the image.
     """
     occupied = world.image.double() > 0.5
     colours = np.tile(np.array(to_rgb(_FREE)), (*occupied.shape, 1))
@@ -120,12 +116,10 @@ def team_map_figure(snapshots: Sequence[TeamSnapshot], belief: BeliefRule | None
     Components within the heights shown have 2σ outlines in the colour of the robot that learned them, at most
     20,000 of them. Parts of paths outside these heights have a white core.
 
-    Args:
-        snapshots: one or more, one per panel.
-        belief: thresholds of free and occupied; the defaults of `BeliefRule` if None.
+    snapshots: one or more, one per panel. belief: thresholds of free and occupied; the defaults of
+    `BeliefRule` if None.
 
-    Raises:
-        InvalidArgumentError: no snapshot, or components whose shapes disagree.
+    Raises `InvalidArgumentError`: no snapshot, or components whose shapes disagree.
     """
     if not snapshots:
         raise InvalidArgumentError("snapshots is empty; give the map at one time at least.")
@@ -252,18 +246,12 @@ def record_rerun(
     One timeline of simulated seconds shows moving robots, occupied cells, 2σ ellipsoids coloured by height,
     and curves of entropy and bytes.
 
-    Args:
-        path: file name that ends in .rrd.
-        trajectories: poses (T, ≥ 3) of each robot, world metres.
-        period: seconds between poses.
-        maps: maps at several times, in any order.
-        resolution: side (m) of the maps' cells.
-        row: explore row of `results.json` with the curves.
+    path: file name that ends in .rrd. trajectories: poses (T, ≥ 3) of each robot, world metres. period:
+    seconds between poses. maps: maps at several times, in any order. resolution: side (m) of the maps' cells.
+    row: explore row of `results.json` with the curves.
 
-    Raises:
-        GmmTorchError: rerun is not installed, or older than 0.23.
-        InvalidArgumentError: another suffix, a period that is not positive, or shapes that disagree.
-        OutputError: the file cannot be written.
+    Raises `GmmTorchError`: rerun is not installed, or older than 0.23; `InvalidArgumentError`: another
+    suffix, a period that is not positive, or shapes that disagree; `OutputError`: the file cannot be written.
     """
     path = Path(path)
     if path.suffix.lower() != ".rrd":

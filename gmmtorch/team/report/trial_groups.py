@@ -60,10 +60,8 @@ def framework_colour(framework: str) -> str:
 
 
 def by_framework(rows: Rows) -> dict[str, list[Mapping[str, Any]]]:
-    """Groups rows by framework: E0, E1, E2, E0 of the thesis, then others in order of occurrence.
-
-    Raises `InvalidArgumentError` if there is no row.
-    """
+    """Groups rows by framework: E0, E1, E2, E0 of the thesis, then others in order of occurrence. Raises
+    `InvalidArgumentError` if there is no row."""
     check_rows(rows)
     found = list(dict.fromkeys(str(row["framework"]) for row in rows))
     order = [name for name in FRAMEWORKS if name in found]
@@ -200,11 +198,9 @@ def milestone_text(rows: Rows, field: str) -> str:
 def paired_difference(
     first: Mapping[Any, float | None], second: Mapping[Any, float | None], by_ratio: bool = False
 ) -> Interval | None:
-    """Returns the mean of first − second over common seeds, with its paired 95 % interval.
-
-    Arguments are values by seed. Returns None if no seed is common, or if a common one has no value. With
-    `by_ratio`, returns the geometric mean of first / second and its interval.
-    """
+    """Returns the mean of first − second over common seeds, with its paired 95 % interval. Arguments are
+    values by seed. Returns None if no seed is common, or if a common one has no value. With `by_ratio`,
+    returns the geometric mean of first / second and its interval."""
     pairs = [(first[seed], second[seed]) for seed in first if seed in second]
     complete = np.array([(a, b) for a, b in pairs if a is not None and b is not None]).reshape(-1, 2)
     if not pairs or len(complete) < len(pairs):
@@ -371,9 +367,7 @@ def write_exploration_board(board: Board, rows: Rows) -> None:
     and as a share of the observable), the entropies of its robots, cumulative bytes and the share of missing
     records over simulated seconds, and every number of the row at the end.
 
-    Args:
-        board: the run; the caller closes it.
-        rows: explore rows of `results.json`.
+    board: the run; the caller closes it. rows: explore rows of `results.json`.
     """
     fields = differing(rows, without=["framework"])
     for row in rows:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import itertools
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
@@ -12,15 +13,14 @@ from torch import Tensor
 
 from gmmtorch.errors import check_whole
 from gmmtorch.mapping import Components, spatial_order, summed
-from gmmtorch.team.sharing.messages.datagrams import check_codec, within
-from gmmtorch.team.sharing.messages.message_registry import (
+from gmmtorch.team.sharing.messages.component_messages import (
     ComponentsMessage,
     CountsMessage,
-    Message,
-    decode,
     encode_components,
     encode_counts,
 )
+from gmmtorch.team.sharing.messages.datagrams import check_codec
+from gmmtorch.team.sharing.messages.message_registry import Message, decode
 from gmmtorch.team.sharing.replica.materialized_view import Changes
 from gmmtorch.team.sharing.replica.record_keys import Intervals
 
@@ -39,7 +39,8 @@ class SendOnce:
 
     def datagrams(self, *, budget: int | None = None) -> list[bytes]:
         """The datagrams that are due, at most `budget` bytes together; the rest stays due."""
-        n = within(self._due, budget)
+        sizes = itertools.accumulate(map(len, self._due))
+        n = len(self._due) if budget is None else sum(size <= budget for size in sizes)
         sent, self._due = self._due[:n], self._due[n:]
         return sent
 
@@ -55,11 +56,9 @@ class SendOnce:
 class Broadcast(SendOnce):
     """The counterpart of `Replica` without repair of losses: for networks without losses, and to compare.
 
-    The sender holds the decoded values of its datagrams. Repeated components count once. Repeated counts are
-    added again, because nothing distinguishes them; counts of unknown components are ignored.
-
-    A robot numbers its components from 0 in each session. So teammates ignore a restarted robot until it has
-    sent more components than before.
+    The sender holds the decoded values of its datagrams. Repeated components count once; repeated counts are
+    added again, because nothing distinguishes them; counts of unknown components are ignored. A robot numbers
+    its components from 0 in each session, so teammates ignore a restarted one until it has sent more.
 
     Attributes:
         refused: number of messages that were refused: "other" (neither components nor counts), "unfit"
@@ -105,19 +104,15 @@ class Broadcast(SendOnce):
         message: the result of `decode(datagram)`, if the caller has it. Raises `DataError` for damaged data.
         """
         message = decode(datagram) if message is None else message
-        if self._is_full(message):
-            self.refused["full"] += 1
-            return False
-        return self._merge(message)
-
-    def _is_full(self, message: Message) -> bool:
-        """Whether there is no room for a message."""
         if isinstance(message, ComponentsMessage):
             n = len(message.components)
         else:
             n = len(message.counts) if isinstance(message, CountsMessage) else 0
         n_batches = len(self._batches) + len(self._gained)
-        return n > 0 and (self._n_rows + n > MOST_ROWS or n_batches >= MOST_BATCHES)
+        if n and (self._n_rows + n > MOST_ROWS or n_batches >= MOST_BATCHES):
+            self.refused["full"] += 1
+            return False
+        return self._merge(message)
 
     def _merge(self, message: Message) -> bool:
         if isinstance(message, ComponentsMessage) and not _is_fit(message.components):

@@ -225,11 +225,9 @@ class RawPoints:
 
 @dataclass(frozen=True)
 class QuantizedPoints:
-    """Rounds each point to the centre of its cell of side `resolution` (m).
-
-    Sorts the cells along a Morton curve, writes the differences as 1 to 9 groups of 7 bits, grouped by their
-    significance, and compresses them with zstd.
-    """
+    """Rounds each point to the centre of its cell of side `resolution` (m). Sorts the cells along a Morton
+    curve, writes the differences as 1 to 9 groups of 7 bits, grouped by their significance, and compresses
+    them with zstd."""
 
     resolution: float
     name: ClassVar[str] = "quantized"
@@ -253,11 +251,9 @@ class QuantizedPoints:
 
 @dataclass(frozen=True)
 class Octree:
-    """The occupied cells of side `resolution` (m) as an octree; each cell is stored once.
-
-    Writes a byte for each inner node, level by level from the root, where bit i stands for child
-    i = 4x + 2y + z, and compresses the bytes with zstd. Decodes to the centres of the cells.
-    """
+    """The occupied cells of side `resolution` (m) as an octree; each cell is stored once. Writes a byte for
+    each inner node, level by level from the root, where bit i stands for child i = 4x + 2y + z, and
+    compresses the bytes with zstd. Decodes to the centres of the cells."""
 
     resolution: float
     name: ClassVar[str] = "octree"
@@ -295,11 +291,9 @@ class Octree:
 
 @dataclass(frozen=True)
 class Draco:
-    """Draco's k-d tree of points on a lattice whose error is at most `error` (m, RMS).
-
-    The lattice step is about 2 · error, which is exact for uniformly distributed points. By default Draco
-    divides the extent by a power of two, and its lattice would be up to twice as fine as necessary.
-    """
+    """Draco's k-d tree of points on a lattice whose error is at most `error` (m, RMS). The lattice step is
+    about 2 · error, which is exact for uniformly distributed points. By default Draco divides the extent by a
+    power of two, and its lattice would be up to twice as fine as necessary."""
 
     error: float
     name: ClassVar[str] = "draco"
@@ -412,11 +406,9 @@ def bytes_of_points(
 ) -> dict[str, int]:
     """Bytes of a frame's points (N, 3) in each codec, by name; 0 bytes without points.
 
-    Args:
-        resolution: cell size (m) of octree and lattice; the RMS error of a point is half of it.
-        target_error: RMS error (m) of Draco's points.
-        depths: (H, W) image of the same points, metres, 0 elsewhere; None leaves the depth image out.
-        names: names from `POINT_CODECS`.
+    resolution: cell size (m) of octree and lattice; the RMS error of a point is half of it. target_error: RMS
+    error (m) of Draco's points. depths: (H, W) image of the same points, metres, 0 elsewhere; None leaves the
+    depth image out. names: names from `POINT_CODECS`.
     """
     sizes = {}
     for name in names:
@@ -428,11 +420,9 @@ def bytes_of_points(
 
 
 def _draco_step(rows: NDArray[np.float64], error: float) -> tuple[float, int]:
-    """Step (m) of a lattice whose RMS error for rows (N, 3) ≥ 0 is at most `error`, and bits per axis.
-
-    The RMS error of uniformly distributed points is step / 2. For other points it may be larger; then the
-    step is reduced.
-    """
+    """Step (m) of a lattice whose RMS error for rows (N, 3) ≥ 0 is at most `error`, and bits per axis. The
+    RMS error of uniformly distributed points is step / 2. For other points it may be larger; then the step is
+    reduced."""
     step = 2 * error
     while True:
         bits = max(1, math.ceil(math.log2(float(rows.max()) / step + 2)))

@@ -4,27 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.team.sharing.messages.message_registry import Message, decode, kind_of
 from gmmtorch.team.sharing.transport.simulated_network import Transport
 
-_BURST = 1.0
-"""Seconds of the rate that may be sent in one burst."""
-_LEAST_BURST = 1200.0
-"""Bytes: one datagram."""
+if TYPE_CHECKING:
+    from gmmtorch.team.sharing.store import Store
+
+_BURST, _LEAST_BURST = 1.0, 1200.0
+"""Seconds of the rate that may be sent in one burst; and bytes, at least: one datagram."""
 
 
 class TokenBucket:
-    """In any t seconds at most `rate` · t bytes are taken, and one burst: a second of the rate, or a
-    datagram.
-
-    The times may come from any clock. If it is set back, that step adds nothing.
-
-    Args:
-        rate: bytes per second.
-    """
+    """In any t seconds at most `rate` (bytes per second) · t bytes are taken, and one burst: a second of the
+    rate, or a datagram. The times may come from any clock; if it is set back, that step adds nothing."""
 
     def __init__(self, rate: float) -> None:
         if not 0 < rate < math.inf:
@@ -58,28 +53,10 @@ class ReceivedMessage(NamedTuple):
     message: Message
 
 
-class RecordStore(Protocol):
-    """Keeps the records of a map on disk.
-
-    n_failed: batches of records that could not be kept.
-    """
-
-    @property
-    def n_failed(self) -> int: ...
-
-    def keep(self, datagrams: Sequence[bytes]) -> object:
-        """Stores the records of datagrams that the robot is about to send, or has merged."""
-
-
 class AnnouncementSchedule:
-    """When a robot announces which records it holds: every period while they change or some are missing.
-
-    A lost announcement must be repeated, but a team at rest would send little else. So the pause doubles
-    after each announcement without news, up to 16 periods.
-
-    Args:
-        period: seconds.
-    """
+    """When a robot announces which records it holds: every `period` (s) while they change or some are
+    missing. A lost announcement must be repeated, but a team at rest would send little else. So the pause
+    doubles after each announcement without news, up to 16 periods."""
 
     def __init__(self, period: float) -> None:
         if not 0 < period < math.inf:
@@ -93,8 +70,7 @@ class AnnouncementSchedule:
 
         The first call starts the first period, and so does a clock that was set back.
 
-        Args:
-            content: changes whenever what is announced changes. urgent: whether records are missing.
+        content: changes whenever what is announced changes. urgent: whether records are missing.
         """
         if self._last is None or now < self._last:
             self._last, self._announced, self._pause = now, content, self._period
@@ -132,7 +108,7 @@ class Radio:
         decode: Callable[[bytes], Message] = decode,
     ) -> None:
         self.robot, self.transport = robot, transport
-        self.store: RecordStore | None = None
+        self.store: Store | None = None
         self.announcements = AnnouncementSchedule(announce_every)
         self.n_received = self.n_damaged = 0
         self._budget = None if budget is None else TokenBucket(budget)

@@ -6,7 +6,6 @@ import logging
 import math
 import time
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,9 +14,10 @@ from gmmtorch.errors import check_number, check_whole
 from gmmtorch.localization import Tracker, register
 from gmmtorch.mapping import Components, GaussianMap, MotionAt, WindowMotions
 from gmmtorch.scan import Scan
-from gmmtorch.team.sharing.radio import Radio, RecordStore
+from gmmtorch.team.sharing.radio import Radio
 from gmmtorch.team.sharing.replica.authorship import MovedMap
 from gmmtorch.team.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.store import Store
 from gmmtorch.team.sharing.transport.simulated_network import Transport
 
 _AGREE = 0.3, math.radians(3)  # metres and radians at the newer scan: two estimates of a frame agree
@@ -27,18 +27,10 @@ _COARSEST = 0.25  # metres: the registration of both maps begins near the estima
 _FEWEST = 20  # components of surfaces in which a scan is searched for
 
 
-class _Place(NamedTuple):
-    """Where a scan was taken (D,), in the robot's frame, and its points (N, D) about it."""
-
-    origin: Tensor
-    points: Tensor
-
-
-class _Estimate(NamedTuple):
-    """transform: (D+1, D+1), frame ← the robot's frame. place: of the scan that was located."""
-
-    transform: Tensor
-    place: _Place
+_Place = tuple[Tensor, Tensor]
+"""Where a scan was taken (D,), in the robot's frame, and its points (N, D) about it."""
+_Estimate = tuple[Tensor, Tensor]
+"""Transform (D+1, D+1), frame ← the robot's frame; and where the scan that was located was taken (D,)."""
 
 
 class FrameJoiner:
@@ -46,9 +38,9 @@ class FrameJoiner:
 
     A scan of the robot is located in the teammates' map (`localization.Tracker`, without a first pose),
     which gives the transform between the frames. Two located scans in succession, taken at different
-    places, must give the same transform: within 0.3 m and 3° at the newer one. The registration of the
-    robot's map with theirs then makes it more accurate, if it is reliable and agrees. It is repeated each
-    time the maps have grown by a fifth, because the frames are known better where the maps overlap more.
+    places, must give the same transform: within 0.3 m and 3° at the newer one. Registration of the robot's
+    map with theirs then makes it more accurate, if it is reliable and agrees; it is repeated each time the
+    maps have grown by a fifth.
 
         joiner = FrameJoiner(replica)                # replica = Replica(robot, own_frame=True)
         joiner.add(scan)                             # each scan that the robot maps, in its own frame
@@ -80,13 +72,12 @@ class FrameJoiner:
     def add(self, scan: Scan) -> None:
         """Remember a scan of the robot, in the frame in which it adds components."""
         origin = scan.origin.detach().cpu().double()
-        if self._places and float((self._places[-1].origin - origin).norm()) < self._spacing:
+        if self._places and float((self._places[-1][0] - origin).norm()) < self._spacing:
             return
         points = scan.points.detach().cpu().double()
         chosen = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:_POINTS]
-        place = _Place(origin, points[chosen] - origin)
-        self._places.append(place)
-        self._waiting.append(place)
+        self._places.append((origin, points[chosen] - origin))
+        self._waiting.append(self._places[-1])
         if len(self._places) > self._most:
             self._places, self._spacing = self._places[::2], 2 * self._spacing
             self._waiting = self._waiting[::2]
@@ -100,30 +91,28 @@ class FrameJoiner:
         self._last = None
 
     def search(self) -> bool:
-        """Search for one scan, the newest that was not searched for, in the first of `other_frames`.
-
-        If there is none, the frame that was joined is estimated again when the maps have grown.
-
-        Returns whether a frame was joined or moved. The time is that of a `Tracker` without a first pose, or
-        of one registration.
-        """
+        """Search for one scan, the newest that was not searched for, in the first of `other_frames`. If there
+        is none, estimate the joined frame again when the maps have grown. Returns whether a frame was joined
+        or moved. The time is that of a `Tracker` without a first pose, or of one registration."""
         frames = self._replica.other_frames
         if not frames:
             return self._estimate_again()
         self._choose(frames[0])
         if not self._waiting:
             return False
-        place = self._waiting.pop()
+        origin, points = self._waiting.pop()
         tracker = self._tracker_of(frames[0])
-        if tracker is None or tracker.dim != len(place.origin):
+        if tracker is None or tracker.dim != len(origin):
             return False
         tracker.restart()
-        location = tracker.locate(place.points)
+        location = tracker.locate(points)
         self.n_searches += 1
         if not location.found:
             return False
         self.n_located += 1
-        return self._agreed(frames[0], _Estimate(_shifted(location.pose, -place.origin), place))
+        frame = location.pose.clone()  # of the robot, instead of the scan's
+        frame[:-1, -1] -= frame[:-1, :-1] @ origin.to(frame)
+        return self._agreed(frames[0], (frame, origin))
 
     def _choose(self, frame: int) -> None:
         """Go on with this frame; all scans wait again if it is another one or has grown."""
@@ -145,9 +134,7 @@ class FrameJoiner:
     def _agreed(self, frame: int, now: _Estimate) -> bool:
         """Join if the estimate agrees with the last one."""
         last, self._last = self._last, now
-        if last is None or not _agree(last.transform, now):
-            return False
-        if float((last.place.origin - now.place.origin).norm()) < self._spacing:
+        if last is None or not _agree(last[0], now) or float((last[1] - now[1]).norm()) < self._spacing:
             return False
         own, _ = self._split()
         self._replica.join(frame, _refined(own, self._replica.components(frame), now))
@@ -161,7 +148,7 @@ class FrameJoiner:
             return False
         self._n_components = n
         own, theirs = self._split()
-        found = _refined(own, theirs, _Estimate(transform, self._places[-1]))
+        found = _refined(own, theirs, (transform, self._places[-1][0]))
         if torch.equal(found, transform):
             return False
         self._replica.join(self._replica.placement.root, found)
@@ -180,32 +167,25 @@ class FrameJoiner:
 def _refined(own: Components, theirs: Components, estimate: _Estimate) -> Tensor:
     """The transform that lays a map over another one, if it is reliable and agrees; else the estimate's."""
     if bool(own.max_range.all()) or bool(theirs.max_range.all()):
-        return estimate.transform
-    found = register(own, theirs, estimate.transform, coarsest=_COARSEST)
-    return found.transform if found.reliable and _agree(found.transform, estimate) else estimate.transform
+        return estimate[0]
+    found = register(own, theirs, estimate[0], coarsest=_COARSEST)
+    return found.transform if found.reliable and _agree(found.transform, estimate) else estimate[0]
 
 
 def _moved(places: Sequence[_Place], motion_at: Callable[[Tensor], Tensor]) -> list[_Place]:
     if not places:
         return []
-    motions = motion_at(torch.stack([place.origin for place in places]))
+    motions = motion_at(torch.stack([origin for origin, _ in places]))
     return [
-        _Place(motion[:-1, :-1] @ place.origin + motion[:-1, -1], place.points @ motion[:-1, :-1].T)
-        for place, motion in zip(places, motions, strict=True)
+        (motion[:-1, :-1] @ origin + motion[:-1, -1], points @ motion[:-1, :-1].T)
+        for (origin, points), motion in zip(places, motions, strict=True)
     ]
-
-
-def _shifted(pose: Tensor, shift: Tensor) -> Tensor:
-    """The pose (D+1, D+1) after a shift (D,) of its own frame."""
-    moved = pose.clone()
-    moved[:-1, -1] += pose[:-1, :-1] @ shift.to(pose)
-    return moved
 
 
 def _agree(transform: Tensor, estimate: _Estimate) -> bool:
     """Whether a transform puts the estimate's scan where the estimate does."""
-    apart = transform - estimate.transform
-    shift = apart[:-1, :-1] @ estimate.place.origin + apart[:-1, -1]
+    apart = transform - estimate[0]
+    shift = apart[:-1, :-1] @ estimate[1] + apart[:-1, -1]
     turn = torch.linalg.matrix_norm(apart[:-1, :-1]) / math.sqrt(2)
     return bool(shift.norm() < _AGREE[0]) and bool(turn < _AGREE[1])
 
@@ -237,7 +217,7 @@ class SharedMap:
         replica: Replica,
         transport: Transport,
         *,
-        store: RecordStore | None = None,
+        store: Store | None = None,
         announce_every: float = 1.0,
         budget: float | None = None,
         joiner: FrameJoiner | None = None,
@@ -250,7 +230,6 @@ class SharedMap:
 
     @property
     def robot(self) -> int:
-        """Number of the robot."""
         return self.replica.robot
 
     def add(self, scan: Scan) -> None:
@@ -259,10 +238,8 @@ class SharedMap:
             self._joiner.add(scan)
 
     def publish(self, own: GaussianMap, windows: WindowMotions) -> None:
-        """Makes the robot's records those of its map, which has no unfinished window.
-
-        What was published before its window moved gets a correction, one record for each window.
-        """
+        """Makes the robot's records those of its map, which has no unfinished window. What was published
+        before its window moved gets a correction, one record for each window."""
         moved = None
         if windows.moved or self.replica.is_corrected:
             moved = MovedMap(*windows.as_inserted(own), windows.motions)

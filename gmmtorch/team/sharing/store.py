@@ -154,10 +154,8 @@ def _check_size(place: Path, max_bytes: int) -> None:
 
 
 def _open_tables(db: sqlite3.Connection, path: Path, max_bytes: int) -> None:
-    """Lock the file for this process, check its tables, or create them in an empty file.
-
-    Anything else in the file, such as a trigger, is refused.
-    """
+    """Lock the file for this process, check its tables, or create them in an empty file. Anything else in the
+    file, such as a trigger, is refused."""
     db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max_bytes)
     _set(db, "locking_mode = EXCLUSIVE")  # before anything is read: then WAL needs no shared memory
     _set(db, "trusted_schema = OFF", "cell_size_check = ON", "mmap_size = 0")
@@ -283,12 +281,9 @@ class Store:
     ) -> None:
         """Open or create the store of a robot.
 
-        Args:
-            path: the file. SQLite writes `<path>-wal` next to it.
-            robot: number of the robot.
-            facts: plain values by name that identify the world or log. They are written to a new file; an
-                existing file must have equal ones.
-            max_bytes: largest size of the file.
+        path: the file. SQLite writes `<path>-wal` next to it. robot: number of the robot. facts: plain values
+        by name that identify the world or log. They are written to a new file; an existing file must have
+        equal ones. max_bytes: largest size of the file.
 
         Raises `InvalidArgumentError` if another process has the file open, or if it belongs to another
         robot, world or log; `DataError` if it is damaged, is no store, or is of a later version.
@@ -309,9 +304,7 @@ class Store:
 
     def begin_session(self, session: bytes) -> frozenset[bytes]:
         """The robot's earlier sessions. Keeps `session` (8 bytes) with them: call it before anything is sent.
-
-        See `FramedTransport.disown`.
-        """
+        See `FramedTransport.disown`."""
         former = {row for (row,) in self._rows("SELECT id FROM session")} - {session}
 
         def add() -> None:
@@ -326,11 +319,9 @@ class Store:
     # -- records ------------------------------------------------------------------------------------
 
     def restore(self, replica: Replica) -> Restored:
-        """Load the stored records into a new replica; from now on the store keeps this replica.
-
-        Damaged rows are skipped and logged: teammates have what was sent. Raises `InvalidArgumentError` if
-        the replica has records, or an incarnation that was used before.
-        """
+        """Load the stored records into a new replica; from now on the store keeps this replica. Damaged rows
+        are skipped and logged: teammates have what was sent. Raises `InvalidArgumentError` if the replica has
+        records, or an incarnation that was used before."""
         before = replica.held  # one record, if the replica has a frame of its own
         if before.size > (replica.placement.root != WORLD):
             raise InvalidArgumentError("replica has records already; restore its store first.")
@@ -356,10 +347,8 @@ class Store:
 
     def keep(self, datagrams: Sequence[bytes]) -> bool:
         """Commit the records in datagrams that the replica sends or has merged; returns whether all are on
-        the disk.
-
-        Datagrams without records are ignored. Records that the file has already are not written again.
-        """
+        the disk. Datagrams without records are ignored. Records that the file has already are not written
+        again."""
         rows, kept = [], self._kept
         for datagram in datagrams:
             check_datagram(datagram, least=1)
@@ -407,10 +396,8 @@ class Store:
     # -- progress in a log --------------------------------------------------------------------------
 
     def save_progress(self, n_scans: int, state: dict[str, Any]) -> bool:
-        """Keep the state of the robot's own map after so many scans; returns whether it is on the disk.
-
-        The newest two states are kept, in case one is damaged later.
-        """
+        """Keep the state of the robot's own map after so many scans; returns whether it is on the disk. The
+        newest two states are kept, in case one is damaged later."""
         tree, tensors = split_tensors(state)
         data = pack_tensors(tensors, "progress", 1, tree=tree)
 
@@ -429,10 +416,8 @@ class Store:
         return is_saved
 
     def progress(self) -> tuple[int, dict[str, Any]] | None:
-        """Scans and state of the newest progress that is not damaged; None if there is none.
-
-        Raises `DataError` for a state of a later version.
-        """
+        """Scans and state of the newest progress that is not damaged; None if there is none. Raises
+        `DataError` for a state of a later version."""
         for n_scans, digest, data in self._rows("SELECT * FROM progress ORDER BY scans DESC"):
             if digest != _digest(data):
                 _log.warning(

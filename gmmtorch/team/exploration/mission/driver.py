@@ -146,9 +146,8 @@ def drive(
     A tick that takes longer than `tick_seconds` delays all later ticks by the excess; none is skipped or
     shortened.
 
-    Args:
-        stop: checked before each tick, and at least every 20 ms of a `WallClock`.
-        on_step: called after every tick and every exchange.
+    stop: checked before each tick, and at least every 20 ms of a `WallClock`. on_step: called after every
+    tick and every exchange.
     """
     begin, ticks, late = 0.0, 0, 0
 
@@ -178,9 +177,7 @@ def settle(
     on_step: Callable[[], object] = lambda: None,
 ) -> None:
     """Exchanges messages until `mission.content` has not changed for `quiet` seconds, or `stop` returns True.
-
-    Raises `InvalidArgumentError` if `quiet` is negative or infinite.
-    """
+    Raises `InvalidArgumentError` if `quiet` is negative or infinite."""
     check_number("settle", quiet)
 
     def idle() -> None:

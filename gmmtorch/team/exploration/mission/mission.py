@@ -216,9 +216,7 @@ class Mission:
 
     def converge(self, limit: float) -> float | None:
         """Lets robots of a simulated team exchange messages without moving until all have the same digest.
-
-        Returns the simulated seconds that it takes, or None if it takes more than `limit` seconds.
-        """
+        Returns the simulated seconds that it takes, or None if it takes more than `limit` seconds."""
         with torch.inference_mode():
             for tick in range(math.floor(limit * self.options.rate) + 1):
                 if len({agent.digest() for agent in self.agents}) == 1:
@@ -285,8 +283,7 @@ def plan_together(
     A robot sends its final plan before the robots that plan after it listen; they wait for it as long as the
     network takes.
 
-    Args:
-        agents: sorted by robot id. number: of the planning round. generator: for the coordination's draws.
+    agents: sorted by robot id. number: of the planning round. generator: for the coordination's draws.
 
     Returns the plans by robot id, in the order in which they became final.
     """
@@ -319,11 +316,9 @@ def plan_together(
 
 
 def plan_alone(agent: Agent, options: TeamOptions, now: float, number: int) -> None:
-    """Makes and follows the next plan of a robot whose teammates run in other processes.
-
-    The robot avoids the paths of the plans that it has heard, and discounts the views of those heard in the
-    last planning period.
-    """
+    """Makes and follows the next plan of a robot whose teammates run in other processes. The robot avoids the
+    paths of the plans that it has heard, and discounts the views of those heard in the last planning
+    period."""
     agent.begin_planning(now)
     heard = agent.robot.plans
     step = options.dynamics.step

@@ -33,13 +33,9 @@ class Interval(NamedTuple):
 
 
 def mean_band(curves: ArrayLike, confidence: float = 0.95) -> Band:
-    """Mean of S curves (S, T) and its Student's t interval at each of T times.
-
-    mean ± t_{S−1} s/√S, with s the sample standard deviation. For S = 1 the spread is unknown, and the band
-    is (−∞, ∞).
-
-    Raises `InvalidArgumentError` for no curve, values that are not finite, or a confidence outside (0, 1).
-    """
+    """Mean of S curves (S, T) and its Student's t interval at each of T times. mean ± t_{S−1} s/√S, with s
+    the sample standard deviation. For S = 1 the spread is unknown, and the band is (−∞, ∞). Raises
+    `InvalidArgumentError` for no curve, values that are not finite, or a confidence outside (0, 1)."""
     from scipy.stats import t
 
     values = _finite("curves", curves, 2)
@@ -56,9 +52,7 @@ def mean_band(curves: ArrayLike, confidence: float = 0.95) -> Band:
 
 def paired_interval(a: ArrayLike, b: ArrayLike, confidence: float = 0.95) -> Interval:
     """Student's t interval of the mean of a − b, over pairs of trials (S,) with the same seed and start.
-
-    Pairing removes the variance that both trials of a seed share. A single pair gives (−∞, ∞).
-    """
+    Pairing removes the variance that both trials of a seed share. A single pair gives (−∞, ∞)."""
     first, second = _finite("a", a, 1), _finite("b", b, 1)
     if first.shape != second.shape:
         raise InvalidArgumentError(
@@ -230,11 +224,9 @@ def compared(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def with_times(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Rows with t50 and t90 (s): when the entropy reduction first reaches 50 and 90 % of a reference.
-
-    The reference, `reference_bits`, is the mean final reduction of E1 (`grid_shared`). Without missions of E1
-    it is that of the best variant.
-    """
+    """Rows with t50 and t90 (s): when the entropy reduction first reaches 50 and 90 % of a reference. The
+    reference, `reference_bits`, is the mean final reduction of E1 (`grid_shared`). Without missions of E1 it
+    is that of the best variant."""
     final: dict[tuple[Any, ...], list[float]] = {}
     for row in rows:
         final.setdefault(variant_of(row), []).append(row["entropy_reduction_bits"])
@@ -263,8 +255,7 @@ def with_network_costs(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
     A field is None if nothing was sent, if a time was never reached, or without companion.
 
-    Args:
-        rows: with t90 (`with_times`).
+    rows: with t90 (`with_times`).
     """
     lossless: dict[tuple[Any, ...], dict[str, Any]] = {}
     for row in rows:

@@ -42,11 +42,9 @@ class DuplicateIdError(GmmTorchError):
 
 
 class FlyingRobotView:
-    """The robot of a `Mission` without simulated network.
-
-    `status` is one short line for a terminal, `scalars` are numbers for a plot over time, `row` is the row
-    of results.json, and `files` are the robot's map and what else it made.
-    """
+    """The robot of a `Mission` without simulated network. `status` is one short line for a terminal,
+    `scalars` are numbers for a plot over time, `row` is the row of results.json, and `files` are the robot's
+    map and what else it made."""
 
     def __init__(self, mission: Mission, transport: FramedTransport) -> None:
         (self._agent,) = mission.agents

@@ -99,11 +99,9 @@ def make_agent(
 ) -> Agent:
     """A robot at its start pose (4,).
 
-    Args:
-        memo, evidence: caches of decoded datagrams and of evidence, and watch: the robots of a simulation
-            share them; None: its own.
-        incarnation: of its replica and view library. A robot that may be restarted needs another one in each
-            session (`record_keys.drawn_incarnation`).
+    memo, evidence: caches of decoded datagrams and of evidence, and watch: the robots of a simulation share
+    them; None: its own. incarnation: of its replica and view library. A robot that may be restarted needs
+    another one in each session (`record_keys.drawn_incarnation`).
 
     Raises `InvalidArgumentError` for options that contradict each other or the world.
     """
@@ -183,10 +181,8 @@ OnMission = Callable[[Mission], object]
 
 @dataclass(frozen=True)
 class WorldOptions:
-    """Which world; see `world.open_world`.
-
-    size (m), seed: of generated worlds. path, bounds: of a mesh. cache: keep computed properties on disk.
-    """
+    """Which world; see `world.open_world`. size (m), seed: of generated worlds. path, bounds: of a mesh.
+    cache: keep computed properties on disk."""
 
     name: str = "warehouse"
     path: str | None = None
@@ -251,8 +247,7 @@ def run_mission(
 
     Raises `OutputError`, before anything is computed, if the trial's folder cannot be written to.
 
-    Args:
-        on_tick: called at the start and after every tick.
+    on_tick: called at the start and after every tick.
     """
     if trial.folder is not None:
         check_writable(trial.folder)
@@ -280,10 +275,9 @@ def run_trials(
     Each trial uses one thread, so results do not depend on `workers`. If one trial fails, no other starts;
     those that are running end, keep their rows, and then the error is raised.
 
-    Args:
-        on_row: called with each row when it is there.
-        on_event: called with the simulated seconds of all trials together (`STAGE`).
-        on_sample: with one worker, then called with the running mission whenever its curves grow.
+    on_row: called with each row when it is there. on_event: called with the simulated seconds of all trials
+    together (`STAGE`). on_sample: with one worker, then called with the running mission whenever its curves
+    grow.
     """
     check_whole("workers", workers, 1)
     rows = [kept_row(trial) for trial in trials]

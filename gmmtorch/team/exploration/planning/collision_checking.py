@@ -132,8 +132,7 @@ def feasible(
     the cells that it touches at the start, and it must move away from every point q of those: (x − x₀)·(q
     − x₀) ≤ 0. So no known obstacle comes closer than it is at the start, or than the radius.
 
-    Args:
-        start: (..., 7) or broadcastable: the states before the first step. radius: of the robot (m).
+    start: (..., 7) or broadcastable: the states before the first step. radius: of the robot (m).
     """
     begin = start.to(rollout).expand(*rollout.shape[:-2], 7)
     origin = begin[..., :3]
@@ -157,9 +156,8 @@ def feasible_motions(
 ) -> Tensor:
     """`feasible` of motions, (N, P), by the fused kernel.
 
-    Args:
-        longest: (2,), longest step (m) and largest turn (rad) in a step. after: steps of the peers before
-            the motions begin.
+    longest: (2,), longest step (m) and largest turn (rad) in a step. after: steps of the peers before the
+    motions begin.
     """
     return motions_are_clear(
         motions,
@@ -191,11 +189,9 @@ def _covering_boxes(square: float) -> list[tuple[int, int, int]]:
 
 
 def _points_along(states: Tensor, spacing: float) -> Tensor:
-    """Sample points (..., n, 3) of paths (..., L, 7), at most `spacing` apart along each path.
-
-    The first state is left out. Steps are treated as straight; an arc of chord c that turns by φ deviates
-    from its chord by c φ/8.
-    """
+    """Sample points (..., n, 3) of paths (..., L, 7), at most `spacing` apart along each path. The first
+    state is left out. Steps are treated as straight; an arc of chord c that turns by φ deviates from its
+    chord by c φ/8."""
     place, yaw = states[..., :3], states[..., 3]
     step = place[..., 1:, :] - place[..., :-1, :]
     chord = step.square().sum(-1)

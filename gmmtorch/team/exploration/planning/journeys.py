@@ -35,9 +35,7 @@ class DistanceField:
     @classmethod
     def to(cls, local_map: LocalMap, goals: Tensor, offsets: Tensor | None = None) -> DistanceField:
         """Compute the distance to the nearest of goals (M, 3), metres; `offsets` (M,) are added to each goal.
-
-        Goals outside the local map are ignored. Without a goal inside, all distances are inf.
-        """
+        Goals outside the local map are ignored. Without a goal inside, all distances are inf."""
         _, inside = local_map.flat_index(goals)
         cells = local_map.cells_of(goals[inside])
         begin = torch.zeros(len(cells)) if offsets is None else offsets[inside]
@@ -102,11 +100,8 @@ def geodesic(
     never thinner than the body of the robot, by which the passable cells were shrunk.
     Sources always count as passable. inf: cannot be reached.
 
-    Args:
-        passable: (nx, ny, nz) bool. sources: (M, 3) int64, cells of it.
-        resolution: side (m) of its cells.
-        offsets: (M,) metres, at least zero, that each source starts with.
-        coarse: nx' = ⌈nx/coarse⌉.
+    passable: (nx, ny, nz) bool. sources: (M, 3) int64, cells of it. resolution: side (m) of its cells.
+    offsets: (M,) metres, at least zero, that each source starts with. coarse: nx' = ⌈nx/coarse⌉.
     """
     open_cells = coarsened(passable, coarse)
     start = torch.full(open_cells.shape, math.inf, device=passable.device)
@@ -135,10 +130,8 @@ def coarsened(passable: Tensor, coarse: int) -> Tensor:
 
 def _wave(open_cells: Tensor, start: Tensor) -> Tensor:
     """Return the smallest number of cell widths to each cell: a wave spreads from `start` until it converges.
-
-    The minimum over the 26 neighbours is computed axis by axis: edges from faces, corners from edges.
-    Cells lie in one padded row, so that a shift is a slice.
-    """
+    The minimum over the 26 neighbours is computed axis by axis: edges from faces, corners from edges. Cells
+    lie in one padded row, so that a shift is a slice."""
     inside = (slice(1, -1),) * 3
     shape = tuple(n + 2 for n in open_cells.shape)
     wall = torch.full(shape, math.inf, device=start.device)
@@ -188,9 +181,7 @@ class Goal:
 
     def cost(self, states: Tensor) -> Tensor:
         """Remaining cost (...,) in metres from states (..., 7): the way, the turn into it, and the last turn.
-
-        Close to the goal, and directly above or below it, only the last turn counts.
-        """
+        Close to the goal, and directly above or below it, only the last turn counts."""
         points, yaw = states[..., :3], states[..., 3]
         metres, there = self.distances.way(points, _AHEAD)
         way = there - points
@@ -235,9 +226,7 @@ class Journey:
     @classmethod
     def chosen(cls, task: PlanningTask, least: float, given_up: Tensor | None = None) -> Journey | None:
         """Start a journey to the view with the largest value/(1 + metres), and take it from the library.
-
-        Returns None if no view worth `least` can be reached. Views close to `given_up` (N, 4) are ignored.
-        """
+        Returns None if no view worth `least` can be reached. Views close to `given_up` (N, 4) are ignored."""
         known = task.library.candidates()
         if not known.keys:
             return None

@@ -99,8 +99,7 @@ def continuations(
 ) -> tuple[Tensor, Tensor]:
     """The ends (N, P, 7) of all primitives from states (N, 7), and which primitives are feasible (N, P).
 
-    Args:
-        after: primitives of the robot before these states.
+    after: primitives of the robot before these states.
     """
     passable = task.local_map.passable
     continued = primitives.continued(states) if is_fused(passable, states) else None
@@ -123,10 +122,8 @@ def is_boxed_in(primitives: Primitives, task: PlanningTask) -> bool:
 
 class Waiting:
     """The fallback when no primitive is feasible: come to rest, then look around after some plans at rest.
-
     Stopping is safe because it is the braking of the last plan, which was feasible. A robot at rest that
-    turns in place occupies no new space.
-    """
+    turns in place occupies no new space."""
 
     def __init__(self, primitives: Primitives, patience: int = 2) -> None:
         self._primitives, self._patience = primitives, patience

@@ -64,8 +64,7 @@ def frontier_cells(local_map: LocalMap) -> Tensor:
 def find_frontiers(local_map: LocalMap, start: Tensor, exhausted: Tensor, least: int = _LEAST) -> Frontiers:
     """Find clusters of at least `least` cells that a robot at `start` (3,) can look at, most promising first.
 
-    Args:
-        exhausted: (E, 3), targets that remained after a look; cells within a metre of them are ignored.
+    exhausted: (E, 3), targets that remained after a look; cells within a metre of them are ignored.
     """
     distances = DistanceField.to(local_map, start[None])
     cells = frontier_cells(local_map).nonzero()
@@ -108,10 +107,8 @@ def find_frontiers(local_map: LocalMap, start: Tensor, exhausted: Tensor, least:
 
 
 def _parts(distances: DistanceField, counts: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the cluster (n,) and the middle (n, 3) of each coarse frontier cell with a positive count.
-
-    A cluster is a connected set of cells, cut by a lattice of cubes that one view covers.
-    """
+    """Return the cluster (n,) and the middle (n, 3) of each coarse frontier cell with a positive count. A
+    cluster is a connected set of cells, cut by a lattice of cubes that one view covers."""
     labels, _ = ndimage.label(counts.numpy() > 0, structure=np.ones((3, 3, 3)))
     cells = (counts > 0).nonzero()
     cube = cells // _GLANCE
@@ -134,11 +131,9 @@ def _middles(distances: DistanceField, cells: Tensor) -> Tensor:
 
 
 class FrontierPlanner:
-    """Flies to the frontier with the largest size/(1 + distance), and stays with it while it exists.
-
-    The view library stores the other frontiers with their sizes as values. The robot uses them when its
-    window contains no frontier.
-    """
+    """Flies to the frontier with the largest size/(1 + distance), and stays with it while it exists. The view
+    library stores the other frontiers with their sizes as values. The robot uses them when its window
+    contains no frontier."""
 
     def __init__(self, primitives: Primitives) -> None:
         self._primitives = primitives

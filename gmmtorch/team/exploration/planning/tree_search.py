@@ -92,10 +92,8 @@ def search_tree(
     counts as taken. UCT chooses the primitives (see `_Tree._promising`). A leaf counts as visited with zero
     return until its round ends.
 
-    Args:
-        memory: values of views; None: only the goal counts.
-        goal: the goal; None: only views count.
-        first: primitives of a branch that is tried first, such as the rest of the last plan.
+    memory: values of views; None: only the goal counts. goal: the goal; None: only views count. first:
+    primitives of a branch that is tried first, such as the rest of the last plan.
     """
     tree = _Tree(primitives, rule, task, memory, goal)
     tree.grow(first)

@@ -48,11 +48,8 @@ def beam_templates(
 ) -> BeamTemplates:
     """Compute templates of a pinhole camera that looks along its heading with pitch 0; yaw k is 2πk/n_yaws.
 
-    Args:
-        horizontal_fov, vertical_fov: radians, each in (0, π).
-        max_range: metres along the beam.
-        resolution: side (m) of the cells.
-        n_beams: approximate number of beams; rows and columns are evenly spaced.
+    horizontal_fov, vertical_fov: radians, each in (0, π). max_range: metres along the beam. resolution: side
+    (m) of the cells. n_beams: approximate number of beams; rows and columns are evenly spaced.
     """
     directions, solid_angles = pinhole_beams(horizontal_fov, vertical_fov, n_beams)
     if not 0 < max_range < math.inf:
@@ -80,10 +77,8 @@ def beam_templates(
 
 
 def pinhole_beams(horizontal_fov: float, vertical_fov: float, n_beams: int) -> tuple[Tensor, Tensor]:
-    """Return unit directions (B, 3), x ahead, y left, z up, and the solid angle (B,) of each.
-
-    Rows and columns are at equal angles. Their patches tile the image exactly.
-    """
+    """Return unit directions (B, 3), x ahead, y left, z up, and the solid angle (B,) of each. Rows and
+    columns are at equal angles. Their patches tile the image exactly."""
     for name, fov in (("horizontal_fov", horizontal_fov), ("vertical_fov", vertical_fov)):
         if not 0 < fov < math.pi:
             raise InvalidArgumentError(f"{name}={fov} must be between 0 and π radians, both excluded.")
@@ -109,8 +104,7 @@ def pinhole_beams(horizontal_fov: float, vertical_fov: float, n_beams: int) -> t
 def cells_along(directions: Tensor, reach: float) -> tuple[Tensor, Tensor, Tensor]:
     """Return every cell that rays from the centre of cell 0 pass through, in order.
 
-    Args:
-        directions: (..., 3) unit vectors. reach: length of the rays, in cells.
+    directions: (..., 3) unit vectors. reach: length of the rays, in cells.
 
     Returns:
         Cells (..., C, 3) int64, zeros beyond the end; the distances (..., C + 1), in cells, at which the ray
@@ -146,8 +140,7 @@ def depth_kernel(depths: Tensor, sigma: float, band: int, lengths: Tensor) -> Te
 
     K_ij = exp(−(d_i − d_j)²/4σ²): a reading of cell i is normal about its depth d_i, with deviation σ.
 
-    Args:
-        depths: (..., C), metres. sigma: metres. lengths: (...,) number of cells of each beam.
+    depths: (..., C), metres. sigma: metres. lengths: (...,) number of cells of each beam.
     """
     n_cells = depths.shape[-1]
     kernel = depths.new_zeros(band, *depths.shape[:-1], n_cells + 1)

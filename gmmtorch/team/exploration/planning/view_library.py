@@ -152,11 +152,9 @@ class ViewLibrary:
         return [key for key in added if key in self._views]
 
     def revalue(self, keys: list[int], values: Tensor, now: float, least: float) -> None:
-        """Set the values of views at the time `now` (s); those below `least` are removed.
-
-        A small change is not sent, because it changes no plan; but once in half the time to live the view
-        is, so that it is not removed.
-        """
+        """Set the values of views at the time `now` (s); those below `least` are removed. A small change is
+        not sent, because it changes no plan; but once in half the time to live the view is, so that it is not
+        removed."""
         for key, value in zip(keys, values.tolist(), strict=True):
             known = self._views.get(key)
             if value < least:
@@ -210,10 +208,8 @@ class ViewLibrary:
     def datagrams(self, now: float | None = None, budget: int | None = None) -> list[bytes]:
         """Datagrams of changes made here, of removals that others lack, and of repeated views.
 
-        Args:
-            now: time (s) by this robot's clock; None: the time of the last call with one.
-            budget: largest size of all together; None: no limit. The rest stays due, as does what exceeds
-                `MOST_DATAGRAMS`.
+        now: time (s) by this robot's clock; None: the time of the last call with one. budget: largest size of
+        all together; None: no limit. The rest stays due, as does what exceeds `MOST_DATAGRAMS`.
         """
         left = math.inf if budget is None else check_whole("budget", budget, 0)
         now = self._now if now is None else now
@@ -240,10 +236,8 @@ class ViewLibrary:
         return sent
 
     def receive(self, message: ViewsMessage, now: float) -> bool:
-        """Merge the views of another robot at the time `now` (s); returns whether they were accepted.
-
-        Never raises for a decoded message.
-        """
+        """Merge the views of another robot at the time `now` (s); returns whether they were accepted. Never
+        raises for a decoded message."""
         self._now = now if math.isfinite(now) else self._now
         keys = keys_of(message.ids)
         named = Intervals.of(keys) | message.removed
@@ -325,10 +319,8 @@ class ViewLibrary:
             self._cached = None
 
     def _whole(self, keys: Intervals) -> Intervals:
-        """The intervals of removed keys that contain any of `keys`, as a whole.
-
-        This takes no more bytes, and repeats earlier removals, which may have been lost.
-        """
+        """The intervals of removed keys that contain any of `keys`, as a whole. This takes no more bytes, and
+        repeats earlier removals, which may have been lost."""
         if not keys:
             return keys
         edges, begins = self._removed.edges.reshape(-1, 2), keys.edges[::2]

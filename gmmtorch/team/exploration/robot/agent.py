@@ -33,7 +33,7 @@ from gmmtorch.team.sharing import (
     MAX_BYTES,
     PlanMessage,
     Radio,
-    RecordStore,
+    Store,
     Transport,
     ViewsMessage,
     encode_plan,
@@ -84,9 +84,8 @@ class StoppingCriterion:
     def note(self, now: float, learned: float, known: float, boxed_in: bool = False) -> None:
         """Updates the criterion at the time `now` (s).
 
-        Args:
-            learned: bits that the robot's own frames have removed from its map so far.
-            known: bits removed in total. boxed_in: whether the robot was boxed in since the last call.
+        learned: bits that the robot's own frames have removed from its map so far. known: bits removed in
+        total. boxed_in: whether the robot was boxed in since the last call.
         """
         if boxed_in and self._noted_at is not None:
             self._boxed_in += now - self._noted_at
@@ -213,8 +212,7 @@ class Robot:
     def local_map(self, planning_prior: float, radius: float, window: tuple[int, int, int]) -> LocalMap:
         """A snapshot of `window` cells around the robot, for the planner.
 
-        Args:
-            planning_prior: occupancy probability of unobserved cells. radius: of the robot, metres.
+        planning_prior: occupancy probability of unobserved cells. radius: of the robot, metres.
         """
         local, rule = self.mapper.local, self.mapper.belief.rule
         box = local.around(self.position, window)
@@ -295,7 +293,7 @@ class Agent:
         """Equal for robots that hold the same map."""
         return self.robot.mapper.shared.digest()
 
-    def keep_in(self, store: RecordStore) -> None:
+    def keep_in(self, store: Store) -> None:
         """Stores the map's records from now on, and adds the records that the store restored to the map."""
         self.radio.store = store
         self.robot.mapper.center_on(self.robot.position)
@@ -362,11 +360,9 @@ class Agent:
             self.radio.keep(merged)
 
     def _note_plan(self, sender: int, plan: PlanMessage, now: float) -> None:
-        """Stores a teammate's plan, unless it is a repetition or a later plan has overtaken it.
-
-        A plan with a lower number comes from a restarted robot if it is much lower, or if the stored path has
-        been flown.
-        """
+        """Stores a teammate's plan, unless it is a repetition or a later plan has overtaken it. A plan with a
+        lower number comes from a restarted robot if it is much lower, or if the stored path has been
+        flown."""
         if plan.sender != sender or plan.sender == self.number or plan.sender >= self.options.size:
             self.refused["stranger"] += 1
             return
@@ -397,10 +393,8 @@ class Agent:
     ) -> Plan:
         """A plan from the last snapshot.
 
-        Args:
-            final: ids of the teammates whose views are discounted, if their plan arrived at the time `since`
-                (s) or later; None: `now`.
-            peers: committed paths of the other robots, which the plan avoids.
+        final: ids of the teammates whose views are discounted, if their plan arrived at the time `since` (s)
+        or later; None: `now`. peers: committed paths of the other robots, which the plan avoids.
         """
         with self.watch("planning"):
             if self._local_map is None:

@@ -100,11 +100,9 @@ class FrameUpdate(NamedTuple):
 
 
 class Memo:
-    """A cache of a pure function's values, which the robots of a simulation share.
-
-    Robots that receive the same datagram get the same evidence from it, so one computation serves all. The
-    cache keeps the `size` values used last.
-    """
+    """A cache of a pure function's values, which the robots of a simulation share. Robots that receive the
+    same datagram get the same evidence from it, so one computation serves all. The cache keeps the `size`
+    values used last."""
 
     def __init__(self, size: int) -> None:
         self._size = check_whole("size", size, 1)
@@ -183,8 +181,7 @@ def novel_beams(
     The first beam of each block of `side` × `side` pixels decides for the block: neighbouring pixels are much
     closer to one another than the cells are wide.
 
-    Args:
-        width: of the image, pixels. within, short: see `beam_novelty`.
+    width: of the image, pixels. within, short: see `beam_novelty`.
     """
     n, across = len(frame.pixel), -(-width // side)
     block = frame.pixel // (side * width) * across + frame.pixel % width // side

@@ -71,10 +71,8 @@ def start_poses(world: World, n: int, primitives: Primitives) -> Tensor:
 
 
 def check_start(world: World, poses: Tensor, primitives: Primitives) -> Tensor:
-    """Check that robots can start at poses (n, 4), x, y, z (m) and yaw (rad), float64; return them.
-
-    Raises `InvalidArgumentError` that names the first bad pose and a better place for it.
-    """
+    """Check that robots can start at poses (n, 4), x, y, z (m) and yaw (rad), float64; return them. Raises
+    `InvalidArgumentError` that names the first bad pose and a better place for it."""
     for i, pose in enumerate(poses):
         others = poses[:i, :3]
         if not bool(torch.isfinite(pose).all()):

@@ -322,11 +322,8 @@ def open_world(
     **options: Any,
 ) -> World:
     """Open the world `name`: "warehouse" or "tunnels" with a seed and a size (m), or the "mesh" in a file.
-
-    `options` are those of `World.from_mesh`, which also raises its errors. Raises `InvalidArgumentError`
-    for an unknown name or an option that the world does not have, and `MissingDataError` for a missing
-    file.
-    """
+    `options` are those of `World.from_mesh`, which also raises its errors. Raises `InvalidArgumentError` for
+    an unknown name or an option that the world does not have, and `MissingDataError` for a missing file."""
     check_choice("world", name, ("warehouse", "tunnels", "mesh"))
     if name == "mesh":
         if size is not None:

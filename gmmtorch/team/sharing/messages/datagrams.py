@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from enum import IntEnum
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
+from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_whole
 from gmmtorch.linalg import check_rigid
 from gmmtorch.mapping import BitReader, BitWriter, Ints
 from gmmtorch.team.sharing.replica.record_keys import END, MOST_RECORDS, NUMBER_BITS, Intervals, authors
@@ -100,12 +99,9 @@ def split(
     max_bytes: int = MAX_BYTES,
     is_allowed: Callable[[int, int], bool] = lambda begin, end: True,
 ) -> list[bytes]:
-    """Datagrams of n items, which are halved until each part fits.
-
-    encode(begin, end) makes the datagram of items begin … end − 1; is_allowed(begin, end) tells whether
-    these may be in one datagram, however few bytes they take. Raises `InvalidArgumentError` if a single
-    item does not fit.
-    """
+    """Datagrams of n items, which are halved until each part fits. encode(begin, end) makes the datagram of
+    items begin … end − 1; is_allowed(begin, end) tells whether they may be in one, however few bytes they
+    take. Raises `InvalidArgumentError` if an item does not fit."""
 
     def parts(begin: int, end: int) -> list[bytes]:
         if end - begin == 1 or is_allowed(begin, end):
@@ -123,22 +119,14 @@ def split(
     return parts(0, n) if n else []
 
 
-def within(datagrams: Sequence[bytes], budget: int | None) -> int:
-    """How many of the first datagrams take at most `budget` bytes together; None: all."""
-    sizes = itertools.accumulate(map(len, datagrams))
-    return len(datagrams) if budget is None else sum(size <= budget for size in sizes)
-
-
 def check_codec(codec: str) -> str:
     """The codec; raises `InvalidArgumentError` unless it is one of `CODECS`."""
-    if codec not in CODECS:
-        raise InvalidArgumentError(f"codec={codec!r} must be one of {', '.join(CODECS)}.")
+    check_choice("codec", codec, CODECS)
     return codec
 
 
 def check_places(name: str, places: Tensor, farthest: float = FARTHEST) -> Tensor:
-    """The positions (N, D), m; raises `InvalidArgumentError` unless all coordinates are at most
-    `farthest`."""
+    """The positions (N, D), m; raises `InvalidArgumentError` if a coordinate is beyond `farthest`."""
     bad = ~(places.abs() <= farthest).all(1)
     if bool(bad.any()):
         first = int(bad.nonzero()[0])
@@ -176,8 +164,7 @@ def id_order(ids: Tensor) -> Ints:
 
 
 def write_ids(writer: BitWriter, ids: Ints) -> None:
-    """Write distinct ids (J, 2) in `id_order`: for each robot their number, the first, and the gaps between
-    them."""
+    """Write distinct ids (J, 2) in `id_order`: for each robot their number, the first, and the gaps."""
     robots, first, n_each = np.unique(ids[:, 0], return_index=True, return_counts=True)
     writer.number(len(robots))
     for robot, begin, n in zip(robots.tolist(), first.tolist(), n_each.tolist(), strict=True):
@@ -226,8 +213,7 @@ def read_keys(reader: BitReader) -> Ints:
 
 
 def write_intervals(writer: BitWriter, intervals: Intervals, begin: int) -> None:
-    """Write their number; for each the gap before it, from `begin` or the last end, and its length less
-    one."""
+    """Write their number; for each the gap before it, from `begin` or the last end, and its length − 1."""
     writer.number(len(intervals))
     for first, end in intervals.pairs():
         writer.number(first - begin)
@@ -278,10 +264,7 @@ def is_motion(pose: Tensor) -> bool:
 
 
 def pose_of(transform: Tensor) -> Tensor:
-    """The pose of a rigid motion (3, 3) or (4, 4).
-
-    Raises `InvalidArgumentError` if it is not rigid or moves too far.
-    """
+    """The pose of a rigid motion (3, 3) or (4, 4); raises `InvalidArgumentError` if it is none."""
     if transform.shape not in ((3, 3), (4, 4)):
         raise InvalidArgumentError(f"transform has shape {tuple(transform.shape)}; give (3, 3) or (4, 4).")
     rotation, translation = check_rigid(transform.detach().cpu().double(), len(transform) - 1)

@@ -38,11 +38,9 @@ LARGEST_ROBOT, LARGEST_FRAME, MOST_PARTS = (1 << 16) - 1, (1 << 32) - 1, (1 << 1
 
 @dataclass(frozen=True, eq=False)
 class PointsMessage:
-    """Part `part` of `n_parts` of the novel beams of a robot's frame.
-
-    origin (3,) of all beams, ends (N, 3), float64, metres, world frame; is_hit (N,) bool: the others are
-    no-return beams, which end at the range where they are cut off.
-    """
+    """Part `part` of `n_parts` of the novel beams of a robot's frame. origin (3,) of all beams, ends (N, 3),
+    float64, metres, world frame; is_hit (N,) bool: the others are no-return beams, which end at the range
+    where they are cut off."""
 
     sender: int
     frame: int
@@ -58,9 +56,8 @@ def encode_points(sender: int, frame: int, origin: Tensor, ends: Tensor, is_hit:
 
     Ends are stored as float32 offsets from the origin, so that they are equally exact anywhere in the world.
 
-    Args:
-        sender: id of the robot, up to 65535. frame: its number, up to 2³² − 1.
-        origin: (3,), metres. ends: (N, 3), metres. is_hit: (N,) bool.
+    sender: id of the robot, up to 65535. frame: its number, up to 2³² − 1. origin: (3,), metres. ends: (N,
+    3), metres. is_hit: (N,) bool.
 
     Raises `InvalidArgumentError` for values out of range, and for positions beyond `datagrams.FARTHEST`.
     """
@@ -104,20 +101,12 @@ def read_points(body: bytes) -> PointsMessage:
     offsets = offsets.astype(np.float64)  # after the check, as casting some NaNs raises a warning
     origin = torch.tensor([x, y, z], dtype=torch.float64)
     check_places("origin", origin[None])
-    return PointsMessage(
-        sender=sender,
-        frame=frame,
-        part=part,
-        n_parts=n_parts,
-        origin=origin,
-        ends=check_places("ends", origin + torch.from_numpy(offsets)),
-        is_hit=torch.from_numpy(bits[:n] != 0),
-    )
+    ends = check_places("ends", origin + torch.from_numpy(offsets))
+    return PointsMessage(sender, frame, part, n_parts, origin, ends, torch.from_numpy(bits[:n] != 0))
 
 
 MOST_POSES = 1000
-"""Poses of a path, and of the views of a plan. The poses of a robot at rest take no bits, so data do not
-bound their number."""
+"""Poses of a path, and of the views of a plan: those of a robot at rest take no bits that bound them."""
 STEPS_PER_METRE = 100
 """Positions are whole centimetres."""
 YAW_STEPS = 256
@@ -177,7 +166,10 @@ def encode_views(message: ViewsMessage, max_bytes: int = MAX_BYTES) -> list[byte
         )
     if not Intervals.span(0, END).covers(m.removed):
         raise InvalidArgumentError(f"removed={m.removed!r} goes beyond the largest key, {END - 1}.")
-    keys = _keys(m.ids)
+    try:
+        keys = keys_of(check_ids("ids", m.ids))
+    except DataError as error:
+        raise InvalidArgumentError(f"ids: {error}") from error
     order, removed = np.argsort(keys), m.removed
     keys = keys[order]
     steps, halves = _pose_steps("poses", m.poses)[order], _halves(m.values)[order]
@@ -202,11 +194,13 @@ def read_views(body: bytes) -> ViewsMessage:
     reader = BitReader(body)
     keys = read_keys(reader)
     poses = _read_poses(reader, len(keys))
-    values = _values(reader.fixed(len(keys), _HALF_BITS))
+    values = reader.fixed(len(keys), _HALF_BITS).astype(np.uint16).view(np.float16).astype(np.float64)
+    if not np.isfinite(values).all():
+        raise DataError("Values are NaN or infinite: it is damaged.")
     stamps = _seconds_of(reader.column(len(keys)))
     removed = read_intervals(reader, 0, END)
     reader.finish()
-    return ViewsMessage(ids_of(keys), poses, values, stamps, removed)
+    return ViewsMessage(ids_of(keys), poses, torch.from_numpy(values), stamps, removed)
 
 
 def encode_plan(
@@ -216,10 +210,8 @@ def encode_plan(
 
     Poses are rounded to 1 cm and 1/256 of a turn, times to 1 ms.
 
-    Args:
-        sender: id of the robot. number: rises with each of its plans.
-        time: (s) of the first pose of the path. step: (s) from each pose to the next, above zero.
-        path: (S, 4). views: (V, 4).
+    sender: id of the robot. number: rises with each of its plans. time: (s) of the first pose of the path.
+    step: (s) from each pose to the next, above zero. path: (S, 4). views: (V, 4).
 
     Raises `InvalidArgumentError` if the plan does not fit into a datagram.
     """
@@ -267,26 +259,12 @@ def _read_size(reader: BitReader) -> int:
     return n
 
 
-def _keys(ids: Tensor) -> Ints:
-    try:
-        return keys_of(check_ids("ids", ids))
-    except DataError as error:
-        raise InvalidArgumentError(f"ids: {error}") from error
-
-
 def _halves(values: Tensor) -> Ints:
     """The bits (V,) of values rounded to float16."""
     rows = values.detach().double().cpu().numpy()
     if rows.ndim != 1 or not (np.abs(rows) <= np.finfo(np.float16).max).all():
         raise InvalidArgumentError("values must be a row of numbers up to 65504, the most of float16.")
     return rows.astype(np.float16).view(np.uint16).astype(np.int64)
-
-
-def _values(bits: Ints) -> Tensor:
-    values = bits.astype(np.uint16).view(np.float16).astype(np.float64)
-    if not np.isfinite(values).all():
-        raise DataError("Values are NaN or infinite: it is damaged.")
-    return torch.from_numpy(values)
 
 
 # -- poses and times ------------------------------------------------------------------------------------
@@ -330,10 +308,7 @@ def _read_poses(reader: BitReader, n: int) -> Tensor:
 
 
 def _write_path(writer: BitWriter, steps: Ints) -> None:
-    """Write poses (S, 4) along a path: the first, then four columns of the steps from each pose to the next.
-
-    At constant speed and turn rate the steps are nearly equal.
-    """
+    """Write poses (S, 4) of a path: the first, then columns of the steps, which are nearly equal."""
     for axis in range(4 if len(steps) else 0):
         ways = np.diff(steps[:, axis])
         if axis == 3:  # the shorter direction

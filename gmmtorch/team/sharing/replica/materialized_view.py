@@ -38,15 +38,9 @@ _FINGERPRINT_BYTES = 16
 
 
 class ComponentTable:
-    """Components that are added and dropped, but never changed.
-
-    Batches are numbered in the order of arrival. If components of a batch are dropped, the rest becomes a new
-    batch.
-
-    Attributes:
-        dim: 2 or 3.
-        end: number of the next batch.
-    """
+    """Components that are added and dropped, but never changed. Batches are numbered in the order of arrival;
+    `end` is the number of the next. If components of a batch are dropped, the rest becomes a new batch. dim:
+    2 or 3."""
 
     def __init__(self, dim: int = 3) -> None:
         self.dim = dim
@@ -162,11 +156,8 @@ _EMPTY: _Row = np.zeros(0, np.int64), np.zeros(0, np.int64)
 
 
 class Counters:
-    """The records of counters.
-
-    The largest counter of a component counts for each author, and authors are summed in rising order. So the
-    sums depend neither on the order of the records nor on repetitions.
-    """
+    """The records of counters. The largest counter of a component counts for each author, and authors are
+    summed in rising order. So the sums depend neither on the order of the records nor on repetitions."""
 
     def __init__(self) -> None:
         self._records: dict[int, dict[int, CountersMessage]] = {}  # by author and key
@@ -239,10 +230,8 @@ def _largest_of(records: Iterable[CountersMessage]) -> _Row:
 
 
 def gains(components: Components, gain: Tensor) -> Components:
-    """Components (K,) whose support and counts are the points (K,) that they gain.
-
-    The points are distributed over a component's viewpoints in proportion to their counts.
-    """
+    """Components (K,) whose support and counts are the points (K,) that they gain. The points are distributed
+    over a component's viewpoints in proportion to their counts."""
     ratio = torch.where(components.support > 0, gain / components.support, 0.0)
     several = torch.bincount(components.seen_by, minlength=len(components)).clamp_min(1)
     equal = torch.where(components.support > 0, 0.0, gain / several)  # for components without support
@@ -272,10 +261,8 @@ def latest(records: Sequence[CorrectionMessage]) -> list[CorrectionMessage]:
 
 
 def corrected(components: Components, keys: Ints, records: Sequence[CorrectionMessage]) -> Components:
-    """Components (K,) moved by the corrections of their scans, with their origins.
-
-    A component of two scans is moved by the correction of the scan with the higher number.
-    """
+    """Components (K,) moved by the corrections of their scans, with their origins. A component of two scans
+    is moved by the correction of the scan with the higher number."""
     motions = [record for record in latest(records) if record.dim == components.dim]
     which = np.full(len(keys), -1)
     for number, record in enumerate(motions):
@@ -407,11 +394,10 @@ class Changes:
     """What a replica added to its map.
 
     added: batches of new components in frames of this robot's root, its own included, one for each datagram
-    in the order of arrival, with their own counts.
-    gained: components whose counters rose, by id; support and counts are the rise. Points that were
-    assigned to a component before it arrived are included when it arrives.
-    rebuilt: components were superseded or corrected, or frames were placed, so that everything must be
-    derived from `components()` again. `added` and `gained` are empty then; later changes continue from there.
+    in the order of arrival, with their own counts. gained: components whose counters rose, by id; support
+    and counts are the rise, with what was assigned to a component before it arrived.
+    rebuilt: components were superseded or corrected, or frames were placed: derive everything from
+    `components()` again. `added` and `gained` are empty then; later changes continue from there.
     """
 
     added: list[Components]
@@ -446,8 +432,7 @@ class ChangeLog:
         self, table: ComponentTable, counters: Counters, placed: Callable[[Components, Ints], Components]
     ) -> Changes:
         """The changes since the last call. placed: the components with these keys that are in the map, where
-        they are in it.
-        """
+        they are in it."""
         if self._touched == [] and self._batch == table.end and not self._rebuilt:
             return Changes([], Components.empty(table.dim), False)
         before = {} if self._rebuilt or self._reported is None else self._reported

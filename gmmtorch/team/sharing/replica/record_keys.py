@@ -1,9 +1,8 @@
 """Keys of records (the robot, its incarnation, and a number), and sets of keys stored as intervals.
 
 A record's id is (robot, sequence), as a component's in a map; sequence = incarnation · 2²⁸ + number. A
-robot draws a new incarnation whenever it starts, and numbers its records from 0. So a robot that lost its
-disk, or whose disk is older than its last datagrams, gives no id twice, without knowing its earlier
-records. Two of n incarnations are equal with probability n²/2²⁵: 3·10⁻⁶ for ten.
+robot draws a new incarnation whenever it starts, and numbers its records from 0. So it gives no id twice,
+even if it lost its disk. Two of n incarnations are equal with probability n²/2²⁵: 3·10⁻⁶ for ten.
 
 Here an id is one whole number, the key: robot · 2⁵² + sequence. An author is one incarnation of a robot, as
 the number robot · 2²⁴ + incarnation.

@@ -60,10 +60,8 @@ class FramedTransport(ABC):
     # -- the transport -------------------------------------------------------------------------------------
 
     def send(self, sender: int, datagrams: Sequence[bytes], now: float, kind: str) -> None:
-        """Broadcast datagrams of at most 1200 bytes; `sender` must be this robot. See `Transport`.
-
-        Does not wait: datagrams that the network does not take at once are lost.
-        """
+        """Broadcast datagrams of at most 1200 bytes; `sender` must be this robot. See `Transport`. Does not
+        wait: datagrams that the network does not take at once are lost."""
         self._check("sender", sender)
         frames = [self._sealer.seal(datagram) for datagram in datagrams]
         carried = _sum(*(self._carry(frame, kind) for frame in frames))
@@ -94,9 +92,7 @@ class FramedTransport(ABC):
 
     def disown(self, former: Iterable[bytes]) -> None:
         """Set the sessions of this robot's former starts. Their frames are no sign of a duplicate robot id.
-
-        Without them, `sessions.OwnIdWatch` decides by the frames' numbers and times.
-        """
+        Without them, `sessions.OwnIdWatch` decides by the frames' numbers and times."""
         self._opener.former = frozenset(former)
 
     @property
@@ -120,10 +116,8 @@ class FramedTransport(ABC):
         return said.wire_bytes + self.overhead * said.datagrams
 
     def books(self, robot: int) -> dict[str, Any]:
-        """Traffic and errors, as fields of a results row. `robot` must be this one.
-
-        A robot's own frames that multicast brings back are not counted as refused.
-        """
+        """Traffic and errors, as fields of a results row. `robot` must be this one. A robot's own frames that
+        multicast brings back are not counted as refused."""
         self._check_robot("robot", robot)
         said = self.traffic()
         with self._lock:

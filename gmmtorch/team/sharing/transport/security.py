@@ -48,11 +48,9 @@ class TeamKey:
 
     @classmethod
     def from_file(cls, path: str | Path) -> TeamKey:
-        """The key in a file of 64 hexadecimal digits that only its owner may read.
-
-        Raises `MissingDataError` if there is no file, and `DataError` if it contains something else, or if
-        other users may read or write it.
-        """
+        """The key in a file of 64 hexadecimal digits that only its owner may read. Raises `MissingDataError`
+        if there is no file, and `DataError` if it contains something else, or if other users may read or
+        write it."""
         path = Path(path)
         try:
             if not path.is_file():

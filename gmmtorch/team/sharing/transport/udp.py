@@ -109,10 +109,9 @@ class UdpTransport(FramedTransport):
     ) -> UdpTransport:
         """Sends each datagram once, to all that have joined the group, also on this machine.
 
-        Args:
-            group: an address 224.0.0.0 … 239.255.255.255 (239.… are for private use), and a port.
-            interface: the address of this machine's interface to the team's network.
-            ttl: how many networks a datagram may cross, 0 … 255; 1: it does not pass a router.
+        group: an address 224.0.0.0 … 239.255.255.255 (239.… are for private use), and a port. interface: the
+        address of this machine's interface to the team's network. ttl: how many networks a datagram may
+        cross, 0 … 255; 1: it does not pass a router.
 
         The other arguments and errors are those of `unicast`; here the interface needs a key.
         """
