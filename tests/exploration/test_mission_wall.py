@@ -14,11 +14,12 @@ import torch
 from exploration.replays import FakeTime, Together
 from exploration.rooms import small_room
 
+from gmmtorch.errors import GmmTorchError
 from gmmtorch.simulation.sensors.depth_camera import DepthCamera
 from gmmtorch.team.exploration.mission.driver import Stopwatch, WallClock, drive, settle
 from gmmtorch.team.exploration.mission.mission import Mission
 from gmmtorch.team.exploration.mission.options import TeamOptions
-from gmmtorch.team.exploration.mission.robot_view import DuplicateIdError, FlyingRobotView
+from gmmtorch.team.exploration.mission.robot_view import FlyingRobotView
 from gmmtorch.team.exploration.mission.trials import make_agent, start_poses
 from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
 from gmmtorch.team.exploration.world.world import World
@@ -177,7 +178,7 @@ def test_a_duplicate_id_is_reported_with_its_address(world, monkeypatch):
             return bool(link.duplicates)
 
         settle(mission, WallClock(), 20.0, stop=is_reported)
-        with pytest.raises(DuplicateIdError, match=rf"robot 0 \(127.0.0.1:{other.address[1]}.*id="):
+        with pytest.raises(GmmTorchError, match=rf"robot 0 \(127.0.0.1:{other.address[1]}.*id="):
             view.check_id()
         assert "another robot has id 0" in view.status()
         assert view.row()["refused"].keys() == {"duplicate_id"}

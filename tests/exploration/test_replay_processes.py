@@ -14,11 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from own_process import answer_of
 
-from gmmtorch.errors import DataError
+from gmmtorch.errors import DataError, GmmTorchError
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.team.exploration.mission.driver import WallClock, settle
 from gmmtorch.team.exploration.mission.replay import ReplayMission
-from gmmtorch.team.exploration.mission.robot_view import DuplicateIdError, ReplayingRobotView
+from gmmtorch.team.exploration.mission.robot_view import ReplayingRobotView
 from gmmtorch.team.sharing.replica.replica import Replica
 from gmmtorch.team.sharing.transport.security import TeamKey
 from gmmtorch.team.sharing.transport.simulated_network import Network
@@ -73,7 +73,7 @@ def test_a_robot_without_network_continues_and_catches_up_later():
 def has_duplicate(view: ReplayingRobotView) -> bool:
     try:
         view.check_id()
-    except DuplicateIdError:
+    except GmmTorchError:
         return True
     return False
 
@@ -87,7 +87,7 @@ def test_duplicate_ids_are_detected_over_udp(monkeypatch):
     transports[0].peers, transports[1].peers = [transports[1].address], [transports[0].address]
     until(lambda: all(map(has_duplicate, views)), *team)
     for view, transport, other in zip(views, transports, reversed(transports), strict=True):
-        with pytest.raises(DuplicateIdError, match=f"robot 5.*{other.address[1]}.*folder"):
+        with pytest.raises(GmmTorchError, match=f"robot 5.*{other.address[1]}.*folder"):
             view.check_id()
         assert "another robot has id 5" in view.status()
         assert list(view.row()["namesakes"]) == ["5"]

@@ -25,7 +25,7 @@ from gmmtorch.mapping.codec.lattice import LARGEST_VARIANCE
 from gmmtorch.mapping.codec.quantization import MOST_POINTS
 from gmmtorch.mapping.components import Components
 from gmmtorch.team.exploration.planning.view_library import ViewLibrary
-from gmmtorch.team.sharing.messages import message_registry as messages
+from gmmtorch.team.sharing.messages import message_registry
 from gmmtorch.team.sharing.messages.component_messages import (
     MOST_COMPONENTS_SENT,
     ComponentsMessage,
@@ -33,7 +33,7 @@ from gmmtorch.team.sharing.messages.component_messages import (
     encode_components,
     encode_counts,
 )
-from gmmtorch.team.sharing.messages.datagrams import FARTHEST, Kind
+from gmmtorch.team.sharing.messages.datagrams import CODECS, FARTHEST, Kind
 from gmmtorch.team.sharing.messages.message_registry import Message, decode
 from gmmtorch.team.sharing.messages.mission_messages import (
     PlanMessage,
@@ -149,7 +149,7 @@ def encoded_again(message: Message, kind: Kind) -> list[bytes]:
 _CODEC = {
     kind: codec
     for kinds in ((1, 2, 3), (4, 5, 6))
-    for kind, codec in zip(map(Kind, kinds), messages.CODECS, strict=True)
+    for kind, codec in zip(map(Kind, kinds), CODECS, strict=True)
 }
 
 
@@ -326,6 +326,6 @@ def test_unexpected_errors_of_a_reader_refuse_the_datagram(sound, monkeypatch):
         def careless(body: bytes, error: type[Exception] = error) -> Message:
             raise error("oh")
 
-        monkeypatch.setitem(messages._KINDS, Kind.PLAN, ("plans", careless))
+        monkeypatch.setitem(message_registry._KINDS, Kind.PLAN, ("plans", careless))
         with pytest.raises(DataError, match="oh"):
             decode(sound[8])

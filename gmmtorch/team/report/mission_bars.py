@@ -30,7 +30,7 @@ from gmmtorch.report import (
     stacked_bars,
     tick_text,
 )
-from gmmtorch.team.exploration import Interval, mean_band
+from gmmtorch.team.exploration import mean_band
 from gmmtorch.team.report.trial_groups import (
     about,
     by_framework,
@@ -204,10 +204,11 @@ def _draw_group(
         axes.annotate(f"{len(values)} of {n_trials}", (place, values.max()), (0, 6), **look)
         axes.margins(y=0.14)  # room for the text above the highest dot
         return
-    _draw_interval(axes, place, Interval(*(float(part[0]) for part in mean_band(values[:, None]))), hue)
+    _draw_interval(axes, place, [float(part[0]) for part in mean_band(values[:, None])], hue)
 
 
-def _draw_interval(axes: Axes, place: float, interval: Interval, hue: str) -> None:
+def _draw_interval(axes: Axes, place: float, interval: Sequence[float], hue: str) -> None:
+    """Draws mean, low and high."""
     mean, low, high = interval
     axes.plot([place - 0.24, place + 0.24], [mean, mean], color=hue, linewidth=2.4)
     if math.isfinite(low):

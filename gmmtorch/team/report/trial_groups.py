@@ -197,7 +197,7 @@ def milestone_text(rows: Rows, field: str) -> str:
 
 def paired_difference(
     first: Mapping[Any, float | None], second: Mapping[Any, float | None], by_ratio: bool = False
-) -> Interval | None:
+) -> Interval[float] | None:
     """Returns the mean of first − second over common seeds, with its paired 95 % interval. Arguments are
     values by seed. Returns None if no seed is common, or if a common one has no value. With `by_ratio`,
     returns the geometric mean of first / second and its interval."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -15,21 +15,19 @@ from gmmtorch.team.exploration.mission.mission import Mission
 from gmmtorch.team.exploration.mission.options import THESIS
 from gmmtorch.team.exploration.world.scoring import accuracy, disagreement, overlap
 
-
-class Band(NamedTuple):
-    """Mean (T,) over trials, and the confidence limits low (T,) and high (T,) of the expected value."""
-
-    mean: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
+T = TypeVar("T")
 
 
-class Interval(NamedTuple):
+class Interval(NamedTuple, Generic[T]):
     """Mean over trials, and the confidence limits low and high of the expected value."""
 
-    mean: float
-    low: float
-    high: float
+    mean: T
+    low: T
+    high: T
+
+
+Band = Interval[np.ndarray]
+"""The same at T times, each (T,)."""
 
 
 def mean_band(curves: ArrayLike, confidence: float = 0.95) -> Band:
@@ -50,7 +48,7 @@ def mean_band(curves: ArrayLike, confidence: float = 0.95) -> Band:
     return Band(mean, mean - half, mean + half)
 
 
-def paired_interval(a: ArrayLike, b: ArrayLike, confidence: float = 0.95) -> Interval:
+def paired_interval(a: ArrayLike, b: ArrayLike, confidence: float = 0.95) -> Interval[float]:
     """Student's t interval of the mean of a − b, over pairs of trials (S,) with the same seed and start.
     Pairing removes the variance that both trials of a seed share. A single pair gives (−∞, ∞)."""
     first, second = _finite("a", a, 1), _finite("b", b, 1)
@@ -58,7 +56,8 @@ def paired_interval(a: ArrayLike, b: ArrayLike, confidence: float = 0.95) -> Int
         raise InvalidArgumentError(
             f"a has shape {first.shape} and b {second.shape}; they must have one trial for each seed."
         )
-    return Interval(*(float(value[0]) for value in mean_band((first - second)[:, None], confidence)))
+    mean, low, high = (float(value[0]) for value in mean_band((first - second)[:, None], confidence))
+    return Interval(mean, low, high)
 
 
 def time_to_share(times: ArrayLike, reduction: ArrayLike, reference: float, share: float) -> float | None:

@@ -37,10 +37,6 @@ Files = Mapping[str, tuple[str, Callable[[Path], object]]]
 """By name: the file name, and what writes the file to a path."""
 
 
-class DuplicateIdError(GmmTorchError):
-    """Another robot uses this robot's id."""
-
-
 class FlyingRobotView:
     """The robot of a `Mission` without simulated network. `status` is one short line for a terminal,
     `scalars` are numbers for a plot over time, `row` is the row of results.json, and `files` are the robot's
@@ -53,7 +49,7 @@ class FlyingRobotView:
         self.robot = self._agent.number
 
     def check_id(self) -> None:
-        """Raises `DuplicateIdError` if another robot uses this robot's id."""
+        """Raises `GmmTorchError` if another robot uses this robot's id."""
         _check_id(self._agent.radio, self._n_conflicts)
 
     @property
@@ -204,7 +200,7 @@ def _placement(replica: Replica) -> dict[str, Any]:
 
 def _check_id(radio: Radio, n_conflicts: int) -> None:
     if (message := radio.duplicate_id(n_conflicts)) is not None:
-        raise DuplicateIdError(message)
+        raise GmmTorchError(message)
 
 
 def _reception(radio: Radio) -> dict[str, int]:

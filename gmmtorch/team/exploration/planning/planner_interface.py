@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -65,18 +65,11 @@ class Planner(Protocol):
     def plan(self, task: PlanningTask) -> Plan: ...
 
 
-class Options(NamedTuple):
-    """All primitives from N states. paths: (N, P, S, 7); braking: (N, P, B, 7); feasible: (N, P) bool."""
-
-    paths: Tensor
-    braking: Tensor
-    feasible: Tensor
-
-
 def options(
     primitives: Primitives, states: Tensor, task: PlanningTask, *, after: int = 0, may_escape: bool = False
-) -> Options:
-    """Roll out all primitives from states (N, 7) that are reached `after` so many primitives, and check them.
+) -> tuple[Tensor, Tensor, Tensor]:
+    """All primitives from states (N, 7) that are reached `after` so many primitives: paths (N, P, S, 7),
+    braking (N, P, B, 7), and which are feasible (N, P).
 
     may_escape: a robot whose own cell is no longer passable may leave it, see `collision_checking.feasible`.
     """
@@ -91,7 +84,7 @@ def options(
         start=states[:, None],
         radius=dynamics.radius if may_escape else None,
     )
-    return Options(paths, braking, safe)
+    return paths, braking, safe
 
 
 def continuations(
@@ -104,8 +97,8 @@ def continuations(
     passable = task.local_map.passable
     continued = primitives.continued(states) if is_fused(passable, states) else None
     if continued is None:
-        there = options(primitives, states, task, after=after)
-        return there.paths[:, :, -1], there.feasible
+        paths, _, safe = options(primitives, states, task, after=after)
+        return paths[:, :, -1], safe
     steps = after * primitives.dynamics.n_steps
     return continued[0].ends, feasible_motions(*continued, task.local_map, task.peers, steps)
 
@@ -115,9 +108,9 @@ _METRES = 0.8  # largest distance of one plan
 
 def is_boxed_in(primitives: Primitives, task: PlanningTask) -> bool:
     """Return whether no primitive that moves the robot is feasible. Turning in place at rest always is."""
-    here = options(primitives, task.state[None].double(), task, may_escape=True)
-    leads = (here.paths[0, :, -1, :3] - task.state[:3]).norm(dim=1) > LEAST
-    return not bool((here.feasible[0] & leads).any())
+    paths, _, safe = options(primitives, task.state[None].double(), task, may_escape=True)
+    leads = (paths[0, :, -1, :3] - task.state[:3]).norm(dim=1) > LEAST
+    return not bool((safe[0] & leads).any())
 
 
 class Waiting:

@@ -351,10 +351,10 @@ class RandomPlanner:
         self._last = -1
 
     def plan(self, task: PlanningTask) -> Plan:
-        here = options(self._primitives, task.state[None].double(), task, may_escape=True)
-        moved = (here.paths[0, :, -1, :3] - task.state[:3]).norm(dim=1)
+        paths, braking, safe = options(self._primitives, task.state[None].double(), task, may_escape=True)
+        moved = (paths[0, :, -1, :3] - task.state[:3]).norm(dim=1)
         moved[self._primitives.stop] = 0
-        possible = (moved + _TURNING * (self._primitives.commands[:, 2] != 0)) * here.feasible[0]
+        possible = (moved + _TURNING * (self._primitives.commands[:, 2] != 0)) * safe[0]
         if not bool(possible.any()):
             self._last = -1
             return self._waiting.plan(task)
@@ -362,8 +362,8 @@ class RandomPlanner:
         goes_on = float(torch.rand((), generator=task.generator)) < _PERSISTENCE
         if not (goes_on and self._last >= 0 and possible[self._last] > 0):
             self._last = int(torch.multinomial(possible, 1, generator=task.generator))
-        path = here.paths[0, self._last]
-        return Plan(path, here.braking[0, self._last], path[-1:, :4], 0.0, "explore")
+        path = paths[0, self._last]
+        return Plan(path, braking[0, self._last], path[-1:, :4], 0.0, "explore")
 
 
 PLANNERS = ("mcts", "frontier", "random")

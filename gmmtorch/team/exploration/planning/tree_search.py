@@ -129,8 +129,8 @@ class _Tree:
         self._nodes = [root]
         if goal is not None:
             self._metres[0] = goal.cost(start).clamp_max(_FAR)
-        self._options = options(primitives, start[None], task, may_escape=True)
-        self._open([root], self._options.paths[:, :, -1], self._options.feasible)
+        self._paths, self._braking, feasible = options(primitives, start[None], task, may_escape=True)
+        self._open([root], self._paths[:, :, -1], feasible)
 
     def grow(self, first: Sequence[int]) -> None:
         """Try the branch `first`, then the most promising leaves, round by round."""
@@ -157,8 +157,8 @@ class _Tree:
         branch = last.path()[1:]
         return Found(
             actions=[node.action for node in branch],
-            path=self._options.paths[0, branch[0].action],
-            braking=self._options.braking[0, branch[0].action],
+            path=self._paths[0, branch[0].action],
+            braking=self._braking[0, branch[0].action],
             views=self._states[[node.number for node in branch], :4],
             value=last.value,
             information=last.information,

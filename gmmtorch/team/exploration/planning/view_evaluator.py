@@ -184,22 +184,6 @@ class ViewValues(NamedTuple):
     measured: Tensor
 
 
-class _Layout(NamedTuple):
-    """Index tables for all local maps of one shape with n cells."""
-
-    shape: tuple[int, ...]
-    n_blocks: int
-    block: Tensor  # (n + 1,) int32, coarse block of each cell; the last is for cells outside
-    offsets: Tensor  # (Y, B, C + 1) int32, templates in the flat index
-
-
-class _Window(NamedTuple):
-    """Data shared by all evaluations of one local map."""
-
-    cells: Cells
-    unresolved: Tensor  # (G,) sum of o(1 − o)
-
-
 class ViewEvaluator:
     """Computes the information of depth images from a lattice of poses: every `stride`-th cell, n_yaws
     headings.
@@ -252,8 +236,8 @@ class ViewEvaluator:
             _with_end(templates.volumes.float()).flatten(0, 1).to(device),
             kernel.to(device),
         )
-        self._layout: _Layout | None = None
-        self._windows: weakref.WeakKeyDictionary[LocalMap, _Window] = weakref.WeakKeyDictionary()
+        self._empty: Cells | None = None  # of the last shape
+        self._windows: weakref.WeakKeyDictionary[LocalMap, tuple[Cells, Tensor]] = weakref.WeakKeyDictionary()
 
     def keys(self, poses: Tensor) -> Tensor:
         """Return lattice poses (V, 4) int64 nearest to poses (V, 4): x, y, z, yaw; metres, radians, world."""
@@ -277,12 +261,12 @@ class ViewEvaluator:
 
     def evaluate(self, local_map: LocalMap, keys: Tensor) -> ViewValues:
         """Evaluate each view (V, 4) alone. Beams end at the map's border; a camera outside sees nothing."""
-        window = self._window(local_map)
+        cells, unresolved = self._window(local_map)
         cameras = (keys[:, :3] * self.stride - local_map.low.to(keys.device)).to(self.device)
         gain, taken = information_by_block(
-            self._beams, window.cells, cameras, keys[:, 3].to(self.device), self.information == "fsmi"
+            self._beams, cells, cameras, keys[:, 3].to(self.device), self.information == "fsmi"
         )
-        enough = (_SATURATED * window.unresolved).clamp_min_(torch.finfo(torch.float32).tiny)
+        enough = (_SATURATED * unresolved).clamp_min_(torch.finfo(torch.float32).tiny)
         measured = taken.div_(enough).clamp_max_(1)
         if self.device.type != "cpu":
             gain, measured = torch.stack([gain, measured]).cpu()
@@ -292,20 +276,30 @@ class ViewEvaluator:
         """Return what views from poses (M, 4) leave of each block, (G,) float32: Π (1 − measured)."""
         return (1 - self.evaluate(local_map, self.keys(poses)).measured).prod(0)
 
-    def _window(self, local_map: LocalMap) -> _Window:
+    def _window(self, local_map: LocalMap) -> tuple[Cells, Tensor]:
+        """The cells of a local map, and the sum of o(1 − o) in each block (G,), for all its evaluations."""
         window = self._windows.get(local_map)
-        if window is None:
-            if not math.isclose(local_map.resolution, self.resolution, rel_tol=1e-9):
-                raise InvalidArgumentError(
-                    f"The local map has cells of {local_map.resolution} m, but the evaluator has "
-                    f"{self.resolution} m; give both the same resolution."
-                )
-            if self._layout is None or self._layout.shape != local_map.shape:
-                self._layout = self._laid_out(local_map.shape)
-            window = self._windows[local_map] = self._prepared(local_map, self._layout)
-        return window
+        if window is not None:
+            return window
+        if not math.isclose(local_map.resolution, self.resolution, rel_tol=1e-9):
+            raise InvalidArgumentError(
+                f"The local map has cells of {local_map.resolution} m, but the evaluator has "
+                f"{self.resolution} m; give both the same resolution."
+            )
+        if self._empty is None or self._empty.shape != local_map.shape:
+            self._empty = self._laid_out(local_map.shape)
+        occupancy = local_map.occupancy.float().to(self.device)
+        observed = local_map.observed.to(self.device)
+        occupancy = occupancy.masked_fill(observed & (occupancy <= _KNOWN_FREE), 0.0)
+        occupancy.masked_fill_(observed & (occupancy >= _KNOWN_OCCUPIED), 1.0)
+        occupancy = _with_end(occupancy.view(-1))
+        cells = self._empty._replace(occupancy=occupancy)
+        unresolved = torch.bincount(cells.block, (1 - occupancy).mul_(occupancy), cells.n_blocks)
+        self._windows[local_map] = cells, unresolved
+        return cells, unresolved
 
-    def _laid_out(self, shape: tuple[int, ...]) -> _Layout:
+    def _laid_out(self, shape: tuple[int, ...]) -> Cells:
+        """The index tables of all local maps of a shape, without occupancy."""
         if math.prod(shape) >= _BEYOND:
             raise InvalidArgumentError(f"A local map of {shape} cells is too large; the limit is 2³⁰ cells.")
         _, ny, nz = shape
@@ -314,17 +308,8 @@ class ViewEvaluator:
         block = ((x[:, None, None] * counts[1] + y[:, None]) * counts[2] + z).view(-1)
         x, y, z = self._offsets.unbind(-1)
         offsets = torch.where(self._exists, (x * ny + y) * nz + z, _BEYOND)
-        return _Layout(shape, math.prod(counts), _with_end(block), _with_end(offsets, _BEYOND).int())
-
-    def _prepared(self, local_map: LocalMap, layout: _Layout) -> _Window:
-        occupancy = local_map.occupancy.float().to(self.device)
-        observed = local_map.observed.to(self.device)
-        occupancy = occupancy.masked_fill(observed & (occupancy <= _KNOWN_FREE), 0.0)
-        occupancy.masked_fill_(observed & (occupancy >= _KNOWN_OCCUPIED), 1.0)
-        occupancy = _with_end(occupancy.view(-1))
-        unresolved = torch.bincount(layout.block, (1 - occupancy).mul_(occupancy), layout.n_blocks)
-        cells = Cells(layout.shape, layout.n_blocks, layout.block, occupancy, layout.offsets)
-        return _Window(cells, unresolved)
+        nothing = torch.zeros(0, device=self.device)
+        return Cells(shape, math.prod(counts), _with_end(block), nothing, _with_end(offsets, _BEYOND).int())
 
 
 def _with_end(cells: Tensor, value: float = 0) -> Tensor:

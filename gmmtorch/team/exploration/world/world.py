@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ from gmmtorch.errors import (
     MissingDataError,
     OutputError,
     check_choice,
+    check_number,
 )
 from gmmtorch.events import Event, ignore
 from gmmtorch.files import pack_tensors, read_tensors, require, write_bytes
@@ -41,76 +42,45 @@ from gmmtorch.team.exploration.world.navigable import (
 
 _log = logging.getLogger(__name__)
 
+_CELLS = ("occupied", "observable", "navigable")
+_Cells = dict[str, Tensor]
+"""Bool tensors (nx, ny, nz) by these names."""
 _KIND = "gmmtorch-world"
 VERSION = 1
 """Increase it when the same mesh would give other cells."""
 
 
-def cache_folder() -> Path:
-    """Return $GMMTORCH_CACHE, else gmmtorch in $XDG_CACHE_HOME, else in ~/.cache."""
-    own = os.environ.get("GMMTORCH_CACHE")
-    if own:
-        return Path(own)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "gmmtorch"
-
-
 def cached_cells(
-    triangles: Tensor,
-    options: Mapping[str, Any],
-    names: tuple[str, ...],
-    shape: tuple[int, ...],
-    compute: Callable[[], dict[str, Tensor]],
-) -> dict[str, Tensor]:
-    """Return bool tensors of this shape by name, from the cache, or computed and stored there."""
-    key = world_key(triangles, options)
-    cells = load_cells(key, names, shape)
-    if cells is None:
-        cells = compute()
-        save_cells(key, cells)
-    return cells
+    triangles: Tensor, options: Mapping[str, Any], shape: tuple[int, ...], compute: Callable[[], _Cells]
+) -> _Cells:
+    """Return the cells of a world of this shape, from the cache, or computed and stored there.
 
-
-def world_key(triangles: Tensor, options: Mapping[str, Any]) -> str:
-    """Hash triangles (T, 3, 3), float64, options (JSON), and the version."""
+    The folder is $GMMTORCH_CACHE, else gmmtorch in $XDG_CACHE_HOME, else in ~/.cache. The name of a file is a
+    hash of the triangles (T, 3, 3), float64, the options (JSON), and the version; cells are packed as bits.
+    """
     digest = hashlib.sha256(triangles.contiguous().numpy().tobytes())
     digest.update(json.dumps({"version": VERSION, **options}, sort_keys=True).encode())
-    return digest.hexdigest()
-
-
-def load_cells(key: str, names: tuple[str, ...], shape: tuple[int, ...]) -> dict[str, Tensor] | None:
-    """Read bool tensors of this shape by name; None if the file is missing or damaged."""
-    path = _path(key)
+    key, n_cells = digest.hexdigest(), math.prod(shape)
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "gmmtorch"
+    path = Path(os.environ.get("GMMTORCH_CACHE") or home) / "worlds" / f"{key[:32]}.safetensors"
     try:
         tensors, facts = read_tensors(path, _KIND, VERSION)
-        packed = [
-            require(tensors, name, (math.ceil(math.prod(shape) / 8),), torch.uint8, path) for name in names
-        ]
+        packed = [require(tensors, name, (math.ceil(n_cells / 8),), torch.uint8, path) for name in _CELLS]
         if facts.get("key") != key or facts.get("shape") != list(shape):
             raise DataError(f"{path} belongs to another world.")
+        bits = (np.unpackbits(part.numpy(), count=n_cells).view(np.bool_) for part in packed)
+        return {name: torch.from_numpy(bit).view(shape) for name, bit in zip(_CELLS, bits, strict=True)}
     except MissingDataError:
-        return None
+        pass
     except (DataError, OSError) as error:
         _log.warning("The cached world cannot be used and is computed again: %s", error)
-        return None
-    bits = (np.unpackbits(part.numpy(), count=math.prod(shape)) for part in packed)
-    return {
-        name: torch.from_numpy(bit.view(np.bool_)).view(shape) for name, bit in zip(names, bits, strict=True)
-    }
-
-
-def save_cells(key: str, cells: Mapping[str, Tensor]) -> None:
-    """Store bool tensors, all of one shape. A failure is logged as a warning."""
-    packed = {name: torch.from_numpy(np.packbits(cell.numpy())) for name, cell in cells.items()}
-    shape = list(next(iter(cells.values())).shape)
-    data = pack_tensors(packed, _KIND, VERSION, key=key, shape=shape)
+    cells = compute()
     try:
-        write_bytes(_path(key), data)
+        packed_bits = {name: torch.from_numpy(np.packbits(cell.numpy())) for name, cell in cells.items()}
+        write_bytes(path, pack_tensors(packed_bits, _KIND, VERSION, key=key, shape=list(shape)))
     except OutputError as error:
         _log.warning("The world is not cached: %s", error)
-
-
-def _path(key: str) -> Path:
-    return cache_folder() / "worlds" / f"{key[:32]}.safetensors"
+    return cells
 
 
 MAX_CELLS = 1 << 28
@@ -121,8 +91,6 @@ _SHARP = 0.4
 
 _FINEST = 0.01
 """Smallest angle (rad) between those rays."""
-
-_CELLS = ("occupied", "observable", "navigable")
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,19 +160,19 @@ class World:
         mesh = MeshWorld(triangles)
         box = _lattice_box(mesh, bounds, resolution, name)
         place = None if start is None else _point(start)
-        options = _CellOptions(
-            resolution,
-            box.low.tolist(),
-            box.high.tolist(),
-            vertical_fov,
-            max_range,
-            robot_radius,
-            None if place is None else place.tolist(),
-            spacing,
-        )
+        options: dict[str, Any] = {  # what the cells depend on besides the triangles; the key of the cache
+            "resolution": resolution,
+            "low": box.low.tolist(),
+            "high": box.high.tolist(),
+            "vertical_fov": vertical_fov,
+            "max_range": max_range,
+            "robot_radius": robot_radius,
+            "start": None if place is None else place.tolist(),
+            "spacing": spacing,
+        }
 
-        def compute() -> dict[str, Tensor]:
-            cells = _compute_cells(mesh, triangles, box, options, name, on_event)
+        def compute() -> _Cells:
+            cells = _compute_cells(mesh, triangles, box, place, options, name, on_event)
             if cells is None:
                 raise InvalidArgumentError(
                     f"bounds={_listed(bounds)} contain no surface of {name}, which extends from "
@@ -212,7 +180,7 @@ class World:
                 )
             return cells
 
-        cells = cached_cells(triangles, options._asdict(), _CELLS, box.shape, compute) if cache else compute()
+        cells = cached_cells(triangles, options, box.shape, compute) if cache else compute()
         return cls(name, mesh, resolution, box, **cells, robot_radius=robot_radius, start=place)
 
     def centers(self, cells: Tensor) -> Tensor:
@@ -220,34 +188,26 @@ class World:
         return (cells + self.box.low + 0.5).double() * self.resolution
 
 
-class _CellOptions(NamedTuple):
-    """What the cells of a world depend on besides its triangles; the key of the cache."""
-
-    resolution: float
-    low: list[int]
-    high: list[int]
-    vertical_fov: float
-    max_range: float
-    robot_radius: float
-    start: list[float] | None
-    spacing: float
-
-
 def _compute_cells(
-    mesh: MeshWorld, triangles: Tensor, box: Box, options: _CellOptions, name: str, on_event: Event
-) -> dict[str, Tensor] | None:
+    mesh: MeshWorld,
+    triangles: Tensor,
+    box: Box,
+    start: Tensor | None,
+    options: Mapping[str, Any],
+    name: str,
+    on_event: Event,
+) -> _Cells | None:
     """Return the occupied, observable and navigable cells; None if no cell is occupied."""
-    resolution, radius = options.resolution, options.robot_radius
+    resolution, radius, max_range = (options[key] for key in ("resolution", "robot_radius", "max_range"))
     grounded = above_floor(mesh, resolution, box)
     occupied, clear = occupied_and_clear(mesh, triangles, resolution, box, grounded, radius, on_event)
     if not bool(occupied.any()):
         return None
-    start = None if options.start is None else _point(options.start)
     navigable = connected(clear, mesh, resolution, box, start, radius, name)
-    places = viewpoints(navigable, max(1, round(options.spacing / resolution)))
-    angle = max(resolution / (_SHARP * options.max_range), _FINEST)
-    directions = view_directions(options.vertical_fov, angle)
-    seen = observable_cells(mesh, occupied, box, resolution, places, directions, options.max_range, on_event)
+    places = viewpoints(navigable, max(1, round(options["spacing"] / resolution)))
+    angle = max(resolution / (_SHARP * max_range), _FINEST)
+    directions = view_directions(options["vertical_fov"], angle)
+    seen = observable_cells(mesh, occupied, box, resolution, places, directions, max_range, on_event)
     seen = (seen | navigable) & (grounded | occupied)
     return {"occupied": occupied, "observable": seen, "navigable": navigable}
 
@@ -259,8 +219,7 @@ def _check_sizes(
     if not 0 < vertical_fov <= math.pi:
         raise InvalidArgumentError(f"vertical_fov={vertical_fov} must be above 0 and at most π rad.")
     for key, value in {"max_range": max_range, "robot_radius": robot_radius, "spacing": spacing}.items():
-        if not (math.isfinite(value) and value > 0):
-            raise InvalidArgumentError(f"{key}={value} must be above zero metres.")
+        check_number(key, value, above=True)
     if max_range <= robot_radius + 2 * resolution:
         raise InvalidArgumentError(
             f"max_range={max_range} m ends within two cells of the robot (robot_radius={robot_radius} m, "

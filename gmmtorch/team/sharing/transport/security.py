@@ -17,9 +17,16 @@ from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
-from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError, OutputError, check_whole
+from gmmtorch.errors import (
+    DataError,
+    GmmTorchError,
+    InvalidArgumentError,
+    MissingDataError,
+    OutputError,
+    check_whole,
+)
 from gmmtorch.optional_packages import needs_extra
 from gmmtorch.team.sharing.messages.datagrams import MAX_BYTES, check_datagram
 
@@ -301,29 +308,18 @@ _WARNINGS = {
 _log = logging.getLogger(__name__)
 
 
-class _Cipher:
-    """ChaCha20-Poly1305 with a team's key."""
-
-    def __init__(self, key: TeamKey) -> None:
-        with needs_extra("A team key needs", "cryptography", "network"):
-            from cryptography.exceptions import InvalidTag
-            from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
-        self._aead, self._invalid = ChaCha20Poly1305(key._data), InvalidTag
-
-    def encrypt(self, header: bytes, datagram: bytes) -> bytes:
-        return self._aead.encrypt(_nonce(header), datagram, header)
-
-    def decrypt(self, header: bytes, data: bytes) -> bytes | None:
-        """The datagram; None if key, header or data differ from those that it was sealed with."""
-        try:
-            return self._aead.decrypt(_nonce(header), data, header)
-        except self._invalid:
-            return None
+_NONCE = slice(3, None)
+"""Of a header: session and number, 12 bytes; unique for each datagram under one key."""
 
 
-def _nonce(header: bytes) -> bytes:
-    """Session and number, 12 bytes: unique for each datagram under one key."""
-    return header[3:]
+def _cipher(key: TeamKey | None) -> tuple[Any, type[Exception]]:
+    """ChaCha20-Poly1305 with a team's key, None without one; and the error of data that were altered."""
+    if key is None:
+        return None, GmmTorchError
+    with needs_extra("A team key needs", "cryptography", "network"):
+        from cryptography.exceptions import InvalidTag
+        from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
+    return ChaCha20Poly1305(key._data), InvalidTag
 
 
 class Sealer:
@@ -337,7 +333,7 @@ class Sealer:
     def __init__(self, sender: int, key: TeamKey | None = None) -> None:
         self.sender = check_whole("sender", sender, 0, MAX_SENDER)
         self.overhead = PLAIN_OVERHEAD if key is None else SEALED_OVERHEAD
-        self._cipher = None if key is None else _Cipher(key)
+        self._cipher, _ = _cipher(key)
         self._first = bytes([(_PLAIN if key is None else _SEALED) << 4 | FRAME_VERSION])
         self._lock = threading.Lock()
         self._begin()
@@ -355,7 +351,9 @@ class Sealer:
             header = self._first + self.sender.to_bytes(2, "little") + self.session
             header += self._number.to_bytes(4, "little")
             self._number += 1
-        return header + (datagram if self._cipher is None else self._cipher.encrypt(header, datagram))
+        if self._cipher is not None:
+            datagram = self._cipher.encrypt(header[_NONCE], datagram, header)
+        return header + datagram
 
     def __reduce__(self) -> NoReturn:
         raise InvalidArgumentError("A Sealer cannot be copied: two with one session would share nonces.")
@@ -382,7 +380,7 @@ class Opener:
         own: this robot's sealer, to recognize its own frames, and other robots with its id.
         clock: seconds that never go back.
         """
-        self._cipher = None if key is None else _Cipher(key)
+        self._cipher, self._altered = _cipher(key)
         self._own = own
         self._form = _PLAIN if key is None else _SEALED
         self._sessions = Sessions(clock)
@@ -421,8 +419,9 @@ class Opener:
         own = self._own
         if own is not None and (sender, session) == (own.sender, own.session):
             return sender, b"", "echo"
-        datagram = data if self._cipher is None else self._cipher.decrypt(header, data)
-        if datagram is None:
+        try:
+            datagram = data if self._cipher is None else self._cipher.decrypt(header[_NONCE], data, header)
+        except self._altered:
             return sender, b"", "wrong_key"
         number = int.from_bytes(header[11:], "little")
         address = f"{source} (session {session.hex()})"  # the log of that robot shows its session, too
