@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapping.random_components import random_components
 from sharing.message_examples import codecs, frame_of_components
-from sharing.replica_histories import told
-from sharing.replica_model import rows
+from sharing.replica_histories import rows, told
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.components import Components

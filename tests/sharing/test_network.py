@@ -150,24 +150,6 @@ def test_deliveries_equal_a_brute_force_model(conditions, sent, walks, seed):
         assert network.reception(robot) == Reception(**model.books[robot])
 
 
-@settings(max_examples=40)
-@given(conditions=conditions, sent=sent, seed=st.integers(0, 9))
-def test_reception_counts_balance_at_any_time(conditions, sent, seed):
-    network, now, to_hear = Network(N, conditions, seed), 0.0, 0
-    network.place(on_a_line([0.0, 1.0, 2.0]))
-    for sender, datagrams, pause, kind in sent:
-        now += pause
-        network.send(sender, datagrams, now, kind)
-        network.deliver(sender, now)
-        to_hear += (N - 1) * len(datagrams)
-        r = network.reception()
-        assert to_hear + r.duplicated == (
-            r.datagrams + r.lost + r.cut_off + r.out_of_reach + network.n_in_flight
-        )
-        each = [network.reception(robot) for robot in range(N)]
-        assert r == Reception(*map(sum, zip(*each, strict=True)))
-
-
 # -- loss, duplication, jitter: by their distributions ---------------------------------------------------
 
 
