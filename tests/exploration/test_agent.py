@@ -25,7 +25,6 @@ from gmmtorch.team.exploration.planning.planner_interface import Plan, PlanningT
 from gmmtorch.team.exploration.planning.primitives import Primitives
 from gmmtorch.team.exploration.planning.roadmap import Roadmap
 from gmmtorch.team.exploration.planning.view_evaluator import ViewEvaluator
-from gmmtorch.team.exploration.planning.view_library import ViewLibrary
 from gmmtorch.team.exploration.robot.agent import Agent, Robot, StoppingRule
 from gmmtorch.team.exploration.robot.mapper import GridMapper, Mapper, Memo
 from gmmtorch.team.exploration.world.starts import InitialFreeSpace
@@ -33,6 +32,7 @@ from gmmtorch.team.sharing.messages.component_messages import encode_components
 from gmmtorch.team.sharing.messages.message_registry import decode, kind_of
 from gmmtorch.team.sharing.messages.mission_messages import PlanMessage, encode_plan
 from gmmtorch.team.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.view_library import ViewLibrary
 
 START = torch.tensor([*PLACES[0][0], PLACES[0][1]], dtype=torch.float64)
 LAUNCH = InitialFreeSpace(cells_in_sphere(START[:3], 1.4, 0.2), START[None, :3])

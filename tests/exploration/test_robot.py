@@ -34,12 +34,12 @@ from gmmtorch.team.exploration.planning.planner_interface import (
     shortened,
 )
 from gmmtorch.team.exploration.planning.roadmap import Roadmap
-from gmmtorch.team.exploration.planning.view_library import ViewLibrary
 from gmmtorch.team.exploration.robot.agent import Agent, Robot, StoppingCriterion, StoppingRule
 from gmmtorch.team.exploration.robot.mapper import GridMapper, Memo
 from gmmtorch.team.exploration.world.scoring import BeliefMap, BeliefRule
 from gmmtorch.team.exploration.world.starts import InitialFreeSpace
 from gmmtorch.team.exploration.world.world import World
+from gmmtorch.team.sharing.view_library import ViewLibrary
 
 BOX = Box(torch.tensor([0, 0, 0]), torch.tensor([32, 32, 16]))
 WINDOW = (32, 32, 16)

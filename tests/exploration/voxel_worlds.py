@@ -17,8 +17,8 @@ from gmmtorch.team.exploration.planning.planner_interface import Plan, Planner, 
 from gmmtorch.team.exploration.planning.primitives import Dynamics, Primitives
 from gmmtorch.team.exploration.planning.roadmap import Roadmap
 from gmmtorch.team.exploration.planning.view_evaluator import ViewEvaluator
-from gmmtorch.team.exploration.planning.view_library import ViewLibrary
 from gmmtorch.team.exploration.robot.mapper import LocalMap
+from gmmtorch.team.sharing.view_library import ViewLibrary
 
 RESOLUTION = 0.2
 PRIMITIVES = Primitives(Dynamics())

@@ -24,7 +24,6 @@ from gmmtorch.mapping.codec.bitstream import BitWriter
 from gmmtorch.mapping.codec.lattice import LARGEST_VARIANCE
 from gmmtorch.mapping.codec.quantization import MOST_POINTS
 from gmmtorch.mapping.components import Components
-from gmmtorch.team.exploration.planning.view_library import ViewLibrary
 from gmmtorch.team.sharing.messages import message_registry
 from gmmtorch.team.sharing.messages.component_messages import (
     MOST_COMPONENTS_SENT,
@@ -54,6 +53,7 @@ from gmmtorch.team.sharing.messages.record_messages import (
     encode_record,
 )
 from gmmtorch.team.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.view_library import ViewLibrary
 
 
 @pytest.fixture(scope="module")

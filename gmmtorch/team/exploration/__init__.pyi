@@ -28,17 +28,12 @@ from .mission.robot_view import MissionMoments as MissionMoments
 from .mission.robot_view import ReplayingRobotView as ReplayingRobotView
 from .mission.robot_view import ReplayMoments as ReplayMoments
 from .mission.robot_view import RobotView as RobotView
-from .mission.robot_view import sharing_row as sharing_row
 from .mission.trials import STAGE as STAGE
-from .mission.trials import TRAJECTORIES as TRAJECTORIES
 from .mission.trials import Trial as Trial
 from .mission.trials import WorldOptions as WorldOptions
-from .mission.trials import keep_row as keep_row
-from .mission.trials import kept_row as kept_row
 from .mission.trials import make_agent as make_agent
 from .mission.trials import run_mission as run_mission
 from .mission.trials import run_trials as run_trials
-from .mission.trials import save_trajectories as save_trajectories
 from .mission.trials import start_poses as start_poses
 from .planning.primitives import Dynamics as Dynamics
 from .robot.agent import Agent as Agent

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
 from gmmtorch.team.sharing.messages.message_registry import Message, decode, kind_of
 from gmmtorch.team.sharing.transport.simulated_network import Transport
 
@@ -114,6 +114,13 @@ class Radio:
         self._budget = None if budget is None else TokenBucket(budget)
         self._decode = decode
 
+    @staticmethod
+    def check(announce_every: float, budget: float | None) -> None:
+        """Raises `InvalidArgumentError` unless these are arguments of a radio."""
+        AnnouncementSchedule(announce_every)
+        if budget is not None:
+            TokenBucket(budget)
+
     def within_budget(
         self, make: Callable[[int | None], list[bytes]], now: float, spare: int = 0
     ) -> list[bytes]:
@@ -159,6 +166,12 @@ class Radio:
         if self.store is not None:
             self.store.keep(datagrams)
 
+    def row(self) -> dict[str, Any]:
+        """What was sent, received, and not stored, as a part of a row of results.json."""
+        received = {"heard": self.n_received, "damaged": self.n_damaged}
+        unkept = {"unkept": 0 if self.store is None else self.store.n_failed}  # batches of records
+        return {**self.transport.books(self.robot), **received, **unkept}
+
     def duplicate_id(self, n_conflicts: int) -> str | None:
         """An error message if another robot uses this robot's id, else None.
 
@@ -172,6 +185,11 @@ class Radio:
             f"Another robot uses the id of robot {self.robot}{address}: give each robot its own id (id=…) "
             "and its own folder."
         )
+
+    def check_id(self, n_conflicts: int) -> None:
+        """Raises `GmmTorchError` if another robot uses this robot's id; see `duplicate_id`."""
+        if (message := self.duplicate_id(n_conflicts)) is not None:
+            raise GmmTorchError(message)
 
     def warnings(self, n_conflicts: int) -> str:
         """The end of a status line: what is wrong with the network, or nothing."""

@@ -6,6 +6,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,6 +17,7 @@ from gmmtorch.mapping import Components, GaussianMap, MotionAt, WindowMotions
 from gmmtorch.scan import Scan
 from gmmtorch.team.sharing.radio import Radio
 from gmmtorch.team.sharing.replica.authorship import MovedMap
+from gmmtorch.team.sharing.replica.materialized_view import robot_of_frame
 from gmmtorch.team.sharing.replica.replica import Replica
 from gmmtorch.team.sharing.store import Store
 from gmmtorch.team.sharing.transport.simulated_network import Transport
@@ -285,3 +287,23 @@ class SharedMap:
         if transform is None:
             return found
         return found.transformed(torch.linalg.inv(transform).to(found.means), torch.ones(len(found)).bool())
+
+    def row(self) -> dict[str, Any]:
+        """What the robot shared with its team, as a part of a row of results.json."""
+        replica, radio, (root, transform) = self.replica, self.radio, self.replica.placement
+        robot = robot_of_frame(root)
+        return {
+            "robot": replica.robot,
+            "digest": replica.digest().hex(),
+            "incarnation": replica.incarnation,
+            "frame": {  # in which the map is, None: the world; and the pose of this robot's frame in it
+                "of_robot": None if robot < 0 else robot,
+                "transform": None if transform is None else transform.tolist(),
+            },
+            "n_components": replica.n_components,
+            "n_records": replica.held.size,
+            "missing": replica.missing.size,
+            **radio.row(),
+            "not_merged": dict(replica.refused),
+            "conflicts": {str(robot): n for robot, n in sorted(replica.duplicates.items()) if n},
+        }

@@ -6,11 +6,13 @@ import functools
 import math
 import operator
 from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from gmmtorch.files import write_npz
 from gmmtorch.kernels import mark_cells_of_rays
 from gmmtorch.occupancy import Box, to_lattice
 from gmmtorch.simulation import DepthFrame
@@ -227,6 +229,11 @@ class Mission:
                     agent.send_views(now)
                 self._listen(now + self.tick_seconds)
         return None
+
+    def save_trajectories(self, folder: Path) -> None:
+        """Writes poses (T, 4) of each robot, one per tick, as arrays robot_0, … of trajectories.npz."""
+        poses = {f"robot_{n}": torch.stack(path).numpy() for n, path in enumerate(self.trajectories)}
+        write_npz(folder / "trajectories.npz", **poses)
 
     # -- the stages of a tick ---------------------------------------------------------------------
 

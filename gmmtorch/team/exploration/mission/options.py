@@ -18,10 +18,9 @@ from gmmtorch.team.exploration.robot.gmm_mapper import FrameRule
 from gmmtorch.team.exploration.world.scoring import BeliefRule
 from gmmtorch.team.sharing import (
     POINT_CODECS,
-    AnnouncementSchedule,
     LinkConditions,
     Partition,
-    TokenBucket,
+    Radio,
     check_codec,
 )
 
@@ -63,7 +62,7 @@ class TeamOptions:
         for the planner. rest: when a robot stops exploring.
     codec: of components, see `sharing.messages`; losses are repaired for "quantized" only.
     latency … partitions: of the simulated network, see `LinkConditions`.
-    announce_every: seconds, see `AnnouncementSchedule`.
+    announce_every: seconds, see `Radio`.
     budget: bytes per second that a robot sends of its map and views; None: no limit.
     sample_every: simulated seconds between the values of curves, rounded to whole frames.
     codecs: other codecs whose bytes for the novel points are measured.
@@ -127,9 +126,7 @@ class TeamOptions:
         check_number("margin", self.margin)
         # These check their own arguments.
         Coordination(self.coordination, self.n_rounds)
-        AnnouncementSchedule(self.announce_every)
-        if self.budget is not None:
-            TokenBucket(self.budget)
+        Radio.check(self.announce_every, self.budget)
         self.conditions.check_team(self.size)
         if not 0 < self.planning_prior < 1:
             raise InvalidArgumentError(f"planner.prior={self.planning_prior} must be between 0 and 1.")

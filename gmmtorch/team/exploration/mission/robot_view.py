@@ -12,7 +12,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import GmmTorchError
 from gmmtorch.files import write_npz
 from gmmtorch.live import COMPONENTS, CurveRecord, Curves, Moment, ViewedCells, ViewedRobot, seen_paths
 from gmmtorch.mapping import GaussianMap
@@ -27,10 +26,7 @@ from gmmtorch.team.sharing import (
     FramedTransport,
     Network,
     PlanMessage,
-    Radio,
     Replica,
-    SharedMap,
-    robot_of_frame,
 )
 
 Files = Mapping[str, tuple[str, Callable[[Path], object]]]
@@ -50,7 +46,7 @@ class FlyingRobotView:
 
     def check_id(self) -> None:
         """Raises `GmmTorchError` if another robot uses this robot's id."""
-        _check_id(self._agent.radio, self._n_conflicts)
+        self._agent.radio.check_id(self._n_conflicts)
 
     @property
     def _n_conflicts(self) -> int:
@@ -92,12 +88,10 @@ class FlyingRobotView:
             "observable_bits": belief.observable_bits,
             "n_components": None if components is None else len(components),
             "n_records": shared.held.size,
-            **self._transport.books(self.robot),
-            **_reception(self._agent.radio),
+            **self._agent.radio.row(),
             "not_merged": dict(Counter(self._agent.refused) + Counter(shared.refused)),
             "path_length": robot.path_length,
             "collisions": robot.collisions,
-            "unkept": _n_unkept(self._agent.radio),
             "stage_seconds": dict(self._mission.watch.seconds),
         }
 
@@ -122,7 +116,7 @@ class ReplayingRobotView:
         self.robot = self._replica.robot
 
     def check_id(self) -> None:
-        _check_id(self._mission.shared.radio, self._replica.duplicates[self.robot])
+        self._mission.shared.radio.check_id(self._replica.duplicates[self.robot])
 
     def status(self) -> str:
         n_scans, replica = self._mission.n_scans, self._replica
@@ -156,7 +150,7 @@ class ReplayingRobotView:
             "n_scans": mission.n_scans,
             "resumed_at": mission.resumed_at,
             "unread": mission.n_unread,
-            **sharing_row(mission.shared),
+            **mission.shared.row(),
             "stage_seconds": mission.watch.seconds,
         }
 
@@ -167,49 +161,6 @@ class ReplayingRobotView:
 
 
 RobotView = FlyingRobotView | ReplayingRobotView
-
-
-def sharing_row(shared: SharedMap) -> dict[str, Any]:
-    """What a robot shared with its team, as a part of a row of results.json."""
-    replica = shared.replica
-    return {
-        "robot": replica.robot,
-        "digest": replica.digest().hex(),
-        "incarnation": replica.incarnation,
-        "frame": _placement(replica),
-        "n_components": replica.n_components,
-        "n_records": replica.held.size,
-        "missing": replica.missing.size,
-        **shared.radio.transport.books(replica.robot),
-        **_reception(shared.radio),
-        "not_merged": dict(replica.refused),
-        "conflicts": {str(robot): n for robot, n in sorted(replica.duplicates.items()) if n},
-        "unkept": _n_unkept(shared.radio),
-    }
-
-
-def _placement(replica: Replica) -> dict[str, Any]:
-    """The robot in whose frame the map is (None: the world), and the pose of this robot's frame in it."""
-    root, transform = replica.placement
-    robot = robot_of_frame(root)
-    return {
-        "of_robot": None if robot < 0 else robot,
-        "transform": None if transform is None else transform.tolist(),
-    }
-
-
-def _check_id(radio: Radio, n_conflicts: int) -> None:
-    if (message := radio.duplicate_id(n_conflicts)) is not None:
-        raise GmmTorchError(message)
-
-
-def _reception(radio: Radio) -> dict[str, int]:
-    return {"heard": radio.n_received, "damaged": radio.n_damaged}
-
-
-def _n_unkept(radio: Radio) -> int:
-    """Batches of records that the store could not keep."""
-    return 0 if radio.store is None else radio.store.n_failed
 
 
 ENTROPY, SENT, RECEIVED = "entropy left [%]", "sent [kB]", "received [kB]"

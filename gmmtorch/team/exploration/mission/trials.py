@@ -21,7 +21,7 @@ from torch import Tensor
 from gmmtorch import __version__
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
 from gmmtorch.events import Event, ignore
-from gmmtorch.files import check_writable, write_json, write_npz
+from gmmtorch.files import check_writable, write_json
 from gmmtorch.occupancy import RollingWindow
 from gmmtorch.processes import end_with_parent
 from gmmtorch.team.exploration.mission.driver import SimulatedClock, Stopwatch, drive
@@ -32,14 +32,13 @@ from gmmtorch.team.exploration.planning.planners import make_planner
 from gmmtorch.team.exploration.planning.primitives import Primitives
 from gmmtorch.team.exploration.planning.roadmap import Roadmap
 from gmmtorch.team.exploration.planning.view_evaluator import ViewEvaluator
-from gmmtorch.team.exploration.planning.view_library import ViewLibrary
 from gmmtorch.team.exploration.robot.agent import Agent, Robot
 from gmmtorch.team.exploration.robot.gmm_mapper import GmmMapper
 from gmmtorch.team.exploration.robot.mapper import GridMapper, Mapper, Memo
 from gmmtorch.team.exploration.world import starts
 from gmmtorch.team.exploration.world.scoring import BeliefMap
 from gmmtorch.team.exploration.world.world import World, open_world
-from gmmtorch.team.sharing import Broadcast, Network, Replica, Transport
+from gmmtorch.team.sharing import Broadcast, Network, Replica, Transport, ViewLibrary
 
 _SLACK = 24
 """Cells by which the sliding map moves, once the robot is so far from its centre. Rays are long: a map that
@@ -172,7 +171,6 @@ def _mapper(
 
 ROW = "row.json"
 STAGE = "simulated seconds"
-TRAJECTORIES = "trajectories.npz"
 _CONVERGENCE = 120.0
 """Simulated seconds after a mission in which the maps may become equal."""
 
@@ -239,6 +237,24 @@ class Trial:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()[:16]
 
+    def kept_row(self, **more: Any) -> dict[str, Any] | None:
+        """The row that `keep_row` kept for an equal trial with the same `more` facts; None: there is none."""
+        if self.folder is None or not (self.folder / ROW).is_file():
+            return None
+        path = self.folder / ROW
+        try:
+            kept = json.loads(path.read_text("utf-8"))
+            row: dict[str, Any] = kept["row"]
+            is_same = kept["facts"] == {**self.facts(), **more}
+        except (ValueError, KeyError, TypeError) as error:
+            raise DataError(f"{path} is damaged ({error!r}); delete it to run the trial again.") from error
+        return row if is_same else None
+
+    def keep_row(self, row: dict[str, Any], **more: Any) -> None:
+        """Keeps the row of the finished trial in its folder, if it has one."""
+        if self.folder is not None:
+            write_json(self.folder / ROW, {"facts": {**self.facts(), **more}, "row": row})
+
 
 def run_mission(
     trial: Trial, world: World | None = None, on_tick: OnMission = lambda mission: None
@@ -280,7 +296,7 @@ def run_trials(
     grow.
     """
     check_whole("workers", workers, 1)
-    rows = [kept_row(trial) for trial in trials]
+    rows = [trial.kept_row() for trial in trials]
     missing = [i for i, row in enumerate(rows) if row is None]
     durations = [trial.team.duration for trial in trials]
     seconds = [0.0 if row is None else whole for whole, row in zip(durations, rows, strict=True)]
@@ -311,38 +327,12 @@ def run_trials(
     return [row for row in rows if row is not None]
 
 
-def kept_row(trial: Trial, **more: Any) -> dict[str, Any] | None:
-    """The row that `keep_row` kept for an equal trial with the same `more` facts; None: there is none."""
-    if trial.folder is None or not (trial.folder / ROW).is_file():
-        return None
-    path = trial.folder / ROW
-    try:
-        kept = json.loads(path.read_text("utf-8"))
-        row: dict[str, Any] = kept["row"]
-        is_same = kept["facts"] == {**trial.facts(), **more}
-    except (ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{path} is damaged ({error!r}); delete it to run the trial again.") from error
-    return row if is_same else None
-
-
-def keep_row(trial: Trial, row: dict[str, Any], **more: Any) -> None:
-    """Keeps the row of a finished trial in its folder, if it has one."""
-    if trial.folder is not None:
-        write_json(trial.folder / ROW, {"facts": {**trial.facts(), **more}, "row": row})
-
-
-def save_trajectories(mission: Mission, path: Path) -> None:
-    """Writes poses (T, 4) of each robot, one per tick, as arrays robot_0, robot_1, … of an npz file."""
-    poses = {f"robot_{n}": torch.stack(path).numpy() for n, path in enumerate(mission.trajectories)}
-    write_npz(path, **poses)
-
-
 def _run_and_keep(trial: Trial, on_tick: OnMission = lambda mission: None) -> dict[str, Any]:
     torch.set_num_threads(1)
     mission, row = run_mission(trial, on_tick=on_tick)
     if trial.folder is not None:
-        save_trajectories(mission, trial.folder / TRAJECTORIES)
-    keep_row(trial, row)
+        mission.save_trajectories(trial.folder)
+    trial.keep_row(row)
     return row
 
 

@@ -14,8 +14,8 @@ from gmmtorch.team.exploration.planning.collision_checking import feasible, feas
 from gmmtorch.team.exploration.planning.coordination import PeerTrajectories, clear_of
 from gmmtorch.team.exploration.planning.primitives import Primitives
 from gmmtorch.team.exploration.planning.roadmap import Roadmap
-from gmmtorch.team.exploration.planning.view_library import ViewLibrary
 from gmmtorch.team.exploration.robot.mapper import LocalMap
+from gmmtorch.team.sharing import ViewLibrary
 
 LEAST = 0.05
 """Smallest displacement (m) that counts as motion."""

@@ -22,9 +22,9 @@ from gmmtorch.team.exploration.planning.view_evaluator import (
     ViewCache,
     ViewEvaluator,
 )
-from gmmtorch.team.exploration.planning.view_library import SPACING
 from gmmtorch.team.exploration.robot.mapper import LocalMap
 from gmmtorch.team.exploration.world.navigable import widened
+from gmmtorch.team.sharing import ViewLibrary
 
 _SEARCH = SearchRule(depth=3, n_rounds=2, n_leaves=24)
 _LEAST = 20  # cells of the smallest frontier
@@ -317,7 +317,7 @@ class TreePlanner:
         return self._branch[1:] if task.now > self._when else self._branch
 
     def _revalue(self, task: PlanningTask, memory: ViewCache) -> None:
-        keys = task.library.covered(task.local_map, task.now, _REVALUED)
+        keys = task.library.covered(task.local_map.is_passable, task.now, _REVALUED)
         if keys:
             known = task.library.candidates()
             at = {key: row for row, key in enumerate(known.keys)}
@@ -334,7 +334,7 @@ class TreePlanner:
         if self._journey is not None:
             known.append(self._journey.pose[None])
         apart = torch.cdist(poses[:, :3], torch.cat(known)[:, :3])
-        values = values.masked_fill((apart < SPACING).any(1), 0.0)
+        values = values.masked_fill((apart < ViewLibrary.spacing).any(1), 0.0)
         task.library.add(poses, values, task.now, _WORTHWHILE * self._largest, _ADDED)
 
 

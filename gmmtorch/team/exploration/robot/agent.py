@@ -26,7 +26,6 @@ from gmmtorch.team.exploration.planning.planner_interface import (
 from gmmtorch.team.exploration.planning.primitives import Primitives
 from gmmtorch.team.exploration.planning.roadmap import Roadmap
 from gmmtorch.team.exploration.planning.view_evaluator import ViewEvaluator
-from gmmtorch.team.exploration.planning.view_library import ViewLibrary
 from gmmtorch.team.exploration.robot.mapper import FrameUpdate, LocalMap, Mapper, Memo
 from gmmtorch.team.exploration.world.starts import InitialFreeSpace
 from gmmtorch.team.sharing import (
@@ -35,6 +34,7 @@ from gmmtorch.team.sharing import (
     Radio,
     Store,
     Transport,
+    ViewLibrary,
     ViewsMessage,
     encode_plan,
 )

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections import Counter, OrderedDict
+from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,16 +18,13 @@ from gmmtorch.occupancy import Box, CellEvidence, RollingWindow, cast_evidence
 from gmmtorch.simulation import DepthFrame
 from gmmtorch.team.exploration.world.scoring import BeliefMap
 from gmmtorch.team.sharing import (
-    MOST_PARTS,
     Broadcast,
-    Intervals,
     Message,
     PointsMessage,
     ReceivedMessage,
     Replica,
-    SendOnce,
+    SharedPoints,
     decode,
-    encode_points,
 )
 
 
@@ -196,61 +192,6 @@ def novel_beams(
     return (unobserved | (bits >= rule.threshold))[number[block]]
 
 
-MOST_INTERVALS = 1 << 14
-"""Intervals of received parts kept for a teammate; beyond, the oldest gaps count as received."""
-
-
-class SharedPoints(SendOnce):
-    """The points that a robot sends, and which parts of its teammates' frames have arrived. No losses are
-    repaired, so nothing is announced.
-
-    A robot numbers its frames from 0 in each session. So teammates ignore a restarted robot until its frames
-    have higher numbers than before.
-
-    Args:
-        robot: its id. size: robots of the team.
-
-    Attributes:
-        refused: messages of points that were not merged: "stranger" (not from a teammate), "repeated"
-            (received before, or so late that this is no longer known).
-    """
-
-    def __init__(self, robot: int, size: int) -> None:
-        super().__init__()
-        self.refused: Counter[str] = Counter()
-        self._robot, self._size = robot, size
-        self._n_frames = 0
-        self._received: dict[int, Intervals] = {}  # parts of frames, by sender
-
-    def add(self, frame: DepthFrame, novel: Tensor) -> list[bytes]:
-        """Queues the novel beams (N,) bool of the next frame; returns the datagrams."""
-        datagrams = []
-        if bool(novel.any()):
-            datagrams = encode_points(
-                self._robot,
-                self._n_frames,
-                frame.origin.cpu(),
-                frame.ends[novel].cpu(),
-                frame.is_hit[novel].cpu(),
-            )
-        self._n_frames += 1
-        self._due += datagrams
-        return datagrams
-
-    def accept(self, message: PointsMessage) -> bool:
-        """Whether this part of a teammate's frame is new; from now on it counts as received."""
-        if message.sender == self._robot or message.sender >= self._size:
-            self.refused["stranger"] += 1
-            return False
-        number = message.frame * MOST_PARTS + message.part
-        received = self._received.get(message.sender, Intervals.empty())
-        if number in received:
-            self.refused["repeated"] += 1
-            return False
-        self._received[message.sender] = _bounded(received | Intervals.span(number, number + 1))
-        return True
-
-
 class GridMapper(Mapper):
     """The voxel map of one robot.
 
@@ -323,9 +264,3 @@ class GridMapper(Mapper):
             return cast_evidence(origin, ends, is_hit, grid.resolution, grid.box)
 
         return self._memo(tuple(datagrams), make)
-
-
-def _bounded(numbers: Intervals) -> Intervals:
-    """The same set, with its first gaps closed if it has more than `MOST_INTERVALS` intervals."""
-    excess = max(0, len(numbers) - MOST_INTERVALS)
-    return Intervals(np.concatenate([numbers.edges[:1], numbers.edges[1 + 2 * excess :]]))

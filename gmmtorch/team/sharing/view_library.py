@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -13,26 +13,26 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
-from gmmtorch.team.exploration.robot.mapper import LocalMap
-from gmmtorch.team.sharing import (
-    LARGEST_INCARNATION,
-    LARGEST_ROBOT,
+from gmmtorch.team.sharing.messages.mission_messages import (
     LATEST,
-    MOST_RECORDS,
     TICKS,
-    Intervals,
     ViewsMessage,
     encode_views,
+    quantized_poses,
+)
+from gmmtorch.team.sharing.replica.record_keys import (
+    LARGEST_INCARNATION,
+    LARGEST_ROBOT,
+    MOST_RECORDS,
+    Intervals,
     first_key,
     ids_of,
     keys_of,
-    quantized_poses,
     robot_of,
 )
 
-SPACING = 1.5
 _TURN = math.pi / 4
-"""Metres and radians. A view is not added if another one is nearer than both."""
+"""Radians. A view is not added if another one is nearer than that and than `ViewLibrary.spacing`."""
 MOST_OWN_VIEWS = 256
 """Views of one robot; the least valuable are removed."""
 TIME_TO_LIVE = 1800.0
@@ -92,6 +92,9 @@ class ViewLibrary:
         version: rises with every change.
     """
 
+    spacing = 1.5
+    """Metres between views of one direction, at least."""
+
     def __init__(self, robot: int, *, incarnation: int = 0) -> None:
         for name, number, most in (
             ("robot", robot, LARGEST_ROBOT),
@@ -137,7 +140,7 @@ class ViewLibrary:
         for row in order.tolist():
             if len(added) == most:
                 break
-            if bool(_is_near(rows[row], near, SPACING, _TURN).any()):
+            if bool(_is_near(rows[row], near, self.spacing, _TURN).any()):
                 continue
             if self._n == MOST_RECORDS:
                 raise InvalidArgumentError(f"{MOST_RECORDS} views are the most of one incarnation.")
@@ -181,10 +184,11 @@ class ViewLibrary:
         seen = _is_near(poses[:, None], known.poses, *_VISITED).any(0)
         self.remove([known.keys[row] for row in seen.nonzero()[:, 0].tolist()], now)
 
-    def covered(self, local_map: LocalMap, now: float, most: int) -> list[int]:
-        """At most `most` views in the local map whose value is no longer fresh, the oldest first."""
+    def covered(self, is_near: Callable[[Tensor], Tensor], now: float, most: int) -> list[int]:
+        """At most `most` views where `is_near`, of places (V, 3), whose value is no longer fresh, the oldest
+        first."""
         known = self.candidates()
-        inside = local_map.is_passable(known.poses[:, :3]).nonzero()[:, 0].tolist()
+        inside = is_near(known.poses[:, :3]).nonzero()[:, 0].tolist()
         due = sorted((self._valued_at[known.keys[row]], known.keys[row]) for row in inside)
         return [key for valued, key in due[:most] if valued <= now - _FRESH]
 
