@@ -15,8 +15,9 @@ from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
-from gmmtorch.team.exploration.robot.mapper import MOST_INTERVALS, GridMapper, Memo, novel_beams
+from gmmtorch.team.exploration.robot.mapper import GridMapper, Memo, novel_beams
 from gmmtorch.team.exploration.world.scoring import BeliefMap, BeliefRule
+from gmmtorch.team.sharing.broadcast import MOST_INTERVALS
 from gmmtorch.team.sharing.messages.message_registry import decode
 from gmmtorch.team.sharing.messages.mission_messages import POINTS_PER_DATAGRAM, PointsMessage, encode_points
 from gmmtorch.team.sharing.radio import ReceivedMessage
@@ -277,7 +278,7 @@ def test_points_of_strangers_are_dropped_and_counted() -> None:
 
 
 def test_memory_is_bounded_for_invented_frame_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gmmtorch.team.exploration.robot.mapper.MOST_INTERVALS", 20)
+    monkeypatch.setattr("gmmtorch.team.sharing.broadcast.MOST_INTERVALS", 20)
     one, view = mapper(), frame(0, n=1)
     datagrams = [said(view, number=7 * k)[0] for k in range(60)]
     assert one.receive(heard(*datagrams)) == datagrams
