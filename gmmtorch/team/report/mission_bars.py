@@ -52,8 +52,7 @@ class _Measure(NamedTuple):
     by_ratio: bool = False
 
 
-_MOST_ALL_PAIRS = 3
-"""Frameworks that are all compared with each other; more are compared with the first only."""
+_MOST_ALL_PAIRS = 3  # frameworks that are all compared with each other; more are compared with the first only
 _MEASURES = (
     _Measure("bytes_sent", "bytes sent", by_ratio=True),
     _Measure("t90", "t90", "s"),

@@ -41,8 +41,7 @@ class TokenBucket:
         self._tokens -= n_bytes
 
 
-_LONGEST_PAUSE = 16
-"""Announcement periods between two announcements of the same content, at most."""
+_LONGEST_PAUSE = 16  # announcement periods between two announcements of the same content, at most
 
 
 class ReceivedMessage(NamedTuple):

@@ -48,15 +48,12 @@ class FrameJoiner:
         joiner.add(scan)                             # each scan that the robot maps, in its own frame
         joiner.search()                              # repeatedly: True if the frame was placed
 
-    Of several frames the one of the robot with the lowest id is joined; see `Replica.join`.
-
     Args:
         replica: of the robot. Its frame must have gravity along −z in 3D, to within about 10°.
         spacing: metres between the places of scans that are remembered.
         most_places: scans that are remembered; of more, every second one is left out.
 
-    Attributes:
-        n_searches: scans that were searched for. n_located: of these, how many were found.
+    Attributes: n_searches: scans that were searched for; n_located: of these, those that were found.
     """
 
     def __init__(self, replica: Replica, *, spacing: float = 1.0, most_places: int = 256) -> None:
@@ -198,13 +195,11 @@ _SEARCHING = 0.2
 
 
 class SharedMap:
-    """Publishes the components of a robot's own map, and merges those of its teammates.
-
-    Times are seconds of any clock.
+    """Publishes the components of a robot's own map, and merges those of its teammates. Times are seconds of
+    any clock.
 
     Args:
-        replica: of this robot; nothing else may add components to it.
-        transport: the network.
+        replica: of this robot; nothing else may add components to it. transport: the network.
         store: keeps records before they are sent; it has restored the replica. None: nothing is kept.
         announce_every: seconds between announcements while there is news.
         budget: bytes per second for records; None: no limit.

@@ -50,18 +50,14 @@ _DISK = {
     sqlite3.SQLITE_PERM,
     sqlite3.SQLITE_READONLY,
 }
-_LONGEST_SHOWN = 40
-"""Characters of a fact in a message."""
+_LONGEST_SHOWN = 40  # characters of a fact in a message
 
 
 def open_file(path: Path, facts: Mapping[str, Any], max_bytes: int) -> tuple[sqlite3.Connection, bool]:
     """The checked and locked file of a store, new if there is none; and whether it can be written.
 
-    If it cannot be written, its content is returned in memory, or an empty store if it cannot be read either,
-    and a warning is logged.
-
-    Raises `InvalidArgumentError` if another connection has the file, or if its facts differ; `DataError` if
-    it is damaged, is no store, or is of another version.
+    If not, a warning is logged, and its content is returned in memory, or an empty store if it cannot be read
+    either. Raises as `Store` does.
     """
     try:
         return _opened(path, path, facts, max_bytes), True
@@ -225,13 +221,11 @@ def _value(db: sqlite3.Connection, pragma: str) -> Any:
 
 MOST_SESSIONS = 1024
 """Sessions that are kept: the newest."""
-_MOST_LOG_BYTES = 1 << 20
-"""Datagrams in the log before it is compacted. To replay that many takes seconds."""
+_MOST_LOG_BYTES = 1 << 20  # datagrams in the log before it is compacted. To replay that many takes seconds.
 _MOST_NAMES = 1 << 16
 """Intervals of names of records in the file, 1 MiB. Beyond that they are forgotten, and some records are
 written twice."""
-_MOST_PATIENCE = 1 << 10
-"""Calls of `keep` between two attempts to write to a disk that failed."""
+_MOST_PATIENCE = 1 << 10  # calls of `keep` between two attempts to write to a disk that failed
 _log = logging.getLogger(__name__)
 
 
@@ -259,16 +253,11 @@ class Store:
     -9` at any instant and a loss of power. The file has a log of datagrams; when the log is long, a
     transaction replaces it by batches of all components and the datagrams of the other records.
 
-    If the disk is full or fails, a warning is logged once and the robot continues. `keep` then returns False,
-    and tries again before the 1st, 2nd, 4th, 8th, … call that follows. If the file cannot be written when
-    it is opened, the store reads a copy of it and keeps nothing.
+    If the disk fails, a warning is logged once and the robot continues. `keep` then returns False, and tries
+    again before the 1st, 2nd, 4th, 8th, … call that follows. If the file cannot be written when it is opened
+    (`is_writable`), the store reads a copy of it and keeps nothing. `n_failed` counts the failed calls.
 
     For one thread. One process at a time has the file open; the lock ends with the process.
-
-    Attributes:
-        is_writable: False if the file could not be written when it was opened.
-        n_failed: calls of `keep` and `save_progress` that could not write to a file that was writable at
-            first.
     """
 
     def __init__(

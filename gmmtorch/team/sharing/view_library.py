@@ -45,14 +45,10 @@ MOST_VIEWS = 1 << 14
 """Views, and intervals of removed keys. More are not accepted from other robots."""
 MOST_DATAGRAMS = 8
 """Datagrams of one call; the rest waits."""
-_RUN = 96
-"""Views, or intervals of removed keys, that are encoded together: about a datagram."""
-_VISITED = 0.8, math.pi / 5
-"""Metres and radians within which a view counts as visited."""
-_FRESH = 10.0
-"""Seconds for which a value needs no new evaluation."""
-_SMALL_CHANGE = 0.2
-"""Change of a value, relative to it, that is not sent."""
+_RUN = 96  # views, or intervals of removed keys, that are encoded together: about a datagram
+_VISITED = 0.8, math.pi / 5  # metres and radians within which a view counts as visited
+_FRESH = 10.0  # seconds for which a value needs no new evaluation
+_SMALL_CHANGE = 0.2  # change of a value, relative to it, that is not sent
 _LARGEST_VALUE = float(np.finfo(np.float16).max)
 
 
@@ -80,12 +76,10 @@ class ViewLibrary:
     made here are sent once, in the next `datagrams`. After a minute without messages of a view, its finder
     sends it again, or another robot if the finder is gone: for losses, and for robots that join late. If a
     robot sends a view that was removed here, the removal is sent again. Views are stored as messages carry
-    them: poses to 1 cm and 1/256 of a turn, values as float16, stamps in milliseconds. Without losses all
-    libraries are equal.
+    them (`encode_views`), so that without losses all libraries are equal.
 
     Args:
-        robot: id of the robot, which is part of the keys of its views.
-        incarnation: of the robot's start (`record_keys.drawn_incarnation`), so that no key is given twice.
+        robot, incarnation: id and start of the robot, so that no key is given twice.
 
     Attributes:
         refused: number of messages that were not accepted, by reason: "duplicate_id", "full".

@@ -9,8 +9,7 @@ from typing import NamedTuple, Protocol
 
 from gmmtorch.errors import check_number
 
-_LONGEST_SLEEP = 0.02
-"""Seconds between two calls of `idle` at most."""
+_LONGEST_SLEEP = 0.02  # seconds between two calls of `idle` at most
 _SHORTEST_SLEEP = 1e-4
 """Seconds. Rounding of shorter sleeps could keep the clock from ever reaching its target."""
 
@@ -85,8 +84,7 @@ class Stopwatch:
         self._inner = outer + spent
 
 
-_LOOK = 0.2
-"""Mission seconds between two checks for news while a team settles, at most."""
+_LOOK = 0.2  # mission seconds between two checks for news while a team settles, at most
 
 
 class Exchanging(Protocol):

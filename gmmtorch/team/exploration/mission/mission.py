@@ -27,8 +27,7 @@ from gmmtorch.team.exploration.world.scoring import BeliefMap
 from gmmtorch.team.exploration.world.world import World
 from gmmtorch.team.sharing import Network, bytes_of_points
 
-_SEEN_STRIDE = 4
-"""Pixels between the beams, along rows and columns, that mark cells as seen."""
+_SEEN_STRIDE = 4  # pixels between the beams, along rows and columns, that mark cells as seen
 
 
 class MissionScore:

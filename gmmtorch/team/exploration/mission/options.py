@@ -24,10 +24,8 @@ from gmmtorch.team.sharing import (
     check_codec,
 )
 
-_MOST_ROBOTS = 31
-"""Bits of the integer that stores which robots saw a cell."""
-_LATE_JITTERS = 5
-"""Mean jitters. Less than 1 % of the datagrams arrive later."""
+_MOST_ROBOTS = 31  # bits of the integer that stores which robots saw a cell
+_LATE_JITTERS = 5  # mean jitters. Less than 1 % of the datagrams arrive later.
 
 FRAMEWORKS = ("gmm_shared", "grid_shared", "grid_isolated", "gmm_thesis")
 """E0, E1 and E2 of the thesis; and `gmm_shared` with the options of `THESIS`."""

@@ -43,8 +43,7 @@ from gmmtorch.team.sharing import Broadcast, Network, Replica, Transport, ViewLi
 _SLACK = 24
 """Cells by which the sliding map moves, once the robot is so far from its centre. Rays are long: a map that
 is filled in wide slabs casts each ray far less often. Planners read a smaller window around the robot."""
-_ROUNDING = 4
-"""Cells by which the planner's window may be off the robot."""
+_ROUNDING = 4  # cells by which the planner's window may be off the robot
 _CACHED_MESSAGES = 4096
 """Decoded datagrams in the cache of a simulated team: more than are in flight together."""
 _CACHED_MESSAGES_ALONE = 64
@@ -171,8 +170,7 @@ def _mapper(
 
 ROW = "row.json"
 STAGE = "simulated seconds"
-_CONVERGENCE = 120.0
-"""Simulated seconds after a mission in which the maps may become equal."""
+_CONVERGENCE = 120.0  # simulated seconds after a mission in which the maps may become equal
 
 OnMission = Callable[[Mission], object]
 

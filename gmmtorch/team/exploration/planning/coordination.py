@@ -79,8 +79,7 @@ class Coordination:
         return settled
 
 
-_MOST_STEPS = 1000
-"""Largest number of steps of a received plan that are used."""
+_MOST_STEPS = 1000  # largest number of steps of a received plan that are used
 
 
 @dataclass(frozen=True, eq=False)

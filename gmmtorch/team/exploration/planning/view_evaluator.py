@@ -16,8 +16,7 @@ from gmmtorch.team.exploration.planning.planner_interface import PlanningTask
 from gmmtorch.team.exploration.robot.mapper import LocalMap
 
 _MOST_CELLS = 1 << 22
-_NEGLIGIBLE = 1e-5
-"""Values of the depth kernel below this count as zero."""
+_NEGLIGIBLE = 1e-5  # values of the depth kernel below this count as zero
 
 
 class BeamTemplates(NamedTuple):
@@ -156,8 +155,7 @@ BLOCK = 4
 
 INFORMATION = ("csqmi", "fsmi")
 
-_SIGMA = 0.05
-"""Standard deviation of a reading (m), for CSQMI."""
+_SIGMA = 0.05  # standard deviation of a reading (m), for CSQMI
 _KNOWN_FREE, _KNOWN_OCCUPIED = 0.05, 0.5
 """Observed cells below and above these probabilities count as certain. They do not weaken the beams behind
 them, and they do not attract a robot to space that it has seen well."""
@@ -190,12 +188,10 @@ class ViewEvaluator:
 
     Args:
         horizontal_fov, vertical_fov: radians, in (0, π). The camera looks along the heading with pitch 0.
-        max_range: metres along the beam.
-        resolution: side of the local map's cells (m).
+        max_range: metres along the beam. resolution: side of the local map's cells (m).
         information: of a beam, "csqmi" or "fsmi".
         n_beams: approximate number of beams that represent an image.
-        n_yaws: number of headings.
-        stride: cells between positions.
+        n_yaws: number of headings. stride: cells between positions.
         device: of the computation. Poses and values are on the CPU, where the planner's tree is: it decides
             after every few views, so it would wait for each of its operations on another device.
     """
@@ -317,8 +313,7 @@ def _with_end(cells: Tensor, value: float = 0) -> Tensor:
     return torch.cat([cells, torch.full_like(cells[..., :1], value)], -1)
 
 
-_LEAST_ROWS = 128
-"""Rows of a table; few plans evaluate more views, so that tables seldom grow."""
+_LEAST_ROWS = 128  # rows of a table; few plans evaluate more views, so that tables seldom grow
 
 
 class ViewCache:

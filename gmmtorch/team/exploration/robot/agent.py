@@ -43,8 +43,7 @@ if TYPE_CHECKING:
     from gmmtorch.team.exploration.mission.options import TeamOptions
 
 
-_NEWS_SHARE = 0.25
-"""Share of the best window that teammates must learn before a resting robot explores again."""
+_NEWS_SHARE = 0.25  # share of the best window that teammates must learn before a resting robot explores again
 
 
 @dataclass(frozen=True)
@@ -109,16 +108,13 @@ class StoppingCriterion:
             self.rests, self._known_at_rest = True, known
 
 
-_RECENT_FRAMES = 12
-"""Frames whose returns are obstacles for the planner, even where the map is free."""
-_TRAIL_LENGTH = 200
-"""Positions of the trail, at most."""
-_STANDING = 1e-3
-"""Metres per step. A robot that moves less is at rest."""
+_RECENT_FRAMES = 12  # frames whose returns are obstacles for the planner, even where the map is free
+_TRAIL_LENGTH = 200  # positions of the trail, at most
+_STANDING = 1e-3  # metres per step. A robot that moves less is at rest.
 
 
 class Robot:
-    """One robot.
+    """The state of one robot.
 
     Attributes:
         state: (7,) x, y, z, yaw (m, rad) and the velocities v, v_z, ω (m/s, rad/s).
@@ -232,12 +228,9 @@ class Robot:
         )
 
 
-_SEEDS_PER_MISSION = 1 << 10
-"""Robot ids for which the random draws differ."""
-_LATEST_PLANS = 10
-"""A plan whose number is lower than the last one's by more comes from a restarted robot."""
-_RESTING_PLANS = 10
-"""Plans of a robot at rest, of which one is sent."""
+_SEEDS_PER_MISSION = 1 << 10  # robot ids for which the random draws differ
+_LATEST_PLANS = 10  # A plan whose number is lower than the last one's by more comes from a restarted robot
+_RESTING_PLANS = 10  # plans of a robot at rest, of which one is sent
 _PATIENCE = 15
 """Consecutive plans without progress after which a robot looks around. Leaving a start takes up to six."""
 

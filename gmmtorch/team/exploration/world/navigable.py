@@ -141,8 +141,7 @@ def meets_others(positions: Tensor, radius: float) -> Tensor:
 
 
 _GOLDEN = (math.sqrt(5) - 1) / 2
-_AT_SURFACE = 1e-3
-"""Tolerance (m) for float32 rays. A ray can only end in a cell that the mesh meets."""
+_AT_SURFACE = 1e-3  # tolerance (m) for float32 rays. A ray can only end in a cell that the mesh meets.
 
 _RAYS_AT_ONCE = 1 << 18
 

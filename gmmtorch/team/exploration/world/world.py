@@ -43,8 +43,7 @@ from gmmtorch.team.exploration.world.navigable import (
 _log = logging.getLogger(__name__)
 
 _CELLS = ("occupied", "observable", "navigable")
-_Cells = dict[str, Tensor]
-"""Bool tensors (nx, ny, nz) by these names."""
+_Cells = dict[str, Tensor]  # bool tensors (nx, ny, nz) by these names
 _KIND = "gmmtorch-world"
 VERSION = 1
 """Increase it when the same mesh would give other cells."""
@@ -86,11 +85,9 @@ def cached_cells(
 MAX_CELLS = 1 << 28
 """Largest number of cells of a world; computing it takes about 2 GB."""
 
-_SHARP = 0.4
-"""Share of the camera's range at which the rays that find observable cells are one cell apart."""
+_SHARP = 0.4  # share of the camera's range at which the rays that find observable cells are one cell apart
 
-_FINEST = 0.01
-"""Smallest angle (rad) between those rays."""
+_FINEST = 0.01  # smallest angle (rad) between those rays
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,17 +95,14 @@ class World:
     """A mesh within bounds, on a lattice of cells.
 
     Attributes:
-        name: used in messages and results.
-        mesh: the mesh; it casts rays.
-        resolution: side of a cell (m).
+        name: in messages and results. mesh: casts rays. resolution: side of a cell (m).
         box: the lattice cells of the bounds.
         occupied: (nx, ny, nz) bool, cells that the mesh meets.
         navigable: bool, connected cells above a floor at whose centre a robot does not touch the mesh. Cells
             without a surface below them are outside, such as the rock around a mine without a roof.
         observable: bool, cells that a camera in the navigable space can see: occupied cells, and free cells
             above a floor.
-        robot_radius: metres.
-        start: (3,), metres, the default start of the robots.
+        robot_radius: metres. start: (3,), metres, the default start of the robots.
     """
 
     name: str

@@ -57,10 +57,8 @@ MOST_COMPONENTS_SENT = 1024
 map's datagrams have about 170."""
 
 _SIZES = struct.Struct("<BIII")  # dimensions, components, origins, viewpoints
-_FIRST_GUESS = 128
-"""Components that are likely to fit into a datagram."""
-_FILL = 0.95
-"""Share of a datagram to fill, as components differ in size."""
+_FIRST_GUESS = 128  # components that are likely to fit into a datagram
+_FILL = 0.95  # share of a datagram to fill, as components differ in size
 
 
 @dataclass(frozen=True, eq=False)

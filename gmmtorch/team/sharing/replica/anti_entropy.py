@@ -96,8 +96,7 @@ class Backlog:
         return Intervals.union(self._theirs.values()) - held
 
 
-_RUN = 96
-"""Components with consecutive keys that are sent together: about one datagram."""
+_RUN = 96  # components with consecutive keys that are sent together: about one datagram
 
 
 def packets(

@@ -42,8 +42,7 @@ from gmmtorch.team.sharing.replica.record_keys import (
 )
 from gmmtorch.team.sharing.replica.records import MOST_VIEWPOINTS, Records
 
-_MOST_RUNS = 128
-"""Intervals of keys in a correction, which then fits into a datagram."""
+_MOST_RUNS = 128  # intervals of keys in a correction, which then fits into a datagram
 
 
 class MovedMap(NamedTuple):
@@ -82,15 +81,12 @@ class MovedMap(NamedTuple):
         return found
 
 
-_MOST_SUPERSESSIONS = 32
-"""Effective supersessions of this author before they are merged."""
+_MOST_SUPERSESSIONS = 32  # effective supersessions of this author before they are merged
 _MOST_OUTDATED = 64
 """Outdated entries in records of counters, beyond as many as are current, before all are rewritten."""
-_MOST_SHORT = 16
-"""Records of counters shorter than half of `RECORD_BYTES` before they are merged."""
+_MOST_SHORT = 16  # records of counters shorter than half of `RECORD_BYTES` before they are merged
 _MOST_POINTS = 2.0**40
-_MORE_PREDICTIONS = 1.5
-"""Growth of the number of predictions after which a calibration is written again."""
+_MORE_PREDICTIONS = 1.5  # growth of the number of predictions after which a calibration is written again
 
 
 Published = tuple[Ints, Intervals, list[Packet]]

@@ -150,8 +150,7 @@ def _normalized(components: Components) -> Components:
     )
 
 
-_Row = tuple[Ints, Ints]
-"""Keys of components (N,), rising, and the largest counter of each, in steps."""
+_Row = tuple[Ints, Ints]  # keys of components (N,), rising, and the largest counter of each, in steps
 _EMPTY: _Row = np.zeros(0, np.int64), np.zeros(0, np.int64)
 
 

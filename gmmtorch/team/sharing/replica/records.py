@@ -44,8 +44,7 @@ of each of 64 robots."""
 MOST_INTERVALS = 1 << 14
 """Intervals of held keys, with those that waiting supersessions may add. A team that loses datagrams has
 fewer."""
-_BATCH = 2048
-"""Components of a stored batch."""
+_BATCH = 2048  # components of a stored batch
 _PIECE = 128
 """Components of a batch in the table after loading: to drop one takes time in proportion to its batch."""
 

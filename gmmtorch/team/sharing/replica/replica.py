@@ -403,8 +403,7 @@ class Replica:
         return components.on_cpu()
 
 
-_QUANTIZED = b"\x11"
-"""First byte of a datagram of components that every robot encodes equally."""
+_QUANTIZED = b"\x11"  # first byte of a datagram of components that every robot encodes equally
 
 
 def _keys(name: str, ids: ArrayLike) -> Ints:

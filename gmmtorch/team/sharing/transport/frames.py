@@ -26,13 +26,12 @@ class FramedTransport(ABC):
 
     A subclass sends frames (`_carry`), passes received ones to `_take` from one thread, and ends that thread
     (`_shut`). A network that is down is no error: `_count_failure` counts it. The times `now` are not used:
-    `deliver` returns what has arrived; it does not depend on the clocks of the team.
+    `deliver` returns what has arrived.
 
     Attributes:
         sent, received: frames that were given to the network and that came from it, refused ones included.
-        failures: number of network errors, by the name of the error.
-        n_dropped: datagrams that were dropped because the queue was full.
-        n_lost: datagrams that were dropped as `lose` demands.
+        failures: number of network errors, by the name of the error. n_dropped, n_lost: datagrams that were
+            dropped because the queue was full, and as `lose` demands.
     """
 
     def __init__(self, robot: int, key: TeamKey | None, max_waiting: int) -> None:

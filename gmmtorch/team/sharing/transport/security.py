@@ -308,8 +308,7 @@ _WARNINGS = {
 _log = logging.getLogger(__name__)
 
 
-_NONCE = slice(3, None)
-"""Of a header: session and number, 12 bytes; unique for each datagram under one key."""
+_NONCE = slice(3, None)  # of a header: session and number, 12 bytes; unique for each datagram under one key
 
 
 def _cipher(key: TeamKey | None) -> tuple[Any, type[Exception]]:

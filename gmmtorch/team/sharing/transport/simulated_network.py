@@ -99,8 +99,7 @@ class LinkConditions:
         """Which of n receivers lose a datagram."""
         if self.loss == 0:
             return [False] * n
-        drawn = torch.rand(n, generator=generator, dtype=torch.float64) < self.loss
-        return [bool(lost) for lost in drawn]
+        return (torch.rand(n, generator=generator, dtype=torch.float64) < self.loss).tolist()
 
     def draw_delays(self, n: int, generator: torch.Generator) -> list[list[float]]:
         """For each of n receivers, the delays (s) of the one or two copies of a datagram."""
@@ -150,11 +149,8 @@ def _are_groups(value: Any) -> bool:
     if not (_is_list(value) and value and all(_is_list(group) and group for group in value)):
         return False
     robots: list[Any] = [robot for group in value for robot in group]
-    return all(map(_is_robot, robots)) and len(set(robots)) == len(robots)
-
-
-def _is_robot(value: Any) -> bool:
-    return _is_number(value) and isinstance(value, numbers.Integral) and int(value) >= 0
+    are_whole = all(_is_number(robot) and isinstance(robot, numbers.Integral) for robot in robots)
+    return are_whole and min(robots) >= 0 and len(set(robots)) == len(robots)
 
 
 def _is_list(value: Any) -> bool:
@@ -215,13 +211,8 @@ class Reception(NamedTuple):
     out_of_reach: int = 0
 
 
-class _Arrival(NamedTuple):
-    """A datagram in flight to one robot; sorted by time, then by the order of sending."""
-
-    time: float
-    order: int
-    sender: int
-    datagram: bytes
+_Arrival = tuple[float, int, int, bytes]
+"""A datagram in flight to one robot: time, order of sending, by which equal times are sorted, sender, bytes."""
 
 
 class Network:
@@ -236,9 +227,8 @@ class Network:
        second alone may be cut off; a datagram whose first copy is cut off has no second;
     3. the robot loses it, with probability `loss`.
 
-    Without jitter, a sender's datagrams arrive in order. With jitter, they overtake one another if their
-    delays differ by more than the time between them. Losses have a random generator of their own: the same
-    `seed` loses the same datagrams under all other conditions. Delivered datagrams are not stored.
+    Losses have a random generator of their own: the same `seed` loses the same datagrams under all other
+    conditions.
     """
 
     def __init__(self, n_robots: int, conditions: LinkConditions | None = None, seed: int = 0) -> None:
@@ -277,7 +267,7 @@ class Network:
             lost = self.conditions.draw_losses(len(others), self._losses)
             delays = self.conditions.draw_delays(len(others), self._delays)
             for robot, is_near, is_lost, times in zip(others, near, lost, delays, strict=True):
-                copies = [_Arrival(end + time, self._n_sent, sender, data) for time in times]
+                copies = [(end + time, self._n_sent, sender, data) for time in times]
                 self._carry(copies, robot, begin, is_near, is_lost)
             self._n_sent += 1
         before = self._traffic.get((sender, kind), Traffic())
@@ -288,9 +278,9 @@ class Network:
         """(sender, datagram) in the order of arrival, at equal times in that of sending; see `Transport`."""
         self._check("robot", robot, now)
         queue, delivered = self._queues[robot], []
-        while queue and queue[0].time <= now:
-            arrival = heapq.heappop(queue)
-            delivered.append((arrival.sender, arrival.datagram))
+        while queue and queue[0][0] <= now:
+            _, _, sender, datagram = heapq.heappop(queue)
+            delivered.append((sender, datagram))
         self._received[robot]["datagrams"] += len(delivered)
         self._received[robot]["bytes"] += sum(len(data) for _, data in delivered)
         return delivered
@@ -366,7 +356,7 @@ class Network:
         counts, (first, *second) = self._received[receiver], copies
 
         def is_cut(copy: _Arrival) -> bool:
-            return self.conditions.cut(copy.sender, receiver, begin, copy.time)
+            return self.conditions.cut(copy[2], receiver, begin, copy[0])
 
         if not is_near:
             counts["out_of_reach"] += 1
