@@ -212,7 +212,7 @@ class Reception(NamedTuple):
 
 
 _Arrival = tuple[float, int, int, bytes]
-"""A datagram in flight to one robot: time, order of sending, by which equal times are sorted, sender, bytes."""
+"""A datagram in flight to one robot: time, order of sending, sender, datagram; sorted by the first two."""
 
 
 class Network:
