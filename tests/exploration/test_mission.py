@@ -130,7 +130,7 @@ def test_reach_depends_on_where_robots_are(world: World) -> None:
     near, far = (flown(world, replace(options, reach=reach)) for reach in (0.1, 1e3))
     row = mission_row(near, 1.0)
     assert row["reception"]["out_of_reach"] == row["datagrams"] > 0
-    assert row["reception"]["datagrams"] == near.network.n_in_flight == 0
+    assert row["reception"]["datagrams"] == 0
     kept = [without_seconds(mission_row(made, 1.0)) for made in (far, flown(world, options))]
     assert [each.pop("reach") for each in kept] == [1e3, None]
     assert kept[0] == kept[1]

@@ -150,7 +150,7 @@ class PlanMessage:
     views: Tensor
 
 
-def encode_views(message: ViewsMessage, max_bytes: int = MAX_BYTES) -> list[bytes]:
+def encode_views(message: ViewsMessage) -> list[bytes]:
     """Datagrams of views, 9 to 11 bytes each, and of removed keys; empty without either. Ids in any order.
 
     Poses are rounded to 1 cm and 1/256 of a turn (`quantized_poses`), values to float16 (65504 at most),
@@ -187,7 +187,7 @@ def encode_views(message: ViewsMessage, max_bytes: int = MAX_BYTES) -> list[byte
         write_intervals(writer, Intervals(removed.edges[edges]), 0)
         return make_datagram(Kind.VIEWS, writer.to_bytes())
 
-    return split(len(keys) + len(removed), part, "view", max_bytes)
+    return split(len(keys) + len(removed), part, "view")
 
 
 def read_views(body: bytes) -> ViewsMessage:

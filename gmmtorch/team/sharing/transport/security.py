@@ -80,12 +80,12 @@ class TeamKey:
         return cls._from_hex(data, f"The team key {path}")
 
     @classmethod
-    def from_environment(cls, variable: str = KEY_VARIABLE) -> TeamKey:
-        """The key in an environment variable, as 64 hexadecimal digits. Raises as `from_file` does."""
-        text = os.environ.get(variable)
+    def from_environment(cls) -> TeamKey:
+        """The key in `KEY_VARIABLE`, as 64 hexadecimal digits. Raises as `from_file` does."""
+        text = os.environ.get(KEY_VARIABLE)
         if text is None:
-            raise MissingDataError(f"${variable} is not set. {_HELP}")
-        return cls._from_hex(text.encode(errors="replace"), f"The team key in ${variable}")
+            raise MissingDataError(f"${KEY_VARIABLE} is not set. {_HELP}")
+        return cls._from_hex(text.encode(errors="replace"), f"The team key in ${KEY_VARIABLE}")
 
     @classmethod
     def _from_hex(cls, data: bytes, what: str) -> TeamKey:

@@ -302,11 +302,6 @@ class Network:
         return Reception(*(sum(counts[field] for counts in chosen) for field in Reception._fields))
 
     @property
-    def n_bytes(self) -> int:
-        """Bytes of all datagrams, without headers."""
-        return self.traffic().bytes
-
-    @property
     def bytes_by_kind(self) -> dict[str, int]:
         """Bytes without headers, by the kinds that the senders gave, sorted."""
         return {kind: self.traffic(kind=kind).bytes for kind in sorted({k for _, k in self._traffic})}
@@ -326,11 +321,6 @@ class Network:
             "dropped": 0,
             "namesakes": {},
         }
-
-    @property
-    def n_in_flight(self) -> int:
-        """Datagrams in flight, one for each robot that will receive it."""
-        return sum(map(len, self._queues))
 
     def _near(self, sender: int, others: Sequence[int]) -> list[bool]:
         """Whether each of the others is in reach."""
