@@ -21,9 +21,9 @@ from gmmtorch.team.exploration.mission.driver import Stopwatch
 from gmmtorch.team.exploration.mission.options import TeamOptions
 from gmmtorch.team.exploration.planning.collision_checking import cells_in_sphere
 from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
+from gmmtorch.team.exploration.planning.journeys import Roadmap
 from gmmtorch.team.exploration.planning.planner_interface import Plan, PlanningTask
 from gmmtorch.team.exploration.planning.primitives import Primitives
-from gmmtorch.team.exploration.planning.roadmap import Roadmap
 from gmmtorch.team.exploration.planning.view_evaluator import ViewEvaluator
 from gmmtorch.team.exploration.robot.agent import Agent, Robot, StoppingRule
 from gmmtorch.team.exploration.robot.mapper import GridMapper, Mapper, Memo

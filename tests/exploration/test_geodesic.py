@@ -12,8 +12,13 @@ from exploration.voxel_worlds import RESOLUTION, surroundings_from
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmmtorch.team.exploration.planning.journeys import DistanceField, coarsened, geodesic
-from gmmtorch.team.exploration.planning.roadmap import Roadmap, at_the_rim
+from gmmtorch.team.exploration.planning.journeys import (
+    DistanceField,
+    Roadmap,
+    at_the_rim,
+    coarsened,
+    geodesic,
+)
 from gmmtorch.team.exploration.robot.mapper import LocalMap
 
 STEPS = [step for step in itertools.product((-1, 0, 1), repeat=3) if any(step)]

@@ -25,6 +25,7 @@ from gmmtorch.team.exploration.mission.mission import Mission
 from gmmtorch.team.exploration.mission.trials import assemble
 from gmmtorch.team.exploration.planning.collision_checking import cells_in_sphere
 from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
+from gmmtorch.team.exploration.planning.journeys import Roadmap
 from gmmtorch.team.exploration.planning.planner_interface import (
     Plan,
     PlanningTask,
@@ -33,7 +34,6 @@ from gmmtorch.team.exploration.planning.planner_interface import (
     retreat,
     shortened,
 )
-from gmmtorch.team.exploration.planning.roadmap import Roadmap
 from gmmtorch.team.exploration.robot.agent import Agent, Robot, StoppingCriterion, StoppingRule
 from gmmtorch.team.exploration.robot.mapper import GridMapper, Memo
 from gmmtorch.team.exploration.world.scoring import BeliefMap, BeliefRule

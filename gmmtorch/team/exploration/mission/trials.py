@@ -28,9 +28,9 @@ from gmmtorch.team.exploration.mission.driver import SimulatedClock, Stopwatch, 
 from gmmtorch.team.exploration.mission.mission import Mission, MissionScore
 from gmmtorch.team.exploration.mission.options import TeamOptions
 from gmmtorch.team.exploration.mission.results import mission_row
+from gmmtorch.team.exploration.planning.journeys import Roadmap
 from gmmtorch.team.exploration.planning.planners import make_planner
 from gmmtorch.team.exploration.planning.primitives import Primitives
-from gmmtorch.team.exploration.planning.roadmap import Roadmap
 from gmmtorch.team.exploration.planning.view_evaluator import ViewEvaluator
 from gmmtorch.team.exploration.robot.agent import Agent, Robot
 from gmmtorch.team.exploration.robot.gmm_mapper import GmmMapper

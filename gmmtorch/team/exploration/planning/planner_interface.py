@@ -12,8 +12,8 @@ from torch import Tensor
 from gmmtorch.kernels import is_fused
 from gmmtorch.team.exploration.planning.collision_checking import feasible, feasible_motions
 from gmmtorch.team.exploration.planning.coordination import PeerTrajectories, clear_of
+from gmmtorch.team.exploration.planning.journeys import Roadmap
 from gmmtorch.team.exploration.planning.primitives import Primitives
-from gmmtorch.team.exploration.planning.roadmap import Roadmap
 from gmmtorch.team.exploration.robot.mapper import LocalMap
 from gmmtorch.team.sharing import ViewLibrary
 

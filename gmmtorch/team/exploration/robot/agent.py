@@ -15,6 +15,7 @@ from gmmtorch.simulation import DepthFrame, MeshWorld
 from gmmtorch.team.exploration.mission.driver import Stopwatch
 from gmmtorch.team.exploration.planning.collision_checking import local_map_of
 from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
+from gmmtorch.team.exploration.planning.journeys import Roadmap
 from gmmtorch.team.exploration.planning.planner_interface import (
     Plan,
     Planner,
@@ -24,7 +25,6 @@ from gmmtorch.team.exploration.planning.planner_interface import (
     shortened,
 )
 from gmmtorch.team.exploration.planning.primitives import Primitives
-from gmmtorch.team.exploration.planning.roadmap import Roadmap
 from gmmtorch.team.exploration.planning.view_evaluator import ViewEvaluator
 from gmmtorch.team.exploration.robot.mapper import FrameUpdate, LocalMap, Mapper, Memo
 from gmmtorch.team.exploration.world.starts import InitialFreeSpace
