@@ -33,8 +33,7 @@ from gmmtorch.team.sharing import Replica
 from gmmtorch.team.sharing.messages.record_messages import CorrectionMessage
 from gmmtorch.team.sharing.shared_map import SharedMap
 from gmmtorch.team.sharing.store import Store
-from gmmtorch.team.sharing.transport.link_conditions import LinkConditions
-from gmmtorch.team.sharing.transport.simulated_network import Network
+from gmmtorch.team.sharing.transport.simulated_network import LinkConditions, Network
 
 N_SCANS = 58
 NEAR = 0.15

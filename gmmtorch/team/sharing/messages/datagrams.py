@@ -1,16 +1,141 @@
-"""Fields of several messages in a bit stream: sets of ids and keys, intervals, numbers and rigid motions."""
+"""What datagrams have in common: first byte, checksum and limits; and the fields of several messages."""
 
 from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from enum import IntEnum
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
+from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_whole
 from gmmtorch.linalg import check_rigid
 from gmmtorch.mapping import BitReader, BitWriter, Ints
-from gmmtorch.team.sharing.messages.envelope import FARTHEST, LARGEST_NUMBER
 from gmmtorch.team.sharing.replica.record_keys import END, MOST_RECORDS, NUMBER_BITS, Intervals, authors
+
+VERSION = 1
+MAX_BYTES = 1200
+"""Longest datagram. With its headers it fits the smallest path of IPv6, so it is never fragmented."""
+FARTHEST = 2.0**24
+"""Largest coordinate (m) of a position in a message: 16 777 km, so that UTM and earth-centred coordinates
+fit. Moved by a correction, positions stay within 2³² cells of 2 cm, where rays can be cast."""
+LARGEST_NUMBER = (1 << 60) - 1
+"""Largest robot id, and largest number of anything that a robot counts."""
+CODECS = ("quantized", "float", "thesis")
+"""Encodings of components and counts."""
+_KIND_BITS = 4
+_CHECKSUM_BYTES = 4
+
+
+class Kind(IntEnum):
+    """The low half of a datagram's first byte; the high half is the version. 14 is retired."""
+
+    CALIBRATION = 0
+    COMPONENTS = 1
+    FLOAT_COMPONENTS = 2
+    THESIS_COMPONENTS = 3
+    COUNTS = 4
+    FLOAT_COUNTS = 5
+    THESIS_COUNTS = 6
+    POINTS = 7
+    VIEWS = 8
+    PLAN = 9
+    ANNOUNCEMENT = 10
+    SUPERSESSION = 11
+    COUNTERS = 12
+    CORRECTION = 13
+    FRAME = 15
+
+
+OWN_CHECKSUM = frozenset({Kind.COMPONENTS})
+"""Kinds whose body ends with a checksum of its own, and gets no second one."""
+
+
+def make_datagram(kind: Kind, body: bytes) -> bytes:
+    """First byte, body, CRC-32 of both (4 bytes, little-endian)."""
+    data = bytes([VERSION << _KIND_BITS | kind]) + body
+    if kind in OWN_CHECKSUM:
+        return data
+    return data + zlib.crc32(data).to_bytes(_CHECKSUM_BYTES, "little")
+
+
+def parse_datagram(datagram: bytes) -> tuple[Kind, bytes]:
+    """Kind and body of a datagram. Raises `DataError` if it is too long, foreign or damaged."""
+    if len(datagram) > MAX_BYTES:
+        raise DataError(f"The datagram has {len(datagram)} bytes; {MAX_BYTES} are the most: it is foreign.")
+    if not datagram:
+        raise DataError("The datagram is empty.")
+    version, number = datagram[0] >> _KIND_BITS, datagram[0] & ((1 << _KIND_BITS) - 1)
+    if version != VERSION:
+        raise DataError(
+            f"The datagram is of version {version}; this gmmtorch reads version {VERSION}. It is foreign or "
+            "damaged, or gmmtorch must be updated on one of the robots."
+        )
+    try:
+        kind = Kind(number)
+    except ValueError as error:
+        raise DataError(f"The datagram has the unknown kind {number}: it is foreign or damaged.") from error
+    if kind in OWN_CHECKSUM:
+        return kind, datagram[1:]
+    data, checksum = datagram[:-_CHECKSUM_BYTES], datagram[-_CHECKSUM_BYTES:]
+    if len(datagram) <= _CHECKSUM_BYTES or zlib.crc32(data) != int.from_bytes(checksum, "little"):
+        raise DataError("The datagram does not match its checksum: it is truncated or damaged.")
+    return kind, data[1:]
+
+
+def check_datagram(datagram: bytes, least: int = 0) -> None:
+    """Raise `InvalidArgumentError` unless a datagram is bytes, from `least` to `MAX_BYTES`."""
+    if not isinstance(datagram, bytes) or not least <= len(datagram) <= MAX_BYTES:
+        what = f"{len(datagram)} bytes" if isinstance(datagram, bytes) else type(datagram).__name__
+        raise InvalidArgumentError(f"A datagram is {what}; it must be bytes, from {least} to {MAX_BYTES}.")
+
+
+def split(
+    n: int,
+    encode: Callable[[int, int], bytes],
+    what: str,
+    max_bytes: int = MAX_BYTES,
+    is_allowed: Callable[[int, int], bool] = lambda begin, end: True,
+) -> list[bytes]:
+    """Datagrams of n items, which are halved until each part fits. encode(begin, end) makes the datagram of
+    items begin … end − 1; is_allowed(begin, end) tells whether they may be in one, however few bytes they
+    take. Raises `InvalidArgumentError` if an item does not fit."""
+
+    def parts(begin: int, end: int) -> list[bytes]:
+        if end - begin == 1 or is_allowed(begin, end):
+            datagram = encode(begin, end)
+            if len(datagram) <= max_bytes:
+                return [datagram]
+            if end - begin == 1:
+                raise InvalidArgumentError(
+                    f"A single {what} takes {len(datagram)} bytes; a datagram has room for {max_bytes}. "
+                    "Give it fewer sensor origins."
+                )
+        middle = (begin + end) // 2
+        return parts(begin, middle) + parts(middle, end)
+
+    return parts(0, n) if n else []
+
+
+def check_codec(codec: str) -> str:
+    """The codec; raises `InvalidArgumentError` unless it is one of `CODECS`."""
+    check_choice("codec", codec, CODECS)
+    return codec
+
+
+def check_places(name: str, places: Tensor, farthest: float = FARTHEST) -> Tensor:
+    """The positions (N, D), m; raises `InvalidArgumentError` if a coordinate is beyond `farthest`."""
+    bad = ~(places.abs() <= farthest).all(1)
+    if bool(bad.any()):
+        first = int(bad.nonzero()[0])
+        raise InvalidArgumentError(
+            f"{name}[{first}] is {places[first].tolist()}; positions must be finite, and up to "
+            f"{farthest:g} m on each axis. Is it in metres, and the world's origin near?"
+        )
+    return places
+
 
 _LEAST_BITS = 8  # of a number in the stream
 _NUMBERS = {2: 4, 3: 7}
@@ -39,8 +164,7 @@ def id_order(ids: Tensor) -> Ints:
 
 
 def write_ids(writer: BitWriter, ids: Ints) -> None:
-    """Write distinct ids (J, 2) in `id_order`: for each robot their number, the first, and the gaps between
-    them."""
+    """Write distinct ids (J, 2) in `id_order`: for each robot their number, the first, and the gaps."""
     robots, first, n_each = np.unique(ids[:, 0], return_index=True, return_counts=True)
     writer.number(len(robots))
     for robot, begin, n in zip(robots.tolist(), first.tolist(), n_each.tolist(), strict=True):
@@ -89,8 +213,7 @@ def read_keys(reader: BitReader) -> Ints:
 
 
 def write_intervals(writer: BitWriter, intervals: Intervals, begin: int) -> None:
-    """Write their number; for each the gap before it, from `begin` or the last end, and its length less
-    one."""
+    """Write their number; for each the gap before it, from `begin` or the last end, and its length − 1."""
     writer.number(len(intervals))
     for first, end in intervals.pairs():
         writer.number(first - begin)
@@ -141,10 +264,7 @@ def is_motion(pose: Tensor) -> bool:
 
 
 def pose_of(transform: Tensor) -> Tensor:
-    """The pose of a rigid motion (3, 3) or (4, 4).
-
-    Raises `InvalidArgumentError` if it is not rigid or moves too far.
-    """
+    """The pose of a rigid motion (3, 3) or (4, 4); raises `InvalidArgumentError` if it is none."""
     if transform.shape not in ((3, 3), (4, 4)):
         raise InvalidArgumentError(f"transform has shape {tuple(transform.shape)}; give (3, 3) or (4, 4).")
     rotation, translation = check_rigid(transform.detach().cpu().double(), len(transform) - 1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -13,26 +13,26 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
-from gmmtorch.team.exploration.robot.mapper import LocalMap
-from gmmtorch.team.sharing import (
-    LARGEST_INCARNATION,
-    LARGEST_ROBOT,
+from gmmtorch.team.sharing.messages.mission_messages import (
     LATEST,
-    MOST_RECORDS,
     TICKS,
-    Intervals,
     ViewsMessage,
     encode_views,
+    quantized_poses,
+)
+from gmmtorch.team.sharing.replica.record_keys import (
+    LARGEST_INCARNATION,
+    LARGEST_ROBOT,
+    MOST_RECORDS,
+    Intervals,
     first_key,
     ids_of,
     keys_of,
-    quantized_poses,
     robot_of,
 )
 
-SPACING = 1.5
 _TURN = math.pi / 4
-"""Metres and radians. A view is not added if another one is nearer than both."""
+"""Radians. A view is not added if another one is nearer than that and than `ViewLibrary.spacing`."""
 MOST_OWN_VIEWS = 256
 """Views of one robot; the least valuable are removed."""
 TIME_TO_LIVE = 1800.0
@@ -45,14 +45,10 @@ MOST_VIEWS = 1 << 14
 """Views, and intervals of removed keys. More are not accepted from other robots."""
 MOST_DATAGRAMS = 8
 """Datagrams of one call; the rest waits."""
-_RUN = 96
-"""Views, or intervals of removed keys, that are encoded together: about a datagram."""
-_VISITED = 0.8, math.pi / 5
-"""Metres and radians within which a view counts as visited."""
-_FRESH = 10.0
-"""Seconds for which a value needs no new evaluation."""
-_SMALL_CHANGE = 0.2
-"""Change of a value, relative to it, that is not sent."""
+_RUN = 96  # views, or intervals of removed keys, that are encoded together: about a datagram
+_VISITED = 0.8, math.pi / 5  # metres and radians within which a view counts as visited
+_FRESH = 10.0  # seconds for which a value needs no new evaluation
+_SMALL_CHANGE = 0.2  # change of a value, relative to it, that is not sent
 _LARGEST_VALUE = float(np.finfo(np.float16).max)
 
 
@@ -80,17 +76,18 @@ class ViewLibrary:
     made here are sent once, in the next `datagrams`. After a minute without messages of a view, its finder
     sends it again, or another robot if the finder is gone: for losses, and for robots that join late. If a
     robot sends a view that was removed here, the removal is sent again. Views are stored as messages carry
-    them: poses to 1 cm and 1/256 of a turn, values as float16, stamps in milliseconds. Without losses all
-    libraries are equal.
+    them (`encode_views`), so that without losses all libraries are equal.
 
     Args:
-        robot: id of the robot, which is part of the keys of its views.
-        incarnation: of the robot's start (`record_keys.drawn_incarnation`), so that no key is given twice.
+        robot, incarnation: id and start of the robot, so that no key is given twice.
 
     Attributes:
         refused: number of messages that were not accepted, by reason: "duplicate_id", "full".
         version: rises with every change.
     """
+
+    spacing = 1.5
+    """Metres between views of one direction, at least."""
 
     def __init__(self, robot: int, *, incarnation: int = 0) -> None:
         for name, number, most in (
@@ -137,7 +134,7 @@ class ViewLibrary:
         for row in order.tolist():
             if len(added) == most:
                 break
-            if bool(_is_near(rows[row], near, SPACING, _TURN).any()):
+            if bool(_is_near(rows[row], near, self.spacing, _TURN).any()):
                 continue
             if self._n == MOST_RECORDS:
                 raise InvalidArgumentError(f"{MOST_RECORDS} views are the most of one incarnation.")
@@ -152,11 +149,9 @@ class ViewLibrary:
         return [key for key in added if key in self._views]
 
     def revalue(self, keys: list[int], values: Tensor, now: float, least: float) -> None:
-        """Set the values of views at the time `now` (s); those below `least` are removed.
-
-        A small change is not sent, because it changes no plan; but once in half the time to live the view
-        is, so that it is not removed.
-        """
+        """Set the values of views at the time `now` (s); those below `least` are removed. A small change is
+        not sent, because it changes no plan; but once in half the time to live the view is, so that it is not
+        removed."""
         for key, value in zip(keys, values.tolist(), strict=True):
             known = self._views.get(key)
             if value < least:
@@ -183,10 +178,11 @@ class ViewLibrary:
         seen = _is_near(poses[:, None], known.poses, *_VISITED).any(0)
         self.remove([known.keys[row] for row in seen.nonzero()[:, 0].tolist()], now)
 
-    def covered(self, local_map: LocalMap, now: float, most: int) -> list[int]:
-        """At most `most` views in the local map whose value is no longer fresh, the oldest first."""
+    def covered(self, is_near: Callable[[Tensor], Tensor], now: float, most: int) -> list[int]:
+        """At most `most` views where `is_near`, of places (V, 3), whose value is no longer fresh, the oldest
+        first."""
         known = self.candidates()
-        inside = local_map.is_passable(known.poses[:, :3]).nonzero()[:, 0].tolist()
+        inside = is_near(known.poses[:, :3]).nonzero()[:, 0].tolist()
         due = sorted((self._valued_at[known.keys[row]], known.keys[row]) for row in inside)
         return [key for valued, key in due[:most] if valued <= now - _FRESH]
 
@@ -210,10 +206,8 @@ class ViewLibrary:
     def datagrams(self, now: float | None = None, budget: int | None = None) -> list[bytes]:
         """Datagrams of changes made here, of removals that others lack, and of repeated views.
 
-        Args:
-            now: time (s) by this robot's clock; None: the time of the last call with one.
-            budget: largest size of all together; None: no limit. The rest stays due, as does what exceeds
-                `MOST_DATAGRAMS`.
+        now: time (s) by this robot's clock; None: the time of the last call with one. budget: largest size of
+        all together; None: no limit. The rest stays due, as does what exceeds `MOST_DATAGRAMS`.
         """
         left = math.inf if budget is None else check_whole("budget", budget, 0)
         now = self._now if now is None else now
@@ -240,10 +234,8 @@ class ViewLibrary:
         return sent
 
     def receive(self, message: ViewsMessage, now: float) -> bool:
-        """Merge the views of another robot at the time `now` (s); returns whether they were accepted.
-
-        Never raises for a decoded message.
-        """
+        """Merge the views of another robot at the time `now` (s); returns whether they were accepted. Never
+        raises for a decoded message."""
         self._now = now if math.isfinite(now) else self._now
         keys = keys_of(message.ids)
         named = Intervals.of(keys) | message.removed
@@ -325,10 +317,8 @@ class ViewLibrary:
             self._cached = None
 
     def _whole(self, keys: Intervals) -> Intervals:
-        """The intervals of removed keys that contain any of `keys`, as a whole.
-
-        This takes no more bytes, and repeats earlier removals, which may have been lost.
-        """
+        """The intervals of removed keys that contain any of `keys`, as a whole. This takes no more bytes, and
+        repeats earlier removals, which may have been lost."""
         if not keys:
             return keys
         edges, begins = self._removed.edges.reshape(-1, 2), keys.edges[::2]

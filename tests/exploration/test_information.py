@@ -1,4 +1,4 @@
-"""Information of a beam against enumeration of all maps, with readings integrated by quadrature."""
+"""Information of a beam against enumeration, its cells against ray casting, and discounts by a dictionary."""
 
 from __future__ import annotations
 
@@ -7,11 +7,82 @@ import math
 
 import pytest
 import torch
+from exploration.voxel_worlds import surroundings_from
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels.rays.beam_information import banded_csqmi, first_block, shannon, sharpened
-from gmmtorch.team.exploration.information.beam_templates import depth_kernel, needed_band
+from gmmtorch.kernels.rays.ray_traversal import traverse
+from gmmtorch.team.exploration.planning.view_evaluator import (
+    InformationDiscount,
+    beam_templates,
+    cells_along,
+    depth_kernel,
+    needed_band,
+    pinhole_beams,
+)
+
+FOV = (1.5184, 1.0123)
+
+
+@given(st.integers(0, 2**32), st.floats(0.2, 12.0))
+def test_template_cells_equal_ray_traversal_in_order(seed, reach):
+    generator = torch.Generator().manual_seed(seed)
+    directions = torch.randn(20, 3, generator=generator, dtype=torch.float64)
+    directions /= directions.norm(dim=1, keepdim=True)
+    cells, bounds, lengths = cells_along(directions, reach)
+    half = 14
+    starts = torch.full((20, 3), half + 0.5, dtype=torch.float64)
+    ends = starts + reach * directions
+    shape = (2 * half + 1,) * 3
+    found = [set() for _ in range(20)]
+    for visits in traverse(starts, ends, shape):
+        for voxel, ray in zip(visits.voxel.tolist(), visits.ray.tolist(), strict=True):
+            found[ray].add(voxel)
+    strides = torch.tensor([shape[1] * shape[2], shape[2], 1])
+    for ray, length in enumerate(lengths.tolist()):
+        mine = ((cells[ray, :length] + half) * strides).sum(1).tolist()
+        last = int(((ends[ray].floor().long()) * strides).sum())
+        assert len(set(mine)) == length
+        assert set(mine) == found[ray] | {last}
+        assert mine[-1] == last
+        middle = (bounds[ray, 1 : length + 1] + bounds[ray, :length])[:, None] / 2 * directions[ray]
+        assert torch.equal((middle + 0.5).floor().long(), cells[ray, :length])
+        assert float(bounds[ray, 0]) == 0
+        assert float(bounds[ray, length]) == reach
+        assert bool((bounds[ray].diff() >= 0).all())
+        assert not bool(cells[ray, length:].any())
+
+
+@pytest.mark.parametrize("n_beams", [1, 7, 160, 1000])
+def test_solid_angles_tile_the_image(n_beams):
+    directions, solid_angles = pinhole_beams(*FOV, n_beams)
+    assert 0.75 * n_beams <= len(directions) <= 1.25 * n_beams
+    u, v = math.tan(FOV[0] / 2), math.tan(FOV[1] / 2)
+    whole = 4 * math.asin(u * v / math.sqrt((1 + u * u) * (1 + v * v)))  # of a rectangular pyramid
+    assert float(solid_angles.sum()) == pytest.approx(whole, rel=1e-12)
+    torch.testing.assert_close(directions.norm(dim=1), torch.ones(len(directions)).double())
+    assert bool((directions[:, 1].abs() <= u * directions[:, 0]).all())
+    assert bool((directions[:, 2].abs() <= v * directions[:, 0]).all())
+    assert float(directions[:, 1:].sum(0).abs().max()) < 1e-9  # as many to either side
+    assert float(solid_angles.max() / solid_angles.min()) < 1.7
+
+
+def test_beam_templates_reject_cameras_without_view():
+    for fov in (0.0, -1.0, math.pi, math.nan):
+        with pytest.raises(InvalidArgumentError, match="horizontal_fov"):
+            pinhole_beams(fov, 1.0, 10)
+        with pytest.raises(InvalidArgumentError, match="vertical_fov"):
+            pinhole_beams(1.0, fov, 10)
+    with pytest.raises(InvalidArgumentError, match="n_beams"):
+        pinhole_beams(1.0, 1.0, 0)
+    for far in (0.0, math.inf, math.nan):
+        with pytest.raises(InvalidArgumentError, match="max_range"):
+            beam_templates(*FOV, far, 0.2, 10, 4)
+    with pytest.raises(InvalidArgumentError, match="coarser"):
+        beam_templates(*FOV, 6.0, 1e-4, 160, 16)
+
 
 N_CELLS = 8
 MAPS = torch.tensor(list(itertools.product([0.0, 1.0], repeat=N_CELLS)), dtype=torch.float64)
@@ -164,3 +235,42 @@ def test_depth_kernel_equals_the_dense_kernel_within_its_band():
             there = i + s < length
             expected = math.exp(-(float(depths[i + s] - depths[i]) ** 2) / (4 * 0.01)) if there else 0.0
             assert float(kernel[s - 1, row, i]) == pytest.approx(expected, abs=1e-12)
+
+
+SHAPE = (12, 9, 8)
+COUNTS = (3, 3, 2)
+
+
+def window(low: tuple[int, int, int]):
+    return surroundings_from(torch.ones(SHAPE, dtype=torch.bool), low)
+
+
+corners = st.tuples(*[st.integers(-3, 3).map(lambda n: 4 * n)] * 3)
+
+
+@given(lows=st.lists(corners, min_size=1, max_size=5), seed=st.integers(0, 99))
+def test_weights_equal_a_dictionary_for_any_window(lows, seed):
+    generator = torch.Generator().manual_seed(seed)
+    discount, kept = InformationDiscount(), {}
+    for now, low in enumerate(lows):
+        measured = torch.rand(18, generator=generator) * (torch.rand(18, generator=generator) < 0.5)
+        discount.note(window(low), measured, float(now))
+        for share, block in zip(measured.tolist(), itertools.product(*map(range, COUNTS)), strict=True):
+            name = tuple(a // 4 + b for a, b in zip(low, block, strict=True))
+            kept[name] = kept.get(name, 1.0) * (1 - 0.25 * share)
+    for low in lows:
+        expected = [
+            kept.get(tuple(a // 4 + b for a, b in zip(low, block, strict=True)), 1.0)
+            for block in itertools.product(*map(range, COUNTS))
+        ]
+        torch.testing.assert_close(discount.weights(window(low)), torch.tensor(expected))
+
+
+def test_note_counts_once_for_each_time():
+    discount = InformationDiscount()
+    assert discount.weights(window((0, 0, 0))).tolist() == [1.0] * 18
+    for _ in range(3):
+        discount.note(window((0, 0, 0)), torch.ones(18), 2.0)
+    assert discount.weights(window((0, 0, 0))).tolist() == [0.75] * 18
+    discount.note(window((0, 0, 0)), torch.ones(18), 4.0)
+    assert discount.weights(window((0, 0, 0))).tolist() == [0.5625] * 18

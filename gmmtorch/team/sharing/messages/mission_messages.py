@@ -1,31 +1,112 @@
-"""Views worth visiting, and the plan of a robot, as datagrams. See docs/messages.md."""
+"""Points of a frame, views worth visiting, and the plan of a robot, as datagrams. See docs/messages.md."""
 
 from __future__ import annotations
 
 import math
+import struct
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.mapping import BitReader, BitWriter, Ints
-from gmmtorch.team.sharing.messages.envelope import FARTHEST, MAX_BYTES, Kind, make_datagram, split
-from gmmtorch.team.sharing.messages.fields import (
+from gmmtorch.team.sharing.messages.datagrams import (
+    FARTHEST,
+    MAX_BYTES,
+    Kind,
     check_ids,
+    check_places,
+    make_datagram,
     read_intervals,
     read_keys,
     read_number,
+    split,
     write_intervals,
     write_keys,
     write_number,
 )
 from gmmtorch.team.sharing.replica.record_keys import END, Intervals, ids_of, keys_of
 
+_HEADER = struct.Struct("<HI3dHHH")  # sender, frame, origin, part, parts, points
+_POINT_BYTES = 12
+_OVERHEAD = len(make_datagram(Kind.POINTS, b""))
+POINTS_PER_DATAGRAM = (MAX_BYTES - _OVERHEAD - _HEADER.size) * 8 // (8 * _POINT_BYTES + 1)
+LARGEST_ROBOT, LARGEST_FRAME, MOST_PARTS = (1 << 16) - 1, (1 << 32) - 1, (1 << 16) - 1
+
+
+@dataclass(frozen=True, eq=False)
+class PointsMessage:
+    """Part `part` of `n_parts` of the novel beams of a robot's frame. origin (3,) of all beams, ends (N, 3),
+    float64, metres, world frame; is_hit (N,) bool: the others are no-return beams, which end at the range
+    where they are cut off."""
+
+    sender: int
+    frame: int
+    part: int
+    n_parts: int
+    origin: Tensor
+    ends: Tensor
+    is_hit: Tensor
+
+
+def encode_points(sender: int, frame: int, origin: Tensor, ends: Tensor, is_hit: Tensor) -> list[bytes]:
+    """Datagrams of beams in order, 12 1/8 bytes each; empty without beams.
+
+    Ends are stored as float32 offsets from the origin, so that they are equally exact anywhere in the world.
+
+    sender: id of the robot, up to 65535. frame: its number, up to 2³² − 1. origin: (3,), metres. ends: (N,
+    3), metres. is_hit: (N,) bool.
+
+    Raises `InvalidArgumentError` for values out of range, and for positions beyond `datagrams.FARTHEST`.
+    """
+    check_whole("sender", sender, 0, LARGEST_ROBOT)
+    check_whole("frame", frame, 0, LARGEST_FRAME)
+    if ends.shape[1:] != (3,) or origin.shape != (3,) or is_hit.shape != ends.shape[:1]:
+        raise InvalidArgumentError(
+            f"origin {tuple(origin.shape)}, ends {tuple(ends.shape)} and is_hit {tuple(is_hit.shape)} must "
+            "be (3,), (N, 3) and (N,)."
+        )
+    place = origin.detach().double().cpu()
+    check_places("origin", place[None])
+    rounded = (ends.detach().double().cpu() - place).float()
+    check_places("ends", place + rounded.double())
+    offsets = rounded.numpy()
+    hits = is_hit.cpu().numpy().astype(bool)
+    starts = range(0, len(offsets), POINTS_PER_DATAGRAM)
+    if len(starts) > MOST_PARTS:
+        raise InvalidArgumentError(
+            f"{len(offsets)} points of one frame; at most {MOST_PARTS * POINTS_PER_DATAGRAM} can be sent."
+        )
+    datagrams = []
+    for part, begin in enumerate(starts):
+        chosen = slice(begin, begin + POINTS_PER_DATAGRAM)
+        rows, bits = offsets[chosen], np.packbits(hits[chosen])
+        header = _HEADER.pack(sender, frame, *place.tolist(), part, len(starts), len(rows))
+        datagrams.append(make_datagram(Kind.POINTS, header + rows.astype("<f4").tobytes() + bits.tobytes()))
+    return datagrams
+
+
+def read_points(body: bytes) -> PointsMessage:
+    if len(body) < _HEADER.size:
+        raise DataError(f"{len(body)} bytes are too few for points.")
+    sender, frame, x, y, z, part, n_parts, n = _HEADER.unpack_from(body)
+    if len(body) != _HEADER.size + _POINT_BYTES * n + (n + 7) // 8 or not part < n_parts or n == 0:
+        raise DataError(f"{len(body)} bytes with {n} points, part {part} of {n_parts}: it is damaged.")
+    offsets = np.frombuffer(body, "<f4", 3 * n, _HEADER.size).reshape(n, 3)
+    bits = np.unpackbits(np.frombuffer(body, np.uint8, offset=_HEADER.size + _POINT_BYTES * n))
+    if bits[n:].any() or not np.isfinite(offsets).all():
+        raise DataError("Points are NaN or infinite, or padding bits are set: it is damaged.")
+    offsets = offsets.astype(np.float64)  # after the check, as casting some NaNs raises a warning
+    origin = torch.tensor([x, y, z], dtype=torch.float64)
+    check_places("origin", origin[None])
+    ends = check_places("ends", origin + torch.from_numpy(offsets))
+    return PointsMessage(sender, frame, part, n_parts, origin, ends, torch.from_numpy(bits[:n] != 0))
+
+
 MOST_POSES = 1000
-"""Poses of a path, and of the views of a plan. The poses of a robot at rest take no bits, so data do not
-bound their number."""
+"""Poses of a path, and of the views of a plan: those of a robot at rest take no bits that bound them."""
 STEPS_PER_METRE = 100
 """Positions are whole centimetres."""
 YAW_STEPS = 256
@@ -69,7 +150,7 @@ class PlanMessage:
     views: Tensor
 
 
-def encode_views(message: ViewsMessage, max_bytes: int = MAX_BYTES) -> list[bytes]:
+def encode_views(message: ViewsMessage) -> list[bytes]:
     """Datagrams of views, 9 to 11 bytes each, and of removed keys; empty without either. Ids in any order.
 
     Poses are rounded to 1 cm and 1/256 of a turn (`quantized_poses`), values to float16 (65504 at most),
@@ -85,7 +166,10 @@ def encode_views(message: ViewsMessage, max_bytes: int = MAX_BYTES) -> list[byte
         )
     if not Intervals.span(0, END).covers(m.removed):
         raise InvalidArgumentError(f"removed={m.removed!r} goes beyond the largest key, {END - 1}.")
-    keys = _keys(m.ids)
+    try:
+        keys = keys_of(check_ids("ids", m.ids))
+    except DataError as error:
+        raise InvalidArgumentError(f"ids: {error}") from error
     order, removed = np.argsort(keys), m.removed
     keys = keys[order]
     steps, halves = _pose_steps("poses", m.poses)[order], _halves(m.values)[order]
@@ -103,18 +187,20 @@ def encode_views(message: ViewsMessage, max_bytes: int = MAX_BYTES) -> list[byte
         write_intervals(writer, Intervals(removed.edges[edges]), 0)
         return make_datagram(Kind.VIEWS, writer.to_bytes())
 
-    return split(len(keys) + len(removed), part, "view", max_bytes)
+    return split(len(keys) + len(removed), part, "view")
 
 
 def read_views(body: bytes) -> ViewsMessage:
     reader = BitReader(body)
     keys = read_keys(reader)
     poses = _read_poses(reader, len(keys))
-    values = _values(reader.fixed(len(keys), _HALF_BITS))
+    values = reader.fixed(len(keys), _HALF_BITS).astype(np.uint16).view(np.float16).astype(np.float64)
+    if not np.isfinite(values).all():
+        raise DataError("Values are NaN or infinite: it is damaged.")
     stamps = _seconds_of(reader.column(len(keys)))
     removed = read_intervals(reader, 0, END)
     reader.finish()
-    return ViewsMessage(ids_of(keys), poses, values, stamps, removed)
+    return ViewsMessage(ids_of(keys), poses, torch.from_numpy(values), stamps, removed)
 
 
 def encode_plan(
@@ -124,10 +210,8 @@ def encode_plan(
 
     Poses are rounded to 1 cm and 1/256 of a turn, times to 1 ms.
 
-    Args:
-        sender: id of the robot. number: rises with each of its plans.
-        time: (s) of the first pose of the path. step: (s) from each pose to the next, above zero.
-        path: (S, 4). views: (V, 4).
+    sender: id of the robot. number: rises with each of its plans. time: (s) of the first pose of the path.
+    step: (s) from each pose to the next, above zero. path: (S, 4). views: (V, 4).
 
     Raises `InvalidArgumentError` if the plan does not fit into a datagram.
     """
@@ -175,26 +259,12 @@ def _read_size(reader: BitReader) -> int:
     return n
 
 
-def _keys(ids: Tensor) -> Ints:
-    try:
-        return keys_of(check_ids("ids", ids))
-    except DataError as error:
-        raise InvalidArgumentError(f"ids: {error}") from error
-
-
 def _halves(values: Tensor) -> Ints:
     """The bits (V,) of values rounded to float16."""
     rows = values.detach().double().cpu().numpy()
     if rows.ndim != 1 or not (np.abs(rows) <= np.finfo(np.float16).max).all():
         raise InvalidArgumentError("values must be a row of numbers up to 65504, the most of float16.")
     return rows.astype(np.float16).view(np.uint16).astype(np.int64)
-
-
-def _values(bits: Ints) -> Tensor:
-    values = bits.astype(np.uint16).view(np.float16).astype(np.float64)
-    if not np.isfinite(values).all():
-        raise DataError("Values are NaN or infinite: it is damaged.")
-    return torch.from_numpy(values)
 
 
 # -- poses and times ------------------------------------------------------------------------------------
@@ -238,10 +308,7 @@ def _read_poses(reader: BitReader, n: int) -> Tensor:
 
 
 def _write_path(writer: BitWriter, steps: Ints) -> None:
-    """Write poses (S, 4) along a path: the first, then four columns of the steps from each pose to the next.
-
-    At constant speed and turn rate the steps are nearly equal.
-    """
+    """Write poses (S, 4) of a path: the first, then columns of the steps, which are nearly equal."""
     for axis in range(4 if len(steps) else 0):
         ways = np.diff(steps[:, axis])
         if axis == 3:  # the shorter direction

@@ -13,10 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.team.exploration.information import view_library
-from gmmtorch.team.exploration.information.view_library import ViewLibrary
-from gmmtorch.team.sharing.messages.message_registry import ViewsMessage, decode
+from gmmtorch.team.sharing import view_library
+from gmmtorch.team.sharing.messages.message_registry import decode
+from gmmtorch.team.sharing.messages.mission_messages import ViewsMessage
 from gmmtorch.team.sharing.replica.record_keys import Intervals, first_key, robot_of
+from gmmtorch.team.sharing.view_library import ViewLibrary
 
 
 def key(robot: int, number: int) -> int:
@@ -121,16 +122,16 @@ def test_views_in_the_window_are_valued_again_and_worthless_ones_removed():
     a, b, c = library.add(poses, torch.tensor([3.0, 2.0, 1.0]), 0.0, 0.0)
     passable = torch.ones(20, 10, 10, dtype=torch.bool)
     here = surroundings_from(passable)
-    assert library.covered(here, 5.0, most=9) == []  # known well enough
-    assert library.covered(here, 20.0, most=9) == [a, b]
-    assert library.covered(here, 20.0, most=1) == [a]
+    assert library.covered(here.is_passable, 5.0, most=9) == []  # known well enough
+    assert library.covered(here.is_passable, 20.0, most=9) == [a, b]
+    assert library.covered(here.is_passable, 20.0, most=1) == [a]
     library.revalue([a], torch.tensor([1.0]), 20.0, least=0.5)
-    assert library.covered(here, 21.0, most=1) == [b]  # the one that waits the longest
+    assert library.covered(here.is_passable, 21.0, most=1) == [b]  # the one that waits the longest
     library.revalue([b], torch.tensor([0.1]), 21.0, least=0.5)
     assert library.candidates().keys == [a, c]
     assert library.candidates().values.tolist() == [1.0, 1.0]
     passable[5, 5, 5] = False
-    assert library.covered(here, 40.0, most=9) == []  # nobody can be there
+    assert library.covered(here.is_passable, 40.0, most=9) == []  # nobody can be there
 
 
 def test_visited_views_are_removed():
