@@ -11,8 +11,7 @@ from pathlib import Path
 
 import gmmtorch as gt
 from gmmtorch.export.bag import write_bag
-from gmmtorch.export.mesh import surface_mesh
-from gmmtorch.export.mesh_formats import write_mesh
+from gmmtorch.export.mesh import surface_mesh, write_mesh
 from gmmtorch.mapping.map_builder import MapBuilder
 
 output = Path("outputs/examples")

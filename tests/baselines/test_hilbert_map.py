@@ -17,10 +17,9 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.baselines.bgk_map import sparse_kernel
-from gmmtorch.experiments.baselines.hilbert.hilbert_features import FourierFeatures, NystroemFeatures
-from gmmtorch.experiments.baselines.hilbert.hilbert_map import Features, HilbertMap
-from gmmtorch.experiments.baselines.hilbert.lattice_features import LatticeFeatures
-from gmmtorch.experiments.baselines.hilbert.logistic_regression import logistic_regression
+from gmmtorch.experiments.baselines.hilbert_features import FourierFeatures, LatticeFeatures, NystroemFeatures
+from gmmtorch.experiments.baselines.hilbert_map import Features, HilbertMap
+from gmmtorch.experiments.baselines.logistic_regression import logistic_regression
 from gmmtorch.scan import Scan
 
 LEARNING = {"gap": RESOLUTION, "alpha": 0.05, "batch_size": 512, "learning_rate": 1.0}

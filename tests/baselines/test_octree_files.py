@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from gmmtorch.errors import DataError, MissingDataError
-from gmmtorch.experiments.baselines.octomap_map import OctoMapMap
-from gmmtorch.experiments.baselines.octree_files import parsed_octree
+from gmmtorch.experiments.baselines.octomap_map import OctoMapMap, parsed_octree
 from gmmtorch.scan import Scan
 
 pyoctomap = pytest.importorskip("pyoctomap")

@@ -31,7 +31,7 @@ from gmmtorch.datasets.recordings.ros.bag_topics import LASER as LASERS
 from gmmtorch.datasets.recordings.ros.bag_topics import Sensor
 from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree
 from gmmtorch.export.bag import BagWriter
-from gmmtorch.live.mapper.live_scans import LiveOptions, LiveScans
+from gmmtorch.live.live_scans import LiveOptions, LiveScans
 from gmmtorch.live.ros import Node
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.map_builder import MapBuilder

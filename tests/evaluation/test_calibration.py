@@ -12,7 +12,7 @@ from sklearn.calibration import calibration_curve
 from sklearn.metrics import brier_score_loss, log_loss
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.experiments.evaluation.calibration import (
+from gmmtorch.experiments.evaluation.metrics import (
     SeenPredictions,
     accuracy,
     brier_score,

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.export.floor_and_ceiling import Levels, of_components, of_grid
+from gmmtorch.export.navigation import Levels, of_components, of_grid
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.occupancy_grid import OccupancyGrid
 from gmmtorch.scan import Scan

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.export.map_server import highest_in_band, write_map_server
+from gmmtorch.export.navigation import highest_in_band, write_map_server
 from gmmtorch.occupancy.evidence import Thresholds
 from gmmtorch.occupancy.grid import VoxelGrid
 

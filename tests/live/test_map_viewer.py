@@ -15,7 +15,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.live import viewer_scene
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.query import Query
-from gmmtorch.report.scenes.ellipsoids import unit_sphere
+from gmmtorch.report.ellipsoids import unit_sphere
 
 pytest.importorskip("viser")
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.report.scenes.ellipsoids import ellipse_outlines, ellipsoid_mesh, principal_axes, unit_sphere
+from gmmtorch.report.ellipsoids import ellipse_outlines, ellipsoid_mesh, principal_axes, unit_sphere
 
 
 def components(k: int, dim: int) -> tuple[torch.Tensor, torch.Tensor]:

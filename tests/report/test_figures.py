@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.report.maps.accuracy_figures import auc_against_kept_figure, convergence_figure, roc_figure
-from gmmtorch.report.scenes.mixture_figures import mixture_figure
+from gmmtorch.report.accuracy_figures import auc_against_kept_figure, convergence_figure, roc_figure
+from gmmtorch.report.mixture_figures import mixture_figure
 from gmmtorch.report.style import save_figure
 
 
@@ -117,10 +117,10 @@ import sys, torch
 import gmmtorch.report
 assert "matplotlib" not in sys.modules and "tensorboard" not in sys.modules
 from gmmtorch.report.tensorboard_writer import Board
-from gmmtorch.report.maps.accuracy_figures import roc_figure
-from gmmtorch.report.maps.map_figures import map_figure
-from gmmtorch.report.maps.map_images import MapPanel
-from gmmtorch.report.scenes.mixture_figures import mixture_figure
+from gmmtorch.report.accuracy_figures import roc_figure
+from gmmtorch.report.map_figures import map_figure
+from gmmtorch.report.map_images import MapPanel
+from gmmtorch.report.mixture_figures import mixture_figure
 from gmmtorch.report.style import save_figure
 eye, panel = torch.eye(2)[None], MapPanel("m", lambda x: x[:, 0] * 0 + 0.2, 0.5, (0, 0, 0), (1, 1, 1))
 with Board(sys.argv[1]) as board:

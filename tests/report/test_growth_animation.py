@@ -11,7 +11,7 @@ from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.report import style
-from gmmtorch.report.maps.growth_animation import GrowthFrame, save_growth
+from gmmtorch.report.map_figures import GrowthFrame, save_growth
 
 
 def grown(n_frames: int) -> list[GrowthFrame]:

@@ -7,8 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.axes import Axes
 
-from gmmtorch.report.labels import Label, place_labels
-from gmmtorch.report.style import figure_title, label_axes, new_figure
+from gmmtorch.report.style import Label, figure_title, label_axes, new_figure, place_labels
 
 
 def pixels(axes: Axes, x: np.ndarray, y: np.ndarray) -> np.ndarray:

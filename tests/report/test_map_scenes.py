@@ -9,8 +9,8 @@ import torch
 from matplotlib.axes import Axes
 
 from gmmtorch.mapping.components import Components
-from gmmtorch.report.scenes import map_scenes
-from gmmtorch.report.scenes.map_scenes import OccupancyPanel, cells_near, map_scene_figure
+from gmmtorch.report import scenes
+from gmmtorch.report.scenes import OccupancyPanel, cells_near, map_scene_figure
 
 
 def test_cells_near_points_are_those_of_a_search(generator):
@@ -26,7 +26,7 @@ def test_cells_near_points_are_those_of_a_search(generator):
 
 
 def test_cells_are_larger_if_there_are_too_many(monkeypatch, generator):
-    monkeypatch.setattr(map_scenes, "_MAX_CELLS", 500)
+    monkeypatch.setattr(scenes, "_MAX_CELLS", 500)
     points = 5 * torch.rand(1000, 3, generator=generator, dtype=torch.float64)
     centres, side = cells_near(points, 0.25)
     assert side in (0.5, 1.0, 2.0, 4.0)

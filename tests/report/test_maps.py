@@ -10,9 +10,8 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import VoxelGrid
 from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
-from gmmtorch.report.maps.map_figures import map_figure
-from gmmtorch.report.maps.map_images import MapPanel, height_image, roof_above, slice_image
-from gmmtorch.report.maps.map_regions import robust_bounds
+from gmmtorch.report.map_figures import map_figure
+from gmmtorch.report.map_images import MapPanel, height_image, robust_bounds, roof_above, slice_image
 
 
 def wall_map(dim: int) -> SparseEvidence:

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.events import Event, OnRows, Row, ignore
-from gmmtorch.experiments.evaluation import calibration, metrics, queries
-from gmmtorch.experiments.evaluation.calibration import SeenPredictions
+from gmmtorch.experiments.evaluation import metrics, queries
 from gmmtorch.experiments.evaluation.mapping_methods import Form, MapFactory
+from gmmtorch.experiments.evaluation.metrics import SeenPredictions
 from gmmtorch.experiments.evaluation.protocol_options import Protocol
 from gmmtorch.experiments.evaluation.queries import UNKNOWN, Queries
 from gmmtorch.files import check_writable
@@ -187,7 +187,7 @@ def _calibrated_scores(made: Built, seen: SeenPredictions | None) -> Row:
     if seen is None:
         return {f"calibrated_{name}": None for name in names}
     known = made.asked.labels != UNKNOWN
-    found = calibration.scores(seen.calibrated(made.theta)[known], made.asked.labels[known])
+    found = metrics.scores(seen.calibrated(made.theta)[known], made.asked.labels[known])
     return {f"calibrated_{name}": found[name] for name in names}
 
 
@@ -206,7 +206,7 @@ def _score(
         "auc": curve.auc,
         "auc_low": low,
         "auc_high": high,
-        **calibration.scores(theta[known], asked.labels[known]),
+        **metrics.scores(theta[known], asked.labels[known]),
         "n_components": built.n_components if isinstance(built, GaussianMap) else None,
         "nbytes": built.nbytes,
         "query_seconds": seconds,

@@ -10,9 +10,7 @@ from xml.sax.saxutils import quoteattr
 
 from gmmtorch.datasets import ARRAY, BASE, NAME
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
-from gmmtorch.live.ros.message_types import MessageTypes, dds_type, ros_type
-from gmmtorch.live.ros.middleware import Endpoint
-from gmmtorch.live.ros.quality import Quality
+from gmmtorch.live.ros.topics import Endpoint, MessageTypes, Quality, dds_type, ros_type
 from gmmtorch.optional_packages import needs_extra
 
 LOOPBACK = "127.0.0.1"

@@ -14,10 +14,18 @@ from typing import Any, NamedTuple
 
 from gmmtorch.datasets import TransformTree
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice
-from gmmtorch.live.ros import dds, quality, zenoh_middleware
-from gmmtorch.live.ros.message_types import MessageTypes
-from gmmtorch.live.ros.middleware import MAX_MESSAGE_BYTES, Endpoint, Middleware
-from gmmtorch.live.ros.topic_names import TopicNames
+from gmmtorch.live.ros import dds, zenoh_middleware
+from gmmtorch.live.ros.topics import (
+    MAX_MESSAGE_BYTES,
+    Endpoint,
+    MessageTypes,
+    Middleware,
+    Quality,
+    TopicNames,
+    mismatch,
+    published,
+    subscribed,
+)
 
 logger = logging.getLogger("gmmtorch")
 MIDDLEWARE = ("dds", "zenoh")
@@ -137,9 +145,7 @@ class Node:
 
     # -- topics ---------------------------------------------------------------------------------------
 
-    def publisher(
-        self, topic: str, message_type: str, offered: quality.Quality | None = None
-    ) -> Callable[..., None]:
+    def publisher(self, topic: str, message_type: str, offered: Quality | None = None) -> Callable[..., None]:
         """Declares a publisher; the result publishes a message from nested fields and a stamp (ns).
 
         The stamp goes into headers that have none; without one it is `now`. Fields that are not given are
@@ -147,9 +153,7 @@ class Node:
         """
         name = self.names.resolve(topic)
         self.types.check(message_type)
-        send = self._middleware.publisher(
-            name, message_type, offered or quality.published(name, message_type)
-        )
+        send = self._middleware.publisher(name, message_type, offered or published(name, message_type))
 
         def publish(message: Mapping[str, Any] | bytes, stamp: int | None = None) -> None:
             if not isinstance(message, bytes):
@@ -163,12 +167,12 @@ class Node:
         topic: str,
         message_type: str,
         callback: Callback,
-        requested: quality.Quality | None = None,
+        requested: Quality | None = None,
     ) -> Subscription:
         """Calls `callback` with each message of a topic."""
         name = self.names.resolve(topic)
         self.types.check(message_type)
-        asked = requested or quality.subscribed(name, message_type)
+        asked = requested or subscribed(name, message_type)
         made = Subscription(name, message_type, callback, max(asked.depth, 1))
         self.subscriptions.append(made)
         self._middleware.subscribe(name, message_type, asked, lambda data: self._receive(made, data))
@@ -199,9 +203,9 @@ class Node:
         if all(endpoint.type != subscription.type for endpoint in named):
             types = ", ".join(sorted({endpoint.type for endpoint in named}))
             return f"topic {subscription.topic} has messages of type {types}, not {subscription.type}"
-        asked = quality.subscribed(subscription.topic, subscription.type)
+        asked = subscribed(subscription.topic, subscription.type)
         for endpoint in named:
-            if reason := quality.mismatch(endpoint.quality, asked):
+            if reason := mismatch(endpoint.quality, asked):
                 return f"topic {subscription.topic} cannot be received: {reason}"
         return f"topic {subscription.topic} has a publisher, which sends nothing"
 

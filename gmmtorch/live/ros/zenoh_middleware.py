@@ -15,10 +15,15 @@ from collections.abc import Callable
 from typing import Any
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
-from gmmtorch.live.ros.message_types import MessageTypes, dds_type, ros_type
-from gmmtorch.live.ros.middleware import MAX_MESSAGE_BYTES, Endpoint
-from gmmtorch.live.ros.quality import Quality
-from gmmtorch.live.ros.topic_names import TopicNames
+from gmmtorch.live.ros.topics import (
+    MAX_MESSAGE_BYTES,
+    Endpoint,
+    MessageTypes,
+    Quality,
+    TopicNames,
+    dds_type,
+    ros_type,
+)
 from gmmtorch.optional_packages import needs_extra
 
 ROUTER = "tcp/127.0.0.1:7447"

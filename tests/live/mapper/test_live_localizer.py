@@ -16,9 +16,9 @@ from gmmtorch.datasets.recordings.ros.bag_reader import Topic
 from gmmtorch.datasets.recordings.ros.bag_topics import LASER
 from gmmtorch.datasets.recordings.ros.bag_topics import Sensor as SensorTopic
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.live.mapper import live_scans
-from gmmtorch.live.mapper.live_localizer import LiveLocalizer
-from gmmtorch.live.mapper.live_scans import LiveOptions, LiveScans
+from gmmtorch.live import live_scans
+from gmmtorch.live.live_mapper import LiveLocalizer
+from gmmtorch.live.live_scans import LiveOptions, LiveScans
 from gmmtorch.live.ros import Node
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.scan import Scan
@@ -86,7 +86,7 @@ def test_poses_and_the_transform_to_odometry_are_published(node, known, monkeypa
         node, "publisher", lambda topic, _: lambda message, stamp=None: sent[topic].append(message)
     )
     localizer = LiveLocalizer(node, scans, known)
-    from gmmtorch.export.message_fields import transform_fields
+    from gmmtorch.export.bag import transform_fields
 
     for index, at in enumerate(PATH):
         in_odom = np.linalg.inv(odom_in_map) @ pose(*at)

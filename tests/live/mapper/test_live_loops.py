@@ -22,9 +22,9 @@ from gmmtorch.datasets.base import Ranges
 from gmmtorch.datasets.recordings.ros.bag_reader import Topic
 from gmmtorch.datasets.recordings.ros.bag_topics import LASER, Sensor
 from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree
-from gmmtorch.live.mapper import live_scans
-from gmmtorch.live.mapper.live_mapper import LiveMapper
-from gmmtorch.live.mapper.live_scans import LiveOptions, LiveScans
+from gmmtorch.live import live_scans
+from gmmtorch.live.live_mapper import LiveMapper
+from gmmtorch.live.live_scans import LiveOptions, LiveScans
 from gmmtorch.live.ros import Node
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap

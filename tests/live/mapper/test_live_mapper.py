@@ -22,14 +22,12 @@ from gmmtorch.datasets.recordings.ros.bag_reader import Topic
 from gmmtorch.datasets.recordings.ros.bag_topics import CLOUD, LASER, Sensor
 from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
-from gmmtorch.live.mapper.bag_player import BagPlayer
-from gmmtorch.live.mapper.diagnostics import Diagnostics
-from gmmtorch.live.mapper.live_mapper import LiveMapper
-from gmmtorch.live.mapper.live_scans import LiveOptions, LiveScans
-from gmmtorch.live.mapper.map_publisher import MapPublisher
-from gmmtorch.live.mapper.sensor_topics import find_sensor, open_scans
+from gmmtorch.live.bag_player import BagPlayer
+from gmmtorch.live.live_mapper import LiveMapper
+from gmmtorch.live.live_scans import LiveOptions, LiveScans, find_sensor, open_scans
+from gmmtorch.live.publishers import Diagnostics, MapPublisher
 from gmmtorch.live.ros import Node, Quality
-from gmmtorch.live.ros.quality import LATCHED
+from gmmtorch.live.ros.topics import LATCHED
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.map_builder import MapBuilder
 from gmmtorch.team.sharing import Replica

@@ -17,10 +17,10 @@ from gmmtorch.datasets.recordings.ros.bag_reader import Topic
 from gmmtorch.datasets.recordings.ros.bag_topics import LASER, Sensor
 from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.export.message_fields import transform_fields
-from gmmtorch.live.mapper import pose_publisher
-from gmmtorch.live.mapper.live_mapper import LiveMapper
-from gmmtorch.live.mapper.live_scans import LiveOptions, LiveScans
+from gmmtorch.export.bag import transform_fields
+from gmmtorch.live import publishers
+from gmmtorch.live.live_mapper import LiveMapper
+from gmmtorch.live.live_scans import LiveOptions, LiveScans
 from gmmtorch.live.ros import Node, Quality
 from gmmtorch.mapping.gaussian_map import GaussianMap
 
@@ -45,7 +45,7 @@ def test_a_mapper_without_transforms_finds_and_publishes_the_poses(ros_domain, m
     def publisher(topic: str, message_type: str, offered: Quality | None = None) -> Any:
         return lambda message, stamp=None: sent.append((topic, message))
 
-    monkeypatch.setattr(pose_publisher, "SETTLING", 0.0)
+    monkeypatch.setattr(publishers, "SETTLING", 0.0)
     with Node("test", domain=ros_domain) as node:
         monkeypatch.setattr(node, "publisher", publisher)
         mount = np.eye(4)
@@ -77,7 +77,7 @@ def test_a_mapper_without_transforms_finds_and_publishes_the_poses(ros_domain, m
 
 def test_a_robot_that_another_node_moves_gets_no_second_transform(ros_domain, monkeypatch, caplog):
     topics: list[str] = []
-    monkeypatch.setattr(pose_publisher, "SETTLING", 0.0)
+    monkeypatch.setattr(publishers, "SETTLING", 0.0)
     with Node("test", domain=ros_domain) as node:
         monkeypatch.setattr(
             node, "publisher", lambda topic, *_: lambda message, stamp=None: topics.append(topic)

@@ -17,8 +17,8 @@ from gmmtorch.datasets.recordings.ros.bag_reader import BagReader, Topic
 from gmmtorch.datasets.recordings.ros.bag_topics import CLOUD, DEPTH, LASER, Sensor
 from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree
 from gmmtorch.export.bag import BagWriter
-from gmmtorch.live.mapper import live_scans
-from gmmtorch.live.mapper.live_scans import DROPPED, LiveOptions, LiveScans
+from gmmtorch.live import live_scans
+from gmmtorch.live.live_scans import DROPPED, LiveOptions, LiveScans
 
 KINDS = {LASER: "/scan", CLOUD: "/points", DEPTH: "/camera/depth"}
 

@@ -13,9 +13,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.live.ros import zenoh_middleware
-from gmmtorch.live.ros.message_types import MessageTypes, dds_type, ros_type
-from gmmtorch.live.ros.middleware import Endpoint
-from gmmtorch.live.ros.quality import Quality, mismatch
+from gmmtorch.live.ros.topics import Endpoint, MessageTypes, Quality, dds_type, mismatch, ros_type
 
 TYPES = MessageTypes()
 STORE = get_typestore(Stores.ROS2_JAZZY)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
-from gmmtorch.export.message_fields import cloud_fields, transform_fields
+from gmmtorch.export.bag import cloud_fields, transform_fields
 from gmmtorch.live.ros import Node, Quality
 from gmmtorch.live.ros.dds import _settings
 from gmmtorch.live.ros.node import reading

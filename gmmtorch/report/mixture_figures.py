@@ -16,15 +16,16 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.report import style
-from gmmtorch.report.maps.map_regions import inside, robust_bounds
-from gmmtorch.report.scenes.ellipsoids import (
+from gmmtorch.report.ellipsoids import (
     checked_components,
     checked_rows,
     cut_away,
     ellipse_outlines,
     height_colours,
 )
-from gmmtorch.report.scenes.scene import (
+from gmmtorch.report.map_images import inside, robust_bounds
+from gmmtorch.report.scene_renderer import Canvas
+from gmmtorch.report.scenes import (
     SOUTH_WEST,
     Ellipsoids,
     balls,
@@ -32,8 +33,7 @@ from gmmtorch.report.scenes.scene import (
     draw_scene,
     height_bar,
 )
-from gmmtorch.report.scenes.scene_renderer import Canvas
-from gmmtorch.report.table import count_text
+from gmmtorch.report.text import count_text
 from gmmtorch.scan import ArrayLike
 
 MAX_POINTS = 20_000

@@ -15,7 +15,7 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.mapping import Components
 from gmmtorch.report import style
-from gmmtorch.report.scenes.scene_renderer import N_SIGMA, Camera
+from gmmtorch.report.scene_renderer import N_SIGMA, Camera
 from gmmtorch.scan import ArrayLike
 
 _THINNESS = 0.1  # thickness of an embedded 2D ellipse, as a share of its minor axis

@@ -1,20 +1,31 @@
-"""MapPublisher: a map as ROS messages: occupancy grid and its updates, points, and ellipsoids."""
+"""What live mapping and localisation publish: the map, the sensor's pose, and how they keep up."""
 
 from __future__ import annotations
 
 import time
+from collections import deque
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, MemoryLimitError, check_choice
-from gmmtorch.export import CellCloud, cloud_fields, highest_in_band, of_components
+from gmmtorch.datasets import in_space
+from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, check_choice
+from gmmtorch.export import (
+    CellCloud,
+    cloud_fields,
+    highest_in_band,
+    odometry_fields,
+    of_components,
+    transform_fields,
+)
 from gmmtorch.live import viewer_scene
+from gmmtorch.live.live_scans import SETTLING, LiveScan, LiveScans
 from gmmtorch.live.ros import Node
-from gmmtorch.live.ros.quality import LATCHED
-from gmmtorch.mapping import GaussianMap, Query
+from gmmtorch.live.ros.topics import LATCHED
+from gmmtorch.localization import Location
+from gmmtorch.mapping import GaussianMap, Query, resident_bytes
 from gmmtorch.occupancy import CellClass, KeptEvidence, Thresholds, VoxelGrid, probability
 
 CLOUDS = ("cells", "means", "none")
@@ -184,3 +195,139 @@ def _markers(shown: GaussianMap, header: dict[str, Any]) -> list[dict[str, Any]]
             }
         )
     return made
+
+
+_PLANAR = (0, 1, 5)
+"""Rows of x, y and the heading among those of a pose's covariance in ROS."""
+
+
+class PosePublisher:
+    """Publishes poses on the topic pose, and transforms on /tf, each with the stamp of a scan.
+
+    Args:
+        node: whose names are resolved in its namespace and remapped.
+        frame: in which the poses are.
+    """
+
+    def __init__(self, node: Node, frame: str) -> None:
+        self._node, self._frame = node, frame
+        self._robot: str | None = None  # the frame that moves with the sensor, and has no parent
+        self._candidate: tuple[list[str], float] = ([], 0.0)
+        self._send_pose = node.publisher("pose", "nav_msgs/msg/Odometry")
+        self._send_transform = node.publisher("/tf", "tf2_msgs/msg/TFMessage")
+
+    def publish(self, location: Location, newest: LiveScan, child: str, below: np.ndarray) -> None:
+        """Publishes the pose of a scan's sensor, and the transform from the frame to `child`.
+
+        below: (4, 4) child ← sensor.
+        """
+        pose = in_space(location.pose.cpu().numpy()[None])[0]
+        fields = odometry_fields(self._frame, newest.frame, pose)
+        fields["pose"]["covariance"] = _covariance(location.covariance.cpu())
+        self._send_pose(fields, newest.stamp)
+        if child != self._frame:  # TF of somebody else has a frame of this name
+            above = pose @ np.linalg.inv(below)
+            self._send_transform(transform_fields({(self._frame, child): above}), newest.stamp)
+
+    def publish_odometry(self, location: Location, newest: LiveScan) -> None:
+        """Publishes a pose, and the transform to the robot's frame: the root of those fixed to the sensor.
+
+        The transform is published once the root has not changed for half a second, and only if no other node
+        moves it.
+        """
+        tree, child, below = self._node.transforms, self._frame, np.eye(4)
+        try:
+            chain = tree.chain(newest.frame)
+            fixed = tree.static_part(chain)
+            if self._robot is None and len(fixed) < len(chain):
+                raise DataError(f"TF of another node moves {fixed[-1]} in {chain[len(fixed)]}")
+            if fixed != self._candidate[0]:
+                self._candidate = fixed, time.monotonic()
+            if self._robot is not None or time.monotonic() - self._candidate[1] >= SETTLING:
+                self._robot = child = fixed[-1]
+                below = tree.lookup(fixed, np.array([newest.stamp]), 0.0).matrices[0]
+        except DataError as error:
+            self._node.warn("odometry", f"{error}; only the topic pose is published.")
+        self.publish(location, newest, child, below)
+
+
+def _covariance(of_pose: Tensor) -> np.ndarray:
+    """The covariance (36,) of x, y, z and turns about them, from one of a pose, (3, 3) or (6, 6); zeros if
+    it is unknown (NaN), as ROS has it.
+    """
+    found = np.zeros((6, 6))
+    rows = list(_PLANAR) if len(of_pose) == len(_PLANAR) else list(range(6))
+    found[np.ix_(rows, rows)] = torch.nan_to_num(of_pose).numpy()
+    return found.ravel()
+
+
+_PERIOD = 1.0  # s
+_MOST = 10_000  # latencies that are kept
+_OTHER_CLOCK = 60.0  # s of latency, which shows that stamps come from another clock
+_OK, _WARN = 0, 1
+
+
+class Diagnostics:
+    """Counts scans and latencies of a mapper, and publishes them once a second."""
+
+    def __init__(self, node: Node, scans: LiveScans, name: str = "gmmtorch mapping") -> None:
+        self._node, self._scans, self._name = node, scans, name
+        self._latencies: deque[float] = deque(maxlen=_MOST)
+        self._send = node.publisher("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+        self._begin = time.monotonic()
+        self._last, self._n_last, self._n_dropped = self._begin, 0, 0
+        self._nbytes = 0
+        self._rate = 0.0
+
+    def note_latency(self, seconds: float) -> None:
+        """Notes the time from the stamp of a scan to the publication of a map with it."""
+        if abs(seconds) > _OTHER_CLOCK:
+            self._node.warn(
+                "clock",
+                f"stamps are {seconds:.0f} s away from the clock of this node. For a recording that is "
+                "played set node.use_sim_time=true; for a sensor with a clock of its own "
+                "sensor.clock=received.",
+            )
+            return
+        self._latencies.append(seconds)
+
+    def is_due(self) -> bool:
+        """Whether a second has passed since the last publication."""
+        return time.monotonic() - self._last >= _PERIOD
+
+    def publish(self, n_scans: int, n_components: int, nbytes: int) -> None:
+        """Publishes the numbers; nbytes: of the map."""
+        now = time.monotonic()
+        self._rate = (n_scans - self._n_last) / max(now - self._last, 1e-3)
+        self._last, self._n_last = now, n_scans
+        self._nbytes = nbytes
+        dropped = self._scans.n_dropped
+        is_late, self._n_dropped = dropped > self._n_dropped, dropped
+        if is_late:
+            self._node.warn("dropped", f"{dropped} scans were dropped: the sensor is faster than mapping.")
+        numbers = self.numbers(n_scans, n_components)
+        status = {
+            "level": _WARN if is_late else _OK,
+            "name": self._name,
+            "message": "scans are dropped" if is_late else "keeps up",
+            "hardware_id": self._scans.name,
+            "values": [{"key": key, "value": f"{value:.6g}"} for key, value in numbers.items()],
+        }
+        self._send({"status": [status]})
+
+    def numbers(self, n_scans: int, n_components: int) -> dict[str, float]:
+        """All numbers by name; latencies in s are those of the last 10,000 scans."""
+        latencies = np.array(self._latencies) if self._latencies else np.array([np.nan])
+        counts: Any = self._node.counts
+        return {
+            "n_scans": n_scans,
+            "scans_per_second": self._rate,
+            "latency_median": float(np.median(latencies)),
+            "latency_p99": float(np.percentile(latencies, 99)),
+            "n_dropped": self._scans.n_dropped + counts.get(self._scans.name, {}).get("dropped", 0),
+            "n_malformed": sum(c["malformed"] for c in counts.values()),
+            "n_components": n_components,
+            "nbytes": self._nbytes,
+            "memory_bytes": resident_bytes(),
+            "seconds": time.monotonic() - self._begin,
+        }

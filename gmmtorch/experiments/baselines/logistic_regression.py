@@ -14,8 +14,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from gmmtorch.experiments.baselines.hilbert.hilbert_features import DenseDesign
-from gmmtorch.experiments.baselines.hilbert.lattice_features import LatticeDesign
+from gmmtorch.experiments.baselines.hilbert_features import DenseDesign, LatticeDesign
 
 _CONJUGATE_STEPS = 10  # each step lowers the error, and each round starts from the last round's mean
 
