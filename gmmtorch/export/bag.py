@@ -230,70 +230,11 @@ class BagWriter:
         topic = "/tf_static" if static else "/tf"
         self.message(topic, "tf2_msgs/msg/TFMessage", time, transform_fields(edges))
 
-    def odometry(self, topic: str, time: float, frame: str, child: str, matrix: ArrayLike) -> None:
-        """Writes an Odometry message: the pose of `child` in `frame`."""
-        self.message(topic, "nav_msgs/msg/Odometry", time, odometry_fields(frame, child, matrix))
-
-    def cloud(
-        self, topic: str, time: float, frame: str, points: ArrayLike, offsets: ArrayLike | None = None
-    ) -> None:
-        """Writes points (N, 3) of the sensor frame as PointCloud2 in float32.
-
-        offsets: (N,) times of the points in seconds after `time`, stored in a field t (uint32, ns).
-        """
-        columns = np.asarray(points, dtype=np.float32).reshape(-1, 3)
-        fields = [(axis, "<f4") for axis in "xyz"] + ([] if offsets is None else [("t", "<u4")])
-        table = np.zeros(len(columns), np.dtype(fields))
-        table["x"], table["y"], table["z"] = columns.T
-        if offsets is not None:
-            table["t"] = np.round(np.asarray(offsets) * 1e9)
-        self.cloud_table(topic, time, frame, table)
-
-    def cloud_table(self, topic: str, time: float, frame: str, table: np.ndarray) -> None:
-        """Writes a structured array (N,) or (H, W) as PointCloud2: its fields, in its byte order."""
+    def cloud(self, topic: str, time: float, frame: str, points: ArrayLike) -> None:
+        """Writes points (N, 3) of the sensor frame as PointCloud2 in float32."""
+        columns = np.ascontiguousarray(np.asarray(points, dtype="<f4").reshape(-1, 3))
+        table = columns.view([(axis, "<f4") for axis in "xyz"]).reshape(-1)
         self.message(topic, "sensor_msgs/msg/PointCloud2", time, cloud_fields(frame, table))
-
-    def laser(
-        self,
-        topic: str,
-        time: float,
-        frame: str,
-        ranges: ArrayLike,
-        angle_min: float,
-        angle_increment: float,
-        range_max: float,
-        time_increment: float = 0.0,
-    ) -> None:
-        """Writes ranges (N,) in metres as LaserScan, which stores float32. Angles in radians."""
-        values = np.asarray(ranges, dtype=np.float32)
-        fields = {
-            "header": {"frame_id": frame},
-            "angle_min": angle_min,
-            "angle_max": angle_min + angle_increment * (len(values) - 1),
-            "angle_increment": angle_increment,
-            "time_increment": time_increment,
-            "range_min": 0.0,
-            "range_max": range_max,
-            "ranges": values,
-        }
-        self.message(topic, "sensor_msgs/msg/LaserScan", time, fields)
-
-    def depth(
-        self, topic: str, time: float, frame: str, millimetres: ArrayLike, intrinsics: ArrayLike
-    ) -> None:
-        """Writes a depth image (H, W) in whole millimetres as 16UC1, and its CameraInfo beside it.
-
-        intrinsics: pinhole matrix (3, 3) in pixels.
-        """
-        image = np.asarray(millimetres, dtype="<u2")
-        header, (height, width) = {"header": {"frame_id": frame}}, image.shape
-        size = {"height": height, "width": width}
-        data = np.frombuffer(image.tobytes(), np.uint8)
-        content = {**header, **size, "encoding": "16UC1", "step": 2 * width, "data": data}
-        self.message(topic, "sensor_msgs/msg/Image", time, content)
-        matrix = np.asarray(intrinsics, dtype=np.float64).ravel()
-        info = {**header, **size, ("K" if self._is_ros1 else "k"): matrix}
-        self.message(f"{topic.rpartition('/')[0]}/camera_info", "sensor_msgs/msg/CameraInfo", time, info)
 
 
 def _nanoseconds(time: float) -> int:

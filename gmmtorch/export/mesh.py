@@ -6,7 +6,6 @@ import itertools
 import json
 import struct
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,6 +14,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
+from gmmtorch.export.point_cloud import ply_bytes
 from gmmtorch.files import write_bytes
 from gmmtorch.linalg import ragged_index
 from gmmtorch.mapping import Components
@@ -56,8 +56,7 @@ class _Field(NamedTuple):
     normal: Tensor
 
 
-@dataclass(frozen=True, eq=False)
-class _Sheets:
+class _Sheets(NamedTuple):
     """Flat components: means (K, 3), axes (K, 3, 3) as columns with the normal first, deviations (K, 2) along
     the surface, weights (K,)."""
 
@@ -118,16 +117,20 @@ def _windows(sheets: _Sheets, side: float, memory_limit: int) -> _Windows:
     """The rectangles around all sheets, cut so that the boxes around oblique ones stay small."""
     reach = _EXTENT * sheets.deviations
     n = (2 * reach / (_WINDOW * side)).ceil().clamp_min(1)
-    if float(n.prod(1).sum()) * _POINT_BYTES > memory_limit:
-        raise MemoryLimitError(
-            f"resolution={side:g} m needs more than {memory_limit:,} bytes of lattice points; use larger "
-            "cells."
-        )
+    _check_memory(float(n.prod(1).sum()), side, memory_limit)
     n = n.long()
     sheet, number = ragged_index(n.prod(1))
     place = torch.stack([number // n[sheet, 1], number % n[sheet, 1]], 1)
     half = reach[sheet] / n[sheet]
     return _Windows(sheet, (2 * place + 1) * half - reach[sheet], half)
+
+
+def _check_memory(n_points: float, side: float, memory_limit: int) -> None:
+    if _POINT_BYTES * n_points > memory_limit:
+        raise MemoryLimitError(
+            f"resolution={side:g} m needs more than {memory_limit:,} bytes of lattice points; use larger "
+            "cells."
+        )
 
 
 def _field(sheets: _Sheets, side: float, memory_limit: int) -> _Field:
@@ -153,11 +156,7 @@ def _field(sheets: _Sheets, side: float, memory_limit: int) -> _Field:
         starts.append(max(starts[-1] + 1, end))
     keys, sums = [first.new_zeros(0)], [sheets.means.new_zeros(0, 5)]
     for begin, end in itertools.pairwise(starts):
-        if _POINT_BYTES * sum(map(len, keys)) > memory_limit:
-            raise MemoryLimitError(
-                f"resolution={side:g} m needs more than {memory_limit:,} bytes of lattice points; use larger "
-                "cells."
-            )
+        _check_memory(sum(map(len, keys)), side, memory_limit)
         rows = slice(begin, end)
         part = _Windows(*(value[rows] for value in windows))
         for kept, found in zip((keys, sums), _near(sheets, part, first[rows], size[rows], side), strict=True):
@@ -289,20 +288,7 @@ def _ply(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> bytes:
     rows = np.empty(len(vertices), [(name, "<f8" if i < 3 else "<f4") for i, name in enumerate(names)])
     for i, name in enumerate(names):
         rows[name] = (vertices if i < 3 else normals)[:, i % 3]
-    triangles = np.empty(len(faces), [("n", "u1"), ("corners", "<i4", 3)])
-    triangles["n"], triangles["corners"] = 3, faces
-    header = "\n".join(
-        [
-            "ply",
-            "format binary_little_endian 1.0",
-            f"element vertex {len(vertices)}",
-            *(f"property {'double' if i < 3 else 'float'} {name}" for i, name in enumerate(names)),
-            f"element face {len(faces)}",
-            "property list uchar int vertex_indices",
-            "end_header\n",
-        ]
-    )
-    return header.encode("ascii") + rows.tobytes() + triangles.tobytes()
+    return ply_bytes(rows, faces=faces)
 
 
 def _obj(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> bytes:
@@ -318,6 +304,17 @@ def _glb(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> bytes:
     parts = [local.tobytes(), normals.astype("<f4").tobytes(), faces.astype("<u4").tobytes()]
     begins = np.cumsum([0, *map(len, parts)]).tolist()
     x, y, z = middle.tolist()
+    kinds = (
+        (_GLTF_FLOAT, len(local), "VEC3"),
+        (_GLTF_FLOAT, len(normals), "VEC3"),
+        (_GLTF_UINT, faces.size, "SCALAR"),
+    )
+    accessors: list[dict[str, object]] = [
+        {"bufferView": view, "componentType": kind, "count": count, "type": shape}
+        for view, (kind, count, shape) in enumerate(kinds)
+    ]
+    accessors[0] |= {"min": local.min(0).tolist(), "max": local.max(0).tolist()}
+    grey = {"baseColorFactor": [0.75, 0.75, 0.78, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.9}
     content = {
         "asset": {"version": "2.0", "generator": "gmmtorch"},
         "scene": 0,
@@ -326,33 +323,13 @@ def _glb(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> bytes:
         "meshes": [
             {"primitives": [{"attributes": {"POSITION": 0, "NORMAL": 1}, "indices": 2, "material": 0}]}
         ],
-        "materials": [
-            {
-                "doubleSided": True,
-                "pbrMetallicRoughness": {
-                    "baseColorFactor": [0.75, 0.75, 0.78, 1.0],
-                    "metallicFactor": 0.0,
-                    "roughnessFactor": 0.9,
-                },
-            }
-        ],
+        "materials": [{"doubleSided": True, "pbrMetallicRoughness": grey}],
         "buffers": [{"byteLength": begins[-1]}],
         "bufferViews": [
             {"buffer": 0, "byteOffset": begin, "byteLength": len(part), "target": target}
             for begin, part, target in zip(begins, parts, (_ARRAY, _ARRAY, _ELEMENTS), strict=False)
         ],
-        "accessors": [
-            {
-                "bufferView": 0,
-                "componentType": _GLTF_FLOAT,
-                "count": len(local),
-                "type": "VEC3",
-                "min": local.min(0).tolist(),
-                "max": local.max(0).tolist(),
-            },
-            {"bufferView": 1, "componentType": _GLTF_FLOAT, "count": len(normals), "type": "VEC3"},
-            {"bufferView": 2, "componentType": _GLTF_UINT, "count": faces.size, "type": "SCALAR"},
-        ],
+        "accessors": accessors,
     }
     text = json.dumps(content).encode()
     text += b" " * (-len(text) % 4)

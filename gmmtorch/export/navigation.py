@@ -10,7 +10,6 @@ metres in the world frame, z up.
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,29 +23,18 @@ from gmmtorch.mapping import Components
 from gmmtorch.occupancy import CellClass, OccupancyGrid, Thresholds, VoxelGrid
 
 
-def highest_in_band(
-    grid: VoxelGrid, probability: Tensor, z_min: float = -math.inf, z_max: float = math.inf
-) -> tuple[VoxelGrid, Tensor]:
-    """Projects a 3D map to a 2D grid and probability (n_x, n_y): the highest θ of each column in the band.
+def highest_in_band(grid: VoxelGrid, probability: Tensor) -> tuple[VoxelGrid, Tensor]:
+    """Projects a 3D map of a band of heights to a 2D grid and probability (n_x, n_y): the highest θ of each
+    column, so a column is free only if all its cells are.
 
-    The band is z_min ≤ z ≤ z_max (m).
-    A cell counts if it overlaps the band, so a column is free only if all its cells in the band are free.
-    Raises `InvalidArgumentError` for a map that is not 3D, and for a band without cells.
+    Raises `InvalidArgumentError` for a map that is not 3D.
     """
     if grid.dim != 3 or tuple(probability.shape) != grid.shape:
         raise InvalidArgumentError(
             f"probability has shape {tuple(probability.shape)} on a grid of {grid.shape}; a band needs a 3D "
             "map."
         )
-    low = grid.origin[2] + grid.resolution * torch.arange(grid.shape[2], dtype=torch.float64)
-    meets = (low <= z_max) & (low + grid.resolution > z_min)
-    if not bool(meets.any()):
-        raise InvalidArgumentError(
-            f"z_min={z_min}, z_max={z_max} contains no cell of the map, which reaches from "
-            f"{grid.origin[2]:.6g} to {float(low[-1]) + grid.resolution:.6g} m."
-        )
-    flat = VoxelGrid(grid.origin[:2], grid.resolution, grid.shape[:2])
-    return flat, probability[..., meets.to(probability.device)].amax(2)
+    return VoxelGrid(grid.origin[:2], grid.resolution, grid.shape[:2]), probability.amax(2)
 
 
 def write_map_server(

@@ -84,19 +84,23 @@ class CellCloud:
 
 def write_ply(path: str | Path, cells: CellCloud) -> Path:
     """Writes the cells, atomically, as binary PLY: vertices x, y, z (double) and intensity = θ (float)."""
-    kind = [("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("intensity", "<f4")]
-    header = "\n".join(
-        [
-            "ply",
-            "format binary_little_endian 1.0",
-            f"comment centres of cells of {cells.resolution!r} m; intensity is the probability of occupancy",
-            f"element vertex {len(cells)}",
-            *(f"property double {axis}" for axis in "xyz"),
-            "property float intensity",
-            "end_header\n",
-        ]
-    )
-    return write_bytes(path, header.encode("ascii") + _records(cells, kind))
+    comment = f"centres of cells of {cells.resolution!r} m; intensity is the probability of occupancy"
+    return write_bytes(path, ply_bytes(_records(cells, "<f8"), comment))
+
+
+def ply_bytes(vertices: np.ndarray, comment: str = "", faces: np.ndarray | None = None) -> bytes:
+    """Binary PLY of vertices, a structured array (V,) of float32 and float64, and of triangles (F, 3)."""
+    names = {"<f8": "double", "<f4": "float"}
+    header = ["ply", "format binary_little_endian 1.0"] + [f"comment {comment}"] * bool(comment)
+    header += [f"element vertex {len(vertices)}"]
+    header += [f"property {names[vertices.dtype[name].str]} {name}" for name in vertices.dtype.names or ()]
+    content = vertices.tobytes()
+    if faces is not None:
+        triangles = np.empty(len(faces), [("n", "u1"), ("corners", "<i4", 3)])
+        triangles["n"], triangles["corners"] = 3, faces
+        header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+        content += triangles.tobytes()
+    return "\n".join([*header, "end_header\n"]).encode("ascii") + content
 
 
 def write_pcd(path: str | Path, cells: CellCloud) -> Path:
@@ -112,7 +116,6 @@ def write_pcd(path: str | Path, cells: CellCloud) -> Path:
             f"cells of {cells.resolution} m lie {far:.6g} m from the origin, where the float32 numbers of a "
             "PCD file are too coarse; write PLY, which has doubles, or move the map closer to its origin."
         )
-    kind = [(name, "<f4") for name in ("x", "y", "z", "intensity")]
     header = "\n".join(
         [
             "# .PCD v0.7 - Point Cloud Data file format",
@@ -128,16 +131,16 @@ def write_pcd(path: str | Path, cells: CellCloud) -> Path:
             "DATA binary\n",
         ]
     )
-    return write_bytes(path, header.encode("ascii") + _records(cells, kind))
+    return write_bytes(path, header.encode("ascii") + _records(cells, "<f4").tobytes())
 
 
-def _records(cells: CellCloud, kind: list[tuple[str, str]]) -> bytes:
-    """One packed record per cell: x, y, z, intensity."""
-    rows = np.empty(len(cells), dtype=kind)
+def _records(cells: CellCloud, kind: str) -> np.ndarray:
+    """A structured array of cells: x, y, z of this type, and intensity."""
+    rows = np.empty(len(cells), [*((axis, kind) for axis in "xyz"), ("intensity", "<f4")])
     for axis, values in zip("xyz", cells.positions().T, strict=True):
         rows[axis] = values
     rows["intensity"] = cells.probability.detach().cpu().numpy()
-    return rows.tobytes()
+    return rows
 
 
 _REACH = 1 << 15  # cells on either side of the origin, because OctoMap's keys have 16 bits

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-from gmmtorch.datasets import NANOSECONDS, TF_TYPES, BagReader, RawMessage, Topic
-from gmmtorch.errors import DataError, InvalidArgumentError, check_number
+from gmmtorch.datasets import NANOSECONDS, TF_TYPES, BagReader, RawMessage
+from gmmtorch.errors import DataError, check_number
 from gmmtorch.export import time_fields
 from gmmtorch.live.ros import Node
 from gmmtorch.live.ros.node import CLOCK, TRANSFORMS
@@ -24,49 +23,35 @@ class BagPlayer:
         node: publishes the topics under their names, remapped.
         path: see `BagReader`.
         rate: of the recording's speed.
-        topics: that are played; None: all whose type is known.
 
     Attributes:
         n_played: messages so far.
         unknown: topics that are left out, because their type is not one of ROS 2 Jazzy.
 
-    Raises `DataError` if the bag has none of the topics.
+    Raises `DataError` if the bag has no topic of a known type.
     """
 
-    def __init__(
-        self, node: Node, path: str | Path, rate: float = 1.0, topics: Collection[str] | None = None
-    ) -> None:
+    def __init__(self, node: Node, path: str | Path, rate: float = 1.0) -> None:
         check_number("rate", rate, above=True)
         self._node, self._rate = node, rate
         self._reader = BagReader(Path(path).expanduser())
         found = [topic for topic in self._reader.topics if topic.n_messages and topic.name != "/clock"]
-        missing = set(topics or ()) - {topic.name for topic in found}
-        if missing:
-            names = ", ".join(topic.name for topic in found)
-            raise InvalidArgumentError(
-                f"topics={sorted(missing)} are not in {path}, whose topics are {names}."
-            )
-        chosen = [topic for topic in found if topics is None or topic.name in topics]
-        known = [topic for topic in chosen if _played_type(topic.type) in node.types.definitions]
-        self.unknown = [topic for topic in chosen if topic not in known]
+        known = [topic for topic in found if _played_type(topic.type) in node.types.definitions]
+        self.unknown = [topic for topic in found if topic not in known]
         if not known:
             raise DataError(f"{path} has no message of a type that ROS 2 Jazzy knows.")
         self.n_played = 0
-        self._topics = known
-        self._send = {topic: self._publisher(topic) for topic in known}
+        self._send = {topic: node.publisher(topic.name, _played_type(topic.type)) for topic in known}
         self._send_clock = node.publisher("/clock", CLOCK)
-
-    def _publisher(self, topic: Topic) -> Callable[..., None]:
-        return self._node.publisher(topic.name, _played_type(topic.type))
 
     @property
     def n_messages(self) -> int:
         """Messages that are played."""
-        return sum(topic.n_messages for topic in self._topics)
+        return sum(topic.n_messages for topic in self._send)
 
     def wait_for_subscriber(self, seconds: float) -> bool:
         """Waits until another node subscribes to a played topic; returns whether one did."""
-        names = {self._node.names.resolve(topic.name) for topic in self._topics if not _is_tf(topic)}
+        names = {self._node.names.resolve(topic.name) for topic in self._send if topic.type not in TF_TYPES}
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             if any(subscriber.topic in names for subscriber in self._node.subscribers()):
@@ -78,22 +63,20 @@ class BagPlayer:
     def play(self) -> Iterator[RawMessage]:
         """Publishes the messages, each at its time, and yields it afterwards."""
         begin, first = time.monotonic(), None
-        kinds = {(topic.name, topic.type): topic for topic in self._topics}
-        for message in self._reader.messages({topic.name for topic in self._topics}):
-            topic = kinds.get((message.topic, message.type))
-            if topic is None:
+        send = {(topic.name, topic.type): publish for topic, publish in self._send.items()}
+        for message in self._reader.messages({topic.name for topic in self._send}):
+            publish = send.get((message.topic, message.type))
+            if publish is None:
                 continue
             first = message.time if first is None else first
             self._wait(begin, first, message.time)
             self._tick(message.time)
-            self._send[topic](self._content(message))
+            if self._reader.is_ros1:
+                publish(self._node.types.from_ros1(message.data, _played_type(message.type)))
+            else:
+                publish(message.data)
             self.n_played += 1
             yield message
-
-    def _content(self, message: RawMessage) -> bytes:
-        if not self._reader.is_ros1:
-            return message.data
-        return self._node.types.from_ros1(message.data, _played_type(message.type))
 
     def _wait(self, begin: float, first: int, until: int) -> None:
         """Waits for the time of a message (ns), and publishes the clock meanwhile."""
@@ -104,13 +87,8 @@ class BagPlayer:
         time.sleep(max(0.0, due - time.monotonic()))
 
     def _tick(self, now: int) -> None:
-        clock: dict[str, Any] = {"clock": time_fields(max(now, 0))}
-        self._send_clock(clock)
+        self._send_clock({"clock": time_fields(max(now, 0))})
 
 
 def _played_type(message_type: str) -> str:
     return TRANSFORMS if message_type in TF_TYPES else message_type
-
-
-def _is_tf(topic: Topic) -> bool:
-    return topic.type in TF_TYPES

@@ -290,9 +290,14 @@ class LiveScans(Dataset):
     def _convert(self, item: _Waiting) -> bool:
         """Makes a message the newest scan, unless it is left out."""
         conversion = self._conversion
-        if conversion is None or not self._is_in_order(item.stamp):
-            self._note("no pose at the time of the scan" if conversion is None else "stamp out of order")
+        if conversion is None:
+            self._note("no pose at the time of the scan")
             return False
+        last = self._last_stamp
+        if last is not None and last - _BACKWARDS < item.stamp < last:
+            self._note("stamp out of order")
+            return False
+        self._last_stamp = item.stamp
         try:
             poses = conversion.source.at(np.array([item.stamp]), item.frame)
             if not poses.known[0] or (np.abs(poses.matrices[0, :3, 3]) > FARTHEST).any():
@@ -305,13 +310,6 @@ class LiveScans(Dataset):
             return False
         self._n_posed += 1
         return (self._n_posed - 1) % self._options.stride == 0 and self._keep(item, found, poses.matrices[0])
-
-    def _is_in_order(self, stamp: int) -> bool:
-        last = self._last_stamp
-        if last is not None and last - _BACKWARDS < stamp < last:
-            return False
-        self._last_stamp = stamp
-        return True
 
     def _keep(self, item: _Waiting, found: Reading, matrix: np.ndarray) -> bool:
         conversion = self._conversion
@@ -475,12 +473,10 @@ def _sensors(node: Node, name: str | None) -> list[Sensor]:
         Sensor(Topic(topic, message_type, 0), _KINDS[message_type])
         for topic, types in node.topics().items()
         for message_type in types
-        if message_type in _KINDS and (topic == name if name else not _is_colour(topic, message_type))
+        if message_type in _KINDS
+        # Images without "depth" in their name have colours.
+        and (topic == name if name else not message_type.endswith("Image") or "depth" in topic.lower())
     ]
-
-
-def _is_colour(topic: str, message_type: str) -> bool:
-    return message_type.endswith("Image") and "depth" not in topic.lower()
 
 
 def open_scans(

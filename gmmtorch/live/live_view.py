@@ -106,17 +106,15 @@ class LiveView:
         if self._is_busy or time.monotonic() < self._next or not self.viewer.n_viewers:
             return
         self._begin = time.monotonic()
-        with torch.inference_mode():  # missions run in it, and their tensors must not be changed outside
-            moment = take()
-        self._hand_over(moment)
+        self._hand_over(take)
 
     def finish(self, take: Callable[[], Moment]) -> None:
         """Draws what `take` returns, for browsers to come as well; returns when it is drawn."""
-        with self._changed:
-            self._changed.wait_for(lambda: not self._is_busy)
-        with torch.inference_mode():
-            last = take()
-        self._hand_over(last)
+        self._wait()
+        self._hand_over(take)
+        self._wait()
+
+    def _wait(self) -> None:
         with self._changed:
             self._changed.wait_for(lambda: not self._is_busy)
 
@@ -130,7 +128,9 @@ class LiveView:
         self._thread.join()
         self.viewer.stop()
 
-    def _hand_over(self, moment: Moment) -> None:
+    def _hand_over(self, take: Callable[[], Moment]) -> None:
+        with torch.inference_mode():  # missions run in it, and their tensors must not be changed outside
+            moment = take()
         with self._changed:
             self._waiting, self._is_busy = moment, True
             self._changed.notify_all()
@@ -138,7 +138,12 @@ class LiveView:
     # -- the thread -----------------------------------------------------------------------------------
 
     def _work(self) -> None:
-        while (moment := self._taken()) is not None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting is not None or self._is_stopped)
+                moment, self._waiting = self._waiting, None
+            if self._is_stopped or moment is None:
+                return
             try:
                 with torch.inference_mode():
                     self._draw(moment)
@@ -150,13 +155,6 @@ class LiveView:
                 self._next = self._begin + max(_PERIOD, spent / _SHARE)
                 self._is_busy = False
                 self._changed.notify_all()
-
-    def _taken(self) -> Moment | None:
-        """The next moment to draw; None: the view has been stopped."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._waiting is not None or self._is_stopped)
-            moment, self._waiting = self._waiting, None
-            return None if self._is_stopped else moment
 
     def _draw(self, moment: Moment) -> None:
         colours = [robot_colour(robot.number) for robot in moment.robots]

@@ -284,8 +284,7 @@ class MapViewer:
                 return
             resolution = self._resolution.value
             position = (start + nearest * along)[:dim]
-            known = viewer_scene.place_at(self._map, position, resolution)
-            self._place.content = viewer_scene.place_text(known, resolution)
+            self._place.content = viewer_scene.place_text(self._map, position, resolution)
             spot = torch.nn.functional.pad(position, (0, 3 - dim)) - self.shift
             self._remove("place")
             self._nodes["place"] = self.server.scene.add_icosphere(

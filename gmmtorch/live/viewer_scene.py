@@ -59,15 +59,6 @@ class Instances(NamedTuple):
     scales: np.ndarray
 
 
-class Place(NamedTuple):
-    """What a map knows about a place (D,): θ, hits and misses of the cell around it."""
-
-    position: Tensor
-    occupancy: float
-    hits: float
-    misses: float
-
-
 class Slice(NamedTuple):
     """A picture of occupancy in a plane: RGBA (rows, columns, 4) uint8, highest y first. In 3D unknown is
     clear, and free is translucent. middle (3,), world frame, and size (2,), metres."""
@@ -174,7 +165,13 @@ def segments(paths: Sequence[Tensor]) -> Tensor:
 def frame(components: Components, paths: Sequence[Tensor]) -> Frame:
     """The first view of components and the sensor's paths (S, 3)."""
     solid = surfaces(components)
-    return frame_of(solid.means, paths)._replace(open_height=_open_height(components, solid))
+    found = frame_of(solid.means, paths)
+    if components.dim == 2:
+        return found
+    chosen = components.selected(solid.rows.to(components.means.device))
+    seen_from = first_viewpoints(chosen).cpu()
+    _, top = cut_away(chosen.means.cpu(), chosen.covariances.cpu(), seen_from, SOUTH_WEST)
+    return found._replace(open_height=top)
 
 
 def frame_of(places: Tensor, paths: Sequence[Tensor]) -> Frame:
@@ -187,14 +184,6 @@ def frame_of(places: Tensor, paths: Sequence[Tensor]) -> Frame:
     distance = 0.6 * float((high - low)[:2].norm()) + 2.0
     height = float(path[:, 2].median()) if len(path) else float(low[2] + high[2]) / 2
     return Frame(low, high, shift, distance, height, math.inf)
-
-
-def _open_height(components: Components, solid: Solid) -> float:
-    if components.dim == 2:
-        return math.inf
-    chosen = components.selected(solid.rows.to(components.means.device))
-    seen_from = first_viewpoints(chosen).cpu()
-    return cut_away(chosen.means.cpu(), chosen.covariances.cpu(), seen_from, SOUTH_WEST)[1]
 
 
 def occupancy_slice(shown: GaussianMap, resolution: float, height: float, view: Frame) -> Slice:
@@ -217,11 +206,8 @@ def occupancy_slice(shown: GaussianMap, resolution: float, height: float, view: 
 
 
 def first_hit(solid: Solid, origin: Tensor, direction: Tensor) -> float:
-    """Distance (m) along a ray to the first 2σ ellipsoid that it enters; inf if it meets none.
-
-    Args:
-        origin, direction: (3,), of any length; the distance is in multiples of the direction.
-    """
+    """Distance along a ray to the first 2σ ellipsoid that it enters; inf if it meets none. origin (3,),
+    metres; direction (3,): of any length, in whose multiples the distance is."""
     if len(solid.means) == 0:
         return float("inf")
     precision = torch.linalg.inv(solid.covariances)
@@ -235,23 +221,18 @@ def first_hit(solid: Solid, origin: Tensor, direction: Tensor) -> float:
     return float(torch.where(met, enter, torch.inf).min())
 
 
-def place_at(shown: GaussianMap, position: Tensor, resolution: float) -> Place:
-    """What the map knows about the cube of a side (m) around a position (D,)."""
+def place_text(shown: GaussianMap, position: Tensor, resolution: float) -> str:
+    """A table of what the map knows about the cube of a side (m) around a position (D,), in Markdown."""
     corner = (position - resolution / 2).tolist()
-    cell = VoxelGrid(tuple(corner), resolution, (1,) * len(corner))
-    evidence = shown.evidence(cell)
-    theta = torch.as_tensor(shown.occupancy(position[None], resolution))
-    return Place(position, float(theta[0]), float(evidence.hits.sum()), float(evidence.misses.sum()))
-
-
-def place_text(known: Place, resolution: float) -> str:
-    """A table of what the map knows about a cell of a side (m), in Markdown."""
-    where = ", ".join(f"{value:.2f}" for value in known.position.tolist())
-    kind = "unknown" if known.hits + known.misses < 0.01 else "free" if known.occupancy < 0.5 else "occupied"
+    evidence = shown.evidence(VoxelGrid(tuple(corner), resolution, (1,) * len(corner)))
+    theta = float(torch.as_tensor(shown.occupancy(position[None], resolution))[0])
+    hits, misses = float(evidence.hits.sum()), float(evidence.misses.sum())
+    where = ", ".join(f"{value:.2f}" for value in position.tolist())
+    kind = "unknown" if hits + misses < 0.01 else "free" if theta < 0.5 else "occupied"
     return (
         f"**{kind}** at ({where}) m\n\n"
-        f"| | |\n|---|---|\n| occupancy θ | {known.occupancy:.3f} |\n| hits | {known.hits:.3g} |\n"
-        f"| misses | {known.misses:.3g} |\n| cell | {resolution:g} m |"
+        f"| | |\n|---|---|\n| occupancy θ | {theta:.3f} |\n| hits | {hits:.3g} |\n"
+        f"| misses | {misses:.3g} |\n| cell | {resolution:g} m |"
     )
 
 

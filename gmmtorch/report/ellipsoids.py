@@ -32,9 +32,9 @@ class EllipsoidMesh(NamedTuple):
 
 
 def checked_components(means: ArrayLike, covariances: ArrayLike) -> tuple[Tensor, Tensor]:
-    """Returns means (K, D) and covariances (K, D, D) as float64 tensors.
+    """Returns means (K, D) and covariances (K, D, D), D = 2 or 3, as float64 tensors.
 
-    Raises `InvalidArgumentError` for other shapes, D other than 2 or 3, and values that are not finite.
+    Raises `InvalidArgumentError` for other shapes, and for values that are not finite.
     """
     mean = torch.as_tensor(means).detach().double()
     covariance = torch.as_tensor(covariances).detach().double()
@@ -100,26 +100,22 @@ def height_colours(heights: Tensor, scale: Normalize | None = None) -> Tensor:
 def ellipsoid_mesh(means: ArrayLike, covariances: ArrayLike, n_vertices: int = 162) -> EllipsoidMesh:
     """Returns the surfaces (x − μ)ᵀ Σ⁻¹ (x − μ) = 4 of K components, in order, coloured by height.
 
-    Args:
-        means: (K, D), metres; 2D components become thin 3D ones at z = 0.
-        covariances: (K, D, D), m²; a singular one gives a flat ellipsoid.
-        n_vertices: vertices per ellipsoid, 4 or more; each then has 2·n_vertices − 4 faces.
-
-    Raises:
-        InvalidArgumentError: shapes disagree, values are not finite, or too few vertices.
+    means (K, D), metres; covariances (K, D, D), m². Components in 2D become thin ones at z = 0. Each has
+    `n_vertices`, 4 or more, and 2·n_vertices − 4 faces. Raises `InvalidArgumentError` for other input.
     """
     mean, covariance = checked_components(means, covariances)
     if mean.shape[1] == 2:
-        mean, covariance = _embedded(mean, covariance)
+        solid = covariance.new_zeros(len(mean), 3, 3)
+        solid[:, :2, :2] = covariance
+        solid[:, 2, 2] = (_THINNESS * principal_axes(covariance)[0][:, 0]) ** 2
+        mean, covariance = torch.nn.functional.pad(mean, (0, 1)), solid
     sphere, triangles = (part.to(mean.device) for part in unit_sphere(n_vertices))
     deviations, directions = principal_axes(covariance)
     vertices = mean[:, None] + N_SIGMA * sphere @ (directions * deviations[:, None, :]).mT
     offsets = torch.arange(len(mean), device=mean.device)[:, None, None] * n_vertices
     colors = height_colours(mean[:, 2]).mul(255).to(torch.uint8).to(mean.device)
     return EllipsoidMesh(
-        vertices.reshape(-1, 3),
-        (triangles + offsets).reshape(-1, 3),
-        colors.repeat_interleave(n_vertices, 0),
+        vertices.reshape(-1, 3), (triangles + offsets).reshape(-1, 3), colors.repeat_interleave(n_vertices, 0)
     )
 
 
@@ -137,15 +133,6 @@ def unit_sphere(n_vertices: int) -> tuple[Tensor, Tensor]:
     faces = torch.from_numpy(ConvexHull(vertices.numpy()).simplices).long()
     inward = torch.linalg.det(vertices[faces]) < 0
     return vertices, torch.where(inward[:, None], faces[:, [0, 2, 1]], faces)
-
-
-def _embedded(mean: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
-    """Converts 2D components to 3D ones in the plane z = 0, a tenth as thick as their minor axis."""
-    k = len(mean)
-    solid = covariance.new_zeros(k, 3, 3)
-    solid[:, :2, :2] = covariance
-    solid[:, 2, 2] = (_THINNESS * principal_axes(covariance)[0][:, 0]) ** 2
-    return torch.cat([mean, mean.new_zeros(k, 1)], 1), solid
 
 
 _FLAT = 0.1  # largest ratio of the two smallest variances of a flat component
@@ -174,11 +161,8 @@ def cut_away(
     faces away from the viewer, and components attached to such surfaces. A component is attached if most of
     its nearest flat neighbours, at its mean or at either end, are left out; a flat one, if all are.
 
-    Args:
-        mean: (K, 3), metres.
-        covariance: (K, 3, 3), m².
-        seen_from: (K, 3), a sensor origin that observed each; if None, only the height counts.
-        camera: the viewer.
+    mean (K, 3), metres; covariance (K, 3, 3), m²; seen_from (K, 3): a sensor origin that observed each; if
+    None, only the height counts.
     """
     if len(mean) == 0:
         return torch.ones(0, dtype=torch.bool), math.inf
@@ -190,7 +174,9 @@ def cut_away(
     normal, longest = directions[:, :, 0], directions[:, :, 2]
     side = normal * ((seen_from - mean) * normal).sum(1, keepdim=True).sign()
     hides = flat & (side @ camera.axes[2] < _BACK_FACE)
-    ceiling = _level_ceiling(mean, mean[flat & (side[:, 2] < _OVERHEAD), 2])
+    overhead = mean[flat & (side[:, 2] < _OVERHEAD), 2]
+    is_level = len(overhead) and float(overhead.median()) >= _share_of_height(mean, _LEVEL)
+    ceiling = _share_of_height(mean, _CUT) if is_level else math.inf
     end = N_SIGMA * longest * deviations[:, 2:]
     kept = (mean[:, 2] <= ceiling) & ~hides
     if bool(flat.any()):
@@ -198,12 +184,6 @@ def cut_away(
         share = _hidden_share(places, mean[flat], hides[flat]).amax(0)
         kept &= share < torch.where(flat, 1.0, _MAX_SHARE)
     return kept, ceiling
-
-
-def _level_ceiling(mean: Tensor, overhead: Tensor) -> float:
-    """Returns the height of the cut if the heights (N,) of overhead surfaces form a level ceiling, else ∞."""
-    level = len(overhead) and float(overhead.median()) >= _share_of_height(mean, _LEVEL)
-    return _share_of_height(mean, _CUT) if level else math.inf
 
 
 def _share_of_height(mean: Tensor, share: float) -> float:

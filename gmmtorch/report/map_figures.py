@@ -74,8 +74,7 @@ def map_figure(
         max_pixels: pixels along each side of a picture; larger regions are sampled more coarsely.
         max_queries: largest number of queries for one view from above.
 
-    Raises:
-        InvalidArgumentError: no panel, or panels and trajectories of different dimensions.
+    Raises `InvalidArgumentError` without a panel, and for panels and trajectories of different dimensions.
     """
     if not panels:
         raise InvalidArgumentError("panels is empty; give at least one map to show.")
@@ -95,7 +94,10 @@ def map_figure(
     figure, grid, shown_pixels = _sheet(panels, n_columns, n_bands * n_views)
     bands = [grid[i * n_views : (i + 1) * n_views] for i in range(n_bands)]
     slices = np.concatenate([band[0] for band in bands])
-    height = _slice_height(panels[0], flown)
+    if flown is not None and dim == 3:
+        height = float(np.median(flown[:, 2]))
+    else:
+        height = 0.0 if dim == 2 else (panels[0].low[2] + panels[0].high[2]) / 2
     for axes, panel in zip(slices, panels, strict=False):
         _draw_slice(axes, panel, paths, height, max_pixels, shown_pixels)
     greys = ScalarMappable(Normalize(0, 1), occupancy_colours())
@@ -104,7 +106,8 @@ def map_figure(
     if dim == 3:
         views = [band[1] for band in bands]
         # One ceiling for all: panels that are cut at different heights cannot be compared.
-        top = min(_ceiling(panel, flown) for panel in panels)
+        has_roof = flown is not None and any(roof_above(panel, flown) for panel in panels)
+        top = height + HEADROOM if has_roof else math.inf
         _draw_heights(figure, views, panels, paths, top, shown_pixels, max_queries)
     for axes in bands[-1][:, len(panels) - (n_bands - 1) * n_columns :].flat:
         axes.set_visible(False)
@@ -120,12 +123,7 @@ def map_figure(
 
 
 def _draw_slice(
-    axes: Axes,
-    panel: MapPanel,
-    paths: list[np.ndarray],
-    height: float,
-    max_pixels: int,
-    shown_pixels: int,
+    axes: Axes, panel: MapPanel, paths: list[np.ndarray], height: float, max_pixels: int, shown_pixels: int
 ) -> None:
     """Draws θ of the cells in 2D, or of those at z = `height` (m) in 3D, and the sensor paths."""
     cells = f"cells of {style.metres(panel.resolution)}"
@@ -172,12 +170,6 @@ def _sheet(panels: Sequence[MapPanel], n_columns: int, n_rows: int) -> tuple[Fig
     return figure, axes, int(width * max(shape, 1.0) * style.SAVED_DPI)
 
 
-def _slice_height(panel: MapPanel, path: np.ndarray | None) -> float:
-    if panel.dim == 2:
-        return 0.0
-    return (panel.low[2] + panel.high[2]) / 2 if path is None else float(np.median(path[:, 2]))
-
-
 def occupancy_colours() -> Colormap:
     """Returns the colours of θ: white for free, black for occupied, blue-grey for NaN."""
     greys = LinearSegmentedColormap.from_list("occupancy", _GREYS)
@@ -207,12 +199,6 @@ def _legend_beside(truth: ArrayLike | None, lost: ArrayLike | None) -> list[Arti
     true = Line2D([], [], color=_TRUE, linewidth=3, label="true path")
     mark = Line2D([], [], color=_LOST, marker="x", linestyle="", markeredgewidth=2, label="scan not found")
     return [line for line, given in ((true, truth), (mark, lost)) if given is not None]
-
-
-def _ceiling(panel: MapPanel, path: np.ndarray | None) -> float:
-    if path is None or not roof_above(panel, path):
-        return math.inf
-    return float(np.median(path[:, 2])) + HEADROOM
 
 
 def _below(panel: MapPanel, ceiling: float) -> MapPanel:
@@ -257,11 +243,7 @@ class GrowthFrame(NamedTuple):
 
 
 def save_growth(
-    path: str | Path,
-    frames: Sequence[GrowthFrame],
-    *,
-    resolution: float,
-    period: float = 0.15,
+    path: str | Path, frames: Sequence[GrowthFrame], *, resolution: float, period: float = 0.15
 ) -> Path:
     """Writes frames as an animated WebP or GIF that repeats, and returns its path.
 
@@ -271,8 +253,7 @@ def save_growth(
         resolution: side (m) of the cells of occupancy.
         period: seconds of a frame; the last one is shown for four seconds.
 
-    Raises:
-        InvalidArgumentError: another suffix, no frame, or a map in 3D.
+    Raises `InvalidArgumentError` for another suffix, no frame, or a map in 3D.
     """
     path = Path(path)
     if path.suffix.lower() not in (".webp", ".gif"):

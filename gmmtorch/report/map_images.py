@@ -24,13 +24,8 @@ Corners = tuple[tuple[float, ...], tuple[float, ...]]
 def busiest_regions(points: ArrayLike, n: int, side: float | None = None) -> list[Corners]:
     """Returns the corners of the `n` squares of the plane that contain the most surface, no two adjacent.
 
-    Surface is counted in cells of a hundredth of the side, so points on top of each other count once. Returns
-    fewer squares if there are not enough.
-
-    Args:
-        points: (N, 2), world metres.
-        n: number of squares.
-        side: side of a square (m); if None, a tenth of the longer side of the cloud.
+    Surface is counted in cells of a hundredth of the side, so points (N, 2) on top of each other count once.
+    Returns fewer squares if there are not enough. side: in metres; a tenth of the longer side of the cloud.
     """
     cloud = _finite(points)
     if n < 1 or len(cloud) == 0:
@@ -216,14 +211,8 @@ def height_image(panel: MapPanel, max_pixels: int = MAX_PIXELS, max_queries: int
 def highest_occupancy(probability: ArrayLike, low: ArrayLike, resolution: float) -> MapImage:
     """Returns the highest occupancy of the known cells in each column; ½ where none is known.
 
-    Args:
-        probability: occupancy (nx, ny, nz) of the cells; within 0.02 of ½ is unknown. Truth values are
-            accepted.
-        low: corner (3,) of the lowest cell, world metres.
-        resolution: side (m) of a cell.
-
-    Raises:
-        InvalidArgumentError: shapes disagree, or there is no layer of cells.
+    probability (nx, ny, nz): within 0.02 of ½ is unknown; truth values are accepted. low (3,): corner of the
+    lowest cell, world metres. Raises `InvalidArgumentError` for other shapes, and without a layer of cells.
     """
     theta, corner = torch.as_tensor(probability).detach().cpu().double(), as_array(low)
     if theta.ndim != 3 or corner.shape != (3,) or theta.shape[2] == 0:

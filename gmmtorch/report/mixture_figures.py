@@ -25,14 +25,7 @@ from gmmtorch.report.ellipsoids import (
 )
 from gmmtorch.report.map_images import inside, robust_bounds
 from gmmtorch.report.scene_renderer import Canvas
-from gmmtorch.report.scenes import (
-    SOUTH_WEST,
-    Ellipsoids,
-    balls,
-    canvas_around,
-    draw_scene,
-    height_bar,
-)
+from gmmtorch.report.scenes import SOUTH_WEST, Ellipsoids, balls, canvas_around, draw_scene, height_bar
 from gmmtorch.report.text import count_text
 from gmmtorch.scan import ArrayLike
 
@@ -73,8 +66,7 @@ def mixture_figure(
         title: title of the figure; the numbers of components and points are added.
         max_components: largest number to draw; if None, 5,000 in 2D and 3,000 in 3D.
 
-    Raises:
-        InvalidArgumentError: shapes disagree.
+    Raises `InvalidArgumentError` if shapes disagree.
     """
     mean, covariance = (value.cpu() for value in checked_components(means, covariances))
     dim = mean.shape[1]
@@ -117,11 +109,7 @@ def _flat_figure(points: np.ndarray, mean: Tensor, covariance: Tensor, box: tupl
 
 
 def _solid_figure(
-    points: np.ndarray,
-    mean: Tensor,
-    covariance: Tensor,
-    seen_from: Tensor | None,
-    box: tuple[Corner, Corner],
+    points: np.ndarray, mean: Tensor, covariance: Tensor, seen_from: Tensor | None, box: tuple[Corner, Corner]
 ) -> Figure:
     low, high = box
     canvas = canvas_around(low, high, SOUTH_WEST, int(_PANEL_WIDTH * style.SAVED_DPI))
@@ -168,11 +156,7 @@ def _draw_in_space(
 
 
 def _draw_from_above(
-    axes: Axes,
-    points: np.ndarray,
-    outlines: np.ndarray,
-    colours: np.ndarray,
-    box: tuple[Corner, Corner],
+    axes: Axes, points: np.ndarray, outlines: np.ndarray, colours: np.ndarray, box: tuple[Corner, Corner]
 ) -> None:
     """Draws points, and ellipses (K, C, 2) with colours (K, 3), in the x-y plane."""
     size = float(np.clip(12000 / max(len(points), 1), 1.0, 14))

@@ -71,14 +71,8 @@ def draw_paths(
 ) -> None:
     """Draws the path of each robot from above; parts outside the band of heights (m) have a white core.
 
-    A triangle shows the last pose and its heading (a square, if poses have no heading).
-
-    Args:
-        axes: with x and y in metres.
-        trajectories: poses (T, ≥ 2) of each robot, world metres.
-        band: lowest and highest z (m) that the map shows.
-        ends: also draws a disc at the first pose.
-        width: line width in points.
+    A triangle shows the last pose and its heading (a square, if poses have no heading), and with `ends` a
+    disc the first pose. trajectories: poses (T, ≥ 2) of each robot, world metres. width: in points.
     """
     for robot, trajectory in enumerate(trajectories):
         poses = style.as_array(trajectory)

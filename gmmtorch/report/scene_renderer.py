@@ -85,14 +85,8 @@ def render(
     inverted, so flat ellipsoids need no special case. Depth discontinuities are darkened (eye-dome lighting,
     Boucheny 2009).
 
-    Args:
-        means: (K, 3), world metres.
-        covariances: (K, 3, 3), m²; may be singular.
-        colours: (K, 3), in [0, 1].
-        camera: the viewer.
-        canvas: the picture plane.
-        smoothing: rays per pixel along each axis.
-        tops: (K,), heights (m) above which the ellipsoids are cut off; none if None.
+    means (K, 3), world metres; covariances (K, 3, 3), m², which may be singular; colours (K, 3), in [0, 1];
+    smoothing: rays per pixel along each axis; tops (K,): heights (m) above which the ellipsoids are cut off.
     """
     rows, columns = canvas.shape
     fine = canvas._replace(scale=canvas.scale * smoothing)

@@ -62,10 +62,8 @@ def balls(centres: Tensor, radius: float, colours: Tensor) -> Ellipsoids:
 
 
 def path_balls(path: Tensor, radius: float, hue: str) -> Ellipsoids:
-    """Returns a path (M, 3), metres, as a string of small balls, so that surfaces can hide it.
-
-    `radius` is in metres; `hue` is a colour of matplotlib.
-    """
+    """Returns a path (M, 3), metres, as a string of small balls of a radius (m), so that surfaces can hide
+    it."""
     steps = (path[1:] - path[:-1]).norm(dim=1).cumsum(0)
     along = np.concatenate([[0.0], steps.numpy()])
     s = np.arange(0.0, along[-1] + radius, radius)
@@ -95,25 +93,13 @@ def draw_scene(
 ) -> None:
     """Renders the 2σ surfaces of all parts, above a floor grid with lengths along its two near edges.
 
-    Axes coordinates are metres along right and up of the camera.
-
-    Args:
-        axes: the panel; its own axis lines are hidden.
-        parts: what to draw.
-        low, high: (3,) corners of the box whose floor is drawn, world metres.
-        camera: the viewer.
-        canvas: the picture plane, such as `canvas_around` the box.
-        n_ticks: largest number of intervals along an edge.
+    Axes coordinates are metres along right and up of the camera. low, high: (3,) corners of the box whose
+    floor is drawn, world metres. n_ticks: largest number of intervals along an edge.
     """
     tops = [torch.full((len(part.means),), part.top, dtype=torch.float64) for part in parts]
     means, covariances, colours, _ = zip(*parts, strict=True)
     picture = render(
-        torch.cat(means),
-        torch.cat(covariances),
-        torch.cat(colours),
-        camera,
-        canvas,
-        tops=torch.cat(tops),
+        torch.cat(means), torch.cat(covariances), torch.cat(colours), camera, canvas, tops=torch.cat(tops)
     )
     _draw_floor(axes, np.asarray(low), np.asarray(high), camera, n_ticks)
     opacity = torch.isfinite(picture.depth)[..., None]
@@ -156,8 +142,7 @@ def mixture_scene_figure(
         title: title of the figure; by default the number of components.
         max_pixels: width of the picture.
 
-    Raises:
-        InvalidArgumentError: shapes disagree, or components are not finite.
+    Raises `InvalidArgumentError` if shapes disagree, or components are not finite.
     """
     mean, covariance = (value.cpu() for value in checked_components(means, covariances))
     if mean.shape[1] != 3:
@@ -183,7 +168,12 @@ def mixture_scene_figure(
         _mark_path(axes, camera.project(path).numpy()[:, :2], style.colour(robot))
     height_bar(figure, axes, scale)
     style.legend_below(figure, path_handles(trajectories, (-np.inf, np.inf), True, traveller), max_columns=9)
-    style.figure_title(figure, _scene_title(kept) if title is None else title)
+    if title is None:
+        title = f"Gaussian mixture: {count_text(len(kept), 'component')}"
+        if not bool(kept.all()):
+            shown = f"{int(kept.sum()):,} of {count_text(len(kept), 'component')}"
+            title = f"Gaussian mixture: {shown} (ceilings and near walls left out)"
+    style.figure_title(figure, title)
     return figure
 
 
@@ -193,13 +183,6 @@ def _mark_path(axes: Axes, flat: np.ndarray, hue: str) -> None:
     look: dict[str, Any] = {"color": hue, "path_effects": style.halo(2.5)}
     for (x, y), shape in ((flat[0], "o"), (flat[-1], "^")):
         axes.plot(x, y, shape, markersize=9, markeredgecolor="#111111", zorder=4, **look)
-
-
-def _scene_title(kept: Tensor) -> str:
-    count = count_text(len(kept), "component")
-    if bool(kept.all()):
-        return f"Gaussian mixture: {count}"
-    return f"Gaussian mixture: {int(kept.sum()):,} of {count} (ceilings and near walls left out)"
 
 
 def _draw_floor(axes: Axes, low: np.ndarray, high: np.ndarray, camera: Camera, n_ticks: int) -> None:
@@ -368,9 +351,12 @@ class _Hidden:
 
 
 def _surfaces(components: Components, scale: Normalize, hidden: _Hidden, box: Corners) -> Ellipsoids:
-    """The components in the box that are not hidden, coloured by height."""
-    kept = hidden.kept & _lie_inside(components, box)
-    means, covariances = components.means[kept], components.covariances[kept]
+    """The components with means in the box, and ends nearly, that are not hidden, coloured by height."""
+    means, (deviations, directions) = components.means, principal_axes(components.covariances)
+    end = N_SIGMA * directions[:, :, 2] * deviations[:, 2:]
+    wide = tuple(x - _OUTSIDE for x in box[0]), tuple(x + _OUTSIDE for x in box[1])
+    kept = hidden.kept & inside(means, box) & inside(means + end, wide) & inside(means - end, wide)
+    means, covariances = means[kept], components.covariances[kept]
     return Ellipsoids(means.double(), covariances.double(), height_colours(means[:, 2], scale), hidden.top)
 
 
@@ -380,11 +366,3 @@ def _spots(places: Tensor, radius: float, scale: Normalize, hidden: _Hidden, box
     places = places[inside(places, box)]
     places = places[~hidden(places)]
     return balls(places, radius, height_colours(places[:, 2], scale))
-
-
-def _lie_inside(components: Components, box: Corners) -> Tensor:
-    """Mask (K,) of the components whose means are in the box, and whose ends are nearly."""
-    means, (deviations, directions) = components.means, principal_axes(components.covariances)
-    end = N_SIGMA * directions[:, :, 2] * deviations[:, 2:]
-    wide = tuple(x - _OUTSIDE for x in box[0]), tuple(x + _OUTSIDE for x in box[1])
-    return inside(means, box) & inside(means + end, wide) & inside(means - end, wide)

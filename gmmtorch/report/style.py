@@ -78,10 +78,9 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def save_figure(figure: Figure, path: str | Path, dpi: float = SAVED_DPI) -> Path:
-    """Writes the figure atomically in the format of the suffix, and returns the path.
+    """Writes the figure atomically as .png, with `dpi` pixels per inch, .pdf or .svg, and returns the path.
 
-    `dpi` is the number of pixels per inch of PNG. Raises `InvalidArgumentError` for other suffixes than .png,
-    .pdf and .svg.
+    Raises `InvalidArgumentError` for other suffixes.
     """
     path = Path(path)
     if path.suffix.lower() not in _SUFFIXES:
@@ -115,10 +114,7 @@ def draw_grid(axes: Axes, axis: Literal["both", "x", "y"] = "both") -> None:
 def legend_below(figure: Figure, handles: Iterable[Artist] | None = None, max_columns: int = 6) -> None:
     """Draws one legend below the panels, with as many columns as the width of the figure allows.
 
-    Args:
-        figure: the figure, with all its panels.
-        handles: labelled artists; if None, one for each label that occurs in the panels.
-        max_columns: largest number of columns.
+    handles: labelled artists; if None, one for each label that occurs in the panels of the figure.
     """
     if handles is None:
         by_label: dict[str, Any] = {}
@@ -128,13 +124,8 @@ def legend_below(figure: Figure, handles: Iterable[Artist] | None = None, max_co
         handles = by_label.values()
     entries = list(handles)
     for columns in range(min(len(entries), max_columns), 0, -1):
-        legend = figure.legend(
-            handles=entries,
-            loc="outside lower center",
-            ncols=columns,
-            frameon=False,
-            fontsize=LABEL_SIZE,
-        )
+        look: dict[str, Any] = {"ncols": columns, "frameon": False, "fontsize": LABEL_SIZE}
+        legend = figure.legend(handles=entries, loc="outside lower center", **look)
         if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
             return
         legend.remove()
@@ -201,9 +192,7 @@ def line_style(index: int) -> str:
 def line_look(index: int, with_marker: bool = True) -> dict[str, Any]:
     """Returns the options for `Axes.plot` that make the index-th line distinct: colour, style and marker."""
     look: dict[str, Any] = {"color": colour(index), "linestyle": line_style(index), "linewidth": 2}
-    if with_marker:
-        look |= {"marker": marker(index), "markersize": 6}
-    return look
+    return {**look, "marker": marker(index), "markersize": 6} if with_marker else look
 
 
 def marker(index: int) -> str:
@@ -288,20 +277,13 @@ class LineEnd(NamedTuple):
     colour: str
 
 
-class _Place(NamedTuple):
-    """A place of a label relative to its mark: offset in points, and alignment."""
-
-    offset: tuple[float, float]
-    ha: str
-    va: str
-
-
-_PLACES = [
-    _Place((gap * right, gap * up), _SIDES[right], _HEIGHTS[up])
+_PLACES: list[dict[str, Any]] = [
+    {"position": (gap * right, gap * up), "ha": _SIDES[right], "va": _HEIGHTS[up]}
     for straight, diagonal in _GAPS
     for right, up in _DIRECTIONS
     for gap in (diagonal if right and up else straight,)
 ]
+"""Places of a label relative to its mark: offset in points, and alignment."""
 
 
 def place_labels(figure: Figure, labels: Sequence[Label]) -> None:
@@ -349,9 +331,9 @@ def label_ends(axes: Axes, ends: Sequence[LineEnd], size: float = LABEL_SIZE) ->
         axes.text(1.032, share, end.text, fontsize=size, va="center", linespacing=1.15, **look)
 
 
-def _moved(note: Annotation, place: _Place) -> Bbox:
+def _moved(note: Annotation, place: dict[str, Any]) -> Bbox:
     """Moves the text to the place, and returns the pixels that it covers there."""
-    note.set(position=place.offset, ha=place.ha, va=place.va)
+    note.set(**place)
     return note.get_window_extent()
 
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -14,7 +13,6 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.baselines.bgk_map import kernel_offsets, sparse_kernel
 from gmmtorch.experiments.baselines.samples import centroids
-from gmmtorch.files import require
 from gmmtorch.occupancy import CellTable
 
 CHUNK_VALUES = 1 << 22
@@ -88,11 +86,8 @@ class DenseDesign:
 class FourierFeatures:
     """Random Fourier features (Rahimi & Recht 2007): a constant, and √(2/F)·[cos ωᵀx, sin ωᵀx].
 
-    With ω ~ N(0, I/ℓ²), φ(x)ᵀφ(y) ≈ exp(−‖x−y‖²/2ℓ²). Every point is in their reach.
-
-    Args:
-        frequencies: ω (F/2, D), 1/m.
-        anchor: (D,), m, origin of x, so that phases far from the world origin stay exact.
+    With ω ~ N(0, I/ℓ²), φ(x)ᵀφ(y) ≈ exp(−‖x−y‖²/2ℓ²). Every point is in their reach. frequencies: ω (F/2, D),
+    1/m. anchor: (D,), m, origin of x, so that phases far from the world origin stay exact.
     """
 
     max_points = MAX_POINTS
@@ -128,23 +123,13 @@ class FourierFeatures:
         """The tensors from which a file restores the features."""
         return {"frequencies": self.frequencies, "anchor": self.anchor}
 
-    @classmethod
-    def read(cls, tensors: Mapping[str, Tensor], dim: int, path: str | Path) -> FourierFeatures:
-        """The features in a file. Raises `DataError` if they are damaged."""
-        anchor = require(tensors, "anchor", (dim,), torch.float64, path)
-        return cls(require(tensors, "frequencies", (None, dim), torch.float32, path), anchor)
-
 
 class NystroemFeatures:
     """Nyström features L⁻¹ k(x), with k the kernel of the centres and L Lᵀ = K their kernel matrix.
 
     Williams & Seeger 2001. φ(x)ᵀφ(y) = k(x)ᵀ K⁻¹ k(y) is the exact kernel on the span of the centres.
-    Points more than five lengths from all centres are out of reach.
-
-    Args:
-        centers: (F, D), m, relative to the anchor.
-        anchor: (D,), m.
-        length: ℓ of exp(−d²/2ℓ²) (m).
+    Points more than five lengths from all centres are out of reach. centers: (F, D), m, relative to the
+    anchor (D,). length: ℓ of exp(−d²/2ℓ²) (m).
     """
 
     max_points = MAX_POINTS
@@ -191,14 +176,6 @@ class NystroemFeatures:
         """The tensors from which a file restores the features."""
         return {"centers": self.centers, "anchor": self.anchor}
 
-    @classmethod
-    def read(
-        cls, tensors: Mapping[str, Tensor], dim: int, length: float, path: str | Path
-    ) -> NystroemFeatures:
-        """The features in a file. Raises `DataError` if they are damaged."""
-        anchor = require(tensors, "anchor", (dim,), torch.float64, path)
-        return cls(require(tensors, "centers", (None, dim), torch.float32, path), anchor, length)
-
 
 RBF_CUTOFF = 1e-3
 """Kernels on a lattice are zero below this value, as in the code of the authors of Hilbert maps."""
@@ -222,13 +199,9 @@ KERNELS: dict[str, tuple[Kernel, float]] = {
 class LatticeDesign:
     """Features Φ (M, F): kernel values of M points at the nodes around their cells, computed when first used.
 
-    The methods are those of `DenseDesign`, and products with the elementwise square of Φ.
-
-    Args:
-        features: the lattice.
-        within: (M, D) position of each point in its cell, in cells.
-        cell: (M,) index of the cell among the C distinct cells.
-        nodes: (C, O) feature at each of the lattice's `offsets` from the cell; −1 for none.
+    The methods are those of `DenseDesign`, and products with the elementwise square of Φ. within: (M, D)
+    position of each point in its cell, in cells. cell: (M,) index of the cell among the C distinct cells.
+    nodes: (C, O) feature at each of the lattice's `offsets` from the cell; −1 for none.
     """
 
     def __init__(self, features: LatticeFeatures, within: Tensor, cell: Tensor, nodes: Tensor) -> None:
@@ -283,15 +256,8 @@ class LatticeFeatures:
     """Kernels k(‖x − h‖) of compact support, with nodes h at the centres of lattice cells that contain data.
 
     Memory grows with the number of such cells, not with the box around them. Points beyond the support of all
-    nodes are out of reach.
-
-    Args:
-        kernel: "sparse" (Melkumyan & Ramos 2009) or "rbf", cut at 10⁻³.
-        length: of the kernel (m).
-        spacing: of the lattice (m).
-        dim: 2 or 3.
-        width: numbers per node in `table.values`.
-        device: of the tensors.
+    nodes are out of reach. The kernel is "sparse" (Melkumyan & Ramos 2009) or "rbf", cut at 10⁻³; its length
+    and the spacing of the lattice are in metres. width: numbers per node in `table.values`.
     """
 
     def __init__(

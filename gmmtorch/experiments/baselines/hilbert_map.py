@@ -207,13 +207,15 @@ class HilbertMap(TensorFileMap):
 
     def _read_features(self, tensors: dict[str, Tensor], path: str | Path) -> Features:
         assert self.dim is not None
+        if self.features == "sparse":
+            lattice = self._lattice(self.dim, torch.device("cpu"))
+            lattice.table.fill(tensors, path)
+            return lattice
+        anchor = require(tensors, "anchor", (self.dim,), torch.float64, path)
         if self.features == "nystroem":
-            return NystroemFeatures.read(tensors, self.dim, self.length, path)
-        if self.features == "fourier":
-            return FourierFeatures.read(tensors, self.dim, path)
-        lattice = self._lattice(self.dim, torch.device("cpu"))
-        lattice.table.fill(tensors, path)
-        return lattice
+            centers = require(tensors, "centers", (None, self.dim), torch.float32, path)
+            return NystroemFeatures(centers, anchor, self.length)
+        return FourierFeatures(require(tensors, "frequencies", (None, self.dim), torch.float32, path), anchor)
 
 
 _MAX_FULL = 4096  # most hinges with a full covariance

@@ -328,11 +328,8 @@ class OctoMapMap(BaselineMap):
 
 def _flat_index(units: Tensor, shape: tuple[int, ...], low: Tensor) -> Tensor:
     """Row-major index (M,) of the cells that contain points (M, 3), given in cells."""
-    cell = (units.floor() - low).long()
-    flat = cell[:, 0]
-    for axis in range(1, len(shape)):
-        flat = flat * shape[axis] + cell[:, axis]
-    return flat
+    strides = torch.tensor([shape[1] * shape[2], shape[2], 1])
+    return ((units.floor() - low).long() * strides).sum(1)
 
 
 def _checksum(data: bytes) -> bytes:

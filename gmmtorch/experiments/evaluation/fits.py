@@ -272,6 +272,9 @@ def row_of(data: FitData, method: str, mixture: MixtureEstimator, seconds: float
     """
     train, test = data.train, data.test
     forward, backward = psnr_terms(train, _drawn(mixture, len(train), seed))
+    with tempfile.TemporaryDirectory() as folder:
+        mixture.save(Path(folder) / "mixture.safetensors")
+        nbytes = (Path(folder) / "mixture.safetensors").stat().st_size
     return {
         "dataset": data.dataset,
         "method": method,
@@ -287,7 +290,7 @@ def row_of(data: FitData, method: str, mixture: MixtureEstimator, seconds: float
         "psnr_forward_db": _finite(forward),
         "psnr_backward_db": _finite(backward),
         "held_out_psnr2_db": _finite(psnr2(test, _drawn(mixture, len(test), seed))) if len(test) else None,
-        "nbytes": _file_size(mixture),
+        "nbytes": nbytes,
     }
 
 
@@ -323,13 +326,6 @@ def _drawn(mixture: MixtureEstimator, n: int, seed: int) -> Tensor:
 
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
-
-
-def _file_size(mixture: MixtureEstimator) -> int:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "mixture.safetensors"
-        mixture.save(path)
-        return path.stat().st_size
 
 
 _SPLIT_SALT = 0x5EED  # makes the split independent of the sample

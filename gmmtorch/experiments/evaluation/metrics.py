@@ -118,15 +118,12 @@ def unknown_scores(unknown: Tensor, free: Tensor) -> dict[str, float | None]:
     shares of the unknown points. These three are None without unknown points. free_recall: share of the free
     points classified as free.
     """
-    recall = float((free < CALLED_FREE).double().mean())
-    if unknown.numel() == 0:
-        names = ("unknown_auc", "unknown_called_free", "unknown_called_occupied")
-        return {**dict.fromkeys(names), "free_recall": recall}
+    some = unknown.numel() > 0
     return {
-        "unknown_auc": roc(-(unknown - 0.5).abs(), -(free - 0.5).abs()).auc,
-        "unknown_called_free": float((unknown < CALLED_FREE).double().mean()),
-        "unknown_called_occupied": float((unknown > CALLED_OCCUPIED).double().mean()),
-        "free_recall": recall,
+        "free_recall": float((free < CALLED_FREE).double().mean()),
+        "unknown_auc": roc(-(unknown - 0.5).abs(), -(free - 0.5).abs()).auc if some else None,
+        "unknown_called_free": float((unknown < CALLED_FREE).double().mean()) if some else None,
+        "unknown_called_occupied": float((unknown > CALLED_OCCUPIED).double().mean()) if some else None,
     }
 
 

@@ -9,7 +9,6 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from types import TracebackType
 from typing import Any, NamedTuple
 
 from gmmtorch.datasets import TransformTree
@@ -134,9 +133,7 @@ class Node:
     def __enter__(self) -> Node:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -163,11 +160,7 @@ class Node:
         return publish
 
     def subscribe(
-        self,
-        topic: str,
-        message_type: str,
-        callback: Callback,
-        requested: Quality | None = None,
+        self, topic: str, message_type: str, callback: Callback, requested: Quality | None = None
     ) -> Subscription:
         """Calls `callback` with each message of a topic."""
         name = self.names.resolve(topic)
@@ -282,8 +275,7 @@ class Node:
                 size = f"{len(data):,} bytes are more than {MAX_MESSAGE_BYTES:,}, the most of a message"
                 self._note_malformed(subscription, DataError(size))
                 return
-            arrival = Arrival(self._n_arrived, self.now(), time.monotonic(), data)
-            subscription.waiting.append(arrival)
+            subscription.waiting.append(Arrival(self._n_arrived, self.now(), time.monotonic(), data))
             subscription.waiting_bytes += len(data)
             while (
                 len(subscription.waiting) > subscription.depth or subscription.waiting_bytes > _WAITING_BYTES

@@ -26,37 +26,28 @@ class Quality:
     depth: int = 10
 
 
-SENSOR = Quality(reliable=False, depth=1000)
-CLOCK = Quality(reliable=False, depth=1)
-TRANSFORMS = Quality(depth=1000)
 LATCHED = Quality(latched=True, depth=1)
-LATCHED_TRANSFORMS = Quality(latched=True, depth=100)
-
-_SENSOR_PACKAGE = "sensor_msgs/"
 
 
 def subscribed(topic: str, message_type: str) -> Quality:
     """What a subscriber asks for: best effort for sensor data and /clock, latched for /tf_static."""
     if topic.endswith("/tf_static"):
-        return LATCHED_TRANSFORMS
+        return Quality(latched=True, depth=100)
     if topic.endswith("/tf"):
-        return TRANSFORMS
-    if topic == "/clock":
-        return CLOCK
-    if message_type.startswith(_SENSOR_PACKAGE):
-        return SENSOR
+        return Quality(depth=1000)
+    is_sensor = message_type.startswith("sensor_msgs/")
+    if topic == "/clock" or is_sensor:
+        return Quality(reliable=False, depth=1000 if is_sensor else 1)
     return Quality()
 
 
 def published(topic: str, message_type: str) -> Quality:
     """What a publisher offers: latched for static transforms and maps, and reliable, which serves both kinds
     of subscribers."""
-    if topic.endswith("/tf_static") or message_type in (
-        "nav_msgs/msg/OccupancyGrid",
-        "visualization_msgs/msg/MarkerArray",
-    ):
+    is_map = message_type in ("nav_msgs/msg/OccupancyGrid", "visualization_msgs/msg/MarkerArray")
+    if is_map or topic.endswith("/tf_static"):
         return LATCHED
-    return TRANSFORMS if topic.endswith("/tf") else Quality(depth=50)
+    return Quality(depth=1000 if topic.endswith("/tf") else 50)
 
 
 def mismatch(offered: Quality, requested: Quality) -> str | None:
@@ -74,14 +65,10 @@ _NODE = re.compile(_TOKEN)
 
 
 class TopicNames:
-    """Resolves the names that a node uses.
+    """Resolves the names that a node uses, in a namespace, such as robot1; "" or "/": none.
 
-    Args:
-        node: name of the node.
-        namespace: of relative names, such as robot1; "" or "/": none.
-        remap: name → other name. Both sides are resolved in the namespace before they are compared.
-
-    Raises `InvalidArgumentError` for names that ROS 2 does not allow.
+    remap: name → other name, both resolved in the namespace before they are compared. Raises
+    `InvalidArgumentError` for names that ROS 2 does not allow.
     """
 
     def __init__(self, node: str, namespace: str = "", remap: Mapping[str, str] | None = None) -> None:
@@ -116,7 +103,7 @@ _NAME = re.compile(r"(\w+)/msg/(\w+)")
 _DDS_NAME = re.compile(r"(\w+)::msg::dds_::(\w+)_")
 _MORE = {
     "map_msgs/msg/OccupancyGridUpdate": "std_msgs/Header header\nint32 x\nint32 y\nuint32 width\n"
-    "uint32 height\nint8[] data\n",
+    "uint32 height\nint8[] data\n"
 }
 """Types that rosbags does not have, in the form of .msg files."""
 

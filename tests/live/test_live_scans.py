@@ -11,12 +11,13 @@ import torch
 
 pytest.importorskip("rosbags", reason="needs the extra [ros]: rosbags")
 
+from sensor_bags import BagWriter
+
 from gmmtorch.datasets import load
 from gmmtorch.datasets.base import Ranges
 from gmmtorch.datasets.recordings.ros.bag_reader import BagReader, Topic
 from gmmtorch.datasets.recordings.ros.bag_topics import CLOUD, DEPTH, LASER, Sensor
 from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree
-from gmmtorch.export.bag import BagWriter
 from gmmtorch.live import live_scans
 from gmmtorch.live.live_scans import DROPPED, LiveOptions, LiveScans
 
