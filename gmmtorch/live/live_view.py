@@ -6,6 +6,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -251,10 +252,7 @@ class CurveRecord:
 
     def copy(self) -> tuple[list[float], dict[str, dict[str, list[float]]]]:
         """The times and the curves as they are now."""
-        return list(self.times), {
-            title: {name: list(values) for name, values in series.items()}
-            for title, series in self.curves.items()
-        }
+        return list(self.times), deepcopy(self.curves)
 
 
 class TeamMap(Protocol):

@@ -24,7 +24,6 @@ from gmmtorch.report.ellipsoids import (
     height_colours,
 )
 from gmmtorch.report.map_images import inside, robust_bounds
-from gmmtorch.report.scene_renderer import Canvas
 from gmmtorch.report.scenes import SOUTH_WEST, Ellipsoids, balls, canvas_around, draw_scene, height_bar
 from gmmtorch.report.text import count_text
 from gmmtorch.scan import ArrayLike
@@ -118,7 +117,18 @@ def _solid_figure(
     figure = style.new_figure(2 * _PANEL_WIDTH + 1.0, float(np.clip(_PANEL_WIDTH * tall, 4.0, 7.0)) + 1.4)
     space, plan = figure.subplots(1, 2)
     scale = Normalize(low[2], high[2], clip=True)
-    _draw_in_space(space, points, mean, covariance, seen_from, box, canvas, scale)
+    shown, cloud, top = inside(mean, box), torch.from_numpy(points), np.inf
+    if seen_from is None:
+        style.label_axes(space, "in space")
+        cloud = cloud[inside(cloud, box)]
+    else:  # also without points, which would stand where the components were that hide the inside
+        style.label_axes(space, "in space, ceilings and near walls left out")
+        kept, top = cut_away(mean, covariance, seen_from, SOUTH_WEST)
+        shown, cloud = shown & kept, cloud[:0]
+    components = Ellipsoids(mean[shown], covariance[shown], height_colours(mean[shown, 2], scale), top)
+    grey = torch.tensor(to_rgb(_POINT), dtype=torch.float64)
+    dots = balls(cloud, _POINT_PIXELS / canvas.scale, grey)
+    draw_scene(space, [components, dots], low, high, SOUTH_WEST, canvas)
     order = torch.argsort(mean[:, 2], stable=True)  # higher components cover lower ones
     mean, covariance = mean[order], covariance[order]
     outlines = ellipse_outlines(mean[:, :2], covariance[:, :2, :2])
@@ -127,32 +137,6 @@ def _solid_figure(
     height_bar(figure, plan, scale)
     _mixture_legend(figure, "2σ ellipsoids", len(points) > 0)
     return figure
-
-
-def _draw_in_space(
-    axes: Axes,
-    points: np.ndarray,
-    mean: Tensor,
-    covariance: Tensor,
-    seen_from: Tensor | None,
-    box: tuple[Corner, Corner],
-    canvas: Canvas,
-    scale: Normalize,
-) -> None:
-    """Draws the components and points inside the box; with `seen_from`, without the
-    components that hide the inside, and without points, which would stand where these were."""
-    shown, cloud, top = inside(mean, box), torch.from_numpy(points), np.inf
-    if seen_from is None:
-        style.label_axes(axes, "in space")
-        cloud = cloud[inside(cloud, box)]
-    else:
-        style.label_axes(axes, "in space, ceilings and near walls left out")
-        kept, top = cut_away(mean, covariance, seen_from, SOUTH_WEST)
-        shown, cloud = shown & kept, cloud[:0]
-    components = Ellipsoids(mean[shown], covariance[shown], height_colours(mean[shown, 2], scale), top)
-    grey = torch.tensor(to_rgb(_POINT), dtype=torch.float64)
-    dots = balls(cloud, _POINT_PIXELS / canvas.scale, grey)
-    draw_scene(axes, [components, dots], *box, SOUTH_WEST, canvas)
 
 
 def _draw_from_above(

@@ -233,34 +233,21 @@ def compare(
     if not methods:
         raise InvalidArgumentError(f"method is empty; name at least one of {known}.")
     options.check(data.train.shape[0], seed)
-    outcome = FitOutcome()
+    outcome, pruning = FitOutcome(), pruning or PruneOptions()
     for method in methods:
         begin = time.perf_counter()
-        mixture = _fit_and_prune(method, data, options, seed, on_event, own.get(method, {}), pruning)
+        is_tree = method == "hierarchical"  # which is pruned while it grows
+        more = tree_options(pruning, data.train, data.views) if is_tree else {}
+        fit = _fit_ours if issubclass(ESTIMATORS[method], MixtureEstimator) else _fit_scikit_learn
+        mixture = fit(method, data, options, seed, on_event, {**more, **own.get(method, {})})
+        if not is_tree:
+            mixture = pruned(mixture, pruning, data.train, data.views)
         seconds = time.perf_counter() - begin
         outcome.mixtures[method] = mixture
         outcome.lower_bounds[method] = mixture.lower_bounds_
         outcome.rows.append(row_of(data, method, mixture, seconds, seed))
         on_rows(outcome.rows)
     return outcome
-
-
-def _fit_and_prune(
-    method: str,
-    data: FitData,
-    options: FitOptions,
-    seed: int,
-    on_event: Event,
-    own: Mapping[str, Any],
-    pruning: PruneOptions | None,
-) -> MixtureEstimator:
-    pruning = pruning or PruneOptions()
-    is_tree = method == "hierarchical"
-    if is_tree:
-        own = {**tree_options(pruning, data.train, data.views), **own}
-    fit = _fit_ours if issubclass(ESTIMATORS[method], MixtureEstimator) else _fit_scikit_learn
-    mixture = fit(method, data, options, seed, on_event, own)
-    return mixture if is_tree else pruned(mixture, pruning, data.train, data.views)
 
 
 def row_of(data: FitData, method: str, mixture: MixtureEstimator, seconds: float, seed: int) -> Row:
