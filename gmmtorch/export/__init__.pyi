@@ -3,6 +3,7 @@ from .bag import cloud_fields as cloud_fields
 from .bag import odometry_fields as odometry_fields
 from .bag import time_fields as time_fields
 from .bag import transform_fields as transform_fields
+from .bag import write_bag as write_bag
 from .mesh import TriangleMesh as TriangleMesh
 from .mesh import surface_mesh as surface_mesh
 from .mesh import write_mesh as write_mesh
