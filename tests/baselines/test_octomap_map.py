@@ -119,12 +119,6 @@ def test_octomap_file_stores_the_settings_exactly(tmp_path: Path):
     assert len(made.occupancy(lattice(3)).unique()) == 3
 
 
-def test_octomap_load_rejects_files_of_other_programs(tmp_path: Path):
-    (tmp_path / "map.ot").write_bytes(pyoctomap.OcTree(0.1).write())
-    with pytest.raises(DataError, match=r"map\.ot"):
-        OctoMapMap.load(tmp_path / "map.ot")
-
-
 def test_octomap_load_rejects_a_tree_that_would_end_the_process(tmp_path: Path):
     """OctoMap recurses as deep as a file says; a checksum does not show that its writer was honest."""
     made = OctoMapMap(RESOLUTION)

@@ -239,9 +239,20 @@ def test_calibration_errors_match_a_loop_over_bins():
     assert curve.n_points.tolist() == sizes
 
 
-def test_log_loss_matches_scikit_learn():
+def test_scores_match_scikit_learn():
     theta, labels = drawn()
-    assert log_loss_bits(theta, labels) == pytest.approx(log_loss(labels, theta) / math.log(2), rel=1e-9)
+    found = scores(theta, labels)
+    assert list(found) == ["ece", "brier", "log_loss_bits", "accuracy"]
+    assert all(type(value) is float for value in found.values())
+    assert found["ece"] == reliability(theta, labels).expected_error
+    assert found["brier"] == brier_score(theta, labels)
+    assert found["brier"] == pytest.approx(brier_score_loss(labels, theta), rel=1e-9)
+    assert found["log_loss_bits"] == log_loss_bits(theta, labels)
+    assert found["log_loss_bits"] == pytest.approx(log_loss(labels, theta) / math.log(2), rel=1e-9)
+    called = (theta > 0.5).double()
+    called[theta == 0.5] = 0.5  # counts one half
+    assert found["accuracy"] == accuracy(theta, labels)
+    assert found["accuracy"] == pytest.approx(1 - float((called - labels).abs().mean()))
 
 
 def test_log_loss_is_one_bit_at_one_half_and_52_for_a_certain_mistake():
@@ -249,12 +260,6 @@ def test_log_loss_is_one_bit_at_one_half_and_52_for_a_certain_mistake():
     assert log_loss_bits(torch.tensor([0.5, 0.5]), labels) == 1
     assert log_loss_bits(torch.tensor([0.0, 1.0]), labels) == pytest.approx(0, abs=1e-12)
     assert log_loss_bits(torch.tensor([1.0, 0.0]), labels) == pytest.approx(52)
-
-
-def test_brier_score_matches_scikit_learn():
-    theta, labels = drawn()
-    assert brier_score(theta, labels) == pytest.approx(brier_score_loss(labels, theta), rel=1e-9)
-    assert brier_score(torch.full((10,), 0.5), torch.arange(10) % 2) == 0.25
 
 
 def test_a_tally_of_predictions_has_the_scores_of_its_points():
@@ -312,15 +317,6 @@ def test_bins_of_a_tally_with_few_predictions_are_pooled():
     assert curve.n_points.tolist() == [21, 4]
     assert curve.predicted == pytest.approx([5.5 / 21, 3.9 / 4])
     assert curve.observed == pytest.approx([6 / 21, 1])
-
-
-def test_scores_contain_ece_brier_log_loss_and_accuracy():
-    theta, labels = drawn()
-    found = scores(theta.float(), labels)
-    assert list(found) == ["ece", "brier", "log_loss_bits", "accuracy"]
-    assert found["ece"] == pytest.approx(reliability(theta, labels).expected_error, abs=1e-4)
-    assert found["accuracy"] == accuracy(theta, labels)
-    assert all(type(value) is float for value in found.values())
 
 
 def test_prior_and_dead_band_match_counting():

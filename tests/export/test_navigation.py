@@ -12,7 +12,6 @@ import yaml
 from export.map_examples import example_grid, random_probabilities, read_map_image
 from hypothesis import given
 from hypothesis import strategies as st
-from PIL import Image
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
@@ -53,13 +52,6 @@ def test_map_server_rounding_never_changes_a_class(tmp_path):
     assert found.thresholds == rule
     assert torch.equal(rule.classify(found.probability), rule.classify(theta))
     assert float((found.probability - theta).abs().max()) <= 1 / 255
-
-
-def test_map_server_image_has_the_highest_y_in_the_first_row(tmp_path):
-    theta = torch.full((3, 2), 0.0, dtype=torch.float64)
-    theta[0, 1] = 1.0  # lowest x, highest y: the upper left corner
-    _, image = write_map_server(tmp_path / "up.yaml", example_grid((3, 2)), theta)
-    assert np.asarray(Image.open(image)).tolist() == [[0, 255, 255], [255, 255, 255]]
 
 
 def test_map_server_yaml_has_the_expected_keys(tmp_path):
