@@ -21,8 +21,8 @@ from gmmtorch.experiments.evaluation.fits import ESTIMATORS, FitOutcome, Views, 
 from gmmtorch.experiments.evaluation.metrics import psnr2
 from gmmtorch.experiments.evaluation.protocol_options import FitOptions
 from gmmtorch.mixture.estimators.sensor_model import measured_sensor
-from gmmtorch.mixture.reduction.prune_options import PruneOptions
-from gmmtorch.mixture.reduction.pruning import prune
+from gmmtorch.mixture.prune_options import PruneOptions
+from gmmtorch.mixture.pruning import prune
 
 SMALL = FitOptions(n_components=6, max_iter=60)
 

@@ -8,6 +8,8 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from mixture.estimator_contract import MixtureContract
 from mixture.fit_contract import FitContract, blobs
 from mixture.mixture_cases import random_spd
@@ -15,10 +17,11 @@ from scipy.optimize import minimize
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from gmmtorch.mixture import DeconvolvedGaussianMixture
+from gmmtorch.errors import InvalidArgumentError, NumericalError
+from gmmtorch.mixture import DeconvolvedGaussianMixture, GaussianMixture
 from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.estimators import deconvolution
-from gmmtorch.mixture.estimators.deconvolution import (
+from gmmtorch.mixture.estimators import deconvolved
+from gmmtorch.mixture.estimators.deconvolved import (
     Block,
     bound_variances,
     expectation,
@@ -135,7 +138,7 @@ def test_chunks_do_not_change_the_iteration(monkeypatch):
     rng = np.random.default_rng(0)
     block, parameters = noisy_cloud(rng, 50, 3), random_mixture(rng, 4, 3)
     whole = step(block, parameters)
-    monkeypatch.setattr(deconvolution, "_CHUNK_ELEMENTS", 12)
+    monkeypatch.setattr(deconvolved, "_CHUNK_ELEMENTS", 12)
     chunked = step(block, parameters)
     assert whole[1] == pytest.approx(chunked[1], rel=1e-12)
     torch.testing.assert_close(whole[0].covariances, chunked[0].covariances)
@@ -160,7 +163,7 @@ def test_excluded_pairs_have_no_share(monkeypatch):
     block = Block(points, torch.ones(400, dtype=torch.float64), noise)
     few, value = expectation(block, parameters)
     n_few = sum(len(pairs.row) for _, pairs in pair_chunks(points, noise, parameters))
-    monkeypatch.setattr(deconvolution, "_NEGLIGIBLE", 1e300)
+    monkeypatch.setattr(deconvolved, "_NEGLIGIBLE", 1e300)
     every, expected = expectation(block, parameters)
     assert n_few < 0.5 * 400 * 30
     assert float(value) == pytest.approx(float(expected), rel=1e-13)
@@ -185,8 +188,8 @@ def test_points_with_equal_covariances_are_grouped():
     parts = group_by_noise(block.points, block.weight, noise)
     assert [part.noise.ndim for part in parts] == [2, 2, 2]
     assert sum(len(part.points) for part in parts) == 3000
-    together = deconvolution.deconvolution_step(parts)(parameters)
-    apart = deconvolution.deconvolution_step([block._replace(noise=noise)])(parameters)
+    together = deconvolved.deconvolution_step(parts)(parameters)
+    apart = deconvolved.deconvolution_step([block._replace(noise=noise)])(parameters)
     assert together[1] == pytest.approx(apart[1], rel=1e-10)
     torch.testing.assert_close(together[0].covariances, apart[0].covariances, rtol=1e-9, atol=1e-9)
     assert len(group_by_noise(*block)) == 1  # all covariances differ
@@ -274,3 +277,119 @@ def test_bound_variances_is_the_constrained_maximum(dim, bounds):
     )
     assert cost(found) <= best + 1e-7
     assert cost(found) == pytest.approx(best, abs=1e-3)  # the search comes close
+
+
+# -- whole fits ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+@pytest.mark.parametrize("noise", [None, "shared", "each"])
+def test_fit_without_noise_equals_plain_em(dim, noise):
+    points = blobs(dim)
+    zero = {None: None, "shared": np.zeros((dim, dim)), "each": np.zeros((len(points), dim, dim))}[noise]
+    options = {"reg_covar": 0.0, "tol": 0.0, "max_iter": 40, "random_state": 0}
+    weight = np.random.default_rng(0).random(len(points))
+    mine = DeconvolvedGaussianMixture(3, **options).fit(points, None, weight, zero)
+    plain = GaussianMixture(3, dtype="float64", **options).fit(points, sample_weight=weight)
+    np.testing.assert_allclose(mine.lower_bounds_, plain.lower_bounds_, atol=1e-8)
+    np.testing.assert_allclose(mine.weights_, plain.weights_, atol=1e-8)
+    np.testing.assert_allclose(mine.means_, plain.means_, atol=1e-8)
+    np.testing.assert_allclose(mine.covariances_, plain.covariances_, atol=1e-8)
+
+
+@st.composite
+def noisy_fits(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    dim, seed = draw(st.integers(1, 3)), draw(st.integers(0, 10_000))
+    rng = np.random.default_rng(seed)
+    n = draw(st.integers(4, 40))
+    scale = 10.0 ** rng.uniform(-2, 1, size=n)
+    points = np.round(rng.normal(size=(n, dim)) * 2, draw(st.integers(0, 3)))  # duplicates, with few digits
+    noise = random_spd(rng, n, dim) * scale[:, None, None]
+    noise[rng.random(n) < 0.3] = 0
+    reg = draw(st.sampled_from([1e-6, 1e-3, 0.01]))
+    thickness = draw(st.sampled_from([None, reg**0.5, 0.1, 1.0]))
+    options = {"n_components": draw(st.integers(1, 4)), "reg_covar": reg, "thickness": thickness}
+    return points, rng.random(n) + 1e-3, noise, options
+
+
+@given(case=noisy_fits())
+def test_likelihood_never_decreases(case):
+    points, weight, noise, options = case
+    mixture = DeconvolvedGaussianMixture(tol=0.0, max_iter=25, random_state=0, **options)
+    mixture.fit(points, None, weight, noise)
+    bounds = np.array(mixture.lower_bounds_)
+    assert np.isfinite(bounds).all()
+    assert (np.diff(bounds) >= -1e-9 * (1 + np.abs(bounds[1:]))).all()
+    assert len(bounds) == 25
+    variances = np.linalg.eigvalsh(mixture.covariances_)
+    reg, thickness = options["reg_covar"], options["thickness"]
+    assert (variances >= reg * (1 - 1e-9)).all()
+    if thickness is not None:
+        assert (variances[:, 0] <= thickness**2 * (1 + 1e-6)).all()
+
+
+def test_noise_free_sheets_are_found():
+    """Two sheets, 1 mm thick, measured with noise of 1 to 6 cm that differs by point and direction."""
+    rng = np.random.default_rng(0)
+    n = 4000
+    true = np.diag([0.5, 0.3, 1e-3]) ** 2
+    centers = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2.5]])
+    label = rng.integers(2, size=n)
+    noise = random_spd(rng, n, 3, 0.02)
+    error = np.einsum("nij,nj->ni", np.linalg.cholesky(noise), rng.normal(size=(n, 3)))
+    points = centers[label] + rng.multivariate_normal(np.zeros(3), true, n) + error
+    options = {"tol": 1e-7, "max_iter": 200, "random_state": 0}
+    mixture = DeconvolvedGaussianMixture(2, **options).fit(points, noise_covariances=noise)
+    order = mixture.means_[:, 2].argsort()
+    np.testing.assert_allclose(mixture.means_[order], centers, atol=0.03)
+    for found in mixture.covariances_:
+        np.testing.assert_allclose(np.diag(found)[:2], np.diag(true)[:2], rtol=0.08)
+        assert found[2, 2] ** 0.5 < 0.008
+    plain = GaussianMixture(2, **options).fit(points)
+    assert (plain.covariances_[:, 2, 2] ** 0.5 > 0.03).all()
+    fresh_noise = noise[:100]
+    mine = mixture.score_samples(points[:100], fresh_noise)
+    assert mine.mean() > plain.score_samples(points[:100]).mean()
+
+
+# -- arguments -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("noise", "said"),
+    [
+        (np.zeros((239, 2, 2)), r"shape \(239, 2, 2\)"),
+        (np.zeros((3, 3)), r"shape \(3, 3\)"),
+        (np.zeros(240), r"shape \(240,\)"),
+        (np.full((2, 2), np.nan), r"\[0\] has NaN"),
+        (np.array([[1.0, 0.5], [0.0, 1.0]]), "not symmetric"),
+        (np.array([[1.0, 2.0], [2.0, 1.0]]), "negative eigenvalue"),
+        (-np.eye(2), "negative eigenvalue"),
+    ],
+)
+def test_invalid_noise_is_named(noise, said):
+    mixture = DeconvolvedGaussianMixture(2, random_state=0)
+    for kind in (np.asarray, torch.from_numpy):
+        with pytest.raises(InvalidArgumentError, match=f"^noise_covariances.*{said}"):
+            mixture.fit(kind(blobs(2)), noise_covariances=kind(noise))
+    mixture.fit(blobs(2))
+    with pytest.raises(InvalidArgumentError, match=f"^noise_covariances.*{said}"):
+        mixture.score_samples(blobs(2), noise)
+
+
+def test_noise_of_points_of_weight_zero_is_excluded():
+    rng = np.random.default_rng(0)
+    points, noise = blobs(2), random_spd(rng, 240, 2, 0.2)
+    present = rng.random(240) > 0.4
+    weighted = DeconvolvedGaussianMixture(2, random_state=0).fit(points, None, present.astype(float), noise)
+    without = DeconvolvedGaussianMixture(2, random_state=0).fit(points[present], None, None, noise[present])
+    assert torch.equal(weighted.means, without.means)
+
+
+def test_collapse_without_regularisation_is_an_error():
+    with pytest.raises(NumericalError, match="reg_covar"):
+        DeconvolvedGaussianMixture(1, reg_covar=0.0).fit(np.ones((5, 2)))
+    with pytest.raises(NumericalError, match="reg_covar"):
+        DeconvolvedGaussianMixture(1, reg_covar=0.0).fit(
+            np.ones((5, 2)), noise_covariances=np.zeros((5, 2, 2))
+        )

@@ -39,12 +39,18 @@ class Processes:
 
     def gather(self, rows: Tensor) -> list[Tensor]:
         """The rows (n, C) of all processes, by rank; n may differ."""
-        return [rows]
+        counts = torch.zeros(self.size, dtype=torch.int64)
+        counts[self.rank] = rows.shape[0]
+        lengths = self.sum(counts).tolist()
+        padded = rows.new_zeros(self.size, max(lengths), rows.shape[1])
+        padded[self.rank, : rows.shape[0]] = rows
+        return [part[:n] for part, n in zip(self.sum(padded), lengths, strict=True)]
 
     def broadcast(self, vector: Tensor | None) -> Tensor:
         """The vector (n,), float64, of rank 0. Other ranks may pass None."""
-        assert vector is not None
-        return vector
+        given = torch.zeros(0, dtype=torch.float64) if vector is None or self.rank else vector
+        length = int(self.sum(torch.tensor(given.numel())))
+        return self.sum(given if self.rank == 0 else given.new_zeros(length))
 
 
 SINGLE_PROCESS = Processes()
@@ -62,42 +68,15 @@ class ProcessGroup(Processes):
 
     def sum(self, tensor: Tensor) -> Tensor:
         total = tensor.to(self._device).contiguous()
-        with self._detect_lost_process():
-            self._distributed.all_reduce(total)
-        return total.to(tensor.device)
-
-    def gather(self, rows: Tensor) -> list[Tensor]:
-        lengths = torch.zeros(self.size, dtype=torch.float64)
-        lengths[self.rank] = rows.shape[0]
-        counts = [int(n) for n in self.sum(lengths)]
-        padded = rows.new_zeros(max(counts), rows.shape[1]).to(self._device)
-        padded[: rows.shape[0]] = rows
-        all_rows = [torch.empty_like(padded) for _ in counts]
-        with self._detect_lost_process():
-            self._distributed.all_gather(all_rows, padded)
-        return [part[:n].to(rows.device) for part, n in zip(all_rows, counts, strict=True)]
-
-    def broadcast(self, vector: Tensor | None) -> Tensor:
-        length = 0 if vector is None or self.rank else vector.numel()
-        length = int(self.sum(torch.tensor([length], dtype=torch.float64)))
-        if vector is None or self.rank:
-            vector = torch.empty(length, dtype=torch.float64)
-        sent = vector.to(self._device).contiguous()
-        with self._detect_lost_process():
-            self._distributed.broadcast(sent, 0)
-        return sent.to(vector.device)
-
-    @contextmanager
-    def _detect_lost_process(self) -> Iterator[None]:
-        """Turns errors of torch about a lost process into a `LostProcessError`."""
         try:
-            yield
+            self._distributed.all_reduce(total)
         except RuntimeError as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise LostProcessError(
                 f"rank {self.rank} of {self.size} lost another process, or got no answer within "
                 f"{self._timeout:g} s ({reason})."
             ) from error
+        return total.to(tensor.device)
 
 
 def is_launched() -> bool:

@@ -20,8 +20,8 @@ from gmmtorch.arrays import ArrayLike
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em import loop
-from gmmtorch.mixture.em.grouping import Rows
 from gmmtorch.mixture.em.initialization import flat_pieces, replicated
+from gmmtorch.mixture.em.truncated import Rows
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 from gmmtorch.pinhole import check_intrinsics, metric_depth
 

@@ -17,7 +17,7 @@ from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, check_number
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.estimators.sensor_model import SensorModel, cos_incidence
-from gmmtorch.mixture.reduction.merge import parameters_of
+from gmmtorch.mixture.reduction import parameters_of
 
 if TYPE_CHECKING:
     from gmmtorch.mixture.estimator import MixtureEstimator
@@ -101,9 +101,8 @@ def prune(
         mixture: parameters or a fitted estimator; it is not modified.
         n_points: Σ p, the (weighted) number of points of the fit; component j has N_j = π_j Σ p points.
         min_support: smallest number of points N_j of a component that is kept.
-        min_density_share: smallest ratio of `support_density` to `expected_density` of a component that
-            is kept. If above zero, needs `sensor` and `origins`, and a mixture in 2D or 3D.
-        sensor: see `sensor_model`.
+        min_density_share: smallest `density_share` of a component that is kept. If above zero, needs
+            `sensor` (see `sensor_model`) and `origins`, and a mixture in 2D or 3D.
         origins: (D,) or (S, D), sensor origins, world frame.
         counts: (K, S) points of each component seen from each origin, if known. Components without
             any are kept at any density.
@@ -139,13 +138,8 @@ def prune(
             f"{len(weights)} components: {largest}; lower these limits."
         )
     remaining = Parameters(weights[kept] / weights[kept].sum(), means[kept], covariances[kept])
-    return _as_given_type(mixture, remaining), kept
-
-
-def _as_given_type(mixture: Mixture, remaining: Parameters) -> Mixture:
-    """The remaining components, in the type of the given mixture."""
     if isinstance(mixture, Parameters):
-        return cast(Mixture, remaining)
+        return cast(Mixture, remaining), kept
     # The scalar options only: initial parameters for K components do not fit fewer.
     options = mixture._scalar_options()
     options.pop("n_components")
@@ -153,7 +147,7 @@ def _as_given_type(mixture: Mixture, remaining: Parameters) -> Mixture:
         *remaining, lower_bounds=mixture.lower_bounds_, converged=mixture.converged_, **options
     )
     pruned._tensors = mixture._tensors
-    return cast(Mixture, pruned)
+    return cast(Mixture, pruned), kept
 
 
 def checked_origins(origins: ArrayLike, like: Tensor) -> Tensor:

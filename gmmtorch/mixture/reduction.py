@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import numbers
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -19,9 +20,8 @@ from torch import Tensor
 
 from gmmtorch.arrays import as_tensor
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, check_whole
-from gmmtorch.linalg import check_symmetric, pack_symmetric
+from gmmtorch.linalg import check_symmetric, pack_symmetric, safe_cholesky
 from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.reduction.moments import COSTS, Cost, Gaussians
 from gmmtorch.mixture.validation import checked_parameter
 
 if TYPE_CHECKING:  # an estimator imports scikit-learn, which `simplify` does not need
@@ -61,33 +61,35 @@ def simplify(
     Args:
         parameters: a fitted mixture; or weights (K,), not negative, which need not add up to one (supports
             in points are allowed); means (K, D); covariances (K, D, D). K may be 0.
-        n_components: stop at this number of components.
-        max_cost: stop if every merge costs more; see `cost` for the unit.
+        n_components, max_cost: stop at this number of components, and if every merge costs more.
         cost: "kullback_leibler" (`kullback_leibler_bound`: nats times the unit of the weights) or
             "hellinger" (`squared_hellinger`: 0 to 1), which merges similar components of any weight.
         neighbors: nearest components, by distance of the means, that a component may merge with in a
             round. Used above `most_exact` components only.
-        most_exact: up to this number of components, all pairs are considered and merged one at a time;
-            512 if None. With 0 all merges are in rounds: many times faster, with nearly the same result.
+        most_exact: up to this number of components (None: 512), all pairs are considered and merged one at
+            a time. With 0 all merges are in rounds: many times faster, with nearly the same result.
 
-    Raises:
-        InvalidArgumentError: neither n_components nor max_cost, or an invalid one; parameters that are
-            not a mixture. NumericalError: a covariance that is not positive definite.
+    Raises `InvalidArgumentError` for neither n_components nor max_cost, an invalid option, or parameters that
+    are not a mixture; `NumericalError` for a covariance that is not positive definite.
     """
     weights, means, covariances = _checked(parameters)
     if n_components is None and max_cost is None:
         raise InvalidArgumentError("n_components=None and max_cost=None: give at least one as the limit.")
     min_components = 1 if n_components is None else check_whole("n_components", n_components, 1)
-    limit = math.inf if max_cost is None else _checked_cost(max_cost)
+    limit: object = math.inf if max_cost is None else max_cost
+    if not isinstance(limit, numbers.Real) or not float(limit) >= 0:
+        raise InvalidArgumentError(f"max_cost={max_cost!r} must be a number of at least 0.")
     check_choice("cost", cost, COSTS)
     check_whole("neighbors", neighbors, 1)
     exact = check_whole("most_exact", _MOST_EXACT if most_exact is None else most_exact, 0)
 
-    order = _canonical_order(weights, means, covariances)
+    # Sorted by their values, so that the given order has no effect.
+    columns = torch.cat([means, pack_symmetric(covariances), weights[:, None]], 1).cpu().numpy()
+    order = torch.from_numpy(np.lexsort(columns.T[::-1])).to(means.device)
     given = Gaussians.of(Parameters(weights[order], means[order], covariances[order]))
-    left, labels = _merge_in_rounds(given, max(min_components, exact), limit, COSTS[cost], neighbors)
+    left, labels = _merge_in_rounds(given, max(min_components, exact), float(limit), COSTS[cost], neighbors)
     if left.weights.shape[0] <= exact:
-        left, merged = _merge_greedily(left, min_components, limit, COSTS[cost])
+        left, merged = _merge_greedily(left, min_components, float(limit), COSTS[cost])
         labels = merged[labels]
     bound = given.weights @ (left.half_log_dets[labels] - given.half_log_dets)
     labels, kept = _in_order_given(torch.empty_like(labels).scatter_(0, order, labels), left.weights.shape[0])
@@ -216,30 +218,13 @@ def _checked(parameters: Parameters | MixtureEstimator) -> Parameters:
     if means.ndim != 2 or means.shape[1] == 0:
         raise InvalidArgumentError(f"means has shape {tuple(means.shape)}; expected (K, D).")
     k, dim = means.shape
-    shapes = {"weights": (k,), "means": (k, dim), "covariances": (k, dim, dim)}
-    checked = Parameters(
-        *(
-            checked_parameter(value, shape, name, means.device)
-            for value, (name, shape) in zip(parameters, shapes.items(), strict=True)
-        )
-    )
+    given = zip(parameters, ((k,), (k, dim), (k, dim, dim)), Parameters._fields, strict=True)
+    checked = Parameters(*(checked_parameter(*values, means.device) for values in given))
     if bool((checked.weights < 0).any()):
         first = int((checked.weights < 0).nonzero()[0])
         raise InvalidArgumentError(f"weights[{first}]={float(checked.weights[first])} must be at least 0.")
     check_symmetric(checked.covariances, "covariances")
     return checked
-
-
-def _checked_cost(max_cost: object) -> float:
-    if not isinstance(max_cost, numbers.Real) or not float(max_cost) >= 0:
-        raise InvalidArgumentError(f"max_cost={max_cost!r} must be a number of at least 0.")
-    return float(max_cost)
-
-
-def _canonical_order(weights: Tensor, means: Tensor, covariances: Tensor) -> Tensor:
-    """Order (K,) that sorts components by their values, so that the given order has no effect."""
-    columns = torch.cat([means, pack_symmetric(covariances), weights[:, None]], 1).cpu().numpy()
-    return torch.from_numpy(np.lexsort(columns.T[::-1])).to(means.device)
 
 
 def _in_order_given(labels: Tensor, n: int) -> tuple[Tensor, Tensor]:
@@ -265,21 +250,18 @@ def merge(
     neighbors: int = 8,
     **options: Any,
 ) -> GaussianMixture:
-    """Merge two fitted mixtures into one mixture of the points that both were fitted to.
+    """Merge two fitted mixtures of equal dimension into one mixture of the points that both were fitted to.
 
     The result is on the device, and has the array kind, of `a`.
 
     Args:
-        a, b: mixtures of equal dimension.
         weight_a, weight_b: number of points that each mixture stands for.
         n_components, max_cost, cost, neighbors: how the union is simplified, see `simplify`. The weights
-            add up to one, so max_cost is in nats per point. The union is not simplified without
-            n_components and max_cost.
+            add up to one, so max_cost is in nats per point. Without n_components and max_cost, it is not.
         options: constructor options of the resulting `GaussianMixture`.
 
-    Raises:
-        NotFittedError: a mixture without parameters. InvalidArgumentError: different dimensions;
-            weights that are negative or both zero; arguments that `simplify` rejects.
+    Raises `NotFittedError` for a mixture without parameters, and `InvalidArgumentError` for different
+    dimensions, weights that are negative or both zero, and arguments that `simplify` rejects.
     """
     from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 
@@ -313,3 +295,114 @@ def merge(
     found = GaussianMixture.from_parameters(*(values if isinstance(a.means_, Tensor) else arrays), **options)
     found.n_samples_seen_ = total
     return found
+
+
+# -- moments and costs of merges ------------------------------------------------------------------
+
+
+def merge_components(
+    weights: Tensor, means: Tensor, covariances: Tensor, labels: Tensor, n: int
+) -> Parameters:
+    """Merge each group of components into one component.
+
+    w = Σ w_i, μ = Σ w_i μ_i / w and Σ = Σ (w_i/w)(Σ_i + (μ_i − μ)(μ_i − μ)ᵀ). The mean and covariance
+    of the whole mixture do not change.
+
+    weights: (K,), not negative; they need not add up to one, so supports (points) are allowed. If all weights
+    of a group are zero, its members count equally. labels: (K,) whole numbers, the group of each component.
+    n: number of groups. Raises `InvalidArgumentError` for labels outside 0 … n − 1, or an empty group.
+    """
+    if labels.shape != weights.shape or (
+        labels.numel() and not 0 <= int(labels.min()) <= int(labels.max()) < n
+    ):
+        raise InvalidArgumentError(
+            f"labels has shape {tuple(labels.shape)}; expected one whole number of 0 … n − 1 = {n - 1} for "
+            f"each of {weights.shape[0]} components."
+        )
+    members = torch.bincount(labels, minlength=n)
+    if bool((members == 0).any()):
+        raise InvalidArgumentError(
+            f"labels leaves {int((members == 0).sum())} of n={n} groups empty; number them without gaps."
+        )
+    total = weights.new_zeros(n).index_add_(0, labels, weights)
+    share = torch.where(total[labels] > 0, weights / total[labels], 1 / members[labels])
+    mean = means.new_zeros(n, means.shape[1]).index_add_(0, labels, share[:, None] * means)
+    offset = means - mean[labels]
+    scatter = share[:, None, None] * (covariances + offset[:, :, None] * offset[:, None, :])
+    covariance = torch.zeros_like(covariances[:n]).index_add_(0, labels, scatter)
+    return Parameters(total, mean, covariance)
+
+
+def merge_pairs(first: Parameters, second: Parameters) -> Parameters:
+    """Merge each component of `first` (P of them) with the component of `second` in the same row.
+
+    Without cancellation: with a = w₁/w and b = w₂/w, Σ = a Σ₁ + b Σ₂ + ab (μ₁ − μ₂)(μ₁ − μ₂)ᵀ. If both
+    weights are zero, both components count equally.
+    """
+    weight = first.weights + second.weights
+    b = torch.where(weight > 0, second.weights / weight, 0.5)[:, None]
+    offset = second.means - first.means
+    mean = first.means + b * offset
+    scatter = (1 - b)[:, None] * b[:, None] * offset[:, :, None] * offset[:, None, :]
+    return Parameters(
+        weight, mean, (1 - b)[:, None] * first.covariances + b[:, None] * second.covariances + scatter
+    )
+
+
+# -- costs ------------------------------------------------------------------------------------------
+
+
+class Gaussians(NamedTuple):
+    """Weighted Gaussians (K,) with ½ log|Σ| (K,) of each, which the costs use repeatedly."""
+
+    weights: Tensor
+    means: Tensor
+    covariances: Tensor
+    half_log_dets: Tensor
+
+    @classmethod
+    def of(cls, parameters: Parameters) -> Gaussians:
+        return cls(*parameters, _half_log_det(safe_cholesky(parameters.covariances)))
+
+    def at(self, index: Tensor | slice) -> Gaussians:
+        return Gaussians(*(value[index] for value in self))
+
+    def merged(self, other: Gaussians) -> Gaussians:
+        """Each component merged with the one in the same row of `other`."""
+        return Gaussians.of(merge_pairs(Parameters(*self[:3]), Parameters(*other[:3])))
+
+
+def _half_log_det(factors: Tensor) -> Tensor:
+    return factors.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+
+
+Cost = Callable[[Gaussians, Gaussians], Tensor]
+"""Cost (P,) of merging P components with P others, row by row; either side may be a single component."""
+
+
+def kullback_leibler_bound(first: Gaussians, second: Gaussians) -> Tensor:
+    """Runnalls' bound B = ½ [(w₁+w₂) log|Σ| − w₁ log|Σ₁| − w₂ log|Σ₂|], Σ of the merged pair, (P,).
+
+    B is an upper bound of w KL(p‖q), with p the mixture (of total weight w) before the merge and q the
+    mixture after it. The unit is nats per point if weights add up to one, and nats if weights are
+    supports in points. The bounds of successive merges add up to a bound for all of them.
+    Source: Runnalls, IEEE Trans. AES 43(3), 2007.
+    """
+    half_log_det = first.merged(second).half_log_dets
+    cost = first.weights * (half_log_det - first.half_log_dets)
+    return (cost + second.weights * (half_log_det - second.half_log_dets)).clamp_min(0)
+
+
+def squared_hellinger(first: Gaussians, second: Gaussians) -> Tensor:
+    """H² = 1 − |Σ₁|^¼ |Σ₂|^¼ |Σ|^−½ exp(−⅛ (μ₁−μ₂)ᵀ Σ⁻¹ (μ₁−μ₂)), Σ = ½(Σ₁+Σ₂), (P,).
+
+    0 for equal Gaussians, 1 for Gaussians without overlap. Weights have no effect.
+    """
+    factors = safe_cholesky((first.covariances + second.covariances) / 2)
+    offset = (first.means - second.means)[:, :, None]
+    squared = torch.linalg.solve_triangular(factors, offset, upper=False).square().sum((1, 2))
+    log_overlap = (first.half_log_dets + second.half_log_dets) / 2 - _half_log_det(factors) - squared / 8
+    return -torch.expm1(log_overlap.clamp_max(0))
+
+
+COSTS: dict[str, Cost] = {"kullback_leibler": kullback_leibler_bound, "hellinger": squared_hellinger}

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import KW_ONLY, dataclass
 from numbers import Integral, Real
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from sklearn.utils._param_validation import HasMethods, Interval
@@ -15,13 +16,18 @@ from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.estimator import AT_LEAST_ZERO, COUNT, MixtureEstimator
 from gmmtorch.mixture.estimators.sensor_model import SensorModel
-from gmmtorch.mixture.estimators.trees.density_limit import DensityLimit
-from gmmtorch.mixture.estimators.trees.growth import Tree, grow
+from gmmtorch.mixture.estimators.tree_growth import Children, Members, Tree, grow, keep_children
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
-from gmmtorch.mixture.reduction.pruning import checked_origins
+from gmmtorch.mixture.pruning import checked_origins, density_share
 from gmmtorch.mixture.validation import Array, RandomState
 
 
+def _node_attribute(read: Callable[[Tree], Tensor], doc: str) -> Any:
+    """A fitted attribute, of the kind of the points given to `fit`."""
+    return property(lambda mixture: mixture._as_fit_kind(read(mixture._tree())), doc=doc)
+
+
+@dataclass(eq=False, repr=False)
 class HierarchicalGaussianMixture(MixtureEstimator):
     """Hierarchical EM (thesis 2.1.2, equations 2.7–2.9; Eckart et al., 2016): a tree of Gaussians.
 
@@ -65,12 +71,7 @@ class HierarchicalGaussianMixture(MixtureEstimator):
     a level, and of each accepted level. They do not decrease within the EM of a level.
     """
 
-    _extra_names: ClassVar[tuple[str, ...]] = (
-        "node_parents",
-        "node_weights",
-        "node_means",
-        "node_covariances",
-    )
+    _extra_names: ClassVar[tuple[str, ...]] = tuple(f"node_{name}" for name in Tree._fields)
     _finds_n_components = True
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         **MixtureEstimator._parameter_constraints,
@@ -85,45 +86,27 @@ class HierarchicalGaussianMixture(MixtureEstimator):
         "sensor": [HasMethods(["point_density"]), None],
         "min_gain": [AT_LEAST_ZERO],
     }
-    node_parents: Tensor
-    node_weights: Tensor
-    node_means: Tensor
-    node_covariances: Tensor
+    node_parents: ClassVar[Tensor]  # buffers, which only a fitted tree has
+    node_weights: ClassVar[Tensor]
+    node_means: ClassVar[Tensor]
+    node_covariances: ClassVar[Tensor]
 
-    def __init__(
-        self,
-        n_components: int | None = None,
-        *,
-        branching: int = 8,
-        max_levels: int = 4,
-        tol: float = 1e-3,
-        max_iter: int = 100,
-        reg_covar: float = 1e-6,
-        soft_threshold: float = 0.1,
-        planarity_threshold: float = 0.0,
-        thickness: float = 0.0,
-        min_support: float = 4.0,
-        min_density_share: float = 0.0,
-        sensor: SensorModel | None = None,
-        min_gain: float = 1.0,
-        random_state: RandomState = None,
-        dtype: str = "float32",
-    ) -> None:
-        self.n_components = n_components
-        self.branching = branching
-        self.max_levels = max_levels
-        self.tol = tol
-        self.max_iter = max_iter
-        self.reg_covar = reg_covar
-        self.soft_threshold = soft_threshold
-        self.planarity_threshold = planarity_threshold
-        self.thickness = thickness
-        self.min_support = min_support
-        self.min_density_share = min_density_share
-        self.sensor = sensor
-        self.min_gain = min_gain
-        self.random_state = random_state
-        self.dtype = dtype
+    n_components: int | None = None
+    _: KW_ONLY
+    branching: int = 8
+    max_levels: int = 4
+    tol: float = 1e-3
+    max_iter: int = 100
+    reg_covar: float = 1e-6
+    soft_threshold: float = 0.1
+    planarity_threshold: float = 0.0
+    thickness: float = 0.0
+    min_support: float = 4.0
+    min_density_share: float = 0.0
+    sensor: SensorModel | None = None
+    min_gain: float = 1.0
+    random_state: RandomState = None
+    dtype: str = "float32"
 
     # -- learning ---------------------------------------------------------------------------------
 
@@ -188,42 +171,21 @@ class HierarchicalGaussianMixture(MixtureEstimator):
         self._fitted()
         if "node_parents" in self._buffers:
             return Tree(self.node_parents, self.node_weights, self.node_means, self.node_covariances)
-        return Tree(
-            torch.full(self.weights.shape, -1, device=self.weights.device),
-            self.weights,
-            self.means,
-            self.covariances,
-        )
+        parents = torch.full(self.weights.shape, -1, device=self.weights.device)
+        return Tree(parents, self.weights, self.means, self.covariances)
 
     @property
     def n_levels_(self) -> int:
         """Number of levels."""
         return int(self._tree().levels().max())
 
-    @property
-    def node_parents_(self) -> Array:
-        """The parent (M,) of each node, −1 on the first level."""
-        return self._as_fit_kind(self._tree().parents)
-
-    @property
-    def node_levels_(self) -> Array:
-        """The level (M,) of each node, from 1."""
-        return self._as_fit_kind(self._tree().levels())
-
-    @property
-    def node_weights_(self) -> Array:
-        """The share (M,) of the cloud in each node."""
-        return self._as_fit_kind(self._tree().weights)
-
-    @property
-    def node_means_(self) -> Array:
-        """Means (M, D) of the nodes."""
-        return self._as_fit_kind(self._tree().means)
-
-    @property
-    def node_covariances_(self) -> Array:
-        """Covariances (M, D, D) of the nodes."""
-        return self._as_fit_kind(self._tree().covariances)
+    node_parents_ = _node_attribute(
+        lambda tree: tree.parents, "Parent (M,) of each node, −1 on the first level."
+    )
+    node_levels_ = _node_attribute(Tree.levels, "Level (M,) of each node, from 1.")
+    node_weights_ = _node_attribute(lambda tree: tree.weights, "Share (M,) of the cloud in each node.")
+    node_means_ = _node_attribute(lambda tree: tree.means, "Means (M, D) of the nodes.")
+    node_covariances_ = _node_attribute(lambda tree: tree.covariances, "Covariances (M, D, D) of the nodes.")
 
     def _set_extra(self, tensors: Mapping[str, Tensor]) -> None:
         if tensors:
@@ -263,3 +225,31 @@ def check_tree(tree: Tree, leaf_weights: Tensor) -> None:
         raise InvalidArgumentError(
             f"The tree's {leaves.numel()} leaves are not the mixture's {len(leaf_weights)} components."
         )
+
+
+class DensityLimit(NamedTuple):
+    """When a child is too sparse for a surface.
+
+    least: smallest share of the density of a surface. sensor: gives this density. origins: (S, D), relative
+    to the centre of the cloud. seen: (N, S) points of each row of the cloud seen from each origin; None: the
+    nearest origin has seen all of them.
+    """
+
+    least: float
+    sensor: SensorModel
+    origins: Tensor
+    seen: Tensor | None = None
+
+    def drop_sparse_children(self, children: Children, centers: Tensor, members: Members) -> Children:
+        """Set sparse children of G nodes with centers (G, D) to weight 0, in favour of their siblings.
+
+        members: of the children, which are numbered node · m + child.
+        """
+        found = children._replace(means=children.means + centers[:, None]).flat()
+        support, counts = members.mass(len(found.weights)), None
+        if self.seen is not None:
+            seen = self.seen.index_select(0, members.point)
+            seen = seen * (members.weight / seen.sum(1).clamp_min(torch.finfo(seen.dtype).tiny))[:, None]
+            counts = seen.new_zeros(len(support), seen.shape[1]).index_add_(0, members.node, seen)
+        share = density_share(support, found, self.sensor, self.origins, counts)
+        return keep_children(children, (share >= self.least).view_as(children.weights))
