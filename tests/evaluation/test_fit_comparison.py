@@ -17,8 +17,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.events import ignore
-from gmmtorch.experiments.evaluation.fits.fit_comparison import ESTIMATORS, FitOutcome, compare, means, split
-from gmmtorch.experiments.evaluation.fits.fit_pruning import Views
+from gmmtorch.experiments.evaluation.fits import ESTIMATORS, FitOutcome, Views, compare, means, split
 from gmmtorch.experiments.evaluation.metrics import psnr2
 from gmmtorch.experiments.evaluation.protocol_options import FitOptions
 from gmmtorch.mixture.estimators.sensor_model import measured_sensor
