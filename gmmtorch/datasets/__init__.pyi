@@ -40,9 +40,6 @@ from .recordings.ros.transform_tree import TransformTree as TransformTree
 from .recordings.ros.transform_tree import frame_name as frame_name
 from .recordings.ros.transform_tree import stamp_of as stamp_of
 from .recordings.trajectory import NANOSECONDS as NANOSECONDS
-from .recordings.trajectory import in_plane as in_plane
-from .recordings.trajectory import in_space as in_space
-from .recordings.trajectory import pose_matrix as pose_matrix
 from .recordings.trajectory import read_trajectory as read_trajectory
 from .recordings.trajectory import to_nanoseconds as to_nanoseconds
 from .sources import load as load

@@ -17,11 +17,13 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError, check_whole
+from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 
 _ROUNDING = 1e-6
 """Upper bound of the relative rounding error of a range recomputed from rotated float32 coordinates."""
 
+_ROUNDED_ROTATION = 1e-2  # largest error of an entry of R Rᵀ
 _MAX_TEXT_BYTES = 1 << 28
 _GZIP_BLOCK_BYTES = 1 << 20
 
@@ -80,7 +82,7 @@ class Ranges:
 
     def posed(self, points: Tensor, pose: Tensor) -> Scan:
         """A scan from points (N, 3) in the sensor frame and the pose (4, 4), world ← sensor; see `scan`."""
-        return self.scan(points @ pose[:3, :3].T + pose[:3, 3], pose[:3, 3])
+        return self.scan(Pose.from_matrix(pose).apply(points), pose[:3, 3])
 
 
 class Dataset(Sequence[Scan]):
@@ -216,18 +218,23 @@ def natural_key(path: Path) -> list[tuple[int, int | str]]:
     return [(0, int(w)) if w.isdecimal() else (1, w) for w in re.split(r"(\d+)", path.name)]
 
 
-def check_pose(matrix: Tensor, where: str) -> Tensor:
-    """The pose (4, 4), world ← sensor. Raises `DataError`, which begins with `where`, unless it is rigid."""
-    rotation = matrix[:3, :3]
-    error = (rotation @ rotation.T - torch.eye(3, dtype=matrix.dtype)).abs().max()
-    if not (
-        bool(torch.isfinite(matrix).all()) and float(error) < 1e-2 and float(torch.linalg.det(rotation)) > 0
-    ):
+def check_poses(matrices: Tensor, where: str) -> Tensor:
+    """The poses (N, 4, 4) or (4, 4), world ← sensor, as files state them, whose rotations are rounded.
+
+    Raises `DataError`, which begins with `where` and the number of the row from 1, unless they are rigid.
+    """
+    rotation = matrices[..., :3, :3]
+    error = (rotation @ rotation.mT - torch.eye(3, dtype=matrices.dtype)).abs().amax((-2, -1))
+    finite = torch.isfinite(matrices).flatten(-2).all(-1)
+    bad = ~(finite & (error < _ROUNDED_ROTATION) & (torch.linalg.det(rotation) > 0))
+    if bool(bad.any()):
+        row = int(bad.reshape(-1).nonzero()[0])
         raise DataError(
-            f"{where} is not a rigid pose (rotation off by {float(error):.2g}); expected world ← sensor, "
-            "a rotation matrix and a translation in metres."
+            f"{where}{f' {row + 1}' if bad.ndim else ''} is not a rigid pose (rotation off by "
+            f"{float(error.reshape(-1)[row]):.2g}); expected world ← sensor, a rotation matrix and a "
+            "translation in metres."
         )
-    return matrix
+    return matrices
 
 
 def gunzip(path: Path) -> bytes | None:
@@ -305,9 +312,5 @@ def start_frame(scans: Dataset, index: int) -> Tensor:
     and x points ahead. In 3D it is upright. Without poses it has the axes of the world.
     """
     pose, origin = scans.pose(index), scans[index].origin.double()
-    frame = torch.eye(len(origin) + 1, dtype=torch.float64)
-    frame[:-1, -1] = origin
-    if pose is not None and float(pose[:2, 0].norm()) > 0:
-        (cos, sin) = (pose[:2, 0] / pose[:2, 0].norm()).tolist()
-        frame[:2, :2] = torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64)
-    return frame
+    yaw = 0.0 if pose is None else math.atan2(float(pose[1, 0]), float(pose[0, 0]))
+    return Pose.from_yaw(yaw, origin).matrix

@@ -17,6 +17,7 @@ from torch import Tensor
 from gmmtorch.datasets.base import Dataset, Ranges, gunzip, require_path
 from gmmtorch.datasets.number_rows import number_rows
 from gmmtorch.errors import DataError
+from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 
 _MAX_BEAMS = 100_000
@@ -64,13 +65,8 @@ class CarmenLog(Dataset):
         return self.ranges.scan(ends, origin)
 
     def _known_pose(self, index: int) -> Tensor:
-        return planar_pose(*self._records[index][-3:].tolist())
-
-
-def planar_pose(x: float, y: float, theta: float) -> Tensor:
-    """The pose (3, 3), float64, at (x, y) metres with heading theta (rad)."""
-    cos, sin = math.cos(theta), math.sin(theta)
-    return torch.tensor([[cos, -sin, x], [sin, cos, y], [0, 0, 1]], dtype=torch.float64)
+        x, y, theta = self._records[index][-3:]
+        return Pose.from_yaw(theta, torch.stack([x, y])).matrix
 
 
 def _read_records(path: Path) -> tuple[list[Tensor], Tensor]:

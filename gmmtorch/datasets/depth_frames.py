@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets.base import Dataset, Ranges, check_pose, natural_key, require_path
+from gmmtorch.datasets.base import Dataset, Ranges, check_poses, natural_key, require_path
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_number, check_whole
-from gmmtorch.linalg import nearest_rotations
 from gmmtorch.pinhole import back_project, check_intrinsics, is_centered
+from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 
 _INVALID = (0, 65535)
@@ -95,9 +95,8 @@ class DepthFrames(Dataset):
         The rotation, which is rounded in the file, is made orthonormal.
         """
         position = self._position(index)
-        pose = self._known_pose(position).clone()
-        pose[:3, :3] = nearest_rotations(pose[:3, :3])
-        return self._depth(position), pose
+        pose = Pose.from_matrix(self._known_pose(position)).orthonormal()
+        return self._depth(position), pose.matrix
 
     def _depth(self, index: int) -> Tensor:
         """Depth (H, W) in metres, float64; 0 for invalid pixels."""
@@ -116,7 +115,7 @@ class DepthFrames(Dataset):
     def _known_pose(self, index: int) -> Tensor:
         path = self._files[index]
         path = path.with_name(path.name.replace(".depth.png", ".pose.txt"))
-        pose = check_pose(_matrix(path, 4), str(path))
+        pose = check_poses(_matrix(path, 4), str(path))
         return torch.cat([self._upright @ pose[:3], pose[3:]])
 
 

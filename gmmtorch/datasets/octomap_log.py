@@ -23,9 +23,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets.base import Dataset, Ranges, check_pose, gunzip, require_path
+from gmmtorch.datasets.base import Dataset, Ranges, gunzip, require_path
 from gmmtorch.datasets.number_rows import number_rows
 from gmmtorch.errors import DataError
+from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 
 _LINE_BYTES = 1 << 12
@@ -103,16 +104,13 @@ def _node_pose(line: str, where: str) -> Tensor:
     numbers = number_rows([line.removeprefix("NODE")], 6, where + ", NODE line")[0]
     if not np.isfinite(numbers).all():
         raise DataError(f"{where}: the pose {numbers.tolist()} is not finite.")
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3], pose[:3, 3] = rotation(*numbers[3:]), torch.from_numpy(numbers[:3])
-    return pose
+    return Pose(rotation(*numbers[3:]), torch.from_numpy(numbers[:3])).matrix
 
 
 def rotation(roll: float, pitch: float, yaw: float) -> Tensor:
     """R = Rz(yaw) Ry(pitch) Rx(roll), (3, 3), from angles in radians."""
-    from scipy.spatial.transform import Rotation
-
-    return torch.from_numpy(Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix())
+    x, y, z = Pose.from_turn(torch.diag(torch.tensor([roll, pitch, yaw], dtype=torch.float64))).rotation
+    return z @ y @ x
 
 
 def _node_positions(file: io.BufferedIOBase) -> list[int]:
@@ -167,18 +165,15 @@ def _read_points(file: io.BufferedIOBase, position: int, where: str) -> np.ndarr
 
 def _read_pose(file: io.BufferedIOBase, position: int, where: str) -> Tensor:
     """Pose (4, 4), world ← sensor, of the node at a byte position."""
-    from scipy.spatial.transform import Rotation
-
     length = file.seek(0, io.SEEK_END)
     x, y, z, *quaternion = _pose_numbers(file, position, length, where)
     norm = math.hypot(*quaternion)
     if not abs(norm - 1) < _NORM_ERROR:
         raise DataError(f"{where}: the quaternion {quaternion} has length {norm:.3g} instead of 1.")
-    pose = torch.eye(4, dtype=torch.float64)
-    w, *axis = quaternion  # SciPy has the scalar last
-    pose[:3, :3] = torch.from_numpy(Rotation.from_quat([*axis, w]).as_matrix())
-    pose[:3, 3] = torch.tensor([x, y, z], dtype=torch.float64)
-    return check_pose(pose, where)
+    if not all(map(math.isfinite, (x, y, z))):
+        raise DataError(f"{where} is not a rigid pose: its position {[x, y, z]} is not finite.")
+    w, *axis = quaternion
+    return Pose.from_quaternion([x, y, z], [*axis, w]).matrix
 
 
 def _count(file: io.BufferedIOBase, position: int, where: str) -> int:

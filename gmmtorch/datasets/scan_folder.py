@@ -15,8 +15,9 @@ from gmmtorch.datasets.base import Dataset, Ranges, natural_key, require_path
 from gmmtorch.datasets.number_rows import number_rows
 from gmmtorch.datasets.point_files.cloud_files import read_cloud
 from gmmtorch.datasets.point_files.pcd_files import pcd_header
-from gmmtorch.datasets.recordings.trajectory import kitti_matrices, read_rows
+from gmmtorch.datasets.recordings.trajectory import kitti_poses, read_rows
 from gmmtorch.errors import DataError
+from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 
 
@@ -43,7 +44,7 @@ class ScanFolder(Dataset):
         if not self._files:
             raise DataError(f"{scans} contains no .pcd and no .ply file; put one file per scan there.")
         if standing:
-            self._poses = torch.eye(4, dtype=torch.float64).repeat(len(self._files), 1, 1)
+            self._poses = Pose.identity(3, len(self._files)).matrix
             return
         self._poses = _read_poses(path / "poses.txt")
         if len(self._poses) != len(self._files):
@@ -79,7 +80,7 @@ def _read_poses(path: Path) -> torch.Tensor:
     rows = read_rows(path)
     if rows.shape[1] != 12:
         raise DataError(f"{path} has {rows.shape[1]} numbers per row; a KITTI pose has 12.")
-    return torch.from_numpy(kitti_matrices(path, rows))
+    return kitti_poses(path, rows).matrix
 
 
 class PcdViewpoint(Dataset):
@@ -106,9 +107,7 @@ class PcdViewpoint(Dataset):
 
     def _known_pose(self, index: int) -> torch.Tensor:
         """The position in VIEWPOINT with the rotation of the world frame."""
-        pose = torch.eye(4, dtype=torch.float64)
-        pose[:3, 3] = _viewpoint(self._files[index])
-        return pose
+        return Pose.from_yaw(0.0, _viewpoint(self._files[index])).matrix
 
     def _read(self, index: int) -> Scan:
         path = self._files[index]

@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from gmmtorch.datasets import in_space, to_nanoseconds
+from gmmtorch.datasets import to_nanoseconds
 from gmmtorch.errors import InvalidArgumentError, OutputError
 from gmmtorch.export.message_fields import built_message, cloud_fields, odometry_fields, transform_fields
 from gmmtorch.optional_packages import needs_extra
+from gmmtorch.pose import Pose
 from gmmtorch.scan import ArrayLike, Scan
 
 
@@ -52,7 +53,7 @@ def write_bag(
                 )
             points = scan.points.detach().cpu().double().numpy()
             local = (points - given[:dim, dim]) @ given[:dim, :dim]
-            bag.transforms(time, {("map", "lidar"): in_space(given[None])[0]})
+            bag.transforms(time, {("map", "lidar"): Pose.from_matrix(given).in_space().matrix})
             bag.cloud(topic, time, "lidar", np.pad(local, ((0, 0), (0, 3 - dim))))
     return Path(path)
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from gmmtorch.datasets import NANOSECONDS
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.pose import Pose
 from gmmtorch.scan import ArrayLike
 
 _BASE, _NAME, _ARRAY = 1, 2, 3
@@ -48,11 +49,9 @@ def time_fields(stamp: int) -> dict[str, int]:
 
 def pose_fields(matrix: ArrayLike) -> tuple[dict[str, float], dict[str, float]]:
     """Translation and rotation of a pose (4, 4) as fields of messages."""
-    from scipy.spatial.transform import Rotation
-
-    pose = np.asarray(matrix, dtype=np.float64)
-    turn = Rotation.from_matrix(pose[:3, :3]).as_quat()
-    return dict(zip("xyz", pose[:3, 3].tolist(), strict=True)), dict(zip("xyzw", turn.tolist(), strict=True))
+    pose = Pose.from_matrix(matrix)
+    shift, turn = pose.translation.tolist(), pose.quaternion().tolist()
+    return dict(zip("xyz", shift, strict=True)), dict(zip("xyzw", turn, strict=True))
 
 
 def transform_fields(edges: Mapping[tuple[str, str], ArrayLike]) -> dict[str, Any]:

@@ -15,11 +15,12 @@ from torch import Tensor
 from gmmtorch.arrays import as_tensor
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, NumericalError
 from gmmtorch.files import pack_tensors, read_tensors, require, write_bytes
-from gmmtorch.linalg import check_rigid, check_symmetric, safe_cholesky
+from gmmtorch.linalg import check_symmetric, safe_cholesky
 from gmmtorch.mixture.density import MixtureDensity
 from gmmtorch.mixture.em.covariance_types import check_type, compact, type_shape
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.validation import Array, checked_parameter
+from gmmtorch.pose import Pose
 
 _FILE_KIND, _FILE_VERSION = "gmmtorch.mixture", 1
 _EXTRA = "extra."  # prefix of the names of extra tensors in a file
@@ -149,8 +150,7 @@ class MixtureState(MixtureDensity):
         `covariance_type="full"`.
         """
         means = self._fitted()
-        matrix = as_tensor(transform, "transform", torch.float64, means.device)
-        rotation, translation = check_rigid(matrix, means.shape[1])
+        rotation, translation = Pose.checked(transform, means.shape[1], device=means.device).parts
         moved = type(self)(**BaseEstimator.get_params(self, deep=False))
         if self._fitted_type == "diag":
             moved.covariance_type = "full"

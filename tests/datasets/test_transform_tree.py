@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree
 
@@ -61,7 +62,7 @@ def test_a_chain_equals_interpolation_by_hand(keep):
     poses = tree.lookup(tree.chain("lidar"), times, np.inf)
     assert poses.known.all()
     point = np.array([1.0, -2.0, 3.0])
-    for time, matrix in zip(times.tolist(), poses.matrices, strict=True):
+    for time, matrix in zip(times.tolist(), poses.poses.matrix.numpy(), strict=True):
         expected = by_hand(upper, time, by_hand(lower, time, point))
         assert np.allclose(matrix[:3, :3] @ point + matrix[:3, 3], expected, atol=1e-9)
 
@@ -78,7 +79,7 @@ def test_a_growing_tree_answers_as_a_complete_one():
         assert not growing.lookup(["base", "odom"], time, np.inf).known[0]
         growing.add(message("odom", "base", sample), static=False)
         found = growing.lookup(["base", "odom"], time, np.inf)
-        assert np.array_equal(found.matrices, whole.lookup(["base", "odom"], time, np.inf).matrices)
+        assert torch.equal(found.poses.matrix, whole.lookup(["base", "odom"], time, np.inf).poses.matrix)
 
 
 def test_old_transforms_are_forgotten_and_memory_is_bounded():

@@ -8,8 +8,8 @@ import pytest
 import torch
 from localization.looping_robot import ANGLES, BACK, DriftingOdometry, lap
 
-from gmmtorch.localization import Odometry
-from gmmtorch.localization.odometry import loop_closure
+from gmmtorch.localization import Odometry, loop_closure
+from gmmtorch.pose import Pose
 
 N_SCANS = 56
 
@@ -43,7 +43,7 @@ def test_poses_are_near_the_truth_once_the_sensor_is_back(driven):
     off = (odometry.poses - true)[:, :2, 2].norm(dim=1)
     assert float(off.max()) < 0.1
     assert torch.equal(odometry.poses[0], torch.eye(3).double())
-    assert torch.equal(odometry.keyframes[-1].pose, odometry.poses[odometry._frames[-1]])
+    assert torch.equal(odometry.keyframes[-1].pose.matrix, odometry.poses[odometry._frames[-1]])
     assert torch.allclose(odometry.trajectory().poses[:, :2, 2], odometry.poses[:, :2, 2], atol=0.05)
     chain = odometry.trajectory(loops=False).poses
     assert torch.allclose(chain[: len(before)], before, atol=1e-5)
@@ -56,10 +56,9 @@ def test_a_closure_counts_only_if_the_next_one_agrees(driven, monkeypatch, shift
     odometry, _, _ = driven
     left = list(shifts)  # of the new keyframe along x, by each closure
 
-    def closure(poses: torch.Tensor, places: Any, old: int, new: int, *_: Any) -> loop_closure._Closure:
-        moved = poses[new].clone()
-        moved[0, 2] += left.pop(0)
-        motion = torch.linalg.solve(poses[old], moved)
+    def closure(poses: Pose, places: Any, old: int, new: int, *_: Any) -> loop_closure._Closure:
+        moved = Pose.from_yaw(0.0, [left.pop(0), 0.0]) @ poses[new]
+        motion = poses[old].inverse() @ moved
         return loop_closure._Closure(old, new, motion, torch.eye(3).double() * 1e4)
 
     monkeypatch.setattr(loop_closure, "_closure", closure)
@@ -70,7 +69,7 @@ def test_a_closure_counts_only_if_the_next_one_agrees(driven, monkeypatch, shift
         assert (poses is not None) == (count > 0)
         found.append(poses)
     if counts[-1]:
-        assert float((found[-1][-1] - odometry.keyframes[54].pose)[0, 2]) > 0.2
+        assert float((found[-1].translation[-1] - odometry.keyframes[54].pose.translation)[0]) > 0.2
 
 
 def test_scans_that_are_no_keyframes_are_not_searched_for():

@@ -8,7 +8,7 @@ import torch
 import gmmtorch as gt
 from gmmtorch.errors import DataError
 from gmmtorch.localization import Tracker
-from gmmtorch.localization.scan_locations import clock_faults, locate_scans
+from gmmtorch.localization.tracker import clock_faults, locate_scans
 
 COVERED, DAMAGED = range(5, 15), 18
 

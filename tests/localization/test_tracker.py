@@ -11,7 +11,7 @@ from torch import Tensor
 import gmmtorch as gt
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.localization import Tracker
-from gmmtorch.localization.rigid_motions import generators
+from gmmtorch.pose import generators
 
 
 def in_sensor_frame(scan: gt.Scan, pose: Tensor) -> Tensor:

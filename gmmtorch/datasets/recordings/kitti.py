@@ -12,9 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets.base import Dataset, Ranges, check_pose, natural_key, require_path
+from gmmtorch.datasets.base import Dataset, Ranges, check_poses, natural_key, require_path
 from gmmtorch.datasets.recordings.trajectory import Trajectory, read_rows, read_trajectory, to_nanoseconds
 from gmmtorch.errors import DataError
+from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 
 _POINT_BYTES = 16
@@ -65,10 +66,9 @@ class Kitti(Dataset):
                 raise DataError(
                     f"{path / 'times.txt'} is missing; the trajectory {poses} needs times of scans."
                 )
-            found = trajectory.at(to_nanoseconds(times[: len(files)]), max_gap)
-            matrices, known = found.matrices, found.known
+            found, known = trajectory.at(to_nanoseconds(times[: len(files)]), max_gap)
         else:
-            matrices, known = _of_lidar(path, trajectory, len(files)), np.ones(len(files), bool)
+            found, known = _of_lidar(path, trajectory, len(files)), np.ones(len(files), bool)
         if not known.any() and times is not None:
             raise DataError(
                 f"{path}: no scan has a pose. Scans are from {times[0]:.3f} to {times[-1]:.3f} s, poses from "
@@ -76,7 +76,7 @@ class Kitti(Dataset):
             )
         self._skip("no pose at the time of the scan", *np.flatnonzero(~known).tolist())
         self._files = [file for file, is_known in zip(files, known, strict=True) if is_known]
-        self._poses = torch.from_numpy(matrices[known])
+        self._poses = found[known].matrix
         self._times = None if times is None else torch.from_numpy(times[: len(files)][known])
 
     def _count(self) -> int:
@@ -100,19 +100,18 @@ def _find_poses(path: Path) -> Path:
     return beside
 
 
-def _of_lidar(path: Path, trajectory: Trajectory, n_scans: int) -> np.ndarray:
-    """Poses (N, 4, 4) of the Velodyne, Tr⁻¹ P Tr, from those of the camera."""
+def _of_lidar(path: Path, trajectory: Trajectory, n_scans: int) -> Pose:
+    """Poses (N) of the Velodyne, Tr⁻¹ P Tr, from those of the camera."""
     if len(trajectory) < n_scans:
         raise DataError(
             f"{path} has {n_scans} scans, but only {len(trajectory)} poses; write one row for each scan."
         )
     mount = _calibration(path / "calib.txt")
-    poses: np.ndarray = np.linalg.inv(mount) @ trajectory.matrices[:n_scans] @ mount
-    return poses
+    return mount.inverse() @ trajectory.poses[:n_scans] @ mount
 
 
-def _calibration(path: Path) -> np.ndarray:
-    """camera ← Velodyne (4, 4), the row Tr of calib.txt."""
+def _calibration(path: Path) -> Pose:
+    """camera ← Velodyne, the row Tr of calib.txt."""
     if not path.is_file():
         raise DataError(
             f"{path} is missing; it states the Velodyne's pose on the camera. If poses.txt has poses of the "
@@ -126,8 +125,7 @@ def _calibration(path: Path) -> np.ndarray:
             except ValueError as error:
                 raise DataError(f"{path}: the row {name} is not 12 numbers ({error}).") from error
             matrix = np.vstack([rows, [0, 0, 0, 1]])
-            check_pose(torch.from_numpy(matrix), f"{path}, row {name}")
-            return matrix
+            return Pose.from_matrix(check_poses(torch.from_numpy(matrix), f"{path}, row {name}"))
     raise DataError(
         f"{path} has no row Tr (camera ← Velodyne); a calibration without rotation: '{_CALIBRATION}'."
     )

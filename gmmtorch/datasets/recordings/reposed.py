@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset
-from gmmtorch.datasets.recordings.trajectory import in_plane, read_trajectory, to_nanoseconds
+from gmmtorch.datasets.recordings.trajectory import read_trajectory, to_nanoseconds
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.linalg import nearest_rotations
+from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 
 _MAX_GAP = 2.0
@@ -37,20 +37,19 @@ def with_trajectory(source: Dataset, path: str | Path, stride: int) -> Dataset:
         )
     trajectory = read_trajectory(path, len(source))
     if not trajectory.has_times:
-        matrices, known = trajectory.matrices, np.ones(len(source), bool)
+        found, known = trajectory.poses, np.ones(len(source), bool)
     else:
         if source.times is None:
             raise InvalidArgumentError(
                 f"dataset.poses={path} has poses at times, but the scans have no times; give a KITTI "
                 "trajectory, one row for each scan."
             )
-        matrices, known = trajectory.at(to_nanoseconds(source.times.numpy()), _MAX_GAP)
+        found, known = trajectory.at(to_nanoseconds(source.times.numpy()), _MAX_GAP)
         if not known.any():
             first, last = float(source.times[0]), float(source.times[-1])
             raise DataError(f"{path} has no pose for the scans, which are from {first:.3f} to {last:.3f} s.")
-    is_flat = source[0].dim == 2
-    poses = torch.from_numpy(in_plane(matrices) if is_flat else matrices)
-    return with_poses(source, poses, torch.from_numpy(known), stride)
+    poses = found.in_plane() if source[0].dim == 2 else found
+    return with_poses(source, poses.matrix, torch.from_numpy(known), stride)
 
 
 def with_poses(source: Dataset, poses: Tensor, known: Tensor, stride: int = 1) -> Reposed:
@@ -91,13 +90,11 @@ class Reposed(Dataset):
         return self._poses[self._position(index)]
 
     def _read(self, index: int) -> Scan:
-        before = self._source.pose(self._indices[index])
-        motion = self._poses[index] @ torch.linalg.inv(before)
-        motion[:-1, :-1] = nearest_rotations(motion[:-1, :-1])  # rotations in files are rounded
+        before = Pose.from_matrix(self._source.pose(self._indices[index]))
+        now = Pose.from_matrix(self._poses[index])
+        turn = (now @ before.inverse()).orthonormal().rotation  # rotations in files are rounded
         scan: Scan = self._source[self._indices[index]]
-        motion[-1] = torch.eye(len(motion), dtype=motion.dtype)[-1]
-        motion[:-1, -1] = self._poses[index][:-1, -1] - motion[:-1, :-1] @ before[:-1, -1]
-        return scan.transformed(motion)
+        return scan.transformed(Pose(turn, now.translation - turn @ before.translation).matrix)
 
 
 class ReposedDepth(Reposed):

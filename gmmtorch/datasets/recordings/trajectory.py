@@ -11,20 +11,19 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from gmmtorch.datasets.base import check_pose
+from gmmtorch.datasets.base import check_poses
 from gmmtorch.datasets.number_rows import number_rows
 from gmmtorch.errors import DataError, MissingDataError
+from gmmtorch.pose import Pose
 
 NANOSECONDS = 1_000_000_000
-MIN_NORM = 1e-6
-"""A quaternion with a smaller norm states no rotation."""
 _log = logging.getLogger(__name__)
 
 
-class Poses(NamedTuple):
-    """matrices: (M, 4, 4). known: (M,) whether the pose is known at the time."""
+class PosesAt(NamedTuple):
+    """poses: of space (M). known: (M,) whether the pose is known at the time."""
 
-    matrices: np.ndarray
+    poses: Pose
     known: np.ndarray
 
 
@@ -32,60 +31,46 @@ class Poses(NamedTuple):
 class Trajectory:
     """Poses of one frame in another at increasing times.
 
-    times: (N,) int64, nanoseconds. matrices: (N, 4, 4) float64, metres.
+    times: (N,) int64, nanoseconds. poses: of space (N).
     has_times: False if the poses are those of scans 0, 1, 2, …, which `times` counts.
     """
 
     times: np.ndarray
-    matrices: np.ndarray
+    poses: Pose
     has_times: bool = True
 
     @staticmethod
-    def from_samples(times: np.ndarray, matrices: np.ndarray) -> Trajectory:
+    def from_samples(times: np.ndarray, poses: Pose) -> Trajectory:
         """The trajectory of samples in the order of recording.
 
         If the clock jumps, the longest sequence of increasing times is kept. Of samples with equal times the
         last one counts.
         """
         kept = strictly_increasing(times)
-        return Trajectory(times[kept], matrices[kept])
+        return Trajectory(times[kept], poses[kept])
 
     def __len__(self) -> int:
         return len(self.times)
 
-    def at(self, times: np.ndarray, max_gap: float = np.inf) -> Poses:
+    def at(self, times: np.ndarray, max_gap: float = np.inf) -> PosesAt:
         """Poses at times (M,) in ns: linear in position, spherical linear in rotation (Shoemake 1985).
 
         A sample's own pose is returned unchanged. A pose is unknown before the first sample, after the last
         one, and between samples that are more than `max_gap` seconds apart.
         """
         if len(self) == 0:
-            return Poses(np.tile(np.eye(4), (len(times), 1, 1)), np.zeros(len(times), bool))
+            return PosesAt(Pose.identity(3, len(times)), np.zeros(len(times), bool))
         after = np.searchsorted(self.times, times).clip(0, len(self) - 1)
         exact = self.times[after] == times
         before = np.maximum(after - 1, 0)
         gap = self.times[after] - self.times[before]
         inside = (self.times[0] <= times) & (times <= self.times[-1]) & (gap <= max_gap * NANOSECONDS)
         share = np.where(exact, 1.0, (times - self.times[before]) / np.maximum(gap, 1)).clip(0, 1)
-        found = self.matrices[after].copy()
-        between = inside & ~exact
+        found, between = self.poses[after], inside & ~exact
         if between.any():
-            found[between] = _between(
-                self.matrices[before[between]], self.matrices[after[between]], share[between]
-            )
-        return Poses(found, exact | inside)
-
-
-def _between(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Poses (M, 4, 4) at a share (M,) of the way from the first to the second."""
-    from scipy.spatial.transform import Rotation
-
-    start = Rotation.from_matrix(first[:, :3, :3])
-    turn = (start.inv() * Rotation.from_matrix(second[:, :3, :3])).as_rotvec()
-    found = np.tile(np.eye(4), (len(share), 1, 1))
-    found[:, :3, :3] = (start * Rotation.from_rotvec(turn * share[:, None])).as_matrix()
-    found[:, :3, 3] = first[:, :3, 3] + (second[:, :3, 3] - first[:, :3, 3]) * share[:, None]
-    return found
+            way = self.poses[before[between]].towards(found[between], share[between])
+            found.rotation[between], found.translation[between] = way.parts
+        return PosesAt(found, exact | inside)
 
 
 def increasing(times: np.ndarray) -> np.ndarray:
@@ -111,24 +96,6 @@ def strictly_increasing(times: np.ndarray) -> np.ndarray:
     return order[np.append(np.diff(times[order]) > 0, True)] if len(order) else order
 
 
-def pose_matrix(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
-    """Poses (…, 4, 4) from positions (…, 3) and quaternions (…, 4) x, y, z, w, which are normalized.
-
-    Raises `ValueError` if a number is not finite or a quaternion is zero.
-    """
-    with np.errstate(over="ignore"):
-        norm = np.linalg.norm(quaternion, axis=-1, keepdims=True)
-    if not (np.isfinite(position).all() and np.isfinite(norm).all() and (norm > MIN_NORM).all()):
-        raise ValueError(f"position {position} with quaternion {quaternion} is not a pose")
-    x, y, z, w = np.moveaxis(quaternion / norm, -1, 0)
-    found = np.zeros((*position.shape[:-1], 4, 4))
-    found[..., 0, :3] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], -1)
-    found[..., 1, :3] = np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], -1)
-    found[..., 2, :3] = np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], -1)
-    found[..., :3, 3], found[..., 3, 3] = position, 1
-    return found
-
-
 def read_trajectory(path: str | Path, n_scans: int | None = None) -> Trajectory:
     """A trajectory file: TUM rows (time x y z qx qy qz qw), or KITTI rows (12 numbers, no time).
 
@@ -152,7 +119,7 @@ def read_trajectory(path: str | Path, n_scans: int | None = None) -> Trajectory:
             f"{path} has {len(rows)} poses without times for {n_scans} scans; write one row for each scan, "
             "or a TUM trajectory, which has times."
         )
-    return Trajectory(np.arange(len(rows)), kitti_matrices(path, rows), has_times=False)
+    return Trajectory(np.arange(len(rows)), kitti_poses(path, rows), has_times=False)
 
 
 def read_rows(path: Path) -> np.ndarray:
@@ -164,25 +131,23 @@ def read_rows(path: Path) -> np.ndarray:
     return number_rows(lines, None, f"{path}, row")
 
 
-def kitti_matrices(path: Path, rows: np.ndarray) -> np.ndarray:
-    """Poses (N, 4, 4) from KITTI rows (N, 12). Raises `DataError` for a row that is not rigid."""
-    matrices = np.tile(np.eye(4), (len(rows), 1, 1))
-    matrices[:, :3] = rows.reshape(-1, 3, 4)
-    for number, matrix in enumerate(matrices, 1):
-        check_pose(torch.from_numpy(matrix), f"{path}, row {number}")
-    return matrices
+def kitti_poses(path: Path, rows: np.ndarray) -> Pose:
+    """The poses (N) of KITTI rows (N, 12). Raises `DataError` for a row that is not rigid."""
+    matrices = Pose.identity(3, len(rows)).matrix
+    matrices[:, :3] = torch.from_numpy(rows.reshape(-1, 3, 4))
+    return Pose.from_matrix(check_poses(matrices, f"{path}, row"))
 
 
 def _tum(path: Path, rows: np.ndarray) -> Trajectory:
     if not np.isfinite(rows[:, 0]).all() or (np.abs(rows[:, 0]) > 9e9).any():
         raise DataError(f"{path} has times that are not seconds; a TUM row is: time x y z qx qy qz qw.")
     try:
-        matrices = pose_matrix(rows[:, 1:4], rows[:, 4:])
+        poses = Pose.from_quaternion(rows[:, 1:4], rows[:, 4:])
     except ValueError as error:
         raise DataError(f"{path}: a row is not a pose; a TUM row is: time x y z qx qy qz qw.") from error
     times = to_nanoseconds(rows[:, 0])
     order = order_of_rows(path, times)
-    return Trajectory.from_samples(times[order], matrices[order])
+    return Trajectory.from_samples(times[order], poses[order])
 
 
 def order_of_rows(path: Path, times: np.ndarray) -> np.ndarray:
@@ -200,21 +165,3 @@ def to_nanoseconds(seconds: np.ndarray) -> np.ndarray:
     """Times in seconds as int64 nanoseconds."""
     whole = np.floor(seconds)
     return whole.astype(np.int64) * NANOSECONDS + np.round((seconds - whole) * 1e9).astype(np.int64)
-
-
-def in_plane(matrices: np.ndarray) -> np.ndarray:
-    """Poses (N, 4, 4) as poses (N, 3, 3) of the plane: x, y and the heading of the x axis."""
-    found = np.tile(np.eye(3), (len(matrices), 1, 1))
-    heading = np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0])
-    cos, sin = np.cos(heading), np.sin(heading)
-    found[:, 0, 0], found[:, 0, 1], found[:, 1, 0], found[:, 1, 1] = cos, -sin, sin, cos
-    found[:, :2, 2] = matrices[:, :2, 3]
-    return found
-
-
-def in_space(poses: np.ndarray) -> np.ndarray:
-    """Poses (N, 3, 3) of the plane as poses (N, 4, 4) at height 0; poses (N, 4, 4) as they are."""
-    dim = poses.shape[1] - 1
-    found = np.tile(np.eye(4), (len(poses), 1, 1))
-    found[:, :dim, :dim], found[:, :dim, 3] = poses[:, :dim, :dim], poses[:, :dim, dim]
-    return found

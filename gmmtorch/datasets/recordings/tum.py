@@ -83,7 +83,7 @@ class TumRgbd(Dataset):
                 f"{trajectory.times[-1] / NANOSECONDS:.3f} s."
             )
         self._files = [files[index] for index in np.flatnonzero(found.known)]
-        self._poses = torch.from_numpy(found.matrices[found.known])
+        self._poses = found.poses[found.known].matrix
         self._times = torch.from_numpy(times[found.known] / NANOSECONDS)
 
     def _count(self) -> int:

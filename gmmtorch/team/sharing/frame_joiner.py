@@ -12,6 +12,7 @@ from torch import Tensor
 from gmmtorch.errors import check_number, check_whole
 from gmmtorch.localization import Tracker, register
 from gmmtorch.mapping import Components, GaussianMap
+from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 from gmmtorch.team.sharing.replica.replica import Replica
 
@@ -168,7 +169,7 @@ class FrameJoiner:
         is_own = placed.ids[:, 0] == self._replica.robot
         own, theirs = (placed.selected(which.nonzero().squeeze(1)) for which in (is_own, ~is_own))
         if to_root is not None:
-            own = own.transformed(torch.linalg.inv(to_root), torch.ones(len(own)) > 0)
+            own = own.transformed(Pose.from_matrix(to_root).inverse().matrix, torch.ones(len(own)) > 0)
         return own, theirs
 
 

@@ -8,6 +8,7 @@ import time
 import torch
 
 from gmmtorch.mapping import Components, GaussianMap, MotionAt, WindowMotions
+from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 from gmmtorch.team.sharing.frame_joiner import FrameJoiner
 from gmmtorch.team.sharing.radio import Radio, RecordStore
@@ -112,4 +113,6 @@ class SharedMap:
         found, transform = self.replica.components(), self.replica.placement.transform
         if transform is None:
             return found
-        return found.transformed(torch.linalg.inv(transform).to(found.means), torch.ones(len(found)).bool())
+        return found.transformed(
+            Pose.from_matrix(transform).inverse().matrix.to(found.means), torch.ones(len(found)).bool()
+        )

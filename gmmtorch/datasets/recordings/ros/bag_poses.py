@@ -19,12 +19,13 @@ from gmmtorch.datasets.recordings.ros.pose_sources import (
     RegisteredPoses,
     Standing,
     TfPoses,
-    mount_matrix,
+    mount_of,
     pose_sample,
 )
 from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree
 from gmmtorch.datasets.recordings.trajectory import Trajectory, read_trajectory
 from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.pose import Pose
 
 _log = logging.getLogger(__name__)
 _HEAD_BYTES = 1024
@@ -66,7 +67,7 @@ class BagSurvey:
         self._is_cloud = sensor.kind in (CLOUD, LIST)
         self._infos: dict[bytes, dict[str, Any]] = {}
         self._poses, self._frame, self.max_gap = poses, frame, max_gap
-        self._extrinsic = mount_matrix(extrinsic)
+        self._extrinsic = mount_of(extrinsic)
         self._pose_topic = poses if poses in {t.name for t in reader.topics} else None
         self._file = None
         transforms = [t.name for t in reader.topics if t.type in TF_TYPES and t.n_messages]
@@ -86,7 +87,7 @@ class BagSurvey:
                 )
         self.heads: list[tuple[int, bytes]] = []
         self.tree = TransformTree()
-        self._samples: list[tuple[int, np.ndarray]] = []
+        self._samples: list[tuple[int, Pose]] = []
         self._frames: Counter[tuple[str, str]] = Counter()  # of world and body
         for message in reader.messages(
             {topic, *transforms, *(name for name in (info_topic, self._pose_topic) if name)}
@@ -107,10 +108,10 @@ class BagSurvey:
             if message.type in TF_TYPES:
                 self.tree.add(content, static=message.topic.endswith("tf_static"))
                 return
-            time, matrix, *pose_frames = pose_sample(content)
+            time, pose, *pose_frames = pose_sample(content)
         except (DataError, ValueError, KeyError, TypeError):  # also a definition in the bag that is damaged
             return  # a transform that is missed leaves a gap, which `max_gap` notices
-        self._samples.append((time, matrix))
+        self._samples.append((time, pose))
         self._frames[pose_frames[0], pose_frames[1]] += 1
 
     def camera_info(self) -> dict[str, Any] | None:
@@ -191,8 +192,8 @@ class BagSurvey:
         if self._poses in (None, "tf"):
             return self._from_tf(frames, where, seen_from, first if sensor_frame is None else None)
         if self._pose_topic is not None:
-            times, matrices = [list(column) for column in zip(*self._samples, strict=True)] or ([], [])
-            stamps, poses = np.array(times, np.int64), np.array(matrices).reshape(-1, 4, 4)
+            stamps = np.array([time for time, _ in self._samples], np.int64)
+            poses = Pose.stack([pose for _, pose in self._samples] or [Pose.identity(3)])[: len(stamps)]
             trajectory = Trajectory.from_samples(stamps, poses)
             sensors = frames if seen_from is None else [seen_from]
             mounts = {frame: self._mount(frame, where) if mount is None else mount for frame in sensors}
@@ -212,10 +213,10 @@ class BagSurvey:
                 f"frame {first} already. Choose dataset.poses=tf, or dataset.sensor_frame={first} if that is "
                 "the frame of the sensor."
             )
-        fixed = np.eye(4) if mount is None else mount
+        fixed = Pose.identity(3) if mount is None else mount
         trajectory = read_trajectory(self._file, len(self.heads))
         if not trajectory.has_times:
-            return PosesByIndex({r.stamp: trajectory.matrices[r.number] for r in records}, fixed)
+            return PosesByIndex({r.stamp: trajectory.poses[r.number] for r in records}, fixed)
         return BodyPoses(trajectory, dict.fromkeys(frames, fixed), self.max_gap, str(self._file))
 
     def _from_tf(
@@ -235,11 +236,11 @@ class BagSurvey:
             )
         return source
 
-    def _mount(self, frame: str, where: str) -> np.ndarray:
+    def _mount(self, frame: str, where: str) -> Pose:
         """body ← sensor from the static transforms."""
         body = self._frames.most_common(1)[0][0][1] if self._frames else ""
         if body in ("", frame):
-            return np.eye(4)
+            return Pose.identity(3)
         try:
             chain = self.tree.chain(frame, body) if frame in self.tree.frames else []
         except DataError:
@@ -251,8 +252,7 @@ class BagSurvey:
                 "sensor's pose on the body: dataset.extrinsic=[x,y,z,qx,qy,qz,qw], which is [0,0,0,0,0,0,1] "
                 "if they are the same."
             )
-        matrix: np.ndarray = self.tree.lookup(chain, np.zeros(1, np.int64), np.inf).matrices[0]
-        return matrix
+        return self.tree.lookup(chain, np.zeros(1, np.int64), np.inf).poses[0]
 
 
 def _counted(frames: Counter[str]) -> str:

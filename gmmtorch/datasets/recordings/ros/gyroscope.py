@@ -12,12 +12,15 @@ from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from gmmtorch.datasets.recordings.ros.bag_reader import BagReader
 from gmmtorch.datasets.recordings.ros.bag_topics import IMU_TYPE, choose_imu
 from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree, frame_name, stamp_of
 from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, strictly_increasing
 from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.pose import Pose
 
 MAX_GAP = 0.2
 """Longest time (s) between two messages over which rates are interpolated. If the rate changes by 10 rad/s²,
@@ -41,48 +44,43 @@ class Gyroscope:
     times: np.ndarray
     rates: np.ndarray
 
-    def turns(self, stamps: np.ndarray) -> np.ndarray:
+    def turns(self, stamps: np.ndarray) -> Tensor:
         """Rotations (M, 3, 3) of the IMU since the stamp before, before ← now, at stamps (M,), ns, in order.
 
         Rates are linear between messages, and each interval is one turn by their mean. The first rotation is
         the identity. A rotation is NaN if a stamp is outside the times of the messages, or if messages
         between the two stamps are more than `MAX_GAP` apart.
         """
-        from scipy.spatial.transform import Rotation
-
         seconds, rise = np.diff(self.times) / NANOSECONDS, np.diff(self.rates, axis=0)
         is_gap = seconds > MAX_GAP
         means = np.where(is_gap[:, None], 0, self.rates[:-1] + rise / 2)
-        steps = Rotation.from_rotvec(means * seconds[:, None]).as_quat()
-        starts = Rotation.from_quat(_products(np.concatenate([[[0.0, 0.0, 0.0, 1.0]], steps])))
+        steps = _rotations(means * seconds[:, None])
+        starts = _products(torch.cat([torch.eye(3)[None].double(), steps]))
         at = (np.searchsorted(self.times, stamps, side="right") - 1).clip(0, len(seconds) - 1)
         since = ((stamps - self.times[at]) / NANOSECONDS).clip(0, seconds[at])
         rates = self.rates[at] + rise[at] * (since / seconds[at] / 2)[:, None]
-        found = starts[at] * Rotation.from_rotvec(rates * since[:, None])
-        turns = np.tile(np.eye(3), (len(stamps), 1, 1))
-        turns[1:] = (found[:-1].inv() * found[1:]).as_matrix()
+        found = starts[at] @ _rotations(rates * since[:, None])
+        turns = torch.cat([starts[:1], found[:-1].mT @ found[1:]])
         inside = (self.times[0] <= stamps) & (stamps <= self.times[-1])
         begun = np.searchsorted(self.times[:-1][is_gap], stamps[1:])
         ended = np.searchsorted(self.times[1:][is_gap], stamps[:-1], side="right")
-        turns[1:][~(inside[:-1] & inside[1:]) | (begun > ended)] = np.nan
+        turns[1:][~(inside[:-1] & inside[1:]) | (begun > ended)] = torch.nan
         return turns
 
 
-def _products(quaternions: np.ndarray) -> np.ndarray:
-    """Products q₀, q₀q₁, q₀q₁q₂, … (N, 4) of unit quaternions (N, 4), with arrays of N/2, N/4, … pairs."""
-    if len(quaternions) < 2:
-        return quaternions
-    found = quaternions.copy()
-    found[1::2] = _products(_product(quaternions[:-1:2], quaternions[1::2]))
+def _rotations(vectors: np.ndarray) -> Tensor:
+    """Rotations (N, 3, 3) of rotation vectors (N, 3), rad."""
+    return Pose.from_turn(torch.from_numpy(vectors)).rotation
+
+
+def _products(turns: Tensor) -> Tensor:
+    """Products R₀, R₀R₁, R₀R₁R₂, … (N, 3, 3) of rotations (N, 3, 3), by batches of N/2, N/4, … pairs."""
+    if len(turns) < 2:
+        return turns
+    found = turns.clone()
+    found[1::2] = _products(turns[:-1:2] @ turns[1::2])
     if len(found) > 2:
-        found[2::2] = _product(found[1:-1:2], quaternions[2::2])
-    return found
-
-
-def _product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    from scipy.spatial.transform import Rotation
-
-    found: np.ndarray = (Rotation.from_quat(first) * Rotation.from_quat(second)).as_quat()
+        found[2::2] = found[1:-1:2] @ turns[2::2]
     return found
 
 
@@ -132,7 +130,7 @@ def read_gyroscope(reader: BagReader, topic: str | None, clock: str) -> Gyroscop
 
 def sensor_turns(
     gyroscope: Gyroscope, tree: TransformTree, frames: list[str], stamps: np.ndarray, max_gap: float
-) -> np.ndarray:
+) -> Tensor:
     """Rotations (M, 3, 3) of a sensor since the scan before, before ← now; the first is the identity.
 
     Where the rotation of the IMU or of its mounting is unknown, they are NaN, and a warning states how many.
@@ -144,7 +142,7 @@ def sensor_turns(
 
     Raises `InvalidArgumentError` if TF does not connect the frames, or if no rotation is known.
     """
-    mounts = np.tile(np.eye(3), (len(stamps), 1, 1))  # IMU ← sensor
+    mounts = Pose.identity(3, len(stamps)).rotation  # IMU ← sensor
     for frame in set(frames) - {gyroscope.frame}:
         rows = np.array([row for row, name in enumerate(frames) if name == frame])
         try:
@@ -154,10 +152,11 @@ def sensor_turns(
                 f"the IMU of {gyroscope.topic} must be mounted beside the sensor, but {error}",
                 "Record /tf_static with both frames",
             ) from error
-        mounts[rows] = np.where(found.known[:, None, None], found.matrices[:, :3, :3], np.nan)
+        found.poses.rotation[~found.known] = torch.nan
+        mounts[rows] = found.poses.rotation
     turns = gyroscope.turns(stamps)
-    turns[1:] = np.swapaxes(mounts[:-1], 1, 2) @ turns[1:] @ mounts[1:]
-    n, n_unknown = len(turns) - 1, int(np.isnan(turns).any((1, 2)).sum())
+    turns[1:] = mounts[:-1].mT @ turns[1:] @ mounts[1:]
+    n, n_unknown = len(turns) - 1, int(turns.isnan().flatten(1).any(1).sum())
     if n and n_unknown == n:
         first, last = gyroscope.times[[0, -1]] / NANOSECONDS
         raise _unusable(

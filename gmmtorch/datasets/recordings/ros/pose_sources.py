@@ -9,11 +9,12 @@ import numpy as np
 from gmmtorch.datasets.recordings.ros.transform_tree import (
     TransformTree,
     frame_name,
+    pose_of,
     stamp_of,
-    transform_matrix,
 )
-from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, Poses, Trajectory, pose_matrix
+from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, PosesAt, Trajectory
 from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.pose import Pose
 
 
 class PoseSource(Protocol):
@@ -21,7 +22,7 @@ class PoseSource(Protocol):
 
     can_deskew: bool
 
-    def at(self, times: np.ndarray, frame: str) -> Poses:
+    def at(self, times: np.ndarray, frame: str) -> PosesAt:
         """Poses of the sensor frame at times (M,) in ns."""
 
     def explain(self, time: int, frame: str) -> str:
@@ -33,8 +34,8 @@ class Standing:
 
     can_deskew = False
 
-    def at(self, times: np.ndarray, frame: str) -> Poses:
-        return Poses(np.tile(np.eye(4), (len(times), 1, 1)), np.ones(len(times), bool))
+    def at(self, times: np.ndarray, frame: str) -> PosesAt:
+        return PosesAt(Pose.identity(3, len(times)), np.ones(len(times), bool))
 
     def explain(self, time: int, frame: str) -> str:
         return "all poses are known"
@@ -68,7 +69,7 @@ class TfPoses:
                 raise DataError(f"{self._where}: {error}") from error
         return self._chains[frame]
 
-    def at(self, times: np.ndarray, frame: str) -> Poses:
+    def at(self, times: np.ndarray, frame: str) -> PosesAt:
         return self._tree.lookup(self.chain(frame), times, self._max_gap)
 
     def explain(self, time: int, frame: str) -> str:
@@ -80,21 +81,19 @@ class BodyPoses:
 
     Args:
         trajectory: world ← body.
-        mounts: body ← sensor, (4, 4), for each frame of a sensor.
+        mounts: body ← sensor for each frame of a sensor.
         max_gap: longest time in seconds between two poses to interpolate.
         name: of the trajectory, for messages.
     """
 
     can_deskew = True
 
-    def __init__(
-        self, trajectory: Trajectory, mounts: dict[str, np.ndarray], max_gap: float, name: str
-    ) -> None:
+    def __init__(self, trajectory: Trajectory, mounts: dict[str, Pose], max_gap: float, name: str) -> None:
         self._trajectory, self._mounts, self._max_gap, self._name = trajectory, mounts, max_gap, name
 
-    def at(self, times: np.ndarray, frame: str) -> Poses:
+    def at(self, times: np.ndarray, frame: str) -> PosesAt:
         poses = self._trajectory.at(times, self._max_gap)
-        return poses._replace(matrices=poses.matrices @ self._mounts[frame])
+        return poses._replace(poses=poses.poses @ self._mounts[frame])
 
     def explain(self, time: int, frame: str) -> str:
         times = self._trajectory.times / NANOSECONDS
@@ -114,14 +113,13 @@ class RegisteredPoses:
     def __init__(self, source: PoseSource, sensor: str, fixed: PoseSource) -> None:
         self.sensor, self._source, self._fixed = sensor, source, fixed
 
-    def at(self, times: np.ndarray, frame: str) -> Poses:
+    def at(self, times: np.ndarray, frame: str) -> PosesAt:
         poses = self._source.at(times, self.sensor)
         return poses._replace(known=poses.known & self._fixed.at(times, frame).known)
 
-    def of_points(self, time: int, frame: str) -> np.ndarray:
-        """The pose (4, 4) at a known time (ns) of the frame of the points."""
-        matrix: np.ndarray = self._fixed.at(np.array([time]), frame).matrices[0]
-        return matrix
+    def of_points(self, time: int, frame: str) -> Pose:
+        """The pose at a known time (ns) of the frame of the points."""
+        return self._fixed.at(np.array([time]), frame).poses[0]
 
     def explain(self, time: int, frame: str) -> str:
         return self._source.explain(time, self.sensor)
@@ -132,43 +130,43 @@ class PosesByIndex:
 
     can_deskew = False
 
-    def __init__(self, poses: dict[int, np.ndarray], mount: np.ndarray) -> None:
+    def __init__(self, poses: dict[int, Pose], mount: Pose) -> None:
         self._poses, self._mount = poses, mount
 
-    def at(self, times: np.ndarray, frame: str) -> Poses:
-        found = [self._poses[time] for time in times.tolist()]
-        return Poses(np.array(found).reshape(-1, 4, 4) @ self._mount, np.ones(len(times), bool))
+    def at(self, times: np.ndarray, frame: str) -> PosesAt:
+        found = Pose.stack([self._poses[time] for time in times.tolist()])
+        return PosesAt(found @ self._mount, np.ones(len(times), bool))
 
     def explain(self, time: int, frame: str) -> str:
         return "all poses are known"
 
 
-def pose_sample(message: dict[str, Any]) -> tuple[int, np.ndarray, str, str]:
-    """(time in ns, world ← body (4, 4), frames of world and body or "") of a message of a pose topic.
+def pose_sample(message: dict[str, Any]) -> tuple[int, Pose, str, str]:
+    """(time in ns, world ← body, frames of world and body or "") of a message of a pose topic.
 
     Raises `ValueError` if it is not a pose.
     """
     time = stamp_of(message["header"])
     if "transform" in message:
         content = message["transform"]
-        matrix = transform_matrix(content["translation"], content["rotation"])
+        pose = pose_of(content["translation"], content["rotation"])
     else:
         content = message["pose"]
         content = content.get("pose", content)  # with covariance
-        matrix = transform_matrix(content["position"], content["orientation"])
+        pose = pose_of(content["position"], content["orientation"])
     world, body = message["header"]["frame_id"], message.get("child_frame_id", "")
-    return time, matrix, frame_name(world), frame_name(body)
+    return time, pose, frame_name(world), frame_name(body)
 
 
-def mount_matrix(extrinsic: list[float] | None) -> np.ndarray | None:
-    """body ← sensor (4, 4) from x, y, z, qx, qy, qz, qw. Raises `InvalidArgumentError`."""
+def mount_of(extrinsic: list[float] | None) -> Pose | None:
+    """body ← sensor from x, y, z, qx, qy, qz, qw. Raises `InvalidArgumentError`."""
     if extrinsic is None:
         return None
     try:
-        numbers = np.array([float(value) for value in extrinsic])
-        if numbers.shape != (7,):
+        numbers = [float(value) for value in extrinsic]
+        if len(numbers) != 7:
             raise ValueError
-        return pose_matrix(numbers[:3], numbers[3:])
+        return Pose.from_quaternion(numbers[:3], numbers[3:])
     except (TypeError, ValueError) as error:
         raise InvalidArgumentError(
             f"dataset.extrinsic={extrinsic} is not the sensor's pose on the body: give x, y, z (m), qx, qy, "

@@ -21,8 +21,9 @@ from gmmtorch.datasets.recordings.ros.pose_sources import RegisteredPoses
 from gmmtorch.datasets.recordings.ros.scan_conversion import ScanConversion
 from gmmtorch.datasets.recordings.ros.sensor_messages import Reading
 from gmmtorch.datasets.recordings.ros.transform_tree import frame_name, stamp_of
-from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, in_plane, increasing
+from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, increasing
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice
+from gmmtorch.pose import Pose
 from gmmtorch.scan import FARTHEST, Scan
 
 HEADER = "std_msgs/msg/Header"
@@ -125,13 +126,13 @@ class RosBag(Dataset):
         records = self._ordered(records)
         self._source = survey.source(records, self._where, sensor_frame)
         self._conversion = ScanConversion(sensor, ranges, self._source, deskew, camera)
-        self._records, self._matrices = self._posed(records)
+        self._records, self._in_space = self._posed(records)
         self._samples = self._first_readings()
         rate = Rate.of(records, clock)
         for index, found in self._samples.items():
             self._conversion.learn_times(found, self._records[index].stamp, rate)
-        self._is_flat = self._conversion.is_flat(self._matrices, self._samples.values())
-        self._poses = torch.from_numpy(in_plane(self._matrices) if self._is_flat else self._matrices)
+        self._is_flat = self._conversion.is_flat(self._in_space, self._samples.values())
+        self._poses = (self._in_space.in_plane() if self._is_flat else self._in_space).matrix
         seconds = [record.stamp / NANOSECONDS for record in self._records]
         self._times = torch.tensor(seconds, dtype=torch.float64)
 
@@ -156,14 +157,15 @@ class RosBag(Dataset):
         self._skip("stamp out of order (the clock jumped)", *left_out)
         return kept
 
-    def _posed(self, records: list[Record]) -> tuple[list[Record], np.ndarray]:
-        """The messages whose pose is known, and their poses (N, 4, 4)."""
-        matrices, known = np.empty((len(records), 4, 4)), np.empty(len(records), bool)
+    def _posed(self, records: list[Record]) -> tuple[list[Record], Pose]:
+        """The messages whose pose is known, and their poses in space (N)."""
+        poses, known = Pose.identity(3, len(records)), np.empty(len(records), bool)
         for frame in dict.fromkeys(record.frame for record in records):
             of_frame = np.array([i for i, record in enumerate(records) if record.frame == frame])
             times = np.array([records[i].stamp for i in of_frame])
-            matrices[of_frame], known[of_frame] = self._source.at(times, frame)
-        known &= (np.abs(matrices[:, :3, 3]) <= FARTHEST).all(1)
+            found, known[of_frame] = self._source.at(times, frame)
+            poses.rotation[of_frame], poses.translation[of_frame] = found.parts
+        known &= (poses.translation.abs() <= FARTHEST).all(1).numpy()
         if not known.any():
             first, last = records[0], records[-1]
             raise DataError(
@@ -175,7 +177,7 @@ class RosBag(Dataset):
             )
         unknown = (records[i].number for i in np.flatnonzero(~known))
         self._skip("no pose at the time of the scan", *unknown)
-        return [records[i] for i in np.flatnonzero(known)], matrices[known]
+        return [records[i] for i in np.flatnonzero(known)], poses[known]
 
     def _first_readings(self) -> dict[int, Reading]:
         """The first readings with points of ten, by index. Raises `DataError` if none can be decoded."""
@@ -197,24 +199,23 @@ class RosBag(Dataset):
         See `Dataset.turns`. TF states how the IMU is mounted. Where the IMU has no messages, rotations are
         NaN, and a warning states how many. Raises `InvalidArgumentError`, with the remedy, if all are.
         """
-        records, matrices = self._records[:: self.stride], self._matrices[:: self.stride]
+        records, poses = self._records[:: self.stride], self._in_space[:: self.stride]
         gyroscope = read_gyroscope(self._reader, self._imu_topic, self._clock)
         stamps = np.array([record.stamp for record in records])
         source = self._source
         frames = [source.sensor if isinstance(source, RegisteredPoses) else r.frame for r in records]
         turns = sensor_turns(gyroscope, self._tree, frames, stamps, self._max_gap)
         if self._is_flat:  # as the heading changes in the plane, also of a sensor on its head
-            motions = np.tile(np.eye(4), (len(turns) - 1, 1, 1))
-            motions[:, :3, :3] = turns[1:]
-            before, now = in_plane(matrices[:-1]), in_plane(matrices[:-1] @ motions)
-            turns = np.concatenate([np.eye(2)[None], (np.swapaxes(before, 1, 2) @ now)[:, :2, :2]])
-        return torch.from_numpy(turns)
+            turned = Pose(poses.rotation[:-1] @ turns[1:], poses.translation[:-1])
+            motions = poses[:-1].in_plane().inverse() @ turned.in_plane()
+            turns = torch.cat([torch.eye(2)[None].double(), motions.rotation])
+        return turns
 
     def _count(self) -> int:
         return len(self._records)
 
     def _read(self, index: int) -> Scan:
-        record, matrix = self._records[index], self._matrices[index]
+        record, pose = self._records[index], self._in_space[index]
 
         def skip(reason: str) -> None:
             self._skip(reason, record.number)
@@ -223,9 +224,9 @@ class RosBag(Dataset):
             found = self._samples.pop(index, None) or self._reading(index)
         except DataError:
             skip("message that cannot be decoded")
-            origin = torch.from_numpy(matrix[: 2 if self._is_flat else 3, 3].copy())
+            origin = pose.translation[: 2 if self._is_flat else 3].clone()
             return Scan(origin.new_empty(0, len(origin)), origin)
-        return self._conversion.scan(found, record.stamp, record.frame, matrix, self._is_flat, skip)
+        return self._conversion.scan(found, record.stamp, record.frame, pose, self._is_flat, skip)
 
     def _reading(self, index: int) -> Reading:
         record = self._records[index]

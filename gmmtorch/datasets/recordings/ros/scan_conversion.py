@@ -18,6 +18,7 @@ from gmmtorch.datasets.recordings.ros.point_times import N_SAMPLES, PointTimes, 
 from gmmtorch.datasets.recordings.ros.pose_sources import PoseSource, RegisteredPoses
 from gmmtorch.datasets.recordings.ros.sensor_messages import Reading
 from gmmtorch.errors import DataError
+from gmmtorch.pose import Pose
 from gmmtorch.scan import FARTHEST, Scan
 
 _LEVEL = math.cos(math.radians(10))
@@ -69,15 +70,15 @@ class ScanConversion:
         """Number of the first readings with points that show how the sensor measures."""
         return 1 if self._sensor.is_camera else _N_SHAPES if self._times is None else N_SAMPLES
 
-    def is_flat(self, matrices: np.ndarray, samples: Iterable[Reading]) -> bool:
-        """Whether scans are 2D: the sensor is level at all poses (N, 4, 4), and a laser or a planar lidar.
+    def is_flat(self, poses: Pose, samples: Iterable[Reading]) -> bool:
+        """Whether scans are 2D: the sensor is level at all poses, and a laser or a planar lidar.
 
         A lidar is planar if most of its samples are; those with few points do not count.
         """
         planar = [is_planar(found) for found in samples if len(found.points) >= _MIN_PLANAR]
         is_planar_cloud = not self._sensor.is_camera and 2 * sum(planar) > len(planar)
         is_planar_sensor = self._sensor.kind == bag_topics.LASER or is_planar_cloud
-        return is_planar_sensor and self.is_level(matrices)
+        return is_planar_sensor and self.is_level(poses)
 
     def learn_times(self, found: Reading, stamp: int, rate: Rate) -> None:
         """Learns from one of the first readings how the sensor states times of points."""
@@ -85,16 +86,16 @@ class ScanConversion:
             self._times.learn(found.times, stamp, rate)
 
     @staticmethod
-    def is_level(matrices: np.ndarray) -> bool:
-        """Whether the sensor stands upright, or on its head, at all poses (N, 4, 4)."""
-        return bool((np.abs(matrices[:, 2, 2]) > _LEVEL).all())
+    def is_level(poses: Pose) -> bool:
+        """Whether the sensor stands upright, or on its head, at all poses."""
+        return bool((poses.rotation[..., 2, 2].abs() > _LEVEL).all())
 
     def scan(
         self,
         found: Reading,
         stamp: int,
         frame: str,
-        matrix: np.ndarray,
+        pose: Pose,
         is_flat: bool,
         skip: Callable[[str], None],
     ) -> Scan:
@@ -102,12 +103,12 @@ class ScanConversion:
 
         Args:
             found: the points. stamp: of their message, ns. frame: of the sensor.
-            matrix: (4, 4) pose of the sensor at the stamp.
+            pose: of the sensor at the stamp.
             is_flat: whether scans are 2D.
             skip: is called with the reason if the scan has no points, lacks some, or is not deskewed.
         """
         dim = 2 if is_flat else 3
-        origin = torch.from_numpy(matrix[:dim, 3].copy())
+        origin = pose.translation[:dim].clone()
         if len(found.points) == 0:
             skip("message without a valid point")
         elif is_flat and not is_planar(found):
@@ -115,8 +116,8 @@ class ScanConversion:
             return Scan(origin.new_empty(0, dim), origin)
         found, offsets = self._timed(found, stamp, skip)
         if isinstance(self.source, RegisteredPoses):
-            matrix = self.source.of_points(stamp, frame)
-        ends = self._in_world(found.points, offsets, stamp, frame, matrix, skip)
+            pose = self.source.of_points(stamp, frame)
+        ends = self._in_world(found.points, offsets, stamp, frame, pose, skip)
         ends[(ends.abs() > FARTHEST).any(1)] = torch.nan  # no sensor measures them
         return self._ranges.scan(ends[:, :dim].contiguous(), origin, torch.from_numpy(found.no_return))
 
@@ -154,11 +155,11 @@ class ScanConversion:
         offsets: np.ndarray | None,
         stamp: int,
         frame: str,
-        matrix: np.ndarray,
+        pose: Pose,
         skip: Callable[[str], None],
     ) -> Tensor:
         """Points (N, 3) in the world frame, each with the pose of its own time (N,) if that is known."""
-        local, pose = torch.from_numpy(points), torch.from_numpy(matrix)
+        local = torch.from_numpy(points)
         if offsets is not None:
             first, last = int(offsets.min()), int(offsets.max())
             n_knots = min(_KNOTS, len(points)) if last > first else 1
@@ -166,10 +167,9 @@ class ScanConversion:
             poses = self.source.at(stamp + knots, frame)
             if poses.known.all():
                 nearest = np.round((offsets - first) * ((n_knots - 1) / max(last - first, 1)))
-                own = torch.from_numpy(poses.matrices)[torch.from_numpy(nearest.astype(np.int64))]
-                return (own[:, :3, :3] @ local[:, :, None])[:, :, 0] + own[:, :3, 3]
+                return poses.poses[nearest.astype(np.int64)].apply(local[:, None])[:, 0]
             skip("points not deskewed: no poses during the sweep")
-        return local @ pose[:3, :3].T + pose[:3, 3]
+        return pose.apply(local)
 
 
 def is_planar(found: Reading) -> bool:

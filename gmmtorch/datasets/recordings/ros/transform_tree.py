@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from gmmtorch.datasets.recordings.trajectory import MIN_NORM, NANOSECONDS, Poses, Trajectory, pose_matrix
+from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, PosesAt, Trajectory
 from gmmtorch.errors import DataError
+from gmmtorch.pose import MIN_NORM, Pose
 
 _TRAVEL = 0.1
 """A frame travels if it moves farther, in metres; noise and the joints of wheels do not."""
@@ -26,7 +27,7 @@ class TransformTree:
     def __init__(self, keep: float | None = None) -> None:
         self._keep = None if keep is None else int(keep * NANOSECONDS)
         self._samples: dict[str, tuple[array[int], array[float]]] = {}
-        self._static: dict[str, np.ndarray] = {}
+        self._static: dict[str, Pose] = {}
         self._parents: dict[str, Counter[str]] = {}
         self._edges: dict[str, Trajectory] = {}
 
@@ -37,7 +38,7 @@ class TransformTree:
             translation, rotation = entry["transform"]["translation"], entry["transform"]["rotation"]
             if static:
                 try:
-                    self._static[child] = transform_matrix(translation, rotation)
+                    self._static[child] = pose_of(translation, rotation)
                 except ValueError:
                     continue
             else:
@@ -117,16 +118,15 @@ class TransformTree:
             trees.setdefault(at, []).append(frame)
         return "; ".join(", ".join(frames) for frames in trees.values()) or "none"
 
-    def lookup(self, chain: list[str], times: np.ndarray, max_gap: float) -> Poses:
+    def lookup(self, chain: list[str], times: np.ndarray, max_gap: float) -> PosesAt:
         """Poses of the first frame of a chain in its last one, at times (M,) in ns."""
-        matrices = np.tile(np.eye(4), (len(times), 1, 1))
-        known = np.ones(len(times), bool)
+        poses, known = Pose.identity(3, len(times)), np.ones(len(times), bool)
         for child in chain[:-1]:
             step = self._step(child, times, max_gap)
-            matrices, known = step.matrices @ matrices, known & step.known
-        return Poses(matrices, known)
+            poses, known = step.poses @ poses, known & step.known
+        return PosesAt(poses, known)
 
-    def between(self, frame: str, other: str, times: np.ndarray, max_gap: float) -> Poses:
+    def between(self, frame: str, other: str, times: np.ndarray, max_gap: float) -> PosesAt:
         """Poses frame ← other of two frames at times (M,) in ns, from the nearest frame above both.
 
         Raises `DataError` if there is no such frame.
@@ -140,7 +140,7 @@ class TransformTree:
             )
         up = self.lookup(ours[: ours.index(top) + 1], times, max_gap)
         down = self.lookup(others[: others.index(top) + 1], times, max_gap)
-        return Poses(np.linalg.inv(up.matrices) @ down.matrices, up.known & down.known)
+        return PosesAt(up.poses.inverse() @ down.poses, up.known & down.known)
 
     def above(self, frame: str) -> list[str]:
         """A frame and those above it, as far as each has one parent."""
@@ -178,7 +178,7 @@ class TransformTree:
         """The diagonal (m) of the box around the positions of a frame in its parent."""
         if child not in self._samples or len(edge := self._edge(child)) == 0:
             return 0.0
-        return float(np.linalg.norm(np.ptp(edge.matrices[:, :3, 3], axis=0)))
+        return float(np.linalg.norm(np.ptp(edge.poses.translation.numpy(), axis=0)))
 
     def latest(self, chain: list[str]) -> int | None:
         """The time (ns) up to which all transforms of a chain are known; None if all are static."""
@@ -195,9 +195,9 @@ class TransformTree:
                 return f"{parent} ← {child} is known from {times[0]:.3f} to {times[-1]:.3f} s"
         return "all transforms are known"
 
-    def _step(self, child: str, times: np.ndarray, max_gap: float) -> Poses:
+    def _step(self, child: str, times: np.ndarray, max_gap: float) -> PosesAt:
         if child not in self._samples:
-            return Poses(np.tile(self._static[child], (len(times), 1, 1)), np.ones(len(times), bool))
+            return PosesAt(Pose.identity(3, len(times)) @ self._static[child], np.ones(len(times), bool))
         return self._edge(child).at(times, max_gap)
 
     def _edge(self, child: str) -> Trajectory:
@@ -205,7 +205,7 @@ class TransformTree:
             times, numbers = (np.array(column) for column in self._samples[child])
             numbers = numbers.reshape(-1, 7)
             valid = np.isfinite(numbers).all(1) & (np.linalg.norm(numbers[:, 3:], axis=1) > MIN_NORM)
-            poses = pose_matrix(numbers[valid, :3], numbers[valid, 3:])
+            poses = Pose.from_quaternion(numbers[valid, :3], numbers[valid, 3:])
             self._edges[child] = Trajectory.from_samples(times[valid], poses)
         return self._edges[child]
 
@@ -220,8 +220,6 @@ def stamp_of(header: dict[str, Any]) -> int:
     return int(header["stamp"]["sec"]) * NANOSECONDS + int(header["stamp"]["nanosec"])
 
 
-def transform_matrix(translation: dict[str, float], rotation: dict[str, float]) -> np.ndarray:
-    """The pose (4, 4) of a Transform or Pose message. Raises `ValueError` if it is not one."""
-    return pose_matrix(
-        np.array([translation[axis] for axis in "xyz"]), np.array([rotation[axis] for axis in "xyzw"])
-    )
+def pose_of(translation: dict[str, float], rotation: dict[str, float]) -> Pose:
+    """The pose of a Transform or Pose message. Raises `ValueError` if it is not one."""
+    return Pose.from_quaternion([translation[axis] for axis in "xyz"], [rotation[axis] for axis in "xyzw"])

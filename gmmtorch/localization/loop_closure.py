@@ -12,11 +12,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gmmtorch.localization.local_map import Expectation, Keyframe, LocalMap
 from gmmtorch.localization.location import Location
-from gmmtorch.localization.odometry.local_map import Expectation, Keyframe, LocalMap
-from gmmtorch.localization.odometry.pose_graph import Edges, optimised
-from gmmtorch.localization.rigid_motions import logarithm
+from gmmtorch.localization.pose_graph import Edges, optimised
 from gmmtorch.mapping import WindowedRule
+from gmmtorch.pose import Pose
 
 _ROUNDS = 3  # of closing and correcting: corrected poses bring more places together
 _APART = 15  # keyframes between two visits of a place
@@ -40,12 +40,12 @@ class _Closure(NamedTuple):
 
     source: int
     target: int
-    motion: Tensor
+    motion: Pose
     information: Tensor
 
 
 def closed(
-    poses: Tensor,
+    poses: Pose,
     edges: Edges,
     places: Sequence[tuple[int, Keyframe]],
     least_explained: float,
@@ -54,12 +54,14 @@ def closed(
     """The edges of a pose graph, with those of the loop closures that can be found.
 
     Args:
-        poses: (N, D+1, D+1), world ← sensor. edges: of odometry.
+        poses: (N), world ← sensor. edges: of odometry.
         places: number of the pose, and keyframe, in order.
     """
     tried: set[tuple[int, int]] = set()
     for _ in range(_ROUNDS):
-        pairs = [pair for pair in _candidates(poses[[at for at, _ in places]]) if pair not in tried]
+        pairs = [
+            pair for pair in _candidates(poses.translation[[at for at, _ in places]]) if pair not in tried
+        ]
         found = [edge for pair in pairs if (edge := _closure(poses, places, *pair, least_explained, rule))]
         tried.update(pairs)
         if not found:
@@ -92,13 +94,13 @@ class LoopCloser:
         """Whether the newest of n keyframes is searched for."""
         return n > _APART and n % _SPACING == 1
 
-    def corrected(self, keyframes: Sequence[Keyframe], edges: Edges) -> Tensor | None:
-        """Corrected poses (K, D+1, D+1) of K keyframes if the newest one closes a loop, otherwise None.
+    def corrected(self, keyframes: Sequence[Keyframe], edges: Edges) -> Pose | None:
+        """Corrected poses (K) of K keyframes if the newest one closes a loop, otherwise None.
 
         edges: of odometry, between successive keyframes.
         """
-        poses = torch.stack([frame.pose for frame in keyframes])
-        pairs = _candidates(poses, [len(keyframes) - 1])
+        poses = Pose.stack([frame.pose for frame in keyframes])
+        pairs = _candidates(poses.translation, [len(keyframes) - 1])
         places = list(enumerate(keyframes))
         found = _closure(poses, places, *pairs[0], self._least_explained, self._rule) if pairs else None
         if found is None:
@@ -113,42 +115,39 @@ class LoopCloser:
         return optimised(poses, edges.joined(_edges(self.closures)), with_covariances=False).poses
 
 
-def _agree(poses: Tensor, last: _Closure, now: _Closure) -> bool:
+def _agree(poses: Pose, last: _Closure, now: _Closure) -> bool:
     """Whether the last closure, moved along the poses to the ends of the new one, gives its motion."""
-    before = torch.linalg.solve(poses[now.source], poses[last.source])
-    after = torch.linalg.solve(poses[last.target], poses[now.target])
-    return not _is_beyond(torch.linalg.solve(now.motion, before @ last.motion @ after), _AGREE)
+    before = poses[now.source].inverse() @ poses[last.source]
+    after = poses[last.target].inverse() @ poses[now.target]
+    return not _is_beyond(now.motion.inverse() @ before @ last.motion @ after, _AGREE)
 
 
-def _is_noticed(poses: Tensor, closure: _Closure) -> bool:
+def _is_noticed(poses: Pose, closure: _Closure) -> bool:
     """Whether the poses disagree with a closure."""
-    between = torch.linalg.solve(poses[closure.source], poses[closure.target])
-    return _is_beyond(torch.linalg.solve(closure.motion, between), _NOTICED)
+    between = poses[closure.source].inverse() @ poses[closure.target]
+    return _is_beyond(closure.motion.inverse() @ between, _NOTICED)
 
 
-def _is_beyond(motion: Tensor, limits: tuple[float, float]) -> bool:
-    """Whether a motion (D+1, D+1) is longer than a shift (m) or turns by more than an angle (rad)."""
-    dim = len(motion) - 1
-    step = logarithm(motion[None])[0]
-    return bool(step[:dim].norm() > limits[0]) or bool(step[dim:].norm() > limits[1])
+def _is_beyond(motion: Pose, limits: tuple[float, float]) -> bool:
+    """Whether a motion is longer than a shift (m) or turns by more than an angle (rad)."""
+    return bool(motion.translation.norm() > limits[0]) or bool(motion.angle() > limits[1])
 
 
 def _edges(closures: Sequence[_Closure]) -> Edges:
     source, target, motions, information = zip(*closures, strict=True)
     is_closure = torch.ones(len(closures), dtype=torch.bool)
     return Edges(
-        torch.tensor(source), torch.tensor(target), torch.stack(motions), torch.stack(information), is_closure
+        torch.tensor(source), torch.tensor(target), Pose.stack(motions), torch.stack(information), is_closure
     )
 
 
-def _candidates(poses: Tensor, rows: Sequence[int] | None = None) -> list[tuple[int, int]]:
+def _candidates(at: Tensor, rows: Sequence[int] | None = None) -> list[tuple[int, int]]:
     """Pairs (old, new) of rows of keyframes that may be at one place: for each new one, the nearest.
 
-    poses: (K, D+1, D+1) of the keyframes. rows: new ones; None: every third.
+    at: positions (K, D) of the keyframes. rows: new ones; None: every third.
     """
-    if not len(poses):
+    if not len(at):
         return []
-    at = poses[:, :-1, -1]
     path = torch.cat([torch.zeros(1), (at[1:] - at[:-1]).norm(dim=1)]).cumsum(0)
     order = torch.arange(len(at))
     new = order if rows is None else torch.tensor(rows)
@@ -165,7 +164,7 @@ def _candidates(poses: Tensor, rows: Sequence[int] | None = None) -> list[tuple[
 
 
 def _closure(
-    poses: Tensor,
+    poses: Pose,
     places: Sequence[tuple[int, Keyframe]],
     old: int,
     new: int,
@@ -179,20 +178,17 @@ def _closure(
         [places[row][1]._replace(pose=poses[places[row][0]]) for row in order], least_explained, rule
     )
     source, target = places[old][0], places[new][0]
-    expected = Expectation(poses[target][None], _REACH / 2, _ANGLE, _MOST_EXPLAINED)
+    expected = Expectation(poses[[target]], _REACH / 2, _ANGLE, _MOST_EXPLAINED)
     location = local.locate(places[new][1], expected)
     if not location.found or location.explained < _MOST_EXPLAINED:
         return None
-    motion = torch.linalg.solve(poses[source], location.pose)
+    motion = poses[source].inverse() @ Pose.from_matrix(location.pose)
     return _Closure(source, target, motion, information_of(location))
 
 
 def information_of(location: Location) -> Tensor:
     """The inverse covariance (F, F) of a location in the frame of the sensor."""
-    dim = len(location.pose) - 1
-    turn = torch.eye(len(location.covariance)).double()
-    turn[:dim, :dim] = location.pose[:dim, :dim]
-    if dim == 3:
-        turn[3:, 3:] = location.pose[:dim, :dim]
-    covariance = location.covariance + torch.diag(_SYSTEMATIC[dim].square())
+    pose = Pose.from_matrix(location.pose)
+    turn = Pose(pose.rotation, torch.zeros_like(pose.translation)).adjoint()
+    covariance = location.covariance + torch.diag(_SYSTEMATIC[pose.dim].square())
     return torch.linalg.inv(turn.T @ covariance @ turn)

@@ -21,7 +21,7 @@ from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.localization.rigid_motions import generators, logarithm
+from gmmtorch.pose import Pose
 
 _SETTLED = 1e-7  # metres and radians: a smaller step ends the optimisation
 _MOST_STEPS = 100
@@ -31,40 +31,45 @@ _COLUMNS = 256  # of the inverse at a time
 
 
 class Edges(NamedTuple):
-    """E measured motions: source, target (E,); motions (E, D+1, D+1), source ← target, metres; information
-    (E, F, F), the inverse covariance of a shift (m) and a turn (rad) in the frame of the target; and whether
-    an edge is a closure (E,), which may be wrong.
+    """E measured motions: source, target (E,); motions (E), source ← target; information (E, F, F), the
+    inverse covariance of a shift (m) and a turn (rad) in the frame of the target; and whether an edge is a
+    closure (E,), which may be wrong.
     """
 
     source: Tensor
     target: Tensor
-    motions: Tensor
+    motions: Pose
     information: Tensor
     is_closure: Tensor
 
     def joined(self, others: Edges) -> Edges:
-        return Edges(*(torch.cat(pair) for pair in zip(self, others, strict=True)))
+        return Edges(
+            torch.cat([self.source, others.source]),
+            torch.cat([self.target, others.target]),
+            Pose.cat([self.motions, others.motions]),
+            torch.cat([self.information, others.information]),
+            torch.cat([self.is_closure, others.is_closure]),
+        )
 
     def at(self, rows: Tensor) -> Edges:
-        return Edges(*(value[rows] for value in self))
+        source, target, motions, information, is_closure = self
+        return Edges(source[rows], target[rows], motions[rows], information[rows], is_closure[rows])
 
 
 class OptimisedPoses(NamedTuple):
-    """Poses (N, D+1, D+1), world ← sensor; covariances (N, F, F) of a shift (m) and a turn (rad) in the
+    """Poses (N), world ← sensor; covariances (N, F, F) of a shift (m) and a turn (rad) in the
     frame of the sensor, zero for the first pose, NaN if they were not asked for; weight (E,) of each edge,
     near 0 for a rejected closure; and whether the last step was small.
     """
 
-    poses: Tensor
+    poses: Pose
     covariances: Tensor
     weights: Tensor
     converged: bool
 
 
-def optimised(
-    poses: Tensor, edges: Edges, scale: float = 3.0, with_covariances: bool = True
-) -> OptimisedPoses:
-    """The poses (N, D+1, D+1) that agree best with the edges, from a first guess; the first one stays.
+def optimised(poses: Pose, edges: Edges, scale: float = 3.0, with_covariances: bool = True) -> OptimisedPoses:
+    """The poses (N) that agree best with the edges, from a first guess; the first one stays.
 
     scale: deviations c at which a closure loses most of its weight. with_covariances: their time is
     proportional to N².
@@ -75,31 +80,31 @@ def optimised(
     n, free = len(poses), edges.information.shape[1]
     _check(n, edges)
     if n == 1:
-        return OptimisedPoses(poses, poses.new_zeros(1, free, free), edges.source.new_ones(0).double(), True)
+        return OptimisedPoses(poses, torch.zeros(1, free, free).double(), torch.ones(0).double(), True)
     wide, step = scale * _FIRST_SCALE**0.5, torch.full((1,), torch.inf)
     for _ in range(_MOST_STEPS):
         weights = _weights(poses, edges, max(wide, scale))
         hessian, gradient = _normal_equations(poses, edges, weights)
         step = torch.from_numpy(splu(hessian).solve(-gradient)).view(n - 1, free)
-        poses = torch.cat([poses[:1], _moved(poses[1:], step)])
+        poses = Pose.cat([poses[:1], _moved(poses[1:], step)])
         if float(step.abs().max()) < _SETTLED and wide <= scale:
             break
         wide *= _NARROWING
     weights = _weights(poses, edges, scale)
     converged = float(step.abs().max()) < _SETTLED
     if not with_covariances:
-        return OptimisedPoses(poses, torch.full((n, free, free), torch.nan).to(poses), weights, converged)
+        return OptimisedPoses(poses, torch.full((n, free, free), torch.nan).double(), weights, converged)
     hessian, _ = _normal_equations(poses, edges, weights)
     return OptimisedPoses(poses, _marginals(hessian, n, free), weights, converged)
 
 
-def residuals(poses: Tensor, edges: Edges) -> Tensor:
+def residuals(poses: Pose, edges: Edges) -> Tensor:
     """e_ij (E, F) of the edges: a shift (m) and a turn (rad)."""
-    between = torch.linalg.solve(poses[edges.source], poses[edges.target])
-    return logarithm(torch.linalg.solve(edges.motions, between))
+    between = poses[edges.source].inverse() @ poses[edges.target]
+    return (edges.motions.inverse() @ between).log()
 
 
-def square_errors(poses: Tensor, edges: Edges) -> Tensor:
+def square_errors(poses: Pose, edges: Edges) -> Tensor:
     """e_ijᵀ Σ_ij⁻¹ e_ij (E,)."""
     error = residuals(poses, edges)
     return torch.einsum("ei,eij,ej->e", error, edges.information, error)
@@ -124,20 +129,20 @@ def _check(n: int, edges: Edges) -> None:
         raise InvalidArgumentError(f"edges do not connect pose {apart[0]} with the first one; add an edge.")
 
 
-def _weights(poses: Tensor, edges: Edges, scale: float) -> Tensor:
+def _weights(poses: Pose, edges: Edges, scale: float) -> Tensor:
     """Of each edge (E,): ρ′ of its square error."""
     square = square_errors(poses, edges)
     return torch.where(edges.is_closure, (1 + square / scale**2).reciprocal().square(), 1.0)
 
 
-def _normal_equations(poses: Tensor, edges: Edges, weights: Tensor) -> tuple[csc_matrix, np.ndarray]:
+def _normal_equations(poses: Pose, edges: Edges, weights: Tensor) -> tuple[csc_matrix, np.ndarray]:
     """The Gauss–Newton Hessian and the gradient for steps of all poses but the first one, in their frames.
 
     With T_i ← T_i Exp(x_i): ∂e/∂x_j ≈ I and ∂e/∂x_i ≈ −Ad(T_j⁻¹ T_i), which is exact where e = 0.
     """
     n, free = len(poses), edges.information.shape[1]
     error = residuals(poses, edges)
-    before = -_adjoint(torch.linalg.solve(poses[edges.target], poses[edges.source]))
+    before = -(poses[edges.target].inverse() @ poses[edges.source]).adjoint()
     after = torch.eye(free).to(before).expand_as(before)
     information = weights[:, None, None] * edges.information
     rows, columns, values = [], [], []
@@ -174,31 +179,6 @@ def _marginals(hessian: csc_matrix, n: int, free: int) -> Tensor:
     return (covariances + covariances.mT) / 2
 
 
-# -- motions --------------------------------------------------------------------------------------
-
-
-def _moved(poses: Tensor, steps: Tensor) -> Tensor:
-    """Poses (N, D+1, D+1) moved by steps (N, F), a shift and a turn in their own frames."""
-    dim = poses.shape[1] - 1
-    turn = torch.einsum("nk,kij->nij", steps[:, dim:], generators(dim).to(steps))
-    moved = poses.clone()
-    moved[:, :dim, :dim] = poses[:, :dim, :dim] @ torch.linalg.matrix_exp(turn)
-    moved[:, :dim, dim] += (poses[:, :dim, :dim] @ steps[:, :dim, None])[:, :, 0]
-    return moved
-
-
-def _adjoint(motions: Tensor) -> Tensor:
-    """(E, F, F): a shift and a turn in the source's frame, as they appear in the target's frame."""
-    dim = motions.shape[1] - 1
-    rotation, translation = motions[:, :dim, :dim], motions[:, :dim, dim]
-    basis = generators(dim).to(motions)
-    free = dim + len(basis)
-    found = motions.new_zeros(len(motions), free, free)
-    found[:, :dim, :dim] = rotation
-    if dim == 2:
-        found[:, :2, 2] = -(basis[0] @ translation[:, :, None])[:, :, 0]
-        found[:, 2, 2] = 1
-        return found
-    found[:, 3:, 3:] = rotation
-    found[:, :3, 3:] = torch.einsum("ek,kij->eij", translation, basis) @ rotation
-    return found
+def _moved(poses: Pose, steps: Tensor) -> Pose:
+    """Poses (N) moved by steps (N, F), a shift and a turn in their own frames."""
+    return poses @ Pose.from_turn(steps[:, poses.dim :], steps[:, : poses.dim])

@@ -1,4 +1,9 @@
-"""LocalMap: the surfaces around a moving sensor, from its last keyframes, in which the next scan is found."""
+"""LocalMap: the surfaces and the free space around a moving sensor, in which the next scan is found.
+
+Each keyframe is also kept as a range image: the nearest return in each direction. A point of another scan is,
+in such an image, in front of the surface (free space, which contradicts it), on the surface, or behind it or
+outside the field of view (unknown).
+"""
 
 from __future__ import annotations
 
@@ -10,12 +15,18 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gmmtorch.localization.alignment import (
+    Alignment,
+    AlignmentTarget,
+    align,
+    differences,
+    distinct,
+    seen_normals,
+)
 from gmmtorch.localization.location import CORRELATED, Location, pose_covariance
-from gmmtorch.localization.odometry.free_space import FreeSpace, View
-from gmmtorch.localization.registration.alignment import Alignment, AlignmentTarget, align, seen_normals
-from gmmtorch.localization.registration.registration import register
-from gmmtorch.localization.rigid_motions import Motions, distinct, generators, logarithm
+from gmmtorch.localization.registration import register
 from gmmtorch.mapping import Components, WindowedRule, learn_window, surface_mixture
+from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 
 _BLURS = {2: (0.2, 0.08, 0.03), 3: (0.25, 0.1, 0.04)}  # metres
@@ -51,23 +62,28 @@ _USUAL = 0.85  # of the share that is expected to be explained: less, and the se
 _ALIKE = 2.0  # nats by which another pose must be worse
 
 
+_IMAGE_CELL = {2: math.radians(1), 3: math.radians(3)}  # of an image
+_MARGIN = 0.25, 0.02  # metres, and share of the range, that a point may be in front of or behind a surface
+_KEPT_POINTS = 200  # of each earlier scan, that a new scan must not look through
+
+
 class Keyframe(NamedTuple):
-    """A scan that stays: its points (N, D) and their mixture, in the frame of the sensor, and its pose
-    (D+1, D+1), world ← sensor.
+    """A scan that stays: its points (N, D) and their mixture, in the frame of the sensor, and its pose,
+    world ← sensor.
     """
 
     points: Tensor
     mixture: Components
-    pose: Tensor
+    pose: Pose
 
 
 class Expectation(NamedTuple):
-    """Where a scan is expected: poses (B, D+1, D+1), world ← sensor; the standard deviations of the first one
+    """Where a scan is expected: poses (B), world ← sensor; the standard deviations of the first one
     (m, rad); the share of its points that is usually explained; and the largest shift (m) and turn (rad) from
     the nearest of the poses.
     """
 
-    poses: Tensor
+    poses: Pose
     distance: float
     angle: float
     explained: float
@@ -96,19 +112,20 @@ class LocalMap:
     ) -> None:
         self.least_explained, self.n_points = least_explained, n_points
         self.dim = keyframes[0].points.shape[1]
-        self._center = keyframes[-1].pose[: self.dim, self.dim]
+        self._center = keyframes[-1].pose.translation
         # One mixture of all points: where many scans overlap, a sum of their mixtures would outweigh the
         # surfaces that only one of them saw, and pull the next scan back.
-        scans = [Scan(frame.points, torch.zeros(self.dim)).transformed(frame.pose) for frame in keyframes]
+        scans = [
+            Scan(frame.points, torch.zeros(self.dim)).transformed(frame.pose.matrix) for frame in keyframes
+        ]
         self._components = learn_window(scans, rule, torch.Generator().manual_seed(0))
         mixture = surface_mixture(self._components, "the local map")
         centered = mixture._replace(means=mixture.means - self._center)
         normals = seen_normals(self._components)
         self._target = functools.partial(AlignmentTarget, centered, normals=normals)
         self._targets = [self._target(blur) for blur in _BLURS[self.dim]]
-        self._space = FreeSpace(
-            [frame.points for frame in keyframes], torch.stack([frame.pose for frame in keyframes])
-        )
+        poses = Pose.stack([frame.pose for frame in keyframes])
+        self._space = FreeSpace([frame.points for frame in keyframes], poses)
 
     def locate(self, scan: Keyframe, expected: Expectation) -> Location:
         """The pose of a scan, whose own pose is not used; `found` if it is sure."""
@@ -125,25 +142,25 @@ class LocalMap:
 
     def _searches(
         self, scan: Keyframe, expected: Expectation
-    ) -> Iterator[tuple[Tensor, list[AlignmentTarget]]]:
+    ) -> Iterator[tuple[Pose, list[AlignmentTarget]]]:
         """Starts, and the levels they climb; the cheapest search first."""
         near = expected._replace(distance=min(expected.distance, _NEAR), angle=min(expected.angle, _NEAR / 2))
         starts = self._lattice(scan, near, self._targets[0], _SPACING[self.dim])
         if self.dim == 3:
-            registered = register(scan.mixture, self._components, expected.poses).transform
-            starts = torch.cat([registered[None], starts])
+            registered = register(scan.mixture, self._components, expected.poses.matrix).transform
+            starts = Pose.cat([Pose.from_matrix(registered[None]), starts])
         yield starts, self._targets
         coarse = self._target(_COARSE[self.dim])
         wide = expected._replace(distance=_FARTHEST / 2, angle=math.pi / 2)
         starts = self._lattice(scan, wide, coarse, coarse.blur)
         yield starts, [coarse, *self._targets]
         if self.dim == 3:
-            registered = register(scan.mixture, self._components, starts, coarsest=coarse.blur).transform
-            yield registered[None], self._targets
+            found = register(scan.mixture, self._components, starts.matrix, coarsest=coarse.blur)
+            yield Pose.from_matrix(found.transform[None]), self._targets
 
     def _lattice(
         self, scan: Keyframe, expected: Expectation, target: AlignmentTarget, spacing: float
-    ) -> Tensor:
+    ) -> Pose:
         """The expected poses, and the best of the starts around them, `spacing` metres apart."""
         reach = math.ceil(min(2 * expected.distance, _FARTHEST) / spacing)
         side = torch.arange(-reach, reach + 1).double() * spacing
@@ -151,33 +168,33 @@ class LocalMap:
         turn = _TURNED[self.dim] * spacing
         n_turns = math.ceil(min(2 * expected.angle, math.pi) / turn)
         angles = torch.arange(-n_turns, n_turns + 1).double() * turn
-        turns = torch.linalg.matrix_exp(angles[:, None, None] * generators(self.dim)[-1])
-        poses = expected.poses[:, None, None].repeat(1, len(shifts), len(turns), 1, 1)
-        poses[..., :-1, -1] += shifts[None, :, None]
-        poses[..., :-1, :-1] = turns @ poses[..., :-1, :-1]
-        starts = torch.cat([expected.poses, poses.flatten(0, 2)])
+        turns = Pose.from_yaw(angles, torch.zeros(self.dim).double()).rotation
+        rotations = (turns @ expected.poses.rotation[:, None, None]).expand(-1, len(shifts), -1, -1, -1)
+        places = (expected.poses.translation[:, None] + shifts)[:, :, None].expand(-1, -1, len(turns), -1)
+        starts = Pose.cat([expected.poses, Pose(rotations.flatten(0, 2), places.flatten(0, 2))])
         points = scan.points[:_RANKED]
-        score = torch.cat([target.sums(points, self._motions(part)).score for part in starts.split(_AT_ONCE)])
+        parts = torch.arange(len(starts)).split(_AT_ONCE)
+        score = torch.cat([target.sums(points, self._about(starts[part])).score for part in parts])
         total = score / CORRELATED - self._unlikely(starts, expected)
         best = total.argsort(descending=True, stable=True)[: _SORTED[self.dim]]
         view = self._space.view(points, starts[best])
         against = _CONTRADICTED * (view.in_free_space + view.looked_through) - _UNKNOWN * view.unknown
         total = total[best] - against * len(points) / CORRELATED
         starts = starts[best[total.argsort(descending=True, stable=True)]]
-        starts = starts[distinct(self._motions(starts), _SPREAD * spacing, _SPREAD * turn)]
-        return torch.cat([expected.poses, starts[: _CLIMBED[self.dim]]])
+        starts = starts[distinct(starts, _SPREAD * spacing, _SPREAD * turn)]
+        return Pose.cat([expected.poses, starts[: _CLIMBED[self.dim]]])
 
     def _climbed(
-        self, scan: Keyframe, expected: Expectation, starts: Tensor, targets: list[AlignmentTarget]
+        self, scan: Keyframe, expected: Expectation, starts: Pose, targets: list[AlignmentTarget]
     ) -> _Found:
-        motions, kept = self._motions(starts), len(starts)
+        motions, kept = self._about(starts), len(starts)
         for target in targets:
             points = scan.points[: self.n_points if target is targets[-1] else _COARSE_POINTS]
             found = align(points, target, motions, _STEPS)
             kept = max(kept // 3, 3)
             total, view = self._total(found, points, expected)
             order = total.argsort(descending=True, stable=True)
-            order = order[distinct(found.motions.at(order), target.blur / 2, target.blur / 2)]
+            order = order[distinct(found.motions[order], target.blur / 2, target.blur / 2)]
             order = order[:kept]
             found, total, view = found.at(order), total[order], view.at(order)
             motions = found.motions
@@ -194,7 +211,7 @@ class LocalMap:
 
     def _total(self, found: Alignment, points: Tensor, expected: Expectation) -> tuple[Tensor, View]:
         """Log-likelihood of the points and of the motion (B,), nats; how the points agree with free space."""
-        poses = self._poses(found.motions)
+        poses = self._placed(found.motions)
         view = self._space.view(points, poses)
         contradicted = view.in_free_space + view.looked_through
         mean = (
@@ -202,11 +219,10 @@ class LocalMap:
         )
         return mean * len(points) / CORRELATED - self._unlikely(poses, expected), view
 
-    def _unlikely(self, poses: Tensor, expected: Expectation) -> Tensor:
+    def _unlikely(self, poses: Pose, expected: Expectation) -> Tensor:
         """Half the square deviation (B,) of poses from the nearest expected one."""
-        shift = torch.cdist(poses[:, :-1, -1], expected.poses[:, :-1, -1])
-        chord = torch.linalg.matrix_norm(poses[:, None, :-1, :-1] - expected.poses[:, :-1, :-1])
-        turned = 2 * (chord / math.sqrt(8)).clamp_max(1).asin()
+        shift = torch.cdist(poses.translation, expected.poses.translation)
+        turned = (poses[:, None].inverse() @ expected.poses).angle()
         is_near = (shift <= expected.max_step) & (turned <= expected.max_turn)
         square = (shift / expected.distance).square() + (turned / expected.angle).square()
         return square.amin(1) / 2 + torch.where(is_near.any(1), 0.0, _NEVER)
@@ -215,10 +231,9 @@ class LocalMap:
         self, points: Tensor, found: Alignment, total: Tensor, view: View, expected: Expectation
     ) -> _Found:
         """The best pose; if others explain the scan nearly as well, the most expected one, with a doubt."""
-        poses = self._poses(found.motions)
-        shift = (poses[:, :-1, -1] - poses[0, :-1, -1]).norm(dim=1)
-        turn = torch.linalg.matrix_norm(poses[:, :-1, :-1] - poses[0, :-1, :-1]) / math.sqrt(2)
-        rivals = ((shift > _APART) | (turn > _APART)) & (total >= total[0] - _ALIKE)
+        poses = self._placed(found.motions)
+        is_apart = differences(poses, poses[:1], _APART, _APART)[:, 0] > 1
+        rivals = is_apart & (total >= total[0] - _ALIKE)
         chosen = rivals | (torch.arange(len(total)) == 0)
         best = int(torch.where(chosen, self._unlikely(poses, expected), torch.inf).argmin())
         covariance, loosest = pose_covariance(found.information[best], points)
@@ -238,29 +253,26 @@ class LocalMap:
         if bool(rivals.any()):
             doubts.append("another pose explains the scan as well")
             covariance = covariance + _scatter(poses[best], poses[chosen])
-        return _Found(
-            Location(poses[best], covariance, share, tuple(doubts)), float(total[best]), contradicted
-        )
+        location = Location(poses[best].matrix, covariance, share, tuple(doubts))
+        return _Found(location, float(total[best]), contradicted)
 
-    def _motions(self, poses: Tensor) -> Motions:
-        return Motions(poses[:, :-1, :-1], poses[:, :-1, -1] - self._center)
+    def _about(self, poses: Pose) -> Pose:
+        """Poses in the world, about the centre of the map."""
+        return Pose(poses.rotation, poses.translation - self._center)
 
-    def _poses(self, motions: Motions) -> Tensor:
-        poses = torch.eye(self.dim + 1).double().repeat(len(motions.rotations), 1, 1)
-        left, _, right = torch.linalg.svd(motions.rotations)
-        poses[:, :-1, :-1] = left @ right
-        poses[:, :-1, -1] = motions.translations + self._center
-        return poses
+    def _placed(self, motions: Pose) -> Pose:
+        """Poses about the centre of the map, in the world."""
+        return Pose(motions.orthonormal().rotation, motions.translation + self._center)
 
 
-def _slid(found: Alignment, points: Tensor) -> Motions:
+def _slid(found: Alignment, points: Tensor) -> Pose:
     """The first motion, moved along the direction that the points fix least, by up to two deviations."""
     covariance, loosest = pose_covariance(found.information[0], points)
     scale = torch.ones(len(covariance)).double()
     scale[points.shape[1] :] = 1 / points.norm(dim=1).median().clamp_min(1e-3)
     axis = torch.linalg.eigh(covariance / scale[:, None] / scale)[1][:, -1] * scale
     steps = torch.linspace(-1, 1, _SLIDES).double() * min(2 * loosest, _SLIDE)
-    return found.motions.at(torch.zeros(_SLIDES, dtype=torch.int64)).moved(steps[:, None] * axis)
+    return found.motions[[0] * _SLIDES].moved(steps[:, None] * axis)
 
 
 def nowhere(dim: int) -> Tensor:
@@ -270,10 +282,100 @@ def nowhere(dim: int) -> Tensor:
     return torch.diag(deviations.square())
 
 
-def _scatter(pose: Tensor, others: Tensor) -> Tensor:
-    """The second moment (F, F) of other poses (B, D+1, D+1) about a pose, where each may be the true one."""
-    off = others.clone()
-    off[:, :-1, :-1] = others[:, :-1, :-1] @ pose[:-1, :-1].T
-    off[:, :-1, -1] -= pose[:-1, -1]
-    steps = logarithm(off)
+def _scatter(pose: Pose, others: Pose) -> Tensor:
+    """The second moment (F, F) of other poses (B) about a pose, where each may be the true one."""
+    turned = others.rotation @ pose.rotation.T
+    steps = Pose(turned, others.translation - pose.translation).log()
     return steps.T @ steps / len(steps)
+
+
+# -- free space -----------------------------------------------------------------------------------
+
+
+class View(NamedTuple):
+    """Of B poses: shares (B,) of the points that lie in free space, of the points that no earlier scan could
+    see, and of the earlier points that the scan looks through.
+    """
+
+    in_free_space: Tensor
+    unknown: Tensor
+    looked_through: Tensor
+
+    def at(self, rows: Tensor) -> View:
+        return View(*(value[rows] for value in self))
+
+
+class FreeSpace:
+    """What some scans saw, as range images.
+
+    Args:
+        points: (N, D) of each scan, in the frame of its sensor, metres.
+        poses: (K), world ← sensor, one for each scan.
+    """
+
+    def __init__(self, points: Sequence[Tensor], poses: Pose) -> None:
+        images = [range_image(one) for one in points]
+        self._nearest, self._farthest = (torch.stack(part) for part in zip(*images, strict=True))
+        self._inverse = poses.inverse()
+        some = [one[:: math.ceil(len(one) / _KEPT_POINTS) or 1] for one in points]
+        self._points = torch.cat([poses[row].apply(part) for row, part in enumerate(some)])
+
+    def view(self, points: Tensor, poses: Pose) -> View:
+        """How a scan's points (N, D) agree with the space that was seen, at poses (B)."""
+        there = self._inverse[:, None].apply(poses.apply(points))  # (K, B, N, D)
+        free, known = _compared(there, self._nearest, self._farthest)
+        free_anywhere = free.any(0)
+        is_unknown = ~(known.any(0) | free_anywhere)
+        seen = poses.inverse().apply(self._points)
+        nearest, farthest = range_image(points)
+        through, met = _compared(seen[None], nearest[None], farthest[None])
+        through, met = through[0], met[0]
+        share = through.sum(1) / (through | met).sum(1).clamp_min(_KEPT_POINTS // 4)
+        return View(free_anywhere.double().mean(1), is_unknown.double().mean(1), share.double())
+
+
+def range_image(points: Tensor) -> tuple[Tensor, Tensor]:
+    """The nearest return (C,) around each direction, and the farthest in it; infinity and zero without."""
+    dim = points.shape[1]
+    cells, distance = _cells(points)
+    across, high = _size(dim)
+    nearest = torch.full((across * high,), math.inf).to(points).scatter_reduce(0, cells, distance, "amin")
+    farthest = torch.zeros(across * high).to(points).scatter_reduce(0, cells, distance, "amax")
+    sides = nearest.view(high, across)
+    sides = torch.minimum(sides, torch.minimum(sides.roll(1, 1), sides.roll(-1, 1)))
+    if dim == 3:
+        up = torch.nn.functional.pad(sides[None, None], (0, 0, 1, 1), value=math.inf)[0, 0]
+        sides = torch.minimum(sides, torch.minimum(up[2:], up[:-2]))
+    around = torch.where(farthest > 0, sides.flatten(), math.inf)
+    return around, farthest
+
+
+def _compared(points: Tensor, nearest: Tensor, farthest: Tensor) -> tuple[Tensor, Tensor]:
+    """Whether points (K, B, N, D) are in front of the surfaces of K images, and whether they are on them."""
+    cells, distance = _cells(points)
+    flat = cells.flatten(1)
+    near = nearest.gather(1, flat).view_as(distance)
+    far = farthest.gather(1, flat).view_as(distance)
+    margin = _MARGIN[0] + _MARGIN[1] * distance
+    is_seen = torch.isfinite(near)
+    return is_seen & (distance < near - margin), is_seen & (distance >= near - margin) & (
+        distance <= far + margin
+    )
+
+
+def _cells(points: Tensor) -> tuple[Tensor, Tensor]:
+    """The cell of each point's direction, and its distance."""
+    dim = points.shape[-1]
+    across, high = _size(dim)
+    distance = points.norm(dim=-1)
+    column = (torch.atan2(points[..., 1], points[..., 0]) / _IMAGE_CELL[dim]).round().long() % across
+    if dim == 2:
+        return column, distance
+    sine = points[..., 2] / distance.clamp_min(1e-9)
+    row = ((sine.clamp(-1, 1).asin() + math.pi / 2) / _IMAGE_CELL[dim]).long().clamp_max(high - 1)
+    return row * across + column, distance
+
+
+def _size(dim: int) -> tuple[int, int]:
+    across = round(2 * math.pi / _IMAGE_CELL[dim])
+    return across, 1 if dim == 2 else across // 2

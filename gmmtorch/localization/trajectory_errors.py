@@ -18,7 +18,7 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_whole
-from gmmtorch.linalg import check_rigid
+from gmmtorch.pose import Pose
 
 Alignment = Literal["none", "first", "rigid"]
 ALIGNMENTS: tuple[Alignment, ...] = ("none", "first", "rigid")
@@ -55,7 +55,7 @@ def absolute_trajectory_error(
 ) -> PoseErrors:
     """Errors of poses (N, D+1, D+1) against the true poses of the same times, after `aligned`."""
     given, true = _checked(estimate, truth, 1)
-    return _errors(torch.linalg.solve(true, aligned(given, true, align)))
+    return _errors(true.inverse() @ _aligned(given, true, align))
 
 
 def relative_pose_error(estimate: ArrayLike, truth: ArrayLike, delta: int = 1) -> PoseErrors:
@@ -66,8 +66,8 @@ def relative_pose_error(estimate: ArrayLike, truth: ArrayLike, delta: int = 1) -
     """
     check_whole("delta", delta, 1)
     given, true = _checked(estimate, truth, delta + 1)
-    moved, expected = (torch.linalg.solve(poses[:-delta], poses[delta:]) for poses in (given, true))
-    return _errors(torch.linalg.solve(expected, moved))
+    moved, expected = (poses[:-delta].inverse() @ poses[delta:] for poses in (given, true))
+    return _errors(expected.inverse() @ moved)
 
 
 def aligned(estimate: ArrayLike, truth: ArrayLike, align: Alignment = "rigid") -> Tensor:
@@ -79,17 +79,20 @@ def aligned(estimate: ArrayLike, truth: ArrayLike, align: Alignment = "rigid") -
     Raises `InvalidArgumentError` for poses of other shapes, for poses that are not rigid, and for `rigid` if
     the positions lie on a line (in 2D, in a point), so that they determine no rotation.
     """
+    return _aligned(*_checked(estimate, truth, 1), align).matrix
+
+
+def _aligned(given: Pose, true: Pose, align: Alignment) -> Pose:
     check_choice("align", align, ALIGNMENTS)
-    given, true = _checked(estimate, truth, 1)
     if align == "none":
         return given
     if align == "first":
-        return true[0] @ torch.linalg.solve(given[0], given)
-    return _umeyama(given[:, :-1, -1], true[:, :-1, -1]) @ given
+        return true[0] @ given[0].inverse() @ given
+    return _umeyama(given.translation, true.translation) @ given
 
 
-def _umeyama(positions: Tensor, true: Tensor) -> Tensor:
-    """The motion (D+1, D+1) that lays positions (N, D) over the true ones with the least squares."""
+def _umeyama(positions: Tensor, true: Tensor) -> Pose:
+    """The motion that lays positions (N, D) over the true ones with the least squares."""
     dim = positions.shape[1]
     center, true_center = positions.mean(0), true.mean(0)
     left, values, right = torch.linalg.svd((true - true_center).T @ (positions - center))
@@ -100,21 +103,16 @@ def _umeyama(positions: Tensor, true: Tensor) -> Tensor:
         )
     flip = torch.ones_like(values)
     flip[-1] = torch.linalg.det(left @ right).sign()
-    found = torch.eye(dim + 1).to(positions)
-    found[:dim, :dim] = left @ (flip[:, None] * right)
-    found[:dim, dim] = true_center - found[:dim, :dim] @ center
-    return found
+    turn = left @ (flip[:, None] * right)
+    return Pose(turn, true_center - turn @ center)
 
 
-def _errors(motions: Tensor) -> PoseErrors:
-    """Lengths and angles of motions (N, D+1, D+1); ‖R − I‖_F = 2√2 sin(angle/2) is exact near zero."""
-    turned = motions[:, :-1, :-1] - torch.eye(motions.shape[1] - 1).to(motions)
-    half = torch.linalg.matrix_norm(turned) / math.sqrt(8)
-    return PoseErrors(motions[:, :-1, -1].norm(dim=1), 2 * half.clamp_max(1).asin())
+def _errors(motions: Pose) -> PoseErrors:
+    return PoseErrors(motions.translation.norm(dim=1), motions.angle())
 
 
-def _checked(estimate: ArrayLike, truth: ArrayLike, least: int) -> tuple[Tensor, Tensor]:
-    """Both trajectories in float64 on one device."""
+def _checked(estimate: ArrayLike, truth: ArrayLike, least: int) -> tuple[Pose, Pose]:
+    """Both trajectories on one device."""
     given = as_tensor(estimate, "estimate", torch.float64).detach()
     true = as_tensor(truth, "truth", torch.float64, given.device).detach()
     if given.shape != true.shape or given.ndim != 3 or given.shape[1:] not in ((3, 3), (4, 4)):
@@ -124,16 +122,5 @@ def _checked(estimate: ArrayLike, truth: ArrayLike, least: int) -> tuple[Tensor,
         )
     if len(given) < least:
         raise InvalidArgumentError(f"estimate has {len(given)} poses; expected at least {least}.")
-    for name, poses in (("estimate", given), ("truth", true)):
-        for pose in poses[_worst(poses)[None]]:
-            check_rigid(pose, poses.shape[1] - 1, name)
-    return given, true
-
-
-def _worst(poses: Tensor) -> Tensor:
-    """The index of the pose that is least rigid; of a NaN, if there is one."""
-    turn, eye = poses[:, :-1, :-1], torch.eye(poses.shape[1]).to(poses)
-    off = (turn @ turn.mT - eye[:-1, :-1]).abs().amax((1, 2)) + (poses[:, -1] - eye[-1]).abs().amax(1)
-    off = off + (torch.linalg.det(turn) < 0)
-    finite = torch.isfinite(poses).flatten(1).all(1)
-    return torch.where(finite, off, torch.inf).argmax()
+    n, dim = len(given), given.shape[1] - 1
+    return Pose.checked(given, dim, "estimate", n=n), Pose.checked(true, dim, "truth", n=n)

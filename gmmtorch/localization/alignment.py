@@ -13,17 +13,17 @@ sensor is behind it.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from gmmtorch.kernels import AlignmentSums, alignment_sums
-from gmmtorch.localization.registration.overlap import deviations
-from gmmtorch.localization.rigid_motions import Motions, chosen_rows
 from gmmtorch.mapping import Components
 from gmmtorch.mixture import Parameters, merge_components
 from gmmtorch.occupancy import ConeIndex, Cones
+from gmmtorch.pose import Pose
 
 CUTOFF = 3.5
 """Deviations beyond which a component is left out of a point."""
@@ -34,6 +34,7 @@ _SETTLED = 0.05  # of the blur: steps below this end a climb
 _SADDLE = 0.05  # of EM's information: with less curvature Newton's step is too long
 _ENTRIES = {2: 16, 3: 64}  # of the index, for each component
 _RIDGE = 1e-9
+_TURNED = math.radians(10)  # between the headings of neighbouring starts, for each metre between their places
 _FLAT = 0.25  # of the next deviation: thinner components have a face
 
 
@@ -42,14 +43,14 @@ class Alignment(NamedTuple):
     v (m) and a turn ω (rad) about the sensor, F = D + D(D−1)/2, and whether the last step was small (B,).
     """
 
-    motions: Motions
+    motions: Pose
     score: Tensor
     explained: Tensor
     information: Tensor
     converged: Tensor
 
     def at(self, rows: Tensor) -> Alignment:
-        return Alignment(self.motions.at(rows), *(value[rows] for value in self[1:]))
+        return Alignment(self.motions[rows], *(value[rows] for value in self[1:]))
 
 
 class AlignmentTarget:
@@ -73,13 +74,12 @@ class AlignmentTarget:
         ellipsoids = Cones(means, covariances, means, surfaces.weights, nothing)
         self.index = ConeIndex(ellipsoids, 1e-3 * blur, CUTOFF, entries_per_cone=_ENTRIES[dim], smallest=True)
 
-    def sums(self, points: Tensor, motions: Motions) -> AlignmentSums:
+    def sums(self, points: Tensor, motions: Pose) -> AlignmentSums:
         """ℓ of points (N, D) under each motion, and its derivatives."""
-        moved = points @ motions.rotations.mT + motions.translations[:, None]
-        lists = self.index.buckets(moved.flatten(0, 1)), *self.index.lists
+        lists = self.index.buckets(motions.apply(points).flatten(0, 1)), *self.index.lists
         target = self.means, self.precisions, self.normals
         limits = self.blur, CUTOFF**2, _OUTLIERS, _EXPLAINED
-        return alignment_sums(points, motions, lists, target, limits)
+        return alignment_sums(points, motions.parts, lists, target, limits)
 
 
 def seen_normals(surfaces: Components) -> Tensor:
@@ -98,6 +98,11 @@ def seen_normals(surfaces: Components) -> Tensor:
     return (normals * (sign * is_flat)[:, None])[solid]
 
 
+def deviations(mixture: Parameters) -> Tensor:
+    """Standard deviations (K, D) along the principal axes, in rising order."""
+    return torch.linalg.eigvalsh(mixture.covariances).clamp_min(0).sqrt()
+
+
 def merged_below(surfaces: Parameters, normals: Tensor, blur: float) -> tuple[Parameters, Tensor]:
     """The surfaces with those merged that a blur hides: smaller ones of one side in a cell of that size."""
     small = deviations(surfaces)[:, -1] < blur
@@ -108,7 +113,7 @@ def merged_below(surfaces: Parameters, normals: Tensor, blur: float) -> tuple[Pa
     return merge_components(*surfaces, labels, len(cells)), torch.nn.functional.normalize(summed)
 
 
-def align(points: Tensor, target: AlignmentTarget, motions: Motions, max_steps: int) -> Alignment:
+def align(points: Tensor, target: AlignmentTarget, motions: Pose, max_steps: int) -> Alignment:
     """Climbs ℓ from B motions in parallel. A step that lowers ℓ is taken back, and the next one is shorter.
 
     Args:
@@ -126,7 +131,7 @@ def align(points: Tensor, target: AlignmentTarget, motions: Motions, max_steps: 
         trial = motions.moved(step)
         tried = target.sums(points, trial)
         better = tried.score >= sums.score
-        motions = Motions(*chosen_rows(better, trial, motions))
+        motions = Pose(*chosen_rows(better, trial.parts, motions.parts))
         sums = AlignmentSums(*chosen_rows(better, tried, sums))
         share = torch.where(better, (2 * share).clamp_max(1), share / 4)
         settled = (step / scale).norm(dim=1) < _SETTLED * target.blur
@@ -134,6 +139,11 @@ def align(points: Tensor, target: AlignmentTarget, motions: Motions, max_steps: 
             break
     n = len(points)
     return Alignment(motions, sums.score / n, sums.n_explained / n, sums.observed, settled)
+
+
+def chosen_rows(better: Tensor, new: tuple[Tensor, ...], old: tuple[Tensor, ...]) -> list[Tensor]:
+    """Rows of `new` where `better` (B,), else of `old`."""
+    return [torch.where(better.view(-1, *[1] * (n.ndim - 1)), n, o) for n, o in zip(new, old, strict=True)]
 
 
 def _steps(sums: AlignmentSums, scale: Tensor, longest: float) -> Tensor:
@@ -148,3 +158,54 @@ def _steps(sums: AlignmentSums, scale: Tensor, longest: float) -> Tensor:
     step = torch.linalg.solve(curvature, sums.gradient * scale)
     length = step.norm(dim=1, keepdim=True)
     return step * (longest / length.clamp_min(longest)) * scale
+
+
+# -- starts of a search ---------------------------------------------------------------------------
+
+
+def differences(some: Pose, others: Pose, distance: float, angle: float) -> Tensor:
+    """How different motions are (A, B): the larger of the shift in `distance` and the turn in `angle`."""
+    shift = torch.cdist(some.translation, others.translation)
+    turn = torch.linalg.matrix_norm(some.rotation[:, None] - others.rotation) / math.sqrt(2)
+    return torch.maximum(shift / distance, turn / angle)
+
+
+def distinct(motions: Pose, distance: float, angle: float) -> Tensor:
+    """Rows of motions, best first, without those within both (m, rad) of a better one."""
+    is_near = differences(motions, motions, distance, angle) < 1
+    return (~is_near.tril(-1).any(1)).nonzero().squeeze(1)
+
+
+def best_distinct(motions: Pose, score: Tensor, distance: float) -> Tensor:
+    """Rows of motions by falling score, without those close to a better one: by less than `distance` (m) and
+    the turn that belongs to it.
+    """
+    order = score.argsort(descending=True, stable=True)
+    return order[distinct(motions[order], distance, _TURNED * distance)]
+
+
+def around(start: Pose, distance: float, angle: float, blur: float) -> Pose:
+    """Starts on a lattice of places, `blur` metres apart, up to `distance` metres from one along the ground,
+    and of headings up to `angle` radians; the start itself among them.
+    """
+    like = start.translation
+    n, m = math.ceil(distance / blur), math.ceil(angle / (_TURNED * blur))
+    side = torch.linspace(-distance, distance, 2 * n + 1).to(like)
+    places = torch.cartesian_prod(side, side)
+    places = places[places.norm(dim=1) <= distance * (1 + 1e-9)]
+    places = torch.nn.functional.pad(places, (0, start.dim - 2))
+    turned = Pose.from_yaw(torch.linspace(-angle, angle, 2 * m + 1).to(like), torch.zeros_like(like[0]))
+    return _crossed(turned.rotation @ start.rotation, like + places)
+
+
+def everywhere(places: Tensor, blur: float) -> Pose:
+    """Starts at places (S, D) with all headings; upright in 3D."""
+    n = math.ceil(math.pi / (_TURNED * blur))
+    angles = torch.arange(n).to(places) * (2 * math.pi / n)
+    return _crossed(Pose.from_yaw(angles, torch.zeros_like(places[0])).rotation, places)
+
+
+def _crossed(rotations: Tensor, translations: Tensor) -> Pose:
+    """Every pair of a rotation and a translation."""
+    n = len(rotations)
+    return Pose(rotations.repeat(len(translations), 1, 1), translations.repeat_interleave(n, 0))
