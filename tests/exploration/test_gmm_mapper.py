@@ -32,7 +32,7 @@ from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.association import count_explained
 from gmmtorch.occupancy.voxels.boxes import intersection
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
-from gmmtorch.simulation.sensors.depth_camera import DepthFrame
+from gmmtorch.simulation.robot_camera import DepthFrame
 from gmmtorch.team.exploration.robot.gmm_mapper import FrameRule, GmmMapper
 from gmmtorch.team.exploration.robot.mapper import FrameUpdate
 from gmmtorch.team.sharing.messages.message_registry import (

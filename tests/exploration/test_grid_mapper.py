@@ -12,7 +12,7 @@ from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
-from gmmtorch.simulation.sensors.depth_camera import DepthFrame
+from gmmtorch.simulation.robot_camera import DepthFrame
 from gmmtorch.team.exploration.robot.grid_mapper import MOST_INTERVALS, GridMapper
 from gmmtorch.team.exploration.robot.mapper import Memo
 from gmmtorch.team.exploration.world.scoring import BeliefMap, BeliefRule

@@ -11,7 +11,7 @@ from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
-from gmmtorch.simulation.sensors.depth_camera import DepthFrame
+from gmmtorch.simulation.robot_camera import DepthFrame
 from gmmtorch.team.exploration.robot.mapper import Memo, novel_beams
 
 RULE = NoveltyRule(resolution=0.2, observed=0.5)

@@ -14,7 +14,7 @@ from pretended_gpu import GPUTensor, pretended_gpu
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import kernels
 from gmmtorch.mapping.components import Components
-from gmmtorch.simulation.worlds.furniture import box
+from gmmtorch.simulation.furniture import box
 from gmmtorch.team.cli.reporting.explore_pictures import _coverage, _team_view
 from gmmtorch.team.exploration.mission.driver import SimulatedClock, drive
 from gmmtorch.team.exploration.mission.mission import Mission

@@ -14,7 +14,7 @@ import torch
 from exploration.replays import FakeTime, Together
 from exploration.rooms import small_room
 
-from gmmtorch.simulation.sensors.depth_camera import DepthCamera
+from gmmtorch.simulation.robot_camera import DepthCamera
 from gmmtorch.team.exploration.mission.driver import Stopwatch, WallClock, drive, settle
 from gmmtorch.team.exploration.mission.mission import Mission
 from gmmtorch.team.exploration.mission.options import TeamOptions

@@ -15,7 +15,7 @@ from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
-from gmmtorch.simulation.sensors.depth_camera import DepthFrame
+from gmmtorch.simulation.robot_camera import DepthFrame
 from gmmtorch.team.exploration.information.view_library import ViewLibrary
 from gmmtorch.team.exploration.planning.collision_checking import cells_in_sphere
 from gmmtorch.team.exploration.planning.planner_interface import Plan

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 
 import pytest
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.simulation import World2D, World3D, building_2d, building_3d, poses_3d, spinning_lidar
-from gmmtorch.simulation.worlds.floor_plan import Footprint, Room, circle, place
+from gmmtorch.simulation.furniture import Footprint, Room, circle, place
 
 CLEARANCE = 0.4
 
@@ -62,14 +63,12 @@ def test_hall_path_is_clear_of_walls_and_furniture(seed):
     world = hall(seed)
     ring = torch.cat([circle(1.0, 24), torch.zeros(24, 1, dtype=torch.float64)], 1)
     stations = world.path[::20]
-    for height in (0.1, 0.73, 1.4):
-        origins = torch.cat([stations, torch.full_like(stations[:, :1], height)], 1)
-        distance = world.distances(origins.repeat_interleave(24, 0), ring.repeat(len(stations), 1))
-        assert float(distance.min()) > CLEARANCE
-    steps = stations[1:] - stations[:-1]
-    low = torch.full_like(stations[:-1, :1], 1.0)
-    ahead = world.distances(torch.cat([stations[:-1], low], 1), torch.cat([steps, torch.zeros_like(low)], 1))
-    assert bool((ahead > 1).all())
+    for here, ahead in itertools.pairwise(stations):
+        for height in (0.1, 0.73, 1.4):
+            origin = torch.cat([here, torch.tensor([height])])
+            assert float(world.distances(origin, ring).min()) > CLEARANCE
+        step = torch.cat([ahead - here, torch.zeros(1)])[None]
+        assert float(world.distances(origin, step)) > 1
 
 
 def test_office_is_closed_and_its_corridor_is_long():

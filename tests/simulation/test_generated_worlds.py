@@ -12,10 +12,10 @@ from scipy.ndimage import label
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.voxelize import occupied_cells
-from gmmtorch.simulation.worlds.furniture import UNIT_CUBE, copies
-from gmmtorch.simulation.worlds.mesh_world import MeshWorld
-from gmmtorch.simulation.worlds.tunnels import tunnels
-from gmmtorch.simulation.worlds.warehouse import warehouse, warehouse_start
+from gmmtorch.simulation.furniture import UNIT_CUBE, copies
+from gmmtorch.simulation.mesh_world import MeshWorld
+from gmmtorch.simulation.mine import tunnels
+from gmmtorch.simulation.warehouses import warehouse, warehouse_start
 
 Generate = Callable[..., torch.Tensor]
 

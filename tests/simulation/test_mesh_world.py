@@ -9,8 +9,8 @@ import torch
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.simulation import ray_triangles
-from gmmtorch.simulation.worlds.furniture import box
-from gmmtorch.simulation.worlds.mesh_world import MeshWorld, checked_triangles
+from gmmtorch.simulation.furniture import box
+from gmmtorch.simulation.mesh_world import MeshWorld, checked_triangles
 
 HALL = box((0, 0, 0), (20, 6, 3))
 SMALL = box((40, 0, 0), (44, 4, 3))

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.simulation import laser_2d, sense, simulate_scan, spinning_lidar
-from gmmtorch.simulation.sensors.range_sensors import depth_camera
+from gmmtorch.simulation.sensors import depth_camera
 
 
 class Shell:

@@ -14,10 +14,11 @@ import torch
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
-from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
+from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
-from gmmtorch.simulation.sensors.range_sensors import pixel_rays
-from gmmtorch.simulation.worlds.mesh_world import MeshWorld
+from gmmtorch.simulation.mesh_world import MeshWorld
+from gmmtorch.simulation.sensors import check_share, pixel_rays
 
 _CLOSEST_READING = 1e-3
 _TEAMMATE_MARGIN = 0.05
@@ -80,14 +81,9 @@ class DepthCamera:
                     f"{name}={getattr(self, name)} must be an angle above 0 and below π radians: "
                     "a camera needs a field of view."
                 )
-        if not (math.isfinite(self.max_range) and self.max_range > _CLOSEST_READING):
-            raise InvalidArgumentError(
-                f"max_range={self.max_range} must be a distance above {_CLOSEST_READING} metres."
-            )
-        if not (math.isfinite(self.noise) and self.noise >= 0):
-            raise InvalidArgumentError(f"noise={self.noise} must be zero or more, metres per square metre.")
-        if not 0 <= self.dropout < 1:
-            raise InvalidArgumentError(f"dropout={self.dropout} must be a share of the pixels in [0, 1).")
+        check_number("max_range", self.max_range, above=True, least=_CLOSEST_READING)
+        check_number("noise", self.noise)
+        check_share(self.dropout)
 
     @cached_property
     def directions(self) -> Tensor:
@@ -154,9 +150,7 @@ class DepthCamera:
 
     def _turned(self, yaw: float) -> Tensor:
         """Directions of the beams (N, 3) in the world frame."""
-        cos, sin = math.cos(yaw), math.sin(yaw)
-        turn = torch.tensor([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-        return self.directions @ turn
+        return self.directions @ Pose.from_yaw(yaw, [0.0, 0.0, 0.0]).rotation.T
 
 
 def _distance_to_spheres(centers: Tensor, radius: float, directions: Tensor) -> Tensor:

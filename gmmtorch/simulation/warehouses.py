@@ -15,8 +15,19 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import check_whole
-from gmmtorch.simulation.worlds.floor_plan import Room, checked_size, circle, uniform
-from gmmtorch.simulation.worlds.furniture import RACK_DEPTH, UNIT_CUBE, Bays, box, copies, prism, racks
+from gmmtorch.simulation.furniture import (
+    RACK_DEPTH,
+    UNIT_CUBE,
+    Bays,
+    Room,
+    box,
+    checked_size,
+    circle,
+    copies,
+    prism,
+    racks,
+    uniform,
+)
 
 _SHELL = 0.13
 """Thickness of floor, outer walls and ceiling (m). Only their inner faces are drawn. The faces do not lie on

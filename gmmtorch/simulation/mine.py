@@ -16,8 +16,8 @@ from torch import Tensor
 
 from gmmtorch.errors import GmmTorchError, check_whole
 from gmmtorch.optional_packages import load_open3d
-from gmmtorch.simulation.worlds.floor_plan import checked_size, uniform
-from gmmtorch.simulation.worlds.mesh_world import have_area
+from gmmtorch.simulation.furniture import checked_size, uniform
+from gmmtorch.simulation.mesh_world import have_area
 
 _CELL = 0.4
 """Spacing of the field's grid, metres."""

@@ -1,7 +1,7 @@
 """Distance along rays to the nearest line segment (2D) or triangle (3D), in plain torch.
 
-Worlds have few segments, so each ray is tested against all of them. Rays that start at one point, as
-those of a sensor do, are grouped into bundles of similar direction. Each bundle is tested only against
+Worlds have few segments, so each ray is tested against all of them. The rays of a sensor
+start at one point and are grouped into bundles of similar direction. Each bundle is tested only against
 the triangles whose bounding cone overlaps the cone of the bundle: a few per cent of all triangles.
 
 Operations on bundles are kept small and gather with `index_select`. Above about 32 thousand elements
@@ -67,38 +67,34 @@ def ray_segments(origins: ArrayLike, directions: ArrayLike, segments: ArrayLike)
     return best
 
 
-def ray_triangles(origins: ArrayLike, directions: ArrayLike, triangles: ArrayLike) -> Tensor:
+def ray_triangles(origin: ArrayLike, directions: ArrayLike, triangles: ArrayLike) -> Tensor:
     """Distances (N,), float64, to the nearest triangle, in multiples of the direction's length; inf if none.
 
     A ray passes through a triangle if it passes all three edges on the same side. The side of the edge
-    p → q is the triple product d · ((p − o) × (q − o)) = d · (p × q) + (o × d) · (q − p). Adjacent
-    triangles share an edge with opposite sign, so no ray passes between them.
-    Both faces count. A ray in the plane of a triangle does not hit it.
+    p → q is the triple product d · ((p − o) × (q − o)). Adjacent triangles share an edge with opposite sign,
+    so no ray passes between them. Both faces count. A ray in the plane of a triangle does not hit it.
 
     Args:
-        origins: (N, 3), or (3,) if all rays start at one point.
+        origin: (3,), where all rays start.
         directions: (N, 3).
         triangles: (T, 3, 3), the three corners of each triangle.
     """
-    origins = as_tensor(origins, "origins", torch.float64)
-    one_origin = origins.ndim == 1
-    origins, directions, triangles = _checked(origins, directions, triangles, (3, 3))
+    origin = as_tensor(origin, "origin", torch.float64)
+    if origin.shape != (3,):
+        raise InvalidArgumentError(f"origin has shape {tuple(origin.shape)}; expected (3,), metres.")
+    _, directions, triangles = _checked(origin, directions, triangles, (3, 3))
     best = torch.full_like(directions[:, 0], torch.inf)
     if triangles.shape[0] == 0 or directions.shape[0] == 0:
         return best
-    centre = origins[0]  # the products below lose the fewest digits about this point
-    origins, triangles = origins - centre, triangles - centre
-    rays = torch.cat([directions, torch.linalg.cross(origins, directions)], 1)
+    triangles = triangles - origin
     ahead = triangles.roll(-1, dims=1)
-    edges = torch.cat([torch.linalg.cross(triangles, ahead), ahead - triangles], 2)  # (T, 3, 6)
-    normals = edges[:, :, :3].sum(1)
+    edges = torch.linalg.cross(triangles, ahead)  # (T, 3, 3)
+    normals = edges.sum(1)
     offsets = (normals * triangles[:, 0]).sum(1)
-    slack = _SLACK * rays.norm(dim=1).max() * edges.norm(dim=2).amax(1)
-    if one_origin:  # all moments o × d are zero
-        rays, edges = rays[:, :3], edges[..., :3]
-    lines, sides = rays.T.contiguous(), edges.permute(1, 2, 0).contiguous()  # one row per coordinate
-    bundles = _direction_bundles(directions) if one_origin else _single_ray_bundles(directions.shape[0])
-    for ray, triangle in _candidates(bundles, triangles):
+    largest = torch.cat([edges, ahead - triangles], 2).norm(dim=2).amax(1)
+    slack = _SLACK * directions.norm(dim=1).max() * largest
+    lines, sides = directions.T.contiguous(), edges.permute(1, 2, 0).contiguous()  # one row per coordinate
+    for ray, triangle in _candidates(_direction_bundles(directions), triangles):
         line = [row.index_select(0, ray) for row in lines]
         side_a, side_b, side_c = (
             _dot(line, [row.index_select(0, triangle) for row in edge]) for edge in sides
@@ -107,10 +103,7 @@ def ray_triangles(origins: ArrayLike, directions: ArrayLike, triangles: ArrayLik
         highest = torch.maximum(torch.maximum(side_a, side_b), side_c)
         bound = slack.index_select(0, triangle)
         steepness = side_a + side_b + side_c  # d · normal
-        height = offsets.index_select(0, triangle)
-        if not one_origin:
-            height = height - (normals[triangle] * origins[ray]).sum(1)
-        t = height / steepness
+        t = offsets.index_select(0, triangle) / steepness
         hit = ((lowest >= -bound) | (highest <= bound)) & (t > 0) & (steepness.abs() > 4 * bound)
         best.scatter_reduce_(0, ray, torch.where(hit, t, torch.inf), "amin")
     return best
@@ -167,16 +160,15 @@ class _Cones(NamedTuple):
 
 
 class _Bundles(NamedTuple):
-    """Rays grouped into bundles.
+    """Rays grouped into bundles, each with a cone around it.
 
     rays: (N,) indices, sorted by bundle. Bundle g has `sizes[g]` of them, from position `starts[g]` on.
-    cones: one around each bundle; None if the rays start at different points.
     """
 
     rays: Tensor
     starts: Tensor
     sizes: Tensor
-    cones: _Cones | None
+    cones: _Cones
 
 
 def _direction_bundles(directions: Tensor) -> _Bundles:
@@ -192,12 +184,6 @@ def _direction_bundles(directions: Tensor) -> _Bundles:
     return _Bundles(bundle.argsort(stable=True), sizes.cumsum(0) - sizes, sizes, _cones(axis, width))
 
 
-def _single_ray_bundles(n: int) -> _Bundles:
-    """One bundle for each of `n` rays, without cones."""
-    rays = torch.arange(n)
-    return _Bundles(rays, rays, torch.ones_like(rays), None)
-
-
 def _candidates(bundles: _Bundles, triangles: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
     """Yields pairs of ray (P,) and triangle (P,) that may meet, in chunks.
 
@@ -209,11 +195,7 @@ def _candidates(bundles: _Bundles, triangles: Tensor) -> Iterator[tuple[Tensor, 
     cones = _cones(middle, _angle(triangles, middle[:, None]).amax(1))
     for first in range(0, n_bundles, step):
         rows = slice(first, min(first + step, n_bundles))
-        if bundles.cones is None:
-            near = torch.ones(rows.stop - first, n_triangles, dtype=torch.bool)
-        else:
-            near = _overlap(bundles.cones, cones, rows)
-        bundle, triangle = near.nonzero(as_tuple=True)
+        bundle, triangle = _overlap(bundles.cones, cones, rows).nonzero(as_tuple=True)
         bundle = bundle + first
         ends = bundles.sizes[bundle].cumsum(0)
         total = int(ends[-1]) if len(ends) else 0
