@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch import datasets
-from gmmtorch.datasets.depth_frames import DepthFrames
+from gmmtorch.datasets.depth_images import DepthFrames
 from gmmtorch.experiments.evaluation.queries import Queries, hit_and_free, split_indices, test_beams
 from gmmtorch.pinhole import back_project
 from gmmtorch.scan import Scan

@@ -12,7 +12,7 @@ from command_runs import QUIET, Finished, refused, run_here, succeeded
 
 from gmmtorch.cli.localize import overrides
 from gmmtorch.datasets import Dataset, load
-from gmmtorch.datasets.recordings.trajectory import read_trajectory
+from gmmtorch.datasets.trajectory import read_trajectory
 from gmmtorch.export.bag import BagWriter
 from gmmtorch.export.trajectory_files import write_tum
 from gmmtorch.mapping.gaussian_map import GaussianMap

@@ -26,10 +26,9 @@ from mapping.random_components import random_components
 
 from gmmtorch.cli import common
 from gmmtorch.datasets.base import Ranges
-from gmmtorch.datasets.recordings.ros.bag_reader import Topic
-from gmmtorch.datasets.recordings.ros.bag_topics import LASER as LASERS
-from gmmtorch.datasets.recordings.ros.bag_topics import Sensor
-from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree
+from gmmtorch.datasets.ros.bag_reader import LASER as LASERS
+from gmmtorch.datasets.ros.bag_reader import Sensor, Topic
+from gmmtorch.datasets.ros.transform_tree import TransformTree
 from gmmtorch.export.bag import BagWriter
 from gmmtorch.live.mapper.live_scans import LiveOptions, LiveScans
 from gmmtorch.live.ros import Node

@@ -67,7 +67,7 @@ def test_load_applies_the_default_ranges_of_each_data_set(tmp_path):
 def test_importing_datasets_loads_no_reader():
     code = (
         "import sys, gmmtorch.datasets\n"
-        "late = [m for m in ('open3d', 'PIL', 'gmmtorch.simulation', 'gmmtorch.datasets.carmen')"
+        "late = [m for m in ('open3d', 'PIL', 'gmmtorch.simulation', 'gmmtorch.datasets.scan_logs')"
         " if m in sys.modules]\n"
         "sys.exit(', '.join(late) or 0)"
     )

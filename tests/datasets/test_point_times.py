@@ -20,7 +20,7 @@ from gmmtorch.datasets.base import Dataset
 
 pytest.importorskip("rosbags")
 
-from gmmtorch.datasets.recordings.ros.point_times import PointTimes, Rate
+from gmmtorch.datasets.ros.point_times import PointTimes, Rate
 from gmmtorch.export.bag import BagWriter
 
 WALLS = np.array([6.0, 4.0, 1.25])  # half of the room

@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from gmmtorch.datasets import load
-from gmmtorch.datasets.carmen import beam_angles
-from gmmtorch.datasets.depth_frames import back_project
-from gmmtorch.datasets.point_files.cloud_files import read_cloud
+from gmmtorch.datasets.depth_images import back_project
+from gmmtorch.datasets.point_files.point_chunks import read_cloud
+from gmmtorch.datasets.scan_logs import beam_angles
 from gmmtorch.errors import DataError
 from gmmtorch.export.trajectory_files import write_kitti
 from gmmtorch.mapping.gaussian_map import GaussianMap

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree
+from gmmtorch.datasets.ros.transform_tree import TransformTree
 
 Sample = tuple[int, np.ndarray, np.ndarray]
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from gmmtorch.datasets.recordings.trajectory import read_trajectory
+from gmmtorch.datasets.trajectory import read_trajectory
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.export.trajectory_files import write_kitti, write_pose_table, write_tum
 

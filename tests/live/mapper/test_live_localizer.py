@@ -12,9 +12,8 @@ pytest.importorskip("rosbags", reason="needs the extra [ros]: rosbags")
 
 from gmmtorch.datasets import load
 from gmmtorch.datasets.base import Ranges
-from gmmtorch.datasets.recordings.ros.bag_reader import Topic
-from gmmtorch.datasets.recordings.ros.bag_topics import LASER
-from gmmtorch.datasets.recordings.ros.bag_topics import Sensor as SensorTopic
+from gmmtorch.datasets.ros.bag_reader import LASER, Topic
+from gmmtorch.datasets.ros.bag_reader import Sensor as SensorTopic
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.live.mapper import live_scans
 from gmmtorch.live.mapper.live_localizer import LiveLocalizer

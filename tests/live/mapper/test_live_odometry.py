@@ -13,9 +13,8 @@ pytest.importorskip("cyclonedds", reason="needs the extra [ros]: cyclonedds")
 from test_live_localizer import laser, pose, room
 
 from gmmtorch.datasets.base import Ranges
-from gmmtorch.datasets.recordings.ros.bag_reader import Topic
-from gmmtorch.datasets.recordings.ros.bag_topics import LASER, Sensor
-from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree
+from gmmtorch.datasets.ros.bag_reader import LASER, Sensor, Topic
+from gmmtorch.datasets.ros.transform_tree import TransformTree
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.export.message_fields import transform_fields
 from gmmtorch.live.mapper import pose_publisher

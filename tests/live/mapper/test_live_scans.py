@@ -13,9 +13,8 @@ pytest.importorskip("rosbags", reason="needs the extra [ros]: rosbags")
 
 from gmmtorch.datasets import load
 from gmmtorch.datasets.base import Ranges
-from gmmtorch.datasets.recordings.ros.bag_reader import BagReader, Topic
-from gmmtorch.datasets.recordings.ros.bag_topics import CLOUD, DEPTH, LASER, Sensor
-from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree
+from gmmtorch.datasets.ros.bag_reader import CLOUD, DEPTH, LASER, BagReader, Sensor, Topic
+from gmmtorch.datasets.ros.transform_tree import TransformTree
 from gmmtorch.export.bag import BagWriter
 from gmmtorch.live.mapper import live_scans
 from gmmtorch.live.mapper.live_scans import DROPPED, LiveOptions, LiveScans

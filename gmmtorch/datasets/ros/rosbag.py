@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import logging
+from array import array
+from collections import Counter
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +15,22 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset, Ranges, require_path
-from gmmtorch.datasets.recordings.ros import bag_topics
-from gmmtorch.datasets.recordings.ros.bag_poses import BagSurvey, Record
-from gmmtorch.datasets.recordings.ros.bag_reader import BagReader, RawMessage
-from gmmtorch.datasets.recordings.ros.gyroscope import read_gyroscope, sensor_turns
-from gmmtorch.datasets.recordings.ros.image_camera import ImageCamera
-from gmmtorch.datasets.recordings.ros.point_times import Rate
-from gmmtorch.datasets.recordings.ros.pose_sources import RegisteredPoses
-from gmmtorch.datasets.recordings.ros.scan_conversion import ScanConversion
-from gmmtorch.datasets.recordings.ros.sensor_messages import Reading
-from gmmtorch.datasets.recordings.ros.transform_tree import frame_name, stamp_of
-from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, increasing
+from gmmtorch.datasets.ros.bag_poses import BagSurvey, Record, RegisteredPoses
+from gmmtorch.datasets.ros.bag_reader import (
+    IMU_TYPE,
+    BagReader,
+    RawMessage,
+    Sensor,
+    choose_camera_info,
+    choose_imu,
+    choose_sensor,
+)
+from gmmtorch.datasets.ros.image_camera import ImageCamera
+from gmmtorch.datasets.ros.point_times import Rate
+from gmmtorch.datasets.ros.scan_conversion import ScanConversion
+from gmmtorch.datasets.ros.sensor_messages import Reading
+from gmmtorch.datasets.ros.transform_tree import TransformTree, frame_name, stamp_of
+from gmmtorch.datasets.trajectory import NANOSECONDS, increasing, strictly_increasing
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice
 from gmmtorch.pose import Pose
 from gmmtorch.scan import FARTHEST, Scan
@@ -73,10 +82,10 @@ def open_rosbag(
     if not max_gap > 0:
         raise InvalidArgumentError(f"dataset.max_gap={max_gap} must be a time above zero seconds.")
     reader = BagReader(file)
-    sensor = bag_topics.choose_sensor(reader, topic)
+    sensor = choose_sensor(reader, topic)
     info = None
     if sensor.is_camera and intrinsics is None:
-        info = bag_topics.choose_camera_info(reader, sensor.topic.name, camera_info)
+        info = choose_camera_info(reader, sensor.topic.name, camera_info)
     survey = BagSurvey(reader, sensor, info, poses, frame, extrinsic, max_gap)
     camera = ImageCamera(sensor, survey.camera_info(), pixel_stride, depth_scale, intrinsics)
     options = sensor_frame, clock, deskew, imu_topic
@@ -99,7 +108,7 @@ class RosBag(Dataset):
     def __init__(
         self,
         reader: BagReader,
-        sensor: bag_topics.Sensor,
+        sensor: Sensor,
         survey: BagSurvey,
         ranges: Ranges,
         stride: int,
@@ -270,3 +279,165 @@ class DepthBag(RosBag):
         """Depth (H, W) in metres, 0 for invalid pixels, and pose (4, 4), world ← camera, of a scan."""
         position = self._position(index)
         return self._camera.image(self._message(position)), self._poses[position]
+
+
+# -- rotations by an IMU -----------------------------------------------------------------------------
+
+
+IMU_GAP = 0.2
+"""Longest time (s) between two messages over which rates are interpolated. If the rate changes by 10 rad/s²,
+the turn over such a gap is wrong by at most 3°."""
+_FASTEST = 100.0
+"""Largest rate (rad/s) that a gyroscope of a robot measures."""
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Gyroscope:
+    """Angular velocities of one IMU.
+
+    topic: of the IMU, with its bag. frame: in which it measures. n_bad: messages without a usable rate.
+    times: (N,) int64, increasing, ns, at least two. rates: (N, 3) rad/s.
+    """
+
+    topic: str
+    frame: str
+    n_bad: int
+    times: np.ndarray
+    rates: np.ndarray
+
+    def turns(self, stamps: np.ndarray) -> Tensor:
+        """Rotations (M, 3, 3) of the IMU since the stamp before, before ← now, at stamps (M,), ns, in order.
+
+        Rates are linear between messages, and each interval is one turn by their mean. The first rotation is
+        the identity. A rotation is NaN if a stamp is outside the times of the messages, or if messages
+        between the two stamps are more than `IMU_GAP` apart.
+        """
+        seconds, rise = np.diff(self.times) / NANOSECONDS, np.diff(self.rates, axis=0)
+        is_gap = seconds > IMU_GAP
+        means = np.where(is_gap[:, None], 0, self.rates[:-1] + rise / 2)
+        steps = _rotations(means * seconds[:, None])
+        starts = _products(torch.cat([torch.eye(3)[None].double(), steps]))
+        at = (np.searchsorted(self.times, stamps, side="right") - 1).clip(0, len(seconds) - 1)
+        since = ((stamps - self.times[at]) / NANOSECONDS).clip(0, seconds[at])
+        rates = self.rates[at] + rise[at] * (since / seconds[at] / 2)[:, None]
+        found = starts[at] @ _rotations(rates * since[:, None])
+        turns = torch.cat([starts[:1], found[:-1].mT @ found[1:]])
+        inside = (self.times[0] <= stamps) & (stamps <= self.times[-1])
+        begun = np.searchsorted(self.times[:-1][is_gap], stamps[1:])
+        ended = np.searchsorted(self.times[1:][is_gap], stamps[:-1], side="right")
+        turns[1:][~(inside[:-1] & inside[1:]) | (begun > ended)] = torch.nan
+        return turns
+
+
+def _rotations(vectors: np.ndarray) -> Tensor:
+    """Rotations (N, 3, 3) of rotation vectors (N, 3), rad."""
+    return Pose.from_turn(torch.from_numpy(vectors)).rotation
+
+
+def _products(turns: Tensor) -> Tensor:
+    """Products R₀, R₀R₁, R₀R₁R₂, … (N, 3, 3) of rotations (N, 3, 3), by batches of N/2, N/4, … pairs."""
+    if len(turns) < 2:
+        return turns
+    found = turns.clone()
+    found[1::2] = _products(turns[:-1:2] @ turns[1::2])
+    if len(found) > 2:
+        found[2::2] = found[1:-1:2] @ turns[2::2]
+    return found
+
+
+def read_gyroscope(reader: BagReader, topic: str | None, clock: str) -> Gyroscope:
+    """The angular velocities of a bag's IMU; topic and clock are those of `open_rosbag`.
+
+    Messages that cannot be decoded or that state no usable rate are left out. If the clock jumps, the longest
+    series of messages in order is used. Raises `InvalidArgumentError`, with the remedy.
+    """
+    name = choose_imu(reader, topic)
+    where = f"{reader.path}, topic {name}"
+    times, rates = array("q"), array("d")
+    frames: Counter[str] = Counter()
+    faults: Counter[str] = Counter()
+    for message in reader.messages([name]):
+        if message.type != IMU_TYPE:
+            continue
+        try:
+            content = reader.decode(message)
+            velocity = content["angular_velocity"]
+            rate = [velocity[axis] for axis in "xyz"]
+            stamp = stamp_of(content["header"]) if clock == "header" else message.time
+            if content["angular_velocity_covariance"][0] == -1:
+                faults["state that they have no angular velocity (angular_velocity_covariance[0] is -1)"] += 1
+            elif not all(abs(value) <= _FASTEST for value in rate):  # also for NaN
+                faults[f"have an angular velocity that is not finite or above {_FASTEST:g} rad/s"] += 1
+            else:
+                times.append(stamp)
+                rates.extend(rate)
+                frames[frame_name(content["header"]["frame_id"])] += 1
+        except (DataError, OverflowError):
+            faults["cannot be decoded"] += 1
+    kept = strictly_increasing(np.array(times, np.int64))
+    if len(kept) < 2:
+        reasons = "; ".join(f"{n} {reason}" for reason, n in faults.items()) or "their stamps are equal"
+        raise _unusable(
+            f"{where} has {len(kept)} usable angular velocities in {faults.total() + len(times)} messages "
+            f"({reasons})",
+            "Choose another dataset.imu_topic",
+        )
+    if len(frames) > 1:
+        counts = ", ".join(f"{frame or '(unnamed)'} ({n} messages)" for frame, n in frames.most_common(5))
+        raise _unusable(f"{where} has several IMUs, with frames {counts}", "Write each to a topic of its own")
+    samples = np.array(rates).reshape(-1, 3)[kept]
+    return Gyroscope(where, next(iter(frames)), faults.total(), np.array(times, np.int64)[kept], samples)
+
+
+def sensor_turns(
+    gyroscope: Gyroscope, tree: TransformTree, frames: list[str], stamps: np.ndarray, max_gap: float
+) -> Tensor:
+    """Rotations (M, 3, 3) of a sensor since the scan before, before ← now; the first is the identity.
+
+    Where the rotation of the IMU or of its mounting is unknown, they are NaN, and a warning states how many.
+
+    Args:
+        gyroscope: of the IMU. tree: TF, with the mounting of both.
+        frames: of the sensor at each scan (M). stamps: of the scans (M,), ns, in order.
+        max_gap: longest time (s) between two transforms that are interpolated, if the mounting moves.
+
+    Raises `InvalidArgumentError` if TF does not connect the frames, or if no rotation is known.
+    """
+    mounts = Pose.identity(3, len(stamps)).rotation  # IMU ← sensor
+    for frame in set(frames) - {gyroscope.frame}:
+        rows = np.array([row for row, name in enumerate(frames) if name == frame])
+        try:
+            found = tree.between(gyroscope.frame, frame, stamps[rows], max_gap)
+        except DataError as error:
+            raise _unusable(
+                f"the IMU of {gyroscope.topic} must be mounted beside the sensor, but {error}",
+                "Record /tf_static with both frames",
+            ) from error
+        found.poses.rotation[~found.known] = torch.nan
+        mounts[rows] = found.poses.rotation
+    turns = gyroscope.turns(stamps)
+    turns[1:] = mounts[:-1].mT @ turns[1:] @ mounts[1:]
+    n, n_unknown = len(turns) - 1, int(turns.isnan().flatten(1).any(1).sum())
+    if n and n_unknown == n:
+        first, last = gyroscope.times[[0, -1]] / NANOSECONDS
+        raise _unusable(
+            f"{gyroscope.topic} has rotations from {first:.3f} to {last:.3f} s, with gaps of at most "
+            f"{IMU_GAP} s, and none between two scans, which are from {stamps[0] / NANOSECONDS:.3f} to "
+            f"{stamps[-1] / NANOSECONDS:.3f} s",
+            "If the sensors have clocks of their own, use the times of recording: dataset.clock=received",
+        )
+    if n_unknown or gyroscope.n_bad:
+        _log.warning(
+            "%s: %d of %d motions between scans are predicted without the IMU, because it has no message for "
+            "more than %s s there, or TF does not state its mounting. %d of its messages state no usable "
+            "angular velocity.",
+            *(gyroscope.topic, n_unknown, n, IMU_GAP, gyroscope.n_bad),
+        )
+    return turns
+
+
+def _unusable(reason: str, remedy: str) -> InvalidArgumentError:
+    return InvalidArgumentError(
+        f"motion=imu cannot be used: {reason}. {remedy}, or predict with motion=constant."
+    )

@@ -1,4 +1,4 @@
-"""Headers of LAS and LAZ files, checked against the size of the file before anything is allocated.
+"""LAS and LAZ files. Headers are checked against the size of the file before anything is allocated.
 
 Offsets are those of the LAS specification 1.4 (ASPRS) and of the LASzip specification of its chunk table.
 """
@@ -6,11 +6,19 @@ Offsets are those of the LAS specification 1.4 (ASPRS) and of the LASzip specifi
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
-from gmmtorch.errors import DataError
+import numpy as np
 
+from gmmtorch.datasets.point_files.point_rows import check_count
+from gmmtorch.errors import DataError, GmmTorchError
+from gmmtorch.optional_packages import needs_extra
+
+_LAS_BLOCK_BYTES = 1 << 25
+"""Limit of one read: a point may announce 64 kB of extra bytes."""
 _HEADER = struct.Struct("<4s20x2B68xHIIBHI")  # to the number of points, 111 bytes
 _HEADER_BYTES = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375, 5: 393}
 _RECORD_HEADER = struct.Struct("<2x16sHH32x")
@@ -127,3 +135,62 @@ def _damaged(path: Path, reason: str) -> DataError:
     return DataError(
         f"{path} cannot be read as LAS or LAZ: {reason}; it is truncated or damaged. Write or fetch it again."
     )
+
+
+class LasRows:
+    """The points of a LAS or LAZ file, in the file's frame, float64, with scale and offset applied."""
+
+    dim = 3
+
+    def __init__(self, path: Path) -> None:
+        with needs_extra(f"{path}: LAS and LAZ files need", "laspy", "formats"):
+            import laspy
+            import lazrs  # noqa: F401  used by laspy
+        self._laspy: Any = laspy
+        self._path = path
+        self.name = path.stem
+        with _las_errors(path):
+            self.n_rows, self._point_bytes = read_las_header(path)
+        with _las_errors(path), self._open() as reader:
+            if int(reader.header.point_count) != self.n_rows:
+                raise DataError(f"{path} announces two numbers of points; it is damaged. Write it again.")
+            scales, offsets = (
+                np.asarray(of, np.float64) for of in (reader.header.scales, reader.header.offsets)
+            )
+            if not (np.isfinite(offsets).all() and np.isfinite(scales).all() and (scales > 0).all()):
+                raise DataError(
+                    f"{path} has scales {scales} and offsets {offsets}; it is damaged. Write it again."
+                )
+
+    def _open(self) -> Any:
+        return self._laspy.open(self._path, read_evlrs=False)
+
+    def blocks(self, begin: int, end: int, size: int) -> Iterator[np.ndarray]:
+        if begin >= end:  # laspy cannot seek to the end of a file
+            return
+        size = min(size, max(1, _LAS_BLOCK_BYTES // self._point_bytes))
+        with _las_errors(self._path), self._open() as reader:
+            reader.seek(begin)
+            for first in range(begin, end, size):
+                wanted = min(size, end - first)
+                points = reader.read_points(wanted)
+                block = np.stack([points.x, points.y, points.z], 1)
+                check_count(self._path, first, block.shape[0], wanted, self.n_rows)
+                yield block
+
+
+@contextmanager
+def _las_errors(path: Path) -> Iterator[None]:
+    """Turns every error of laspy and lazrs into a `DataError`; their errors share no base class."""
+    try:
+        yield
+    except GmmTorchError:
+        raise
+    except BaseException as error:
+        # lazrs is written in Rust, whose panics are no `Exception`.
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+            raise
+        raise DataError(
+            f"{path} cannot be read as LAS or LAZ ({error}); it is truncated or damaged. "
+            "Write or fetch it again."
+        ) from error

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gmmtorch.datasets.recordings.ros.bag_poses import Record
-from gmmtorch.datasets.recordings.trajectory import NANOSECONDS
+from gmmtorch.datasets.ros.bag_poses import Record
+from gmmtorch.datasets.trajectory import NANOSECONDS
 from gmmtorch.errors import DataError
 
 N_SAMPLES = 10

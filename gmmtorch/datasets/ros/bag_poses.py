@@ -1,4 +1,7 @@
-"""The poses of a bag's scans: one pass over the bag collects the headers of the sensor and all transforms."""
+"""Where a bag's scans get their poses: TF, a topic, a trajectory file, or a sensor that stands still.
+
+One pass over the bag collects the headers of the sensor and all transforms.
+"""
 
 from __future__ import annotations
 
@@ -6,26 +9,190 @@ import logging
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from gmmtorch.datasets.recordings.ros.bag_reader import BagReader, RawMessage
-from gmmtorch.datasets.recordings.ros.bag_topics import CLOUD, LIST, POSE_TYPES, TF_TYPES, Sensor, listed
-from gmmtorch.datasets.recordings.ros.pose_sources import (
-    BodyPoses,
-    PosesByIndex,
-    PoseSource,
-    RegisteredPoses,
-    Standing,
-    TfPoses,
-    mount_of,
-    pose_sample,
+from gmmtorch.datasets.ros.bag_reader import (
+    CLOUD,
+    LIST,
+    POSE_TYPES,
+    TF_TYPES,
+    BagReader,
+    RawMessage,
+    Sensor,
+    listed,
 )
-from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree
-from gmmtorch.datasets.recordings.trajectory import Trajectory, read_trajectory
+from gmmtorch.datasets.ros.transform_tree import (
+    TransformTree,
+    frame_name,
+    pose_of,
+    stamp_of,
+)
+from gmmtorch.datasets.trajectory import NANOSECONDS, PosesAt, Trajectory, read_trajectory
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.pose import Pose
+
+
+class PoseSource(Protocol):
+    """Poses of the sensor in a fixed frame."""
+
+    can_deskew: bool
+
+    def at(self, times: np.ndarray, frame: str) -> PosesAt:
+        """Poses of the sensor frame at times (M,) in ns."""
+
+    def explain(self, time: int, frame: str) -> str:
+        """Why the pose at a time is unknown, for messages."""
+
+
+class Standing:
+    """A sensor that does not move: its frame is the world."""
+
+    can_deskew = False
+
+    def at(self, times: np.ndarray, frame: str) -> PosesAt:
+        return PosesAt(Pose.identity(3, len(times)), np.ones(len(times), bool))
+
+    def explain(self, time: int, frame: str) -> str:
+        return "all poses are known"
+
+
+class TfPoses:
+    """Poses from TF.
+
+    top: the fixed frame; None: the root of the tree of the sensor's frame. where: the topic, for messages.
+    """
+
+    can_deskew = True
+
+    def __init__(self, tree: TransformTree, top: str | None, max_gap: float, where: str) -> None:
+        self._tree, self._max_gap, self._where = tree, max_gap, where
+        self._top = None if top is None else frame_name(top)
+        self._chains: dict[str, list[str]] = {}
+
+    def chain(self, frame: str) -> list[str]:
+        """Frames from the sensor's to the fixed one. Raises `DataError` if TF does not connect them."""
+        if frame not in self._chains:
+            if frame not in self._tree.frames:
+                raise DataError(
+                    f"{self._where}: TF has no frame {frame or '(unnamed)'}, in which the sensor measures; "
+                    f"its frames are {self._tree.describe()}. State which of them is the sensor's: "
+                    "dataset.sensor_frame=NAME, or choose other poses: dataset.poses=TOPIC, FILE or standing."
+                )
+            try:
+                self._chains[frame] = self._tree.chain(frame, self._top)
+            except DataError as error:
+                raise DataError(f"{self._where}: {error}") from error
+        return self._chains[frame]
+
+    def at(self, times: np.ndarray, frame: str) -> PosesAt:
+        return self._tree.lookup(self.chain(frame), times, self._max_gap)
+
+    def explain(self, time: int, frame: str) -> str:
+        return self._tree.unknown_step(self.chain(frame), time, self._max_gap)
+
+
+class BodyPoses:
+    """Poses of a body from a trajectory, and the sensor's pose on it.
+
+    Args:
+        trajectory: world ← body.
+        mounts: body ← sensor for each frame of a sensor.
+        max_gap: longest time in seconds between two poses to interpolate.
+        name: of the trajectory, for messages.
+    """
+
+    can_deskew = True
+
+    def __init__(self, trajectory: Trajectory, mounts: dict[str, Pose], max_gap: float, name: str) -> None:
+        self._trajectory, self._mounts, self._max_gap, self._name = trajectory, mounts, max_gap, name
+
+    def at(self, times: np.ndarray, frame: str) -> PosesAt:
+        poses = self._trajectory.at(times, self._max_gap)
+        return poses._replace(poses=poses.poses @ self._mounts[frame])
+
+    def explain(self, time: int, frame: str) -> str:
+        times = self._trajectory.times / NANOSECONDS
+        if len(times) == 0:
+            return f"{self._name} has no pose"
+        return f"{self._name} has poses from {times[0]:.3f} to {times[-1]:.3f} s"
+
+
+class RegisteredPoses:
+    """Poses of a sensor whose points are in a fixed frame already, as SLAM systems publish them.
+
+    source: poses of the sensor. sensor: its frame. fixed: poses of the frame of the points.
+    """
+
+    can_deskew = False
+
+    def __init__(self, source: PoseSource, sensor: str, fixed: PoseSource) -> None:
+        self.sensor, self._source, self._fixed = sensor, source, fixed
+
+    def at(self, times: np.ndarray, frame: str) -> PosesAt:
+        poses = self._source.at(times, self.sensor)
+        return poses._replace(known=poses.known & self._fixed.at(times, frame).known)
+
+    def of_points(self, time: int, frame: str) -> Pose:
+        """The pose at a known time (ns) of the frame of the points."""
+        return self._fixed.at(np.array([time]), frame).poses[0]
+
+    def explain(self, time: int, frame: str) -> str:
+        return self._source.explain(time, self.sensor)
+
+
+class PosesByIndex:
+    """Poses of a file without times. poses: time (ns) → world ← body; mount: body ← sensor."""
+
+    can_deskew = False
+
+    def __init__(self, poses: dict[int, Pose], mount: Pose) -> None:
+        self._poses, self._mount = poses, mount
+
+    def at(self, times: np.ndarray, frame: str) -> PosesAt:
+        found = Pose.stack([self._poses[time] for time in times.tolist()])
+        return PosesAt(found @ self._mount, np.ones(len(times), bool))
+
+    def explain(self, time: int, frame: str) -> str:
+        return "all poses are known"
+
+
+def pose_sample(message: dict[str, Any]) -> tuple[int, Pose, str, str]:
+    """(time in ns, world ← body, frames of world and body or "") of a message of a pose topic.
+
+    Raises `ValueError` if it is not a pose.
+    """
+    time = stamp_of(message["header"])
+    if "transform" in message:
+        content = message["transform"]
+        pose = pose_of(content["translation"], content["rotation"])
+    else:
+        content = message["pose"]
+        content = content.get("pose", content)  # with covariance
+        pose = pose_of(content["position"], content["orientation"])
+    world, body = message["header"]["frame_id"], message.get("child_frame_id", "")
+    return time, pose, frame_name(world), frame_name(body)
+
+
+def mount_of(extrinsic: list[float] | None) -> Pose | None:
+    """body ← sensor from x, y, z, qx, qy, qz, qw. Raises `InvalidArgumentError`."""
+    if extrinsic is None:
+        return None
+    try:
+        numbers = [float(value) for value in extrinsic]
+        if len(numbers) != 7:
+            raise ValueError
+        return Pose.from_quaternion(numbers[:3], numbers[3:])
+    except (TypeError, ValueError) as error:
+        raise InvalidArgumentError(
+            f"dataset.extrinsic={extrinsic} is not the sensor's pose on the body: give x, y, z (m), qx, qy, "
+            "qz, qw."
+        ) from error
+
+
+# -- one pass over a bag -----------------------------------------------------------------------------
+
 
 _log = logging.getLogger(__name__)
 _HEAD_BYTES = 1024

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets.depth_frames import MAX_PIXELS, metric, read_png
+from gmmtorch.datasets.depth_images import MAX_PIXELS, metric, read_png
 from gmmtorch.errors import DataError
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}

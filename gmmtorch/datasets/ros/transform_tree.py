@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, PosesAt, Trajectory
+from gmmtorch.datasets.trajectory import NANOSECONDS, PosesAt, Trajectory
 from gmmtorch.errors import DataError
 from gmmtorch.pose import MIN_NORM, Pose
 

@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import Ranges
-from gmmtorch.datasets.recordings.ros import bag_topics, sensor_messages
-from gmmtorch.datasets.recordings.ros.bag_topics import Sensor
-from gmmtorch.datasets.recordings.ros.image_camera import ImageCamera
-from gmmtorch.datasets.recordings.ros.point_times import N_SAMPLES, PointTimes, Rate
-from gmmtorch.datasets.recordings.ros.pose_sources import PoseSource, RegisteredPoses
-from gmmtorch.datasets.recordings.ros.sensor_messages import Reading
+from gmmtorch.datasets.ros import bag_reader, sensor_messages
+from gmmtorch.datasets.ros.bag_poses import PoseSource, RegisteredPoses
+from gmmtorch.datasets.ros.bag_reader import Sensor
+from gmmtorch.datasets.ros.image_camera import ImageCamera
+from gmmtorch.datasets.ros.point_times import N_SAMPLES, PointTimes, Rate
+from gmmtorch.datasets.ros.sensor_messages import Reading
 from gmmtorch.errors import DataError
 from gmmtorch.pose import Pose
 from gmmtorch.scan import FARTHEST, Scan
@@ -51,16 +51,16 @@ class ScanConversion:
     ) -> None:
         self.source, self._camera = source, camera
         self._sensor, self._ranges = sensor, ranges
-        self._times = PointTimes(sensor.kind == bag_topics.LASER) if deskew and source.can_deskew else None
+        self._times = PointTimes(sensor.kind == bag_reader.LASER) if deskew and source.can_deskew else None
 
     def points(self, message: dict[str, Any]) -> Reading:
         """The points of a decoded message, in the sensor's frame."""
         kind = self._sensor.kind
-        if kind == bag_topics.CLOUD:
+        if kind == bag_reader.CLOUD:
             return sensor_messages.cloud_points(message)
-        if kind == bag_topics.LIST:
+        if kind == bag_reader.LIST:
             return sensor_messages.listed_points(message, self._sensor.field)
-        if kind == bag_topics.LASER:
+        if kind == bag_reader.LASER:
             return sensor_messages.laser_points(message)
         assert self._camera is not None
         return sensor_messages.reading(self._camera.points(message), None, None)
@@ -77,7 +77,7 @@ class ScanConversion:
         """
         planar = [is_planar(found) for found in samples if len(found.points) >= _MIN_PLANAR]
         is_planar_cloud = not self._sensor.is_camera and 2 * sum(planar) > len(planar)
-        is_planar_sensor = self._sensor.kind == bag_topics.LASER or is_planar_cloud
+        is_planar_sensor = self._sensor.kind == bag_reader.LASER or is_planar_cloud
         return is_planar_sensor and self.is_level(poses)
 
     def learn_times(self, found: Reading, stamp: int, rate: Rate) -> None:
