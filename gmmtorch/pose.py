@@ -259,6 +259,10 @@ class Pose:
         shift = self.translation + (other.translation - self.translation) * part
         return Pose(self.rotation @ step.rotation, shift)
 
+    def shifted(self, shift: Tensor) -> Pose:
+        """The poses with translations t + `shift` (…, D), such as those about another origin."""
+        return Pose(self.rotation, self.translation + shift)
+
     def moved(self, steps: Tensor) -> Pose:
         """The poses after steps (…, F) in the frame of the world: a shift v, and a turn ω about the origin t
         of the moved frame, x → exp([ω]) (x − t) + t + v.

@@ -207,4 +207,6 @@ def _forward(places: Tensor) -> Tensor:
 
 def _sensor_3d(name: str, max_range: float) -> RangeSensor:
     check_choice("sensor", name, ("lidar", "depth_camera"))
-    return (spinning_lidar if name == "lidar" else depth_camera)(max_range=max_range)
+    if name == "lidar":
+        return spinning_lidar(max_range=max_range)
+    return depth_camera(max_range=max_range)

@@ -174,20 +174,20 @@ class LocalMap:
         starts = Pose.cat([expected.poses, Pose(rotations.flatten(0, 2), places.flatten(0, 2))])
         points = scan.points[:_RANKED]
         parts = torch.arange(len(starts)).split(_AT_ONCE)
-        score = torch.cat([target.sums(points, self._about(starts[part])).score for part in parts])
+        score = torch.cat([target.sums(points, starts[part].shifted(-self._center)).score for part in parts])
         total = score / CORRELATED - self._unlikely(starts, expected)
         best = total.argsort(descending=True, stable=True)[: _SORTED[self.dim]]
         view = self._space.view(points, starts[best])
         against = _CONTRADICTED * (view.in_free_space + view.looked_through) - _UNKNOWN * view.unknown
         total = total[best] - against * len(points) / CORRELATED
         starts = starts[best[total.argsort(descending=True, stable=True)]]
-        starts = starts[distinct(starts, _SPREAD * spacing, _SPREAD * turn)]
+        starts = starts[distinct(starts.shifted(-self._center), _SPREAD * spacing, _SPREAD * turn)]
         return Pose.cat([expected.poses, starts[: _CLIMBED[self.dim]]])
 
     def _climbed(
         self, scan: Keyframe, expected: Expectation, starts: Pose, targets: list[AlignmentTarget]
     ) -> _Found:
-        motions, kept = self._about(starts), len(starts)
+        motions, kept = starts.shifted(-self._center), len(starts)
         for target in targets:
             points = scan.points[: self.n_points if target is targets[-1] else _COARSE_POINTS]
             found = align(points, target, motions, _STEPS)
@@ -211,7 +211,7 @@ class LocalMap:
 
     def _total(self, found: Alignment, points: Tensor, expected: Expectation) -> tuple[Tensor, View]:
         """Log-likelihood of the points and of the motion (B,), nats; how the points agree with free space."""
-        poses = self._placed(found.motions)
+        poses = found.motions.orthonormal().shifted(self._center)
         view = self._space.view(points, poses)
         contradicted = view.in_free_space + view.looked_through
         mean = (
@@ -231,8 +231,8 @@ class LocalMap:
         self, points: Tensor, found: Alignment, total: Tensor, view: View, expected: Expectation
     ) -> _Found:
         """The best pose; if others explain the scan nearly as well, the most expected one, with a doubt."""
-        poses = self._placed(found.motions)
-        is_apart = differences(poses, poses[:1], _APART, _APART)[:, 0] > 1
+        poses = found.motions.orthonormal().shifted(self._center)
+        is_apart = differences(found.motions, found.motions[:1], _APART, _APART)[:, 0] > 1
         rivals = is_apart & (total >= total[0] - _ALIKE)
         chosen = rivals | (torch.arange(len(total)) == 0)
         best = int(torch.where(chosen, self._unlikely(poses, expected), torch.inf).argmin())
@@ -255,14 +255,6 @@ class LocalMap:
             covariance = covariance + _scatter(poses[best], poses[chosen])
         location = Location(poses[best].matrix, covariance, share, tuple(doubts))
         return _Found(location, float(total[best]), contradicted)
-
-    def _about(self, poses: Pose) -> Pose:
-        """Poses in the world, about the centre of the map."""
-        return Pose(poses.rotation, poses.translation - self._center)
-
-    def _placed(self, motions: Pose) -> Pose:
-        """Poses about the centre of the map, in the world."""
-        return Pose(motions.orthonormal().rotation, motions.translation + self._center)
 
 
 def _slid(found: Alignment, points: Tensor) -> Pose:

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from scipy.sparse import coo_matrix, csc_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
@@ -104,34 +105,23 @@ def residuals(poses: Pose, edges: Edges) -> Tensor:
     return (edges.motions.inverse() @ between).log()
 
 
-def square_errors(poses: Pose, edges: Edges) -> Tensor:
-    """e_ijᵀ Σ_ij⁻¹ e_ij (E,)."""
-    error = residuals(poses, edges)
-    return torch.einsum("ei,eij,ej->e", error, edges.information, error)
-
-
 def _check(n: int, edges: Edges) -> None:
     ends = torch.cat([edges.source, edges.target])
     if len(ends) and not (int(ends.min()) >= 0 and int(ends.max()) < n):
         raise InvalidArgumentError(f"edges name pose {int(ends.max())}, but there are {n} poses.")
-    root = list(range(n))
-
-    def find(i: int) -> int:
-        while root[i] != i:
-            root[i] = root[root[i]]
-            i = root[i]
-        return i
-
-    for i, j in zip(edges.source.tolist(), edges.target.tolist(), strict=True):
-        root[find(i)] = find(j)
-    apart = [i for i in range(n) if find(i) != find(0)]
-    if apart:
+    links = coo_matrix(
+        (np.ones(len(edges.source)), (edges.source.numpy(), edges.target.numpy())), shape=(n, n)
+    )
+    _, part = connected_components(links, directed=False)
+    apart = np.flatnonzero(part != part[0])
+    if len(apart):
         raise InvalidArgumentError(f"edges do not connect pose {apart[0]} with the first one; add an edge.")
 
 
 def _weights(poses: Pose, edges: Edges, scale: float) -> Tensor:
     """Of each edge (E,): ρ′ of its square error."""
-    square = square_errors(poses, edges)
+    error = residuals(poses, edges)
+    square = torch.einsum("ei,eij,ej->e", error, edges.information, error)
     return torch.where(edges.is_closure, (1 + square / scale**2).reciprocal().square(), 1.0)
 
 

@@ -128,7 +128,8 @@ class Tracker:
         self._motion: Pose | None = None
         self._last: Pose | None = None  # about the centre
         if pose is not None:
-            self._last = self._about(Pose.checked(pose, self.dim, "pose", device=self._center.device))
+            start = Pose.checked(pose, self.dim, "pose", device=self._center.device)
+            self._last = start.shifted(-self._center)
 
     def locate(self, points: ArrayLike, motion: ArrayLike | None = None) -> Location:
         """The pose of the next scan; if it is not `found`, the best guess.
@@ -164,7 +165,7 @@ class Tracker:
         """The location; not found if it is away from the prediction and fits worse than the last scan did."""
         if predicted is None or not location.found or location.explained >= _SURE * self._explained:
             return location
-        pose = self._about(Pose.from_matrix(location.pose))
+        pose = Pose.from_matrix(location.pose).shifted(-self._center)
         if float(differences(pose[None], predicted[None], self.distance, self.angle)) <= 1:
             return location
         doubt = (
@@ -242,7 +243,7 @@ class Tracker:
             doubts.append("another pose explains the scan as well")
         if len(rows) < _FEWEST:
             doubts.append(f"the scan has only {len(rows)} points beyond {_NEAREST} m: is the sensor covered?")
-        pose = self._in_map(found.motions[0])
+        pose = found.motions[0].shifted(self._center)
         in_free_space = 0.0 if doubts or is_tracked else self._in_free_space(rows, pose)
         if in_free_space > _MOST_FREE * (1 - self.least_explained):
             doubts.append(f"{in_free_space:.0%} of the points lie where the map saw free space")
@@ -260,25 +261,17 @@ class Tracker:
         pose = Pose.identity(self.dim, device=self._center.device) if predicted is None else predicted
         covariance = UNSEEN**2 * torch.eye(self.dim * (self.dim + 1) // 2).to(self._center)
         doubt = f"the scan has no points beyond {_NEAREST} m"
-        return Location(self._in_map(pose).matrix, covariance, 0.0, (doubt,))
+        return Location(pose.shifted(self._center).matrix, covariance, 0.0, (doubt,))
 
     def _remember(self, location: Location, predicted: Pose | None, is_measured: bool) -> None:
         if not location.found:
             self.n_lost += 1
             self._last, self._motion = predicted if is_measured else self._last, None
             return
-        now, last = self._about(Pose.from_matrix(location.pose)), self._last
+        now, last = Pose.from_matrix(location.pose).shifted(-self._center), self._last
         is_next = last is not None and self.n_lost == 0 and self._explained > 0
         self._motion = last.inverse() @ now if last is not None and is_next else None
         self._last, self.n_lost, self._explained = now, 0, location.explained
-
-    def _about(self, pose: Pose) -> Pose:
-        """A pose in the map, about the map's centre."""
-        return Pose(pose.rotation, pose.translation - self._center)
-
-    def _in_map(self, pose: Pose) -> Pose:
-        """A pose about the map's centre, in the map."""
-        return Pose(pose.rotation, pose.translation + self._center)
 
 
 def _better(some: Location, other: Location) -> Location:

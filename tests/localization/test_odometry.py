@@ -140,8 +140,8 @@ def test_a_pose_that_slid_along_a_wall_returns_to_where_its_post_is(dim, shift):
     scan = Odometry()._scan(wall_and_post(draw, 600, 3, dim))
     start = Pose.from_yaw([0.0], [shift, 0.0, 0.0][:dim])
     expected = Expectation(Pose.identity(dim, 1), 0.3, 0.2, 0.95)
-    climbed = align(scan.points, local._targets[-1], local._about(start), 15).motions
-    assert float(local._placed(climbed).translation.norm()) > 0.3
+    climbed = align(scan.points, local._targets[-1], start.shifted(-local._center), 15).motions
+    assert float(climbed.orthonormal().shifted(local._center).translation.norm()) > 0.3
     location = local._climbed(scan, expected, start, local._targets[-1:]).location
     assert location.found
     assert float(location.pose[:dim, dim].norm()) < 0.05
@@ -153,9 +153,9 @@ def test_a_small_gain_of_evidence_does_not_move_a_pose_from_the_largest_score():
     local = LocalMap([Odometry()._scan(wall_and_post(draw, 2000, 6, 3))], 0.5, _RULE)
     scan = Odometry()._scan(wall_and_post(draw, 600, 3, 3))
     start = Pose.identity(3, 1)
-    climbed = align(scan.points, local._targets[-1], local._about(start), 15).motions
+    climbed = align(scan.points, local._targets[-1], start.shifted(-local._center), 15).motions
     location = local._climbed(scan, Expectation(start, 0.3, 0.2, 0.95), start, local._targets[-1:]).location
-    assert torch.equal(location.pose, local._placed(climbed)[0].matrix)
+    assert torch.equal(location.pose, climbed.orthonormal().shifted(local._center)[0].matrix)
 
 
 @pytest.mark.parametrize("seed", [0, 2])

@@ -101,12 +101,19 @@ class BodyPoses:
         mounts: body ← sensor for each frame of a sensor.
         max_gap: longest time in seconds between two poses to interpolate.
         name: of the trajectory, for messages.
+        can_deskew: False if it has poses at the stamps of scans only.
     """
 
-    can_deskew = True
-
-    def __init__(self, trajectory: Trajectory, mounts: dict[str, Pose], max_gap: float, name: str) -> None:
+    def __init__(
+        self,
+        trajectory: Trajectory,
+        mounts: dict[str, Pose],
+        max_gap: float,
+        name: str,
+        can_deskew: bool = True,
+    ) -> None:
         self._trajectory, self._mounts, self._max_gap, self._name = trajectory, mounts, max_gap, name
+        self.can_deskew = can_deskew
 
     def at(self, times: np.ndarray, frame: str) -> PosesAt:
         poses = self._trajectory.at(times, self._max_gap)
@@ -140,22 +147,6 @@ class RegisteredPoses:
 
     def explain(self, time: int, frame: str) -> str:
         return self._source.explain(time, self.sensor)
-
-
-class PosesByIndex:
-    """Poses of a file without times. poses: time (ns) → world ← body; mount: body ← sensor."""
-
-    can_deskew = False
-
-    def __init__(self, poses: dict[int, Pose], mount: Pose) -> None:
-        self._poses, self._mount = poses, mount
-
-    def at(self, times: np.ndarray, frame: str) -> PosesAt:
-        found = Pose.stack([self._poses[time] for time in times.tolist()])
-        return PosesAt(found @ self._mount, np.ones(len(times), bool))
-
-    def explain(self, time: int, frame: str) -> str:
-        return "all poses are known"
 
 
 def pose_sample(message: dict[str, Any]) -> tuple[int, Pose, str, str]:
@@ -380,11 +371,13 @@ class BagSurvey:
                 f"frame {first} already. Choose dataset.poses=tf, or dataset.sensor_frame={first} if that is "
                 "the frame of the sensor."
             )
-        fixed = Pose.identity(3) if mount is None else mount
+        mounts = dict.fromkeys(frames, Pose.identity(3) if mount is None else mount)
         trajectory = read_trajectory(self._file, len(self.heads))
         if not trajectory.has_times:
-            return PosesByIndex({r.stamp: trajectory.poses[r.number] for r in records}, fixed)
-        return BodyPoses(trajectory, dict.fromkeys(frames, fixed), self.max_gap, str(self._file))
+            rows, stamps = [r.number for r in records], np.array([r.stamp for r in records])
+            trajectory = Trajectory.from_samples(stamps, trajectory.poses[rows])
+            return BodyPoses(trajectory, mounts, np.inf, str(self._file), can_deskew=False)
+        return BodyPoses(trajectory, mounts, self.max_gap, str(self._file))
 
     def _from_tf(
         self, frames: Counter[str], where: str, seen_from: str | None, fixed: str | None

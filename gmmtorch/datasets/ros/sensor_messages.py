@@ -86,7 +86,9 @@ def _time_field(names: Iterable[str]) -> str | None:
 
 def _table_points(table: np.ndarray, time: str | None) -> Reading:
     times = None if time is None else table[time].astype(table[time].dtype.newbyteorder("="), copy=False)
-    return reading(_coordinates(table), None, times)
+    with np.errstate(invalid="ignore"):  # signalling NaNs, which random bytes contain
+        points = np.stack([table[axis].astype(np.float64) for axis in "xyz"], 1)
+    return reading(points, None, times)
 
 
 def _row_bytes(shape: tuple[int, int], item: int, step: int, most_padding: int, n_bytes: int) -> int:
@@ -117,12 +119,6 @@ def _check_fields(fields: list[dict[str, Any]]) -> None:
                 raise DataError(f"the fields {name} and {their_name} overlap")
     if len({name for _, _, name in ours}) < len(ours) or len({kind[0] for _, kind, _ in ours}) > 1:
         raise DataError(f"x, y, z are not three fields of one kind, but {ours}")
-
-
-def _coordinates(table: np.ndarray) -> np.ndarray:
-    """The fields x, y, z of a structured array (N,) as (N, 3) float64."""
-    with np.errstate(invalid="ignore"):  # signalling NaNs, which random bytes contain
-        return np.stack([table[axis].astype(np.float64) for axis in "xyz"], 1)
 
 
 def listed_points(message: dict[str, Any], field: str) -> Reading:
