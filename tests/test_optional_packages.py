@@ -46,7 +46,7 @@ def bag(folder: Path) -> object:
 
 
 def las(folder: Path) -> object:
-    from gmmtorch.datasets.point_files.point_rows import LasRows
+    from gmmtorch.datasets.point_files.las_files import LasRows
 
     return LasRows(folder / "a.las")
 
