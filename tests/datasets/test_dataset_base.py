@@ -21,34 +21,26 @@ ORIGIN = torch.zeros(2, dtype=torch.float64)
 ENDS = torch.tensor([[1.0, 0.0], [0.0, 5.0], [-20.0, 0.0]], dtype=torch.float64)
 
 
-def test_without_max_range_every_end_is_a_hit():
-    scan = Ranges().scan(ENDS, ORIGIN)
-    assert scan.points.tolist() == ENDS.tolist()
-    assert scan.no_return.shape == (0, 2)
-
-
-def test_ends_at_or_beyond_max_range_become_no_return_beams():
-    scan = Ranges(5.0, 3.0).scan(ENDS, ORIGIN)
-    assert scan.points.tolist() == [[1.0, 0.0]]
-    assert scan.no_return.tolist() == [[0.0, 3.0], [-3.0, 0.0]]
-
-
-def test_no_return_range_zero_drops_no_return_beams():
-    scan = Ranges(5.0, 0.0).scan(ENDS, ORIGIN)
-    assert scan.points.tolist() == [[1.0, 0.0]]
-    assert scan.no_return.shape == (0, 2)
-
-
-def test_free_part_is_limited_by_max_range_and_the_beam():
-    scan = Ranges(6.0, 50.0).scan(ENDS, ORIGIN, no_return=torch.tensor([False, True, False]))
-    assert scan.no_return.tolist() == [[0.0, 5.0], [-6.0, 0.0]]
-
-
-def test_ends_that_are_not_finite_or_at_the_origin_are_dropped():
-    ends = torch.tensor([[math.nan, 0.0], [0.0, math.inf], [0.0, 0.0], [1.0, 1.0]], dtype=torch.float64)
-    scan = Ranges(5.0, 3.0).scan(ends, ORIGIN)
-    assert scan.points.tolist() == [[1.0, 1.0]]
-    assert scan.no_return.shape == (0, 2)
+@pytest.mark.parametrize(
+    ("ranges", "mask", "points", "no_return"),
+    [
+        (Ranges(), None, ENDS.tolist(), []),
+        (Ranges(5.0, 3.0), None, [[1, 0]], [[0, 3], [-3, 0]]),  # at the range or beyond: no return
+        (Ranges(5.0, 0.0), None, [[1, 0]], []),
+        (Ranges(6.0, 50.0), [False, True, False], [[1, 0]], [[0, 5], [-6, 0]]),  # as long as beam and range
+    ],
+)
+def test_ends_become_hits_and_beams_without_return(ranges, mask, points, no_return):
+    given = None if mask is None else torch.tensor(mask)
+    invalid = torch.tensor([[math.nan, 0.0], [0.0, math.inf], [0.0, 0.0]], dtype=torch.float64)
+    for ends in (ENDS, torch.cat([ENDS, invalid])):  # not finite, or at the origin
+        marked = None if given is None else torch.nn.functional.pad(given, (0, len(ends) - 3))
+        before = None if marked is None else marked.clone()
+        scan = ranges.scan(ends, ORIGIN, no_return=marked)
+        assert scan.points.tolist() == points
+        assert scan.no_return.tolist() == no_return
+        assert scan.no_return.shape[1] == 2
+        assert marked is before or torch.equal(marked, before)
 
 
 def test_ends_at_max_range_within_rounding_are_no_hits():
@@ -57,22 +49,14 @@ def test_ends_at_max_range_within_rounding_are_no_hits():
     assert Ranges(50.0, 8.0).scan(ends, torch.zeros(2)).points.shape == (0, 2)
 
 
-def test_the_no_return_mask_is_not_modified():
-    mask = torch.zeros(3, dtype=torch.bool)
-    Ranges(5.0, 3.0).scan(ENDS, ORIGIN, no_return=mask)
-    assert not bool(mask.any())
-
-
-@pytest.mark.parametrize("value", [0.0, -1.0, math.nan])
-def test_max_range_must_be_a_distance(value):
-    with pytest.raises(InvalidArgumentError, match="max_range"):
-        Ranges(value)
-
-
-@pytest.mark.parametrize("value", [-1.0, math.nan, math.inf])
-def test_no_return_range_must_be_a_distance(value):
-    with pytest.raises(InvalidArgumentError, match="no_return_range"):
-        Ranges(None, value)
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("max_range", x) for x in (0.0, -1.0, math.nan)]
+    + [("no_return_range", x) for x in (-1.0, math.nan, math.inf)],
+)
+def test_ranges_must_be_distances(option, value):
+    with pytest.raises(InvalidArgumentError, match=option):
+        Ranges(**{option: value})
 
 
 class _TenScans(Dataset):
@@ -177,27 +161,26 @@ def test_load_states_the_expected_content_of_a_missing_path(name, tmp_path):
     assert isinstance(caught.value, FileNotFoundError)
 
 
-@pytest.mark.parametrize("path", [None, ""])
-def test_load_requires_a_path(path):
-    with pytest.raises(InvalidArgumentError, match=r"dataset\.path is not set"):
-        load("carmen", path)
-
-
-def test_load_rejects_a_folder_in_place_of_a_file(tmp_path):
-    with pytest.raises(MissingDataError, match="not a file"):
-        load("carmen", tmp_path)
-
-
-def test_load_lists_the_options_when_an_option_is_unknown(tmp_path):
-    with pytest.raises(InvalidArgumentError, match=r"sensr='lidar'.*n_scans, seed, sensor"):
-        load("synthetic_building", sensr="lidar")
-    with pytest.raises(InvalidArgumentError, match="takes no further options"):
-        load("carmen", tmp_path, seed=1)
-
-
-def test_load_rejects_a_path_for_a_simulated_data_set(tmp_path):
-    with pytest.raises(InvalidArgumentError, match="is simulated"):
-        load("synthetic_building", tmp_path)
+@pytest.mark.parametrize(
+    ("name", "path", "options", "error", "message"),
+    [
+        ("carmen", None, {}, InvalidArgumentError, r"dataset\.path is not set"),
+        ("carmen", "", {}, InvalidArgumentError, r"dataset\.path is not set"),
+        ("carmen", "/", {}, MissingDataError, "not a file"),
+        ("carmen", "/", {"seed": 1}, InvalidArgumentError, "takes no further options"),
+        ("synthetic_building", "/", {}, InvalidArgumentError, "is simulated"),
+        (
+            "synthetic_building",
+            None,
+            {"sensr": "lidar"},
+            InvalidArgumentError,
+            "sensr=.*n_scans, seed, sensor",
+        ),
+    ],
+)
+def test_load_names_a_wrong_path_or_option(name, path, options, error, message):
+    with pytest.raises(error, match=message):
+        load(name, path, **options)
 
 
 def test_load_applies_the_default_ranges_of_each_data_set(tmp_path):
