@@ -23,14 +23,14 @@ pytest.importorskip("rosbags", reason="needs the extra [ros]: rosbags")
 
 from exploration.replays import content
 from mapping.random_components import random_components
+from sensor_bags import BagWriter
 
 from gmmtorch.cli import common
 from gmmtorch.datasets.base import Ranges
 from gmmtorch.datasets.ros.bag_reader import LASER as LASERS
 from gmmtorch.datasets.ros.bag_reader import Sensor, Topic
 from gmmtorch.datasets.ros.transform_tree import TransformTree
-from gmmtorch.export.bag import BagWriter
-from gmmtorch.live.mapper.live_scans import LiveOptions, LiveScans
+from gmmtorch.live.live_scans import LiveOptions, LiveScans
 from gmmtorch.live.ros import Node
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.map_builder import MapBuilder

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from sensor_bags import BagWriter
 from test_rosbag import POINTS, moved
 
 from gmmtorch.datasets import load
 from gmmtorch.datasets.ros.transform_tree import TransformTree
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.export.bag import BagWriter
 
 Sample = tuple[int, np.ndarray, np.ndarray]
 
