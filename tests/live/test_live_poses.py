@@ -220,7 +220,7 @@ def test_odometry_continues_in_the_map_of_an_earlier_run():
         later.receive(laser(10 + index / 5, room(*at)), 0)
         assert later.advance()
         assert later.newest is not None
-        assert is_near(later.newest.matrix, at)
+        assert is_near(later.newest.pose.matrix.numpy(), at)
         assert later.newest.location is not None
         assert (np.linalg.eigvalsh(later.newest.location.covariance) > 0).all()
 
