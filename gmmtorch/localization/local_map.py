@@ -37,10 +37,7 @@ _SLIDE_STEPS = 3
 _DECISIVE = 4.0  # nats by which such a place must be better: smaller gains do not make poses more exact
 _SPACING = {2: 0.25, 3: 0.5}  # metres between the starts of the first search
 _COARSE = {2: 0.5, 3: 1.0}  # metres of blur, and between the starts, of the last search
-_TURNED = {
-    2: 0.5,
-    3: 0.2,
-}  # radians between the headings of neighbouring starts, for each metre between their places
+_TURNED = {2: 0.5, 3: 0.2}  # radians between the headings of neighbours, for each metre between their places
 _NEAR = 0.5  # metres, and half as many radians, of the deviations of the first search
 _FARTHEST = 3.0  # metres of a search
 _NEVER = 1e4  # nats of a pose that is farther from the expected poses than the sensor moves
@@ -60,8 +57,6 @@ _MOST_CONTRADICTED = 0.3  # sum of both shares
 _LEAST_SEEN = 0.5  # share of the points of which at least so many must lie on surfaces
 _USUAL = 0.85  # of the share that is expected to be explained: less, and the search is wider
 _ALIKE = 2.0  # nats by which another pose must be worse
-
-
 _IMAGE_CELL = {2: math.radians(1), 3: math.radians(3)}  # of an image
 _MARGIN = 0.25, 0.02  # metres, and share of the range, that a point may be in front of or behind a surface
 _KEPT_POINTS = 200  # of each earlier scan, that a new scan must not look through
