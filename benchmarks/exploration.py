@@ -25,7 +25,7 @@ from pathlib import Path
 
 import torch
 
-from gmmtorch.report.table import format_table
+from gmmtorch.report.text import format_table
 from gmmtorch.team.exploration.mission.driver import Stopwatch
 from gmmtorch.team.exploration.mission.mission import Mission
 from gmmtorch.team.exploration.mission.options import TeamOptions

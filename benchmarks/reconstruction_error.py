@@ -35,7 +35,7 @@ from torch import Tensor
 
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.mapping.components import Components
-from gmmtorch.report.table import format_table
+from gmmtorch.report.text import format_table
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld
 from gmmtorch.simulation.worlds.warehouse import warehouse

@@ -40,7 +40,7 @@ import torch
 
 from gmmtorch.errors import DataError
 from gmmtorch.processes import end_with_parent
-from gmmtorch.report.table import format_table
+from gmmtorch.report.text import format_table
 from gmmtorch.team.sharing.messages.datagrams import Kind
 from gmmtorch.team.sharing.messages.message_registry import decode
 from gmmtorch.team.sharing.messages.mission_messages import ViewsMessage

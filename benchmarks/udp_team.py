@@ -27,7 +27,7 @@ from typing import Any
 
 from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.report.table import format_table
+from gmmtorch.report.text import format_table
 from gmmtorch.team.cli.from_options.links import free_addresses
 from gmmtorch.team.sharing.replica.materialized_view import fingerprints
 

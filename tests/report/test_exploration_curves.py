@@ -10,8 +10,7 @@ from matplotlib.colors import to_hex
 from shown import texts
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.report.labels import LineEnd, label_ends
-from gmmtorch.report.style import PALETTE, new_figure
+from gmmtorch.report.style import PALETTE, LineEnd, label_ends, new_figure
 from gmmtorch.team.exploration.mission.results import mean_band, paired_interval
 from gmmtorch.team.report.mission_bars import (
     deviations_figure,
