@@ -131,8 +131,8 @@ def _partition(i: int, value: Any) -> Partition:
         or not _are_groups(fields[2])
     ):
         raise InvalidArgumentError(
-            f"partitions[{i}]={value!r} must have begin and end, finite seconds, the first before the second, "
-            "and groups, lists of robots that are each in one: {begin: 60, end: 120, groups: [[0], [1, 2]]}."
+            f"partitions[{i}]={value!r} must have begin and end, finite seconds, the first before the "
+            "second, and groups, lists of robots that are each in one: {begin: 60, end: 120, groups: [[0], [1, 2]]}."
         )
     begin, end, groups = fields
     return Partition(
