@@ -132,7 +132,8 @@ def _partition(i: int, value: Any) -> Partition:
     ):
         raise InvalidArgumentError(
             f"partitions[{i}]={value!r} must have begin and end, finite seconds, the first before the "
-            "second, and groups, lists of robots that are each in one: {begin: 60, end: 120, groups: [[0], [1, 2]]}."
+            "second, and groups, lists of robots that are each in one: "
+            "{begin: 60, end: 120, groups: [[0], [1, 2]]}."
         )
     begin, end, groups = fields
     return Partition(
