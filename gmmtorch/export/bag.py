@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from gmmtorch.datasets import ARRAY, BASE, NAME, NANOSECONDS, in_space, to_nanoseconds
+from gmmtorch.datasets import ARRAY, BASE, NAME, NANOSECONDS, to_nanoseconds
 from gmmtorch.errors import InvalidArgumentError, OutputError
 from gmmtorch.optional_packages import needs_extra
+from gmmtorch.pose import Pose
 from gmmtorch.scan import ArrayLike, Scan
 
 _POINT_TYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
@@ -52,11 +53,9 @@ def time_fields(stamp: int) -> dict[str, int]:
 
 def pose_fields(matrix: ArrayLike) -> tuple[dict[str, float], dict[str, float]]:
     """Translation and rotation of a pose (4, 4) as fields of messages."""
-    from scipy.spatial.transform import Rotation
-
-    pose = np.asarray(matrix, dtype=np.float64)
-    turn = Rotation.from_matrix(pose[:3, :3]).as_quat()
-    return dict(zip("xyz", pose[:3, 3].tolist(), strict=True)), dict(zip("xyzw", turn.tolist(), strict=True))
+    pose = Pose.from_matrix(matrix)
+    shift, turn = pose.translation.tolist(), pose.quaternion().tolist()
+    return dict(zip("xyz", shift, strict=True)), dict(zip("xyzw", turn, strict=True))
 
 
 def transform_fields(edges: Mapping[tuple[str, str], ArrayLike]) -> dict[str, Any]:
@@ -146,7 +145,7 @@ def write_bag(
                 )
             points = scan.points.detach().cpu().double().numpy()
             local = (points - given[:dim, dim]) @ given[:dim, :dim]
-            bag.transforms(time, {("map", "lidar"): in_space(given[None])[0]})
+            bag.transforms(time, {("map", "lidar"): Pose.from_matrix(given).in_space().matrix})
             bag.cloud(topic, time, "lidar", np.pad(local, ((0, 0), (0, 3 - dim))))
     return Path(path)
 

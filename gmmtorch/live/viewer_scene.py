@@ -14,6 +14,7 @@ from gmmtorch.errors import check_choice
 from gmmtorch.export import TriangleMesh
 from gmmtorch.mapping import Components, GaussianMap
 from gmmtorch.occupancy import VoxelGrid
+from gmmtorch.pose import Pose
 from gmmtorch.report import (
     N_SIGMA,
     SOUTH_WEST,
@@ -89,11 +90,9 @@ def sphere(n_components: int) -> tuple[Tensor, Tensor]:
 
 def instances(solid: Solid) -> Instances:
     """The 2σ ellipsoids."""
-    from scipy.spatial.transform import Rotation
-
     deviations, axes = principal_axes(solid.covariances)
-    turned = Rotation.from_matrix(axes.numpy()).as_quat()[:, [3, 0, 1, 2]] if len(axes) else np.zeros((0, 4))
-    return Instances(turned, solid.means.numpy(), N_SIGMA * deviations.numpy())
+    turned = Pose(axes, solid.means).quaternion()[:, [3, 0, 1, 2]]
+    return Instances(turned.numpy(), solid.means.numpy(), N_SIGMA * deviations.numpy())
 
 
 class Colours(NamedTuple):

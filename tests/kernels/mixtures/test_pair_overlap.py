@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from gmmtorch.kernels import kernels
-from gmmtorch.localization.registration.overlap import Ascent, overlap
-from gmmtorch.localization.rigid_motions import Motions
+from gmmtorch.localization.registration import Ascent, overlap
 from gmmtorch.mixture.em.exact import Parameters
+from gmmtorch.pose import Pose
 
 
 def mixture(k: int, dim: int, kind: str) -> Parameters:
@@ -25,11 +25,11 @@ def mixture(k: int, dim: int, kind: str) -> Parameters:
     return Parameters(torch.rand(k, generator=generator, dtype=torch.float64), means, covariances)
 
 
-def motions_of(n: int, dim: int) -> Motions:
+def motions_of(n: int, dim: int) -> Pose:
     steps = (
         0.2 * torch.randn(n, dim + dim * (dim - 1) // 2, generator=torch.Generator().manual_seed(1)).double()
     )
-    return Motions(torch.eye(dim).double().repeat(n, 1, 1), torch.zeros(n, dim).double()).moved(steps)
+    return Pose.identity(dim, n).moved(steps)
 
 
 @pytest.mark.parametrize("dim", [2, 3])

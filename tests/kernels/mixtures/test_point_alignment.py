@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from gmmtorch.kernels import kernels
-from gmmtorch.localization.registration.alignment import AlignmentTarget
-from gmmtorch.localization.rigid_motions import Motions
+from gmmtorch.localization.alignment import AlignmentTarget
 from gmmtorch.mixture.em.exact import Parameters
+from gmmtorch.pose import Pose
 
 
 def surfaces(k: int, dim: int, kind: str) -> Parameters:
@@ -25,10 +25,10 @@ def surfaces(k: int, dim: int, kind: str) -> Parameters:
     return Parameters(torch.ones(k).double(), means, covariances)
 
 
-def motions_of(n: int, dim: int) -> Motions:
+def motions_of(n: int, dim: int) -> Pose:
     generator = torch.Generator().manual_seed(n)
     steps = 0.3 * torch.randn(n, dim + dim * (dim - 1) // 2, generator=generator).double()
-    return Motions(torch.eye(dim).double().repeat(n, 1, 1), torch.zeros(n, dim).double()).moved(steps)
+    return Pose.identity(dim, n).moved(steps)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
