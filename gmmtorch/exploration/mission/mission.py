@@ -22,7 +22,7 @@ from gmmtorch.exploration.robot.robot_state import Robot
 from gmmtorch.exploration.world.navigable import collides, finely, meets_others
 from gmmtorch.exploration.world.scoring import BeliefMap
 from gmmtorch.exploration.world.world import World
-from gmmtorch.kernels.rays.ray_marks import mark_cells_of_rays
+from gmmtorch.kernels.rays.ray_counting import mark_cells_of_rays
 from gmmtorch.occupancy.voxels.boxes import Box, to_lattice
 from gmmtorch.sharing.transport.simulated_network import Network
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame

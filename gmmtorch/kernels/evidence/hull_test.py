@@ -2,114 +2,17 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.compiler import FusedKernel
+from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel
 from gmmtorch.kernels.evidence.point_evidence import sum_of
-from gmmtorch.kernels.simd import CPU_LANES, SIMD
 from gmmtorch.linalg import ragged_index
 
-_BODY = """
-    const int64_t begin = item / parts * LANES, stop = GMM_MIN(begin + LANES, n_balls), part = item % parts;
-    vec x[DIM], ball, number = (vec)(-1.0);
-    double n_near[LANES];
-    for (int l = 0; l < LANES; ++l) {
-        const int64_t i = GMM_MIN(begin + l, stop - 1);
-        for (int a = 0; a < DIM; ++a) set(x[a], l, centers[i * DIM + a]);
-        set(ball, l, radii[i]);
-        if (begin + l < stop) set(number, l, (double)lists[i]);
-        n_near[l] = 0.0;
-    }
-    const vec reach = spread > 0.0 ? ball : ball + cube_reach;
-    for (int first = 0; first < LANES; ++first) {  // each list of these balls once
-        const double mine = get(number, first);
-        if (mine < 0.0 || (first > 0 && get(number, first - 1) == mine)) continue;
-        const mask active = number == mine;
-        int last = first;
-        while (last + 1 < LANES && get(number, last + 1) == mine) ++last;
-        const int64_t list = (int64_t)mine, from = starts[list];
-        for (int64_t at = from + part; at < starts[list + 1]; at += parts) {
-            const double* row = rows + entries[at] * WIDTH;
-            GMM_FETCH(rows + entries[GMM_MIN(at + AHEAD * parts, starts[list + 1] - 1)] * WIDTH, WIDTH);
-            const double *mean = row + DIM * DIM, *origin = mean + DIM, *squares = origin + DIM;
-            vec ray[DIM], y[DIM], z[DIM], distance = (vec)(0.0);
-            for (int j = 0; j < DIM; ++j) {
-                ray[j] = x[j] - origin[j];
-                distance += ray[j] * ray[j];
-            }
-            distance = root(distance);
-            vec clear = distance - reach;
-            clear = clear < 1e-12 ? (vec)(1e-12) : clear;
-            const vec closeness = 1.0 / clear;
-            vec widened = squares[DIM] * closeness;
-            widened = spread * (widened < 1.0 ? (vec)(1.0) : widened);
-            const vec far = squares[DIM + 1] + widened, beta = far * reach * closeness;
-            // All of the ellipsoid lies within its longest half axis of the mean: a quick test.
-            double mm = 0.0;
-            vec along = (vec)(0.0);
-            for (int j = 0; j < DIM; ++j) {
-                const double seen = mean[j] - origin[j];
-                mm += seen * seen;
-                along += seen * ray[j];
-            }
-            const vec within = squares[DIM + 1] - squares[DIM] + widened + beta, square = distance * distance;
-            mask close = distance <= far + reach;
-            close &= (mm * (1.0 - 1e-14) - within * within) * square <= along * along;
-            widened *= widened;
-            if (any(active & close)) {
-                for (int j = 0; j < DIM; ++j) {
-                    y[j] = z[j] = (vec)(0.0);
-                    for (int i = 0; i < DIM; ++i) {
-                        y[j] += row[i * DIM + j] * (x[i] - mean[i]);
-                        z[j] += row[i * DIM + j] * ray[i];
-                    }
-                }
-            }
-            for (int axis = DIM - 1; axis >= DIM - 2 && any(active & close); --axis) {
-                vec ratio = root(squares[axis] + widened);
-                ratio = beta / (ratio < 1e-12 ? (vec)(1e-12) : ratio);
-                ratio = ratio < 1e-6 ? (vec)(1e-6) : ratio > 1e6 ? (vec)(1e6) : ratio;
-                const vec more = 1.0 + ratio, added = more * widened + (1.0 + 1.0 / ratio) * beta * beta;
-                vec aa = (vec)(0.0), bb = (vec)(0.0), cc = (vec)(0.0);
-                for (int j = 0; j < DIM; ++j) {
-                    const vec weight = 1.0 / (more * squares[j] + added);
-                    aa += weight * z[j] * z[j];
-                    bb += weight * y[j] * z[j];
-                    cc += weight * y[j] * y[j];
-                }
-                bb = bb > 0.0 ? (vec)(0.0) : bb;
-                aa = aa < 1e-300 ? (vec)(1e-300) : aa;
-                close &= cc - bb * bb / aa < 1.0 + 1e-6;
-            }
-            close |= distance <= (reach + cube_reach) * (1.0 + 1e-9);
-            const vec found = close ? (vec)(1.0) : (vec)(0.0);
-            for (int l = first; l <= last; ++l) {
-                const double is_near = get(found, l);
-                near[firsts[begin + l] + at - from] = is_near > 0.0;
-                n_near[l] += is_near;
-            }
-        }
-    }
-    for (int l = 0; l < LANES && begin + l < stop; ++l)
-        if (n_near[l] > 0.0) GMM_ADD(counts + begin + l, n_near[l]);
-"""
-_KERNELS = {
-    dim: FusedKernel(
-        f"near_lists_{dim}d",
-        "const double* rows, const int64* starts, const int32* entries, const int64* lists,"
-        " const int64* firsts, const double* centers, const double* radii, int64 n_balls, double cube_reach,"
-        " double spread, int64 parts, bool* near, double* counts",
-        SIMD
-        + _BODY.replace("AHEAD", "6").replace("WIDTH", str(dim * dim + 3 * dim + 2)).replace("DIM", str(dim)),
-    )
-    for dim in (2, 3)
-}
+_KERNELS = {dim: FusedKernel("evidence/near_lists.h", f"near_lists<{dim}>") for dim in (2, 3)}
 _PARTS = 32  # of a list, on a device with many threads
 
 
@@ -142,7 +45,6 @@ def near_lists(
     radii: Tensor,
     cube_reach: float,
     spread: float,
-    compiled: bool = False,
 ) -> Lists:
     """For each ball (T,), those cones of its list that can give evidence to a cube centred in the ball.
 
@@ -152,7 +54,6 @@ def near_lists(
         lists: (T,) a list of `given` for each ball. Balls of one list that follow each other share its cost.
         centers, radii: (T, D), (T,) of the balls, float64.
         cube_reach: from the centre of a cube to its corners; spread: see `Hulls`; metres.
-        compiled: torch.compile for the twin.
     """
     lengths = given.lengths()[lists]
     if is_fused(table, given.entries, lists, centers):
@@ -168,8 +69,7 @@ def near_lists(
         shift = torch.repeat_interleave(given.starts[lists] - firsts, counts)
         return Lists.of(counts, given.entries[near.nonzero().squeeze(1) + shift])
     ball, cone = given.taken(lists)
-    test = _compiled_near() if compiled else _near_cone
-    near = test(table.T, cone, centers[ball], radii[ball], cube_reach, spread)
+    near = _near_cone(table.T, cone, centers[ball], radii[ball], cube_reach, spread)
     return Lists.of(torch.bincount(ball[near], minlength=len(lists)), cone[near].int())
 
 
@@ -213,9 +113,3 @@ def _near_cone(
         near = near & (cc - bb.clamp_max(0) ** 2 / aa.clamp_min(1e-300) < 1 + 1e-6)
     # The bound does not hold where the cube contains the sensor origin: these cones count as near.
     return near | (distance <= (reach + cube_reach) * (1 + 1e-9))
-
-
-@functools.cache
-def _compiled_near() -> Callable[..., Tensor]:
-    compiled: Callable[..., Tensor] = torch.compile(_near_cone, dynamic=True)
-    return compiled

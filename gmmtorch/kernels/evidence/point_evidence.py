@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels.compiler import FusedKernel
-from gmmtorch.kernels.simd import CPU_LANES, SIMD
+from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel
 
 _SQRT_HALF_PI = math.sqrt(math.pi / 2)
 
@@ -34,145 +33,7 @@ class PointTable(NamedTuple):
     tilts: Tensor
 
 
-_BODY = """
-    const double h = resolution, limit = cutoff * cutoff;
-    const int64_t begin = item * LANES, stop = GMM_MIN(begin + LANES, n_points);
-    vec x[DIM], hits, misses, number = (vec)(-1.0);
-    for (int l = 0; l < LANES; ++l) {
-        const int64_t point = order[GMM_MIN(begin + l, stop - 1)];
-        for (int a = 0; a < DIM; ++a) set(x[a], l, points[point * DIM + a]);
-        set(hits, l, hits_out[point]);
-        set(misses, l, misses_out[point]);
-        if (begin + l < stop) set(number, l, (double)bucket[point]);
-    }
-    for (int first = 0; first < LANES; ++first) {  // each bucket of these points once
-        const double mine = get(number, first);
-        if (mine < 0.0 || (first > 0 && get(number, first - 1) == mine)) continue;
-        const mask active = number == mine;
-        const int64_t list = (int64_t)mine;
-        for (int64_t entry = starts[list]; entry < starts[list + 1]; ++entry) {
-            const double* cone = table + entries[entry] * WIDTH;
-            GMM_FETCH(table + entries[GMM_MIN(entry + 6, starts[list + 1] - 1)] * WIDTH, WIDTH);
-            const double *mean = cone + DIM * DIM, *origin = mean + DIM, *seen = origin + DIM;
-            const double *variance = seen + DIM, *fixed = variance + DIM, *rest = fixed + DIM;
-            vec y[DIM], z[DIM], ray[DIM];
-            vec squared_distance = (vec)(0.0), squared = (vec)(0.0), turn = (vec)(0.0);
-            double seen_squared = 0.0;
-            for (int j = 0; j < DIM; ++j) {
-                const double toward = mean[j] - origin[j];
-                ray[j] = x[j] - origin[j];
-                squared_distance += ray[j] * ray[j];
-                turn += toward * ray[j];
-                seen_squared += toward * toward;
-            }
-            // The mean is farther from the ray than the cutoff for the largest variance: a quick test.
-            const double widest = seen_squared * (1.0 - 1e-14) - limit * (variance[DIM - 1] + h * h / 12.0);
-            const mask near = widest * squared_distance - turn * turn <= GMM_MAX(limit, 9.0) * rest[0];
-            if (!any(active & near)) continue;
-            for (int j = 0; j < DIM; ++j) {
-                y[j] = (vec)(0.0);
-                for (int i = 0; i < DIM; ++i) y[j] += cone[i * DIM + j] * (x[i] - mean[i]);
-                z[j] = y[j] + seen[j];
-                squared += fixed[j] * y[j] * y[j];
-            }
-            const vec kappa = rest[0] / squared_distance;
-            vec wide[DIM], sharp[DIM];
-            for (int j = 0; j < DIM; ++j) wide[j] = variance[j] + kappa;
-            vec determinant;
-            SHARPEN
-            vec aa = (vec)(0.0), bb = (vec)(0.0), cc = (vec)(0.0);
-            for (int j = 0; j < DIM; ++j) {
-                aa += sharp[j] * z[j] * z[j];
-                bb += sharp[j] * y[j] * z[j];
-                cc += sharp[j] * y[j] * y[j];
-            }
-            vec breadth = (vec)(0.0), extent = (vec)(0.0);
-            for (int j = 0; j < DIM; ++j) {
-                const vec size = ray[j] < 0.0 ? -ray[j] : ray[j];
-                breadth += size;
-                extent = size > extent ? size : extent;
-            }
-            const mask at_sensor = extent <= 0.5 * h;
-            // Conservative: squares of differences lose digits, which the second term allows for.
-            const vec room = (limit * (1.0 + 1e-9) + 1e-9 * cc) * aa;
-            const mask passes = (cc * aa - bb * bb < room) & !((bb > 0.0) & (bb * bb > room));
-            const mask strikes = squared < limit;
-            if (!any(active & (at_sensor | passes | strikes))) continue;
-            vec hit = (vec)(0.0);
-            if (any(active & strikes)) {
-                vec fade = limit - squared;
-                fade = fade < 0.0 ? (vec)(0.0) : fade > 1.0 ? (vec)(1.0) : fade;
-                hit = expo(rest[1] - 0.5 * squared) * fade;
-                hit = hit > 1.0 ? (vec)(1.0) : hit;
-            }
-            vec miss = (vec)(0.0);
-            if (any(active & passes)) {
-                const vec length = root(aa), share = bb / aa;
-                vec across = (vec)(0.0);
-                for (int j = 0; j < DIM; ++j) {
-                    const vec part = y[j] - share * z[j];
-                    across += sharp[j] * part * part;
-                }
-                const vec along = share * length, leaving = along + 0.5 * h * length / breadth;
-                const vec beyond = leaving > 0.0 ? leaving : (vec)(0.0);
-                vec fade = limit - across - beyond * beyond;
-                fade = fade < 0.0 ? (vec)(0.0) : fade > 1.0 ? (vec)(1.0) : fade;
-                const vec edge = expo(-0.5 * leaving * leaving);
-                const vec ratio = edge * mills(leaving < 0.0 ? -leaving : leaving);
-                const vec tail = leaving < 0.0 ? 2.5066282746310002 - ratio : ratio;
-                const vec depth = length - along;
-                MOMENT
-                const vec peak = expo(-0.5 * across) * root(determinant) / NORM;
-                miss = peak * moment * breadth * AREA * fade;
-            }
-            miss = at_sensor ? (vec)(1.0) : miss;
-            miss = miss < 1.0 - hit ? miss : 1.0 - hit;
-            hits += active ? hit * rest[3] : (vec)(0.0);
-            misses += active ? miss * rest[2] : (vec)(0.0);
-        }
-    }
-    for (int l = 0; l < LANES; ++l)
-        if (begin + l < stop) {
-            const int64_t point = order[begin + l];
-            hits_out[point] = get(hits, l);
-            misses_out[point] = get(misses, l);
-        }
-"""
-_BY_DIM = {
-    2: {
-        "SHARPEN": "determinant = 1.0 / (wide[0] * wide[1]); sharp[0] = wide[1] * determinant;"
-        " sharp[1] = wide[0] * determinant;",
-        "MOMENT": "const vec moment = depth * tail + edge;",
-        "NORM": "(6.283185307179586 * aa)",
-        "AREA": "h",
-    },
-    3: {
-        "SHARPEN": "const vec pair = wide[0] * wide[1]; determinant = 1.0 / (pair * wide[2]);"
-        " sharp[2] = pair * determinant; const vec third = wide[2] * determinant;"
-        " sharp[0] = wide[1] * third; sharp[1] = wide[0] * third;",
-        "MOMENT": "const vec moment = (depth * depth + 1.0) * tail + (2.0 * depth + along_end) * edge;",
-        "NORM": "(15.749609945722419 * aa * length)",
-        "AREA": "h * h",
-    },
-}
-
-
-def _kernel(dim: int) -> FusedKernel:
-    body = _BODY
-    for name, text in _BY_DIM[dim].items():
-        body = body.replace(name, text)
-    body = body.replace("along_end", "leaving")
-    body = body.replace("WIDTH", str(dim * dim + 5 * dim + 4)).replace("DIM", str(dim))
-    return FusedKernel(
-        f"point_evidence_{dim}d",
-        "const double* points, const int64* order, const int64* bucket, int64 n_points, const int64* starts,"
-        " const int32* entries, const double* table, double resolution, double cutoff, double* hits_out,"
-        " double* misses_out",
-        SIMD + body,
-    )
-
-
-_KERNELS = {dim: _kernel(dim) for dim in (2, 3)}
+_KERNELS = {dim: FusedKernel("evidence/point_evidence.h", f"point_evidence<{dim}>") for dim in (2, 3)}
 
 
 def listed_evidence(
@@ -269,12 +130,6 @@ def _product(v: list[Tensor], w: list[Tensor], sharp: list[Tensor], tilts: Seque
     for (i, j), tilt in zip(pairs, tilts, strict=True):
         product = product - tilt * sharp[i] * sharp[j] * (v[i] * w[j] + v[j] * w[i])
     return product
-
-
-@functools.cache
-def compiled_pair_evidence() -> Callable[..., tuple[Tensor, Tensor]]:
-    compiled: Callable[..., tuple[Tensor, Tensor]] = torch.compile(pair_evidence, dynamic=True)
-    return compiled
 
 
 def tail_moment(along: Tensor, depth: Tensor, dim: int) -> Tensor:

@@ -14,11 +14,7 @@ from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.chunks import chunk_elements, chunked
-from gmmtorch.kernels.compiler import FusedKernel
-from gmmtorch.kernels.simd import CPU_LANES, SIMD
-
-SKIPPED = 37.0
-"""Nats below a row's largest term from which on a responsibility counts as 0: K e⁻³⁷ is below 10⁻¹² of it."""
+from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel
 
 _FEW_ROWS = 2048  # in fewer rows, their order matters little
 _PARTS = 64  # most parts of the rows; each has its own sums, so that threads write apart
@@ -26,157 +22,13 @@ _GPU_THREADS = 1 << 18
 """As many as a large GPU holds at a time; each sums one component over a part of the rows."""
 _GPU_ROWS = 32  # least rows of such a part
 
-PRODUCTS = """
-        vec a = x[0] * w[0], b = x[0] * w[WIDTH], c = x[0] * w[2 * WIDTH], d = x[0] * w[3 * WIDTH];
-        for (int f = 1; f < WIDTH; ++f) {
-            a = fused(x[f], (vec)(w[f]), a);
-            b = fused(x[f], (vec)(w[WIDTH + f]), b);
-            c = fused(x[f], (vec)(w[2 * WIDTH + f]), c);
-            d = fused(x[f], (vec)(w[3 * WIDTH + f]), d);
-        }
-"""
-"""Logits a, b, c, d of four components from features x and natural parameters w."""
-_LOGITS = """
-    // Component by component for LANES rows: what four components share is loaded once.
-    const int64_t lane_rows = GMM_MIN((int64_t)LANES, stop - row);
-    for (int l = 0; l < LANES; ++l) {
-        const double* given = features + (row + GMM_MIN((int64_t)l, lane_rows - 1)) * WIDTH;
-        for (int f = 0; f < WIDTH; ++f) set(x[f], l, given[f]);
-    }
-    vec peak = (vec)(-1e300);
-    LIKELIEST_BEGIN
-    for (int64_t k = 0; k < n_components; k += 4) {
-        const double* w = natural + k * WIDTH;
-        PRODUCTS
-        LOGITS
-    }
-"""
-_SUMS = """
-    const int64_t begin = n_rows * item / n_parts, stop = n_rows * (item + 1) / n_parts;
-    vec* logits = (vec*)(scratch + item * n_components * LANES);
-    vec* sums = (vec*)(partial + item * n_components * WIDTH * LANES);
-    vec x[WIDTH];
-    for (int64_t row = begin; row < stop; row += LANES) {
-        LOGITS_OF_ROWS
-        vec norm = (vec)(0.0), p = (vec)(0.0);
-        for (int l = 0; l < lane_rows; ++l) set(p, l, weight[row + l]);
-        int64_t n_near = 0;
-        for (int64_t k = 0; k < n_components; ++k) {
-            const vec under = logits[k] - peak;
-            if (!any(under > -SKIPPED)) continue;
-            const vec term = under > -SKIPPED ? expo(under) : (vec)(0.0);
-            norm += term;
-            logits[n_near] = term;  // n_near is at most k
-            near[item * n_components + n_near++] = k;
-        }
-        const vec share = p / norm;
-        for (int64_t place = 0; place < n_near; ++place) {
-            vec* sum = sums + near[item * n_components + place] * WIDTH;
-            const vec gamma = logits[place] * share;
-            for (int f = 0; f < WIDTH; ++f) sum[f] = fused(gamma, x[f], sum[f]);
-        }
-        for (int l = 0; l < lane_rows; ++l) {
-            peaks[row + l] = get(peak, l);
-            norms[row + l] = get(norm, l);
-        }
-    }
-"""
-_LIKELIEST = """
-    const int64_t begin = n_rows * item / n_parts, stop = n_rows * (item + 1) / n_parts;
-    vec x[WIDTH];
-    for (int64_t row = begin; row < stop; row += LANES) {
-        LOGITS_OF_ROWS
-        for (int l = 0; l < lane_rows; ++l) likeliest[row + l] = (int64_t)get(first, l);
-    }
-"""
-_NORMS_ON_GPU = """
-    double x[WIDTH];
-    for (int f = 0; f < WIDTH; ++f) x[f] = features[item * WIDTH + f];
-    auto logit = [&](int64_t k) {
-        const double* w = natural + k * WIDTH;
-        double sum = x[0] * w[0];
-        for (int f = 1; f < WIDTH; ++f) sum = fma(x[f], w[f], sum);
-        return sum;
-    };
-    double peak = -1e300, norm = 0.0;
-    int64_t first = 0;
-    for (int64_t k = 0; k < n_components; ++k) {
-        const double value = logit(k);
-        if (value > peak) peak = value, first = k;
-    }
-    if (likeliest) {
-        likeliest[item] = first;
-        return;
-    }
-    for (int64_t k = 0; k < n_components; ++k) {
-        const double under = logit(k) - peak;
-        if (under > -SKIPPED) norm += exp(under);
-    }
-    norms[item] = peak + log(norm);
-"""
-_SUMS_ON_GPU = """
-    const int64_t part = item / n_components, k = item % n_components;
-    const int64_t begin = n_rows * part / n_parts, stop = n_rows * (part + 1) / n_parts;
-    double w[WIDTH], sum[WIDTH];
-    for (int f = 0; f < WIDTH; ++f) w[f] = natural[k * WIDTH + f], sum[f] = 0.0;
-    for (int64_t row = begin; row < stop; ++row) {
-        const double* x = features + row * WIDTH;  // the same for all threads of a warp, but for part
-        double under = x[0] * w[0];
-        for (int f = 1; f < WIDTH; ++f) under = fma(x[f], w[f], under);
-        under -= norms[row];
-        if (!(under > -SKIPPED)) continue;
-        const double gamma = exp(under) * weight[row];
-        for (int f = 0; f < WIDTH; ++f) sum[f] = fma(gamma, x[f], sum[f]);
-    }
-    for (int f = 0; f < WIDTH; ++f) partial[item * WIDTH + f] = sum[f];
-"""
-_STORED = """
-        logits[k] = a, logits[k + 1] = b, logits[k + 2] = c, logits[k + 3] = d;
-        a = a > b ? a : b;
-        c = c > d ? c : d;
-        a = a > c ? a : c;
-        peak = a > peak ? a : peak;
-"""
-_BEST = "".join(
-    f"first = {name} > peak ? (vec)((double)(k + {i})) : first; peak = {name} > peak ? {name} : peak;"
-    for i, name in enumerate("abcd")
-)
-
-
-def _kernel(name: str, body: str, parameters: str, dim: int) -> FusedKernel:
-    width = 1 + dim + dim * (dim + 1) // 2
-    keeps = "vec first = (vec)(0.0);" if name == "most_likely" else ""
-    logits = (
-        _LOGITS.replace("PRODUCTS", PRODUCTS)
-        .replace("LOGITS", _BEST if keeps else _STORED)
-        .replace("LIKELIEST_BEGIN", keeps)
-    )
-    body = body.replace("LOGITS_OF_ROWS", logits)
-    body = body.replace("WIDTH", str(width)).replace("SKIPPED", str(SKIPPED))
-    rows = "const double* features, int64 n_rows, const double* natural, int64 n_components, int64 n_parts, "
-    return FusedKernel(f"{name}_{dim}d", rows + parameters, SIMD + body)
-
-
-_EXPECTATION = {
-    dim: _kernel(
-        "e_step",
-        _SUMS,
-        "const double* weight, double* scratch, int64* near, double* partial, double* peaks, double* norms",
-        dim,
-    )
-    for dim in (1, 2, 3)
-}
-_MOST_LIKELY = {dim: _kernel("most_likely", _LIKELIEST, "int64* likeliest", dim) for dim in (1, 2, 3)}
-_NORMS = {
-    dim: _kernel("row_norms", _NORMS_ON_GPU, "double* norms, int64* likeliest", dim) for dim in (1, 2, 3)
-}
-_SHARES = {
-    dim: _kernel(
-        "component_sums", _SUMS_ON_GPU, "const double* weight, const double* norms, double* partial", dim
-    )
-    for dim in (1, 2, 3)
-}
-_DIMENSIONS = {1 + dim + dim * (dim + 1) // 2: dim for dim in _EXPECTATION}
+_WIDTHS = {1: 3, 2: 6, 3: 10}
+_SOURCE = "mixtures/e_step.h"
+_EXPECTATION = {dim: FusedKernel(_SOURCE, f"e_step<{dim}>") for dim in _WIDTHS}
+_MOST_LIKELY = {dim: FusedKernel(_SOURCE, f"most_likely<{dim}>") for dim in _WIDTHS}
+_NORMS = {dim: FusedKernel(_SOURCE, f"row_norms<{dim}>") for dim in _WIDTHS}
+_SHARES = {dim: FusedKernel(_SOURCE, f"component_sums<{dim}>") for dim in _WIDTHS}
+_DIMENSIONS = {width: dim for dim, width in _WIDTHS.items()}
 
 
 def expectation(

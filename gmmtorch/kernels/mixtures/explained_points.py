@@ -11,59 +11,8 @@ from torch import Tensor
 
 from gmmtorch.kernels.compiler import FusedKernel
 
-_BODY = """
-    constexpr int AT_ONCE = 64, MOST = 64;
-    double squares[AT_ONCE], shares[MOST], total = 0.0;
-    int64_t of[MOST], n_found = 0;
-    double point[DIM];
-    for (int a = 0; a < DIM; ++a) point[a] = points[item * DIM + a];
-    const bool asks = frees != nullptr && frees[item];
-    for (int pass = 0; pass < 2; ++pass) {
-        if (pass == 1 && n_found <= MOST) break;
-        for (int64_t begin = 0; begin < n; begin += AT_ONCE) {
-            const int64_t m = GMM_MIN(n - begin, (int64_t)AT_ONCE);
-            const double* means = table + begin;
-            const double* rows = table + DIM * n + begin;
-            for (int64_t i = 0; i < m; ++i) {
-                double square = 0.0;
-                for (int r = 0; r < DIM; ++r) {
-                    double white = 0.0;
-                    for (int c = 0; c <= r; ++c)
-                        white += rows[(r * DIM + c) * n + i] * (point[c] - means[c * n + i]);
-                    square += white * white;
-                }
-                squares[i] = square;
-            }
-            for (int64_t i = 0; i < m; ++i) {
-                if (!(squares[i] < limit) || (asks && !near[begin + i])) continue;
-                const double share = 1.0 / GMM_MAX(squares[i], least);
-                if (pass == 1) GMM_ADD(gained + begin + i, share / total);
-                else {
-                    if (n_found < MOST) {
-                        of[n_found] = begin + i;
-                        shares[n_found] = share;
-                    }
-                    ++n_found;
-                    total += share;
-                }
-            }
-        }
-    }
-    found[item] = n_found > 0;
-    if (n_found <= MOST)
-        for (int64_t i = 0; i < n_found; ++i) GMM_ADD(gained + of[i], shares[i] / total);
-"""
-
-
 _KERNELS = {
-    dim: FusedKernel(
-        f"explained_points_{dim}d",
-        "const double* points, const bool* frees, const double* table, int64 n, const bool* near,"
-        " double limit, double least, double* gained, bool* found",
-        _BODY.replace("DIM", str(dim)),
-        shares=True,
-    )
-    for dim in (2, 3)
+    dim: FusedKernel("mixtures/explained_points.h", f"explained_points<{dim}>", shares=True) for dim in (2, 3)
 }
 
 

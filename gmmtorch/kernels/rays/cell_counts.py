@@ -1,8 +1,10 @@
-"""Counts of cells: those of a dense block as a list, and the addition of a list to a sparse store."""
+"""Cells of dense blocks and of sparse stores: listed with their counts, found, and added to."""
 
 from __future__ import annotations
 
+import functools
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,42 +13,16 @@ from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.compiler import FusedKernel
 
 _RUN = 256  # cells of an item on a CPU
+_INDEX_RUN = 1 << 10  # of one that searches again only where the block changes
 
 _BLOCK_BITS = 3
 """Cells are listed by blocks of 8³ cells, as sparse stores keep them: neighbours stay together in memory."""
 
-_LIST = FusedKernel(
-    "list_counted_cells",
-    "int64 nx, int64 ny, int64 nz, int64 blocks_y, int64 blocks_z, const double* hits, const double* misses,"
-    " const int64* low, int64* n_before, int64* cells, float* listed_hits, float* listed_misses",
-    f"""
-    constexpr int64_t BITS = {_BLOCK_BITS};
-    const int64_t block[3] = {{item / (blocks_y * blocks_z), item / blocks_z % blocks_y, item % blocks_z}};
-    const int64_t size[3] = {{nx, ny, nz}};
-    int64_t first[3], stop[3], n = cells ? n_before[item] : 0;
-    for (int a = 0; a < 3; ++a) {{
-        const int64_t begin = (((low[a] >> BITS) + block[a]) << BITS) - low[a];
-        first[a] = GMM_MAX(begin, 0);
-        stop[a] = GMM_MIN(begin + (1 << BITS), size[a]);
-    }}
-    for (int64_t x = first[0]; x < stop[0]; ++x)
-        for (int64_t y = first[1]; y < stop[1]; ++y) {{
-            const double *h = hits + (x * ny + y) * nz, *m = misses + (x * ny + y) * nz;
-            for (int64_t z = first[2]; z < stop[2]; ++z) {{
-                if (!(h[z] > 0.0 || m[z] > 0.0)) continue;
-                if (cells) {{
-                    cells[3 * n] = x + low[0];
-                    cells[3 * n + 1] = y + low[1];
-                    cells[3 * n + 2] = z + low[2];
-                    listed_hits[n] = (float)h[z];
-                    listed_misses[n] = (float)m[z];
-                }}
-                ++n;
-            }}
-        }}
-    if (!cells) n_before[item] = n;
-    """,
-)
+_SOURCE = "rays/cell_counts.h"
+_LIST = FusedKernel(_SOURCE, "list_counted_cells")
+_ADD = FusedKernel(_SOURCE, "add_counts")
+_FLAGS = FusedKernel(_SOURCE, "flags_of_cells")
+_INDEX = FusedKernel(_SOURCE, "cell_index")
 
 
 def list_counted_cells(low: Tensor, hits: Tensor, misses: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -65,7 +41,7 @@ def list_counted_cells(low: Tensor, hits: Tensor, misses: Tensor) -> tuple[Tenso
         cells = cells[((x * n_blocks[1] + y) * n_blocks[2] + z).argsort(stable=True)]
         some = [counts[cells.unbind(1)].float() for counts in (hits, misses)]
         return cells + low, some[0], some[1]
-    given = *hits.shape, *n_blocks[1:], hits.contiguous(), misses.contiguous(), low.contiguous()
+    given = *hits.shape, *n_blocks[1:], _BLOCK_BITS, hits.contiguous(), misses.contiguous(), low.contiguous()
     n_items = math.prod(n_blocks)
     in_block = torch.empty(n_items, dtype=torch.int64, device=device)
     _LIST(n_items, *given, in_block, None, None, None, device=device)
@@ -75,24 +51,6 @@ def list_counted_cells(low: Tensor, hits: Tensor, misses: Tensor) -> tuple[Tenso
     listed = torch.empty(2, n, device=device)
     _LIST(n_items, *given, until - in_block, cells, listed[0], listed[1], device=device)
     return cells, listed[0], listed[1]
-
-
-_ADD = FusedKernel(
-    "add_counts",
-    "int64 n_cells, int64 run, const int64* index, const float* more_hits, const float* more_misses,"
-    " int64 n_stored, float* counts, float* before",
-    """
-    const int64_t stop = GMM_MIN(n_cells, (item + 1) * run);
-    for (int64_t c = item * run; c < stop; ++c) {
-        float *hits = counts + index[c], *misses = hits + n_stored;
-        before[c] = *hits;
-        before[n_cells + c] = *misses;
-        if (index[c] == 0) continue;
-        *hits += more_hits[c];
-        *misses += more_misses[c];
-    }
-    """,
-)
 
 
 def add_counts(counts: Tensor, index: Tensor, hits: Tensor, misses: Tensor) -> tuple[Tensor, Tensor]:
@@ -117,21 +75,6 @@ def add_counts(counts: Tensor, index: Tensor, hits: Tensor, misses: Tensor) -> t
     return olds[0], olds[1]
 
 
-_FLAGS = FusedKernel(
-    "flags_of_cells",
-    "int64 n_cells, int64 run, const int64* cells, const int64* low, int64 nx, int64 ny, int64 nz,"
-    " const bool* flags, bool* found",
-    """
-    const int64_t stop = GMM_MIN(n_cells, (item + 1) * run);
-    for (int64_t c = item * run; c < stop; ++c) {
-        const int64_t x = cells[3 * c] - low[0], y = cells[3 * c + 1] - low[1], z = cells[3 * c + 2] - low[2];
-        const bool inside = x >= 0 && x < nx && y >= 0 && y < ny && z >= 0 && z < nz;
-        found[c] = inside && flags[(x * ny + y) * nz + z];
-    }
-    """,
-)
-
-
 def flags_of_cells(cells: Tensor, low: Tensor, flags: Tensor) -> Tensor:
     """The flags (C,) bool of cells (C, 3) int64 in a block (nx, ny, nz), bool; False outside.
 
@@ -148,3 +91,62 @@ def flags_of_cells(cells: Tensor, low: Tensor, flags: Tensor) -> Tensor:
     x, y, z = (cells - low).unbind(1)
     inside = (x >= 0) & (x < nx) & (y >= 0) & (y < ny) & (z >= 0) & (z < nz)
     return inside & flags.reshape(-1)[torch.where(inside, (x * ny + y) * nz + z, 0)]
+
+
+class BlockKeys(NamedTuple):
+    """The index of a sparse store.
+
+    keys: (B,) int64, ascending. slots: (B,) int64, places of the blocks. bounds: (3, D) int64: lowest cell
+    of the block that keys are relative to, then low and high of the cells that can be stored. local_bits: of
+    a cell in its block along an axis. axis_bits: of a block in a key along an axis.
+    """
+
+    keys: Tensor
+    slots: Tensor
+    bounds: Tensor
+    local_bits: int
+    axis_bits: int
+
+
+def cell_index(cells: Tensor, blocks: BlockKeys) -> Tensor:
+    """Flat index (C,) int64 of cells (C, D) in the slots; −1 in blocks that are not stored, 0 out of bounds.
+
+    The fused kernel and its twin give equal indices.
+    """
+    if is_fused(cells, blocks.keys, blocks.bounds):
+        run = _INDEX_RUN if cells.device.type == "cpu" else 1
+        index, (n, dim) = torch.empty_like(cells[:, 0]), cells.shape
+        table = (
+            blocks.keys.contiguous(),
+            blocks.slots.contiguous(),
+            len(blocks.keys),
+            blocks.bounds.contiguous(),
+        )
+        bits = blocks.local_bits, blocks.axis_bits
+        _INDEX(-(-n // run), cells.contiguous(), n, dim, run, *table, *bits, index, device=cells.device)
+        return index
+    return _batched(cells, blocks)
+
+
+def _batched(cells: Tensor, blocks: BlockKeys) -> Tensor:
+    origin, low, high = blocks.bounds.tolist()
+    columns = [cells[:, axis] - origin[axis] for axis in range(len(origin))]
+    inside = functools.reduce(
+        torch.logical_and,
+        [(cells[:, axis] >= low[axis]) & (cells[:, axis] < high[axis]) for axis in range(len(origin))],
+    )
+    half, in_block = 1 << (blocks.axis_bits - 1), (1 << blocks.local_bits) - 1
+    key, place = (columns[0] >> blocks.local_bits) + half, columns[0] & in_block
+    for column in columns[1:]:
+        key = (key << blocks.axis_bits) | ((column >> blocks.local_bits) + half)
+        place = (place << blocks.local_bits) | (column & in_block)
+    if len(blocks.keys) == 0:
+        return torch.where(inside, -1, 0)
+    # Neighbouring cells often share a block: each run of equal keys is searched once.
+    runs, run = torch.unique_consecutive(torch.where(inside, key, -1), return_inverse=True)
+    rank = torch.searchsorted(blocks.keys, runs).clamp_max(len(blocks.keys) - 1)
+    first = torch.where(
+        blocks.keys[rank] == runs, blocks.slots[rank] << (blocks.local_bits * len(origin)), -1
+    )
+    first = first[run]
+    return torch.where(inside, torch.where(first < 0, -1, first + place), 0)

@@ -12,24 +12,10 @@ from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import check_prior
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.compiler import FusedKernel
-from gmmtorch.kernels.rays.ray_traversal import grid_arguments, row_major_strides, traverse
-from gmmtorch.kernels.rays.ray_walk import PARAMETERS, walk
+from gmmtorch.kernels.rays.ray_traversal import rays_argument, row_major_strides, traverse
 
 _CHUNK_VISITS = 1 << 16  # of the twin: fastest when cores share a cache
 _RUN = 256  # cells whose sums an item adds up
-
-_ENTROPY = """
-    // Entropy in bits of a cell with h hits and m misses, its probability within [clamp, 1 - clamp].
-    auto entropy = [&](auto h, auto m, auto prior, auto clamp) {
-        typedef decltype(h) real;
-        const real total = h + m + 2 * prior;
-        real p = total > 0 ? (h + prior) / total : (real)0.5;
-        p = GMM_MIN(GMM_MAX(p, clamp), 1 - clamp);
-        const real q = 1 - p;
-        const real bits = (p > 0 ? p * log(p) : 0) + (q > 0 ? q * log(q) : 0);
-        return bits * (real)-1.4426950408889634;
-    };
-"""
 
 
 class Removed(NamedTuple):
@@ -40,38 +26,8 @@ class Removed(NamedTuple):
     n_new: int
 
 
-_REMOVED = FusedKernel(
-    "entropy_removed",
-    "int64 n_cells, int64 run, const float* hits, const float* misses, const float* more_hits,"
-    " const float* more_misses, const bool* chosen, double prior, double clamp, double* sums",
-    _ENTROPY
-    + """
-    const int64_t stop = GMM_MIN(n_cells, (item + 1) * run);
-    const float lowest = (float)clamp, highest = 1.0f - lowest, each = (float)prior;
-    // Most cells are unknown or certain: their entropies need no logarithm.
-    const float of_unknown = entropy(0.0f, 0.0f, each, lowest);
-    const float of_free = entropy(0.0f, 1e30f, each, lowest);
-    const float of_occupied = entropy(1e30f, 0.0f, each, lowest);
-    auto bits_of = [&](float h, float m) {
-        if (h + m == 0.0f) return of_unknown;
-        const float p = (h + each) / (h + m + 2 * each);
-        return p <= lowest ? of_free : p >= highest ? of_occupied : entropy(h, m, each, lowest);
-    };
-    double all = 0.0, some = 0.0, n_new = 0.0;
-    for (int64_t c = item * run; c < stop; ++c) {
-        const float h = hits[c], m = misses[c];
-        const float gone = bits_of(h, m) - bits_of(h + more_hits[c], m + more_misses[c]);
-        all += gone;
-        if (chosen[c]) {
-            some += gone;
-            if (h + m == 0.0f) n_new += 1.0;
-        }
-    }
-    sums[3 * item] = all;
-    sums[3 * item + 1] = some;
-    sums[3 * item + 2] = n_new;
-    """,
-)
+_REMOVED = FusedKernel("rays/cell_entropy.h", "entropy_removed")
+_ALONG = FusedKernel("rays/cell_entropy.h", "reduction_along_rays")
 
 
 def entropy_removed(
@@ -105,32 +61,6 @@ def entropy_removed(
     )
 
 
-_ALONG = FusedKernel(
-    "reduction_along_rays",
-    PARAMETERS + ", const float* hits, const float* misses, double prior, double observed, double mark,"
-    " double* table, double* sums",
-    _ENTROPY
-    + """
-    double sum = 0.0;
-    const double of_unknown = entropy(0.0, 0.0, prior, 0.0) - entropy(0.0, 1.0, prior, 0.0);
-    """
-    + walk(
-        """
-        double bits = table[voxel];
-        if (bits != bits) {
-            const double h = hits[voxel], m = misses[voxel];
-            bits = of_unknown;
-            if (h + m > 0.0) bits = entropy(h, m, prior, 0.0) - entropy(h, m + 1.0, prior, 0.0);
-            if (h + m < observed) bits += mark;
-            table[voxel] = bits;
-        }
-        sum += bits;
-        """
-    )
-    + "sums[item] = sum;",
-)
-
-
 def reduction_along_rays(
     starts: Tensor,
     stops: Tensor,
@@ -156,10 +86,10 @@ def reduction_along_rays(
     if is_fused(starts, stops, low, hits, misses) and hits.dtype == torch.float32:
         table = torch.nn.functional.pad(torch.full_like(hits, math.nan, dtype=torch.float64), (margin,) * 6)
         hits, misses = (torch.nn.functional.pad(counts, (margin,) * 6) for counts in (hits, misses))
-        grid = grid_arguments(starts.double(), stops.double(), shape, row_major_strides(shape), low)
+        rays = rays_argument(starts.double(), stops.double(), shape, row_major_strides(shape), low)
         sums = torch.empty(len(starts), dtype=torch.float64, device=starts.device)
         counts = hits.contiguous(), misses.contiguous()
-        _ALONG(len(starts), *grid, *counts, prior, observed, mark, table, sums, device=starts.device)
+        _ALONG(len(starts), *rays, *counts, prior, observed, mark, table, sums, device=starts.device)
         return sums
     h, m = hits.double(), misses.double()
     bits = cell_entropy(h, m, prior) - cell_entropy(h, m + 1, prior) + mark * (h + m < observed)

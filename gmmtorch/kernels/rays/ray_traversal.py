@@ -1,4 +1,4 @@
-"""Traversal of a voxel grid by rays. The fused kernel steps from voxel to voxel (`ray_walk`).
+"""Traversal of a voxel grid by rays. The fused kernel steps from voxel to voxel (`ray_walk.h`).
 Its twin enumerates plane crossings, without a stepping loop and without a sort.
 
 A straight segment leaves one voxel at each grid plane that it crosses. The planes crossed along one axis
@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -24,8 +24,10 @@ from torch import Tensor
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.chunks import chunked
 from gmmtorch.kernels.compiler import FusedKernel
-from gmmtorch.kernels.rays.ray_walk import PARAMETERS, TIE, walk
 
+TIE = 1e-13
+"""Distance of crossings that count as one point, relative to the terms: a few hundred times their rounding
+error."""
 CHUNK_VISITS = 1 << 18
 """Voxel visits in one pass: they fit a core's cache."""
 
@@ -135,15 +137,7 @@ def _voxels_left(
     return voxel.long(), inside
 
 
-@functools.cache
-def _compiled_voxels_left() -> Callable[..., tuple[Tensor, Tensor | None]]:
-    compiled: Callable[..., tuple[Tensor, Tensor | None]] = torch.compile(_voxels_left, dynamic=True)
-    return compiled
-
-
-def _crossings(
-    rays: _Rays, shape: tuple[int, ...], strides: list[int], axis: int, masked: bool, compiled: bool
-) -> Visits:
+def _crossings(rays: _Rays, shape: tuple[int, ...], strides: list[int], axis: int, masked: bool) -> Visits:
     """All voxels left through planes of `axis`."""
     device = rays.start.device
     size = torch.tensor(shape, dtype=torch.float64, device=device)
@@ -180,7 +174,7 @@ def _crossings(
         for other in range(len(shape))
         if other != axis
     ]
-    voxel, inside = (_compiled_voxels_left() if compiled else _voxels_left)(ray, along, others, masked)
+    voxel, inside = _voxels_left(ray, along, others, masked)
     return Visits(voxel, ray) if inside is None else Visits(voxel[inside], ray[inside])
 
 
@@ -209,7 +203,6 @@ def traverse(
     shape: tuple[int, ...],
     chunk_visits: int = CHUNK_VISITS,
     strides: list[int] | None = None,
-    compiled: bool = False,
     low: Tensor | None = None,
 ) -> Iterator[Visits]:
     """Voxels that each segment passes through and leaves; the voxel that it ends in is not included.
@@ -220,8 +213,6 @@ def traverse(
         shape: voxels along each axis; voxels outside are left out.
         chunk_visits: approximate number of visits in each chunk.
         strides: strides of the flat voxel index, one for each axis; row-major if not given.
-        compiled: use torch.compile: the same voxels about twice as fast, after about ten seconds for the
-            first call in a process. It needs a C++ compiler.
         low: (D,) index of the grid's lowest voxel, which has the flat index 0; zeros if not given.
 
     Yields:
@@ -234,31 +225,26 @@ def traverse(
     if is_fused(starts, ends, low):
         yield from _fused(starts, ends, shape, chunk_visits, strides, low)
     else:
-        yield from _batched(starts, ends, shape, chunk_visits, strides, compiled, low)
+        yield from _batched(starts, ends, shape, chunk_visits, strides, low)
 
 
-def grid_arguments(
-    starts: Tensor, ends: Tensor, shape: tuple[int, ...], strides: list[int], low: Tensor | None
+def rays_argument(
+    starts: Tensor,
+    ends: Tensor,
+    shape: tuple[int, ...],
+    strides: list[int],
+    low: Tensor | None,
+    unit: float = 1.0,
 ) -> list[Tensor | float]:
-    """The arguments `ray_walk.PARAMETERS` of a fused kernel, for voxels that are not divided."""
+    """The fields of `Rays` of `ray_walk.h`. unit: 1/n if n finer voxels make a voxel and ties are theirs."""
     dim = len(shape)
     low = starts.new_zeros(dim) if low is None else low.double().contiguous()
-    pad = 3 - dim
-    return [starts.contiguous(), ends.contiguous(), low, dim, *shape, *[1] * pad, *strides, *[0] * pad, 1.0]
+    sizes, pad = [*shape, *[1] * (3 - dim)], [0] * (3 - dim)
+    return [starts.contiguous(), ends.contiguous(), low, dim, *sizes, *strides, *pad, TIE, unit]
 
 
-_COUNT_VISITS = FusedKernel(
-    "count_visits", PARAMETERS + ", int64* n_visits", "int64_t n = 0;" + walk("++n;") + "n_visits[item] = n;"
-)
-_LIST_VISITS = FusedKernel(
-    "list_visits",
-    "int64 first_ray, const int64* stops, int64* voxels, int64* rays, " + PARAMETERS,
-    """
-    const int64_t ray = item + first_ray, before = first_ray ? stops[first_ray - 1] : 0;
-    int64_t place = (ray ? stops[ray - 1] : 0) - before;
-    """
-    + walk("voxels[place] = voxel; rays[place] = ray; ++place;", "ray"),
-)
+_COUNT_VISITS = FusedKernel("rays/ray_counting.h", "count_visits")
+_LIST_VISITS = FusedKernel("rays/ray_counting.h", "list_visits")
 
 
 def _fused(
@@ -270,27 +256,27 @@ def _fused(
     low: Tensor | None,
 ) -> Iterator[Visits]:
     device = starts.device
-    grid = grid_arguments(starts, ends, shape, strides, low)
+    rays = rays_argument(starts, ends, shape, strides, low)
     counts = torch.empty(starts.shape[0], dtype=torch.int64, device=device)
-    _COUNT_VISITS(starts.shape[0], *grid, counts, device=device)
+    _COUNT_VISITS(starts.shape[0], *rays, counts, device=device)
     stops = torch.cumsum(counts, 0)
     cuts = _chunk_bounds(counts, chunk_visits)
     sizes = stops[torch.tensor(cuts[1:], device=device) - 1].tolist()
     for begin, stop, before, after in zip(cuts, cuts[1:], [0, *sizes], sizes, strict=False):
         if after > before:
-            listed = functools.partial(_listed, grid, stops, {begin: before, stop: after}, begin)
+            listed = functools.partial(_listed, rays, stops, {begin: before, stop: after}, begin)
             yield from chunked(stop - begin, stop - begin, listed)
 
 
 def _listed(
-    grid: list[Tensor | float], stops: Tensor, known: dict[int, int], begin: int, part: slice
+    rays: list[Tensor | float], stops: Tensor, known: dict[int, int], begin: int, part: slice
 ) -> Visits:
     """Visits of a run of rays; `known`: how many visits come before a ray, where Python has this number."""
     first, last = begin + part.start, begin + part.stop
     before, after = (known[ray] if ray in known else int(stops[ray - 1]) for ray in (first, last))
-    voxels, rays = torch.empty(2, after - before, dtype=torch.int64, device=stops.device)
-    _LIST_VISITS(last - first, first, stops, voxels, rays, *grid, device=stops.device)
-    return Visits(voxels, rays)
+    visits = Visits(*torch.empty(2, after - before, dtype=torch.int64, device=stops.device))
+    _LIST_VISITS(last - first, first, stops, *visits, *rays, device=stops.device)
+    return visits
 
 
 def _batched(
@@ -299,7 +285,6 @@ def _batched(
     shape: tuple[int, ...],
     chunk_visits: int,
     strides: list[int],
-    compiled: bool,
     low: Tensor | None,
 ) -> Iterator[Visits]:
     """The twin: enumerates plane crossings in batches."""
@@ -312,7 +297,7 @@ def _batched(
     for begin, stop in itertools.pairwise(_chunk_bounds(visits, chunk_visits)):
         masked = not bool(fits[begin:stop].all())
         for axis in range(len(shape)):
-            crossings = functools.partial(_crossings_of, rays, begin, shape, strides, axis, masked, compiled)
+            crossings = functools.partial(_crossings_of, rays, begin, shape, strides, axis, masked)
             yield from (found for found in chunked(stop - begin, stop - begin, crossings) if len(found.voxel))
 
 
@@ -323,13 +308,12 @@ def _crossings_of(
     strides: list[int],
     axis: int,
     masked: bool,
-    compiled: bool,
     part: slice,
 ) -> Visits:
     """`_crossings` of a run of rays that starts at `begin`."""
     first, last = begin + part.start, begin + part.stop
     some = _Rays(*(field[first:last] for field in rays))
-    found = _crossings(some, shape, strides, axis, masked, compiled)
+    found = _crossings(some, shape, strides, axis, masked)
     return Visits(found.voxel, found.ray + first if first else found.ray)
 
 

@@ -20,8 +20,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.mixtures.near_pairs import MOST_TESTED, near_pairs
-from gmmtorch.kernels.mixtures.pair_overlap import overlap_sums
+from gmmtorch.kernels.mixtures.pair_overlap import MOST_TESTED, near_pairs, overlap_sums
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.localization.rigid_motions import Motions, chosen_rows, generators
 from gmmtorch.mapping.surfaces import touching

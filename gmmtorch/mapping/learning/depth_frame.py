@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.kernels.mixtures.depth_cells import DepthCells, DepthView, depth_cells
+from gmmtorch.kernels.mixtures.cell_sums import DepthCells, DepthView, depth_cells
 from gmmtorch.linalg import check_rigid
 from gmmtorch.mixture.em.cells import coarsest_allowed
 from gmmtorch.mixture.em.exact import shift_features

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.mixtures.cell_moments import KEY_BITS, cell_moments
+from gmmtorch.kernels.mixtures.cell_sums import KEY_BITS, cell_moments
 from gmmtorch.linalg import dense_ranks
 from gmmtorch.mixture.em.exact import quadratic_features
 

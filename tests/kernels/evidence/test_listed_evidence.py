@@ -5,11 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 from kernels.cones_for_kernels import cones_of
-from scipy.special import erfcx
 
 from gmmtorch.kernels import kernels
 from gmmtorch.kernels.evidence.hull_test import Lists
-from gmmtorch.kernels.simd import MILLS
 from gmmtorch.occupancy.cone_index import Hulls
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.forms.point import PointForm
@@ -58,15 +56,6 @@ def test_evidence_of_points_with_gradients_comes_from_the_twin():
     with kernels("fused"):
         found = PointForm(cones, 0.1)(points)
     assert torch.autograd.grad(found.misses.sum(), points)[0].abs().sum() > 0
-
-
-@pytest.mark.cpu_only
-def test_the_mills_ratio_of_the_kernels_equals_the_error_function():
-    x = torch.cat([torch.linspace(0, 12, 2001), torch.logspace(1, 5, 200)]).double()
-    t = (x - 3.5) / (x + 3.5)
-    found = sum(c * t**i for i, c in enumerate(MILLS)) / (1 + x)
-    exact = torch.from_numpy((torch.pi / 2) ** 0.5 * erfcx((x / 2**0.5).numpy()))
-    assert float((found / exact - 1).abs().max()) < 2e-14
 
 
 @pytest.mark.parametrize("dim", [2, 3])

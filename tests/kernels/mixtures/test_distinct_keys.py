@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gmmtorch.kernels import kernels
-from gmmtorch.kernels.mixtures.distinct_keys import distinct_keys
+from gmmtorch.kernels.mixtures.cell_sums import distinct_keys
 from gmmtorch.linalg import dense_ranks
 
 pytestmark = pytest.mark.cpu_only

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gmmtorch.kernels import kernels
-from gmmtorch.kernels.rays.cell_index import BlockKeys, cell_index
+from gmmtorch.kernels.rays.cell_counts import BlockKeys, cell_index
 
 
 def store(dim: int, n_blocks: int, seed: int = 0) -> tuple[BlockKeys, dict[tuple[int, ...], int]]:
