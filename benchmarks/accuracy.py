@@ -19,8 +19,8 @@ from tables import ROOT, hardware, markdown, publish
 
 from gmmtorch import GaussianMap, IncrementalRule, datasets
 from gmmtorch.datasets import Dataset
-from gmmtorch.evaluation.held_out import Protocol, evaluate
-from gmmtorch.evaluation.methods import choose, methods
+from gmmtorch.experiments.evaluation.held_out import Protocol, evaluate
+from gmmtorch.experiments.evaluation.mapping_methods import choose, methods
 
 KEPT = (1.0, 0.3, 0.1, 0.05)
 

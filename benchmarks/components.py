@@ -16,8 +16,8 @@ import torch
 from tables import hardware, markdown, publish
 
 from gmmtorch import GaussianMap, WindowedRule, datasets
-from gmmtorch.evaluation.held_out import Protocol, evaluate
-from gmmtorch.evaluation.methods import methods
+from gmmtorch.experiments.evaluation.held_out import Protocol, evaluate
+from gmmtorch.experiments.evaluation.mapping_methods import methods
 from gmmtorch.scan import Scan
 
 RULES: dict[str, dict[str, float]] = {

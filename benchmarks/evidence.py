@@ -23,7 +23,7 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from gmmtorch import GaussianMap, datasets
-from gmmtorch.evaluation.queries import hit_and_free, test_beams
+from gmmtorch.experiments.evaluation.queries import hit_and_free, test_beams
 from gmmtorch.kernels import kernels
 from gmmtorch.mapping.learning.rules import IncrementalRule, LearningRule, WindowedRule
 from gmmtorch.occupancy.cones import Cones

@@ -25,12 +25,12 @@ from pathlib import Path
 
 import torch
 
-from gmmtorch.exploration.mission.driver import Stopwatch
-from gmmtorch.exploration.mission.mission import Mission
-from gmmtorch.exploration.mission.options import TeamOptions
-from gmmtorch.exploration.mission.team_setup import assemble
-from gmmtorch.exploration.world.world import World, open_world
 from gmmtorch.report.table import format_table
+from gmmtorch.team.exploration.mission.driver import Stopwatch
+from gmmtorch.team.exploration.mission.mission import Mission
+from gmmtorch.team.exploration.mission.options import TeamOptions
+from gmmtorch.team.exploration.mission.team_setup import assemble
+from gmmtorch.team.exploration.world.world import World, open_world
 
 
 def main() -> None:

@@ -29,7 +29,7 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from gmmtorch import GaussianMixture, HierarchicalGaussianMixture, datasets
-from gmmtorch.evaluation.metrics import psnr2
+from gmmtorch.experiments.evaluation.metrics import psnr2
 
 REG_COVAR = 1e-5
 TIME_LIMIT = 240  # seconds of the processor, for one run

@@ -21,13 +21,13 @@ from odometry import opened
 from tables import hardware, markdown, publish
 
 import gmmtorch as gt
-from gmmtorch.evaluation.trajectories import absolute_trajectory_error
 from gmmtorch.localization import Odometry
+from gmmtorch.localization.trajectories import absolute_trajectory_error
 from gmmtorch.mapping.window_motions import WindowMotions
-from gmmtorch.sharing import Replica
-from gmmtorch.sharing.messages.envelope import Kind, parse_datagram
-from gmmtorch.sharing.shared_map import SharedMap
-from gmmtorch.sharing.transport.simulated_network import Network
+from gmmtorch.team.sharing import Replica
+from gmmtorch.team.sharing.messages.envelope import Kind, parse_datagram
+from gmmtorch.team.sharing.shared_map import SharedMap
+from gmmtorch.team.sharing.transport.simulated_network import Network
 
 
 class Robot:

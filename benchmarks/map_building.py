@@ -19,8 +19,8 @@ from tables import hardware, markdown, publish
 
 from gmmtorch import GaussianMap, IncrementalRule, datasets
 from gmmtorch.datasets.depth_frames import DepthFrames
-from gmmtorch.evaluation.metrics import roc
-from gmmtorch.evaluation.queries import FREE, OCCUPIED, hit_and_free, split_indices, test_beams
+from gmmtorch.experiments.evaluation.metrics import roc
+from gmmtorch.experiments.evaluation.queries import FREE, OCCUPIED, hit_and_free, split_indices, test_beams
 
 FAST = {"cell": 0.05, "iterations": 4, "window": 16, "window_components": 200}
 RULES: list[tuple[str, int, dict[str, Any]]] = [  # name, of how many rows and columns one is used, options

@@ -28,8 +28,15 @@ import torch
 from tables import hardware, markdown, publish
 
 from gmmtorch import GaussianMap, datasets
-from gmmtorch.evaluation.metrics import roc
-from gmmtorch.evaluation.queries import FREE, OCCUPIED, Queries, hit_and_free, split_indices, test_beams
+from gmmtorch.experiments.evaluation.metrics import roc
+from gmmtorch.experiments.evaluation.queries import (
+    FREE,
+    OCCUPIED,
+    Queries,
+    hit_and_free,
+    split_indices,
+    test_beams,
+)
 from gmmtorch.mapping import TiledMap
 
 N_PARTS, N_POINTS = 16, 20_000

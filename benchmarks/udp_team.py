@@ -25,11 +25,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from gmmtorch.cli.from_options.links import free_addresses
 from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.report.table import format_table
-from gmmtorch.sharing.replica.component_table import fingerprints
+from gmmtorch.team.cli.from_options.links import free_addresses
+from gmmtorch.team.sharing.replica.component_table import fingerprints
 
 _PAUSE = 0.1
 _SAMPLE = 10.0  # seconds between looks at the memory
@@ -143,7 +143,7 @@ def _start(
     ]
     with (home / "output.log").open("ab") as output:
         return subprocess.Popen(
-            [sys.executable, "-m", "gmmtorch.cli.robot", *given],
+            [sys.executable, "-m", "gmmtorch.team.cli.robot", *given],
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=output,
