@@ -1,16 +1,17 @@
-"""Sums over cells: those of points, of depth images, and numbers of distinct cells.
+"""Cells: sums of the points or of the depth images in them, numbers of distinct cells, and flat pieces of
+cells.
 
-The twins of the first and the last are in `mixture.em.cells` and `gmmtorch.linalg`; their fused kernels run
-on the CPU and pass over the points once: the cell, its number in a hash table, and the sums. Points of one
-cell often follow each other, and then the table is not asked. Cells and their numbers equal the twin's; sums
-differ by rounding.
+The twins of `cell_moments`, `distinct_keys` and `piece_cuts` are in `mixture.em.cells`, `gmmtorch.linalg` and
+`mixture.em.partition`; their fused kernels run on the CPU. Cells and their numbers equal the twin's; sums
+differ by rounding. Pieces are cut for all levels in one launch. They are those of the twin, except where a
+decision depends on rounding: a point within rounding of a cut, or two directions of equal extent.
 
 A pixel (u, v) of depth z sees the point z (a + u b + v c) + t. All moments of a patch of 4 × 4 pixels are
 therefore sums of z and z², multiplied by u, v and their products. A patch that is smaller than a cell, across
 the view and in depth, is added to the cell that contains its mean. The pixels of any other patch are added
 one by one. The points themselves are never stored. On a CPU the fused kernel passes over an image in one
 item; on CUDA each patch is an item. Its cells are those of the twin, except for patches and points within
-rounding of the side of a cell; sums differ by rounding.
+rounding of the side of a cell.
 """
 
 from __future__ import annotations
@@ -218,3 +219,48 @@ def _pack(cells: Tensor, valid: Tensor) -> Tensor:
 def _features(x: Tensor) -> Tensor:
     """[1, x, x_i x_j (i ≤ j)] (N, 10) of points (N, 3)."""
     return torch.cat([torch.ones_like(x[:, :1]), x, *(x[:, i : i + 1] * x[:, i:] for i in range(3))], 1)
+
+
+DIMENSIONS = (1, 2, 3)
+
+_CUTS = {dim: FusedKernel("mixtures/piece_cuts.h", f"piece_cuts<{dim}>", shares=True) for dim in DIMENSIONS}
+
+
+class CutRule(NamedTuple):
+    """When a piece is cut: the options of `FlatnessRule`, the most levels, and the weight of thickness in the
+    priority of a cut. max_components: −1 for no limit."""
+
+    n_levels: int
+    max_components: int
+    thickness: float
+    length: float
+    min_weight: float
+    min_weight_thick: float
+    outlier_gap: float
+    thickness_priority: float
+
+
+def are_piece_cuts_fused(points: Tensor, weight: Tensor, features: Tensor) -> bool:
+    """Whether the fused kernel computes with these cells."""
+    given = points, weight, features
+    fits = points.device.type == "cpu" and points.shape[1] in DIMENSIONS
+    return fits and all(tensor.dtype == torch.float64 for tensor in given) and is_fused(*given)
+
+
+def piece_cuts(points: Tensor, weight: Tensor, features: Tensor, rule: CutRule) -> tuple[Tensor, int]:
+    """The piece (N,) of each cell, and the number of pieces.
+
+    Args:
+        points (N, D), weight (N,), features (N, F): means, weights and mean features of the cells, float64,
+            on the CPU. N ≥ 1.
+    """
+    n, width = features.shape
+    most = n if rule.max_components < 0 else max(1, min(n, rule.max_components))
+    sums, halves = points.new_empty(most, width), points.new_empty(most, 6)
+    work, along = points.new_empty(most, 2 * points.shape[1] + 2), points.new_empty(n)
+    number, labels = torch.empty(most, dtype=torch.int64), torch.empty(n, dtype=torch.int64)
+    n_pieces = torch.empty(1, dtype=torch.int64)
+    given = points.contiguous(), features.contiguous(), weight.contiguous(), n
+    made = sums, work, halves, along, number, labels, n_pieces
+    _CUTS[points.shape[1]](1, *given, *rule, *made, device=points.device)
+    return labels, int(n_pieces)

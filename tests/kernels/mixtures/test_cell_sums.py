@@ -1,4 +1,4 @@
-"""Sums of depth images over cells: the fused kernel against its twin, and the twin against points."""
+"""Sums over cells, their numbers, and flat pieces: fused kernels against twins, and twins against points."""
 
 from __future__ import annotations
 
@@ -6,12 +6,18 @@ import math
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from kernels.twins import by_both
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import kernels
+from gmmtorch.kernels.mixtures.cell_sums import distinct_keys
+from gmmtorch.linalg import dense_ranks
 from gmmtorch.mapping.learning.depth_frame import DepthFrame, PooledFrames, pool_frames
 from gmmtorch.mixture.em.exact import quadratic_features, shift_features
+from gmmtorch.mixture.em.partition import FlatnessRule, Partition, partition
 
 INTRINSICS = torch.tensor([[64.0, 0, 31.5], [0, 64.0, 23.5], [0, 0, 1]], dtype=torch.float64)
 SIDE = 0.125
@@ -43,10 +49,7 @@ def noisy_depth(seed: int, shape: tuple[int, int] = (48, 64), dtype: torch.dtype
 
 def pooled_by_both(frames: list[DepthFrame], side: float = SIDE, max_cells: int = 5000) -> PooledFrames:
     """The cells of the fused kernel, after a comparison with those of the twin."""
-    with kernels("fused"):
-        fused = pool_frames(frames, side, max_cells)
-    with kernels("torch"):
-        twin = pool_frames(frames, side, max_cells)
+    twin, fused = by_both(lambda: pool_frames(frames, side, max_cells))
     assert torch.equal(fused.counts, twin.counts)
     torch.testing.assert_close(fused.features, twin.features, rtol=1e-13, atol=1e-11)
     torch.testing.assert_close(fused.center, twin.center)
@@ -119,3 +122,94 @@ def test_points_far_apart_have_larger_cells_and_points_beyond_a_map_are_refused(
         depth[3, 3] = value
         with pytest.raises(InvalidArgumentError, match="134217728"):
             pool_frames([frame(depth, pose())], SIDE, 1000)
+
+
+@pytest.mark.cpu_only
+@pytest.mark.parametrize("kind", ["few", "many", "equal", "extreme", "strided"])
+def test_hashed_ranks_equal_the_sorted_ones(kind):
+    generator = torch.Generator().manual_seed(0)
+    keys = torch.randint(0, 300 if kind == "few" else 1 << 40, (20_000,), generator=generator)
+    if kind == "equal":
+        keys = torch.full_like(keys, 7)
+    if kind == "extreme":
+        keys[::3], keys[1::3], keys[2::7] = -(2**63), 2**63 - 1, -1
+    if kind == "strided":
+        keys = (torch.arange(20_000) % 5000) << 40  # equal low bits
+    found = by_both(lambda: dense_ranks(keys))
+    assert torch.equal(found[0][0], found[1][0])
+    assert found[0][1] == found[1][1] == keys.unique().numel()
+
+
+@pytest.mark.cpu_only
+def test_keys_are_numbered_by_their_first_occurrence():
+    with kernels("fused"):
+        distinct, number = distinct_keys(torch.tensor([5, -3, 5, 8, -3]))
+        assert distinct_keys(torch.tensor([], dtype=torch.int64))[0].numel() == 0
+    assert distinct.tolist() == [5, -3, 8]
+    assert number.tolist() == [0, 1, 0, 2, 1]
+
+
+def cells(n: int, dim: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Cells of several surfaces and a few outliers: means, weights and mean features."""
+    generator = torch.Generator().manual_seed(seed)
+    points = torch.rand(n, dim, generator=generator, dtype=torch.float64) * 4 - 2
+    surface = torch.randint(4, (n,), generator=generator)
+    points[surface == 0, 0] = 0.3 * points[surface == 0, -1]
+    points[surface == 1, -1] = points[surface == 1, 0].sin()
+    points[torch.rand(n, generator=generator) < 0.02] *= 7
+    points -= points.mean(0)
+    weight = torch.randint(1, 30, (n,), generator=generator).double()
+    features = quadratic_features(points)
+    features[:, 1 + dim :] += 1e-4 * torch.rand(n, features.shape[1] - 1 - dim, generator=generator).double()
+    return points, weight, features
+
+
+def cut_by_both(rule: FlatnessRule, *given_: Tensor) -> Partition:
+    """The pieces of the fused kernel, after a comparison with those of the twin."""
+    points, weight, *features = given_
+    twin, fused = by_both(lambda: partition(points, weight, rule, *features))
+    assert fused.n_pieces == twin.n_pieces
+    assert torch.equal(fused.labels, twin.labels)
+    return fused
+
+
+@pytest.mark.cpu_only
+@given(
+    n=st.integers(1, 400),
+    dim=st.sampled_from([1, 2, 3]),
+    seed=st.integers(0, 10_000),
+    limit=st.sampled_from([None, 1, 2, 7, 60]),
+    least=st.sampled_from([0.0, 3.0, 40.0]),
+    thickness=st.sampled_from([0.0, 0.02, 0.2]),
+)
+def test_pieces_are_those_of_the_twin(n, dim, seed, limit, least, thickness):
+    rule = FlatnessRule(
+        thickness=thickness, length=0.5, min_weight=least, min_weight_thick=1.0, max_components=limit
+    )
+    found = cut_by_both(rule, *cells(n, dim, seed))
+    assert limit is None or found.n_pieces <= limit
+    assert torch.bincount(found.labels, minlength=found.n_pieces).min() > 0
+
+
+@pytest.mark.cpu_only
+def test_pieces_without_extent_stay_whole():
+    one = torch.zeros(5, 3, dtype=torch.float64)
+    assert cut_by_both(FlatnessRule(thickness=0.0, min_weight=1.0), one, one[:, 0] + 1).n_pieces == 1
+
+
+@pytest.mark.cpu_only
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_pieces_do_not_depend_on_the_unit(scale):
+    points, weight, _ = cells(300, 3, 1)
+    rule = FlatnessRule(0.02 * scale, 0.5 * scale, max_components=40, outlier_gap=3 * scale)
+    found = cut_by_both(rule, points * scale, weight)
+    metres = cut_by_both(FlatnessRule(0.02, 0.5, max_components=40), points, weight)
+    assert found.n_pieces == metres.n_pieces
+
+
+@pytest.mark.cpu_only
+def test_outliers_become_pieces_of_their_own():
+    points = torch.cat([torch.linspace(-1, 1, 50)[:, None].expand(50, 3), torch.full((1, 3), 90.0)]).double()
+    points -= points.mean(0)
+    rule = FlatnessRule(thickness=0.02, length=1.0, min_weight=5.0, min_weight_thick=5.0)
+    assert cut_by_both(rule, points, torch.ones(51).double()).labels[-1] == 1

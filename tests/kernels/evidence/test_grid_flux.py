@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from kernels.cones_for_kernels import cones_of
+from kernels.twins import by_both
 
 from gmmtorch.kernels import kernels
 from gmmtorch.occupancy.cones import Cones
@@ -24,10 +25,8 @@ def cones_around_the_grid(dim: int, kind: str) -> Cones:
 @pytest.mark.parametrize("kind", ["any", "flat", "around"])
 def test_fused_flux_equals_the_twin(dim, kind):
     cones = cones_around_the_grid(dim, kind)
-    grid, found = VoxelGrid((-3.0,) * dim, 0.5, (12, 13, 14)[:dim]), []
-    for choice in ("torch", "fused"):
-        with kernels(choice):
-            found.append(flux_evidence(cones, grid, 7.0, tolerance=1e-6))  # no jump at the cutoff
+    grid = VoxelGrid((-3.0,) * dim, 0.5, (12, 13, 14)[:dim])
+    found = by_both(lambda: flux_evidence(cones, grid, 7.0, tolerance=1e-6))  # no jump at the cutoff
     assert found[0].misses.count_nonzero() > 50
     torch.testing.assert_close(found[1].misses, found[0].misses, rtol=1e-5, atol=1e-5)
     assert found[0].hits.count_nonzero() > 50
@@ -49,11 +48,12 @@ def test_a_looser_tolerance_stays_within_itself():
 def test_fused_flux_of_listed_cells_equals_that_of_boxes(dim, kind):
     cones = cones_around_the_grid(dim, kind)
     cells = torch.cartesian_prod(*[torch.arange(-6, 7)] * dim)[::5].flip(0).double()
-    found = []
-    for choice in ("torch", "fused"):
-        with kernels(choice):
-            pairs = candidate_pairs(cones, cells * 0.5, (cells + 1) * 0.5, 7.0)
-            found.append(cell_flux(cones, cells, 0.5, pairs, 7.0, tolerance=1e-6))
+
+    def flux() -> tuple[torch.Tensor, ...]:
+        pairs = candidate_pairs(cones, cells * 0.5, (cells + 1) * 0.5, 7.0)
+        return cell_flux(cones, cells, 0.5, pairs, 7.0, tolerance=1e-6)
+
+    found = by_both(flux)
     for one, other in zip(*found, strict=True):
         assert one.count_nonzero() > 10
         torch.testing.assert_close(other, one, rtol=1e-5, atol=1e-5)

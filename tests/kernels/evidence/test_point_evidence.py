@@ -5,9 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 from kernels.cones_for_kernels import cones_of
+from kernels.twins import by_both
 
 from gmmtorch.kernels import kernels
-from gmmtorch.kernels.evidence.hull_test import Lists
+from gmmtorch.kernels.evidence.point_evidence import Lists
 from gmmtorch.occupancy.cone_index import Hulls
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.forms.point import PointForm
@@ -30,10 +31,8 @@ def points_of(cones: Cones) -> torch.Tensor:
 def test_fused_evidence_equals_the_twin(dim, kind, resolution, cutoff):
     cones = cones_of(dim, kind)
     points = points_of(cones)
-    form, found = PointForm(cones, resolution, cutoff), []
-    for choice in ("torch", "fused"):
-        with kernels(choice):
-            found.append(form(points))
+    form = PointForm(cones, resolution, cutoff)
+    found = by_both(lambda: form(points))
     assert found[0].misses.count_nonzero() > 1000
     bound = 1e-11 * cones.counts.sum()
     for one, other in zip(*found, strict=True):
@@ -69,10 +68,8 @@ def test_fused_hull_tests_equal_the_twin(dim, kind, smoothed):
     n_cones = len(cones.means)
     given = Lists.of(torch.tensor([n_cones, 0, 3]), torch.randint(n_cones, (n_cones + 3,)).int())
     lists = torch.randint(3, (len(points),), generator=generator)
-    hulls, radius, found = Hulls(cones, 0.1, 3.0, smoothed), torch.rand(len(points)).double(), []
-    for choice in ("torch", "fused"):
-        with kernels(choice):
-            found.append(hulls.near(given, lists, points, radius))
+    hulls, radius = Hulls(cones, 0.1, 3.0, smoothed), torch.rand(len(points)).double()
+    found = by_both(lambda: hulls.near(given, lists, points, radius))
     assert 0 < len(found[0].entries) < int(given.lengths()[lists].sum())
     for one, other in zip(*found, strict=True):
         assert torch.equal(one, other)
