@@ -1,10 +1,10 @@
 """Cells: sums of the points or of the depth images in them, numbers of distinct cells, and flat pieces of
 cells.
 
-The twins of `cell_moments`, `distinct_keys` and `piece_cuts` are in `mixture.em.cells`, `gmmtorch.linalg` and
-`mixture.em.partition`; their fused kernels run on the CPU. Cells and their numbers equal the twin's; sums
-differ by rounding. Pieces are cut for all levels in one launch. They are those of the twin, except where a
-decision depends on rounding: a point within rounding of a cut, or two directions of equal extent.
+The twins of `cell_moments` and `piece_cuts` are in `mixture.em.partition`, that of `distinct_keys` in
+`gmmtorch.linalg`; their fused kernels run on the CPU. Cells and their numbers equal the twin's; sums differ
+by rounding. Pieces are cut for all levels in one launch. They are those of the twin, except where a decision
+depends on rounding: a point within rounding of a cut, or two directions of equal extent.
 
 A pixel (u, v) of depth z sees the point z (a + u b + v c) + t. All moments of a patch of 4 × 4 pixels are
 therefore sums of z and z², multiplied by u, v and their products. A patch that is smaller than a cell, across

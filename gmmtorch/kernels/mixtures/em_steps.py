@@ -9,7 +9,7 @@ N × K numbers is written to memory.
 The kernels of truncated EM run on the CPU and work on groups of rows. One makes the natural parameters of a
 group's candidates about its center, walks the group's rows once, and moves the sums to the components' means:
 nothing is stored for a pair of a row and a candidate. The other chooses the candidates. Their twins are in
-`mixture.em.grouping`, those of the M-step (2.4)-(2.6) and of natural parameters in `mixture.em`. The M-step
+`mixture.em.truncated`, those of the M-step (2.4)-(2.6) and of natural parameters in `mixture.em`. The M-step
 differs from its twin by at most 10⁻¹² of the largest entry of a component, and natural parameters by this
 times the condition number of its covariance.
 """

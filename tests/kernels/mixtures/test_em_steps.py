@@ -12,15 +12,15 @@ from gmmtorch.errors import NumericalError
 from gmmtorch.kernels import kernels
 from gmmtorch.kernels.mixtures import em_steps
 from gmmtorch.mixture.em.exact import Parameters, maximization, natural_parameters, quadratic_features
-from gmmtorch.mixture.em.grouping import (
+from gmmtorch.mixture.em.truncated import (
     Groups,
+    Momentum,
     Rows,
     centered_parameters,
     choose_candidates,
     group_rows,
     truncated_expectation,
 )
-from gmmtorch.mixture.em.truncated import Momentum
 
 
 def mixture(k: int, dim: int, kind: str) -> Parameters:
