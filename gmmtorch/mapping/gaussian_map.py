@@ -61,7 +61,7 @@ class GaussianMap(MapState):
         n_samples: number of rays of method "monte_carlo", drawn from the whole map.
         sampling: sequence of these rays, "sobol", "stratified" or "plain".
         memory_limit: largest number of bytes of the evidence of a grid, and of Monte Carlo evidence.
-        compiled: use torch.compile where a compiled form exists.
+        compiled: has no effect; fused kernels answer queries.
         calibration: from which the map's own goes on, such as that of another map. None: that of the sensor
             model, for the ranges of the map's beams.
 
