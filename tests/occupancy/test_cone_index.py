@@ -154,17 +154,25 @@ def same_evidence(found: PointEvidence, expected: torch.Tensor) -> None:
 
 @pytest.mark.parametrize("dim", [2, 3])
 @settings(max_examples=15)
-@given(seed=st.integers(0, 10_000), n_points=st.sampled_from([3, 100, 400]))
-def test_evidence_of_cones_that_come_and_go_is_that_of_all(dim, seed, n_points):
+@given(
+    seed=st.integers(0, 10_000),
+    n_points=st.sampled_from([3, 100, 400]),
+    largest=st.sampled_from([0, 1 << 21]),
+)
+def test_evidence_of_cones_that_come_and_go_is_that_of_all(dim, seed, n_points, largest):
     generator = torch.Generator().manual_seed(seed)
     cones = random_cones(dim, 30, seed, room=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(point_form, "_FEW_PAIRS", 0)
         patch.setattr(cone_index, "_FEW_PAIRS", 0)
+        patch.setattr(cone_index, "_TABLE", largest)
+        patch.setattr(cone_index, "_CELLS_PER_POINT", 1 << 21)
         form = PointForm(cones, 0.1)
         for step in range(4):
             places, _ = places_on_rays(cones, n_points, CUTOFF, seed + step)
-            same_evidence(form(places), brute(cones, places, 0.1))
+            expected = brute(cones, places, 0.1)
+            same_evidence(form(places), expected)
+            same_evidence(form(places), expected)  # from lists that are all there
             kept = (torch.rand(len(cones.counts), generator=generator) < 0.9).nonzero().squeeze(1)
             new = random_cones(dim, 4, seed + 100 + step, room=True)
             new = new._replace(means=new.means - 3.0 * step)  # also beyond the box of the first ones

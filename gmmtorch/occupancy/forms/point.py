@@ -33,37 +33,35 @@ class PointBlocks(NamedTuple):
     """Points sorted by position, in b blocks of B points; all points of a block lie in one bucket.
 
     points (D, B, b); bucket (b,); centers (b, D) and radius (b,): a ball around the points of each block.
-    point (n,) and slot (n,): indices of the given points, and their places among the b·B slots. Free slots
-    of a block repeat its last point.
+    slot (n,): the places of the given points among the b·B slots. Free slots of a block repeat its last
+    point.
     """
 
     points: Tensor
     bucket: Tensor
     centers: Tensor
     radius: Tensor
-    point: Tensor
     slot: Tensor
 
     @classmethod
-    def of(cls, points: Tensor, bucket: Tensor, index: ConeIndex) -> PointBlocks:
-        """Blocks of points (M, D), at least one, in buckets (M,)."""
-        point = index.in_space_order(points, bucket)
-        touched, count = torch.unique_consecutive(bucket[point], return_counts=True)
-        n_points, n_touched = point.shape[0], touched.shape[0]
+    def of(cls, points: Tensor, bucket: Tensor) -> PointBlocks:
+        """Blocks of points (n, D), at least one, in rising buckets (n,)."""
+        touched, count = torch.unique_consecutive(bucket, return_counts=True)
+        (n_points, dim), n_touched = points.shape, touched.shape[0]
         size = 16 if n_points > 24 * n_touched else 4 if n_points > 4 * n_touched else 1
         n_blocks = (count + size - 1) // size
         first, begin = torch.cumsum(count, 0) - count, (torch.cumsum(n_blocks, 0) - n_blocks) * size
-        number = torch.arange(n_points, device=point.device)
+        number = torch.arange(n_points, device=points.device)
         slot = number + torch.repeat_interleave(begin - first, count)
-        filled = torch.zeros(int(n_blocks.sum()) * size, dtype=torch.int64, device=point.device)
+        filled = torch.zeros(int(n_blocks.sum()) * size, dtype=torch.int64, device=points.device)
         filled[slot] = number
         filled = filled.cummax(0).values
-        gathered = points[point][filled].view(-1, size, index.dim)
+        gathered = points[filled].view(-1, size, dim)
         fixed = gathered.detach()
         centers = 0.5 * (fixed.amin(1) + fixed.amax(1))
         radius = (fixed - centers[:, None]).norm(dim=2).amax(1)
         owner = torch.repeat_interleave(touched, n_blocks)
-        return cls(gathered.permute(2, 1, 0).contiguous(), owner, centers, radius, point, slot)
+        return cls(gathered.permute(2, 1, 0).contiguous(), owner, centers, radius, slot)
 
 
 CHUNK_PAIRS = 1 << 16
@@ -224,30 +222,25 @@ class PointForm:
         for rows, number in self.index.parts(points):
             if not len(rows):
                 continue
-            blocks = PointBlocks.of(points[rows], number, self.index)
+            blocks = PointBlocks.of(points[rows], number[rows])
             chunks = chunks_of(self.index.lists.lengths()[blocks.bucket], CHUNK_PAIRS)
             evidence = torch.cat([self._of_blocks(blocks, part) for part in chunks], 1)
-            place, (hit, miss) = rows[blocks.point], evidence.flatten(1)[:, blocks.slot]
-            hits, misses = hits.index_add(0, place, hit), misses.index_add(0, place, miss)
+            hit, miss = evidence.flatten(1)[:, blocks.slot]
+            hits, misses = hits.index_add(0, rows, hit), misses.index_add(0, rows, miss)
         return PointEvidence(hits, misses)
 
     def _fused(self, points: Tensor, found: Tensor) -> Tensor:
         """Adds hits and misses to `found` (2, M) by the fused kernel."""
         settings = self.rows, self.resolution, self.cutoff, found
-        bucket = torch.zeros_like(points[:, 0], dtype=torch.int64)
         if len(points) * len(self.rows) <= _FEW_PAIRS:
+            bucket = torch.zeros_like(points[:, 0], dtype=torch.int64)
             every = torch.arange(len(self.rows), dtype=torch.int32, device=points.device)
             order = torch.arange(len(points), device=points.device)
             bucket[(points.abs() > _FARTHEST).any(1)] = -1
             listed_evidence(points, order, bucket, Lists.of(order.new_tensor([len(every)]), every), *settings)
             return found
         for rows, number in self.index.parts(points):
-            if len(rows) == len(points):
-                bucket, order = number, self.index.in_space_order(points, number)
-            else:
-                bucket[rows] = number
-                order = rows[self.index.in_space_order(points[rows], number)]
-            listed_evidence(points, order, bucket, self.index.lists, *settings)
+            listed_evidence(points, rows, number, self.index.lists, *settings)
         return found
 
     def _near_cones(self, blocks: PointBlocks, part: slice) -> tuple[Tensor, Tensor]:
@@ -277,7 +270,7 @@ class PointForm:
         n_rows = 0
         for rows, number in self.index.parts(query):
             if len(rows):
-                blocks = PointBlocks.of(query[rows], number, self.index)
+                blocks = PointBlocks.of(query[rows], number[rows])
                 for part in chunks_of(self.index.lists.lengths()[blocks.bucket], CHUNK_PAIRS):
                     n_rows += len(self._near_cones(blocks, part)[0]) * blocks.points.shape[1]
         return n_rows / query.shape[0]
