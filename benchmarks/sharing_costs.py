@@ -24,7 +24,7 @@ from torch import Tensor
 from gmmtorch.mapping.codec.quantization import spatial_order
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.fitting import fit_window
-from gmmtorch.mapping.learning.viewpoints import all_origins
+from gmmtorch.mapping.learning.merging import all_origins
 from gmmtorch.team.exploration.robot.gmm_mapper import FrameRule
 from gmmtorch.team.sharing.codecs.point_codecs import bytes_of_points
 from gmmtorch.team.sharing.messages.fields import pose_of

@@ -16,7 +16,7 @@ from gmmtorch.arrays import as_tensor
 from gmmtorch.datasets import Ranges
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.localization.registration.registration import register
-from gmmtorch.mapping.clearance import clearance, expected_returns
+from gmmtorch.mapping.surfaces import clearance, expected_returns
 from gmmtorch.mixture import DepthCameraModel, LaserModel, Parameters, merge, prune, score_stream, simplify
 from gmmtorch.occupancy import (
     Boundary,

@@ -22,9 +22,8 @@ from gmmtorch.experiments.evaluation.calibration import (
     scores,
 )
 from gmmtorch.experiments.evaluation.queries import hit_and_free
-from gmmtorch.occupancy.calibrator import N_BINS, Calibrator
+from gmmtorch.occupancy.calibrator import N_BINS, Calibrator, reliability_of, scores_of
 from gmmtorch.occupancy.evidence import occupancy_probability
-from gmmtorch.occupancy.reliability import reliability_of, scores_of
 from gmmtorch.scan import Scan
 
 

@@ -16,7 +16,7 @@ from mapping.random_components import random_components
 from sharing.message_examples import examples, frame_of_components, views
 
 from gmmtorch.errors import DataError
-from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
+from gmmtorch.occupancy.voxels.cells import CellEvidence
 from gmmtorch.team.exploration.information.view_evaluator import ViewEvaluator
 from gmmtorch.team.exploration.information.view_library import ViewLibrary
 from gmmtorch.team.exploration.mission.driver import Stopwatch

@@ -29,8 +29,8 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.association import count_explained
-from gmmtorch.occupancy.voxels.boxes import intersection
+from gmmtorch.mapping.learning.novelty import count_explained
+from gmmtorch.occupancy.voxels.cells import intersection
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 from gmmtorch.team.exploration.robot.gmm_mapper import FrameRule, GmmMapper

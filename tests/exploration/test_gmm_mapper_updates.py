@@ -25,7 +25,7 @@ from torch import Tensor
 
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.novelty import beam_novelty
-from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.cells import Box
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 from gmmtorch.team.exploration.robot.gmm_mapper import GmmMapper
 from gmmtorch.team.exploration.robot.mapper import Memo

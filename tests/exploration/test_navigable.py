@@ -7,9 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.cells import Box, occupied_cells
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
-from gmmtorch.occupancy.voxels.voxelize import occupied_cells
 from gmmtorch.simulation.sensors.mesh_raycasting import ray_triangles
 from gmmtorch.simulation.worlds.furniture import box
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld

@@ -12,8 +12,7 @@ from occupancy.test_rolling_window import at, cells_of, new_window, random_evide
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.learning.novelty import beam_novelty
 from gmmtorch.mapping.learning.rules import NoveltyRule
-from gmmtorch.occupancy.voxels.boxes import Box
-from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
+from gmmtorch.occupancy.voxels.cells import Box, CellEvidence
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 

@@ -19,9 +19,9 @@ from gmmtorch.mapping.learning.merging import (
     compact,
     compact_to_bytes,
     estimated_bytes,
+    limit_origins,
     merged,
 )
-from gmmtorch.mapping.learning.viewpoints import limit_origins
 
 
 def pair(offset: float, deviation: float = 0.1, flags: tuple[bool, bool] = (False, False)) -> Components:

@@ -13,12 +13,17 @@ from scipy import stats
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
 from gmmtorch.kernels import kernels
+from gmmtorch.mapping import component_rays as module
+from gmmtorch.mapping.component_rays import (
+    RayDensity,
+    component_evidence,
+    counted_viewpoints,
+    drawn_rays,
+    ray_numbers,
+)
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.rays import component_evidence as module
-from gmmtorch.mapping.rays.component_evidence import component_evidence
-from gmmtorch.mapping.rays.component_rays import RayDensity, counted_viewpoints, drawn_rays, ray_numbers
 from gmmtorch.occupancy.forms.monte_carlo import RayBundle
-from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.cells import Box
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 
 

@@ -12,10 +12,9 @@ from mapping.ray_cases import EVERYTHING, dense, one
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.mapping.component_rays import component_evidence
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.rays.component_evidence import component_evidence
-from gmmtorch.occupancy.voxels.boxes import Box
-from gmmtorch.occupancy.voxels.cell_evidence import sum_evidence
+from gmmtorch.occupancy.voxels.cells import Box, sum_evidence
 
 RESOLUTION = 0.2
 

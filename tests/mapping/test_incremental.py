@@ -20,7 +20,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.evaluation import metrics, queries
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.depth_frame import DepthFrame
+from gmmtorch.mapping.learning.fitting import DepthFrame
 from gmmtorch.mapping.learning.merging import UNNUMBERED, estimated_bytes
 from gmmtorch.mapping.learning.novelty import entropy_reduction
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule

@@ -11,10 +11,9 @@ from torch import Tensor
 
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.depth_frame import DepthFrame
-from gmmtorch.mapping.learning.fitting import fit_window
+from gmmtorch.mapping.learning.fitting import DepthFrame, fit_window
+from gmmtorch.mapping.learning.merging import all_origins
 from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
-from gmmtorch.mapping.learning.viewpoints import all_origins
 from gmmtorch.mapping.learning.windows import surface_fit
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.estimators.sensor_model import measured_sensor

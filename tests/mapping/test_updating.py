@@ -12,7 +12,7 @@ from mapping.random_components import counts_add_up, normal_components
 from scipy.stats import chi2
 
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.association import count_explained
+from gmmtorch.mapping.learning.novelty import count_explained
 
 
 def counts_by_a_loop(components, points, origin, distance, limit, max_range, frees=None):
@@ -97,7 +97,7 @@ def test_association_counts_do_not_depend_on_the_portion_size(k, monkeypatch):
     components = normal_components(k, 2, 1)
     points = torch.randn(200, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     whole = count_explained(components, points, components.origins[0], 100.0)
-    monkeypatch.setattr("gmmtorch.mapping.learning.association._PAIRS_AT_ONCE", 7 * k)
+    monkeypatch.setattr("gmmtorch.mapping.learning.novelty._PAIRS_AT_ONCE", 7 * k)
     parts = count_explained(components, points, components.origins[0], 100.0)
     by_place = count_explained(
         components, points, components.origins[0], 100.0, frees=torch.ones(200, dtype=torch.bool)

@@ -14,8 +14,7 @@ from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule
-from gmmtorch.mapping.map_builder import MapBuilder
-from gmmtorch.mapping.window_motions import WindowMotions
+from gmmtorch.mapping.map_builder import MapBuilder, WindowMotions
 
 N_SCANS, WINDOW = 16, 4
 

@@ -14,7 +14,7 @@ from scipy.stats import multivariate_normal, norm
 
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.occupancy.cones import Cones, WhitenedCones
-from gmmtorch.occupancy.forms.flux.box_mass import box_mass, normal_mass
+from gmmtorch.occupancy.forms.quadrature import box_mass, normal_mass
 
 
 def mass(mean, covariance, low, high, **options):

@@ -14,7 +14,7 @@ from scipy import integrate
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.studies.angular_reference import angular_evidence
 from gmmtorch.occupancy.cones import Cones
-from gmmtorch.occupancy.forms.cone.cone_evidence import cone_evidence, share_beyond_2d
+from gmmtorch.occupancy.forms.cone import cone_evidence, share_beyond_2d
 
 ROUND = [[1.0, 0.0], [0.0, 1.0]]
 

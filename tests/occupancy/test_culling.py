@@ -10,18 +10,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from occupancy.cone_cases import draw_ends, normal, one_each, only, random_covariances, uniform
 
-from gmmtorch.occupancy import culling
+from gmmtorch.occupancy import cones as culling
 from gmmtorch.occupancy.cones import (
     CUTOFF,
     Cones,
     WhitenedCones,
+    ball_rows,
+    candidate_pairs,
     cone_bounds,
     cross,
+    face_rows,
     outside_ball,
     outside_cone,
 )
-from gmmtorch.occupancy.culling import ball_rows, candidate_pairs, cells_in_chunks, face_rows
 from gmmtorch.occupancy.grid import VoxelGrid
+from gmmtorch.occupancy.voxels.cells import cells_in_chunks
 
 GRIDS = {2: VoxelGrid((-2.0, -1.8), 0.2, (20, 18)), 3: VoxelGrid((-2.0, -1.8, -2.1), 0.4, (10, 9, 11))}
 

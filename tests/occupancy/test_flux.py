@@ -14,8 +14,8 @@ from occupancy.exact_angular import exact_evidence
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.occupancy.cones import Cones, cone_bounds
-from gmmtorch.occupancy.forms.flux.adaptive_quadrature import TOLERANCE
-from gmmtorch.occupancy.forms.flux.box_flux import box_flux, flux_evidence
+from gmmtorch.occupancy.forms.flux import box_flux, flux_evidence
+from gmmtorch.occupancy.forms.quadrature import TOLERANCE
 from gmmtorch.occupancy.grid import VoxelGrid
 
 

@@ -9,8 +9,7 @@ from occupancy.cone_cases import random_cones
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels.choice import kernels
 from gmmtorch.occupancy.cones import Cones
-from gmmtorch.occupancy.forms.kept_evidence import KeptEvidence
-from gmmtorch.occupancy.forms.point import PointForm
+from gmmtorch.occupancy.forms.point import KeptEvidence, PointForm
 from gmmtorch.occupancy.grid import VoxelGrid
 
 H = 0.3

@@ -12,7 +12,7 @@ from hypothesis import given
 from scipy import integrate, special
 from torch import Tensor
 
-from gmmtorch.occupancy.forms.cone.polygons import (
+from gmmtorch.occupancy.forms.cone import (
     approximate_erf,
     approximate_probability,
     owens_t,

@@ -13,10 +13,15 @@ from scipy.spatial import ConvexHull
 
 from gmmtorch.experiments.studies.angular_reference import angular_evidence
 from gmmtorch.occupancy.cones import Cones
-from gmmtorch.occupancy.forms.cone.cone_evidence import cone_evidence
-from gmmtorch.occupancy.forms.cone.polygons import polygon_probability
-from gmmtorch.occupancy.forms.cone.projection import Planes
-from gmmtorch.occupancy.forms.cone.silhouette import facing, image, meets_disc, outline
+from gmmtorch.occupancy.forms.cone import (
+    Planes,
+    cone_evidence,
+    facing,
+    image,
+    meets_disc,
+    outline,
+    polygon_probability,
+)
 
 
 def column(*values: float) -> torch.Tensor:

@@ -10,8 +10,7 @@ from occupancy.exact_dda import voxels_left
 
 import gmmtorch.occupancy.voxels.ray_casting as module
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
-from gmmtorch.occupancy.voxels.boxes import Box, to_lattice
-from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence, sum_evidence
+from gmmtorch.occupancy.voxels.cells import Box, CellEvidence, sum_evidence, to_lattice
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence, near_interval
 
 Counts = dict[tuple[int, ...], tuple[float, float]]

@@ -1,4 +1,4 @@
-"""Tests of gmmtorch.occupancy.ray_queries: enumeration of all maps, simulated scans of a wall, bad rays."""
+"""Tests of gmmtorch.occupancy.forms.point: enumeration of all maps, simulated scans of a wall, bad rays."""
 
 import itertools
 
@@ -11,8 +11,7 @@ from occupancy.cone_cases import random_cones
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.evidence import occupancy_probability
-from gmmtorch.occupancy.forms.point import PointForm
-from gmmtorch.occupancy.ray_queries import expected_range, first_hit, hit_probability
+from gmmtorch.occupancy.forms.point import PointForm, expected_range, first_hit, hit_probability
 
 
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=8))

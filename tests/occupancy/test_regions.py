@@ -12,8 +12,7 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.occupancy.cones import Cones
-from gmmtorch.occupancy.forms.flux.box_flux import box_flux
-from gmmtorch.occupancy.forms.flux.regions import Boundary, region_flux
+from gmmtorch.occupancy.forms.flux import Boundary, box_flux, region_flux
 
 SQUARE = torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]).double()
 HORSESHOE = torch.tensor(

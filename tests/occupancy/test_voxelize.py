@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.occupancy.voxels.boxes import Box
-from gmmtorch.occupancy.voxels.voxelize import occupied_cells
+from gmmtorch.occupancy.voxels.cells import Box, occupied_cells
 from gmmtorch.simulation.worlds.furniture import ball, box
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld
 

@@ -10,8 +10,7 @@ import torch
 from scipy.ndimage import label
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
-from gmmtorch.occupancy.voxels.boxes import Box
-from gmmtorch.occupancy.voxels.voxelize import occupied_cells
+from gmmtorch.occupancy.voxels.cells import Box, occupied_cells
 from gmmtorch.simulation.worlds.furniture import UNIT_CUBE, copies
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld
 from gmmtorch.simulation.worlds.tunnels import tunnels

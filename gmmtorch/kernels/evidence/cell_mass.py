@@ -2,7 +2,7 @@
 
 The fused kernel works on boxes of cells around a component. All cells of a grid have the same whitened edges,
 so they share the edge with the closed form. Panels are cut and integrated by the rules of
-`occupancy.forms.flux.adaptive_quadrature`, as in `face_flux`: results differ within the tolerance.
+`occupancy.forms.quadrature`, as in `face_flux`: results differ within the tolerance.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 The fused kernel works on rows: rectangles of faces in one plane of the grid, with one cone. It drops panels
 outside the cone, cuts panels on which the integrand varies much, and integrates the others by Gauss-Legendre
-rules, by the rules of `occupancy.forms.flux.adaptive_quadrature`. Panels that share a vector share the order
+rules, by the rules of `occupancy.forms.quadrature`. Panels that share a vector share the order
 of the rule, the highest that one of them needs. So results differ from the twin within the tolerance.
 """
 

@@ -1,7 +1,7 @@
 """Which points components explain, and the share of each component in them: the sums of `count_explained`.
 
 The fused kernel tests each point against all components, a few dozen at a time, and keeps no list of pairs.
-Its twin is in `mapping.learning.association`.
+Its twin is in `mapping.learning.novelty`.
 """
 
 from __future__ import annotations

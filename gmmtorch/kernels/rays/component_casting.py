@@ -1,7 +1,7 @@
 """Evidence of components in the cells of a box, from rays that are drawn from them and cast.
 
 The fused kernel handles one viewpoint in one item, from its component to the cells, and keeps no list of
-rays. `mapping.rays.component_rays` has its twin, which draws with `truncated_normals` here and casts with
+rays. `mapping.component_rays` has its twin, which draws with `truncated_normals` here and casts with
 `count_in_grid`.
 """
 

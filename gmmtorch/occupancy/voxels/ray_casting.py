@@ -12,8 +12,7 @@ from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import MemoryLimitError
 from gmmtorch.kernels import count_in_grid
 from gmmtorch.occupancy.grid import BYTES_PER_CELL, MEMORY_LIMIT
-from gmmtorch.occupancy.voxels.boxes import Box, flat_index, intersection, to_lattice
-from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
+from gmmtorch.occupancy.voxels.cells import Box, CellEvidence, flat_index, intersection, to_lattice
 
 _CHUNK_VISITS = 1 << 16  # fastest when cores share a cache
 

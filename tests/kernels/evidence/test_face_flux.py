@@ -7,9 +7,8 @@ import torch
 from kernels.cones_for_kernels import cones_of
 
 from gmmtorch.kernels import kernels
-from gmmtorch.occupancy.cones import Cones
-from gmmtorch.occupancy.culling import candidate_pairs
-from gmmtorch.occupancy.forms.flux.box_flux import cell_flux, flux_evidence
+from gmmtorch.occupancy.cones import Cones, candidate_pairs
+from gmmtorch.occupancy.forms.flux import cell_flux, flux_evidence
 from gmmtorch.occupancy.grid import VoxelGrid
 
 

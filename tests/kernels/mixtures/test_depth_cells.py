@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import kernels
-from gmmtorch.mapping.learning.depth_frame import DepthFrame, PooledFrames, pool_frames
+from gmmtorch.mapping.learning.fitting import DepthFrame, PooledFrames, pool_frames
 from gmmtorch.mixture.em.exact import quadratic_features, shift_features
 
 INTRINSICS = torch.tensor([[64.0, 0, 31.5], [0, 64.0, 23.5], [0, 0, 1]], dtype=torch.float64)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from gmmtorch.kernels import kernels
 from gmmtorch.kernels.compiler import compiler_failure
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.association import count_explained
+from gmmtorch.mapping.learning.novelty import count_explained
 
 pytestmark = pytest.mark.skipif(compiler_failure() is not None, reason="the kernel compiler does not work")
 

@@ -10,10 +10,9 @@ from mapping.random_components import random_components
 
 from gmmtorch.errors import NumericalError
 from gmmtorch.kernels import kernels
+from gmmtorch.mapping.component_rays import component_evidence
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.rays.component_evidence import component_evidence
-from gmmtorch.occupancy.voxels.boxes import Box
-from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
+from gmmtorch.occupancy.voxels.cells import Box, CellEvidence
 
 OPTIONS = {
     "plain": {},

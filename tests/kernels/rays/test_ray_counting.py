@@ -12,7 +12,7 @@ from gmmtorch.kernels import kernels
 from gmmtorch.kernels.rays.ray_counting import count_in_grid
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.cells import Box
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 

@@ -7,7 +7,7 @@ import torch
 
 from gmmtorch.kernels import kernels
 from gmmtorch.kernels.rays.ray_marks import mark_cells_of_rays
-from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.cells import Box
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 
 

@@ -1,26 +1,119 @@
-"""Evidence of components in the cells of a box, from the rays that `component_rays` draws."""
+"""Rays from the sensor origins of components to points drawn from the components (thesis 3.2.3).
+
+A viewpoint gets about `rays_per_cell` rays for each cell that its component hides from the sensor. A Gaussian
+hides the area 4π √|Σ₂| (the inverse of ∫p² of its shadow p), Σ₂ its covariance across the view. Each ray has
+an equal share of the viewpoint's count. End points are the first points of one Sobol sequence, rotated on the
+unit cube by a hash of the component's id (Cranley and Patterson 1976), and transformed to normal draws
+truncated at the radius `cutoff` (deviations). The rays of a component therefore depend only on the component,
+and the rays of several batches can be added or removed one by one.
+
+`component_evidence` counts these rays in the cells of a box; `MixtureTiles` finds the batches of components
+whose rays may reach it.
+"""
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
-from gmmtorch.kernels import THINNING, Seen, cast_components, is_fused
+from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
+from gmmtorch.kernels import THINNING, Seen, cast_components, hidden_area, is_fused, truncated_normals
+from gmmtorch.linalg import safe_cholesky
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.rays.component_rays import RayDensity, counted_viewpoints, drawn_rays, ray_numbers
 from gmmtorch.occupancy import (
     Box,
     CellEvidence,
     RayBundle,
+    RollingWindow,
     cast_evidence,
+    check_resolution,
+    cone_bounds,
     intersection,
     near_interval,
     sum_evidence,
+    to_lattice,
 )
+
+
+@dataclass(frozen=True)
+class RayDensity:
+    """The density of rays.
+
+    resolution: side (m) of the cells. least, most: bounds on the number of rays of a viewpoint.
+    """
+
+    resolution: float
+    rays_per_cell: float
+    least: int
+    most: int
+    cutoff: float
+
+    def __post_init__(self) -> None:
+        check_resolution(self.resolution)
+        for name in ("rays_per_cell", "cutoff"):
+            check_number(name, getattr(self, name), above=True)
+        if check_whole("most", self.most, 1) < check_whole("least", self.least, 1):
+            raise InvalidArgumentError(f"most={self.most} must be at least least={self.least}.")
+
+
+def counted_viewpoints(components: Components, resolution: float) -> Tensor:
+    """The viewpoints (C,) that have a count. Checks the components."""
+    if components.dim != 3:
+        raise InvalidArgumentError(f"components have {components.dim} dimensions; their rays need 3.")
+    to_lattice(components.means, resolution, "means")
+    to_lattice(components.origins, resolution, "origins")
+    return (components.seen_count > 0).nonzero().squeeze(1)
+
+
+def ray_numbers(components: Components, seen: Tensor, density: RayDensity) -> Tensor:
+    """Number of rays (C,) of each of the viewpoints `seen` (C,)."""
+    by, viewpoint = components.seen_by[seen], components.seen_from[seen]
+    toward = components.means[by].double() - components.origins[viewpoint].double()
+    hidden = hidden_area(toward, components.covariances[by].double()) / density.resolution**2
+    wanted = (density.rays_per_cell * hidden).ceil().nan_to_num(0)  # NaN is refused when rays are drawn
+    return wanted.clamp(density.least, density.most).long()
+
+
+def drawn_rays(
+    components: Components, seen: Tensor, density: RayDensity, once: Tensor, times: Tensor
+) -> tuple[RayBundle, Tensor, Tensor]:
+    """`times` · `once` rays of each viewpoint `seen` (C,); the viewpoint (R,) of each ray; and the rows
+    (F,) of the first `once` rays of each viewpoint."""
+    used, by = torch.unique(components.seen_by[seen], return_inverse=True)
+    mean, covariance = components.means[used].double(), components.covariances[used].double()
+    origin, count = (
+        components.origins[components.seen_from[seen]].double(),
+        components.seen_count[seen].double(),
+    )
+    factor = safe_cholesky(covariance)
+    number = once * times
+    viewpoint = torch.repeat_interleave(number)
+    first = torch.cumsum(number, 0) - number
+    draw = torch.arange(len(viewpoint), device=seen.device) - first[viewpoint]
+    component = by[viewpoint]
+    longest = density.most * (int(times.max()) if len(times) else 1)
+    normal = truncated_normals(components.ids[used], component, draw, longest, density.cutoff)
+    # Sums and products of single columns: a matrix product may round differently in another batch.
+    ends = []
+    for row in range(3):
+        place = mean[:, row][component]
+        for column in range(row + 1):
+            place = place + factor[:, row, column][component] * normal[column]
+        ends.append(place)
+    rays = RayBundle(
+        origin[viewpoint],
+        torch.stack(ends, 1),
+        (count / number)[viewpoint],
+        ~components.max_range[used][component],
+    )
+    return rays, viewpoint, (draw < once[viewpoint]).nonzero().squeeze(1)
+
 
 _MOST_DRAWS = 1 << 19  # draws at a time, about 250 bytes each
 _FARTHEST = 2.0**31  # cells from the world's origin
@@ -251,3 +344,95 @@ def _in_reach(
     # The margin of half a cell covers the rounding of the draws.
     first, last = near_interval(origins * scale, low[by] * scale, high[by] * scale, box)
     return (first <= last) & (last >= 1) if ends_only else first <= last
+
+
+_REACH = 3.0  # deviations around the means that belong to the box
+_MOST_TILES = 4096  # a batch in more tiles is tested in every search
+
+
+class _Batch(NamedTuple):
+    components: Components
+    low: list[float]  # corners of the box around its rays, metres
+    high: list[float]
+
+
+class MixtureTiles:
+    """Batches of components, each of one message or frame, hashed into cubes by the box around their rays.
+
+    The time of a search grows with the number of near batches, not of all. Batches never change.
+
+    Args:
+        tile: side (m) of the cubes.
+    """
+
+    def __init__(self, tile: float = 8.0) -> None:
+        if not 0 < tile < math.inf:
+            raise InvalidArgumentError(f"tile={tile} must be finite metres above zero.")
+        self.tile = tile
+        self._batches: list[_Batch] = []
+        self._tiles: dict[tuple[int, ...], list[int]] = {}  # rows of the batches in each cube
+        self._everywhere: list[int] = []
+
+    def add(self, components: Components) -> None:
+        """Adds a batch. Raises `InvalidArgumentError` for components that are not in 3D, and means,
+        covariances or origins that are not finite."""
+        if components.dim != 3:
+            raise InvalidArgumentError(f"components have {components.dim} dimensions; tiles need 3.")
+        if not len(components.seen_by):
+            return  # it has no rays
+        lows, highs = cone_bounds(components.cones(), _REACH)
+        low, high = lows.amin(0).tolist(), highs.amax(0).tolist()
+        if not all(map(math.isfinite, (*low, *high))):
+            raise InvalidArgumentError("The components of a batch hold NaN or infinite values.")
+        spans = self._spans(low, high)
+        if math.prod(map(len, spans)) > _MOST_TILES:
+            self._everywhere.append(len(self._batches))
+        else:
+            for place in itertools.product(*spans):
+                self._tiles.setdefault(place, []).append(len(self._batches))
+        self._batches.append(_Batch(components, low, high))
+
+    def near(self, box: Box, resolution: float) -> list[Components]:
+        """Batches whose rays may reach a box of cells of side `resolution` (m), in the order of `add`.
+
+        Rays must end within three deviations of their means, as those of `component_rays` do.
+        """
+        low = [x * resolution for x in box.low.tolist()]
+        high = [x * resolution for x in box.high.tolist()]
+        spans = self._spans(low, high)
+        found = set(self._everywhere)
+        if math.prod(map(len, spans)) < len(self._tiles):
+            for place in itertools.product(*spans):
+                found.update(self._tiles.get(place, ()))
+        else:  # the box has more tiles than are in use
+            for place, numbers in self._tiles.items():
+                if all(x in span for x, span in zip(place, spans, strict=True)):
+                    found.update(numbers)
+        batches = [self._batches[number] for number in sorted(found)]
+        return [
+            batch.components
+            for batch in batches
+            if all(a <= d and c <= b for a, b, c, d in zip(batch.low, batch.high, low, high, strict=True))
+        ]
+
+    def _spans(self, low: list[float], high: list[float]) -> list[range]:
+        """The tiles along each axis from one corner to the other, metres."""
+        return [
+            range(math.floor(a / self.tile), math.floor(b / self.tile) + 1)
+            for a, b in zip(low, high, strict=True)
+        ]
+
+
+def regenerate(
+    sliding: RollingWindow,
+    boxes: Iterable[Box],
+    tiles: MixtureTiles,
+    evidence: Callable[[Components, float, Box], CellEvidence],
+) -> None:
+    """Fills empty boxes that the window has uncovered with the evidence of the mixture (thesis Fig 4.2).
+
+    Rays are clipped to the boxes, so nothing is counted twice. `evidence(components, resolution, box)`.
+    """
+    for box in boxes:
+        if near := tiles.near(box, sliding.resolution):
+            sliding.add(evidence(Components.concatenate(near), sliding.resolution, box))
