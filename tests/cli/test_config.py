@@ -19,10 +19,10 @@ from hydra.core.config_store import ConfigStore
 from hydra.errors import ConfigCompositionException
 from omegaconf import DictConfig, OmegaConf
 
-from gmmtorch import datasets
 from gmmtorch.cli import common, export, localize
 from gmmtorch.cli.from_options import maps
 from gmmtorch.cli.from_options.scans import open_dataset
+from gmmtorch.datasets import sources
 from gmmtorch.errors import InvalidArgumentError, MissingDataError
 from gmmtorch.experiments.cli import methods_of_options
 from gmmtorch.experiments.cli.experiment_schema import STUDIES
@@ -81,7 +81,7 @@ def plain(node: DictConfig) -> dict[str, Any]:
 @pytest.mark.parametrize("dataset", choices("dataset"))
 def test_every_data_set_composes_and_its_reader_takes_its_options(dataset, tmp_path):
     config = composed("fit", f"dataset={dataset}").dataset
-    source = datasets._SOURCES[dataset]
+    source = sources._SOURCES[dataset]
     assert (config.name, config.get("stride", 1)) == (dataset, 1)
     assert (config.no_return_range, config.max_range) == (source.no_return_range, source.max_range)
     if "path" not in list(config):  # `in` is False for a missing value
