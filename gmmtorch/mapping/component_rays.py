@@ -41,6 +41,14 @@ from gmmtorch.occupancy import (
 )
 
 
+class _Counting(NamedTuple):
+    """How rays are counted, see `component_evidence`."""
+
+    shell: float
+    hits_per_ray: int
+    thinned: bool
+
+
 @dataclass(frozen=True)
 class RayDensity:
     """The density of rays.
@@ -154,6 +162,7 @@ def component_evidence(
     check_whole("hits_per_ray", hits_per_ray, 1)
     if not 0 <= shell < math.inf:
         raise InvalidArgumentError(f"shell={shell} must be finite, at least zero cells.")
+    how = _Counting(shell, hits_per_ray, thinned)
     density = RayDensity(resolution, rays_per_cell, least, most, cutoff)
     of_empty = RayDensity(
         resolution,
@@ -164,14 +173,14 @@ def component_evidence(
     )
     seen = counted_viewpoints(components, resolution)
     if is_fused(components.means, box.low):
-        found = _fused(components, seen, box, (density, of_empty), shell, hits_per_ray, thinned)
+        found = _fused(components, seen, box, (density, of_empty), how)
         if found is not None:
             return found
     if density == of_empty:
-        return _drawn(components, seen, box, density, shell, hits_per_ray, thinned)
+        return _drawn(components, seen, box, density, how)
     is_empty = components.max_range[components.seen_by[seen]]
     return sum_evidence(
-        _drawn(components, seen[chosen], box, each, shell, hits_per_ray, thinned)
+        _drawn(components, seen[chosen], box, each, how)
         for chosen, each in ((~is_empty, density), (is_empty, of_empty))
     )
 
@@ -181,9 +190,7 @@ def _drawn(
     seen: Tensor,
     box: Box,
     density: RayDensity,
-    shell: float,
-    hits_per_ray: int,
-    thinned: bool,
+    how: _Counting,
 ) -> CellEvidence:
     """`component_evidence` of the viewpoints `seen` (C,), from a list of their rays."""
     seen = seen[_in_reach(components, seen, box, density)]
@@ -192,10 +199,10 @@ def _drawn(
         _in_reach(components, seen, box, density, ends_only=True)
         & ~components.max_range[components.seen_by[seen]]
     )
-    times = torch.where(ends_here, hits_per_ray, 1)
+    times = torch.where(ends_here, how.hits_per_ray, 1)
     number = ray_numbers(components, seen, density)
     parts = [
-        _evidence(components, seen[some], box, density, number[some], times[some], shell, thinned)
+        _evidence(components, seen[some], box, density, number[some], times[some], how)
         for some in _portions(number * times)
     ]
     return parts[0] if len(parts) == 1 else sum_evidence(parts)
@@ -206,9 +213,7 @@ def _fused(
     seen: Tensor,
     box: Box,
     densities: tuple[RayDensity, RayDensity],
-    shell: float,
-    hits_per_ray: int,
-    thinned: bool,
+    how: _Counting,
 ) -> CellEvidence | None:
     """`component_evidence` by the fused kernel; None for input that the twin corrects, refuses or splits."""
     if len(seen) == 0:
@@ -237,9 +242,9 @@ def _fused(
         least=density.least,
         most=density.most,
         cutoff=(density.cutoff, of_empty.cutoff),
-        shell=shell * density.resolution,
-        hits_per_ray=hits_per_ray,
-        thinned=thinned,
+        shell=how.shell * density.resolution,
+        hits_per_ray=how.hits_per_ray,
+        thinned=how.thinned,
     )
     return None if found is None else CellEvidence.from_dense(window.low, *found)
 
@@ -279,8 +284,7 @@ def _evidence(
     density: RayDensity,
     number: Tensor,
     times: Tensor,
-    shell: float,
-    thinned: bool,
+    how: _Counting,
 ) -> CellEvidence:
     """`component_evidence` of the viewpoints `seen` (C,), with `number` (C,) rays and `times` as many
     hits.
@@ -289,10 +293,10 @@ def _evidence(
     drawn, viewpoint, followed = drawn_rays(components, seen, density, number, times)
     rays, viewpoint = RayBundle(*(field[followed] for field in drawn)), viewpoint[followed]
     stops, weights = rays.ends, rays.weights * times[viewpoint]
-    if shell > 0:
-        stops = _before_surface(components, components.seen_by[seen][viewpoint], rays, shell * resolution)
+    if how.shell > 0:
+        stops = _before_surface(components, components.seen_by[seen][viewpoint], rays, how.shell * resolution)
     starts = rays.origins
-    if thinned:
+    if how.thinned:
         starts, stops, weights = _thinned(starts, stops, weights, viewpoint)
     passing = torch.zeros_like(weights, dtype=torch.bool)
     struck = drawn.ends[drawn.is_hit], drawn.weights[drawn.is_hit]

@@ -24,7 +24,6 @@ from gmmtorch.mapping.learning.windows import (
     absorb,
     joined,
     learn_window,
-    no_prediction,
     predicted,
 )
 from gmmtorch.mapping.query import Query
@@ -166,7 +165,7 @@ class MapState(DeviceModule):
         scans: Iterable[Scan | DepthFrame],
         rule: LearningRule,
         weight: float = 1.0,
-        before: BeforeWindow = no_prediction,
+        before: BeforeWindow | None = None,
     ) -> tuple[Components, int]:
         """`_upcoming`, with the components of scans, or of frames whose points each stand for `weight`.
 

@@ -70,10 +70,6 @@ BeforeWindow = Callable[[Components, Sequence[Scan | DepthFrame]], None]
 """Is called with the components of a map before a window, and the window."""
 
 
-def no_prediction(known: Components, window: Sequence[Scan | DepthFrame]) -> None:
-    """Ignores the window."""
-
-
 # -- an IncrementalRule ---------------------------------------------------------------------------------
 
 
@@ -84,7 +80,7 @@ def absorb(
     size: Size = estimated_bytes,
     weight: float = 1.0,
     doubts: Doubts | None = None,
-    before: BeforeWindow = no_prediction,
+    before: BeforeWindow | None = None,
 ) -> tuple[Components, Doubts]:
     """The components of a map with scans added, merged until they meet the budget; and the doubts after them.
 
@@ -106,7 +102,8 @@ def absorb(
         rule = rule.fitted(scans)
     doubts, left = doubts or Doubts.none(), iter(scans)
     while window := list(islice(left, rule.window)):
-        before(components, window)
+        if before is not None:
+            before(components, window)
         components, doubts = _absorb_window(components, window, rule, size, weight, doubts)
     return components, doubts
 
@@ -149,25 +146,18 @@ def _explain(
     remaining = []
     for scan in scans:
         novel = scan.select(novel_beams(components, scan, rule))
-        frees = _contribute_free_space(components, novel, rule)
+        frees = None  # all returns are novel by the cells before their ends
+        if rule.distance_for != "all":
+            before_ends = Scan(novel.points[:0], novel.origin, novel.points)
+            frees = novel_beams(components, before_ends, rule)
         keep = []
-        for points, max_range, free in (
-            (novel.points, False, frees),
-            (novel.no_return, True, None),
-        ):
+        for points, max_range, free in ((novel.points, False, frees), (novel.no_return, True, None)):
             components, explained = count_explained(
                 components, points, scan.origin, rule.distance, rule.explained, max_range, weight, free
             )
             keep.append(~explained)
         remaining.append(novel.select(torch.cat(keep)))
     return components, remaining
-
-
-def _contribute_free_space(components: Components, scan: Scan, rule: NoveltyRule) -> Tensor | None:
-    """Which returns (N,) of a scan are novel by the cells before their ends alone; None: all."""
-    if rule.distance_for == "all":
-        return None
-    return novel_beams(components, Scan(scan.points[:0], scan.origin, scan.points), rule)
 
 
 def _within_budget(components: Components, rule: IncrementalRule, size: Size) -> Components:

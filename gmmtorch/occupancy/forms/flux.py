@@ -59,6 +59,9 @@ from gmmtorch.occupancy.voxels.cells import cells_in_chunks, row_major
 CHUNK_FACES = 1 << 18
 """Faces, or pairs of a box and a cone, prepared in one pass."""
 
+Rules = tuple[float, float, torch.dtype]
+"""How faces and boxes are integrated: cutoff, tolerance, and type of the integrands."""
+
 _ROOT_TWO_PI = math.sqrt(2 * math.pi)
 _BEFORE = 6.0  # a face farther before the mean than this (Mahalanobis) has the whole component beyond it
 _NEARNESS = 2.5  # variation, in deviations, of a panel as wide as its distance from the sensor origin
@@ -166,7 +169,7 @@ def flux_evidence(
     Raises:
         InvalidArgumentError: a grid of another dimension, or a tolerance outside (0, 1).
     """
-    check_tolerance(tolerance)
+    how = cutoff, check_tolerance(tolerance), dtype
     cones = cones.checked()
     if cones.dim != grid.dim:
         raise InvalidArgumentError(
@@ -186,11 +189,11 @@ def flux_evidence(
             add_row_flux(misses, table, counts, rows, axis, place, cutoff, limits)
         return Evidence(grid, hits.view(grid.shape), misses.view(grid.shape))
     for axis, rows in enumerate(face_rows(cones, grid, cutoff)):
-        misses = _add_faces(misses, white, counts, grid, axis, rows, cutoff, tolerance, dtype)
+        misses = _add_faces(misses, white, counts, grid, axis, rows, how)
     hits = torch.zeros_like(misses)
     for row, cell in cells_in_chunks(balls.first, balls.number, CHUNK_FACES):
         cone, low = balls.cone[row], _world(grid, cell.double())
-        mass = box_mass(white.take(cone), low, low + grid.resolution, cutoff, tolerance, dtype)
+        mass = box_mass(white.take(cone), low, low + grid.resolution, *how)
         hits = hits.index_add(0, row_major(cell.unbind(), grid.shape), mass * counts[cone])
     return Evidence(grid, hits.view(grid.shape), misses.view(grid.shape))
 
@@ -202,9 +205,7 @@ def _add_faces(
     grid: VoxelGrid,
     axis: int,
     rows: FaceRows,
-    cutoff: float,
-    tolerance: float,
-    dtype: torch.dtype,
+    how: Rules,
 ) -> Tensor:
     """misses (cells,) and the flux through rows of faces; the twin of `kernels.evidence.face_flux`."""
     for row, cells in cells_in_chunks(rows.first, rows.number, CHUNK_FACES):
@@ -212,7 +213,7 @@ def _add_faces(
         middle = cells.double() + 0.5
         center = _world(grid, [*middle[:axis], plane.double(), *middle[axis:]])
         side = center.new_full((grid.dim, 1), grid.resolution)
-        flux = _face_flux(white.take(cone), center, side, axis, forward, cutoff, tolerance, dtype)
+        flux = _face_flux(white.take(cone), center, side, axis, forward, how)
         cell = [*cells[:axis], torch.where(forward, plane - 1, plane), *cells[axis:]]
         misses = misses.index_add(0, row_major(cell, grid.shape), flux * counts[cone])
     return misses
@@ -238,7 +239,7 @@ def box_flux(
     Raises:
         InvalidArgumentError: corners of another shape, not finite, or not low < high.
     """
-    check_tolerance(tolerance)
+    how = cutoff, check_tolerance(tolerance), dtype
     cones = cones.checked()
     low, high = checked_boxes(low, high, cones)
     white = WhitenedCones.of(cones)
@@ -250,11 +251,11 @@ def box_flux(
         part, corners = white.take(cone), (low[box].T, high[box].T)
         for axis in range(cones.dim):
             for forward in (False, True):
-                flux = _box_face_flux(part, corners, axis, forward, cutoff, tolerance, dtype)
+                flux = _box_face_flux(part, corners, axis, forward, how)
                 misses = misses.index_add(0, box, flux * counts[cone])
         returned = ~cones.max_range[cone]
         box, cone = box[returned], cone[returned]
-        mass = box_mass(white.take(cone), low[box].T, high[box].T, cutoff, tolerance, dtype)
+        mass = box_mass(white.take(cone), low[box].T, high[box].T, *how)
         hits = hits.index_add(0, box, mass * counts[cone])
     return hits, misses
 
@@ -324,9 +325,7 @@ def _box_face_flux(
     corners: tuple[Tensor, Tensor],
     axis: int,
     forward: bool,
-    cutoff: float,
-    tolerance: float,
-    dtype: torch.dtype,
+    how: Rules,
 ) -> Tensor:
     """Flux (P,) out of one face of each box; 0 where the sensor origin is on the outer side of the face."""
     low, high = corners
@@ -336,7 +335,7 @@ def _box_face_flux(
     low, high, face = low[:, out], high[:, out], face[out]
     middle = 0.5 * (low + high)
     center = torch.cat([middle[:axis], face[None], middle[axis + 1 :]])
-    flux = _face_flux(white.take(out), center, high - low, axis, forward, cutoff, tolerance, dtype)
+    flux = _face_flux(white.take(out), center, high - low, axis, forward, how)
     return flux.new_zeros(corners[0].shape[1]).index_add(0, out, flux)
 
 
@@ -346,9 +345,7 @@ def _face_flux(
     side: Tensor,
     axis: int,
     forward: Tensor | bool,
-    cutoff: float,
-    tolerance: float,
-    dtype: torch.dtype,
+    how: Rules,
 ) -> Tensor:
     """Flux (P,) through faces across `axis`, along or against it, with centres and sides (D, P), metres."""
     others = [b for b in range(len(center)) if b != axis]
@@ -356,6 +353,7 @@ def _face_flux(
     edges = torch.stack([white.matrix[:, b] * side[b] for b in others])
     height = torch.where(torch.as_tensor(forward, device=ray.device), ray[axis], -ray[axis])
     strength = height * side[others].prod(0) * torch.exp(-white.log_norm)
+    cutoff, tolerance, dtype = how
     white_ray = white.apply(ray)
     tensors = (white_ray - white.toward, edges, white_ray, strength)
     return integrate(FacePatches(cutoff, *(part.to(dtype) for part in tensors)), tolerance)
@@ -445,7 +443,7 @@ def region_flux(
 
     Arguments as in `flux_evidence`. Differentiable in the boundary and the cones.
     """
-    check_tolerance(tolerance)
+    how = cutoff, check_tolerance(tolerance), dtype
     cones = cones.checked()
     if boundary.starts.shape[1] != cones.dim:
         raise InvalidArgumentError(
@@ -460,7 +458,7 @@ def region_flux(
         per_pass = max(1, _CHUNK_FACES // max(1, len(cone)))
         for face in torch.arange(len(corners), device=cone.device).split(per_pass):
             both = torch.cartesian_prod(face, cone).reshape(-1, 2).T
-            out, mass = _face_integrals(white, boundary, both[0], both[1], cutoff, tolerance, dtype)
+            out, mass = _face_integrals(white, boundary, both[0], both[1], how)
             misses = misses.index_add(0, both[1], out)
             hits = hits.index_add(0, both[1], mass)
     # The signed masses above the faces sum to the mass in the region, which rounding can make negative.
@@ -472,11 +470,10 @@ def _face_integrals(
     boundary: Boundary,
     face: Tensor,
     cone: Tensor,
-    cutoff: float,
-    tolerance: float,
-    dtype: torch.dtype,
+    how: Rules,
 ) -> tuple[Tensor, Tensor]:
     """Flux out of each face (P,), and the signed mass above it (P,)."""
+    cutoff, tolerance, dtype = how
     part = white.take(cone)
     start, edge = boundary.starts[face].T, boundary.edges[face].permute(1, 2, 0)
     triangular = len(edge) == 2
