@@ -25,9 +25,6 @@ from .codec.thesis_message import decode_thesis as decode_thesis
 from .codec.thesis_message import decode_thesis_updates as decode_thesis_updates
 from .codec.thesis_message import encode_thesis as encode_thesis
 from .codec.thesis_message import encode_thesis_updates as encode_thesis_updates
-from .component_rays import MixtureTiles as MixtureTiles
-from .component_rays import component_evidence as component_evidence
-from .component_rays import regenerate as regenerate
 from .components import Components as Components
 from .gaussian_map import GaussianMap as GaussianMap
 from .learning.fitting import SurfaceFit as SurfaceFit

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, MemoryLimitError, check_number
+from gmmtorch.experiments.baselines.cell_table import CellTable
 from gmmtorch.experiments.baselines.samples import thinned_samples
 from gmmtorch.files import require
 from gmmtorch.occupancy import (
     MEMORY_LIMIT,
-    CellTable,
     TensorFileMap,
     check_length,
     check_resolution,

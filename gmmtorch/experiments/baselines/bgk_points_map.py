@@ -11,9 +11,10 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, check_number, check_whole
 from gmmtorch.experiments.baselines.bgk_map import BGKMap, beta_mean, sparse_kernel
+from gmmtorch.experiments.baselines.cell_table import CellTable
 from gmmtorch.files import require
 from gmmtorch.linalg import ragged_index
-from gmmtorch.occupancy import MEMORY_LIMIT, CellTable
+from gmmtorch.occupancy import MEMORY_LIMIT
 from gmmtorch.scan import Scan
 
 _CHUNK_PAIRS = 1 << 22

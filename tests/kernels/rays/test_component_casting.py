@@ -10,9 +10,9 @@ from mapping.random_components import random_components
 
 from gmmtorch.errors import NumericalError
 from gmmtorch.kernels import kernels
-from gmmtorch.mapping.component_rays import component_evidence
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.voxels.cells import Box, CellEvidence
+from gmmtorch.team.exploration.robot.component_rays import component_evidence
 
 OPTIONS = {
     "plain": {},

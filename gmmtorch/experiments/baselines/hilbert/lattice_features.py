@@ -11,8 +11,8 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.baselines.bgk_map import kernel_offsets, sparse_kernel
+from gmmtorch.experiments.baselines.cell_table import CellTable
 from gmmtorch.experiments.baselines.hilbert.hilbert_features import CHUNK_VALUES, rbf_kernel
-from gmmtorch.occupancy import CellTable
 
 RBF_CUTOFF = 1e-3
 """Kernels on a lattice are zero below this value, as in the code of the authors of Hilbert maps."""

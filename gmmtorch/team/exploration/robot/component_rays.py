@@ -25,7 +25,7 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
 from gmmtorch.kernels import THINNING, Seen, cast_components, hidden_area, is_fused, truncated_normals
 from gmmtorch.linalg import safe_cholesky
-from gmmtorch.mapping.components import Components
+from gmmtorch.mapping import Components
 from gmmtorch.occupancy import (
     Box,
     CellEvidence,

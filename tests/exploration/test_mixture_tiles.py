@@ -7,10 +7,10 @@ import torch
 from mapping.random_components import random_components
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mapping.component_rays import MixtureTiles, component_evidence, regenerate
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.voxels.cells import Box
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
+from gmmtorch.team.exploration.robot.component_rays import MixtureTiles, component_evidence, regenerate
 
 RESOLUTION, SHAPE = 0.25, (24, 20, 12)
 
