@@ -1,7 +1,8 @@
 """Merging of components: fewer components for nearly the same map, under an error bound or a budget.
 
 Also their viewpoints: how they are assigned when components are learned, united and reduced. A viewpoint is a
-sensor origin from which a component was observed, with the count of points observed from it."""
+sensor origin from which a component was observed, with the count of points observed from it.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """Novelty of beams: by how many bits each beam lowers the entropy of a map (thesis 4.1.2).
 
-Association adds the points that a map explains to the counts of components (thesis 4.1.3)."""
+Association adds the points that a map explains to the counts of components (thesis 4.1.3).
+"""
 
 from __future__ import annotations
 
@@ -8,6 +9,7 @@ import functools
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -175,6 +177,13 @@ _PAIRS_AT_ONCE = 1 << 20
 _POINTS_AT_ONCE = 512  # neighbouring points that few components can explain
 
 
+class Explained(NamedTuple):
+    """components: with the new counts; explained (N,) bool: the points that are counted."""
+
+    components: Components
+    explained: Tensor
+
+
 def count_explained(
     components: Components,
     points: Tensor,
@@ -184,14 +193,13 @@ def count_explained(
     max_range: bool = False,
     weight: float = 1.0,
     frees: Tensor | None = None,
-) -> tuple[Components, Tensor]:
+) -> Explained:
     """Adds points (N, D), observed from `origin` (D,), to the counts of the components that explain them.
 
     A component explains a point if d = (z − μ)ᵀ Σ⁻¹ (z − μ) < `explained`, and if one of its origins is
     within `distance` (m) of the sensor: then it also explains the free space before the point. The components
     share the point in proportion to 1/d, N_k += Σ_n w_nk; each share goes to the origin nearest to the
-    sensor. Means and covariances do not change. Returns the components with the new counts, and which points
-    (N,) are counted.
+    sensor. Means and covariances do not change.
 
     Args:
         explained: squared Mahalanobis distance; None: the 95 % quantile of χ² with D degrees of freedom.
@@ -206,7 +214,7 @@ def count_explained(
     is_candidate = components.max_range == max_range
     rows = (is_candidate & near if frees is None else is_candidate).nonzero().squeeze(1)
     if n == 0 or len(rows) == 0:
-        return components, found
+        return Explained(components, found)
     limit = explained_within(components.dim, explained)
     inverse, _ = whitening(components.covariances[rows])
     means = components.means[rows].double()
@@ -216,7 +224,7 @@ def count_explained(
         gained, found = _shared_out(components.selected(rows), points, inverse, limit, near[rows], frees)
     gain = components.support.new_zeros(k).index_copy_(0, rows, gained * weight)
     counts = components.seen_count.index_add(0, nearest[rows], gain[rows])
-    return replace(components, support=components.support + gain, seen_count=counts), found
+    return Explained(replace(components, support=components.support + gain, seen_count=counts), found)
 
 
 def _shared_out(
