@@ -364,7 +364,7 @@ def _world(grid: VoxelGrid, units: Iterable[Tensor]) -> Tensor:
     return torch.stack([o + i * grid.resolution for o, i in zip(grid.origin, units, strict=True)])
 
 
-_CHUNK_FACES = 1 << 16
+_PAIRS_AT_ONCE = 1 << 16
 
 
 class Boundary(NamedTuple):
@@ -454,8 +454,8 @@ def region_flux(
     low, high = corners.flatten(0, 1).amin(0), corners.flatten(0, 1).amax(0)
     reached = [cone for _, cone in candidate_pairs(cones, low[None], high[None], cutoff)]
     hits, misses = torch.zeros_like(counts), torch.zeros_like(counts)
-    for cone in torch.cat(reached or [counts.new_empty(0, dtype=torch.int64)]).split(_CHUNK_FACES):
-        per_pass = max(1, _CHUNK_FACES // max(1, len(cone)))
+    for cone in torch.cat(reached or [counts.new_empty(0, dtype=torch.int64)]).split(_PAIRS_AT_ONCE):
+        per_pass = max(1, _PAIRS_AT_ONCE // max(1, len(cone)))
         for face in torch.arange(len(corners), device=cone.device).split(per_pass):
             both = torch.cartesian_prod(face, cone).reshape(-1, 2).T
             out, mass = _face_integrals(white, boundary, both[0], both[1], how)
