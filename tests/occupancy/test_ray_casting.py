@@ -16,9 +16,9 @@ import gmmtorch.occupancy.voxels.ray_casting as module
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError
 from gmmtorch.occupancy.voxels.cells import Box, CellEvidence, occupied_cells, sum_evidence, to_lattice
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence, near_interval
-from gmmtorch.simulation.worlds.furniture import ball
-from gmmtorch.simulation.worlds.furniture import box as box_mesh
-from gmmtorch.simulation.worlds.mesh_world import MeshWorld
+from gmmtorch.simulation.furniture import ball
+from gmmtorch.simulation.furniture import box as box_mesh
+from gmmtorch.simulation.mesh_world import MeshWorld
 
 Counts = dict[tuple[int, ...], tuple[float, float]]
 

@@ -15,10 +15,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.arrays import ArrayLike, as_tensor
+from gmmtorch.arrays import ArrayLike
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import DepthCells, DepthView, depth_cells
-from gmmtorch.linalg import check_rigid
 from gmmtorch.mapping.components import UNNUMBERED, Components
 from gmmtorch.mapping.learning.merging import AssignedViewpoints, AssignViewpoints
 from gmmtorch.mapping.learning.rules import MixtureRule
@@ -37,6 +36,7 @@ from gmmtorch.mixture import (
     shift_features,
 )
 from gmmtorch.pinhole import back_project, check_intrinsics, metric_depth
+from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ class DepthFrame:
             intrinsics: (3, 3), of the whole image.
         """
         image = metric_depth(depth, depth_scale).detach()
-        rotation, translation = check_rigid(as_tensor(pose, "pose", torch.float64, image.device).detach(), 3)
+        rotation, translation = Pose.checked(pose, 3, "pose", device=image.device).parts
         scaled = check_intrinsics(intrinsics, tuple(image.shape)).to("cpu", copy=True)
         scaled[:2] /= pixel_stride
         taken = image[::pixel_stride, ::pixel_stride]
