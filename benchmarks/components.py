@@ -1,24 +1,22 @@
 """How many components: AUC and bytes of the map as its learning rule varies.
 
-    python benchmarks/components.py --data FOLDER
+    python benchmarks/components.py --data FOLDER [--only components-hall]
 
-FOLDER holds laser2d/intel.log.gz, laser2d/aces.log.gz, hall/ and kinect/. Writes its table into
-BENCHMARKS.md.
+FOLDER holds laser2d/intel.log.gz, laser2d/aces.log.gz, hall/ and kinect/.
 """
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
 
-import torch
-from tables import hardware, markdown, publish
+from harness import Case, Row, held_out, recording, run
 
-from gmmtorch import GaussianMap, WindowedRule, datasets
+from gmmtorch import GaussianMap, WindowedRule
+from gmmtorch.datasets import Dataset
 from gmmtorch.evaluation.held_out import Protocol, evaluate
 from gmmtorch.evaluation.methods import methods
-from gmmtorch.scan import Scan
 
 RULES: dict[str, dict[str, float]] = {
     "default": {},
@@ -38,33 +36,20 @@ RULES: dict[str, dict[str, float]] = {
 }
 
 
-def data(folder: Path, name: str) -> tuple[Sequence[Scan], Protocol]:
-    if name in ("intel", "aces"):
-        dataset = datasets.load("carmen", folder / "laser2d" / f"{name}.log.gz")
-        return list(dataset), Protocol(kept=(1.0, 0.1), resolution=(0.1, 0.02))
-    if name == "hall":
-        return list(datasets.load("scan_folder", folder / "hall")), Protocol(5, (1.0, 0.1), "beams", (0.2,))
-    dataset = datasets.load("depth_frames", folder / "kinect", pixel_stride=2)
-    return list(dataset), Protocol(5, (1.0, 0.1), "beams", (0.05,))
+def protocol(name: str, dataset: Dataset) -> Protocol:
+    if dataset[0].dim == 2:
+        return Protocol(kept=(1.0, 0.1), resolution=(0.1, 0.02))
+    return Protocol(held_out(dataset), (1.0, 0.1), "beams", (0.05 if name == "kinect" else 0.2,))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--names", nargs="+", default=["intel", "aces", "hall", "kinect"])
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-    for name in options.names:
-        scans, protocol = data(options.data, name)
-        rows: list[list[object]] = []
-        header: list[str] = []
-        for rule, changes in RULES.items():
-            outcome = evaluate(name, scans, {"monte_carlo": factory(changes, scans[0].dim)}, protocol)
-            header, row = columns(rule, outcome.rows)
-            rows.append(row)
-        grid = evaluate(name, scans, {"occupancy_grid": methods(GaussianMap)["occupancy_grid"]}, protocol)
-        rows.append(columns("(count grid)", grid.rows)[1])
-        publish(f"components-{name}", f"{name}. {hardware()}\n\n{markdown(header, rows)}")
+def measure(name: str, options: Any) -> Iterator[Row]:
+    dataset = recording(options.data, name, **({"pixel_stride": 2} if name == "kinect" else {}))
+    scans, asked = list(dataset), protocol(name, dataset)
+    for rule, changes in RULES.items():
+        found = evaluate(name, scans, {"monte_carlo": factory(changes, dataset[0].dim)}, asked)
+        yield columns(rule, found.rows)
+    grid = evaluate(name, scans, {"occupancy_grid": methods(GaussianMap)["occupancy_grid"]}, asked)
+    yield columns("(count grid)", grid.rows)
 
 
 def factory(changes: dict[str, float], dim: int):
@@ -80,18 +65,24 @@ def factory(changes: dict[str, float], dim: int):
     return lambda resolution: GaussianMap(rule, cutoff=5.0, prior=1.0)
 
 
-def columns(name: str, rows: list[dict]) -> tuple[list[str], list[object]]:
-    """Header and cells: AUC for each share and resolution, components and bytes for each share."""
-    header, cells = ["rule"], [name]
+def columns(name: str, rows: list[dict[str, Any]]) -> Row:
+    """AUC for each share and resolution, components and bytes for each share."""
+    cells: dict[str, Any] = {"rule": name}
     for kept in dict.fromkeys(row["kept"] for row in rows):
         of = [row for row in rows if row["kept"] == kept]
         for row in of:
-            header.append(f"AUC, {kept:.0%}, {row['resolution']:g} m")
-            cells.append(f"{row['auc']:.4f}")
-        header += [f"components, {kept:.0%}", f"kB, {kept:.0%}"]
-        cells += [f"{of[0]['n_components'] or '–'}", f"{of[0]['nbytes'] / 1e3:.0f}"]
-    return header, cells
+            cells[f"AUC, {kept:.0%}, {row['resolution']:g} m"] = row["auc"]
+        cells[f"components, {kept:.0%}"] = f"{of[0]['n_components'] or '–'}"
+        cells[f"kB, {kept:.0%}"] = of[0]["nbytes"] / 1e3
+    return cells
 
+
+FORMATS = {f"AUC, {share}, {cell} m": ".4f" for share in ("100%", "10%") for cell in (0.1, 0.02, 0.2, 0.05)}
+FORMATS |= dict.fromkeys(("kB, 100%", "kB, 10%"), ".0f")
+CASES = [
+    Case(f"components-{name}", partial(measure, name), name, FORMATS)
+    for name in ("intel", "aces", "hall", "kinect")
+]
 
 if __name__ == "__main__":
-    main()
+    run(__doc__, *CASES)

@@ -3,25 +3,22 @@
     python benchmarks/depth_frame.py --data FOLDER [--every 1] [--device cpu]
 
 FOLDER holds kinect/. Every fifth frame is held out; the mixtures of the others, about 50 components
-each, are one map. Beside it: EM to convergence on all pixels with as many components. Writes its
-table into BENCHMARKS.md.
+each, are one map. Beside it: EM to convergence on all pixels with as many components.
 """
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import time
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import torch
-from tables import hardware, markdown, publish
+from harness import Case, Row, recording, run, score
 from torch import Tensor
 
-from gmmtorch import GaussianMap, GaussianMixture, datasets
+from gmmtorch import GaussianMap, GaussianMixture
 from gmmtorch.datasets.depth_frames import DepthFrames
-from gmmtorch.evaluation.metrics import roc
 from gmmtorch.evaluation.queries import hit_and_free, test_beams
 from gmmtorch.mixture.depth_image import fit_depth_image
 from gmmtorch.pinhole import back_project
@@ -62,15 +59,8 @@ def points_of(depth: Tensor) -> Tensor:
     return back_project(depth.cpu().double(), INTRINSICS.double()).to(depth.device)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--every", type=int, default=1, help="use every n-th frame only")
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--threads", type=int, default=1)
-    options = parser.parse_args()
-    torch.set_num_threads(options.threads)
-    dataset = datasets.load("depth_frames", options.data / "kinect", stride=options.every)
+def measure(options: Any) -> Iterator[Row]:
+    dataset = recording(options.data, "kinect", stride=options.every)
     assert isinstance(dataset, DepthFrames)
     INTRINSICS.copy_(dataset.intrinsics)
     train = [i for i in range(len(dataset)) if i % 5]
@@ -87,22 +77,26 @@ def main() -> None:
 
     for depth, _ in frames[:3]:
         fast(4)(depth)  # first uses set things up
-    rows = []
+    height, width = frames[0][0].shape
+    options.about = (
+        f"{len(frames)} frames of {width} × {height}, {N_COMPONENTS} components each; {RESOLUTION} m."
+    )
     for name, fit in {
         "cells, 4 iterations": fast(4),
         "cells, 8 iterations": fast(8),
         "EM on all pixels, to convergence": full,
     }.items():
         built, milliseconds, likelihood = learned(frames, fit)
-        theta = built.occupancy(asked.points, RESOLUTION)
-        auc = roc(theta[asked.labels == 1], theta[asked.labels == 0]).auc
-        rows.append([name, f"{milliseconds:.1f}", f"{likelihood:.3f}", f"{auc:.4f}"])
-        print(rows[-1], flush=True)
-    header = ["", "ms a frame, median", "log-likelihood a pixel", "AUC of the map"]
-    height, width = frames[0][0].shape
-    sizes = f"{len(frames)} frames of {width} × {height}, {N_COMPONENTS} components each"
-    publish("depth", f"{sizes}; {RESOLUTION} m. {hardware(options.device)}\n\n{markdown(header, rows)}")
+        yield {
+            "": name,
+            "ms a frame, median": milliseconds,
+            "log-likelihood a pixel": likelihood,
+            "AUC of the map": score(built, asked, RESOLUTION),
+        }
 
+
+FORMATS = {"ms a frame, median": ".1f", "log-likelihood a pixel": ".3f", "AUC of the map": ".4f"}
+CASE = Case("depth", measure, formats=FORMATS)
 
 if __name__ == "__main__":
-    main()
+    run(__doc__, CASE, every={"type": int, "default": 1, "help": "use every n-th frame only"})

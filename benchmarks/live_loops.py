@@ -3,22 +3,20 @@
     OMP_NUM_THREADS=1 python benchmarks/live_loops.py --data FOLDER [--names intel hall] [--most 450]
 
 FOLDER holds laser2d/ and hall/. Scans go through odometry into a map, one by one, as in gmmtorch-ros with
-sensor.poses=mixture; the windows of the map are published to a replica. Writes a table of BENCHMARKS.md.
-Errors are those of all poses at the end, with the first pose at the truth. Seconds are CPU time. One thread.
+sensor.poses=mixture; the windows of the map are published to a replica.
+Errors are those of all poses at the end, with the first pose at the truth. Seconds are CPU time.
 """
 
 from __future__ import annotations
 
-import argparse
 import statistics
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
-from odometry import opened
-from tables import hardware, markdown, publish
+from harness import Case, Row, cpu_seconds, run
+from odometry import MOST, first
 
 import gmmtorch as gt
 from gmmtorch.evaluation.trajectories import absolute_trajectory_error
@@ -55,9 +53,8 @@ class Robot:
                 self.publish()
 
     def timed(self, part: str, call: Callable[[], Any]) -> Any:
-        begin = time.process_time()
-        result = call()
-        self.seconds[part].append(time.process_time() - begin)
+        seconds, result = cpu_seconds(call)
+        self.seconds[part].append(seconds)
         return result
 
     def correct(self) -> None:
@@ -71,9 +68,9 @@ class Robot:
             self.n_bytes["corrections" if is_correction else "components"] += len(datagram)
 
 
-def measured(data: Path, name: str, most: int | None) -> dict[str, object]:
-    """The row of the table of one recording."""
-    scans, robot, true = opened(data, name, most), Robot(), []
+def measured(data: Path, name: str, most: int | None) -> Row:
+    """The row of one recording."""
+    scans, robot, true = first(most, data, name), Robot(), []
     for number in range(len(scans)):
         true.append(scans.pose(number))
         robot.take(scans[number].transformed(torch.linalg.inv(true[-1])).points)
@@ -89,25 +86,29 @@ def measured(data: Path, name: str, most: int | None) -> dict[str, object]:
         "scans": len(true),
         "ATE without → with loops": " → ".join(f"{error:.2f}" for error in errors) + " m",
         "corrections": len(move),
-        "seconds of a pose": f"{statistics.mean(pose):.2f}",
+        "seconds of a pose": statistics.mean(pose),
         "of a search (mean, largest)": f"{statistics.mean(searched):.2f}, {max(searched):.2f}",
-        "to move and publish the map (largest)": f"{max(move, default=0.0):.2f}",
-        "searches and moves, relative to the poses": f"{(sum(search) + sum(move)) / sum(pose):.0%}",
+        "to move and publish the map (largest)": max(move, default=0.0),
+        "searches and moves, relative to the poses": 100 * (sum(search) + sum(move)) / sum(pose),
         "components": len(robot.map.components()),
         "sent: components, corrections": ", ".join(f"{n / 1e3:.0f} kB" for n in robot.n_bytes.values()),
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--names", nargs="+", default=["intel", "hall"])
-    parser.add_argument("--most", type=int)
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-    rows = [measured(options.data, name, options.most) for name in options.names]
-    publish("live-loops", f"{markdown(list(rows[0]), [list(row.values()) for row in rows])}\n\n{hardware()}")
+def measure(options: Any) -> Iterator[Row]:
+    return (measured(options.data, name, options.most) for name in options.names)
 
+
+SECONDS = ("seconds of a pose", "to move and publish the map (largest)")
+FORMATS = dict.fromkeys(SECONDS, ".2f") | dict.fromkeys(("scans", "corrections", "components"), ".0f")
+FORMATS["searches and moves, relative to the poses"] = "{:.0f}%"
+CASE = Case(
+    "live-loops",
+    measure,
+    "Errors are those of all poses at the end, with the first pose at the truth. CPU seconds.",
+    FORMATS,
+    ("intel", "hall"),
+)
 
 if __name__ == "__main__":
-    main()
+    run(__doc__, CASE, most=MOST)

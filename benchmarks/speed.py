@@ -1,29 +1,28 @@
 """How fast: an EM iteration beside scikit-learn's, ray casting, and a whole 3D pass by stage.
 
-    python benchmarks/speed.py [--threads 1] [--hall FOLDER]
+    python benchmarks/speed.py --data FOLDER [--threads 1]
 
-All in one process with the threads fixed; writes its tables into BENCHMARKS.md.
+FOLDER holds hall/; `--only em rays` needs none. All in one process with the threads fixed.
 """
 
 from __future__ import annotations
 
-import argparse
 import gc
 import resource
 import statistics
 import threading
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import torch
+from harness import Case, Row, recording, run
 from sklearn.mixture import GaussianMixture as ScikitLearnMixture
-from tables import hardware, markdown, publish
-from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-from gmmtorch import GaussianMap, datasets
+from gmmtorch import GaussianMap
 from gmmtorch.kernels.rays.ray_traversal import traverse
 from gmmtorch.mapping.learning.rules import WindowedRule
 from gmmtorch.mapping.learning.windows import learn_window
@@ -52,8 +51,9 @@ def timed(work: Callable[[], object]) -> float:
     return time.perf_counter() - begin
 
 
-def em_iteration(n: int = 100_000, k: int = 100, iterations: int = 10, repeats: int = 5) -> None:
+def em_iteration(options: Any) -> Iterator[Row]:
     """Seconds an iteration, from the same start, over the same number of iterations."""
+    n, k, iterations, repeats = 100_000, 100, 10, 5
     points = noisy_room(n, seed=1)
     means = points[torch.randperm(n, generator=torch.Generator().manual_seed(2))[:k]]
     covariances = 0.25 * torch.eye(3, dtype=torch.float64).expand(k, 3, 3)
@@ -90,14 +90,16 @@ def em_iteration(n: int = 100_000, k: int = 100, iterations: int = 10, repeats: 
 
     # Turn about, so that a change of the machine's speed meets all alike.
     runs = [(ours(torch.float32), ours(torch.float64), theirs()) for _ in range(repeats)]
-    rows = []
     for index, name in enumerate(("gmmtorch, float32 exponentials", "gmmtorch, float64", "scikit-learn")):
-        times = [run[index][0] for run in runs]
-        ratio = statistics.median(run[2][0] / run[index][0] for run in runs)
-        seconds = f"{statistics.median(times) * 1e3:.0f} ({min(times) * 1e3:.0f}–{max(times) * 1e3:.0f})"
-        rows.append([name, seconds, f"{ratio:.1f}", f"{runs[0][index][1]:.6f}"])
-    header = ["", "ms an iteration, median (range)", "times faster", "mean log-likelihood"]
-    publish("em", f"{hardware()}\n\n{markdown(header, rows)}")
+        times = [1e3 * run[index][0] for run in runs]
+        yield {
+            "": name,
+            "ms an iteration, median (range)": (
+                f"{statistics.median(times):.0f} ({min(times):.0f}–{max(times):.0f})"
+            ),
+            "times faster": statistics.median(run[2][0] / run[index][0] for run in runs),
+            "mean log-likelihood": runs[0][index][1],
+        }
 
 
 class PeakMemory:
@@ -129,9 +131,10 @@ class PeakMemory:
         return (self.peak - self._before) / 2**20
 
 
-def ray_casting(n_rays: int = 1_000_000, repeats: int = 3) -> None:
-    """Visits a second of a million rays of about 5 m through cells of 0.1 and 0.2 m."""
-    rows = []
+def ray_casting(options: Any) -> Iterator[Row]:
+    """Visits a second of rays of about 5 m."""
+    n_rays, repeats = options.rays, 3
+    options.about = f"{n_rays:,} rays."
     for dim, resolution in ((2, 0.1), (2, 0.02), (3, 0.2), (3, 0.05)):
         generator = torch.Generator().manual_seed(0)
         extent = torch.tensor([20.0, 20.0, 4.0][:dim], dtype=torch.float64)
@@ -147,25 +150,19 @@ def ray_casting(n_rays: int = 1_000_000, repeats: int = 3) -> None:
                 cast.append(timed(lambda: sum(1 for _ in traverse(a, b, grid.shape))))  # noqa: B023
                 counted.append(timed(lambda: Evidence.empty(grid).add_rays(starts, ends)))  # noqa: B023
                 blocks.append(timed(lambda: SparseEvidence(resolution, dim).add_rays(starts, ends)))  # noqa: B023
-        rates = [f"{visits / statistics.median(times) / 1e6:.0f}" for times in (cast, counted, blocks)]
-        rows.append(
-            [f"{dim}D", f"{resolution} m", f"{visits / 1e6:.0f} M", *rates, f"{memory.mebibytes:.0f} MiB"]
-        )
-    header = [
-        "",
-        "cell",
-        "visits",
-        "ray casting, M visits/s",
-        "and counting, dense",
-        "and counting, block-sparse",
-        "peak memory above the rays",
-    ]
-    publish("rays", f"{n_rays:,} rays. {hardware()}\n\n{markdown(header, rows)}")
+        label: Row = {"": f"{dim}D", "cell": f"{resolution} m", "visits": visits / 1e6}
+        times = {
+            "ray casting, M visits/s": cast,
+            "and counting, dense": counted,
+            "and counting, block-sparse": blocks,
+        }
+        rates = {name: visits / statistics.median(seconds) / 1e6 for name, seconds in times.items()}
+        yield {**label, **rates, "peak memory above the rays": memory.mebibytes}
 
 
-def hall_by_stage(folder: Path, resolution: float = 0.2) -> None:
+def hall_by_stage(options: Any) -> Iterator[Row]:
     """One pass over every scan: reading, learning, sampling, casting."""
-    dataset = datasets.load("scan_folder", folder)
+    dataset, resolution = recording(options.data, "hall"), 0.2
     stages: dict[str, float] = {}
 
     def stage(name: str, work: Callable[[], object]) -> object:
@@ -191,28 +188,28 @@ def hall_by_stage(folder: Path, resolution: float = 0.2) -> None:
     origins = torch.cat([s.origin.expand_as(s.points) for s in scans])  # type: ignore[attr-defined]
     stage("for comparison: cast every raw beam", lambda: raw.add_rays(origins, ends))
     total = sum(seconds for name, seconds in stages.items() if not name.startswith(("for", "the same")))
-    rows = [[name, f"{seconds:.2f}"] for name, seconds in stages.items()]
-    rows.append(["read to answered", f"{total:.2f}"])
-    facts = (
-        f"{len(scans)} scans, {ends.shape[0]:,} points, {built.n_components:,} components, {resolution} m. "  # type: ignore[arg-type]
+    n_scans, n_points = len(scans), ends.shape[0]  # type: ignore[arg-type]
+    options.about = (
+        f"{n_scans} scans, {n_points:,} points, {built.n_components:,} components, {resolution} m."
     )
-    publish("hall", f"{facts}{hardware()}\n\n{markdown(['stage', 'seconds'], rows)}")
+    for name, seconds in {**stages, "read to answered": total}.items():
+        yield {"stage": name, "seconds": seconds}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument(
-        "--hall", type=Path, help="folder of the hall scans; left out, that table is not remade"
-    )
-    options = parser.parse_args()
-    torch.set_num_threads(options.threads)
-    with threadpool_limits(options.threads):
-        em_iteration()
-        ray_casting()
-        if options.hall:
-            hall_by_stage(options.hall)
-
+RATES = ("ray casting, M visits/s", "and counting, dense", "and counting, block-sparse")
+RAYS = {"visits": "{:.0f} M", **dict.fromkeys(RATES, ".0f"), "peak memory above the rays": "{:.0f} MiB"}
+CASES = (
+    Case(
+        "em",
+        em_iteration,
+        "100,000 points on the surfaces of a room, 1 cm noise, 100 components; ten iterations from the same "
+        "parameters.",
+        {"times faster": ".1f", "mean log-likelihood": ".6f"},
+        needs_data=False,
+    ),
+    Case("rays", ray_casting, formats=RAYS, key=2, needs_data=False),
+    Case("hall", hall_by_stage, formats={"seconds": ".2f"}),
+)
 
 if __name__ == "__main__":
-    main()
+    run(__doc__, *CASES, rays={"type": int, "default": 1_000_000})
