@@ -1,9 +1,9 @@
-"""AUC on held-out real scans: our map beside grids, at every share of the beams kept.
+"""AUC on held-out real scans: our map beside grids, by share of the beams and by learning rule.
 
-    python benchmarks/accuracy.py --data FOLDER
+    python benchmarks/accuracy.py --data FOLDER [--only accuracy readme-accuracy]
 
 FOLDER holds laser2d/*.log.gz, hall/, courtyard/ and kinect/. The defaults of gmmtorch-occupancy, but for the
-budget of maps in 3D.
+budget of maps in 3D. `components-NAME` has AUC, components and bytes of maps as their learning rule varies.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from typing import Any
 
 from harness import Case, Row, held_out, recording, run
 
-from gmmtorch import GaussianMap, IncrementalRule
+from gmmtorch import GaussianMap, IncrementalRule, WindowedRule
+from gmmtorch.datasets import Dataset
 from gmmtorch.evaluation.held_out import Protocol, evaluate
 from gmmtorch.evaluation.methods import choose, methods
 
@@ -46,8 +47,8 @@ def whole(options: Any) -> Iterator[Row]:
         for cell in CELLS.get(name, PLANAR):
             for kept in KEPT:
                 found = {r["method"]: r for r in rows if r["resolution"] == cell and r["kept"] == kept}
-                label: Row = {"data": name, "cell (m)": cell, "beams kept": f"{kept:.0%}"}
-                yield {**label, **{method: summary(found[method]) for method in options.methods}}
+                label: dict[str, Any] = {"data": name, "cell (m)": cell, "beams kept": f"{kept:.0%}"}
+                yield label | {method: summary(found[method]) for method in options.methods}
 
 
 def summary(row: dict[str, Any]) -> str:
@@ -70,11 +71,78 @@ def brief(options: Any) -> Iterator[Row]:
             yield row
 
 
+RULES: dict[str, dict[str, float]] = {
+    "default": {},
+    "noise 5 mm": {"noise": 0.005},
+    "noise 20 mm": {"noise": 0.02},
+    "length 0.15 m": {"length": 0.15},
+    "length 0.6 m": {"length": 0.6},
+    "half min_points": {"min_points": 0.5},  # times the default of the dimension
+    "twice min_points": {"min_points": 2},
+    "no EM after the cuts": {"iterations": 1},
+    "20 iterations of EM": {"iterations": 20},
+    "2 origins": {"max_origins": 2},
+    "20 origins": {"max_origins": 20},
+    "window of 5": {"window": 5},
+    "window of 50": {"window": 50},
+    "one scan, one origin": {"window": 1, "max_origins": 1},
+}
+
+
+def protocol(name: str, dataset: Dataset) -> Protocol:
+    if dataset[0].dim == 2:
+        return Protocol(kept=(1.0, 0.1), resolution=(0.1, 0.02))
+    return Protocol(held_out(dataset), (1.0, 0.1), "beams", (0.05 if name == "kinect" else 0.2,))
+
+
+def by_rule(name: str, options: Any) -> Iterator[Row]:
+    dataset = recording(options.data, name, **({"pixel_stride": 2} if name == "kinect" else {}))
+    scans, asked = list(dataset), protocol(name, dataset)
+    for rule, changes in RULES.items():
+        found = evaluate(name, scans, {"monte_carlo": factory(changes, dataset[0].dim)}, asked)
+        yield columns(rule, found.rows)
+    grid = evaluate(name, scans, {"occupancy_grid": methods(GaussianMap)["occupancy_grid"]}, asked)
+    yield columns("(count grid)", grid.rows)
+
+
+def factory(changes: dict[str, float], dim: int):
+    """Makes maps whose rule has these changes from the default."""
+    options = dict(changes)
+    window = int(options.pop("window", 20))
+    if "min_points" in options:
+        options["min_points"] *= 6 if dim == 2 else 20
+    for whole in ("iterations", "max_origins"):
+        if whole in options:
+            options[whole] = int(options[whole])
+    rule = WindowedRule(window=window, **options)  # type: ignore[arg-type]
+    return lambda resolution: GaussianMap(rule, cutoff=5.0, prior=1.0)
+
+
+def columns(name: str, rows: list[dict[str, Any]]) -> Row:
+    """AUC for each share and resolution, components and bytes for each share."""
+    cells: dict[str, Any] = {"rule": name}
+    for kept in dict.fromkeys(row["kept"] for row in rows):
+        of = [row for row in rows if row["kept"] == kept]
+        for row in of:
+            cells[f"AUC, {kept:.0%}, {row['resolution']:g} m"] = row["auc"]
+        cells[f"components, {kept:.0%}"] = f"{of[0]['n_components'] or '–'}"
+        cells[f"kB, {kept:.0%}"] = of[0]["nbytes"] / 1e3
+    return cells
+
+
+COMPONENTS = {
+    f"AUC, {share}, {cell} m": ".4f" for share in ("100%", "10%") for cell in (0.1, 0.02, 0.2, 0.05)
+}
+COMPONENTS |= dict.fromkeys(("kB, 100%", "kB, 10%"), ".0f")
 ABOUT = "AUC ± half the width of its 95 % bootstrap interval, components, file size."
 BRIEFLY = "AUC, count grid → mixture, by the share of the beams; file sizes with all beams."
 CASES = (
     Case("accuracy", whole, ABOUT, {"cell (m)": "3"}, NAMES, METHODS, key=3),
     Case("readme-accuracy", brief, BRIEFLY, dict.fromkeys(("grid", "mixture"), "{:,.0f} kB"), NAMES, key=2),
+    *(
+        Case(f"components-{name}", partial(by_rule, name), name, COMPONENTS)
+        for name in ("intel", "aces", "hall", "kinect")
+    ),
 )
 
 if __name__ == "__main__":

@@ -176,7 +176,7 @@ PEAK = (
     "hydra.run.dir=$OUT', shell=True, check=True); "
     "print('peak', resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss // 1024, 'MiB')\""
 )
-ODOMETRY = "python benchmarks/odometry.py --data $DATA --methods mixture"
+ODOMETRY = "python benchmarks/odometry.py --data $DATA --only odometry --methods mixture"
 SEEDS = "gmmtorch-explore hydra.run.dir=$OUT experiment=fig4_4_entropy 'study.seeds=[0,1,2,3,4]' "
 TEAMS = (
     "team.size=3 duration=1600 evaluation.every=10 "
@@ -242,7 +242,7 @@ RUNS = {
     "large_cloud": Run(PEAK, [
         Claim("docs/large_clouds.md", "120 MB) needs # MiB of memory", printed("peak # MiB"), at_most(1.25)),
     ], slow=False),
-    "map_building": Run("python benchmarks/map_building.py --data $DATA", [
+    "map_building": Run("python benchmarks/map_building.py --data $DATA --only map-building", [
         *of_table("map-building", 2, BUILT),
         Claim("docs/maps.md", "[# frames of 640", published("map-building", FAST, "frames/s"), times(2)),
     ], slow=False),
@@ -252,12 +252,13 @@ RUNS = {
                         [compact("hall")], slow=False),
     "compact_courtyard": Run(COMPACT + COURTYARD + "'evaluation.resolution=[0.2]' map.max_bytes=16000",
                              [compact("courtyard")], slow=False),
-    "learning": Run("python benchmarks/learning.py --data $DATA --methods gmmtorch scikit-learn", [
+    "learning": Run("python benchmarks/learning.py --data $DATA --only learning-1 "
+                    "--methods gmmtorch scikit-learn", [
         Claim("README.md", "is [# to # times faster](",
               joined(reduced(min, FASTER), reduced(max, FASTER)), times(2)),
         *of_table("learning-1", 2, LEARNED, *PEERS),
     ]),
-    "accuracy": Run("python benchmarks/accuracy.py --data $DATA", [
+    "accuracy": Run("python benchmarks/accuracy.py --data $DATA --only accuracy readme-accuracy", [
         *of_table("readme-accuracy", 2, SHORT),
         *of_table("accuracy", 3, LONG),
         Claim("README.md", "keeps [a room or a hall in # kB]", largest(*SMALL), at_most()),

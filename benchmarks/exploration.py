@@ -83,7 +83,7 @@ def _row(
 FORMATS = dict.fromkeys(("rendering", "mapping", "scoring", "sharing", "planning", "all"), ".1f")
 FORMATS |= {"half": ".0f", "entropy_left": ".4f", "simulated_per_core_second": ".1f"}
 FORMATS |= {"grown_mb": ".0f", "kb_per_robot_second": ".0f"}
-CASE = Case("mission-seconds", measure, formats=FORMATS, key=2, needs_data=False)
+CASE = Case("mission-seconds", measure, columns=FORMATS, key=2, needs_data=False)
 
 if __name__ == "__main__":
     run(

@@ -17,7 +17,7 @@ import resource
 import shlex
 import sys
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -34,7 +34,7 @@ from gmmtorch.evaluation.queries import FREE, OCCUPIED, Queries
 from gmmtorch.files import write_bytes
 
 Cell = float | str | None
-Row = Mapping[str, Cell]
+Row = Mapping[str, Cell] | Sequence[Cell]
 T = TypeVar("T")
 
 
@@ -134,7 +134,8 @@ class Case(NamedTuple):
         measure: yields the rows for the options of the command. `options.names` and `options.methods` are
             the chosen of `data` and `methods`; text in `options.about` is added to `about`.
         about: what the cells are.
-        formats: of the columns with numbers; see `Table`.
+        columns: with their formats, see `Table`. If rows are dictionaries, these name the columns, and only
+            those with numbers have a format here.
         data: names of data sets. methods: names of ours and of the peers.
         key: the number of columns that name a row.
         needs_data: whether `options.data` must be a folder of recordings.
@@ -143,7 +144,7 @@ class Case(NamedTuple):
     name: str
     measure: Callable[[Any], Iterable[Row]]
     about: str = ""
-    formats: Mapping[str, str] = {}
+    columns: Mapping[str, str] = {}
     data: tuple[str, ...] = ()
     methods: tuple[str, ...] = ()
     key: int = 1
@@ -185,7 +186,10 @@ def run(text: str, *cases: Case, **arguments: dict[str, Any]) -> None:
     with threadpool_limits(options.threads):
         for case in chosen:
             result = measured(case, options)
-            print(f"\n{case.name}: {result.about}\n{result.markdown()}", flush=True)
+            print(
+                f"\n{case.file(options.device, options.threads)}: {result.about}\n{result.markdown()}",
+                flush=True,
+            )
 
 
 def measured(case: Case, options: argparse.Namespace) -> Table:
@@ -197,31 +201,32 @@ def measured(case: Case, options: argparse.Namespace) -> Table:
     options.about = ""
     path = results_of(case) / f"{case.file(options.device, options.threads)}.json"
     table = Table("", command_line(), hardware(options.device), {})
-    kept: dict[tuple[Cell, ...], Row] = {}
+    kept: dict[tuple[Cell, ...], dict[str, Cell]] = {}
     if path.exists():
         earlier = Table.load(path)
         if earlier.hardware == table.hardware:
             rows = (dict(zip(earlier.columns, row, strict=True)) for row in earlier.rows)
             kept = {_key(case, row): row for row in rows}
 
-    def write(rows: Collection[Row]) -> None:
+    def write(rows: Collection[dict[str, Cell]]) -> None:
         names = dict.fromkeys(name for row in rows for name in row)
-        table.columns = {name: case.formats.get(name, "") for name in names}
+        table.columns = {name: case.columns.get(name, "") for name in names}
         table.rows = [[row.get(name) for name in names] for row in rows]
         table.about = " ".join(filter(None, (options.about, case.about)))
         table.save(path)
 
     new = {}
-    for row in case.measure(options):
-        print(*(shown(cell, case.formats.get(name, "")) for name, cell in row.items()), sep=" | ", flush=True)
+    for cells in case.measure(options):
+        row = dict(cells if isinstance(cells, Mapping) else zip(case.columns, cells, strict=True))
+        print(*(shown(cell, case.columns.get(name, "")) for name, cell in row.items()), sep=" | ", flush=True)
         new[_key(case, row)] = row
         write((kept | new).values())
-    if len(options.names) == len(case.data) and len(options.methods) == len(case.methods):
+    if new and len(options.names) == len(case.data) and len(options.methods) == len(case.methods):
         write(new.values())  # rows that are not measured any more go
     return table
 
 
-def _key(case: Case, row: Row) -> tuple[Cell, ...]:
+def _key(case: Case, row: dict[str, Cell]) -> tuple[Cell, ...]:
     return tuple(list(row.values())[: case.key])
 
 

@@ -2,9 +2,10 @@
 
     python benchmarks/kernels.py --data $GMMTORCH_DATA [--threads 1] [--device cuda]
     python benchmarks/kernels.py --data $GMMTORCH_DATA --only against --against FOLDER_OF_ANOTHER_VERSION
+    python benchmarks/kernels.py --data $GMMTORCH_DATA --only devices --device cuda --threads 16
 
-`against` has the work of `public_work.py` by both versions in turn, on one thread. A time is the least of
-several runs.
+`against` has the work of `public_work.py` by both versions in turn, on one thread; `devices` has it on a CPU
+and on a GPU. A time is the least of several runs.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from typing import Any
 
 import torch
 from harness import Case, Row, least_seconds, recording, run
-from public_work import counted
+from public_work import counted, large_works, prepare, works
 from torch import Tensor
 
 from gmmtorch import GaussianMap
@@ -144,27 +145,22 @@ def fused(options: Any) -> Iterator[Row]:
         ray_work(options.rays, options.device), map_work(options.data, options.points, options.device)
     )
     for name, function, size, unit in listed:
-        seconds = {}
+        seconds = []
         for choice in ("torch", "fused"):
             with kernels(choice):
-                seconds[choice] = least_seconds(function, options.repeats, options.device)
-        yield {
-            "work": name,
-            "": unit,
-            "tensor operations": size / seconds["torch"] if size else seconds["torch"],
-            "fused": size / seconds["fused"] if size else seconds["fused"],
-            "times faster": seconds["torch"] / seconds["fused"],
-        }
+                seconds.append(least_seconds(function, options.repeats, options.device))
+        slow, fast = (size / each if size else each for each in seconds)
+        yield name, unit, slow, fast, seconds[0] / seconds[1]
 
 
 def operations(options: Any) -> Iterator[Row]:
     for name, function in small_work(options.device):
-        row: dict[str, Any] = {"work": name}
-        for choice, title in (("torch", "tensor operations"), ("fused", "fused")):
+        counts = []
+        for choice in ("torch", "fused"):
             with kernels(choice):
                 function()
-                row[title] = "{:,} ({:,})".format(*counted(function))
-        yield row
+                counts.append("{:,} ({:,})".format(*counted(function)))
+        yield name, *counts
 
 
 def against(options: Any) -> Iterator[Row]:
@@ -183,25 +179,65 @@ def against(options: Any) -> Iterator[Row]:
                 best[0] = min(best[0], result[0])
     for name, by_folder in found.items():
         (before, *were), (after, *are) = by_folder[other], by_folder[this]
-        counts = ["{:,.0f} ({:,.0f})".format(*each) for each in (were, are)]
-        seconds = {"s before": before, "s now": after, "times faster": before / after}
-        yield {"work": name, **seconds, "operations before": counts[0], "now": counts[1]}
+        counts = ("{:,.0f} ({:,.0f})".format(*each) for each in (were, are))
+        yield name, before, after, before / after, *counts
 
 
-THREE = dict.fromkeys(("tensor operations", "fused", "s before", "s now"), "3")
+def devices(options: Any) -> Iterator[Row]:
+    """The work of `public_work.py` on the CPU and on the GPU."""
+    if options.device == "cpu":
+        return
+    prepare(options.data)
+    both = ("cpu", options.device)
+    listed = {device: {**works(options.data, device), **large_works(options.data, device)} for device in both}
+    for name in listed["cpu"]:
+        if options.works and not any(part in name for part in options.works):
+            continue
+        seconds, counts = [], (0, 0)
+        for device in both:
+            work = listed[device][name]()
+            counts = counted(work)  # and what is compiled or loaded once
+            seconds.append(least_seconds(work, options.repeats, device))
+        yield name, *seconds, seconds[0] / seconds[1], "{:,} ({:,})".format(*counts)
+
+
 CASES = (
-    Case("kernels{gpu}", fused, formats={**THREE, "times faster": "3"}),
+    Case(
+        "kernels{gpu}",
+        fused,
+        columns={"work": "", "": "", "tensor operations": "3", "fused": "3", "times faster": "3"},
+    ),
     Case(
         "operations{gpu}",
         operations,
         "Tensor operations and kernel launches. In parentheses: those that wait for the device.",
+        {"work": "", "tensor operations": "", "fused": ""},
         needs_data=False,
     ),
     Case(
         "against",
         against,
         "CPU seconds of another version and of this one.",
-        {**THREE, "times faster": ".1f"},
+        {
+            "work": "",
+            "s before": "3",
+            "s now": "3",
+            "times faster": ".1f",
+            "operations before": "",
+            "now": "",
+        },
+    ),
+    Case(
+        "devices",
+        devices,
+        "In parentheses: operations that wait for the device.",
+        {
+            "work": "",
+            "s on the CPU": "3",
+            "s on the GPU": "3",
+            "times faster": "3",
+            "operations (waits)": "",
+        },
     ),
 )
 
@@ -213,4 +249,5 @@ if __name__ == "__main__":
         rays={"type": int, "default": 1_000_000},
         points={"type": int, "default": 200_000},
         repeats={"type": int, "default": 3},
+        works={"nargs": "*", "help": "of the devices: parts of names"},
     )

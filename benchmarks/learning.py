@@ -2,26 +2,32 @@
 
     pip install 'gmmtorch[benchmarks]'
     python benchmarks/learning.py --data FOLDER [--threads 1] [--names CLOUD …] [--methods METHOD …]
+    python benchmarks/learning.py --only em ten-million
 
 FOLDER holds hall/ and kinect/. All methods see the same clouds, drawn with other seeds than the warm-up's.
+`em` has one iteration of EM. `ten-million` has ten million points and ten thousand components.
 """
 
 from __future__ import annotations
 
 import logging
+import resource
 import statistics
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import sklearn.mixture
 import torch
-from harness import Case, Row, alone, clock, recording, run
-from speed import noisy_room
+from harness import Case, Row, alone, clock, cpu_seconds, least_seconds, recording, run
 from torch import Tensor
 
 from gmmtorch import GaussianMixture, HierarchicalGaussianMixture
 from gmmtorch.evaluation.metrics import psnr2
+from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em import loop
 
 REG_COVAR = 1e-5
 TIME_LIMIT = 240  # seconds of the processor, for one run
@@ -37,6 +43,17 @@ class Cloud(NamedTuple):
     drawn: Callable[[Path, int], tuple[Tensor, Tensor, Tensor | None]]
     tol: float
     peers: tuple[str, ...] = ("scikit-learn", "tgmm", "torchgmm")
+
+
+def noisy_room(n: int, seed: int) -> Tensor:
+    """Points (n, 3) on the walls, floor and ceiling of an 8 × 6 × 3 m room, with 1 cm noise."""
+    generator = torch.Generator().manual_seed(seed)
+    size = torch.tensor([8.0, 6.0, 3.0], dtype=torch.float64)
+    points = torch.rand(n, 3, generator=generator, dtype=torch.float64) * size
+    axis = torch.multinomial(torch.tensor([18.0, 24.0, 48.0]), n, True, generator=generator)
+    side = torch.randint(2, (n,), generator=generator)
+    points[torch.arange(n), axis] = side * size[axis]
+    return points + 0.01 * torch.randn(n, 3, generator=generator, dtype=torch.float64)
 
 
 def room(n: int) -> Callable[[Path, int], tuple[Tensor, Tensor, Tensor | None]]:
@@ -86,9 +103,8 @@ def ours_tree(points: Tensor, k: int, tol: float) -> Learned:
 
 
 def scikit_learn(points: Tensor, k: int, tol: float) -> Learned:
-    from sklearn.mixture import GaussianMixture as Peer
-
-    peer = Peer(k, tol=1e-3, reg_covar=REG_COVAR, random_state=0).fit(points.numpy())
+    options: dict[str, Any] = {"tol": 1e-3, "reg_covar": REG_COVAR, "random_state": 0}
+    peer = sklearn.mixture.GaussianMixture(k, **options).fit(points.numpy())
     weights, means, covariances = (
         torch.from_numpy(x) for x in (peer.weights_, peer.means_, peer.covariances_)
     )
@@ -209,8 +225,106 @@ def measure(options: Any) -> Iterator[Row]:
             yield {**row, "PSNR2 dB": f"{psnr2(train, fresh):.1f}"}
 
 
-FORMATS = {"seconds": ".2f", "times faster": ".0f", "K": ".0f", "held-out nats": ".4f", "PSNR2 dB": ".2f"}
-CASE = Case("learning-{threads}", measure, formats=FORMATS, data=tuple(CLOUDS), methods=tuple(METHODS), key=2)
+def em_iteration(options: Any) -> Iterator[Row]:
+    """Seconds an iteration, from the same start, over the same number of iterations."""
+    n, k, iterations, repeats = 100_000, 100, 10, 5
+    points = noisy_room(n, seed=1)
+    means = points[torch.randperm(n, generator=torch.Generator().manual_seed(2))[:k]]
+    covariances = 0.25 * torch.eye(3, dtype=torch.float64).expand(k, 3, 3)
+    weights = torch.full((k,), 1 / k, dtype=torch.float64)
+
+    def ours(dtype: torch.dtype) -> tuple[float, float]:
+        center = points.mean(0)
+        step = loop.natural_step(em.quadratic_features(points - center), torch.ones(n).double(), 1e-6, dtype)
+        state = em.Parameters(weights, means - center, covariances)
+        begin = time.perf_counter()
+        found = loop.run_em(step, state, tol=0, max_iter=iterations)
+        return (time.perf_counter() - begin) / iterations, found.lower_bounds[-1]
+
+    def theirs() -> tuple[float, float]:
+        def run(max_iter: int) -> tuple[float, sklearn.mixture.GaussianMixture]:
+            peer = sklearn.mixture.GaussianMixture(
+                k,
+                tol=0,
+                max_iter=max_iter,
+                weights_init=weights.numpy(),
+                means_init=means.numpy(),
+                precisions_init=torch.linalg.inv(covariances).numpy(),
+                init_params="random_from_data",
+                random_state=0,
+            )
+            return least_seconds(lambda: peer.fit(points.numpy()), 1), peer
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            short, long = run(1)[0], run(iterations + 1)[0]
+            bound = run(iterations)[1].lower_bounds_[-1]
+        # What is not iteration (start, last E-step) is in both, and drops out.
+        return (long - short) / iterations, float(bound)
+
+    # Turn about, so that a change of the machine's speed meets all alike.
+    runs = [(ours(torch.float32), ours(torch.float64), theirs()) for _ in range(repeats)]
+    for index, name in enumerate(("gmmtorch, float32 exponentials", "gmmtorch, float64", "scikit-learn")):
+        times = [1e3 * run[index][0] for run in runs]
+        spent = f"{statistics.median(times):.0f} ({min(times):.0f}–{max(times):.0f})"
+        ratio = statistics.median(run[2][0] / run[index][0] for run in runs)
+        yield name, spent, ratio, runs[0][index][1]
+
+
+def ten_million(options: Any) -> Iterator[Row]:
+    """Fits that end on the points, and on cells."""
+    parts = [noisy_room(1_000_000, seed).float() for seed in range(-(-options.points // 1_000_000))]
+    points = torch.cat(parts)[: options.points]
+    del parts
+    held_out = noisy_room(20_000, 12345)
+    options.about = f"{len(points):,} points, K = {options.components:,}."
+    for name, max_cells in (("points", None), ("cells only", options.points // 16)):
+        mixture = GaussianMixture(
+            options.components, tol=2e-3, reg_covar=1e-5, max_cells=max_cells, random_state=0
+        )
+        seconds, _ = cpu_seconds(lambda mixture=mixture: mixture.fit(points))
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+        yield name, seconds, mixture.n_iter_, peak, mixture.score(held_out)
+
+
+SCORES = {"held-out nats": ".4f", "PSNR2 dB": ".2f"}
+PEAK = {"peak memory of the process": "{:.1f} GiB", "held-out nats": ".4f"}
+CASES = (
+    Case(
+        "learning-{threads}",
+        measure,
+        "",
+        {"seconds": ".2f", "times faster": ".0f", "K": ".0f", **SCORES},
+        tuple(CLOUDS),
+        tuple(METHODS),
+        key=2,
+    ),
+    Case(
+        "em",
+        em_iteration,
+        "100,000 points on the surfaces of a room, 1 cm noise, 100 components; ten iterations from the same "
+        "parameters.",
+        {
+            "": "",
+            "ms an iteration, median (range)": "",
+            "times faster": ".1f",
+            "mean log-likelihood": ".6f",
+        },
+        needs_data=False,
+    ),
+    Case(
+        "ten-million",
+        ten_million,
+        columns={"EM ends on": "", "CPU s": ".0f", "iterations": ".0f", **PEAK},
+        needs_data=False,
+    ),
+)
 
 if __name__ == "__main__":
-    run(__doc__, CASE, repeats={"type": int, "default": 3, "help": "clouds for ours; peers see the first"})
+    run(
+        __doc__,
+        *CASES,
+        repeats={"type": int, "default": 3, "help": "clouds for ours; peers see the first"},
+        points={"type": int, "default": 10_000_000, "help": "of ten-million"},
+        components={"type": int, "default": 10_000, "help": "of ten-million"},
+    )

@@ -1,16 +1,20 @@
 """Poses estimated from scans alone, against true ones, beside KISS-ICP.
 
-    OMP_NUM_THREADS=1 python benchmarks/odometry.py --data FOLDER [--names hall] [--most 150] [--seeds 0 1]
+    python benchmarks/odometry.py --data FOLDER --only odometry [--names hall] [--most 150] [--seeds 0 1]
+    python benchmarks/odometry.py --data FOLDER --only live-loops --most 450
 
 FOLDER holds hall/, courtyard/, street/ and laser2d/. `--most` limits the scans of each. Each run moves all
 points by noise of 1 mm, because a step that is nearly ambiguous may change with it. The first run also scores
 the map of the scans with the given and with the estimated poses, as gmmtorch-occupancy does.
+
+In `live-loops` scans go through odometry into a map, one by one, as in gmmtorch-ros with
+sensor.poses=mixture; loops are closed meanwhile, and the windows of the map are published to a replica.
 """
 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -24,7 +28,13 @@ from gmmtorch.datasets import Dataset
 from gmmtorch.evaluation.held_out import Protocol, evaluate
 from gmmtorch.evaluation.methods import choose, methods
 from gmmtorch.evaluation.trajectories import absolute_trajectory_error, relative_pose_error
+from gmmtorch.localization import Odometry
 from gmmtorch.localization.odometry.recorded_poses import METHODS, with_odometry
+from gmmtorch.mapping.window_motions import WindowMotions
+from gmmtorch.sharing import Replica
+from gmmtorch.sharing.messages.envelope import Kind, parse_datagram
+from gmmtorch.sharing.shared_map import SharedMap
+from gmmtorch.sharing.transport.simulated_network import Network
 
 NOISE = 1e-3  # metres of standard deviation that move every point of a run
 WRONG = 0.2  # metres of a step
@@ -115,18 +125,105 @@ def measure(options: Any) -> Iterator[Row]:
             yield row
 
 
+class Robot:
+    """Odometry, a map and a replica, and the seconds that each part takes."""
+
+    def __init__(self) -> None:
+        self.odometry, self.map, self.windows = Odometry(), gt.GaussianMap(), WindowMotions()
+        self.shared = SharedMap(Replica(0), Network(1))
+        self.seconds: dict[str, list[float]] = {"pose": [], "search": [], "move": []}
+        self.n_bytes = {"components": 0, "corrections": 0}
+        self.kept: list[int] = []  # scans in the map
+
+    def take(self, points: torch.Tensor) -> None:
+        """Maps a scan (N, D) in the frame of the sensor."""
+        location = self.timed("pose", lambda: self.odometry.add(points))
+        if self.timed("search", self.odometry.close_loops):
+            self.timed("move", self.correct)
+        if location.found:
+            pose = self.odometry.poses[-1]
+            self.kept.append(len(self.odometry.poses) - 1)
+            self.map.insert(gt.Scan(points, torch.zeros(points.shape[1])).transformed(pose))
+            self.windows.add(pose)
+            if self.map.n_pending == 0:
+                self.windows.end()
+                self.publish()
+
+    def timed(self, part: str, call: Callable[[], Any]) -> Any:
+        seconds, result = cpu_seconds(call)
+        self.seconds[part].append(seconds)
+        return result
+
+    def correct(self) -> None:
+        if self.windows.correct(self.map, self.odometry.poses[self.kept]) is not None:
+            self.publish()
+
+    def publish(self) -> None:
+        self.shared.publish(self.map, self.windows)
+        for datagram in self.shared.replica.datagrams():
+            is_correction = parse_datagram(datagram)[0] is Kind.CORRECTION
+            self.n_bytes["corrections" if is_correction else "components"] += len(datagram)
+
+
+def looped(data: Path, name: str, most: int | None) -> Row:
+    """The row of one recording."""
+    scans, robot, true = first(most, data, name), Robot(), []
+    for number in range(len(scans)):
+        true.append(scans.pose(number))
+        robot.take(scans[number].transformed(torch.linalg.inv(true[-1])).points)
+    chain = robot.odometry.trajectory(loops=False).poses
+    errors = [
+        absolute_trajectory_error(poses, torch.stack(true), align="first").rmse
+        for poses in (chain, robot.odometry.poses)
+    ]
+    pose, search, move = (robot.seconds[part] for part in ("pose", "search", "move"))
+    searched = [seconds for seconds in search if seconds > 0.01] or [0.0]  # other scans are no keyframes
+    return {
+        "data": name,
+        "scans": len(true),
+        "ATE without → with loops": " → ".join(f"{error:.2f}" for error in errors) + " m",
+        "corrections": len(move),
+        "seconds of a pose": statistics.mean(pose),
+        "of a search (mean, largest)": f"{statistics.mean(searched):.2f}, {max(searched):.2f}",
+        "to move and publish the map (largest)": max(move, default=0.0),
+        "searches and moves, relative to the poses": 100 * (sum(search) + sum(move)) / sum(pose),
+        "components": len(robot.map.components()),
+        "sent: components, corrections": ", ".join(f"{n / 1e3:.0f} kB" for n in robot.n_bytes.values()),
+    }
+
+
+def live_loops(options: Any) -> Iterator[Row]:
+    return (looped(options.data, name, options.most) for name in options.names)
+
+
 FORMATS = {"scans": ".0f", "median step error": "{:.0f} mm", "scans/s": ".1f"}
+SECONDS = ("seconds of a pose", "to move and publish the map (largest)")
+LOOPS = dict.fromkeys(SECONDS, ".2f") | dict.fromkeys(("scans", "corrections", "components"), ".0f")
+LOOPS["searches and moves, relative to the poses"] = "{:.0f}%"
 NAMES = ("intel", "freiburg-101", "hall", "courtyard", "aces", "street")
-CASE = Case(
-    "odometry",
-    measure,
-    "A cell with several numbers has one for each run.",
-    FORMATS,
-    NAMES,
-    tuple(METHODS),
-    key=3,
+CASES = (
+    Case(
+        "odometry",
+        measure,
+        "A cell with several numbers has one for each run.",
+        FORMATS,
+        NAMES,
+        tuple(METHODS),
+        key=3,
+    ),
+    Case(
+        "live-loops",
+        live_loops,
+        "Errors are those of all poses at the end, with the first pose at the truth. CPU seconds.",
+        LOOPS,
+        ("intel", "hall"),
+    ),
 )
-MOST = {"type": int, "help": "scans of each recording"}
 
 if __name__ == "__main__":
-    run(__doc__, CASE, most=MOST, seeds={"type": int, "nargs": "+", "default": [0, 1, 2]})
+    run(
+        __doc__,
+        *CASES,
+        most={"type": int, "help": "scans of each recording"},
+        seeds={"type": int, "nargs": "+", "default": [0, 1, 2]},
+    )

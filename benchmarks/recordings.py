@@ -128,17 +128,8 @@ def measured(name: str, data: Path) -> tuple[list[Row], dict[str, Any]]:
     asked = hit_and_free(*beams, "uniform", source.resolution, 0)
 
     def row(about: str, seconds: float, cpu: float, built: Any, found: Any, used: str, merge: Any) -> Row:
-        return {
-            "data": name,
-            "how": about,
-            "wall s": seconds,
-            "CPU s": cpu,
-            "AUC": score(built, asked, source.resolution),
-            "components": found["n_components"],
-            "kB": found["nbytes"] / 1e3,
-            "memory of a worker, MB": used,
-            "merging, MB": merge,
-        }
+        auc, n_bytes = score(built, asked, source.resolution), found["nbytes"] / 1e3
+        return name, about, seconds, cpu, auc, found["n_components"], n_bytes, used, merge
 
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
@@ -185,25 +176,20 @@ def costs(options: Any) -> Iterator[Row]:
         merged = measured(name, options.data)[1]
         n_bytes = merged["nbytes"] / merged["metres"]
         seconds = (merged["cpu_seconds"] + merged["merge_cpu_seconds"]) / merged["metres"]
-        yield {
-            "data": name,
-            "path": merged["metres"],
-            "bytes a metre": n_bytes,
-            "CPU a metre": 1e3 * seconds,
-            "bytes, 10,000 km": CITY * n_bytes / 1e9,
-            "core hours, 10,000 km": CITY * seconds / 3600,
-        }
+        city = CITY * n_bytes / 1e9, CITY * seconds / 3600
+        yield name, merged["metres"], n_bytes, 1e3 * seconds, *city
 
 
-FORMATS = dict.fromkeys(("wall s", "CPU s", "kB", "merging, MB"), ".0f")
-COSTS = {"path": "{:,.0f} m", "bytes a metre": "{:.0f} B", "CPU a metre": "{:.0f} ms"}
+RUN = {"data": "", "how": "", "wall s": ".0f", "CPU s": ".0f", "AUC": ".4f", "components": ",.0f"}
+RUN |= {"kB": ".0f", "memory of a worker, MB": "", "merging, MB": ".0f"}
+COSTS = {"data": "", "path": "{:,.0f} m", "bytes a metre": "{:.0f} B", "CPU a metre": "{:.0f} ms"}
 COSTS |= {"bytes, 10,000 km": "{:.1f} GB", "core hours, 10,000 km": "{:.0f} h"}
 CASES = (
     Case(
         "recordings",
         runs,
         "Merging: the peak memory of the process that merges.",
-        {**FORMATS, "AUC": ".4f", "components": ",.0f"},
+        RUN,
         tuple(SOURCES),
         key=2,
     ),

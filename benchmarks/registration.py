@@ -143,8 +143,7 @@ def measure(name: str, options: Any) -> Iterator[Row]:
 def row(label: str, method: Method, clouds: list[list[Cloud]], n_draws: int) -> Row:
     """Successes of each start; medians of the errors of successes, of seconds and of bytes."""
     preparing, made = cpu_seconds(lambda: [[method.prepare(one) for one in pair] for pair in clouds])
-    cells: dict[str, Any] = {"": label}
-    good, seconds = [], []
+    cells, good, seconds = [], [], []
     for metres, degrees in STARTS:
         generator = torch.Generator().manual_seed(0)
         n_good = 0
@@ -157,17 +156,11 @@ def row(label: str, method: Method, clouds: list[list[Cloud]], n_draws: int) -> 
                 if errors[0] < SUCCESS[0] and errors[1] < SUCCESS[1]:
                     n_good += 1
                     good.append(errors)
-        cells[f"{metres:g} m, {degrees:g}°"] = f"{n_good}/{n_draws * len(clouds)}"
-    middle = [statistics.median(column) for column in zip(*good, strict=True)] if good else [math.nan] * 2
+        cells.append(f"{n_good}/{n_draws * len(clouds)}")
+    middle = [statistics.median(column) for column in zip(*good, strict=True)] if good else []
     n_bytes = statistics.median(size for pair in made for _, size in pair)
-    return {
-        **cells,
-        "error (m)": middle[0] if good else "–",
-        "(°)": middle[1] if good else "–",
-        "prepare (s)": preparing / (2 * len(clouds)),
-        "align (s)": statistics.median(seconds),
-        "bytes": n_bytes,
-    }
+    errors = middle if good else ["–", "–"]
+    return label, *cells, *errors, preparing / (2 * len(clouds)), statistics.median(seconds), n_bytes
 
 
 def unknown(clouds: list[list[Cloud]]) -> str:
@@ -193,10 +186,11 @@ def unknown(clouds: list[list[Cloud]]) -> str:
     )
 
 
-FORMATS = {"error (m)": ".3f", "(°)": ".2f", "prepare (s)": ".2f", "align (s)": ".2f", "bytes": ",.0f"}
+COLUMNS = {"": "", **dict.fromkeys((f"{metres:g} m, {degrees:g}°" for metres, degrees in STARTS), "")}
+COLUMNS |= {"error (m)": ".3f", "(°)": ".2f", "prepare (s)": ".2f", "align (s)": ".2f", "bytes": ",.0f"}
 ABOUT = "Results within 0.2 m and 2° of the truth, and median errors of those. CPU seconds, medians."
 CASES = [
-    Case(f"registration-{name}", partial(measure, name), ABOUT, FORMATS, methods=tuple(METHODS))
+    Case(f"registration-{name}", partial(measure, name), ABOUT, COLUMNS, methods=tuple(METHODS))
     for name in PAIRS
 ]
 

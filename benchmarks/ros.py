@@ -96,21 +96,11 @@ def long_run(options: Any) -> Iterator[Row]:
         row, usage, share = played("dds", recorded(options), Path(name), budget, seconds)
     n = len(usage.memory)
     fifths = [f"{usage.memory[min(n - 1, n * k // 5)] / _MEGABYTE:.0f}" for k in range(1, 6)]
-    yield {
-        "minutes": options.minutes,
-        "scans": row["n_scans"],
-        **latencies(row, share),
-        "memory after each fifth": ", ".join(fifths) + " MB",
-    }
+    yield options.minutes, row["n_scans"], *latencies(row, share), ", ".join(fifths) + " MB"
 
 
-def latencies(row: dict[str, Any], share: float) -> Row:
-    return {
-        "dropped": row["n_dropped"],
-        "median latency": row["latency_median"],
-        "99 %": row["latency_p99"],
-        "of a core": 100 * share,
-    }
+def latencies(row: dict[str, Any], share: float) -> list[float]:
+    return [row["n_dropped"], row["latency_median"], row["latency_p99"], 100 * share]
 
 
 def one_play(options: Any) -> Iterator[Row]:
@@ -130,30 +120,26 @@ def one_play(options: Any) -> Iterator[Row]:
                 router.communicate(b"\n")
                 same = (place / "mapper" / "map.safetensors").read_bytes() == expected
                 half, last = (usage.memory[i] / _MEGABYTE for i in (len(usage.memory) // 2, -1))
-                yield {
-                    "middleware, map": f"{middleware}, {'no budget' if budget == 'null' else '16 kB'}",
-                    "scans": f"{row['n_scans']} of 356",
-                    "same map": "yes" if same else "no",
-                    **latencies(row, share),
-                    "memory at half time, at the end": f"{half:.0f}, {last:.0f} MB",
-                }
+                label = f"{middleware}, {'no budget' if budget == 'null' else '16 kB'}"
+                done = f"{row['n_scans']} of 356", "yes" if same else "no"
+                yield label, *done, *latencies(row, share), f"{half:.0f}, {last:.0f} MB"
 
 
-FORMATS = dict.fromkeys(("median latency", "99 %"), "{:.2f} s") | {"of a core": "{:.0f} %"}
-FORMATS |= dict.fromkeys(("minutes", "dropped"), ".0f")
+LATENCY = {"dropped": ".0f", "median latency": "{:.2f} s", "99 %": "{:.2f} s", "of a core": "{:.0f} %"}
+PLAYED = dict.fromkeys(("middleware, map", "scans", "same map"), "")
 CASES = (
     Case(
         "ros",
         one_play,
         "The latency is from the stamp of a scan to a published grid (0.1 m) that includes it.",
-        FORMATS,
+        {**PLAYED, **LATENCY, "memory at half time, at the end": ""},
         methods=("dds", "zenoh"),
     ),
     Case(
         "ros-long",
         long_run,
         "The same recording repeated, one map with a budget of 16 kB, over DDS.",
-        {**FORMATS, "scans": ".0f"},
+        {"minutes": ".0f", "scans": ".0f", **LATENCY, "memory after each fifth": ""},
     ),
 )
 

@@ -67,19 +67,18 @@ def message_sizes(options: Any) -> Iterator[Row]:
     n_points = sum(len(frame.scan.points) for frame in frames)
     options.about = f"{N_FRAMES} frames, {sum(map(len, made)):,} components, {n_points:,} points."
     for content, n_bytes in (*frame_sizes(frames, made), *record_sizes()):
-        yield {"content": str(content), "bytes": str(n_bytes)}
+        yield str(content), str(n_bytes)
 
 
 def replica_costs(options: Any) -> Iterator[Row]:
     frame = Components.concatenate(learned()[1]).selected(torch.arange(PER_FRAME))
     small, large = (replica_times(frame, n, options.repeats) for n in (40 * PER_FRAME, N_HELD))
     for name in small:
-        yield {"operation": name, "ms": small[name], HELD: large[name]}
+        yield name, small[name], large[name]
 
 
 def frame_costs(options: Any) -> Iterator[Row]:
-    for name, value in frame_times(options.repeats).items():
-        yield {"1200 bytes": name, "time": value}
+    yield from frame_times(options.repeats).items()
 
 
 def numbered(components: Components) -> Components:
@@ -233,19 +232,19 @@ def frame_times(repeats: int, n: int = 2000) -> dict[str, float]:
 
 HELD = f"ms with {N_HELD:,} components held"
 CASES = (
-    Case("message-sizes", message_sizes, needs_data=False),
+    Case("message-sizes", message_sizes, columns={"content": "", "bytes": ""}, needs_data=False),
     Case(
         "replica-costs",
         replica_costs,
         f"Processor time of each operation, for a frame of {PER_FRAME} components.",
-        {"ms": ".2f", HELD: ".2f"},
+        {"operation": "", "ms": ".2f", HELD: ".2f"},
         needs_data=False,
     ),
     Case(
         "frame-costs",
         frame_costs,
         "Processor time of a frame with the longest datagram.",
-        {"time": "{:.1f} µs"},
+        {"1200 bytes": "", "time": "{:.1f} µs"},
         needs_data=False,
     ),
 )

@@ -65,7 +65,7 @@ def measure(options: Any) -> Iterator[Row]:
     memory = {name: max(getattr(part, name) for part in parts) for name in ("grown_kb", "held_kb")}
     for about, found in {"schedules": team, "kills": killed, **heard, "memory": memory}.items():
         for name, value in found.items():
-            yield {"": about, "what": name.replace("_", " "), "number": value}
+            yield about, name.replace("_", " "), value
     sound = team["converged"] == team["complete"] == options.schedules
     sound = sound and not any(killed[what] for what in ("lost", "unequal", "refused", "failed"))
     sound = sound and not any(row["raised"] + row["believed"] for row in heard.values())
@@ -223,7 +223,7 @@ def _opened(opener: Opener, frame: bytes) -> str:
         return "raised"
 
 
-CASE = Case("soak-numbers", measure, formats={"number": ",.0f"}, key=2, needs_data=False)
+CASE = Case("soak-numbers", measure, columns={"": "", "what": "", "number": ",.0f"}, key=2, needs_data=False)
 
 if __name__ == "__main__":
     run(

@@ -103,26 +103,17 @@ def joined(scans: Dataset, split: str) -> tuple[Robot, Robot, str, float]:
 
 def row(name: str, split: str, one: Robot, two: Robot, when: str, seconds: float) -> Row:
     places, transform = two.map.components().means, two.replica.placement.transform
-    errors = dict.fromkeys(("error (m)", "at most (m)", "turn (°)"), "–")
+    errors = ["–", "–", "–"]
     if transform is not None:
         error = torch.linalg.inv(two.frame) @ one.frame @ transform
         dim = len(error) - 1
         off = (places @ error[:dim, :dim].T + error[:dim, dim] - places).norm(dim=1)
         angle = torch.linalg.matrix_norm(error[:dim, :dim] - torch.eye(dim)) / math.sqrt(2)
-        turn = math.degrees(float(angle))
-        found = f"{float(off.square().mean().sqrt()):.3f}", f"{float(off.max()):.3f}", f"{turn:.2f}"
-        errors = dict(zip(errors, found, strict=True))
-    components, frames = (one.sent[kind] + two.sent[kind] for kind in ("all", "frames"))
-    return {
-        "log": name,
-        "parts": split,
-        "joined at scan": when,
-        "scans located": f"{two.joiner.n_located} of {two.joiner.n_searches}",
-        **errors,
-        "bytes": components,
-        "of frames": frames,
-        "CPU s a search": seconds,
-    }
+        metres = (float(each) for each in (off.square().mean().sqrt(), off.max()))
+        errors = [*(f"{each:.3f}" for each in metres), f"{math.degrees(float(angle)):.2f}"]
+    located = f"{two.joiner.n_located} of {two.joiner.n_searches}"
+    n_bytes = (one.sent[kind] + two.sent[kind] for kind in ("all", "frames"))
+    return name, split, when, located, *errors, *n_bytes, seconds
 
 
 def foreign(source: Dataset, target: Dataset) -> tuple[int, int, int]:
@@ -184,9 +175,7 @@ def other_places(options: Any) -> Iterator[Row]:
     for names in (DEEP, FLAT):
         logs = {name: recording(options.data, name) for name in names}
         for source, target in itertools.permutations(names, 2):
-            searched, located, n_joined = foreign(logs[source], logs[target])
-            found: Row = {"searched": searched, "located": located, "frames joined": n_joined}
-            yield {"scans of … in the map of …": f"{source} in {target}", **found}
+            yield f"{source} in {target}", *foreign(logs[source], logs[target])
 
 
 CASES = (
@@ -195,7 +184,13 @@ CASES = (
         own_places,
         "Errors are those of the places of robot 1's components in the frame of robot 0. Bytes are those of "
         "both robots.",
-        {"bytes": ",.0f", "of frames": ".0f", "CPU s a search": ".2f"},
+        {
+            **dict.fromkeys(("log", "parts", "joined at scan", "scans located"), ""),
+            **dict.fromkeys(("error (m)", "at most (m)", "turn (°)"), ""),
+            "bytes": ",.0f",
+            "of frames": ".0f",
+            "CPU s a search": ".2f",
+        },
         tuple(dict.fromkeys(name for name, _ in PARTS)),
         key=2,
     ),
@@ -203,7 +198,10 @@ CASES = (
         "foreign-frames",
         other_places,
         "About forty scans of one log are searched for in the whole map of another.",
-        dict.fromkeys(("searched", "located", "frames joined"), ".0f"),
+        {
+            "scans of … in the map of …": "",
+            **dict.fromkeys(("searched", "located", "frames joined"), ".0f"),
+        },
     ),
 )
 
