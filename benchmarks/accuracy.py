@@ -17,8 +17,8 @@ from harness import Case, Row, held_out, recording, run
 
 from gmmtorch import GaussianMap, IncrementalRule, WindowedRule
 from gmmtorch.datasets import Dataset
-from gmmtorch.evaluation.held_out import Protocol, evaluate
-from gmmtorch.evaluation.methods import choose, methods
+from gmmtorch.experiments.evaluation.held_out import Protocol, evaluate
+from gmmtorch.experiments.evaluation.mapping_methods import choose, methods
 
 KEPT = (1.0, 0.3, 0.1, 0.05)
 METHODS = ("occupancy_grid", "occupancy_log_odds", "monte_carlo", "point")

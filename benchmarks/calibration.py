@@ -18,10 +18,10 @@ from harness import Case, Row, held_out, recording, run
 
 from gmmtorch import GaussianMap
 from gmmtorch.errors import MemoryLimitError
-from gmmtorch.evaluation.calibration import accuracy
-from gmmtorch.evaluation.held_out import Built, Protocol, evaluate
-from gmmtorch.evaluation.methods import choose, methods
-from gmmtorch.evaluation.metrics import separating_threshold
+from gmmtorch.experiments.evaluation.calibration import accuracy
+from gmmtorch.experiments.evaluation.held_out import Built, Protocol, evaluate
+from gmmtorch.experiments.evaluation.mapping_methods import choose, methods
+from gmmtorch.experiments.evaluation.metrics import separating_threshold
 
 METHODS = ("point", "occupancy_grid", "occupancy_log_odds", "octomap")
 PLANAR = ("intel", "aces", "freiburg-101", "freiburg-campus", "orebro", "seattle")

@@ -32,10 +32,10 @@ from torch import Tensor
 
 import gmmtorch as gt
 from gmmtorch import GaussianMap, IncrementalRule
-from gmmtorch.baselines import LogOdds, OccupancyGrid, OctoMapMap
-from gmmtorch.evaluation import metrics
-from gmmtorch.evaluation.held_out import Protocol, evaluate
-from gmmtorch.evaluation.methods import choose, methods
+from gmmtorch.experiments.baselines import LogOdds, OccupancyGrid, OctoMapMap
+from gmmtorch.experiments.evaluation import metrics
+from gmmtorch.experiments.evaluation.held_out import Protocol, evaluate
+from gmmtorch.experiments.evaluation.mapping_methods import choose, methods
 from gmmtorch.kernels.rays.ray_traversal import traverse
 from gmmtorch.report.style import PALETTE, label_axes, legend_below, new_figure, save_figure
 from gmmtorch.simulation import World3D, building_3d, poses_3d, spinning_lidar

@@ -21,12 +21,12 @@ from typing import Any
 
 from harness import Case, Row, alone, run
 
-from gmmtorch.exploration.mission.driver import Stopwatch
-from gmmtorch.exploration.mission.mission import Mission
-from gmmtorch.exploration.mission.options import TeamOptions
-from gmmtorch.exploration.mission.team_setup import assemble
-from gmmtorch.exploration.world.world import World, open_world
 from gmmtorch.mapping.map_builder import resident_bytes
+from gmmtorch.team.exploration.mission.driver import Stopwatch
+from gmmtorch.team.exploration.mission.mission import Mission
+from gmmtorch.team.exploration.mission.options import TeamOptions
+from gmmtorch.team.exploration.mission.team_setup import assemble
+from gmmtorch.team.exploration.world.world import World, open_world
 
 
 def measure(options: Any) -> Iterator[Row]:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gmmtorch import datasets
 from gmmtorch.datasets.depth_frames import DepthFrames
-from gmmtorch.evaluation.queries import Queries, hit_and_free, split_indices, test_beams
+from gmmtorch.experiments.evaluation.queries import Queries, hit_and_free, split_indices, test_beams
 from gmmtorch.pinhole import back_project
 from gmmtorch.scan import Scan
 from gmmtorch.simulation.sensors.depth_camera import DepthCamera

@@ -29,8 +29,8 @@ from threadpoolctl import threadpool_limits
 
 from gmmtorch import datasets
 from gmmtorch.datasets import Dataset
-from gmmtorch.evaluation.metrics import roc
-from gmmtorch.evaluation.queries import FREE, OCCUPIED, Queries
+from gmmtorch.experiments.evaluation.metrics import roc
+from gmmtorch.experiments.evaluation.queries import FREE, OCCUPIED, Queries
 from gmmtorch.files import write_bytes
 
 Cell = float | str | None

@@ -25,7 +25,7 @@ from public_work import counted, large_works, prepare, works
 from torch import Tensor
 
 from gmmtorch import GaussianMap
-from gmmtorch.evaluation.queries import hit_and_free, test_beams
+from gmmtorch.experiments.evaluation.queries import hit_and_free, test_beams
 from gmmtorch.kernels import kernels
 from gmmtorch.kernels.mixtures.e_step import expectation
 from gmmtorch.kernels.rays.ray_traversal import traverse

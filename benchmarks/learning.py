@@ -25,7 +25,7 @@ from harness import Case, Row, alone, clock, cpu_seconds, least_seconds, recordi
 from torch import Tensor
 
 from gmmtorch import GaussianMixture, HierarchicalGaussianMixture
-from gmmtorch.evaluation.metrics import psnr2
+from gmmtorch.experiments.evaluation.metrics import psnr2
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em import loop
 

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from gmmtorch import GaussianMap, GaussianMixture, IncrementalRule
 from gmmtorch.datasets.depth_frames import DepthFrames
-from gmmtorch.evaluation.queries import hit_and_free, split_indices, test_beams
+from gmmtorch.experiments.evaluation.queries import hit_and_free, split_indices, test_beams
 from gmmtorch.mixture.depth_image import fit_depth_image
 from gmmtorch.pinhole import back_project
 

@@ -25,16 +25,16 @@ from harness import Case, Row, cpu_seconds, held_out, recording, run
 
 import gmmtorch as gt
 from gmmtorch.datasets import Dataset
-from gmmtorch.evaluation.held_out import Protocol, evaluate
-from gmmtorch.evaluation.methods import choose, methods
-from gmmtorch.evaluation.trajectories import absolute_trajectory_error, relative_pose_error
+from gmmtorch.experiments.evaluation.held_out import Protocol, evaluate
+from gmmtorch.experiments.evaluation.mapping_methods import choose, methods
 from gmmtorch.localization import Odometry
 from gmmtorch.localization.odometry.recorded_poses import METHODS, with_odometry
+from gmmtorch.localization.trajectories import absolute_trajectory_error, relative_pose_error
 from gmmtorch.mapping.window_motions import WindowMotions
-from gmmtorch.sharing import Replica
-from gmmtorch.sharing.messages.envelope import Kind, parse_datagram
-from gmmtorch.sharing.shared_map import SharedMap
-from gmmtorch.sharing.transport.simulated_network import Network
+from gmmtorch.team.sharing import Replica
+from gmmtorch.team.sharing.messages.envelope import Kind, parse_datagram
+from gmmtorch.team.sharing.shared_map import SharedMap
+from gmmtorch.team.sharing.transport.simulated_network import Network
 
 NOISE = 1e-3  # metres of standard deviation that move every point of a run
 WRONG = 0.2  # metres of a step

@@ -32,9 +32,21 @@ from pages import ROOT
 from torch import Tensor
 
 from gmmtorch import GaussianMap, IncrementalRule
-from gmmtorch.baselines.occupancy_grid import OccupancyGrid
-from gmmtorch.evaluation.codecs.point_bytes import compressed
-from gmmtorch.evaluation.codecs.point_codecs import (
+from gmmtorch.experiments.evaluation.metrics import psnr_terms
+from gmmtorch.experiments.evaluation.queries import Queries
+from gmmtorch.experiments.report.rate_distortion_figures import QUALITIES, bytes_for, figures, leads
+from gmmtorch.mapping.codec.quantization import spatial_order
+from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.learning.fitting import SurfaceFit, fit_points
+from gmmtorch.mapping.learning.merging import compact
+from gmmtorch.mapping.learning.viewpoints import all_origins
+from gmmtorch.mapping.learning.windows import surface_fit
+from gmmtorch.occupancy.occupancy_grid import OccupancyGrid
+from gmmtorch.occupancy.protocol import OccupancyMap
+from gmmtorch.report.style import label_of, save_figure
+from gmmtorch.scan import Scan
+from gmmtorch.team.sharing.codecs.point_bytes import compressed
+from gmmtorch.team.sharing.codecs.point_codecs import (
     DepthImage,
     Draco,
     Octree,
@@ -42,19 +54,7 @@ from gmmtorch.evaluation.codecs.point_codecs import (
     QuantizedPoints,
     RawPoints,
 )
-from gmmtorch.evaluation.metrics import psnr_terms
-from gmmtorch.evaluation.queries import Queries
-from gmmtorch.mapping.codec.quantization import spatial_order
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.fitting import SurfaceFit, fit_points
-from gmmtorch.mapping.learning.merging import compact
-from gmmtorch.mapping.learning.viewpoints import all_origins
-from gmmtorch.mapping.learning.windows import surface_fit
-from gmmtorch.occupancy.protocol import OccupancyMap
-from gmmtorch.report.studies.rate_distortion_figures import QUALITIES, bytes_for, figures, leads
-from gmmtorch.report.style import label_of, save_figure
-from gmmtorch.scan import Scan
-from gmmtorch.sharing.messages.message_registry import ComponentsMessage, decode, encode_components
+from gmmtorch.team.sharing.messages.message_registry import ComponentsMessage, decode, encode_components
 
 COMPONENTS = (8, 16, 32, 64, 128, 256, 384)  # of a frame at most: our knob
 FINER = 3  # than a map's rule: a frame by itself has more components than its share of a window

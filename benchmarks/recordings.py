@@ -28,7 +28,7 @@ from typing import Any
 from harness import Case, Row, run, score
 
 from gmmtorch import GaussianMap, datasets
-from gmmtorch.evaluation.queries import hit_and_free, split_indices, test_beams
+from gmmtorch.experiments.evaluation.queries import hit_and_free, split_indices, test_beams
 from gmmtorch.mapping import TiledMap
 
 N_PARTS, N_POINTS = 16, 20_000

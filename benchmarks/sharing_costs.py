@@ -21,14 +21,14 @@ from frames import Frame, simulated
 from harness import Case, Row, run
 from torch import Tensor
 
-from gmmtorch.evaluation.codecs.point_codecs import bytes_of_points
-from gmmtorch.exploration.robot.gmm_mapper import FrameRule
 from gmmtorch.mapping.codec.quantization import spatial_order
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.fitting import fit_window
 from gmmtorch.mapping.learning.viewpoints import all_origins
-from gmmtorch.sharing.messages.fields import pose_of
-from gmmtorch.sharing.messages.message_registry import (
+from gmmtorch.team.exploration.robot.gmm_mapper import FrameRule
+from gmmtorch.team.sharing.codecs.point_codecs import bytes_of_points
+from gmmtorch.team.sharing.messages.fields import pose_of
+from gmmtorch.team.sharing.messages.message_registry import (
     CODECS,
     ViewsMessage,
     decode,
@@ -39,16 +39,16 @@ from gmmtorch.sharing.messages.message_registry import (
     encode_views,
     quantized_poses,
 )
-from gmmtorch.sharing.messages.record_messages import (
+from gmmtorch.team.sharing.messages.record_messages import (
     CorrectionMessage,
     SupersessionMessage,
     counters_message,
     encode_announcements,
     encode_record,
 )
-from gmmtorch.sharing.replica.record_keys import Intervals, first_key
-from gmmtorch.sharing.replica.replica import Replica
-from gmmtorch.sharing.transport.security import Opener, Sealer, TeamKey
+from gmmtorch.team.sharing.replica.record_keys import Intervals, first_key
+from gmmtorch.team.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.transport.security import Opener, Sealer, TeamKey
 
 N_FRAMES, N_HELD, PER_FRAME, INCARNATION = 6, 20_000, 70, 9_876_543
 

@@ -27,8 +27,8 @@ from gmmtorch.datasets import Dataset
 from gmmtorch.datasets.base import start_frame
 from gmmtorch.mapping.components import Components
 from gmmtorch.report.style import PALETTE, save_figure
-from gmmtorch.sharing import FrameJoiner, Replica
-from gmmtorch.sharing.messages.message_registry import kind_of
+from gmmtorch.team.sharing import FrameJoiner, Replica
+from gmmtorch.team.sharing.messages.message_registry import kind_of
 
 EVERY = 5  # scans between two exchanges
 PARTS = (

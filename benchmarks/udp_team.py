@@ -27,10 +27,10 @@ from typing import Any
 
 from harness import Case, Row, run
 
-from gmmtorch.cli.from_options.links import free_addresses
 from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.sharing.replica.component_table import fingerprints
+from gmmtorch.team.cli.from_options.links import free_addresses
+from gmmtorch.team.sharing.replica.component_table import fingerprints
 
 _PAUSE = 0.1
 _SAMPLE = 10.0  # seconds between looks at the memory
@@ -132,7 +132,7 @@ def _start(
     ]
     with (home / "output.log").open("ab") as output:
         return subprocess.Popen(
-            [sys.executable, "-m", "gmmtorch.cli.robot", *given],
+            [sys.executable, "-m", "gmmtorch.team.cli.robot", *given],
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=output,

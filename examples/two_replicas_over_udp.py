@@ -6,7 +6,7 @@ python examples/two_replicas_over_udp.py
 import time
 
 import gmmtorch as gt
-from gmmtorch.sharing.transport.udp import UdpTransport
+from gmmtorch.team.sharing.transport.udp import UdpTransport
 
 scans = list(gt.datasets.load("synthetic_building_2d"))
 halves = scans[: len(scans) // 2], scans[len(scans) // 2 :]

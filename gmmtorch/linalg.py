@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
-from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.mixtures.distinct_keys import distinct_keys
+from gmmtorch.kernels import distinct_keys, is_fused
 
 _MANY_KEYS = 1 << 12  # from here on a hash table is faster than sorting
 _ORTHONORMAL = 1e-5  # largest error of an entry of R Rᵀ

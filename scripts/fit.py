@@ -6,7 +6,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from gmmtorch.cli.fit import main
+from gmmtorch.experiments.cli.fit import main
 
 if __name__ == "__main__":  # the processes of a study import this file
     main()

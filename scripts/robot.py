@@ -6,7 +6,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from gmmtorch.cli.robot import main
+from gmmtorch.team.cli.robot import main
 
 if __name__ == "__main__":
     main()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from gmmtorch.cli.team import main
+from gmmtorch.team.cli.team import main
 
 if __name__ == "__main__":
     main()

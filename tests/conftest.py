@@ -65,7 +65,7 @@ def real_data() -> Path:
 @pytest.fixture
 def steps(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The numbers of ticks done, at the start of every tick of missions in this process."""
-    from gmmtorch.exploration.mission.mission import Mission
+    from gmmtorch.team.exploration.mission.mission import Mission
 
     ticks: list[int] = []
     tick = Mission.tick

@@ -17,6 +17,20 @@ import pytest
 import gmmtorch
 
 PACKAGE = Path(gmmtorch.__file__).parent
+HOMES = ("team", "experiments")
+"""Homes beside the map. A room is a package directly in gmmtorch/ or in a home."""
+GROUND = [
+    "errors",
+    "arrays",
+    "linalg",
+    "files",
+    "events",
+    "scan",
+    "pinhole",
+    "optional_packages",
+    "processes",
+    "kernels",
+]
 ROOMS = [
     "simulation",
     "datasets",
@@ -24,36 +38,41 @@ ROOMS = [
     "occupancy",
     "mapping",
     "localization",
-    "baselines",
     "export",
-    "evaluation",
-    "sharing",
-    "exploration",
     "report",
     "live",
     "cli",
+    "team.sharing",
+    "team.exploration",
+    "team.report",
+    "team.cli",
+    "experiments.baselines",
+    "experiments.evaluation",
+    "experiments.studies",
+    "experiments.report",
+    "experiments.cli",
 ]
-GROUND = [
-    "errors",
-    "lazy_names",
-    "arrays",
-    "linalg",
-    "files",
-    "scan",
-    "pinhole",
-    "optional_packages",
-    "kernels",
-]
+"""The order of the rooms: each imports from earlier ones only. So the map imports no home, and teams do not
+import experiments."""
+OLD_NAMES = ["sharing", "baselines"]
+"""Modules that lead to a home under the names of version 1.0."""
 RANK = {**dict.fromkeys(GROUND, 0), **{room: i for i, room in enumerate(ROOMS, 1)}}
 OWNERS = {"hydra": {"cli"}, "omegaconf": {"cli"}, "matplotlib": {"report"}, "tensorboard": {"report"}}
-"""Heavy third-party packages, and the only rooms that may import each."""
+"""Heavy third-party packages, and the only rooms, in any home, that may import each."""
+
+
+def room_of(name: str) -> str:
+    """The room of a dotted name, without `gmmtorch`: mapping, or team.sharing."""
+    parts = name.split(".")[1:]
+    return ".".join(parts[: 2 if parts and parts[0] in HOMES else 1])
 
 
 def modules() -> Iterator[tuple[Path, str]]:
     for path in sorted(PACKAGE.rglob("*.py")):
         relative = path.relative_to(PACKAGE)
-        if relative.parts != ("__init__.py",):  # the package itself imports from every room
-            yield path, relative.parts[0].removesuffix(".py")
+        name = ".".join(["gmmtorch", *relative.with_suffix("").parts]).removesuffix(".__init__")
+        if name.removeprefix("gmmtorch.") not in ("gmmtorch", *OLD_NAMES, *HOMES):
+            yield path, room_of(name)
 
 
 def imported_names(path: Path) -> Iterator[tuple[str, int, bool]]:
@@ -94,17 +113,44 @@ def test_every_room_has_a_rank():
 def test_a_room_imports_only_from_rooms_above_it(imports):
     violations = []
     for place, room, name, _ in imports:
-        parts = name.split(".")
-        if parts[0] != "gmmtorch":
+        if name.split(".")[0] != "gmmtorch":
             continue
-        target = parts[1] if len(parts) > 1 else ""
+        target = room_of(name)
         if target not in RANK:
-            # An import from the package itself hides the room: only the last room may use it.
-            if room != "cli" and target != "__version__":
+            # An import from the package itself hides the room: only commands may use it.
+            if room.split(".")[-1] != "cli" and target != "__version__":
                 violations.append(f"{place}, which names no room")
         elif target != room and RANK[target] > RANK[room]:
             violations.append(f"{place}: {room} stands above {target}")
     assert not violations, "\n".join(violations)
+
+
+def test_rooms_import_from_each_other_only_what_their_doors_offer(imports):
+    violations = []
+    for place, room, name, _ in imports:
+        target = room_of(name)
+        if (
+            name.split(".")[0] == "gmmtorch"
+            and target in ROOMS
+            and target != room
+            and name != f"gmmtorch.{target}"
+        ):
+            offered = importlib.import_module(f"gmmtorch.{target}").__all__
+            if name.removeprefix(f"gmmtorch.{target}.") not in offered:
+                violations.append(f"{place}, past the door of {target}")
+    assert not violations, "\n".join(violations)
+
+
+@pytest.mark.parametrize("room", [*ROOMS, "kernels"])
+def test_a_door_offers_names_that_exist_and_that_others_use(room):
+    door = importlib.import_module(f"gmmtorch.{room}")
+    folder = PACKAGE.joinpath(*room.split("."))
+    readers = [path for path in PACKAGE.rglob("*.py") if folder not in path.parents]
+    readers += [path for top in ("docs", "tests", "examples") for path in (PACKAGE.parent / top).rglob("*.*")]
+    text = "\n".join(path.read_text("utf-8") for path in readers if path.suffix in (".py", ".md", ".rst"))
+    for name in getattr(door, "__all__", []):
+        is_type = isinstance(getattr(door, name), type)  # the result of a function of the door, perhaps
+        assert is_type or re.search(rf"\b{name}\b", text), f"nothing outside gmmtorch.{room} uses {name}"
 
 
 def test_imports_inside_functions_are_found(imports):
@@ -116,7 +162,7 @@ def test_only_owner_rooms_import_heavy_third_party_packages(imports):
     violations = []
     for place, room, name, inside in imports:
         third_party = "tensorboard" if name.startswith("torch.utils.tensorboard") else name.split(".")[0]
-        if room not in OWNERS.get(third_party, {room}):
+        if room.split(".")[-1] not in OWNERS.get(third_party, {room.split(".")[-1]}):
             violations.append(f"{place}; only {', '.join(OWNERS[third_party])} may")
         if third_party == "open3d" and not inside:
             violations.append(f"{place} outside a function")
@@ -147,7 +193,7 @@ def test_the_package_a_replica_and_the_public_names_load_only_what_they_use():
 import sys
 import gmmtorch
 print(*sys.modules)
-from gmmtorch.sharing import Replica
+from gmmtorch.team.sharing import Replica
 print(*sys.modules)
 for name in gmmtorch.__all__:
     getattr(gmmtorch, name)
@@ -156,7 +202,7 @@ print(*sys.modules)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     package, replica, public = (set(line.split()) for line in done.stdout.splitlines())
     assert not {"torch", "sklearn", "open3d", "scipy", "matplotlib", "numpy", "hydra"} & package
-    assert "gmmtorch.sharing.replica" in replica
+    assert "gmmtorch.team.sharing.replica" in replica
     assert not {"sklearn", "scipy", "matplotlib", "open3d", "hydra", "tensorboard"} & replica
     assert "torch" in public
     assert not {"open3d", "hydra", "matplotlib"} & public
@@ -164,7 +210,7 @@ print(*sys.modules)
 
 def test_every_public_name_resolves():
     for name in gmmtorch.__all__:
-        assert getattr(gmmtorch, name).__name__ in (name, f"gmmtorch.{name}")
+        assert getattr(gmmtorch, name).__name__.split(".")[-1] == name
         assert name in dir(gmmtorch)
     with pytest.raises(AttributeError, match="no_such_name"):
         gmmtorch.no_such_name  # noqa: B018

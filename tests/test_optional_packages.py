@@ -58,20 +58,20 @@ def viewer(folder: Path) -> object:
 
 
 def recording(folder: Path) -> object:
-    from gmmtorch.report.exploration.rerun_recording import load_rerun
+    from gmmtorch.team.report.rerun_recording import load_rerun
 
     return load_rerun()
 
 
 def codec(name: str) -> Callable[[Path], object]:
-    from gmmtorch.evaluation.codecs.point_codecs import bytes_of_points
+    from gmmtorch.team.sharing.codecs.point_codecs import bytes_of_points
 
     return lambda folder: bytes_of_points(torch.rand(50, 3), 0.1, 0.01, names=(name,))
 
 
 def key(folder: Path) -> object:
-    from gmmtorch.sharing.transport.security import TeamKey
-    from gmmtorch.sharing.transport.udp import UdpTransport
+    from gmmtorch.team.sharing.transport.security import TeamKey
+    from gmmtorch.team.sharing.transport.udp import UdpTransport
 
     file = folder / "team.key"
     file.touch(0o600)
@@ -80,7 +80,7 @@ def key(folder: Path) -> object:
 
 
 def zenoh(folder: Path) -> object:
-    from gmmtorch.sharing.transport.zenoh_transport import load_zenoh
+    from gmmtorch.team.sharing.transport.zenoh_transport import load_zenoh
 
     return load_zenoh()
 

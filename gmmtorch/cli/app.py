@@ -26,24 +26,25 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig
 
 from gmmtorch.cli import common
-from gmmtorch.cli.options import command_options, schema
+from gmmtorch.cli.options import command_options
 from gmmtorch.cli.reporting.sweep_table import ERROR_FILE
 from gmmtorch.errors import GmmTorchError
-from gmmtorch.evaluation.processes import end_with_parent
+from gmmtorch.processes import end_with_parent
 
 _FULL_ERROR = "HYDRA_FULL_ERROR"
 """Environment variable with which Hydra raises its errors."""
 
 
-def start(name: str, run: Callable[[DictConfig], Any]) -> None:
+def start(name: str, run: Callable[[DictConfig], Any], register: Callable[[], None]) -> None:
     """Run the command gmmtorch-`name` with the arguments of this process.
 
     Args:
         name: name of the command and of its file in conf/.
         run: does the work for a configuration. Its result is what a sweep can optimize. A `GmmTorchError`
             becomes a one-line message and exit status 1.
+        register: stores the schemas of the command in Hydra's config store.
     """
-    schema.register()
+    register()
     _print_any_text()
     try:
         with interruptible(), _any_help():
@@ -203,7 +204,7 @@ def _result_of(run: Callable[[DictConfig], Any], config: DictConfig) -> Any:
     except RuntimeError as error:
         import torch  # takes a second, which errors of options need not wait for
 
-        from gmmtorch.kernels.chunks import memory_error
+        from gmmtorch.kernels import memory_error
 
         if isinstance(error, torch.OutOfMemoryError):
             raise memory_error(error) from error

@@ -16,11 +16,11 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError, MissingDataError, check_whole
-from gmmtorch.evaluation.events import Row
-from gmmtorch.report.table import format_table
+from gmmtorch.events import Row
+from gmmtorch.report import format_table
 
 if TYPE_CHECKING:
-    from gmmtorch.report.tensorboard_writer import Board
+    from gmmtorch.report import Board
 
 logger = logging.getLogger("gmmtorch")
 _NAMES_ARGUMENTS = (InvalidArgumentError, MissingDataError)
@@ -90,7 +90,7 @@ def check_inputs(config: DictConfig) -> None:
     """Raises the error of an input that does not exist, before a command imports what takes seconds."""
     points = OmegaConf.select(config, "points")
     if points is not None:
-        from gmmtorch.datasets.point_files.headers import point_path
+        from gmmtorch.datasets import point_path
 
         point_path(points)
     for option in ("path", "map.path", "world.path"):
@@ -153,7 +153,7 @@ def save_figures(config: DictConfig, figures: Mapping[str, Any], folder: Path) -
     """Write every figure as NAME.png if `report.figures` is set."""
     if not config.report.figures:
         return
-    from gmmtorch.report.style import save_figure
+    from gmmtorch.report import save_figure
 
     for name, figure in figures.items():
         save_figure(figure, folder / f"{name}.png")
@@ -176,7 +176,7 @@ def show(
     made = figures()
     save_figures(config, made, folder)
     if config.report.tensorboard:
-        from gmmtorch.report.tensorboard_writer import Board
+        from gmmtorch.report import Board
 
         with Board(folder / "tensorboard") as board:
             write(board)

@@ -7,9 +7,10 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from gmmtorch.cli import app, common
+from gmmtorch.cli.options import schema
 from gmmtorch.errors import InvalidArgumentError, check_choice
 from gmmtorch.optional_packages import load_pyoctomap
-from gmmtorch.report.progress import ProgressBars
+from gmmtorch.report import ProgressBars
 
 _OF_SPACE = ("map_server", "octomap", "ply", "pcd", "mesh", "distance_field")
 _OF_COMPONENTS = ("csv", "npz", "mixture")
@@ -29,7 +30,7 @@ _OF_ENDINGS = {
 
 def main() -> None:
     """Entry point of the command."""
-    app.start("export", run)
+    app.start("export", run, schema.register)
 
 
 def run(config: DictConfig) -> None:

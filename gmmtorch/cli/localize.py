@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 from omegaconf import DictConfig
 
 from gmmtorch.cli import app, common
+from gmmtorch.cli.options import schema
 from gmmtorch.errors import InvalidArgumentError, check_choice
-from gmmtorch.report.progress import ProgressBars
+from gmmtorch.report import ProgressBars
 
 if TYPE_CHECKING:
     from gmmtorch.datasets import Dataset
-    from gmmtorch.localization import Tracker
-    from gmmtorch.localization.scan_locations import ScanLocation
+    from gmmtorch.localization import ScanLocation, Tracker
 
 _STAGE = "localising"
 TABLE = "dataset n_scans n_found n_lost_runs ate rpe ate_degrees deviation scans_per_second"
@@ -25,7 +25,7 @@ TABLE = "dataset n_scans n_found n_lost_runs ate rpe ate_degrees deviation scans
 def main() -> None:
     """Entry point of the command."""
     sys.argv[1:] = overrides(sys.argv[1:])
-    app.start("localize", run)
+    app.start("localize", run, schema.register)
 
 
 def overrides(words: Sequence[str]) -> list[str]:
@@ -38,9 +38,7 @@ def run(config: DictConfig) -> None:
     from gmmtorch.cli.from_options import maps
     from gmmtorch.cli.from_options.scans import open_dataset
     from gmmtorch.cli.reporting import localization_outputs
-    from gmmtorch.evaluation.trajectories import ALIGNMENTS
-    from gmmtorch.localization import Tracker
-    from gmmtorch.localization.odometry.recorded_poses import MOTIONS
+    from gmmtorch.localization import ALIGNMENTS, MOTIONS, Tracker
 
     if not config.map.path:
         raise InvalidArgumentError("map is not set; give map=FILE, a map file or a run directory.")
@@ -74,7 +72,7 @@ def run(config: DictConfig) -> None:
 
 def _locate(config: DictConfig, dataset: Dataset, tracker: Tracker, bars: ProgressBars) -> list[ScanLocation]:
     """The locations of all scans."""
-    from gmmtorch.localization.scan_locations import locate_scans
+    from gmmtorch.localization import locate_scans
 
     if len(dataset) and dataset[0].dim != tracker.dim:
         raise InvalidArgumentError(

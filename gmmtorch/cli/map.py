@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 from omegaconf import DictConfig
 
 from gmmtorch.cli import app, common
+from gmmtorch.cli.options import schema
 from gmmtorch.cli.view import open_live_view, serve
 from gmmtorch.errors import check_resolution
-from gmmtorch.report.progress import ProgressBars
-from gmmtorch.report.table import byte_text
+from gmmtorch.report import ProgressBars, byte_text
 
 if TYPE_CHECKING:
     from gmmtorch.cli.reporting.map_outputs import Checkpoint
-    from gmmtorch.live.live_view import LiveView
-    from gmmtorch.mapping.map_builder import MapBuilder
+    from gmmtorch.live import LiveView
+    from gmmtorch.mapping import MapBuilder
 
 _STAGE = "mapping"
 TABLE = (
@@ -26,7 +26,7 @@ TABLE = (
 
 def main() -> None:
     """Entry point of the command."""
-    app.start("map", run)
+    app.start("map", run, schema.register)
 
 
 def run(config: DictConfig) -> None:
@@ -35,7 +35,7 @@ def run(config: DictConfig) -> None:
     from gmmtorch.cli.from_options.scans import open_with_trajectory
     from gmmtorch.cli.reporting import map_outputs
     from gmmtorch.cli.runs import map_recordings
-    from gmmtorch.mapping.map_builder import MapBuilder
+    from gmmtorch.mapping import MapBuilder
 
     device, folder = common.set_up(config), common.run_dir()
     check_resolution(config.resolution)
@@ -54,7 +54,7 @@ def run(config: DictConfig) -> None:
         trajectory = map_outputs.write_trajectory(builder, folder)
         row = map_outputs.result_row(dataset.name, builder, config, odometry)
         if poses is not None:
-            map_outputs.write_pose_table(dataset, poses, folder)
+            map_outputs.write_estimated_poses(dataset, poses, folder)
         exported, errors = map_outputs.write_exports(config, target, folder, bars)
         common.write_results("map", config, [row], folder)
         map_outputs.draw(config, target, [trajectory], row, folder)
@@ -72,7 +72,7 @@ def _build(builder: MapBuilder, checkpoint: Checkpoint, bars: ProgressBars, view
     """Inserts all scans. If the user stops the run, writes the checkpoint and ends the command."""
     moments = None
     if view is not None:
-        from gmmtorch.live.live_moments import BuildMoments
+        from gmmtorch.live import BuildMoments
 
         moments = BuildMoments(builder, lambda: builder.progress().nbytes)
     with app.stop_requests() as is_stopped:

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING
 from omegaconf import DictConfig
 
 from gmmtorch.cli import app, common
+from gmmtorch.cli.options import schema
 from gmmtorch.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
-    from gmmtorch.live.live_view import LiveView
-    from gmmtorch.live.map_viewer import MapViewer
+    from gmmtorch.live import LiveView, MapViewer
 
 # Flags of Hydra whose values are words of their own.
 _FLAGS_WITH_A_VALUE = {"--cfg", "-c", "--package", "-p", "--info", "-i", "--config-path", "-cp"}
@@ -27,7 +27,7 @@ _FLAGS_WITH_A_VALUE |= {"--config-name", "-cn", "--config-dir", "-cd"}
 def main() -> None:
     """Entry point of the command."""
     sys.argv[1:] = overrides(sys.argv[1:])
-    app.start("view", run)
+    app.start("view", run, schema.register)
 
 
 def overrides(words: Sequence[str]) -> list[str]:
@@ -56,8 +56,7 @@ def run(config: DictConfig) -> None:
     """Run the command. Without `html` it serves the page until it is interrupted."""
     from gmmtorch.cli.from_options import maps
     from gmmtorch.cli.reporting import map_outputs
-    from gmmtorch.live.map_page import write_page
-    from gmmtorch.live.map_viewer import MapViewer
+    from gmmtorch.live import MapViewer, write_page
 
     if not config.path:
         raise InvalidArgumentError("path is not set; give a map file or the run directory of gmmtorch-map.")
@@ -78,7 +77,7 @@ def open_live_view(config: DictConfig) -> LiveView | None:
     """The view of a map that grows, whose address it prints; None without `view`."""
     if not config.view:
         return None
-    from gmmtorch.live.live_view import LiveView
+    from gmmtorch.live import LiveView
 
     logging.getLogger("websockets").setLevel(logging.WARNING)  # it reports every connection
     with common.naming({"host": "view_host", "port": "view_port"}):

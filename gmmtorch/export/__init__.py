@@ -1,1 +1,5 @@
 """Files for other programs: map_server images, OctoMap trees, point clouds, mixtures."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from gmmtorch.datasets.recordings.trajectory import in_space, to_nanoseconds
+from gmmtorch.datasets import in_space, to_nanoseconds
 from gmmtorch.errors import InvalidArgumentError, OutputError
 from gmmtorch.export.message_fields import built_message, cloud_fields, odometry_fields, transform_fields
 from gmmtorch.optional_packages import needs_extra

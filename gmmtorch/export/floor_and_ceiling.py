@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mapping.components import Components
+from gmmtorch.mapping import Components
 
 if TYPE_CHECKING:
-    from gmmtorch.baselines.occupancy_grid import OccupancyGrid
+    from gmmtorch.occupancy import OccupancyGrid
 
 _UPRIGHT = 0.9
 """Least |n_z| of the normal of a horizontal surface: 26 degrees."""

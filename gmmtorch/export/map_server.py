@@ -16,8 +16,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.files import write_bytes
-from gmmtorch.occupancy.evidence import Thresholds
-from gmmtorch.occupancy.grid import VoxelGrid
+from gmmtorch.occupancy import Thresholds, VoxelGrid
 
 
 def highest_in_band(

@@ -18,8 +18,8 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
 from gmmtorch.linalg import ragged_index
-from gmmtorch.mapping.components import Components
-from gmmtorch.occupancy.grid import check_resolution
+from gmmtorch.mapping import Components
+from gmmtorch.occupancy import check_resolution
 
 _EXTENT = 2.0  # deviations that a component reaches along its surface; a uniform square ends at √3
 _BAND = 1.75  # cells on either side of a surface in which its distance counts

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gmmtorch.datasets.recordings.trajectory import NANOSECONDS
+from gmmtorch.datasets import NANOSECONDS
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.scan import ArrayLike
 

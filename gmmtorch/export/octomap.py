@@ -9,7 +9,7 @@ import numpy as np
 from gmmtorch.errors import InvalidArgumentError, OutputError
 from gmmtorch.export.point_cloud import CellCloud
 from gmmtorch.files import write_bytes
-from gmmtorch.occupancy.evidence import CellClass, Thresholds
+from gmmtorch.occupancy import CellClass, Thresholds
 from gmmtorch.optional_packages import load_pyoctomap
 
 _REACH = 1 << 15  # cells on either side of the origin, because OctoMap's keys have 16 bits

@@ -11,9 +11,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.files import write_bytes
-from gmmtorch.occupancy.evidence import occupancy_probability
-from gmmtorch.occupancy.grid import VoxelGrid, check_resolution
-from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
+from gmmtorch.occupancy import SparseEvidence, VoxelGrid, check_resolution, occupancy_probability
 
 _MIN_STEPS = 16  # least number of float32 values per cell side; with fewer, centres would be too inexact
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gmmtorch.datasets.recordings.trajectory import in_space
+from gmmtorch.datasets import in_space
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.files import write_bytes
 from gmmtorch.scan import ArrayLike

@@ -4,8 +4,6 @@ Each file holds one loop: the fused kernel, its twin in batched tensor operation
 chooses. The twin defines the result, carries gradients, and runs where the kernel compiler is missing.
 """
 
-from gmmtorch.kernels.choice import KERNELS as KERNELS
-from gmmtorch.kernels.choice import kernels as kernels
-from gmmtorch.kernels.choice import use_kernels as use_kernels
+import lazy_loader
 
-__all__ = ["KERNELS", "kernels", "use_kernels"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

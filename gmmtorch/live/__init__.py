@@ -1,1 +1,5 @@
 """Live maps: the browser viewer, and ROS 2 topics."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

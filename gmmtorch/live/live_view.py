@@ -15,8 +15,8 @@ from torch import Tensor
 from gmmtorch.live import viewer_scene
 from gmmtorch.live.map_viewer import MapViewer, Rgb
 from gmmtorch.live.scene_nodes import RobotNodes
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.report.style import colour
+from gmmtorch.mapping import GaussianMap
+from gmmtorch.report import colour
 
 _PERIOD = 0.5  # s between two pictures, at least
 _SHARE = 0.25  # of the time that the thread draws, at most

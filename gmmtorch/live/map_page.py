@@ -13,13 +13,12 @@ import numpy as np
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_choice
-from gmmtorch.export.mesh import surface_mesh
+from gmmtorch.export import surface_mesh
 from gmmtorch.files import write_bytes
 from gmmtorch.live import viewer_scene
 from gmmtorch.live.viewer_scene import Frame, Solid
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.report.table import byte_text
+from gmmtorch.mapping import Components, GaussianMap
+from gmmtorch.report import byte_text
 
 _TEMPLATE = Path(__file__).with_suffix(".html")
 _PLACE = "__MAP__"

@@ -16,11 +16,10 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_whole
-from gmmtorch.export.mesh import surface_mesh
+from gmmtorch.export import surface_mesh
 from gmmtorch.live import scene_nodes, viewer_scene
 from gmmtorch.live.map_page import write_page
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping import Components, GaussianMap
 from gmmtorch.optional_packages import needs_extra
 
 _PATH_COLOUR, _PATH_WIDTH = (213, 94, 0), 4.0

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from gmmtorch.export.mesh import TriangleMesh
+from gmmtorch.export import TriangleMesh
 from gmmtorch.live import viewer_scene
 from gmmtorch.live.viewer_scene import Slice, Solid
 

@@ -11,22 +11,22 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import check_choice
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.report.maps.map_figures import occupancy_colours
-from gmmtorch.report.maps.map_images import MapPanel, slice_image
-from gmmtorch.report.maps.map_regions import robust_bounds
-from gmmtorch.report.scenes.ellipsoids import (
+from gmmtorch.mapping import Components, GaussianMap
+from gmmtorch.occupancy import VoxelGrid
+from gmmtorch.report import (
     N_SIGMA,
+    SOUTH_WEST,
+    MapPanel,
     cut_away,
     first_viewpoints,
     height_colour_map,
+    height_scale,
+    occupancy_colours,
     principal_axes,
+    robust_bounds,
+    slice_image,
     unit_sphere,
 )
-from gmmtorch.report.scenes.scene import SOUTH_WEST
-from gmmtorch.report.style import height_scale
 
 SHAPES = ("ellipsoids", "splats", "surfaces", "none")
 """How components are drawn: 2σ ellipsoids, Gaussian splats, or the triangle mesh of the surfaces."""

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets.base import Dataset
+from gmmtorch.datasets import Dataset
 from gmmtorch.errors import DataError
 from gmmtorch.localization.location import Location
 from gmmtorch.localization.tracker import Tracker

@@ -29,9 +29,7 @@ from gmmtorch.localization.rigid_motions import (
     everywhere,
     measured_motion,
 )
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.surfaces import Surfaces, surface_mixture
+from gmmtorch.mapping import Components, GaussianMap, Surfaces, surface_mixture
 from gmmtorch.scan import check_positions
 
 _BLURS = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # metres, one level after the other

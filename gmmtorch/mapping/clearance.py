@@ -17,9 +17,8 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, check_number
 from gmmtorch.mapping.surfaces import Surfaces, surface_mixture, touching
-from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.occupancy.forms.flux.box_mass import normal_mass
-from gmmtorch.occupancy.protocol import check_queries
+from gmmtorch.mixture import Parameters
+from gmmtorch.occupancy import check_queries, normal_mass
 
 _CUTOFF = 7.0  # Mahalanobis cutoff: leaves out 3e-12 of the mass along an axis
 _NODES = 32  # Gauss–Legendre nodes along each axis of a ball but the last

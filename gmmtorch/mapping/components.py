@@ -13,7 +13,7 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike, as_tensor, naming_device
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.linalg import argsort, check_symmetric, on_cpu, safe_cholesky
-from gmmtorch.occupancy.cones import Cones
+from gmmtorch.occupancy import Cones
 from gmmtorch.scan import check_positions, extent
 
 _DTYPES = dict.fromkeys(("ids", "seen_by", "seen_from"), torch.int64) | {"max_range": torch.bool}

@@ -30,10 +30,7 @@ from gmmtorch.mapping.query_options import (
     Sampling,
     check_method,
 )
-from gmmtorch.occupancy.calibrator import Calibration
-from gmmtorch.occupancy.evidence import Evidence
-from gmmtorch.occupancy.grid import VoxelGrid, check_resolution
-from gmmtorch.occupancy.protocol import check_queries, check_scan
+from gmmtorch.occupancy import Calibration, Evidence, VoxelGrid, check_queries, check_resolution, check_scan
 from gmmtorch.scan import Scan, as_time, extent
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets.base import Dataset
+from gmmtorch.datasets import Dataset
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
 from gmmtorch.files import joined_tensors, pack_tensors, read_tensors, split_tensors, write_bytes
 from gmmtorch.mapping.gaussian_map import GaussianMap

@@ -22,7 +22,7 @@ from gmmtorch.mapping.learning.rules import LearningRule, WindowedRule, read_rul
 from gmmtorch.mapping.learning.windows import BeforeWindow, absorb, learn_window, no_prediction
 from gmmtorch.mapping.query import Query
 from gmmtorch.mapping.query_options import QueryOptions
-from gmmtorch.occupancy.calibrator import Calibrator
+from gmmtorch.occupancy import Calibrator
 from gmmtorch.scan import Scan
 
 _LONGEST_WINDOW = 40  # scans, if no scan yet shows how many points it holds

@@ -11,17 +11,25 @@ import torch
 from torch import Tensor
 
 from gmmtorch.mapping.query_options import QueryOptions, check_method
-from gmmtorch.occupancy.calibrator import Calibration
-from gmmtorch.occupancy.cone_index import ConeIndex
-from gmmtorch.occupancy.cones import CUTOFF, Cones, former_rows
-from gmmtorch.occupancy.culling import Pairs
-from gmmtorch.occupancy.evidence import Evidence, Rule, probability
-from gmmtorch.occupancy.forms.cone.cone_evidence import cone_evidence
-from gmmtorch.occupancy.forms.flux.box_flux import cell_flux, flux_evidence
-from gmmtorch.occupancy.forms.monte_carlo import sample_rays
-from gmmtorch.occupancy.forms.point import PointEvidence, PointForm
-from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
+from gmmtorch.occupancy import (
+    CUTOFF,
+    Calibration,
+    ConeIndex,
+    Cones,
+    Evidence,
+    Pairs,
+    PointEvidence,
+    PointForm,
+    Rule,
+    SparseEvidence,
+    VoxelGrid,
+    cell_flux,
+    cone_evidence,
+    flux_evidence,
+    former_rows,
+    probability,
+    sample_rays,
+)
 
 _RAYS_AT_ONCE = 1 << 20
 _CELLS_AT_ONCE = 1 << 20

@@ -9,7 +9,7 @@ from gmmtorch.errors import InvalidArgumentError, check_choice, check_prior, che
 from gmmtorch.mapping.learning.rules import LearningRule
 
 if TYPE_CHECKING:
-    from gmmtorch.occupancy.calibrator import Calibration
+    from gmmtorch.occupancy import Calibration
 else:
     Calibration = Any  # its module loads torch
 

@@ -15,8 +15,7 @@ from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
 from gmmtorch.linalg import check_symmetric, safe_cholesky
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.validation import checked_parameter
+from gmmtorch.mixture import Parameters, checked_parameter
 
 Surfaces = Components | GaussianMap | tuple[ArrayLike, ArrayLike, ArrayLike]
 """A map, its components, or (means (K, D), covariances (K, D, D), weights (K,))."""

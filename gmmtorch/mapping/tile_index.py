@@ -14,7 +14,7 @@ from gmmtorch.errors import DataError, GmmTorchError, check_number
 from gmmtorch.files import MAX_FILE_BYTES, pack_tensors, read_tensors, require
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.query import count_many, cutoff_of
-from gmmtorch.occupancy.cones import CUTOFF, cone_bounds
+from gmmtorch.occupancy import CUTOFF, cone_bounds
 from gmmtorch.scan import FARTHEST
 
 INDEX = "index.safetensors"

@@ -24,7 +24,7 @@ from gmmtorch.mapping.learning.rules import IncrementalRule
 from gmmtorch.mapping.query import mean_range
 from gmmtorch.mapping.tile_index import INDEX, TileIndex, index_row, tile_name
 from gmmtorch.mapping.tiles import TiledMap
-from gmmtorch.occupancy.calibrator import Calibration
+from gmmtorch.occupancy import Calibration
 
 SIDE = 100.0
 """Side (m) of the tiles if none is given."""

@@ -32,11 +32,7 @@ from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.query import Query, mean_range, rule_of
 from gmmtorch.mapping.query_options import check_method
 from gmmtorch.mapping.tile_index import INDEX, read_index, tile_name
-from gmmtorch.occupancy.calibrator import Calibration
-from gmmtorch.occupancy.evidence import Rule, probability
-from gmmtorch.occupancy.forms.point import PointEvidence
-from gmmtorch.occupancy.grid import check_resolution
-from gmmtorch.occupancy.protocol import check_queries
+from gmmtorch.occupancy import Calibration, PointEvidence, Rule, check_queries, check_resolution, probability
 
 _BYTES_EACH = 4096  # memory of a component that answers queries, most of it in the spatial index
 _REMEDY = "copy the folder again from where it was written, or merge the recordings again"

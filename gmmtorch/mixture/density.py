@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from gmmtorch.arrays import DeviceModule, check_unmasked
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
-from gmmtorch.kernels.chunks import chunk_elements
+from gmmtorch.kernels import chunk_elements
 from gmmtorch.linalg import inverse_factor, safe_cholesky
 from gmmtorch.mixture.em import by_type
 from gmmtorch.mixture.em import exact as em

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.kernels.evidence.hull_test import Lists, near_lists
+from gmmtorch.kernels import Lists, near_lists
 from gmmtorch.linalg import argsort, dense_ranks
 from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.grid import check_resolution

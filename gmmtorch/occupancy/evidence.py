@@ -15,11 +15,9 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.errors import check_prior as check_prior
-from gmmtorch.kernels.chunks import chunk_elements
-from gmmtorch.kernels.rays.cell_entropy import bernoulli_entropy as bernoulli_entropy
-from gmmtorch.kernels.rays.cell_entropy import occupancy_probability as occupancy_probability
-from gmmtorch.kernels.rays.ray_counting import count_in_grid
-from gmmtorch.kernels.rays.ray_traversal import CHUNK_VISITS
+from gmmtorch.kernels import CHUNK_VISITS, chunk_elements, count_in_grid
+from gmmtorch.kernels import bernoulli_entropy as bernoulli_entropy
+from gmmtorch.kernels import occupancy_probability as occupancy_probability
 from gmmtorch.occupancy.calibrator import Calibration
 from gmmtorch.occupancy.grid import VoxelGrid
 from gmmtorch.occupancy.voxels.boxes import flat_index

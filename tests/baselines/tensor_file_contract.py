@@ -10,9 +10,9 @@ import pytest
 from occupancy.protocol_contract import OccupancyMapContract, open_scan, wall_scan
 from torch import Tensor
 
-from gmmtorch.baselines.baseline_map import TensorFileMap
 from gmmtorch.errors import DataError
 from gmmtorch.files import pack_tensors, read_tensors
+from gmmtorch.occupancy.protocol import TensorFileMap
 
 Damage = dict[str, list[Callable[[Tensor], Tensor]]]
 """Changes of a tensor's values, by the name of the tensor, after which the file is refused."""

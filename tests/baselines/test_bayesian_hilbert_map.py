@@ -14,9 +14,10 @@ from occupancy.protocol_contract import RESOLUTION, lattice, open_scan, wall_sca
 from torch import Tensor
 from torch.distributions import MultivariateNormal, kl_divergence
 
-from gmmtorch.baselines.hilbert.bayesian_hilbert_map import BayesianHilbertMap
-from gmmtorch.baselines.hilbert.lattice_features import LatticeDesign, LatticeFeatures
-from gmmtorch.baselines.hilbert.logistic_regression import (
+from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
+from gmmtorch.experiments.baselines.hilbert.bayesian_hilbert_map import BayesianHilbertMap
+from gmmtorch.experiments.baselines.hilbert.lattice_features import LatticeDesign, LatticeFeatures
+from gmmtorch.experiments.baselines.hilbert.logistic_regression import (
     Posterior,
     fit_posterior,
     jaakkola_lambda,
@@ -24,8 +25,7 @@ from gmmtorch.baselines.hilbert.logistic_regression import (
     moments,
     variational_step,
 )
-from gmmtorch.baselines.samples import beam_samples
-from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
+from gmmtorch.experiments.baselines.samples import beam_samples
 from gmmtorch.scan import Scan
 
 
@@ -236,7 +236,7 @@ def test_a_map_with_full_covariance_is_saved_and_continues(tmp_path):
 
 def test_a_large_scan_learned_in_parts_gives_similar_occupancy(monkeypatch):
     whole = TestMeanField().built(wall_scan(2))
-    monkeypatch.setattr("gmmtorch.baselines.hilbert.lattice_features.CHUNK_VALUES", 1500)
+    monkeypatch.setattr("gmmtorch.experiments.baselines.hilbert.lattice_features.CHUNK_VALUES", 1500)
     parts = TestMeanField().built(wall_scan(2))
     theta = [made.occupancy(lattice(2)) for made in (whole, parts)]
     assert not torch.equal(*theta)
@@ -244,7 +244,7 @@ def test_a_large_scan_learned_in_parts_gives_similar_occupancy(monkeypatch):
 
 
 def test_full_covariance_rejects_too_many_hinges(monkeypatch):
-    monkeypatch.setattr("gmmtorch.baselines.hilbert.bayesian_hilbert_map._MAX_FULL", 10)
+    monkeypatch.setattr("gmmtorch.experiments.baselines.hilbert.bayesian_hilbert_map._MAX_FULL", 10)
     with pytest.raises(MemoryLimitError, match="mean_field"):
         full_map().insert(wall_scan(2))
 

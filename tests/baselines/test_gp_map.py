@@ -20,9 +20,9 @@ from occupancy.protocol_contract import (
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import ConstantKernel, Matern
 
-from gmmtorch.baselines.gp_map import GPMap, gp_regression
-from gmmtorch.baselines.samples import thinned_samples
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.experiments.baselines.gp_map import GPMap, gp_regression
+from gmmtorch.experiments.baselines.samples import thinned_samples
 from gmmtorch.scan import Scan
 
 

@@ -15,12 +15,12 @@ from sklearn.kernel_approximation import Nystroem
 from sklearn.linear_model import LogisticRegression
 from torch import Tensor
 
-from gmmtorch.baselines.bgk_map import sparse_kernel
-from gmmtorch.baselines.hilbert.hilbert_features import FourierFeatures, NystroemFeatures
-from gmmtorch.baselines.hilbert.hilbert_map import Features, HilbertMap
-from gmmtorch.baselines.hilbert.lattice_features import LatticeFeatures
-from gmmtorch.baselines.hilbert.logistic_regression import logistic_regression
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.experiments.baselines.bgk_map import sparse_kernel
+from gmmtorch.experiments.baselines.hilbert.hilbert_features import FourierFeatures, NystroemFeatures
+from gmmtorch.experiments.baselines.hilbert.hilbert_map import Features, HilbertMap
+from gmmtorch.experiments.baselines.hilbert.lattice_features import LatticeFeatures
+from gmmtorch.experiments.baselines.hilbert.logistic_regression import logistic_regression
 from gmmtorch.scan import Scan
 
 LEARNING = {"gap": RESOLUTION, "alpha": 0.05, "batch_size": 512, "learning_rate": 1.0}

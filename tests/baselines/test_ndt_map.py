@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from occupancy.protocol_contract import RESOLUTION, lattice, wall_scan
 from scipy.optimize import minimize_scalar
 
-from gmmtorch.baselines.ndt_map import NDTMap, closest_on_line, combine_moments
 from gmmtorch.errors import MemoryLimitError
+from gmmtorch.experiments.baselines.ndt_map import NDTMap, closest_on_line, combine_moments
 from gmmtorch.files import read_tensors
 from gmmtorch.linalg import unpack_symmetric
 from gmmtorch.scan import Scan

@@ -10,9 +10,9 @@ import torch
 from baselines.tensor_file_contract import TensorFileContract
 from occupancy.protocol_contract import RESOLUTION, lattice, open_scan, wall_scan
 
-from gmmtorch.baselines.occupancy_grid import LogOdds, OccupancyGrid
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import VoxelGrid
+from gmmtorch.occupancy.occupancy_grid import LogOdds, OccupancyGrid
 
 
 class GridContract(TensorFileContract):
@@ -44,7 +44,7 @@ class GridContract(TensorFileContract):
     def test_the_chunk_size_does_not_matter(self, monkeypatch):
         scans = [wall_scan(2, seed) for seed in range(6)]
         whole = self.ask(self.built(*scans), lattice(2))
-        monkeypatch.setattr("gmmtorch.baselines.occupancy_grid._CHUNK_RAYS", 300)
+        monkeypatch.setattr("gmmtorch.occupancy.occupancy_grid._CHUNK_RAYS", 300)
         assert torch.equal(self.ask(self.built(*scans), lattice(2)), whole)
 
 

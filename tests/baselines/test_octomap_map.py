@@ -11,9 +11,9 @@ import pytest
 import torch
 from occupancy.protocol_contract import RESOLUTION, OccupancyMapContract, lattice, open_scan, wall_scan
 
-from gmmtorch.baselines.occupancy_grid import OccupancyGrid
-from gmmtorch.baselines.octomap_map import OctoMapMap
 from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.experiments.baselines.octomap_map import OctoMapMap
+from gmmtorch.occupancy.occupancy_grid import OccupancyGrid
 from gmmtorch.scan import Scan
 
 pyoctomap = pytest.importorskip("pyoctomap")

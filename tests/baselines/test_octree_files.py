@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gmmtorch.baselines.octomap_map import OctoMapMap
-from gmmtorch.baselines.octree_files import parsed_octree
 from gmmtorch.errors import DataError, MissingDataError
+from gmmtorch.experiments.baselines.octomap_map import OctoMapMap
+from gmmtorch.experiments.baselines.octree_files import parsed_octree
 from gmmtorch.scan import Scan
 
 pyoctomap = pytest.importorskip("pyoctomap")

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import pytest
 import torch
 
-from gmmtorch.baselines import BayesianHilbertMap, BGKMap, HilbertMap, OccupancyGrid
-from gmmtorch.baselines.baseline_map import BaselineMap
 from gmmtorch.datasets import load
-from gmmtorch.evaluation import metrics, queries
+from gmmtorch.experiments.baselines import BayesianHilbertMap, BGKMap, HilbertMap, OccupancyGrid
+from gmmtorch.experiments.evaluation import metrics, queries
+from gmmtorch.occupancy.protocol import BaselineMap
 from gmmtorch.scan import Scan
 
 pytestmark = pytest.mark.real_data

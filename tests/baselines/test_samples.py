@@ -9,8 +9,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmmtorch.baselines.samples import beam_samples, centroids, thinned_samples
 from gmmtorch.errors import MemoryLimitError
+from gmmtorch.experiments.baselines.samples import beam_samples, centroids, thinned_samples
 from gmmtorch.scan import Scan
 
 

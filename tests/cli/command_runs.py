@@ -21,11 +21,21 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
 
-from gmmtorch.cli import common, explore, export, fit, localize, map, occupancy, robot, ros, team, view
-from gmmtorch.cli.options import schema
+from gmmtorch.cli import common, export, localize, map, view
+from gmmtorch.experiments.cli import experiment_schema, fit, occupancy
+from gmmtorch.team.cli import explore, robot, ros, team
+from gmmtorch.team.cli.options import team_schema
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 CONF = Path(common.conf_dir())
+
+
+def register_schemas() -> None:
+    """Stores the options of all commands in Hydra's config store."""
+    experiment_schema.register()
+    team_schema.register()
+
+
 COMMANDS = {
     "occupancy": occupancy,
     "fit": fit,
@@ -47,7 +57,7 @@ TINY = {
 
 def composed(command: str, *overrides: str) -> DictConfig:
     """The configuration of a command, with these overrides."""
-    schema.register()
+    register_schemas()
     with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
         return compose(command, overrides=list(overrides))
 

@@ -12,14 +12,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from command_runs import COMMANDS, QUIET, Finished, refused, run_here, succeeded
+from command_runs import COMMANDS, QUIET, Finished, refused, register_schemas, run_here, succeeded
 from omegaconf import DictConfig
 
 import gmmtorch
-from gmmtorch.cli import common, explore, occupancy
-from gmmtorch.cli.options import command_options, schema
+from gmmtorch.cli import common
+from gmmtorch.cli.options import command_options
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.experiments.cli import occupancy
 from gmmtorch.kernels import compiler
+from gmmtorch.team.cli import explore
 
 
 @pytest.fixture
@@ -140,7 +142,7 @@ def test_the_help_describes_every_option_in_a_line(command, run):
 
 @pytest.mark.slow
 def test_every_option_of_every_choice_is_described():
-    schema.register()
+    register_schemas()
     seen = set()  # a choice has the same options in every command
     for command in COMMANDS:
         groups = command_options.groups_of(command)

@@ -10,17 +10,17 @@ import pytest
 from command_runs import QUIET, Finished, refused, run_here, succeeded
 
 from gmmtorch import datasets
-from gmmtorch.baselines.bgk_map import BGKMap
-from gmmtorch.baselines.bgk_points_map import BGKPointsMap
-from gmmtorch.baselines.gp_map import GPMap
-from gmmtorch.baselines.hilbert.bayesian_hilbert_map import BayesianHilbertMap
-from gmmtorch.baselines.hilbert.hilbert_map import HilbertMap
-from gmmtorch.baselines.ndt_map import NDTMap
-from gmmtorch.baselines.occupancy_grid import OccupancyGrid
-from gmmtorch.baselines.octomap_map import OctoMapMap
-from gmmtorch.evaluation import methods
-from gmmtorch.evaluation.queries import FREE, OCCUPIED
+from gmmtorch.experiments.baselines.bgk_map import BGKMap
+from gmmtorch.experiments.baselines.bgk_points_map import BGKPointsMap
+from gmmtorch.experiments.baselines.gp_map import GPMap
+from gmmtorch.experiments.baselines.hilbert.bayesian_hilbert_map import BayesianHilbertMap
+from gmmtorch.experiments.baselines.hilbert.hilbert_map import HilbertMap
+from gmmtorch.experiments.baselines.ndt_map import NDTMap
+from gmmtorch.experiments.baselines.octomap_map import OctoMapMap
+from gmmtorch.experiments.evaluation import methods
+from gmmtorch.experiments.evaluation.queries import FREE, OCCUPIED
 from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.occupancy.occupancy_grid import OccupancyGrid
 
 Run = Callable[..., Finished]
 BASELINES = {
@@ -61,7 +61,7 @@ def all_methods(tmp_path_factory: pytest.TempPathFactory) -> Finished:
 
 
 def test_all_methods_are_tested():
-    assert set(methods.methods(GaussianMap)) == {*OURS, *BASELINES}
+    assert set(methods(GaussianMap)) == {*OURS, *BASELINES}
 
 
 @pytest.mark.parametrize("method", [*OURS, *BASELINES])

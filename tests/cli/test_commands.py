@@ -25,9 +25,9 @@ from command_runs import (
 )
 
 import gmmtorch
-from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
+from gmmtorch.occupancy.occupancy_grid import OccupancyGrid
 
 Run = Callable[..., Finished]
 OCCUPANCY_FIELDS = {

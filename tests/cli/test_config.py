@@ -13,31 +13,34 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_runs import CHECKOUT, CONF, as_it_was, composed, run_python
+from command_runs import CHECKOUT, COMMANDS, CONF, as_it_was, composed, register_schemas, run_python
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.errors import ConfigCompositionException
 from omegaconf import DictConfig, OmegaConf
 
-from gmmtorch import datasets
 from gmmtorch.cli import common, export, localize
-from gmmtorch.cli.from_options import maps, missions
-from gmmtorch.cli.from_options.scans import fit_options, open_dataset
-from gmmtorch.cli.options import schema
-from gmmtorch.cli.studies import fit_studies, occupancy_studies
+from gmmtorch.cli.from_options import maps
+from gmmtorch.cli.from_options.scans import open_dataset
+from gmmtorch.datasets import sources
 from gmmtorch.errors import InvalidArgumentError, MissingDataError
-from gmmtorch.evaluation import methods
-from gmmtorch.evaluation.fits.fit_comparison import ESTIMATORS
-from gmmtorch.exploration.mission.options import FRAMEWORKS, THESIS, TeamOptions
-from gmmtorch.exploration.mission.trials import WorldOptions
-from gmmtorch.exploration.planning.planners import PLANNERS
+from gmmtorch.experiments.cli import methods_of_options
+from gmmtorch.experiments.cli.experiment_schema import STUDIES
+from gmmtorch.experiments.cli.fits_of_options import fit_options
+from gmmtorch.experiments.cli.studies import fit_studies, occupancy_studies
+from gmmtorch.experiments.evaluation import methods
+from gmmtorch.experiments.evaluation.fits.fit_comparison import ESTIMATORS
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
 from gmmtorch.simulation.worlds.tunnels import tunnels
 from gmmtorch.simulation.worlds.warehouse import warehouse
+from gmmtorch.team.cli.from_options import missions
+from gmmtorch.team.exploration.mission.options import FRAMEWORKS, THESIS, TeamOptions
+from gmmtorch.team.exploration.mission.trials import WorldOptions
+from gmmtorch.team.exploration.planning.planners import PLANNERS
 
-COMMANDS = ["occupancy", "fit"]
-CONFIGURED = [*COMMANDS, "map", "explore", "robot", "team", "export", "view", "ros", "localize"]
+SCORED = ["occupancy", "fit"]
+CONFIGURED = [*SCORED, "map", "explore", "robot", "team", "export", "view", "ros", "localize"]
 MAPS = {
     "incremental": IncrementalRule(),
     "per_scan": WindowedRule(window=1, max_origins=1),
@@ -59,7 +62,7 @@ def listed(command: str) -> dict[str, list[str]]:
     return {name: re.findall(r"\w+", text) for name, text in zip(groups[::2], groups[1::2], strict=True)}
 
 
-EXPERIMENTS = [(command, name) for command in COMMANDS for name in listed(command)["experiment"]]
+EXPERIMENTS = [(command, name) for command in SCORED for name in listed(command)["experiment"]]
 
 
 @pytest.fixture(autouse=True)
@@ -78,7 +81,7 @@ def plain(node: DictConfig) -> dict[str, Any]:
 @pytest.mark.parametrize("dataset", choices("dataset"))
 def test_every_data_set_composes_and_its_reader_takes_its_options(dataset, tmp_path):
     config = composed("fit", f"dataset={dataset}").dataset
-    source = datasets._SOURCES[dataset]
+    source = sources._SOURCES[dataset]
     assert (config.name, config.get("stride", 1)) == (dataset, 1)
     assert (config.no_return_range, config.max_range) == (source.no_return_range, source.max_range)
     if "path" not in list(config):  # `in` is False for a missing value
@@ -98,7 +101,7 @@ def test_every_experiment_composes_and_its_methods_and_study_exist(command, name
     assert config.seed == 77
     assert not OmegaConf.missing_keys(config)
     if config.study is None:
-        known = ESTIMATORS if command == "fit" else methods.methods(GaussianMap)
+        known = ESTIMATORS if command == "fit" else methods(GaussianMap)
         assert set(config.method) <= set(known)
         return
     studies = fit_studies.STUDIES if command == "fit" else occupancy_studies.STUDIES
@@ -114,8 +117,8 @@ def test_every_experiment_composes_and_its_methods_and_study_exist(command, name
 
 def test_every_study_has_an_experiment():
     configs = [composed(command, f"experiment={name}") for command, name in EXPERIMENTS]
-    assert {config.study.name for config in configs if config.study is not None} == schema.STUDIES.keys()
-    assert schema.STUDIES.keys() == {*fit_studies.STUDIES, *occupancy_studies.STUDIES}
+    assert {config.study.name for config in configs if config.study is not None} == STUDIES.keys()
+    assert STUDIES.keys() == {*fit_studies.STUDIES, *occupancy_studies.STUDIES}
 
 
 @pytest.mark.parametrize("name", listed("explore")["experiment"])
@@ -189,7 +192,7 @@ def test_an_experiment_can_run_on_another_data_set(command, name):
 
 @pytest.mark.parametrize("command", CONFIGURED[: CONFIGURED.index("export")])
 def test_results_go_to_a_folder_in_outputs(command):
-    schema.register()
+    register_schemas()
     with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
         node = compose(command, return_hydra_config=True, overrides=["hydra.job.num=3"]).hydra
         assert node.job.name == command
@@ -224,7 +227,7 @@ def test_wrong_types_and_names_raise_and_are_named(override):
 
 def stored(*path: str) -> Any:
     """The node with this group and name in Hydra's store."""
-    schema.register()
+    register_schemas()
     folder = ["schema"] if len(path) > 1 else []
     return ConfigStore.instance().load("/".join([*folder, *path]) + ".yaml").node
 
@@ -245,7 +248,7 @@ def differences(config: Any, expected: Any, prefix: str = "") -> Iterator[str]:
 def test_the_files_repeat_the_defaults_of_the_schema(command):
     config = composed(command)
     assert OmegaConf.missing_keys(config) == (set())
-    changed = {"method"} if command in COMMANDS else {"clock"} if command == "team" else set()
+    changed = {"method"} if command in SCORED else {"clock"} if command == "team" else set()
     expected = OmegaConf.structured(stored(f"{'robot' if command == 'team' else command}_schema"))
     assert set(differences(config, expected)) == changed | ({"scans"} if command == "fit" else set())
     assert set(config) >= set(expected)
@@ -304,10 +307,10 @@ def test_an_exploration_of_the_options_is_the_default_one(tmp_path):
 
 
 def test_a_fit_of_the_options_is_the_default_one():
-    from gmmtorch.evaluation.protocol_options import FitOptions, Protocol
+    from gmmtorch.experiments.evaluation.protocol_options import FitOptions, Protocol
 
     assert fit_options(composed("fit")) == FitOptions()
-    assert maps.protocol_of(composed("occupancy")) == Protocol()
+    assert methods_of_options.protocol_of(composed("occupancy")) == Protocol()
 
 
 def test_robots_and_teams_have_the_options_of_an_exploration():
@@ -382,11 +385,11 @@ _HEAVY = {"torch", "numpy", "scipy", "sklearn", "matplotlib", "open3d", "safeten
 _SHOW_ALL = """
 import importlib, sys
 from hydra.core.global_hydra import GlobalHydra
-for command in {commands}:
+for command, module in {commands}.items():
     sys.argv = ["gmmtorch-" + command, *{arguments}]
     print("=====", command)
     try:
-        importlib.import_module("gmmtorch.cli." + command).main()
+        importlib.import_module(module).main()
     except SystemExit as end:
         assert not end.code, end.code
     GlobalHydra.instance().clear()
@@ -398,7 +401,15 @@ print(*sys.modules, file=sys.stderr)
 
 def shown_by(commands: list[str], *arguments: str, cwd: Path) -> dict[str, str]:
     """Standard output of each command in one new process, which must import nothing heavy."""
-    done = run_python(["-c", _SHOW_ALL.format(commands=commands, arguments=list(arguments))], cwd=cwd)
+    done = run_python(
+        [
+            "-c",
+            _SHOW_ALL.format(
+                commands={name: COMMANDS[name].__name__ for name in commands}, arguments=list(arguments)
+            ),
+        ],
+        cwd=cwd,
+    )
     assert done.returncode == 0, done.stderr
     modules = set(done.stderr.split())
     assert {"hydra", "gmmtorch.cli.common"} <= modules
@@ -416,10 +427,10 @@ def test_configuration_is_shown_without_heavy_imports(tmp_path):
 _REFUSE = """
 import importlib, sys
 from hydra.core.global_hydra import GlobalHydra
-for command, *arguments in {runs}:
+for command, module, *arguments in {runs}:
     sys.argv = ["gmmtorch-" + command, *arguments, "hydra.run.dir=run"]
     try:
-        importlib.import_module("gmmtorch.cli." + command).main()
+        importlib.import_module(module).main()
     except SystemExit as end:
         print(end.code)
     GlobalHydra.instance().clear()
@@ -437,7 +448,10 @@ def test_inputs_that_do_not_exist_are_refused_without_heavy_imports(tmp_path):
         ("localize", "map=none"),
         ("explore", "world=mesh", "world.path=none.ply"),
     ]
-    done = run_python(["-c", _REFUSE.format(runs=runs)], cwd=tmp_path)
+    done = run_python(
+        ["-c", _REFUSE.format(runs=[(run[0], COMMANDS[run[0]].__name__, *run[1:]) for run in runs])],
+        cwd=tmp_path,
+    )
     assert not _HEAVY & set(done.stderr.split())
     options = ("points", "points", "path", "path", "output", "map.path", "world.path")
     for option, line in zip(options, done.stdout.splitlines(), strict=True):
@@ -498,7 +512,7 @@ def test_help_names_every_choice_of_every_group():
 @pytest.mark.parametrize("command", CONFIGURED)
 def test_every_command_is_installed_and_has_a_script(command, monkeypatch):
     entries = {point.name: point.value for point in entry_points(group="console_scripts")}
-    assert entries[f"gmmtorch-{command}"] == f"gmmtorch.cli.{command}:main"
+    assert entries[f"gmmtorch-{command}"] == f"{COMMANDS[command].__name__}:main"
     script = CHECKOUT / "scripts" / f"{command}.py"
     assert script.read_text(encoding="utf-8").startswith("#!")
     assert os.access(script, os.X_OK)

@@ -13,7 +13,6 @@ import torch
 from command_runs import Finished, as_it_was, refused, run_here, succeeded
 from export.map_examples import read_map_image
 
-from gmmtorch.baselines.occupancy_grid import LogOdds, OccupancyGrid
 from gmmtorch.cli import common
 from gmmtorch.cli.reporting import exported_files
 from gmmtorch.datasets import load
@@ -21,6 +20,7 @@ from gmmtorch.export.mixture_formats import read_gira_csv, read_npz
 from gmmtorch.export.trajectory_files import write_tum
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mixture import GaussianMixture
+from gmmtorch.occupancy.occupancy_grid import LogOdds, OccupancyGrid
 from gmmtorch.scan import Scan
 
 CONF = Path(common.conf_dir())

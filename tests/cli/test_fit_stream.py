@@ -141,7 +141,15 @@ def test_an_invalid_option_gives_a_one_line_error(run, cloud, options, said):
 )
 def test_jobs_of_a_sweep_can_run_in_parallel(tmp_path):
     options = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
-    arguments = ["-m", "gmmtorch.cli.fit", "-m", *options, *TINY["fit"], *QUIET, "mixture.n_components=2,3"]
+    arguments = [
+        "-m",
+        "gmmtorch.experiments.cli.fit",
+        "-m",
+        *options,
+        *TINY["fit"],
+        *QUIET,
+        "mixture.n_components=2,3",
+    ]
     done = subprocess.run(
         [sys.executable, *arguments],
         cwd=CHECKOUT,

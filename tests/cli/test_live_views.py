@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 from command_runs import QUIET, Finished, refused, room_mesh, run_here, succeeded
 
-from gmmtorch.cli import explore, robot, team
 from gmmtorch.cli import map as map_command
 from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.team.cli import explore, robot, team
 
 pytest.importorskip("viser")
 

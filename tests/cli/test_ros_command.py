@@ -25,8 +25,6 @@ from exploration.replays import content
 from mapping.random_components import random_components
 
 from gmmtorch.cli import common
-from gmmtorch.cli.from_options import links
-from gmmtorch.cli.from_options.robots import shared_map
 from gmmtorch.datasets.base import Ranges
 from gmmtorch.datasets.recordings.ros.bag_reader import Topic
 from gmmtorch.datasets.recordings.ros.bag_topics import LASER as LASERS
@@ -37,9 +35,11 @@ from gmmtorch.live.mapper.live_scans import LiveOptions, LiveScans
 from gmmtorch.live.ros import Node
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.map_builder import MapBuilder
-from gmmtorch.sharing import Replica
-from gmmtorch.sharing.shared_map import SharedMap
-from gmmtorch.sharing.transport.udp import UdpTransport
+from gmmtorch.team.cli.from_options import links
+from gmmtorch.team.cli.from_options.robots import shared_map
+from gmmtorch.team.sharing import Replica
+from gmmtorch.team.sharing.shared_map import SharedMap
+from gmmtorch.team.sharing.transport.udp import UdpTransport
 
 LASER = "sensor_msgs/msg/LaserScan"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"

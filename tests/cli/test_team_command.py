@@ -17,12 +17,12 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 from sharing.test_publish import everything
 
-from gmmtorch.cli import team
-from gmmtorch.cli.from_options.robots import facts_of
-from gmmtorch.cli.team import RobotProcess
-from gmmtorch.sharing.replica.replica import Replica
-from gmmtorch.sharing.store import Store
-from gmmtorch.sharing.transport.team_key import KEY_VARIABLE
+from gmmtorch.team.cli import team
+from gmmtorch.team.cli.from_options.robots import facts_of
+from gmmtorch.team.cli.team import RobotProcess
+from gmmtorch.team.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.store import Store
+from gmmtorch.team.sharing.transport.team_key import KEY_VARIABLE
 
 Run = Callable[..., Finished]
 

@@ -10,8 +10,8 @@ import torch
 from scipy import integrate
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.studies.angular_reference import angular_evidence
-from gmmtorch.evaluation.studies.error_scenes import Scene, cast_rays, random_scene
+from gmmtorch.experiments.studies.angular_reference import angular_evidence
+from gmmtorch.experiments.studies.error_scenes import Scene, cast_rays, random_scene
 from gmmtorch.occupancy.cones import Cones
 
 

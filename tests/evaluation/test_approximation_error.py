@@ -11,10 +11,10 @@ import torch
 from pillar_room import timeless
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.studies.approximation_error import map_rows, run, sweep_rows
-from gmmtorch.evaluation.studies.error_scenes import Scene, cast_rays, methods, random_scene
-from gmmtorch.evaluation.studies.study_options import ApproximationErrorStudy
-from gmmtorch.report.studies.approximation_error_figures import figures
+from gmmtorch.experiments.report.approximation_error_figures import approximation_figures
+from gmmtorch.experiments.studies.approximation_error import map_rows, run_approximation_error, sweep_rows
+from gmmtorch.experiments.studies.error_scenes import Scene, cast_rays, methods, random_scene
+from gmmtorch.experiments.studies.study_options import ApproximationErrorStudy
 
 SMALL = ApproximationErrorStudy(
     dims=(2,),
@@ -31,7 +31,7 @@ SMALL = ApproximationErrorStudy(
 
 @pytest.fixture(scope="module")
 def rows() -> list[dict[str, Any]]:
-    return run(SMALL, seed=0)
+    return run_approximation_error(SMALL, seed=0)
 
 
 def of(rows: list[dict[str, Any]], study: str) -> Iterator[dict[str, Any]]:
@@ -98,7 +98,9 @@ def test_monte_carlo_and_flux_converge_on_a_grid(rows):
 def test_rows_depend_only_on_the_seed_and_progress_is_complete(rows):
     events: list[tuple[str, int, int | None]] = []
     seen: list[int] = []
-    again = run(SMALL, 0, lambda *event: events.append(event), lambda rows: seen.append(len(rows)))
+    again = run_approximation_error(
+        SMALL, 0, lambda *event: events.append(event), lambda rows: seen.append(len(rows))
+    )
     assert timeless(again) == timeless(rows)
     assert [done for _, done, _ in events] == [0, 1, 2, 3]
     assert seen == list(range(1, len(rows) + 1))
@@ -118,7 +120,7 @@ def test_cast_rays_distinguishes_hits_misses_and_no_crossing(generator):
 
 
 def test_every_study_has_a_figure(rows):
-    drawn = figures(rows)
+    drawn = approximation_figures(rows)
     assert list(drawn) == [
         "approximation_error",
         "approximation_error_probability",
@@ -128,7 +130,7 @@ def test_every_study_has_a_figure(rows):
     for figure in drawn.values():
         figure.canvas.draw()
         assert figure.get_suptitle()
-    assert list(figures(list(of(rows, "sweep")))) == ["approximation_error_sweep"]
+    assert list(approximation_figures(list(of(rows, "sweep")))) == ["approximation_error_sweep"]
 
 
 @pytest.mark.parametrize(

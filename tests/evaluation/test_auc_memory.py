@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from evaluation.pillar_room import room_scans
 
-from gmmtorch.evaluation.held_out import Protocol, evaluate
-from gmmtorch.evaluation.methods import Form, MapFactory, methods
-from gmmtorch.evaluation.studies import auc_memory
-from gmmtorch.evaluation.studies.auc_memory import Sized
+from gmmtorch.experiments.evaluation.held_out import Protocol, evaluate
+from gmmtorch.experiments.evaluation.mapping_methods import Form, MapFactory, methods
+from gmmtorch.experiments.studies import auc_memory
+from gmmtorch.experiments.studies.auc_memory import Sized
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import WindowedRule
 
@@ -27,7 +27,9 @@ def test_every_sized_method_has_a_row():
         Sized("grid", None, grid),
     ]
     counts: list[int] = []
-    rows = auc_memory.run("room", scans, sized, PROTOCOL, on_rows=lambda rows: counts.append(len(rows)))
+    rows = auc_memory.run_auc_memory(
+        "room", scans, sized, PROTOCOL, on_rows=lambda rows: counts.append(len(rows))
+    )
     assert [(row["method"], row["size"]) for row in rows] == [("point", 4), ("point", 12), ("grid", None)]
     assert counts == [1, 2, 3]
     assert rows[0]["nbytes"] < rows[1]["nbytes"]

@@ -12,20 +12,19 @@ from sklearn.calibration import calibration_curve
 from sklearn.metrics import brier_score_loss, log_loss
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.calibration import (
+from gmmtorch.experiments.evaluation.calibration import (
     SeenPredictions,
     accuracy,
     brier_score,
     log_loss_bits,
     prior_and_dead_band,
     reliability,
-    reliability_of,
     scores,
-    scores_of,
 )
-from gmmtorch.evaluation.queries import hit_and_free
+from gmmtorch.experiments.evaluation.queries import hit_and_free
 from gmmtorch.occupancy.calibrator import N_BINS, Calibrator
 from gmmtorch.occupancy.evidence import occupancy_probability
+from gmmtorch.occupancy.reliability import reliability_of, scores_of
 from gmmtorch.scan import Scan
 
 

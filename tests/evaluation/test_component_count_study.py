@@ -12,17 +12,17 @@ from sklearn.cluster import MeanShift
 
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.fits.fit_comparison import FitData, Row, split
-from gmmtorch.evaluation.protocol_options import FitOptions
-from gmmtorch.evaluation.studies import component_count
-from gmmtorch.evaluation.studies.component_count import (
+from gmmtorch.experiments.evaluation.fits.fit_comparison import FitData, Row, split
+from gmmtorch.experiments.evaluation.protocol_options import FitOptions
+from gmmtorch.experiments.studies import component_count
+from gmmtorch.experiments.studies.component_count import (
     RULES,
     component_bytes,
     count_modes,
     middle,
-    run,
+    run_component_count,
 )
-from gmmtorch.evaluation.studies.study_options import ComponentCountStudy
+from gmmtorch.experiments.studies.study_options import ComponentCountStudy
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mixture import GaussianMixture
 from gmmtorch.scan import Scan
@@ -53,7 +53,7 @@ def data(scans) -> FitData:
 
 @pytest.fixture(scope="module")
 def rows(data, scans) -> list[Row]:
-    return run(data, scans, STUDY, EM)
+    return run_component_count(data, scans, STUDY, EM)
 
 
 def of(rows: list[Row], rule: str) -> list[Row]:
@@ -138,14 +138,16 @@ def test_a_fixed_map_has_its_number_of_components_per_window(rows, scans):
 
 
 def test_rows_depend_only_on_the_seed(rows, data, scans):
-    assert timeless(run(data, scans, STUDY, EM)) == timeless(rows)
+    assert timeless(run_component_count(data, scans, STUDY, EM)) == timeless(rows)
 
 
 def test_rows_are_reported_one_by_one(data, scans):
     seen: list[int] = []
     events: list[tuple[str, int, int | None]] = []
     study = ComponentCountStudy((2,), multiples=(1.0,), bandwidths=(), window_components=())
-    found = run(data, scans, study, EM, 0, lambda *event: events.append(event), lambda r: seen.append(len(r)))
+    found = run_component_count(
+        data, scans, study, EM, 0, lambda *event: events.append(event), lambda r: seen.append(len(r))
+    )
     assert [row["rule"] for row in found] == ["fixed", "flat_pieces", "hierarchical", "bic"]
     assert seen == [1, 2, 3, 4]
     assert events == [("components", done, 3) for done in range(4)]
@@ -172,7 +174,7 @@ def test_component_bytes_count_four_bytes_per_parameter():
 )
 def test_invalid_options_raise(options, message, data, scans):
     with pytest.raises(InvalidArgumentError, match=message):
-        run(data, scans, ComponentCountStudy(**options), EM)
+        run_component_count(data, scans, ComponentCountStudy(**options), EM)
 
 
 @pytest.mark.real_data
@@ -183,7 +185,7 @@ def test_flat_pieces_match_the_curve_on_a_depth_image(real_data):
         pytest.skip(f"{path} is not there")
     scan = load("depth_frames", path, pixel_stride=4)[40]
     study = ComponentCountStudy((64, 128, 256), multiples=(1.0,), bandwidths=(), window_components=())
-    found = run(split("kinect", scan.points, 0.5, 0), [scan], study)
+    found = run_component_count(split("kinect", scan.points, 0.5, 0), [scan], study)
     pieces, (few, *_, many) = of(found, "flat_pieces")[0], of(found, "fixed")
     assert few["n_components"] < pieces["n_components"] < many["n_components"]
     assert pieces["held_out_log_likelihood"] > few["held_out_log_likelihood"] - 0.05

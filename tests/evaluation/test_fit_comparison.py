@@ -16,11 +16,11 @@ from sklearn.mixture import GaussianMixture as ScikitLearnMixture
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.events import ignore
-from gmmtorch.evaluation.fits.fit_comparison import ESTIMATORS, FitOutcome, compare, means, split
-from gmmtorch.evaluation.fits.fit_pruning import Views
-from gmmtorch.evaluation.metrics import psnr2
-from gmmtorch.evaluation.protocol_options import FitOptions
+from gmmtorch.events import ignore
+from gmmtorch.experiments.evaluation.fits.fit_comparison import ESTIMATORS, FitOutcome, compare, means, split
+from gmmtorch.experiments.evaluation.fits.fit_pruning import Views
+from gmmtorch.experiments.evaluation.metrics import psnr2
+from gmmtorch.experiments.evaluation.protocol_options import FitOptions
 from gmmtorch.mixture.estimators.sensor_model import measured_sensor
 from gmmtorch.mixture.reduction.prune_options import PruneOptions
 from gmmtorch.mixture.reduction.pruning import prune

@@ -11,13 +11,13 @@ import pytest
 import torch
 from pillar_room import room_scans, timeless
 
-from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.held_out import Outcome, evaluate
-from gmmtorch.evaluation.methods import MapFactory, choose, methods
-from gmmtorch.evaluation.protocol_options import Protocol
+from gmmtorch.experiments.evaluation.held_out import Outcome, evaluate
+from gmmtorch.experiments.evaluation.mapping_methods import MapFactory, choose, methods
+from gmmtorch.experiments.evaluation.protocol_options import Protocol
 from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.occupancy.occupancy_grid import OccupancyGrid
 from gmmtorch.scan import Scan
 
 CONTRACT: dict[str, type] = {

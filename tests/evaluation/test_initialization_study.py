@@ -10,12 +10,12 @@ import torch
 from pillar_room import timeless
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.events import ignore
-from gmmtorch.evaluation.fits.fit_comparison import FitData, Row, compare, split
-from gmmtorch.evaluation.protocol_options import FitOptions
-from gmmtorch.evaluation.studies import initialization_study as initialization
-from gmmtorch.evaluation.studies.initialization_study import box_covariances, fit_timed, run
-from gmmtorch.evaluation.studies.study_options import InitializationStudy
+from gmmtorch.events import ignore
+from gmmtorch.experiments.evaluation.fits.fit_comparison import FitData, Row, compare, split
+from gmmtorch.experiments.evaluation.protocol_options import FitOptions
+from gmmtorch.experiments.studies import initialization_study as initialization
+from gmmtorch.experiments.studies.initialization_study import box_covariances, fit_timed, run_initialization
+from gmmtorch.experiments.studies.study_options import InitializationStudy
 from gmmtorch.mixture.em.initialization import INITIALIZATIONS
 
 EM = FitOptions(max_iter=20, algorithm="exact")
@@ -29,7 +29,7 @@ def data(generator) -> FitData:
 
 
 def rows_of(data: FitData, study: InitializationStudy = SMALL, seed: int = 0) -> list[Row]:
-    return run(data, study, EM, seed, ignore, lambda rows: None)
+    return run_initialization(data, study, EM, seed, ignore, lambda rows: None)
 
 
 def test_a_row_for_each_initialization_number_and_seed(data):
@@ -85,7 +85,9 @@ def test_rows_depend_only_on_the_seed(data):
 def test_rows_are_reported_one_by_one_and_progress_is_complete(data):
     seen: list[int] = []
     events: list[tuple[str, int, int | None]] = []
-    run(data, SMALL, EM, 0, lambda *event: events.append(event), lambda rows: seen.append(len(rows)))
+    run_initialization(
+        data, SMALL, EM, 0, lambda *event: events.append(event), lambda rows: seen.append(len(rows))
+    )
     assert seen == list(range(1, 9))
     assert events == [("starts", done, 8) for done in range(9)]
 

@@ -15,7 +15,7 @@ from sklearn.metrics import roc_auc_score
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.metrics import (
+from gmmtorch.experiments.evaluation.metrics import (
     auc_gain,
     auc_interval,
     psnr2,

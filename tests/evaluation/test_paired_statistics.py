@@ -12,7 +12,12 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.paired_statistics import mean_band, on_common_times, paired_interval, time_to_share
+from gmmtorch.team.exploration.mission.paired_statistics import (
+    mean_band,
+    on_common_times,
+    paired_interval,
+    time_to_share,
+)
 
 
 @pytest.mark.parametrize("n", [2, 5, 30])

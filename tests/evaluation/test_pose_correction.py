@@ -10,9 +10,9 @@ from pillar_room import room_scans
 
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.protocol_options import Protocol
-from gmmtorch.evaluation.queries import perturb_poses, pose_perturbations
-from gmmtorch.evaluation.studies.pose_correction import build_by_scan, correct_poses, evaluate_correction
+from gmmtorch.experiments.evaluation.protocol_options import Protocol
+from gmmtorch.experiments.evaluation.queries import perturb_poses, pose_perturbations
+from gmmtorch.experiments.studies.pose_correction import build_by_scan, correct_poses, evaluate_correction
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import WindowedRule
 from gmmtorch.scan import Scan

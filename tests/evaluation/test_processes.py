@@ -8,11 +8,11 @@ import sys
 
 import pytest
 
-from gmmtorch.evaluation.processes import end_with_parent, has_lost_parent
+from gmmtorch.processes import end_with_parent, has_lost_parent
 
 _WORK = """
 work = "\\n".join([
-    "from gmmtorch.evaluation.processes import end_with_parent",
+    "from gmmtorch.processes import end_with_parent",
     "end_with_parent()",
     "print('at work', flush=True)",
     "while True: pass",

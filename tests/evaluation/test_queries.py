@@ -12,12 +12,13 @@ from scipy.stats import kstest
 from sklearn.metrics import brier_score_loss, roc_auc_score
 from torch import Tensor
 
-from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation import queries as query_points  # pytest would collect the name `test_beams`
-from gmmtorch.evaluation.held_out import Protocol, evaluate
-from gmmtorch.evaluation.methods import choose, methods
-from gmmtorch.evaluation.queries import (
+from gmmtorch.experiments.evaluation import (
+    queries as query_points,  # pytest would collect the name `test_beams`
+)
+from gmmtorch.experiments.evaluation.held_out import Protocol, evaluate
+from gmmtorch.experiments.evaluation.mapping_methods import choose, methods
+from gmmtorch.experiments.evaluation.queries import (
     FREE,
     OCCUPIED,
     UNKNOWN,
@@ -28,6 +29,7 @@ from gmmtorch.evaluation.queries import (
     unseen,
 )
 from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.occupancy.occupancy_grid import OccupancyGrid
 from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 from gmmtorch.scan import Scan
 

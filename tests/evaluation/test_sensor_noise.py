@@ -15,9 +15,9 @@ from scipy.stats import multivariate_normal
 
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation import queries
-from gmmtorch.evaluation.studies.sensor_noise import SENSORS, VARIANTS, run, sensor_model
-from gmmtorch.evaluation.studies.study_options import SensorModelStudy
+from gmmtorch.experiments.evaluation import queries
+from gmmtorch.experiments.studies.sensor_noise import SENSORS, VARIANTS, run_sensor_noise, sensor_model
+from gmmtorch.experiments.studies.study_options import SensorModelStudy
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mixture.estimators.sensor_model import LaserModel, LidarModel
 from gmmtorch.scan import Scan
@@ -45,7 +45,7 @@ def scans() -> list[Scan]:
 
 @pytest.fixture(scope="module")
 def rows(scans: list[Scan]) -> dict[tuple[int, str], dict]:
-    found = run("room", scans, STUDY)
+    found = run_sensor_noise("room", scans, STUDY)
     order = [(k, variant) for k in STUDY.n_components for variant in VARIANTS]
     assert [row["variant"] for row in found] == [variant for _, variant in order]
     return dict(zip(order, found, strict=True))
@@ -79,7 +79,7 @@ def test_scores_match_scipy_densities_and_pair_counts(scans, monkeypatch):
         lambda *args, **options: kept.append(make(*args, **options)) or kept[-1],
     )
     study = replace(SMALL, n_components=(6,), n_points=800, max_iter=10, n_neighbors=0, n_samples=5000)
-    row = run("room", scans, study)[2]
+    row = run_sensor_noise("room", scans, study)[2]
     built = kept[2]
     origins, ends = queries.test_beams(scans[::5], 100, 0)
     noise = SENSOR.noise_covariances(ends, origins).numpy()
@@ -121,7 +121,7 @@ def test_planar_components_are_at_most_as_thick_as_the_noise(rows):
 def test_a_sensor_without_noise_gives_the_plain_mixture(scans):
     exact = {"noise": 1e-9, "divergence": 1e-9}
     study = replace(SMALL, sensor_options=exact, n_components=(10,), n_points=600, max_iter=10)
-    plain, _, noise, _ = run("room", scans, study)
+    plain, _, noise, _ = run_sensor_noise("room", scans, study)
     for name in ("held_out_log_likelihood", "auc", "thickness"):
         assert noise[name] == pytest.approx(plain[name], rel=1e-5)
 
@@ -129,8 +129,8 @@ def test_a_sensor_without_noise_gives_the_plain_mixture(scans):
 @pytest.mark.slow
 def test_rows_depend_only_on_the_seed_and_progress_is_complete(scans):
     events: list[tuple[str, int, int | None]] = []
-    first = run("room", scans, SMALL, 3, lambda *event: events.append(event))
-    again, other = (run("room", scans, SMALL, seed) for seed in (3, 4))
+    first = run_sensor_noise("room", scans, SMALL, 3, lambda *event: events.append(event))
+    again, other = (run_sensor_noise("room", scans, SMALL, seed) for seed in (3, 4))
     for row in (*first, *again):
         row.pop("seconds")
     assert first == again
@@ -160,7 +160,7 @@ def test_invalid_options_raise(options, name):
 def test_scans_without_points_raise(scans):
     empty = [Scan(np.empty((0, 2)), scan.origin) if i % 5 else scan for i, scan in enumerate(scans)]
     with pytest.raises(InvalidArgumentError, match="no points"):
-        run("room", empty, STUDY)
+        run_sensor_noise("room", empty, STUDY)
 
 
 def test_sensor_models_are_found_by_name():
@@ -182,6 +182,6 @@ def test_the_noise_model_improves_likelihood_on_real_scans(real_data: Path):
     if not path.is_file():
         pytest.skip(f"{path} is not there")
     study = SensorModelStudy("laser_2d", n_components=(200,), n_points=8000, max_beams=2000, max_iter=15)
-    plain, _, noise, _ = run("intel", list(load("carmen", path, stride=4)), study)
+    plain, _, noise, _ = run_sensor_noise("intel", list(load("carmen", path, stride=4)), study)
     assert noise["held_out_log_likelihood"] > plain["held_out_log_likelihood"]
     assert noise["thickness"] < plain["thickness"]

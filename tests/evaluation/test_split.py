@@ -10,7 +10,7 @@ from pillar_room import room_scans
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.queries import keep_share, perturb_poses, split_indices
+from gmmtorch.experiments.evaluation.queries import keep_share, perturb_poses, split_indices
 from gmmtorch.scan import Scan
 
 SHARES = (0.8, 0.3, 0.1, 0.02)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.trajectories import absolute_trajectory_error, aligned, relative_pose_error
+from gmmtorch.localization.trajectories import absolute_trajectory_error, aligned, relative_pose_error
 
 
 def pose(x: float, y: float, z: float, *turn: float) -> Tensor:

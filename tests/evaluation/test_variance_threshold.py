@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.studies.railing import Railing
-from gmmtorch.evaluation.studies.study_options import COUNTS, VarianceThresholdStudy
-from gmmtorch.evaluation.studies.variance_threshold import (
+from gmmtorch.experiments.studies.railing import Railing
+from gmmtorch.experiments.studies.study_options import COUNTS, VarianceThresholdStudy
+from gmmtorch.experiments.studies.variance_threshold import (
     cells_by_setting,
     decided,
-    run,
+    run_variance_threshold,
     seen_past,
 )
 from gmmtorch.mapping.gaussian_map import GaussianMap
@@ -90,7 +90,7 @@ def test_a_larger_threshold_decides_more_points_and_calibration_keeps_the_rail()
     def new_map(n: int) -> GaussianMap:
         return GaussianMap(window=4, learning=IncrementalRule(n_components=n))
 
-    found = run("railing", railing.scans(5, seed=0), new_map, study, is_thin=railing.holds)
+    found = run_variance_threshold("railing", railing.scans(5, seed=0), new_map, study, is_thin=railing.holds)
     assert [row["n_components"] for row in found.rows[:4]] == [None] * 4
     assert len(found.rows) == 3 * 2 * 2
     for strict, loose in zip(found.rows[::2], found.rows[1::2], strict=True):

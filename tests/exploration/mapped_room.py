@@ -9,19 +9,19 @@ from typing import Any
 import pytest
 import torch
 
-from gmmtorch.exploration.mission.options import THESIS
-from gmmtorch.exploration.robot.gmm_mapper import FrameRule, GmmMapper
-from gmmtorch.exploration.robot.mapper import Memo
-from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
-from gmmtorch.sharing.broadcast import Broadcast
-from gmmtorch.sharing.messages.message_registry import ComponentsMessage, CountsMessage, decode
-from gmmtorch.sharing.radio import ReceivedMessage
-from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.simulation.sensors.depth_camera import DepthCamera, DepthFrame
+from gmmtorch.team.exploration.mission.options import THESIS
+from gmmtorch.team.exploration.robot.gmm_mapper import FrameRule, GmmMapper
+from gmmtorch.team.exploration.robot.mapper import Memo
+from gmmtorch.team.exploration.world.scoring import BeliefMap, BeliefRule
+from gmmtorch.team.sharing.broadcast import Broadcast
+from gmmtorch.team.sharing.messages.message_registry import ComponentsMessage, CountsMessage, decode
+from gmmtorch.team.sharing.radio import ReceivedMessage
+from gmmtorch.team.sharing.replica.replica import Replica
 
 CAMERA = DepthCamera(width=32, height=24, max_range=4.0)
 NOVELTY = NoveltyRule(resolution=0.2, observed=0.5)

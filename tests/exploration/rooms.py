@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gmmtorch.exploration.mission.options import TeamOptions
-from gmmtorch.exploration.world.world import World
 from gmmtorch.simulation.sensors.depth_camera import DepthCamera
 from gmmtorch.simulation.worlds.furniture import box
+from gmmtorch.team.exploration.mission.options import TeamOptions
+from gmmtorch.team.exploration.world.world import World
 
 SMALL = TeamOptions(
     size=2,

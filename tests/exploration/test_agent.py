@@ -16,29 +16,29 @@ from mapping.random_components import random_components
 from sharing.message_examples import examples, frame_of_components, views
 
 from gmmtorch.errors import DataError
-from gmmtorch.exploration.information.view_evaluator import ViewEvaluator
-from gmmtorch.exploration.information.view_library import ViewLibrary
-from gmmtorch.exploration.mission.driver import Stopwatch
-from gmmtorch.exploration.mission.options import TeamOptions
-from gmmtorch.exploration.planning.collision_checking import cells_in_sphere
-from gmmtorch.exploration.planning.coordination import PeerTrajectories
-from gmmtorch.exploration.planning.planner_interface import Plan, PlanningTask
-from gmmtorch.exploration.planning.primitives import Primitives
-from gmmtorch.exploration.planning.roadmap import Roadmap
-from gmmtorch.exploration.robot.agent import Agent
-from gmmtorch.exploration.robot.grid_mapper import GridMapper
-from gmmtorch.exploration.robot.mapper import Mapper, Memo
-from gmmtorch.exploration.robot.robot_state import Robot, StoppingRule
-from gmmtorch.exploration.world.starts import InitialFreeSpace
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
-from gmmtorch.sharing.messages.message_registry import (
+from gmmtorch.team.exploration.information.view_evaluator import ViewEvaluator
+from gmmtorch.team.exploration.information.view_library import ViewLibrary
+from gmmtorch.team.exploration.mission.driver import Stopwatch
+from gmmtorch.team.exploration.mission.options import TeamOptions
+from gmmtorch.team.exploration.planning.collision_checking import cells_in_sphere
+from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
+from gmmtorch.team.exploration.planning.planner_interface import Plan, PlanningTask
+from gmmtorch.team.exploration.planning.primitives import Primitives
+from gmmtorch.team.exploration.planning.roadmap import Roadmap
+from gmmtorch.team.exploration.robot.agent import Agent
+from gmmtorch.team.exploration.robot.grid_mapper import GridMapper
+from gmmtorch.team.exploration.robot.mapper import Mapper, Memo
+from gmmtorch.team.exploration.robot.robot_state import Robot, StoppingRule
+from gmmtorch.team.exploration.world.starts import InitialFreeSpace
+from gmmtorch.team.sharing.messages.message_registry import (
     PlanMessage,
     decode,
     encode_components,
     encode_plan,
     kind_of,
 )
-from gmmtorch.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.replica.replica import Replica
 
 START = torch.tensor([*PLACES[0][0], PLACES[0][1]], dtype=torch.float64)
 LAUNCH = InitialFreeSpace(cells_in_sphere(START[:3], 1.4, 0.2), START[None, :3])

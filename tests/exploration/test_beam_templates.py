@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.information.beam_templates import beam_templates, cells_along, pinhole_beams
 from gmmtorch.kernels.rays.ray_traversal import traverse
+from gmmtorch.team.exploration.information.beam_templates import beam_templates, cells_along, pinhole_beams
 
 FOV = (1.5184, 1.0123)
 

@@ -13,15 +13,15 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.planning.collision_checking import (
+from gmmtorch.team.exploration.planning.collision_checking import (
     cells_in_sphere,
     feasible,
     inflated,
     local_map_of,
 )
-from gmmtorch.exploration.planning.coordination import PeerTrajectories
-from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
-from gmmtorch.exploration.robot.mapper import LocalMap
+from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
+from gmmtorch.team.exploration.planning.primitives import Dynamics, Primitives
+from gmmtorch.team.exploration.robot.mapper import LocalMap
 
 LIBRARY = Primitives(Dynamics())
 RADIUS, CELL = 0.3, 0.2

@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.planning.coordination import (
+from gmmtorch.team.exploration.planning.coordination import (
     COORDINATIONS,
     Coordination,
     PeerTrajectories,
     clear_of,
     predicted_path,
 )
-from gmmtorch.sharing.messages.message_registry import PlanMessage
+from gmmtorch.team.sharing.messages.message_registry import PlanMessage
 
 Choices = list[list[frozenset[int]]]
 """Of each robot, the sets that it may cover."""

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.mission.driver import (
+from gmmtorch.team.exploration.mission.driver import (
     Drivable,
     Run,
     SimulatedClock,

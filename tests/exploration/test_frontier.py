@@ -8,9 +8,9 @@ import math
 import torch
 from exploration.voxel_worlds import EVALUATOR, PRIMITIVES, RESOLUTION, Explorer, explore, two_rooms
 
-from gmmtorch.exploration.planning.frontier import find_frontiers, frontier_cells
-from gmmtorch.exploration.planning.planners import make_planner
-from gmmtorch.exploration.robot.mapper import LocalMap
+from gmmtorch.team.exploration.planning.frontier import find_frontiers, frontier_cells
+from gmmtorch.team.exploration.planning.planners import make_planner
+from gmmtorch.team.exploration.robot.mapper import LocalMap
 
 NONE = torch.zeros(0, 3, dtype=torch.float64)
 

@@ -11,8 +11,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmmtorch.exploration.planning.geodesic import DistanceField, coarsened, geodesic
-from gmmtorch.exploration.robot.mapper import LocalMap
+from gmmtorch.team.exploration.planning.geodesic import DistanceField, coarsened, geodesic
+from gmmtorch.team.exploration.robot.mapper import LocalMap
 
 STEPS = [step for step in itertools.product((-1, 0, 1), repeat=3) if any(step)]
 

@@ -28,13 +28,14 @@ from exploration.mapped_room import (
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.robot.gmm_mapper import FrameRule, GmmMapper
-from gmmtorch.exploration.robot.mapper import FrameUpdate
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.association import count_explained
 from gmmtorch.occupancy.voxels.boxes import intersection
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
-from gmmtorch.sharing.messages.message_registry import (
+from gmmtorch.simulation.sensors.depth_camera import DepthFrame
+from gmmtorch.team.exploration.robot.gmm_mapper import FrameRule, GmmMapper
+from gmmtorch.team.exploration.robot.mapper import FrameUpdate
+from gmmtorch.team.sharing.messages.message_registry import (
     ComponentsMessage,
     CountsMessage,
     decode,
@@ -42,7 +43,6 @@ from gmmtorch.sharing.messages.message_registry import (
     encode_plan,
     encode_points,
 )
-from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 
 Flight = tuple[GmmMapper, list[FrameUpdate], list[bytes]]
 

@@ -23,18 +23,18 @@ from exploration.mapped_room import (
 from scipy.stats import chi2
 from torch import Tensor
 
-from gmmtorch.exploration.robot.gmm_mapper import GmmMapper
-from gmmtorch.exploration.robot.mapper import Memo
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.novelty import beam_novelty
 from gmmtorch.occupancy.voxels.boxes import Box
-from gmmtorch.sharing.messages.message_registry import (
+from gmmtorch.simulation.sensors.depth_camera import DepthFrame
+from gmmtorch.team.exploration.robot.gmm_mapper import GmmMapper
+from gmmtorch.team.exploration.robot.mapper import Memo
+from gmmtorch.team.sharing.messages.message_registry import (
     CountsMessage,
     decode,
     encode_counts,
 )
-from gmmtorch.sharing.replica.replica import Replica
-from gmmtorch.simulation.sensors.depth_camera import DepthFrame
+from gmmtorch.team.sharing.replica.replica import Replica
 
 
 def replica_of(one: GmmMapper) -> Replica:

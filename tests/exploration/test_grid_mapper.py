@@ -8,17 +8,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gmmtorch.exploration.robot.grid_mapper import MOST_INTERVALS, GridMapper
-from gmmtorch.exploration.robot.mapper import Memo
-from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule
 from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
-from gmmtorch.sharing.messages.message_registry import PointsMessage, decode, encode_points
-from gmmtorch.sharing.messages.point_messages import POINTS_PER_DATAGRAM
-from gmmtorch.sharing.radio import ReceivedMessage
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
+from gmmtorch.team.exploration.robot.grid_mapper import MOST_INTERVALS, GridMapper
+from gmmtorch.team.exploration.robot.mapper import Memo
+from gmmtorch.team.exploration.world.scoring import BeliefMap, BeliefRule
+from gmmtorch.team.sharing.messages.message_registry import PointsMessage, decode, encode_points
+from gmmtorch.team.sharing.messages.point_messages import POINTS_PER_DATAGRAM
+from gmmtorch.team.sharing.radio import ReceivedMessage
 
 WIDTH = 24
 BOX = Box(torch.tensor([-20, -20, -10]), torch.tensor([20, 20, 10]))
@@ -177,7 +177,7 @@ def test_points_of_strangers_are_dropped_and_counted() -> None:
 
 
 def test_memory_is_bounded_for_invented_frame_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gmmtorch.exploration.robot.grid_mapper.MOST_INTERVALS", 20)
+    monkeypatch.setattr("gmmtorch.team.exploration.robot.grid_mapper.MOST_INTERVALS", 20)
     one, view = mapper(), frame(0, n=1)
     datagrams = [said(view, number=7 * k)[0] for k in range(60)]
     assert one.receive(heard(*datagrams)) == datagrams

@@ -9,7 +9,7 @@ from exploration.voxel_worlds import surroundings_from
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmmtorch.exploration.information.view_cache import InformationDiscount
+from gmmtorch.team.exploration.information.view_cache import InformationDiscount
 
 SHAPE = (12, 9, 8)
 COUNTS = (3, 3, 2)

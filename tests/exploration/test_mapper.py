@@ -6,13 +6,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from gmmtorch.exploration.robot.mapper import Memo, novel_beams
 from gmmtorch.mapping.learning.novelty import beam_novelty
 from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
+from gmmtorch.team.exploration.robot.mapper import Memo, novel_beams
 
 RULE = NoveltyRule(resolution=0.2, observed=0.5)
 WITHIN = Box(torch.tensor([-7, -30, -5]), torch.tensor([9, 30, 6]))

@@ -11,19 +11,19 @@ import torch
 from exploration.rooms import SHELF, SMALL, room, without_seconds
 from pretended_gpu import GPUTensor, pretended_gpu
 
-from gmmtorch.cli.reporting.explore_pictures import _coverage, _team_view
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.mission.driver import SimulatedClock, drive
-from gmmtorch.exploration.mission.mission import Mission
-from gmmtorch.exploration.mission.options import FRAMEWORKS, THESIS, TeamOptions
-from gmmtorch.exploration.mission.results import mission_row, with_times
-from gmmtorch.exploration.mission.team_setup import assemble
-from gmmtorch.exploration.robot.robot_state import StoppingRule
-from gmmtorch.exploration.world.world import World
 from gmmtorch.kernels import kernels
 from gmmtorch.mapping.components import Components
-from gmmtorch.sharing.transport.link_conditions import Partition
 from gmmtorch.simulation.worlds.furniture import box
+from gmmtorch.team.cli.reporting.explore_pictures import _coverage, _team_view
+from gmmtorch.team.exploration.mission.driver import SimulatedClock, drive
+from gmmtorch.team.exploration.mission.mission import Mission
+from gmmtorch.team.exploration.mission.options import FRAMEWORKS, THESIS, TeamOptions
+from gmmtorch.team.exploration.mission.results import mission_row, with_times
+from gmmtorch.team.exploration.mission.team_setup import assemble
+from gmmtorch.team.exploration.robot.robot_state import StoppingRule
+from gmmtorch.team.exploration.world.world import World
+from gmmtorch.team.sharing.transport.link_conditions import Partition
 
 CONTRACT = """
 framework seed world n_robots duration times entropy_bits entropy_bits_per_robot observable_bits

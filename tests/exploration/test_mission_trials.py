@@ -15,8 +15,9 @@ from exploration.rooms import SMALL, without_seconds
 from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError, OutputError
-from gmmtorch.exploration.mission import trials as trials_module
-from gmmtorch.exploration.mission.trials import (
+from gmmtorch.simulation.worlds.furniture import box
+from gmmtorch.team.exploration.mission import trials as trials_module
+from gmmtorch.team.exploration.mission.trials import (
     ROW,
     STAGE,
     Trial,
@@ -26,7 +27,6 @@ from gmmtorch.exploration.mission.trials import (
     run_mission,
     run_trials,
 )
-from gmmtorch.simulation.worlds.furniture import box
 
 ROOM = box((0.1, 0.1, 0.1), (6.1, 5.1, 3.1))
 

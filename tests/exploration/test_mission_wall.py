@@ -14,18 +14,18 @@ import torch
 from exploration.replays import FakeTime, Together
 from exploration.rooms import small_room
 
-from gmmtorch.exploration.mission.driver import Stopwatch, WallClock, drive, settle
-from gmmtorch.exploration.mission.mission import Mission
-from gmmtorch.exploration.mission.options import TeamOptions
-from gmmtorch.exploration.mission.robot_view import DuplicateIdError, FlyingRobotView
-from gmmtorch.exploration.mission.team_setup import make_agent, start_poses
-from gmmtorch.exploration.planning.coordination import PeerTrajectories
-from gmmtorch.exploration.world.world import World
-from gmmtorch.sharing.messages.message_registry import PlanMessage, encode_plan
-from gmmtorch.sharing.replica.replica import Replica
-from gmmtorch.sharing.store import Store
-from gmmtorch.sharing.transport.udp import UdpTransport
 from gmmtorch.simulation.sensors.depth_camera import DepthCamera
+from gmmtorch.team.exploration.mission.driver import Stopwatch, WallClock, drive, settle
+from gmmtorch.team.exploration.mission.mission import Mission
+from gmmtorch.team.exploration.mission.options import TeamOptions
+from gmmtorch.team.exploration.mission.robot_view import DuplicateIdError, FlyingRobotView
+from gmmtorch.team.exploration.mission.team_setup import make_agent, start_poses
+from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
+from gmmtorch.team.exploration.world.world import World
+from gmmtorch.team.sharing.messages.message_registry import PlanMessage, encode_plan
+from gmmtorch.team.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.store import Store
+from gmmtorch.team.sharing.transport.udp import UdpTransport
 
 TEAM = TeamOptions(
     size=2,
@@ -165,7 +165,7 @@ def test_views_are_sent_once_every_planning_period(world, monkeypatch):
 
 
 def test_a_duplicate_id_is_reported_with_its_address(world, monkeypatch):
-    monkeypatch.setattr("gmmtorch.sharing.transport.sessions.FRESH_SECONDS", 0.1)
+    monkeypatch.setattr("gmmtorch.team.sharing.transport.sessions.FRESH_SECONDS", 0.1)
     path = plan(4).path
     with UdpTransport.unicast(0) as link, UdpTransport.unicast(0, peers=[link.address]) as other:
         mission = mission_of(0, world, TEAM, link)

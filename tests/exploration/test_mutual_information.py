@@ -10,8 +10,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmmtorch.exploration.information.beam_templates import depth_kernel, needed_band
 from gmmtorch.kernels.rays.beam_information import banded_csqmi, first_block, shannon, sharpened
+from gmmtorch.team.exploration.information.beam_templates import depth_kernel, needed_band
 
 N_CELLS = 8
 MAPS = torch.tensor(list(itertools.product([0.0, 1.0], repeat=N_CELLS)), dtype=torch.float64)

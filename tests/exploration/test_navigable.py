@@ -7,19 +7,19 @@ import math
 import torch
 from torch import Tensor
 
-from gmmtorch.exploration.world.navigable import (
-    collides,
-    meets_others,
-    observable_cells,
-    view_directions,
-    viewpoints,
-)
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.occupancy.voxels.voxelize import occupied_cells
 from gmmtorch.simulation.sensors.mesh_raycasting import ray_triangles
 from gmmtorch.simulation.worlds.furniture import box
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld
+from gmmtorch.team.exploration.world.navigable import (
+    collides,
+    meets_others,
+    observable_cells,
+    view_directions,
+    viewpoints,
+)
 
 RESOLUTION = 0.25
 ROOM = torch.cat(

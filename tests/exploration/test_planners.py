@@ -17,11 +17,11 @@ from exploration.voxel_worlds import (
 )
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.planning.collision_checking import feasible
-from gmmtorch.exploration.planning.coordination import PeerTrajectories
-from gmmtorch.exploration.planning.global_planner import Journey
-from gmmtorch.exploration.planning.planner_interface import Plan
-from gmmtorch.exploration.planning.planners import PLANNERS, make_planner
+from gmmtorch.team.exploration.planning.collision_checking import feasible
+from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
+from gmmtorch.team.exploration.planning.global_planner import Journey
+from gmmtorch.team.exploration.planning.planner_interface import Plan
+from gmmtorch.team.exploration.planning.planners import PLANNERS, make_planner
 
 
 def planner_named(name: str):

@@ -11,10 +11,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from gmmtorch.exploration.mission.options import TeamOptions
-from gmmtorch.exploration.mission.planning_round import plan_together
-from gmmtorch.exploration.planning.coordination import COORDINATIONS, Coordination, PeerTrajectories
-from gmmtorch.exploration.planning.planner_interface import Plan
+from gmmtorch.team.exploration.mission.options import TeamOptions
+from gmmtorch.team.exploration.mission.planning_round import plan_together
+from gmmtorch.team.exploration.planning.coordination import COORDINATIONS, Coordination, PeerTrajectories
+from gmmtorch.team.exploration.planning.planner_interface import Plan
 
 N, NOW, NUMBER = 5, 40.0, 20
 OPTIONS = TeamOptions(size=N, latency=0.02, jitter=0.004, margin=0.25)

@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
+from gmmtorch.team.exploration.planning.primitives import Dynamics, Primitives
 
 LIBRARY = Primitives(Dynamics())
 LIMITS = torch.tensor([1.5, 0.75, 1.2], dtype=torch.float64)

@@ -13,14 +13,14 @@ from exploration.rooms import SMALL, small_room
 from exploration.voxel_worlds import PRIMITIVES, Explorer, hollow, surroundings_from, task_of
 from torch import Tensor
 
-from gmmtorch.exploration.mission.mission import Mission
-from gmmtorch.exploration.mission.team_setup import assemble
-from gmmtorch.exploration.planning.coordination import PeerTrajectories
-from gmmtorch.exploration.planning.planner_interface import Plan, PlanningTask
-from gmmtorch.exploration.planning.recovery import Waiting, is_boxed_in, retreat, shortened
-from gmmtorch.exploration.robot.agent import Agent
-from gmmtorch.exploration.robot.robot_state import StoppingRule
-from gmmtorch.exploration.world.world import World
+from gmmtorch.team.exploration.mission.mission import Mission
+from gmmtorch.team.exploration.mission.team_setup import assemble
+from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
+from gmmtorch.team.exploration.planning.planner_interface import Plan, PlanningTask
+from gmmtorch.team.exploration.planning.recovery import Waiting, is_boxed_in, retreat, shortened
+from gmmtorch.team.exploration.robot.agent import Agent
+from gmmtorch.team.exploration.robot.robot_state import StoppingRule
+from gmmtorch.team.exploration.world.world import World
 
 SHAPE = (40, 40, 20)
 HERE = torch.tensor([4.1, 4.1, 2.1], dtype=torch.float64)

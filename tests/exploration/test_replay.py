@@ -15,15 +15,15 @@ from exploration.replays import RULES, content, killed, log, mapped, part, robot
 from gmmtorch.datasets import load
 from gmmtorch.datasets.base import DatasetShard, shard_indices, start_frame
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.exploration.mission.replay import ReplayMission
-from gmmtorch.exploration.mission.robot_view import ReplayingRobotView
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule
 from gmmtorch.scan import Scan
-from gmmtorch.sharing.frame_joiner import FrameJoiner
-from gmmtorch.sharing.replica.replica import Replica
-from gmmtorch.sharing.transport.link_conditions import LinkConditions
-from gmmtorch.sharing.transport.simulated_network import Network
+from gmmtorch.team.exploration.mission.replay import ReplayMission
+from gmmtorch.team.exploration.mission.robot_view import ReplayingRobotView
+from gmmtorch.team.sharing.frame_joiner import FrameJoiner
+from gmmtorch.team.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.transport.link_conditions import LinkConditions
+from gmmtorch.team.sharing.transport.simulated_network import Network
 
 
 def n_missing(mission: ReplayMission) -> int:

@@ -15,14 +15,14 @@ from hypothesis import strategies as st
 from own_process import answer_of
 
 from gmmtorch.errors import DataError
-from gmmtorch.exploration.mission.driver import WallClock, settle
-from gmmtorch.exploration.mission.replay import ReplayMission
-from gmmtorch.exploration.mission.robot_view import DuplicateIdError, ReplayingRobotView
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.sharing.replica.replica import Replica
-from gmmtorch.sharing.transport.security import TeamKey
-from gmmtorch.sharing.transport.simulated_network import Network
-from gmmtorch.sharing.transport.udp import UdpTransport
+from gmmtorch.team.exploration.mission.driver import WallClock, settle
+from gmmtorch.team.exploration.mission.replay import ReplayMission
+from gmmtorch.team.exploration.mission.robot_view import DuplicateIdError, ReplayingRobotView
+from gmmtorch.team.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.transport.security import TeamKey
+from gmmtorch.team.sharing.transport.simulated_network import Network
+from gmmtorch.team.sharing.transport.udp import UdpTransport
 
 N_KILLS = 4
 """`python -m exploration.kill_replay` takes more."""
@@ -79,7 +79,7 @@ def has_duplicate(view: ReplayingRobotView) -> bool:
 
 
 def test_duplicate_ids_are_detected_over_udp(monkeypatch):
-    monkeypatch.setattr("gmmtorch.sharing.transport.sessions.FRESH_SECONDS", 0.1)
+    monkeypatch.setattr("gmmtorch.team.sharing.transport.sessions.FRESH_SECONDS", 0.1)
     transports = [UdpTransport.unicast(5) for _ in range(2)]
     team = [robot(5, part(k, 2, 8), transports[k], announce_every=0.05, rate=200.0) for k in range(2)]
     views = [ReplayingRobotView(*pair) for pair in zip(team, transports, strict=True)]

@@ -10,8 +10,10 @@ from typing import Any
 import pytest
 import torch
 
-from gmmtorch.exploration.mission.options import TeamOptions
-from gmmtorch.exploration.mission.results import (
+from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
+from gmmtorch.team.exploration.mission.options import TeamOptions
+from gmmtorch.team.exploration.mission.results import (
     VARIANT,
     Snapshots,
     differing,
@@ -20,10 +22,8 @@ from gmmtorch.exploration.mission.results import (
     with_network_costs,
     with_times,
 )
-from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule
-from gmmtorch.occupancy.voxels.boxes import Box
-from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
-from gmmtorch.sharing.transport.simulated_network import Reception, Traffic
+from gmmtorch.team.exploration.world.scoring import BeliefMap, BeliefRule
+from gmmtorch.team.sharing.transport.simulated_network import Reception, Traffic
 
 OPTIONS = {
     "framework": "gmm_shared",

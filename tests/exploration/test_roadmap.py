@@ -10,9 +10,9 @@ from exploration.voxel_worlds import RESOLUTION, surroundings_from
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmmtorch.exploration.planning.geodesic import geodesic
-from gmmtorch.exploration.planning.roadmap import Roadmap, at_the_rim
-from gmmtorch.exploration.robot.mapper import LocalMap
+from gmmtorch.team.exploration.planning.geodesic import geodesic
+from gmmtorch.team.exploration.planning.roadmap import Roadmap, at_the_rim
+from gmmtorch.team.exploration.robot.mapper import LocalMap
 
 WINDOW = (24, 24, 12)
 

@@ -11,20 +11,20 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.information.view_library import ViewLibrary
-from gmmtorch.exploration.planning.collision_checking import cells_in_sphere
-from gmmtorch.exploration.planning.planner_interface import Plan
-from gmmtorch.exploration.planning.roadmap import Roadmap
-from gmmtorch.exploration.robot.grid_mapper import GridMapper
-from gmmtorch.exploration.robot.mapper import Memo
-from gmmtorch.exploration.robot.robot_state import Robot, StoppingCriterion, StoppingRule
-from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule
-from gmmtorch.exploration.world.starts import InitialFreeSpace
 from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
+from gmmtorch.team.exploration.information.view_library import ViewLibrary
+from gmmtorch.team.exploration.planning.collision_checking import cells_in_sphere
+from gmmtorch.team.exploration.planning.planner_interface import Plan
+from gmmtorch.team.exploration.planning.roadmap import Roadmap
+from gmmtorch.team.exploration.robot.grid_mapper import GridMapper
+from gmmtorch.team.exploration.robot.mapper import Memo
+from gmmtorch.team.exploration.robot.robot_state import Robot, StoppingCriterion, StoppingRule
+from gmmtorch.team.exploration.world.scoring import BeliefMap, BeliefRule
+from gmmtorch.team.exploration.world.starts import InitialFreeSpace
 
 BOX = Box(torch.tensor([0, 0, 0]), torch.tensor([32, 32, 16]))
 WINDOW = (32, 32, 16)

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule, accuracy, disagreement
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
+from gmmtorch.team.exploration.world.scoring import BeliefMap, BeliefRule, accuracy, disagreement
 
 BOX = Box(torch.tensor([-3, 2, 0]), torch.tensor([9, 11, 7]))
 

@@ -12,15 +12,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.mission.driver import SimulatedClock, drive
-from gmmtorch.exploration.mission.mission import Mission
-from gmmtorch.exploration.mission.team_setup import assemble, start_poses
-from gmmtorch.exploration.planning.collision_checking import cells_in_sphere
-from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
-from gmmtorch.exploration.world import starts
-from gmmtorch.exploration.world.starts import initial_free_space
-from gmmtorch.exploration.world.world import World
 from gmmtorch.simulation.worlds.furniture import box
+from gmmtorch.team.exploration.mission.driver import SimulatedClock, drive
+from gmmtorch.team.exploration.mission.mission import Mission
+from gmmtorch.team.exploration.mission.team_setup import assemble, start_poses
+from gmmtorch.team.exploration.planning.collision_checking import cells_in_sphere
+from gmmtorch.team.exploration.planning.primitives import Dynamics, Primitives
+from gmmtorch.team.exploration.world import starts
+from gmmtorch.team.exploration.world.starts import initial_free_space
+from gmmtorch.team.exploration.world.world import World
 
 PRIMITIVES = Primitives(Dynamics())
 ALONE = replace(SMALL, framework="grid_isolated", size=1)

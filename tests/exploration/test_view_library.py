@@ -13,10 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.information import view_library
-from gmmtorch.exploration.information.view_library import ViewLibrary
-from gmmtorch.sharing.messages.message_registry import ViewsMessage, decode
-from gmmtorch.sharing.replica.record_keys import Intervals, first_key, robot_of
+from gmmtorch.team.exploration.information import view_library
+from gmmtorch.team.exploration.information.view_library import ViewLibrary
+from gmmtorch.team.sharing.messages.message_registry import ViewsMessage, decode
+from gmmtorch.team.sharing.replica.record_keys import Intervals, first_key, robot_of
 
 
 def key(robot: int, number: int) -> int:

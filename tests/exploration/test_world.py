@@ -10,11 +10,11 @@ import torch
 from exploration.rooms import HALL
 
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, MissingDataError
-from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
-from gmmtorch.exploration.world.starts import check_start, start_poses
-from gmmtorch.exploration.world.world import World, open_world
 from gmmtorch.simulation.worlds.furniture import box
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld
+from gmmtorch.team.exploration.planning.primitives import Dynamics, Primitives
+from gmmtorch.team.exploration.world.starts import check_start, start_poses
+from gmmtorch.team.exploration.world.world import World, open_world
 
 
 @pytest.fixture(autouse=True)

@@ -9,16 +9,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gmmtorch.exploration.information.view_evaluator import ViewEvaluator
-from gmmtorch.exploration.information.view_library import ViewLibrary
-from gmmtorch.exploration.planning.collision_checking import cells_in_sphere, local_map_of
-from gmmtorch.exploration.planning.coordination import PeerTrajectories
-from gmmtorch.exploration.planning.planner_interface import Plan, Planner, PlanningTask
-from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
-from gmmtorch.exploration.planning.roadmap import Roadmap
-from gmmtorch.exploration.robot.mapper import LocalMap
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
+from gmmtorch.team.exploration.information.view_evaluator import ViewEvaluator
+from gmmtorch.team.exploration.information.view_library import ViewLibrary
+from gmmtorch.team.exploration.planning.collision_checking import cells_in_sphere, local_map_of
+from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
+from gmmtorch.team.exploration.planning.planner_interface import Plan, Planner, PlanningTask
+from gmmtorch.team.exploration.planning.primitives import Dynamics, Primitives
+from gmmtorch.team.exploration.planning.roadmap import Roadmap
+from gmmtorch.team.exploration.robot.mapper import LocalMap
 
 RESOLUTION = 0.2
 PRIMITIVES = Primitives(Dynamics())

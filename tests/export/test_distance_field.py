@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.export.distance_field import distance_field, write_distance_field
+from gmmtorch.export.distance_fields import distance_field, write_distance_field
 from gmmtorch.occupancy.grid import VoxelGrid
 
 

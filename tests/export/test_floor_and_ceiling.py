@@ -8,10 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.export.floor_and_ceiling import Levels, of_components, of_grid
 from gmmtorch.mapping.components import Components
+from gmmtorch.occupancy.occupancy_grid import OccupancyGrid
 from gmmtorch.scan import Scan
 
 

@@ -15,12 +15,12 @@ from torch import Tensor
 
 from gmmtorch.datasets import Dataset, Ranges, load
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.evaluation.trajectories import absolute_trajectory_error
 from gmmtorch.export.bag import BagWriter
 from gmmtorch.localization import Odometry, Tracker, with_odometry
 from gmmtorch.localization.odometry.odometry import Trajectory
 from gmmtorch.localization.rigid_motions import continued, turns
 from gmmtorch.localization.scan_locations import locate_scans
+from gmmtorch.localization.trajectories import absolute_trajectory_error
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.scan import Scan
 

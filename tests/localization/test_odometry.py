@@ -8,11 +8,11 @@ from torch import Tensor
 
 from gmmtorch.datasets import load
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.evaluation.trajectories import absolute_trajectory_error
 from gmmtorch.localization import Odometry, with_odometry
 from gmmtorch.localization.odometry.local_map import Expectation, LocalMap
 from gmmtorch.localization.odometry.odometry import _RULE, _scaled
 from gmmtorch.localization.registration.alignment import align
+from gmmtorch.localization.trajectories import absolute_trajectory_error
 
 N_2D, N_3D = 14, 6
 

@@ -16,7 +16,7 @@ from mapping.random_components import random_components, rotations
 
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation import metrics, queries
+from gmmtorch.experiments.evaluation import metrics, queries
 from gmmtorch.mapping.codec import component_batch, lattice
 from gmmtorch.mapping.codec.component_batch import decode, encode
 from gmmtorch.mapping.codec.quantization import COUNT_ERROR, ORIGIN_STEP, quantized, spatial_order

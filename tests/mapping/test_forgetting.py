@@ -15,8 +15,8 @@ from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
 from gmmtorch.scan import Scan
-from gmmtorch.sharing import Replica
 from gmmtorch.simulation import World2D, laser_2d, simulate_scan
+from gmmtorch.team.sharing import Replica
 
 RULES = {
     "incremental": IncrementalRule(window=8),

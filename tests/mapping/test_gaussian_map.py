@@ -20,13 +20,13 @@ from mapping.map_cases import (
 )
 from occupancy.protocol_contract import dims, lattice, open_scan, wall_scan
 
-from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError, MemoryLimitError
 from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
 from gmmtorch.occupancy.grid import VoxelGrid
+from gmmtorch.occupancy.occupancy_grid import OccupancyGrid
 from gmmtorch.scan import Scan
 
 BUFFERS = [

@@ -17,7 +17,7 @@ from torch import Tensor
 
 import gmmtorch
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation import metrics, queries
+from gmmtorch.experiments.evaluation import metrics, queries
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.depth_frame import DepthFrame

@@ -77,17 +77,17 @@ def test_chunks_do_not_change_the_statistics(monkeypatch):
     weight = random_weight(500, 1)
     natural = em.natural_parameters(parameters)
     whole = em.expectation(features, weight, natural, torch.float64)
-    labels = em.most_likely(features, parameters)
+    labels = em.most_likely_component(features, parameters)
     monkeypatch.setattr(chunks, "CHUNK_ELEMENTS", 1)  # chunks of 64 rows, the last one shorter
     parts = em.expectation(features, weight, natural, torch.float64)
     torch.testing.assert_close(parts, whole, rtol=1e-12, atol=1e-10)
-    assert torch.equal(em.most_likely(features, parameters), labels)
+    assert torch.equal(em.most_likely_component(features, parameters), labels)
 
 
 def test_most_likely_equals_scipy():
     parameters = random_parameters(6, 2)
     points = cloud(300, 2)
-    labels = em.most_likely(quadratic_features(points), parameters)
+    labels = em.most_likely_component(quadratic_features(points), parameters)
     assert labels.tolist() == scipy_log_joint(points, parameters).argmax(1).tolist()
 
 

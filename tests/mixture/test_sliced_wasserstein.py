@@ -335,7 +335,7 @@ def test_fit_works_under_no_grad():
 @pytest.mark.real_data
 def test_fit_of_a_real_scan_is_closer_than_em(real_data):
     from gmmtorch.datasets import load
-    from gmmtorch.evaluation.metrics import psnr2
+    from gmmtorch.experiments.evaluation.metrics import psnr2
 
     points = load("scan_folder", real_data / "hall")[0].points.double().numpy()[::3]
     fit = SlicedWassersteinGaussianMixture(32, n_projections=128, random_state=0).fit(points)

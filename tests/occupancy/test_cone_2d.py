@@ -12,7 +12,7 @@ from occupancy.cone_cases import one_cone
 from scipy import integrate
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.studies.angular_reference import angular_evidence
+from gmmtorch.experiments.studies.angular_reference import angular_evidence
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.forms.cone.cone_evidence import cone_evidence, share_beyond_2d
 

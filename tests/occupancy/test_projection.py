@@ -11,7 +11,7 @@ import torch
 from hypothesis import given
 from scipy.spatial import ConvexHull
 
-from gmmtorch.evaluation.studies.angular_reference import angular_evidence
+from gmmtorch.experiments.studies.angular_reference import angular_evidence
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.forms.cone.cone_evidence import cone_evidence
 from gmmtorch.occupancy.forms.cone.polygons import polygon_probability

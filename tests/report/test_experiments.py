@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gmmtorch.report.maps.accuracy_figures import comparison_figure
-from gmmtorch.report.studies.fit_study_figures import (
+from gmmtorch.experiments.report.fit_study_figures import (
     component_count_figures,
     initialization_figures,
     sensor_model_figures,
 )
+from gmmtorch.report.maps.accuracy_figures import comparison_figure
 
 
 def study_row(init: str, k: int, seed: int, **more: object) -> dict[str, object]:

@@ -10,26 +10,26 @@ from matplotlib.colors import to_hex
 from shown import texts
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.paired_statistics import mean_band, paired_interval
-from gmmtorch.report.exploration.mission_bars import (
+from gmmtorch.report.labels import LineEnd, label_ends
+from gmmtorch.report.style import PALETTE, new_figure
+from gmmtorch.team.exploration.mission.paired_statistics import mean_band, paired_interval
+from gmmtorch.team.report.mission_bars import (
     deviations_figure,
     profile_figure,
     summary_bars,
 )
-from gmmtorch.report.exploration.mission_curves import (
+from gmmtorch.team.report.mission_curves import (
     bandwidth_figure,
     entropy_figure,
     planner_comparison_figure,
 )
-from gmmtorch.report.exploration.mission_summary import study_summary
-from gmmtorch.report.exploration.trial_groups import (
+from gmmtorch.team.report.mission_summary import study_summary
+from gmmtorch.team.report.trial_groups import (
     FRAMEWORKS,
     framework_colour,
     framework_name,
     seeds_note,
 )
-from gmmtorch.report.labels import LineEnd, label_ends
-from gmmtorch.report.style import PALETTE, new_figure
 
 
 def lines(axes: Axes, colour: str, n_points: int) -> list[np.ndarray]:

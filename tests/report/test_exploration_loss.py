@@ -12,10 +12,10 @@ from matplotlib.colors import to_hex
 from shown import texts
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.paired_statistics import mean_band
-from gmmtorch.report.exploration.network_figures import loss_figure
-from gmmtorch.report.exploration.trial_groups import by_variant
 from gmmtorch.report.style import PALETTE
+from gmmtorch.team.exploration.mission.paired_statistics import mean_band
+from gmmtorch.team.report.network_figures import loss_figure
+from gmmtorch.team.report.trial_groups import by_variant
 
 CUT = {"begin": 60.0, "end": 120.0, "groups": [[0], [1, 2]]}
 

@@ -12,15 +12,15 @@ from exploration_rows import flights
 from matplotlib.colors import to_rgb
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
-from gmmtorch.exploration.world.scoring import BeliefRule
-from gmmtorch.report.exploration.mission_maps import TeamSnapshot, team_map_figure, trajectories_figure
 from gmmtorch.report.maps.map_images import MapImage, highest_occupancy
 from gmmtorch.report.scenes.ellipsoids import cut_away
 from gmmtorch.report.scenes.paths import smooth_path
 from gmmtorch.report.scenes.scene import mixture_scene_figure
 from gmmtorch.report.scenes.scene_renderer import Camera, Canvas, render
 from gmmtorch.report.style import UNKNOWN
+from gmmtorch.team.exploration.planning.primitives import Dynamics, Primitives
+from gmmtorch.team.exploration.world.scoring import BeliefRule
+from gmmtorch.team.report.mission_maps import TeamSnapshot, team_map_figure, trajectories_figure
 
 
 def components(k: int, size: float = 0.5) -> tuple[torch.Tensor, torch.Tensor]:

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.report.studies.rate_distortion_figures import bytes_for, figures, leads
+from gmmtorch.experiments.report.rate_distortion_figures import bytes_for, figures, leads
 
 
 def rows_of(curves: dict[str, list[tuple[float, float]]], dataset: str = "room") -> list[dict[str, Any]]:

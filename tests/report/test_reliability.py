@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.calibration import Reliability
+from gmmtorch.experiments.evaluation.calibration import Reliability
 from gmmtorch.report.maps.accuracy_figures import reliability_figure
 
 CURVE = Reliability(np.array([0.1, 0.4, 0.9]), np.array([0.0, 0.5, 1.0]), np.array([50, 25, 25]))

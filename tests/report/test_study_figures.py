@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
+from gmmtorch.experiments.report import map_study_figures
 from gmmtorch.report.maps.map_regions import busiest_regions
-from gmmtorch.report.studies import map_study_figures
 
 
 def memory_rows() -> list[dict]:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.report.exploration.network_figures import team_run_figure
 from gmmtorch.report.style import save_figure
+from gmmtorch.team.report.network_figures import team_run_figure
 
 
 def row(robot: int, explores: bool = True, **changes: Any) -> dict[str, Any]:

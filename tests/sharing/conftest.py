@@ -7,7 +7,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from gmmtorch.sharing.transport.zenoh_transport import ZenohTransport
+from gmmtorch.team.sharing.transport.zenoh_transport import ZenohTransport
 
 
 @pytest.fixture

@@ -31,9 +31,9 @@ from pathlib import Path
 import torch
 from sharing.schedules import act
 
-from gmmtorch.sharing import store, store_file
-from gmmtorch.sharing.replica.replica import Replica
-from gmmtorch.sharing.store import Store
+from gmmtorch.team.sharing import store, store_file
+from gmmtorch.team.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.store import Store
 
 LIVES = 20
 """Of one robot; then another begins without a file."""

@@ -14,8 +14,8 @@ from mapping.random_components import random_components
 from gmmtorch.mapping.codec.quantization import spatial_order
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.calibrator import Calibration, Calibrator
-from gmmtorch.sharing.messages.fields import pose_of
-from gmmtorch.sharing.messages.message_registry import (
+from gmmtorch.team.sharing.messages.fields import pose_of
+from gmmtorch.team.sharing.messages.message_registry import (
     CODECS,
     ViewsMessage,
     encode_components,
@@ -25,7 +25,7 @@ from gmmtorch.sharing.messages.message_registry import (
     encode_views,
     quantized_poses,
 )
-from gmmtorch.sharing.messages.record_messages import (
+from gmmtorch.team.sharing.messages.record_messages import (
     CalibrationMessage,
     CorrectionMessage,
     FrameMessage,
@@ -35,7 +35,7 @@ from gmmtorch.sharing.messages.record_messages import (
     encode_announcements,
     encode_record,
 )
-from gmmtorch.sharing.replica.record_keys import Intervals, first_key
+from gmmtorch.team.sharing.replica.record_keys import Intervals, first_key
 
 codecs = pytest.mark.parametrize("codec", CODECS)
 numbers = st.integers(0, 300) | st.integers(0, (1 << 60) - 1)

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from sharing.schedules import act
 
-from gmmtorch.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.replica.replica import Replica
 
 
 def exchange(replicas: list[Replica], rounds: int = 6) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from gmmtorch.mapping.components import Components
-from gmmtorch.sharing.messages.message_registry import (
+from gmmtorch.team.sharing.messages.message_registry import (
     ComponentsMessage,
     CorrectionMessage,
     CountersMessage,

@@ -17,9 +17,9 @@ from mapping.random_components import random_components
 from torch import Tensor
 
 from gmmtorch.mapping.components import Components
-from gmmtorch.sharing.replica import authorship
-from gmmtorch.sharing.replica.record_keys import Intervals
-from gmmtorch.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.replica import authorship
+from gmmtorch.team.sharing.replica.record_keys import Intervals
+from gmmtorch.team.sharing.replica.replica import Replica
 
 MOST_ROUNDS = 8
 """Rounds of announcements and answers without loss after which all replicas agree."""

@@ -11,8 +11,8 @@ from pathlib import Path
 import torch
 from sharing.schedules import act
 
-from gmmtorch.sharing.replica.replica import Replica
-from gmmtorch.sharing.store import Restored, Store
+from gmmtorch.team.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.store import Restored, Store
 
 
 def recorded(robot: int, n: int, seed: int = 0) -> list[bytes]:

@@ -23,8 +23,8 @@ from gmmtorch.mapping.codec.component_batch import encode_quantized
 from gmmtorch.mapping.codec.lattice import Lattice
 from gmmtorch.mapping.codec.quantization import Quantized, quantize
 from gmmtorch.mapping.codec.thesis_message import UPDATE_TYPE, message_type
-from gmmtorch.sharing.messages.envelope import MAX_BYTES, VERSION, Kind
-from gmmtorch.sharing.replica.record_keys import END
+from gmmtorch.team.sharing.messages.envelope import MAX_BYTES, VERSION, Kind
+from gmmtorch.team.sharing.replica.record_keys import END
 
 WIDE = 1 << 62
 _WHOLE = [0, 1, -1, 2, 63, 255, 1023, 1024, 1 << 24, 1 << 28, 1 << 31, 1 << 52, 1 << 60, END - 1, -END + 1]

@@ -15,9 +15,9 @@ from sharing.message_examples import sealed
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.codec.bitstream import BitWriter
 from gmmtorch.mapping.codec.quantization import COUNT_ERROR
-from gmmtorch.sharing.messages.fields import pose_of, write_intervals, write_keys
-from gmmtorch.sharing.messages.message_registry import MAX_BYTES, decode
-from gmmtorch.sharing.messages.record_messages import (
+from gmmtorch.team.sharing.messages.fields import pose_of, write_intervals, write_keys
+from gmmtorch.team.sharing.messages.message_registry import MAX_BYTES, decode
+from gmmtorch.team.sharing.messages.record_messages import (
     AnnouncementMessage,
     CorrectionMessage,
     CountersMessage,
@@ -26,9 +26,9 @@ from gmmtorch.sharing.messages.record_messages import (
     encode_announcements,
     encode_record,
 )
-from gmmtorch.sharing.replica.anti_entropy import MOST_PEERS, Backlog
-from gmmtorch.sharing.replica.record_keys import END, Intervals, first_key, keys_in, keys_of
-from gmmtorch.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.replica.anti_entropy import MOST_PEERS, Backlog
+from gmmtorch.team.sharing.replica.record_keys import END, Intervals, first_key, keys_in, keys_of
+from gmmtorch.team.sharing.replica.replica import Replica
 
 robots = st.integers(0, 1023)
 lives = st.integers(0, (1 << 24) - 1)

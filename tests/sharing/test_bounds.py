@@ -11,8 +11,8 @@ import pytest
 import torch
 from mapping.random_components import random_components
 
-from gmmtorch.sharing.messages.message_registry import decode, encode_components
-from gmmtorch.sharing.messages.record_messages import (
+from gmmtorch.team.sharing.messages.message_registry import decode, encode_components
+from gmmtorch.team.sharing.messages.record_messages import (
     RECORD_BYTES,
     AnnouncementMessage,
     CountersMessage,
@@ -20,10 +20,10 @@ from gmmtorch.sharing.messages.record_messages import (
     SupersessionMessage,
     encode_record,
 )
-from gmmtorch.sharing.replica import anti_entropy, records
-from gmmtorch.sharing.replica.anti_entropy import PATIENCE
-from gmmtorch.sharing.replica.record_keys import END, Intervals, first_key, ids_of
-from gmmtorch.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.replica import anti_entropy, records
+from gmmtorch.team.sharing.replica.anti_entropy import PATIENCE
+from gmmtorch.team.sharing.replica.record_keys import END, Intervals, first_key, ids_of
+from gmmtorch.team.sharing.replica.replica import Replica
 
 STRANGER, OWNER = 900, 901
 BURIED = first_key(OWNER)

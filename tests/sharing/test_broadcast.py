@@ -16,16 +16,16 @@ from sharing.replica_model import rows
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.components import Components
-from gmmtorch.sharing.broadcast import Broadcast
-from gmmtorch.sharing.messages.message_registry import (
+from gmmtorch.team.sharing.broadcast import Broadcast
+from gmmtorch.team.sharing.messages.message_registry import (
     ComponentsMessage,
     CountsMessage,
     decode,
     encode_components,
     encode_counts,
 )
-from gmmtorch.sharing.messages.record_messages import encode_announcements
-from gmmtorch.sharing.replica.record_keys import Intervals
+from gmmtorch.team.sharing.messages.record_messages import encode_announcements
+from gmmtorch.team.sharing.replica.record_keys import Intervals
 
 seeds = st.integers(0, 10**6)
 
@@ -175,7 +175,7 @@ def test_unfit_messages_are_refused_and_counted() -> None:
 def test_a_full_broadcast_refuses_others_and_sends_its_own(
     name: str, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(f"gmmtorch.sharing.broadcast.{name}", most)
+    monkeypatch.setattr(f"gmmtorch.team.sharing.broadcast.{name}", most)
     one = Broadcast(0, "float")
     batches = [shifted(frame_of_components(5, robot=1), first) for first in (0, 5, 10, 15)]
     (counted,) = encode_counts(1, {(1, 0): 2.0, (1, 1): 2.0}, "float")

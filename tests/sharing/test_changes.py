@@ -15,11 +15,11 @@ from sharing.replica_model import rows
 from sharing.schedules import act, components
 
 from gmmtorch.mapping.components import Components
-from gmmtorch.sharing.messages.message_registry import decode
-from gmmtorch.sharing.messages.record_messages import CountersMessage, SupersessionMessage, encode_record
-from gmmtorch.sharing.replica import authorship
-from gmmtorch.sharing.replica.record_keys import Intervals
-from gmmtorch.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.messages.message_registry import decode
+from gmmtorch.team.sharing.messages.record_messages import CountersMessage, SupersessionMessage, encode_record
+from gmmtorch.team.sharing.replica import authorship
+from gmmtorch.team.sharing.replica.record_keys import Intervals
+from gmmtorch.team.sharing.replica.replica import Replica
 
 seeds = st.integers(0, 10**6)
 

@@ -10,7 +10,7 @@ from sharing.replica_histories import exchange
 
 import gmmtorch as gt
 from gmmtorch.localization import Tracker
-from gmmtorch.sharing import FrameJoiner, Replica
+from gmmtorch.team.sharing import FrameJoiner, Replica
 
 N_SCANS = 60
 

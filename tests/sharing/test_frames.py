@@ -19,12 +19,12 @@ from sharing.schedules import components
 from sharing.test_changes import Follower
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.sharing.messages.fields import pose_of
-from gmmtorch.sharing.messages.message_registry import FrameMessage, decode, kind_of
-from gmmtorch.sharing.messages.record_messages import encode_record
-from gmmtorch.sharing.replica.record_keys import WORLD, first_key
-from gmmtorch.sharing.replica.replica import Replica
-from gmmtorch.sharing.store import Store
+from gmmtorch.team.sharing.messages.fields import pose_of
+from gmmtorch.team.sharing.messages.message_registry import FrameMessage, decode, kind_of
+from gmmtorch.team.sharing.messages.record_messages import encode_record
+from gmmtorch.team.sharing.replica.record_keys import WORLD, first_key
+from gmmtorch.team.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.store import Store
 
 seeds = st.integers(0, 10**6)
 

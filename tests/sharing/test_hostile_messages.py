@@ -19,16 +19,16 @@ from sharing.message_examples import examples, forged, sealed
 from sharing.structured_bodies import structured
 
 from gmmtorch.errors import DataError
-from gmmtorch.exploration.information.view_library import ViewLibrary
 from gmmtorch.mapping.codec import component_batch as batches
 from gmmtorch.mapping.codec.bitstream import BitWriter
 from gmmtorch.mapping.codec.lattice import LARGEST_VARIANCE
 from gmmtorch.mapping.codec.quantization import MOST_POINTS
 from gmmtorch.mapping.components import Components
-from gmmtorch.sharing.messages import message_registry as messages
-from gmmtorch.sharing.messages.component_messages import MOST_COMPONENTS_SENT
-from gmmtorch.sharing.messages.envelope import FARTHEST, Kind
-from gmmtorch.sharing.messages.message_registry import (
+from gmmtorch.team.exploration.information.view_library import ViewLibrary
+from gmmtorch.team.sharing.messages import message_registry as messages
+from gmmtorch.team.sharing.messages.component_messages import MOST_COMPONENTS_SENT
+from gmmtorch.team.sharing.messages.envelope import FARTHEST, Kind
+from gmmtorch.team.sharing.messages.message_registry import (
     AnnouncementMessage,
     CalibrationMessage,
     ComponentsMessage,
@@ -48,8 +48,8 @@ from gmmtorch.sharing.messages.message_registry import (
     encode_points,
     encode_views,
 )
-from gmmtorch.sharing.messages.record_messages import encode_announcements, encode_record
-from gmmtorch.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.messages.record_messages import encode_announcements, encode_record
+from gmmtorch.team.sharing.replica.replica import Replica
 
 
 @pytest.fixture(scope="module")

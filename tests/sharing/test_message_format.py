@@ -14,8 +14,8 @@ from invalid_values import each_value
 from sharing.message_examples import examples, numbers, places, sealed, views
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.sharing.messages.envelope import FARTHEST, VERSION, Kind
-from gmmtorch.sharing.messages.message_registry import (
+from gmmtorch.team.sharing.messages.envelope import FARTHEST, VERSION, Kind
+from gmmtorch.team.sharing.messages.message_registry import (
     MAX_BYTES,
     PlanMessage,
     decode,
@@ -25,7 +25,7 @@ from gmmtorch.sharing.messages.message_registry import (
     kind_of,
     quantized_poses,
 )
-from gmmtorch.sharing.replica.record_keys import Intervals
+from gmmtorch.team.sharing.replica.record_keys import Intervals
 
 # -- views and plans -------------------------------------------------------------------------------
 

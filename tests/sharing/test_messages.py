@@ -17,9 +17,9 @@ from sharing.message_examples import codecs, frame_of_components, numbers, place
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.codec.quantization import COUNT_ERROR, MOST_POINTS, quantize, quantized
 from gmmtorch.mapping.components import Components
-from gmmtorch.sharing.messages.component_messages import MOST_COMPONENTS_SENT, fitted
-from gmmtorch.sharing.messages.envelope import FARTHEST
-from gmmtorch.sharing.messages.message_registry import (
+from gmmtorch.team.sharing.messages.component_messages import MOST_COMPONENTS_SENT, fitted
+from gmmtorch.team.sharing.messages.envelope import FARTHEST
+from gmmtorch.team.sharing.messages.message_registry import (
     MAX_BYTES,
     CountsMessage,
     PointsMessage,
@@ -28,7 +28,7 @@ from gmmtorch.sharing.messages.message_registry import (
     encode_counts,
     encode_points,
 )
-from gmmtorch.sharing.messages.point_messages import POINTS_PER_DATAGRAM
+from gmmtorch.team.sharing.messages.point_messages import POINTS_PER_DATAGRAM
 
 # -- components ------------------------------------------------------------------------------------
 

@@ -14,10 +14,10 @@ from sharing.schedules import components
 from torch import Tensor
 
 from gmmtorch.mapping.components import Components
-from gmmtorch.sharing.messages.record_messages import CorrectionMessage
-from gmmtorch.sharing.replica import moved_map
-from gmmtorch.sharing.replica.moved_map import MovedMap
-from gmmtorch.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.messages.record_messages import CorrectionMessage
+from gmmtorch.team.sharing.replica import moved_map
+from gmmtorch.team.sharing.replica.moved_map import MovedMap
+from gmmtorch.team.sharing.replica.replica import Replica
 
 N_SCANS = 3
 STILL = torch.eye(4, dtype=torch.float64)

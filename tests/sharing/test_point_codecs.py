@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
-from gmmtorch.evaluation.codecs.point_codecs import (
+from gmmtorch.team.sharing.codecs.point_codecs import (
     POINT_CODECS,
     DepthImage,
     Draco,

@@ -12,7 +12,7 @@ from sharing.replica_histories import everything
 from sharing.schedules import components
 
 from gmmtorch.mapping.components import Components
-from gmmtorch.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.replica.replica import Replica
 
 
 def changed(rng: random.Random, before: Components) -> Components:

@@ -15,12 +15,19 @@ from sharing.schedules import act
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.occupancy.calibrator import Calibrator
-from gmmtorch.sharing.messages.count_messages import counts_of
-from gmmtorch.sharing.messages.message_registry import ComponentsMessage, decode, encode_components
-from gmmtorch.sharing.messages.record_messages import CountersMessage
-from gmmtorch.sharing.replica.component_table import Counters
-from gmmtorch.sharing.replica.record_keys import RECORD_KINDS, Intervals, evict, first_key, keys_in, keys_of
-from gmmtorch.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.messages.count_messages import counts_of
+from gmmtorch.team.sharing.messages.message_registry import ComponentsMessage, decode, encode_components
+from gmmtorch.team.sharing.messages.record_messages import CountersMessage
+from gmmtorch.team.sharing.replica.component_table import Counters
+from gmmtorch.team.sharing.replica.record_keys import (
+    RECORD_KINDS,
+    Intervals,
+    evict,
+    first_key,
+    keys_in,
+    keys_of,
+)
+from gmmtorch.team.sharing.replica.replica import Replica
 
 numbers = st.sets(st.integers(0, 40))
 

@@ -17,7 +17,7 @@ from sharing.schedules import components, run_schedule
 
 import gmmtorch as gt
 from gmmtorch.mapping.codec.quantization import quantized
-from gmmtorch.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.replica.replica import Replica
 
 N_SCHEDULES = int(os.environ.get("GMMTORCH_SCHEDULES", "4"))
 """`scripts/soak.sh` runs more."""

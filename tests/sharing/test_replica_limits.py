@@ -13,9 +13,14 @@ from sharing.replica_histories import everything, exchange, history, replica_of
 
 import gmmtorch as gt
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.sharing.messages.message_registry import MAX_BYTES, decode, encode_components, encode_counts
-from gmmtorch.sharing.replica.records import MOST_VIEWPOINTS
-from gmmtorch.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.messages.message_registry import (
+    MAX_BYTES,
+    decode,
+    encode_components,
+    encode_counts,
+)
+from gmmtorch.team.sharing.replica.records import MOST_VIEWPOINTS
+from gmmtorch.team.sharing.replica.replica import Replica
 
 # -- restarts --------------------------------------------------------------------------------------
 

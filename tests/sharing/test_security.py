@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from sharing.transport_cases import KEY, SECRET, Clock
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError, OutputError
-from gmmtorch.sharing.transport.security import PLAIN_OVERHEAD, REFUSALS, SEALED_OVERHEAD, Opener, Sealer
-from gmmtorch.sharing.transport.team_key import TeamKey
+from gmmtorch.team.sharing.transport.security import PLAIN_OVERHEAD, REFUSALS, SEALED_OVERHEAD, Opener, Sealer
+from gmmtorch.team.sharing.transport.team_key import TeamKey
 
 datagrams = st.binary(max_size=1200)
 

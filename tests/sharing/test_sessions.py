@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sharing.transport_cases import Clock
 
-from gmmtorch.sharing.transport.sessions import (
+from gmmtorch.team.sharing.transport.sessions import (
     FRESH_FRAMES,
     FRESH_SECONDS,
     MAX_SESSIONS,

@@ -15,10 +15,10 @@ from mapping.random_components import random_components
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.occupancy.calibrator import Calibration, Calibrator
-from gmmtorch.sharing.messages.message_registry import CalibrationMessage, decode
-from gmmtorch.sharing.messages.record_messages import encode_record
-from gmmtorch.sharing.replica.record_keys import first_key
-from gmmtorch.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.messages.message_registry import CalibrationMessage, decode
+from gmmtorch.team.sharing.messages.record_messages import encode_record
+from gmmtorch.team.sharing.replica.record_keys import first_key
+from gmmtorch.team.sharing.replica.replica import Replica
 
 
 def learned(n_predicted: int, shift: float = 0.0, mean_range: float = 12.0) -> Calibration:

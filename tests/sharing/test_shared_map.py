@@ -8,10 +8,10 @@ import torch
 from exploration.replays import content, log, mapped
 
 from gmmtorch.mapping.components import Components
-from gmmtorch.sharing import Replica
-from gmmtorch.sharing.shared_map import SharedMap
-from gmmtorch.sharing.transport.link_conditions import LinkConditions
-from gmmtorch.sharing.transport.simulated_network import Network
+from gmmtorch.team.sharing import Replica
+from gmmtorch.team.sharing.shared_map import SharedMap
+from gmmtorch.team.sharing.transport.link_conditions import LinkConditions
+from gmmtorch.team.sharing.transport.simulated_network import Network
 
 
 def of_robot(components: Components, robot: int) -> Components:

@@ -14,10 +14,10 @@ from sharing.replica_histories import replica_of
 from sharing.schedules import act, components, run_schedule
 from sharing.store_cases import altered, filled, killed, recorded, reopened, rows, state
 
-from gmmtorch.sharing import store as store_module
-from gmmtorch.sharing.messages.message_registry import encode_components
-from gmmtorch.sharing.replica.replica import Replica
-from gmmtorch.sharing.store import Store
+from gmmtorch.team.sharing import store as store_module
+from gmmtorch.team.sharing.messages.message_registry import encode_components
+from gmmtorch.team.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.store import Store
 
 N_KILLS = 6
 """`scripts/soak.sh` runs more."""

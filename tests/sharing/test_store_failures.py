@@ -20,9 +20,9 @@ from sharing.schedules import components
 from sharing.store_cases import altered, filled, killed, recorded, reopened, rows, state
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.sharing import store_file
-from gmmtorch.sharing.replica.replica import Replica
-from gmmtorch.sharing.store import Restored, Store
+from gmmtorch.team.sharing import store_file
+from gmmtorch.team.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.store import Restored, Store
 
 # -- damage ----------------------------------------------------------------------------------------
 
@@ -157,7 +157,7 @@ def test_one_process_at_a_time_and_the_lock_ends_with_it(tmp_path):
     with Store(tmp_path / "s", 0), pytest.raises(InvalidArgumentError, match=r"path=.*runs already.*fuser"):
         Store(tmp_path / "s", 0)
     code = (
-        "import sys, time; from gmmtorch.sharing.store import Store\n"
+        "import sys, time; from gmmtorch.team.sharing.store import Store\n"
         "store = Store(sys.argv[1], 0); print('open', flush=True); time.sleep(600)"
     )
     command = [sys.executable, "-c", code, str(tmp_path / "s")]

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.sharing.radio import TokenBucket
+from gmmtorch.team.sharing.radio import TokenBucket
 
 LEAST = 1200
 rates = st.integers(1, 5000)

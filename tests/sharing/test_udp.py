@@ -17,10 +17,10 @@ import pytest
 from sharing.transport_cases import KEY, heard, hostile_frames, until
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
-from gmmtorch.sharing.transport.security import Sealer
-from gmmtorch.sharing.transport.simulated_network import Network, Traffic, Transport
-from gmmtorch.sharing.transport.team_key import TeamKey
-from gmmtorch.sharing.transport.udp import UdpTransport
+from gmmtorch.team.sharing.transport.security import Sealer
+from gmmtorch.team.sharing.transport.simulated_network import Network, Traffic, Transport
+from gmmtorch.team.sharing.transport.team_key import TeamKey
+from gmmtorch.team.sharing.transport.udp import UdpTransport
 
 GROUP = "239.71.77.7"
 Opening = Callable[..., UdpTransport]
@@ -121,7 +121,7 @@ def multicast() -> None:
 @pytest.mark.usefixtures("multicast")
 @pytest.mark.parametrize(("key", "binds_groups"), [(KEY, True), (None, True), (KEY, False)])
 def test_multicast_sends_once_and_delivers_to_the_others_only(key, binds_groups, monkeypatch):
-    monkeypatch.setattr("gmmtorch.sharing.transport.udp._BINDS_GROUPS", binds_groups)
+    monkeypatch.setattr("gmmtorch.team.sharing.transport.udp._BINDS_GROUPS", binds_groups)
     with ExitStack() as stack:
         a = stack.enter_context(UdpTransport.multicast(0, (GROUP, 0), key=key))
         group = a.address
@@ -209,7 +209,7 @@ def test_a_full_queue_keeps_the_newest_datagrams(opening):
 
 
 def test_datagrams_arrive_without_the_calls_that_windows_lacks(opening, monkeypatch):
-    monkeypatch.setattr("gmmtorch.sharing.transport.udp._HAS_NOTES", False)
+    monkeypatch.setattr("gmmtorch.team.sharing.transport.udp._HAS_NOTES", False)
     a, b = team(opening, 2, key=KEY)
     a.send(0, [b"one", bytes(1000)], 0.0, "maps")
     until(lambda: b.received.datagrams == 2)
@@ -219,7 +219,7 @@ def test_datagrams_arrive_without_the_calls_that_windows_lacks(opening, monkeypa
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux counts what a socket has no room for")
 def test_datagrams_dropped_by_the_system_are_counted(opening, raw, monkeypatch):
     """The receiving thread is blocked until the buffer of the socket overflows."""
-    monkeypatch.setattr("gmmtorch.sharing.transport.udp._BUFFER_BYTES", 1 << 14)
+    monkeypatch.setattr("gmmtorch.team.sharing.transport.udp._BUFFER_BYTES", 1 << 14)
     b = opening(1)
     sealer, n = Sealer(0), 200
     with b._lock:
@@ -240,7 +240,7 @@ def heard_any(transport: UdpTransport) -> bool:
 
 
 def test_duplicate_robot_ids_are_detected_by_all(opening, caplog, monkeypatch):
-    monkeypatch.setattr("gmmtorch.sharing.transport.sessions.FRESH_SECONDS", 0.0)
+    monkeypatch.setattr("gmmtorch.team.sharing.transport.sessions.FRESH_SECONDS", 0.0)
     a, first, second = opening(0, key=KEY), opening(3, key=KEY), opening(3, key=KEY)
     everybody = [each.address for each in (a, first, second)]
     for each in (a, first, second):

@@ -16,11 +16,11 @@ from sharing.transport_cases import KEY, heard, hostile_frames, until
 from sharing.zenoh_cases import Opening, endpoint, greet, wait_until_connected, zenoh
 
 from gmmtorch.errors import GmmTorchError
-from gmmtorch.sharing.radio import Radio
-from gmmtorch.sharing.replica.replica import Replica
-from gmmtorch.sharing.transport.security import Sealer
-from gmmtorch.sharing.transport.simulated_network import Traffic, Transport
-from gmmtorch.sharing.transport.zenoh_transport import ZenohTransport
+from gmmtorch.team.sharing.radio import Radio
+from gmmtorch.team.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.transport.security import Sealer
+from gmmtorch.team.sharing.transport.simulated_network import Traffic, Transport
+from gmmtorch.team.sharing.transport.zenoh_transport import ZenohTransport
 
 
 @pytest.fixture
@@ -248,7 +248,7 @@ def said_until(transport: ZenohTransport, last: bytes) -> list[bytes]:
 
 FORGETFUL = """
 import sys
-from gmmtorch.sharing.transport.zenoh_transport import ZenohTransport
+from gmmtorch.team.sharing.transport.zenoh_transport import ZenohTransport
 transport = ZenohTransport(1, connect=[sys.argv[1]])
 while not transport.deliver(1, 0.0):
     transport.send(1, [b"x"], 0.0, "maps")

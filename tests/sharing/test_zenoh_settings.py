@@ -15,8 +15,8 @@ from sharing.transport_cases import KEY, heard
 from sharing.zenoh_cases import endpoint, wait_until_connected, zenoh
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError
-from gmmtorch.sharing.transport import zenoh_transport
-from gmmtorch.sharing.transport.zenoh_transport import ZenohTransport
+from gmmtorch.team.sharing.transport import zenoh_transport
+from gmmtorch.team.sharing.transport.zenoh_transport import ZenohTransport
 
 
 def test_without_a_key_only_loopback_is_allowed(opening, tmp_path):

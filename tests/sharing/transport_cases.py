@@ -6,9 +6,9 @@ import random
 import time
 from collections.abc import Callable
 
-from gmmtorch.sharing.transport.frames import FramedTransport
-from gmmtorch.sharing.transport.security import Sealer
-from gmmtorch.sharing.transport.team_key import TeamKey
+from gmmtorch.team.sharing.transport.frames import FramedTransport
+from gmmtorch.team.sharing.transport.security import Sealer
+from gmmtorch.team.sharing.transport.team_key import TeamKey
 
 SECRET = bytes(range(32))
 KEY = TeamKey(SECRET)

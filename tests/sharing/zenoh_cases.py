@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 from sharing.transport_cases import Heard, until
 
-from gmmtorch.sharing.transport.zenoh_transport import ZenohTransport
+from gmmtorch.team.sharing.transport.zenoh_transport import ZenohTransport
 
 zenoh = pytest.importorskip("zenoh")
 Opening = Callable[..., ZenohTransport]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -12,14 +12,16 @@ from omegaconf import DictConfig
 from gmmtorch.cli import common
 from gmmtorch.cli.options.structured import build
 from gmmtorch.errors import InvalidArgumentError, check_choice
-from gmmtorch.evaluation import methods
-from gmmtorch.evaluation.methods import MapFactory
-from gmmtorch.evaluation.protocol_options import Protocol
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.rules import SOFTMAX_DTYPES, IncrementalRule, LearningRule, WindowedRule
-from gmmtorch.mapping.query_options import QueryOptions
-from gmmtorch.mapping.tile_index import INDEX
-from gmmtorch.mapping.tiles import TiledMap
+from gmmtorch.mapping import (
+    INDEX,
+    SOFTMAX_DTYPES,
+    GaussianMap,
+    IncrementalRule,
+    LearningRule,
+    QueryOptions,
+    TiledMap,
+    WindowedRule,
+)
 
 
 def limits(config: DictConfig) -> dict[str, Any]:
@@ -30,28 +32,6 @@ def limits(config: DictConfig) -> dict[str, Any]:
         "compiled": runtime.compile,
         "random_state": config.seed,
     }
-
-
-def known_methods(config: DictConfig) -> dict[str, MapFactory]:
-    """Every method by name."""
-    options = common.as_options(config.method_options)
-    return methods.methods(map_factory(config), options, **limits(config))
-
-
-def protocol_of(config: DictConfig) -> Protocol:
-    """The held-out test from `evaluation.*`."""
-    return build(Protocol, common.as_options(config.evaluation), "evaluation")
-
-
-def check_factories(factories: Mapping[str, MapFactory], resolution: float) -> None:
-    """Make an empty map with each factory, so that an invalid option fails before any map is built."""
-    for name, factory in factories.items():
-        try:
-            factory(resolution)
-        except TypeError as error:  # for example text, where a baseline compares numbers
-            raise InvalidArgumentError(
-                f"method_options.{name} has a value of the wrong type: {error}."
-            ) from error
 
 
 def open_map(

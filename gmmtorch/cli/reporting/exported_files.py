@@ -9,21 +9,34 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.cli.from_options import maps
-from gmmtorch.datasets.recordings.trajectory import read_trajectory
+from gmmtorch.datasets import read_trajectory
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
-from gmmtorch.evaluation.events import Event
-from gmmtorch.export import distance_field, floor_and_ceiling, map_server, mixture_formats
-from gmmtorch.export.mesh import surface_mesh
-from gmmtorch.export.mesh_formats import write_mesh
-from gmmtorch.export.octomap import write_octomap
-from gmmtorch.export.point_cloud import CellCloud, write_pcd, write_ply
-from gmmtorch.export.trajectory_files import write_kitti
-from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.events import Event
+from gmmtorch.export import (
+    CellCloud,
+    PlainMixture,
+    checked,
+    distance_field,
+    highest_in_band,
+    of_components,
+    of_grid,
+    read_gira_csv,
+    read_npz,
+    surface_mesh,
+    write_distance_field,
+    write_gira_csv,
+    write_kitti,
+    write_map_server,
+    write_mesh,
+    write_npz,
+    write_octomap,
+    write_pcd,
+    write_ply,
+)
+from gmmtorch.mapping import GaussianMap
 from gmmtorch.mixture import GaussianMixture
-from gmmtorch.occupancy.evidence import Thresholds
-from gmmtorch.occupancy.grid import VoxelGrid, check_resolution, rasterize
+from gmmtorch.occupancy import OccupancyGrid, Thresholds, VoxelGrid, check_resolution, rasterize
 
 _EXTENT = 3.0  # standard deviations around each component that the cells cover
 
@@ -42,29 +55,29 @@ def write_poses(path: Path, output: Path) -> str:
 
 def write_components(config: DictConfig) -> str:
     """Write weights, means and covariances; returns a message."""
-    mixture = mixture_formats.checked(_components(config))
+    mixture = checked(_components(config))
     output = Path(config.output)
     if config.format == "csv":
-        mixture_formats.write_gira_csv(output, mixture)
+        write_gira_csv(output, mixture)
     elif config.format == "npz":
-        mixture_formats.write_npz(output, mixture)
+        write_npz(output, mixture)
     else:
         GaussianMixture.from_parameters(*mixture[:3]).save(output)
     k, dim = mixture.means.shape
     return f"{_size(output)}: {k:,} components in {dim}D"
 
 
-def _components(config: DictConfig) -> mixture_formats.PlainMixture:
+def _components(config: DictConfig) -> PlainMixture:
     """The mixture in a file of any supported format; the surface components of a map."""
     path, n_points = Path(config.path), config.n_points
     if path.suffix == ".csv":
-        return mixture_formats.read_gira_csv(path, n_points)
+        return read_gira_csv(path, n_points)
     if path.suffix == ".npz":
-        return mixture_formats.read_npz(path)
+        return read_npz(path)
     try:
         found = maps.open_map(path, config.runtime, config.bounds).components()
         surface = ~found.max_range
-        return mixture_formats.PlainMixture.of_support(
+        return PlainMixture.of_support(
             found.means[surface], found.covariances[surface], found.support[surface]
         )
     except DataError as error:
@@ -74,7 +87,7 @@ def _components(config: DictConfig) -> mixture_formats.PlainMixture:
     except DataError as error:
         raise DataError(f"{path} contains no components to export. {no_map} {error}") from error
     support = None if n_points is None else mixture.weights * n_points
-    return mixture_formats.PlainMixture(mixture.weights, mixture.means, mixture.covariances, support)
+    return PlainMixture(mixture.weights, mixture.means, mixture.covariances, support)
 
 
 # -- space ----------------------------------------------------------------------------------------
@@ -104,12 +117,12 @@ def write_space(config: DictConfig, source: Source, on_event: Event) -> str:
         about = space.choose_band()
         grid, theta = space.dense(on_event)
         if grid.dim == 3:
-            grid, theta = map_server.highest_in_band(grid, theta)  # `dense` returns only the band
-        written = map_server.write_map_server(output, grid, theta, rule)
+            grid, theta = highest_in_band(grid, theta)  # `dense` returns only the band
+        written = write_map_server(output, grid, theta, rule)
         return "\n".join(map(_size, written)) + f": {_cells(grid)}{about}"
     if config.format == "distance_field":
         grid, theta = space.dense(on_event)
-        distance_field.write_distance_field(output, grid, distance_field.distance_field(grid, theta, rule))
+        write_distance_field(output, grid, distance_field(grid, theta, rule))
         return f"{_size(output)}: {_cells(grid)}"
     if config.format == "mesh":
         if not isinstance(source, GaussianMap):
@@ -169,9 +182,9 @@ class _Space:
         if isinstance(source, GaussianMap):
             found = source.components()
             if found.dim == 3 and len(found):
-                levels = floor_and_ceiling.of_components(found, side)
+                levels = of_components(found, side)
         elif (evidence := source.evidence()).dim == 3 and evidence.n_blocks:
-            levels = floor_and_ceiling.of_grid(source, self._config.occupied_thresh)
+            levels = of_grid(source, self._config.occupied_thresh)
         if levels is None:
             return ""
         self.band = levels.band(side)

@@ -15,16 +15,20 @@ from torch import Tensor
 
 from gmmtorch.cli import common
 from gmmtorch.cli.reporting import map_outputs
-from gmmtorch.datasets import Dataset
-from gmmtorch.datasets.recordings.trajectory import in_plane, pose_matrix, read_trajectory, to_nanoseconds
+from gmmtorch.datasets import Dataset, in_plane, pose_matrix, read_trajectory, to_nanoseconds
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.events import Row
-from gmmtorch.evaluation.trajectories import UNSCORED, absolute_trajectory_error, relative_pose_error
-from gmmtorch.export.trajectory_files import write_pose_table, write_tum
-from gmmtorch.localization.scan_locations import ScanLocation, clock_faults, scan_times
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.report.maps.map_figures import map_figure
-from gmmtorch.report.tensorboard_writer import Board
+from gmmtorch.events import Row
+from gmmtorch.export import write_pose_table, write_tum
+from gmmtorch.localization import (
+    UNSCORED,
+    ScanLocation,
+    absolute_trajectory_error,
+    clock_faults,
+    relative_pose_error,
+    scan_times,
+)
+from gmmtorch.mapping import GaussianMap
+from gmmtorch.report import Board, map_figure
 
 _FORMS = {2: "[x,y,yaw]", 3: "[x,y,z,yaw] or [x,y,z,qx,qy,qz,qw]"}
 FOUND, ALL = "trajectory.tum", "trajectory.csv"

@@ -15,28 +15,26 @@ import gmmtorch
 from gmmtorch.cli import common
 from gmmtorch.cli.options import map_schema
 from gmmtorch.cli.reporting import exported_files
-from gmmtorch.datasets import Dataset
-from gmmtorch.datasets.recordings.trajectory import read_trajectory
+from gmmtorch.datasets import Dataset, read_trajectory
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError, MissingDataError, check_number
-from gmmtorch.evaluation.calibration import reliability_of, scores_of
-from gmmtorch.evaluation.events import Event, Row
-from gmmtorch.export import trajectory_files
-from gmmtorch.localization.odometry.odometry import Trajectory
-from gmmtorch.localization.scan_locations import scan_times
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.map_builder import MapBuilder
+from gmmtorch.events import Event, Row
+from gmmtorch.export import write_pose_table, write_tum
+from gmmtorch.localization import Trajectory, scan_times
+from gmmtorch.mapping import Components, GaussianMap, MapBuilder
+from gmmtorch.occupancy import reliability_of, scores_of
 from gmmtorch.optional_packages import load_pyoctomap
-from gmmtorch.report.maps.accuracy_figures import reliability_figure
-from gmmtorch.report.maps.map_figures import map_figure
-from gmmtorch.report.maps.map_images import MapPanel
-from gmmtorch.report.maps.map_regions import robust_bounds
-from gmmtorch.report.scenes.ellipsoids import first_viewpoints
-from gmmtorch.report.scenes.mixture_figures import mixture_figure
-from gmmtorch.report.scenes.scene import mixture_scene_figure
-from gmmtorch.report.style import metres
-from gmmtorch.report.table import byte_text
-from gmmtorch.report.tensorboard_writer import Board
+from gmmtorch.report import (
+    Board,
+    MapPanel,
+    byte_text,
+    first_viewpoints,
+    map_figure,
+    metres,
+    mixture_figure,
+    mixture_scene_figure,
+    reliability_figure,
+    robust_bounds,
+)
 
 EXPORTS = {
     "map_server": ("map_server", "navigation.yaml"),
@@ -122,11 +120,11 @@ RECORDINGS = "recordings"
 
 def write_trajectory(builder: MapBuilder, folder: Path) -> Tensor:
     """Write the trajectory as TUM; returns the sensor positions (S, D)."""
-    trajectory_files.write_tum(folder / TRAJECTORY, builder.times, builder.poses)
+    write_tum(folder / TRAJECTORY, builder.times, builder.poses)
     return builder.poses[:, :-1, -1]
 
 
-def write_pose_table(dataset: Dataset, estimated: Trajectory, folder: Path) -> None:
+def write_estimated_poses(dataset: Dataset, estimated: Trajectory, folder: Path) -> None:
     """Write the estimated poses of all scans with their covariances, if the method gives some."""
     if bool(estimated.covariances.isnan().any()):
         return
@@ -142,9 +140,7 @@ def write_pose_table(dataset: Dataset, estimated: Trajectory, folder: Path) -> N
         "doubts": estimated.doubts,
     }
     spread = axes @ estimated.covariances @ axes.mT  # of the sensor's axes, in those of the world
-    trajectory_files.write_pose_table(
-        folder / POSE_TABLE, scan_times(dataset), estimated.poses, spread, columns
-    )
+    write_pose_table(folder / POSE_TABLE, scan_times(dataset), estimated.poses, spread, columns)
 
 
 def trajectories(run: Path, given: str | None, dim: int) -> list[Tensor]:

@@ -29,19 +29,25 @@ class Job(NamedTuple):
 
 
 class SweepTable(Callback):
-    """Prints the rows of all jobs when a sweep ends. The exit status is 1 if a job failed."""
+    """Prints the rows of all jobs when a sweep ends. The exit status is 1 if a job failed.
+
+    module: dotted name of the command's module, whose `TABLE` names the columns.
+    """
+
+    def __init__(self, module: str) -> None:
+        self._module = module
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         self._begin = time.time()
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
-        from gmmtorch.report.table import format_table
+        from gmmtorch.report import format_table
 
         folder = Path(config.hydra.sweep.dir)
         jobs = read_jobs(folder, self._begin - _CLOCK_STEP)
         if not jobs:  # the command writes no folders
             return
-        rows, columns = joint_rows(jobs, _columns(config.hydra.job.name))
+        rows, columns = joint_rows(jobs, _columns(self._module))
         print(f"\n{len(jobs)} jobs in {folder}\n{format_table(rows, columns)}")
         print(f"\nresults   {folder}/*/results.json\nbrowse    tensorboard --logdir {folder}")
         if failed := [job.name for job in jobs if job.error]:
@@ -96,7 +102,6 @@ def _is_long(value: Any) -> bool:
     return isinstance(value, list | dict)
 
 
-def _columns(command: str) -> list[str]:
+def _columns(module: str) -> list[str]:
     """The columns of a command's own table."""
-    module = importlib.import_module(f"gmmtorch.cli.{command}")
-    return str(getattr(module, "TABLE", "")).split()
+    return str(getattr(importlib.import_module(module), "TABLE", "")).split()

@@ -21,12 +21,10 @@ from gmmtorch.cli.reporting import map_outputs
 from gmmtorch.cli.runs.inputs import find_recordings, local_copy
 from gmmtorch.cli.runs.tasks import Outcome, run_tasks
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MemoryLimitError
-from gmmtorch.evaluation.events import Row
+from gmmtorch.events import Row
 from gmmtorch.files import write_bytes, write_json
-from gmmtorch.mapping.map_builder import MapBuilder, check_same_run, resident_bytes
-from gmmtorch.mapping.tile_merging import merge, tile_files
-from gmmtorch.mapping.tiles import TiledMap
-from gmmtorch.report.progress import ProgressBars
+from gmmtorch.mapping import MapBuilder, TiledMap, check_same_run, merge, resident_bytes, tile_files
+from gmmtorch.report import ProgressBars
 
 _STAGE = "recordings"
 _DONE = "recording.json"  # written last: it says that a recording is complete
@@ -161,7 +159,7 @@ def _mapped(config: DictConfig, path: Path) -> Mapped:
     with tempfile.TemporaryDirectory(prefix="gmmtorch-") as folder:
         map_outputs.write_trajectory(builder, Path(folder))
         if poses is not None:
-            map_outputs.write_pose_table(dataset, poses, Path(folder))
+            map_outputs.write_estimated_poses(dataset, poses, Path(folder))
         files |= {file.name: file.read_bytes() for file in Path(folder).iterdir()}
     row = map_outputs.result_row(dataset.name, builder, config, odometry)
     row |= {"cpu_seconds": time.process_time() - begin, "worker": f"{platform.node()}:{os.getpid()}"}

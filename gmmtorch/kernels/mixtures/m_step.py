@@ -156,7 +156,7 @@ Mixture = tuple[Tensor, Tensor, Tensor]
 """Weights (K,), means (K, D) and covariances (K, D, D)."""
 
 
-def is_fused_on(dim: int, *tensors: Tensor) -> bool:
+def is_m_step_fused(dim: int, *tensors: Tensor) -> bool:
     """Whether the fused kernels compute with these tensors in `dim` dimensions."""
     return dim in DIMENSIONS and all(t.dtype == torch.float64 for t in tensors) and is_fused(*tensors)
 

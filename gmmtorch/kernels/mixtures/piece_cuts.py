@@ -168,7 +168,7 @@ class CutRule(NamedTuple):
     thickness_priority: float
 
 
-def is_fused_on(points: Tensor, weight: Tensor, features: Tensor) -> bool:
+def are_piece_cuts_fused(points: Tensor, weight: Tensor, features: Tensor) -> bool:
     """Whether the fused kernel computes with these cells."""
     given = points, weight, features
     fits = points.device.type == "cpu" and points.shape[1] in DIMENSIONS

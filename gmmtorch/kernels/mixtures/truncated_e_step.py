@@ -268,7 +268,7 @@ _CHOICES = _kernels(
 )
 
 
-def is_fused_on(rows: GroupedRows, *others: Tensor) -> bool:
+def is_truncated_e_step_fused(rows: GroupedRows, *others: Tensor) -> bool:
     """Whether the fused kernels compute with these groups."""
     fits = rows.features.device.type == "cpu" and rows.centers.shape[1] in DIMENSIONS
     return fits and is_fused(*rows, *others)

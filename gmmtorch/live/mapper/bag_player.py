@@ -7,11 +7,9 @@ from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
 
-from gmmtorch.datasets.recordings.ros.bag_reader import BagReader, RawMessage, Topic
-from gmmtorch.datasets.recordings.ros.bag_topics import TF_TYPES
-from gmmtorch.datasets.recordings.trajectory import NANOSECONDS
+from gmmtorch.datasets import NANOSECONDS, TF_TYPES, BagReader, RawMessage, Topic
 from gmmtorch.errors import DataError, InvalidArgumentError, check_number
-from gmmtorch.export.message_fields import time_fields
+from gmmtorch.export import time_fields
 from gmmtorch.live.ros import Node
 from gmmtorch.live.ros.node import CLOCK, TRANSFORMS
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from gmmtorch.live.mapper.live_scans import LiveScans
 from gmmtorch.live.ros import Node
-from gmmtorch.mapping.map_builder import resident_bytes
+from gmmtorch.mapping import resident_bytes
 
 _PERIOD = 1.0  # s
 _MOST = 10_000  # latencies that are kept

@@ -6,15 +6,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, in_space
+from gmmtorch.datasets import NANOSECONDS, in_space
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.live.mapper.diagnostics import Diagnostics
 from gmmtorch.live.mapper.live_mapper import handle_messages
 from gmmtorch.live.mapper.live_scans import LiveScan, LiveScans
 from gmmtorch.live.mapper.pose_publisher import PosePublisher
 from gmmtorch.live.ros import Node
-from gmmtorch.localization.tracker import Tracker
-from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.localization import Tracker
+from gmmtorch.mapping import GaussianMap
 
 MAP = "map"
 """Frame of the map."""

@@ -7,16 +7,15 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 import torch
 
-from gmmtorch.datasets.recordings.trajectory import NANOSECONDS
+from gmmtorch.datasets import NANOSECONDS
+from gmmtorch.live.live_moments import TeamMap
 from gmmtorch.live.mapper.diagnostics import Diagnostics
 from gmmtorch.live.mapper.live_scans import LiveScans
 from gmmtorch.live.mapper.map_publisher import MapPublisher
 from gmmtorch.live.mapper.pose_publisher import PosePublisher
 from gmmtorch.live.ros import Node
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.map_builder import MapBuilder
+from gmmtorch.mapping import GaussianMap, MapBuilder
 from gmmtorch.scan import Scan
-from gmmtorch.sharing.shared_map import SharedMap
 
 _MESSAGES = 500  # of a flood, before a scan is mapped
 _PATIENCE = 3.0  # s that a due publication waits for the end of a window
@@ -51,7 +50,7 @@ class LiveMapper:
         publisher: MapPublisher | None = None,
         period: float = 1.0,
         device: str | torch.device = "cpu",
-        shared: SharedMap | None = None,
+        shared: TeamMap | None = None,
     ) -> None:
         self.builder = MapBuilder(scans, target, device)
         self.shared = shared

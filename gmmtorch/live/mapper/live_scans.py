@@ -15,22 +15,28 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets.base import Dataset, Ranges
-from gmmtorch.datasets.recordings.ros.bag_poses import Record
-from gmmtorch.datasets.recordings.ros.bag_topics import Sensor
-from gmmtorch.datasets.recordings.ros.image_camera import ImageCamera
-from gmmtorch.datasets.recordings.ros.point_times import Rate
-from gmmtorch.datasets.recordings.ros.pose_sources import PoseSource, Standing, TfPoses
-from gmmtorch.datasets.recordings.ros.scan_conversion import ScanConversion
-from gmmtorch.datasets.recordings.ros.sensor_messages import Reading
-from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree, frame_name, stamp_of
-from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, in_plane, in_space
+from gmmtorch.datasets import (
+    NANOSECONDS,
+    Dataset,
+    ImageCamera,
+    PoseSource,
+    Ranges,
+    Rate,
+    Reading,
+    Record,
+    ScanConversion,
+    Sensor,
+    Standing,
+    TfPoses,
+    TransformTree,
+    frame_name,
+    in_plane,
+    in_space,
+    stamp_of,
+)
 from gmmtorch.errors import DataError, check_choice, check_number
-from gmmtorch.localization.location import Location, composed
-from gmmtorch.localization.odometry.odometry import Odometry
-from gmmtorch.localization.odometry.recorded_poses import METHODS, odometry_of
-from gmmtorch.localization.tracker import Tracker
-from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.localization import METHODS, Location, Odometry, Tracker, composed, odometry_of
+from gmmtorch.mapping import GaussianMap
 from gmmtorch.scan import FARTHEST, Scan
 
 DROPPED = "dropped, because mapping is slower than the sensor"

@@ -10,18 +10,12 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError, check_choice
-from gmmtorch.export import floor_and_ceiling
-from gmmtorch.export.map_server import highest_in_band
-from gmmtorch.export.message_fields import cloud_fields
-from gmmtorch.export.point_cloud import CellCloud
+from gmmtorch.export import CellCloud, cloud_fields, highest_in_band, of_components
 from gmmtorch.live import viewer_scene
 from gmmtorch.live.ros import Node
 from gmmtorch.live.ros.quality import LATCHED
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.query import Query
-from gmmtorch.occupancy.evidence import CellClass, Thresholds, probability
-from gmmtorch.occupancy.forms.kept_evidence import KeptEvidence
-from gmmtorch.occupancy.grid import VoxelGrid
+from gmmtorch.mapping import GaussianMap, Query
+from gmmtorch.occupancy import CellClass, KeptEvidence, Thresholds, VoxelGrid, probability
 
 CLOUDS = ("cells", "means", "none")
 _EXTENT = 3.0  # standard deviations around each component that the grid covers
@@ -112,9 +106,7 @@ class MapPublisher:
         low: list[float] = points.amin(0).tolist()
         high: list[float] = points.amax(0).tolist()
         if found.dim == 3:
-            bottom, top = self._band or floor_and_ceiling.of_components(found, self._resolution).band(
-                self._resolution
-            )
+            bottom, top = self._band or of_components(found, self._resolution).band(self._resolution)
             low[2] = low[2] if bottom is None else max(low[2], bottom)
             high[2] = high[2] if top is None else max(low[2], min(high[2], top) - 1e-6)
         return low, high

@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets.recordings.trajectory import in_space
+from gmmtorch.datasets import in_space
 from gmmtorch.errors import DataError
-from gmmtorch.export.message_fields import odometry_fields, transform_fields
+from gmmtorch.export import odometry_fields, transform_fields
 from gmmtorch.live.mapper.live_scans import SETTLING, LiveScan
 from gmmtorch.live.ros import Node
-from gmmtorch.localization.location import Location
+from gmmtorch.localization import Location
 
 _PLANAR = (0, 1, 5)
 """Rows of x, y and the heading among those of a pose's covariance in ROS."""

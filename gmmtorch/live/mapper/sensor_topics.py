@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import time
 
-from gmmtorch.datasets.base import Ranges
-from gmmtorch.datasets.recordings.ros import bag_topics
-from gmmtorch.datasets.recordings.ros.bag_reader import Topic
-from gmmtorch.datasets.recordings.ros.bag_topics import Sensor, nearest_names
+from gmmtorch.datasets import CLOUD, COMPRESSED, DEPTH, INFO_TYPE, LASER, Ranges, Sensor, Topic, nearest_names
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.live.mapper.live_scans import LiveOptions, LiveScans
 from gmmtorch.live.ros import Node
 from gmmtorch.live.ros.node import reading
 
 _KINDS = {
-    "sensor_msgs/msg/PointCloud2": bag_topics.CLOUD,
-    "sensor_msgs/msg/LaserScan": bag_topics.LASER,
-    "sensor_msgs/msg/Image": bag_topics.DEPTH,
-    "sensor_msgs/msg/CompressedImage": bag_topics.COMPRESSED,
+    "sensor_msgs/msg/PointCloud2": CLOUD,
+    "sensor_msgs/msg/LaserScan": LASER,
+    "sensor_msgs/msg/Image": DEPTH,
+    "sensor_msgs/msg/CompressedImage": COMPRESSED,
 }
 _RANKS = list(_KINDS)
 _POLL = 0.2  # s
@@ -80,7 +77,7 @@ def open_scans(
         node.listen_to_transforms()
     if sensor.is_camera and options.intrinsics is None:
         info = camera_info or _camera_info(node, sensor.topic.name)
-        node.subscribe(info, bag_topics.INFO_TYPE, reading(scans.note_camera))
+        node.subscribe(info, INFO_TYPE, reading(scans.note_camera))
     node.subscribe(
         sensor.topic.name,
         sensor.topic.type,
@@ -90,7 +87,7 @@ def open_scans(
 
 
 def _camera_info(node: Node, image: str) -> str:
-    infos = [topic for topic, types in node.topics().items() if bag_topics.INFO_TYPE in types]
+    infos = [topic for topic, types in node.topics().items() if INFO_TYPE in types]
     best = nearest_names(infos, image) if infos else []
     if len(best) != 1:
         raise InvalidArgumentError(

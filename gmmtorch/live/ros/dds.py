@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
-from gmmtorch.datasets.recordings.ros.message_decoder import ARRAY, BASE, NAME
+from gmmtorch.datasets import ARRAY, BASE, NAME
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.live.ros.message_types import MessageTypes, dds_type, ros_type
 from gmmtorch.live.ros.middleware import Endpoint

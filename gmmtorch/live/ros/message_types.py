@@ -6,9 +6,9 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from gmmtorch.datasets.recordings.ros.message_decoder import MessageDecoder
+from gmmtorch.datasets import MessageDecoder
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.export.message_fields import built_message
+from gmmtorch.export import built_message
 from gmmtorch.optional_packages import needs_extra
 
 _NAME = re.compile(r"(\w+)/msg/(\w+)")

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, NamedTuple
 
-from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree
+from gmmtorch.datasets import TransformTree
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice
 from gmmtorch.live.ros import dds, quality, zenoh_middleware
 from gmmtorch.live.ros.message_types import MessageTypes

@@ -15,10 +15,7 @@ from gmmtorch.localization.odometry.free_space import FreeSpace, View
 from gmmtorch.localization.registration.alignment import Alignment, AlignmentTarget, align, seen_normals
 from gmmtorch.localization.registration.registration import register
 from gmmtorch.localization.rigid_motions import Motions, distinct, generators, logarithm
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.rules import WindowedRule
-from gmmtorch.mapping.learning.windows import learn_window
-from gmmtorch.mapping.surfaces import surface_mixture
+from gmmtorch.mapping import Components, WindowedRule, learn_window, surface_mixture
 from gmmtorch.scan import Scan
 
 _BLURS = {2: (0.2, 0.08, 0.03), 3: (0.25, 0.1, 0.04)}  # metres

@@ -16,7 +16,7 @@ from gmmtorch.localization.location import Location
 from gmmtorch.localization.odometry.local_map import Expectation, Keyframe, LocalMap
 from gmmtorch.localization.odometry.pose_graph import Edges, optimised
 from gmmtorch.localization.rigid_motions import logarithm
-from gmmtorch.mapping.learning.rules import WindowedRule
+from gmmtorch.mapping import WindowedRule
 
 _ROUNDS = 3  # of closing and correcting: corrected poses bring more places together
 _APART = 15  # keyframes between two visits of a place

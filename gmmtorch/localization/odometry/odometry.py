@@ -15,9 +15,7 @@ from gmmtorch.localization.odometry.local_map import LOST, Expectation, Keyframe
 from gmmtorch.localization.odometry.loop_closure import LoopCloser, closed, information_of
 from gmmtorch.localization.odometry.pose_graph import Edges, optimised
 from gmmtorch.localization.rigid_motions import continued, measured_motion
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.rules import WindowedRule
-from gmmtorch.mapping.learning.windows import learn_window
+from gmmtorch.mapping import Components, WindowedRule, learn_window
 from gmmtorch.scan import Scan
 
 _RULE = WindowedRule(window=1, noise=0.02, length=0.4, max_cells=5000)

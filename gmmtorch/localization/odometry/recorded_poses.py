@@ -9,9 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets.base import Dataset
-from gmmtorch.datasets.recordings.reposed import Reposed, with_poses
-from gmmtorch.datasets.recordings.trajectory import in_plane
+from gmmtorch.datasets import Dataset, Reposed, in_plane, with_poses
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice
 from gmmtorch.localization.location import Location
 from gmmtorch.localization.odometry.odometry import Odometry, Trajectory

@@ -18,14 +18,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels.mixtures.point_alignment import AlignmentSums, alignment_sums
+from gmmtorch.kernels import AlignmentSums, alignment_sums
 from gmmtorch.localization.registration.overlap import deviations
 from gmmtorch.localization.rigid_motions import Motions, chosen_rows
-from gmmtorch.mapping.components import Components
-from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.reduction.moments import merge_components
-from gmmtorch.occupancy.cone_index import ConeIndex
-from gmmtorch.occupancy.cones import Cones
+from gmmtorch.mapping import Components
+from gmmtorch.mixture import Parameters, merge_components
+from gmmtorch.occupancy import ConeIndex, Cones
 
 CUTOFF = 3.5
 """Deviations beyond which a component is left out of a point."""

@@ -19,13 +19,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.mixtures.near_pairs import MOST_TESTED, near_pairs
-from gmmtorch.kernels.mixtures.pair_overlap import overlap_sums
+from gmmtorch.kernels import MOST_TESTED, is_fused, near_pairs, overlap_sums
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.localization.rigid_motions import Motions, chosen_rows, generators
-from gmmtorch.mapping.surfaces import touching
-from gmmtorch.mixture.em.exact import Parameters
+from gmmtorch.mapping import touching
+from gmmtorch.mixture import Parameters
 
 _CUTOFF = 4.0  # deviations beyond which a pair is left out: its term is below 4e-4 of its maximum
 _SLACK = 0.5  # of the thickness: components may move this far before pairs are listed again

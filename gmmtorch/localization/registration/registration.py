@@ -13,9 +13,8 @@ from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, ch
 from gmmtorch.linalg import check_rigid, nearest_rotations, plane_rotations
 from gmmtorch.localization.registration.overlap import Ascent, deviations, log_self_overlap
 from gmmtorch.localization.rigid_motions import Motions
-from gmmtorch.mapping.surfaces import Surfaces, surface_mixture
-from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.reduction.moments import merge_components
+from gmmtorch.mapping import Surfaces, surface_mixture
+from gmmtorch.mixture import Parameters, merge_components
 
 _BEST_KEPT = 4  # poses that go on from one level to the next,
 _LEAST_SHARE = 0.7  # of the best one's score at least

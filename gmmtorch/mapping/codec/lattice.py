@@ -27,8 +27,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.mixtures.lattice_rounding import LatticeConstants, lattice_restoring, lattice_rounding
+from gmmtorch.kernels import LatticeConstants, is_fused, lattice_restoring, lattice_rounding
 from gmmtorch.scan import FARTHEST
 
 PER_OCTAVE = 4

@@ -26,7 +26,7 @@ from gmmtorch.mapping.codec.quantization import number_after, quantize_numbered
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import LearningRule, changed_options, rule_facts
 from gmmtorch.mapping.query_options import QueryOptions, check_method
-from gmmtorch.occupancy.calibrator import Calibration
+from gmmtorch.occupancy import Calibration
 
 FILE_KIND, FILE_VERSION = "gmmtorch.map", 2
 

@@ -10,11 +10,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.mixtures.explained_points import explained_points
+from gmmtorch.kernels import explained_points, is_fused
 from gmmtorch.linalg import dense_ranks
 from gmmtorch.mapping.components import Components
-from gmmtorch.occupancy.cones import whitening
+from gmmtorch.occupancy import whitening
 
 _LEAST_DISTANCE = 1e-6  # squared Mahalanobis: the thesis's shares are undefined at a mean
 _PAIRS_AT_ONCE = 1 << 20

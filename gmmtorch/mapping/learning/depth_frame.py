@@ -12,10 +12,9 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.kernels.mixtures.depth_cells import DepthCells, DepthView, depth_cells
+from gmmtorch.kernels import DepthCells, DepthView, depth_cells
 from gmmtorch.linalg import check_rigid
-from gmmtorch.mixture.em.cells import coarsest_allowed
-from gmmtorch.mixture.em.exact import shift_features
+from gmmtorch.mixture import coarsest_allowed, shift_features
 from gmmtorch.pinhole import back_project, check_intrinsics, metric_depth
 from gmmtorch.scan import Scan
 

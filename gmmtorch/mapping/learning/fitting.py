@@ -18,14 +18,22 @@ from gmmtorch.mapping.components import UNNUMBERED, Components
 from gmmtorch.mapping.learning.depth_frame import DepthFrame, pool_frames
 from gmmtorch.mapping.learning.rules import MixtureRule
 from gmmtorch.mapping.learning.viewpoints import AssignedViewpoints, AssignViewpoints
-from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em import loop
-from gmmtorch.mixture.em.cells import Cells, pool_into_cells
-from gmmtorch.mixture.em.partition import FlatnessRule, partition, pool
+from gmmtorch.mixture import (
+    Cells,
+    FlatnessRule,
+    Parameters,
+    maximization,
+    most_likely_component,
+    natural_step,
+    partition,
+    pool,
+    pool_into_cells,
+    run_em,
+)
 from gmmtorch.scan import Scan
 
 if TYPE_CHECKING:
-    from gmmtorch.mixture.estimators.sensor_model import SensorModel
+    from gmmtorch.mixture import SensorModel
 
 _FEW_POINTS, _MOST_CELLS = 1_000, 50_000  # fewer points are not pooled; more cells are not worth their time
 _TOLERANCE = 1e-4  # of EM: relative change of the log-likelihood
@@ -118,7 +126,7 @@ def fit_frames(frames: Sequence[DepthFrame], fit: SurfaceFit, viewpoints: Assign
     if cells.weight.shape[0] == 0:
         return Components.empty(3, origins.device)
     found = _mixture_of(cells.features, cells.weight, 3, fit)
-    owner = em.most_likely(cells.features, found)
+    owner = most_likely_component(cells.features, found)
     counts = cells.counts.new_zeros(found.weights.shape[0], len(frames)).index_add_(0, owner, cells.counts)
     found = found._replace(means=found.means + cells.center)
     assigned = viewpoints(counts, found.weights, int(cells.weight.sum()))
@@ -126,7 +134,7 @@ def fit_frames(frames: Sequence[DepthFrame], fit: SurfaceFit, viewpoints: Assign
 
 
 def _components(
-    found: em.Parameters, assigned: AssignedViewpoints, origins: Tensor, max_range: bool
+    found: Parameters, assigned: AssignedViewpoints, origins: Tensor, max_range: bool
 ) -> Components:
     """The components that keep a viewpoint; not numbered."""
     kept, support, seen_by, seen_from, seen_count = (part.to(origins.device) for part in assigned)
@@ -154,7 +162,7 @@ def _points_before(scan: Scan, n: int) -> Tensor:
 
 def _measured_sensor(clouds: Sequence[Tensor], origins: Tensor) -> SensorModel:
     """A sensor with the spacing of the beams of the largest scan."""
-    from gmmtorch.mixture.estimators.sensor_model import measured_sensor
+    from gmmtorch.mixture import measured_sensor
 
     largest = max(range(len(clouds)), key=lambda number: len(clouds[number]))
     return measured_sensor(clouds[largest], origins[largest])
@@ -189,7 +197,7 @@ class _Learned(NamedTuple):
     n_points: number of points that pruning leaves.
     """
 
-    mixture: em.Parameters
+    mixture: Parameters
     counts: Tensor
     n_points: float
 
@@ -198,7 +206,7 @@ def _from_flat_pieces(window: _Window, fit: SurfaceFit) -> _Learned:
     """EM on cells from flat pieces; pruned components lose their points."""
     cells = window.pooled(fit, fit.cell)
     mixture = _mixture_of(cells.features, cells.weight, window.points.shape[1], fit)
-    owner = em.most_likely(cells.features, mixture)
+    owner = most_likely_component(cells.features, mixture)
     counts = window.counts(owner[cells.member], mixture.weights.shape[0])
     n_points, rule = len(window.points), fit.rule
     if rule.prune == "none":
@@ -207,21 +215,19 @@ def _from_flat_pieces(window: _Window, fit: SurfaceFit) -> _Learned:
     if window.sensor is None:
         kept = support >= rule.min_support
     else:
-        from gmmtorch.mixture.reduction.pruning import density_share
+        from gmmtorch.mixture import density_share
 
         share = density_share(support, mixture, window.sensor, window.origins, counts)
         kept = share >= rule.min_density_share
     weights = mixture.weights[kept]
-    left = em.Parameters(weights / weights.sum(), mixture.means[kept], mixture.covariances[kept])
+    left = Parameters(weights / weights.sum(), mixture.means[kept], mixture.covariances[kept])
     return _Learned(left, counts[kept], float(support[kept].sum()))
 
 
 def _from_tree(window: _Window, fit: SurfaceFit) -> _Learned:
     """The leaves of a tree over cells; the points of pruned children go to their siblings."""
     # Loaded here, because they load scikit-learn, which a replica does not need.
-    from gmmtorch.mixture.estimators.trees.density_limit import DensityLimit
-    from gmmtorch.mixture.estimators.trees.growth import grow
-    from gmmtorch.mixture.estimators.trees.hierarchical import HierarchicalGaussianMixture
+    from gmmtorch.mixture import DensityLimit, HierarchicalGaussianMixture, grow
 
     rule, flatness = fit.rule, fit.flatness
     cells = window.pooled(fit, fit.noise)  # a tree uses the means of cells only
@@ -240,8 +246,8 @@ def _from_tree(window: _Window, fit: SurfaceFit) -> _Learned:
     means = cells.features[:, 1 : 1 + window.points.shape[1]].contiguous()
     grown = grow(means, cells.weight, tree, density=limit).tree
     leaves = grown.leaves()
-    mixture = em.Parameters(grown.weights[leaves], grown.means[leaves], grown.covariances[leaves])
-    owner = em.most_likely(cells.features, mixture)
+    mixture = Parameters(grown.weights[leaves], grown.means[leaves], grown.covariances[leaves])
+    owner = most_likely_component(cells.features, mixture)
     return _Learned(mixture, window.counts(owner[cells.member], len(leaves)), len(window.points))
 
 
@@ -251,12 +257,12 @@ _LEARNERS: dict[str, Callable[[_Window, SurfaceFit], _Learned]] = {
 }
 
 
-def _mixture_of(features: Tensor, weight: Tensor, dim: int, fit: SurfaceFit) -> em.Parameters:
+def _mixture_of(features: Tensor, weight: Tensor, dim: int, fit: SurfaceFit) -> Parameters:
     """The mixture of cells with mean features (N, F) and weights (N,), by EM from flat pieces."""
     means = features[:, 1 : 1 + dim].contiguous()
     moments = (features,) if fit.partition_by_moments else ()
     pieces = partition(means, weight, fit.flatness, *moments)
     smallest_variance = fit.noise**2
-    first = em.maximization(pool(features, weight, pieces.labels, pieces.n_pieces), smallest_variance)
-    step = loop.natural_step(features, weight, smallest_variance, fit.dtype)
-    return loop.run_em(step, first, tol=_TOLERANCE, max_iter=fit.iterations).parameters
+    first = maximization(pool(features, weight, pieces.labels, pieces.n_pieces), smallest_variance)
+    step = natural_step(features, weight, smallest_variance, fit.dtype)
+    return run_em(step, first, tol=_TOLERANCE, max_iter=fit.iterations).parameters

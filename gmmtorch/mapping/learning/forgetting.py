@@ -26,12 +26,12 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.kernels.evidence.beam_passes import PassLimits, beam_passes
+from gmmtorch.kernels import PassLimits, beam_passes
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.association import explained_within
 from gmmtorch.mapping.learning.depth_frame import DepthFrame, as_scans
 from gmmtorch.mapping.learning.rules import CONTRADICTION, FORGET_OFF, LearningRule
-from gmmtorch.occupancy.cones import whitening
+from gmmtorch.occupancy import whitening
 from gmmtorch.scan import Scan
 
 _FLAT = 3.0  # times the noise: the smallest deviation of a flat component, at most

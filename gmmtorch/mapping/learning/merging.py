@@ -11,9 +11,7 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.mapping.components import UNNUMBERED, Components
 from gmmtorch.mapping.learning.viewpoints import limit_origins, union_of_viewpoints
-from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.reduction.merge import simplify
-from gmmtorch.mixture.reduction.moments import merge_components
+from gmmtorch.mixture import Parameters, merge_components, simplify
 
 Size = Callable[[Components], int]
 """Number of bytes of the file of given components."""

@@ -8,16 +8,21 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.kernels.rays.cell_entropy import cell_entropy, reduction_along_rays
-from gmmtorch.kernels.rays.ray_traversal import traverse
+from gmmtorch.kernels import cell_entropy, reduction_along_rays, traverse
 from gmmtorch.linalg import dense_ranks
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import NoveltyRule
-from gmmtorch.occupancy.evidence import bernoulli_entropy, occupancy_probability
-from gmmtorch.occupancy.forms.point import point_evidence
-from gmmtorch.occupancy.voxels.boxes import Box, flat_index, intersection, to_lattice
-from gmmtorch.occupancy.voxels.ray_casting import rays_in_box
-from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
+from gmmtorch.occupancy import (
+    Box,
+    RollingWindow,
+    bernoulli_entropy,
+    flat_index,
+    intersection,
+    occupancy_probability,
+    point_evidence,
+    rays_in_box,
+    to_lattice,
+)
 from gmmtorch.scan import Scan
 
 _CHUNK_BEAMS = 1 << 14

@@ -14,10 +14,7 @@ from torch import Tensor
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.depth_frame import DepthFrame
 from gmmtorch.mapping.query import MANY_POINTS, cutoff_of
-from gmmtorch.occupancy.calibrator import Calibrator, Prediction
-from gmmtorch.occupancy.cone_index import spectrum_of
-from gmmtorch.occupancy.cones import Cones
-from gmmtorch.occupancy.forms.point import PointEvidence, listed_points
+from gmmtorch.occupancy import Calibrator, Cones, PointEvidence, Prediction, listed_points, spectrum_of
 from gmmtorch.scan import Scan
 
 SIDES = (0.02, 0.1, 0.4)

@@ -15,7 +15,7 @@ from gmmtorch.errors import (
     check_resolution,
     check_whole,
 )
-from gmmtorch.mixture.reduction.prune_options import PruneOptions
+from gmmtorch.mixture import PruneOptions
 
 if TYPE_CHECKING:
     from gmmtorch.mapping.learning.depth_frame import DepthFrame

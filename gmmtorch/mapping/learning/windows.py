@@ -19,8 +19,7 @@ from gmmtorch.mapping.learning.merging import Size, compact, compact_to_bytes, e
 from gmmtorch.mapping.learning.novelty import novel_beams
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
 from gmmtorch.mapping.learning.viewpoints import all_origins, limit_origins, sampled_origins
-from gmmtorch.mixture.em.exact import SOFTMAX_DTYPES
-from gmmtorch.mixture.em.partition import FlatnessRule, surface_rule
+from gmmtorch.mixture import SOFTMAX_DTYPES, FlatnessRule, surface_rule
 from gmmtorch.scan import Scan
 
 BeforeWindow = Callable[[Components, Sequence[Scan | DepthFrame]], None]

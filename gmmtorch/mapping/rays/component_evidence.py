@@ -9,14 +9,18 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
-from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.rays.component_casting import THINNING, Seen, cast_components
+from gmmtorch.kernels import THINNING, Seen, cast_components, is_fused
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.rays.component_rays import RayDensity, counted_viewpoints, drawn_rays, ray_numbers
-from gmmtorch.occupancy.forms.monte_carlo import RayBundle
-from gmmtorch.occupancy.voxels.boxes import Box, intersection
-from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence, sum_evidence
-from gmmtorch.occupancy.voxels.ray_casting import cast_evidence, near_interval
+from gmmtorch.occupancy import (
+    Box,
+    CellEvidence,
+    RayBundle,
+    cast_evidence,
+    intersection,
+    near_interval,
+    sum_evidence,
+)
 
 _MOST_DRAWS = 1 << 19  # draws at a time, about 250 bytes each
 _FARTHEST = 2.0**31  # cells from the world's origin

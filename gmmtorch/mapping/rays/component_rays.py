@@ -16,12 +16,10 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
-from gmmtorch.kernels.rays.component_casting import hidden_area, truncated_normals
+from gmmtorch.kernels import hidden_area, truncated_normals
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.mapping.components import Components
-from gmmtorch.occupancy.forms.monte_carlo import RayBundle
-from gmmtorch.occupancy.grid import check_resolution
-from gmmtorch.occupancy.voxels.boxes import to_lattice
+from gmmtorch.occupancy import RayBundle, check_resolution, to_lattice
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,7 @@ from typing import NamedTuple
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.components import Components
-from gmmtorch.occupancy.cones import cone_bounds
-from gmmtorch.occupancy.voxels.boxes import Box
-from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
-from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
+from gmmtorch.occupancy import Box, CellEvidence, RollingWindow, cone_bounds
 
 _REACH = 3.0  # deviations around the means that belong to the box
 _MOST_TILES = 4096  # a batch in more tiles is tested in every search

@@ -23,8 +23,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import NumericalError
-from gmmtorch.kernels.chunks import chunk_elements, chunked
-from gmmtorch.kernels.mixtures.e_step import softmax
+from gmmtorch.kernels import chunk_elements, chunked, softmax
 from gmmtorch.linalg import safe_cholesky, unpack_symmetric
 from gmmtorch.mixture.em.covariance_types import compact, constrain, type_shape
 from gmmtorch.mixture.em.exact import LOG_2PI, MIN_LOG_WEIGHT, Parameters, natural_of_precisions, products

@@ -13,8 +13,7 @@ from typing import NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.mixtures.cell_moments import KEY_BITS, cell_moments
+from gmmtorch.kernels import KEY_BITS, cell_moments, is_fused
 from gmmtorch.linalg import dense_ranks
 from gmmtorch.mixture.em.exact import quadratic_features
 

@@ -19,9 +19,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels.mixtures import e_step, m_step
-from gmmtorch.kernels.mixtures.e_step import expectation as expectation
-from gmmtorch.kernels.mixtures.e_step import exponent_floor as exponent_floor
+from gmmtorch.kernels import expectation as expectation
+from gmmtorch.kernels import exponent_floor as exponent_floor
+from gmmtorch.kernels import fused_maximization, fused_natural_parameters, is_m_step_fused, most_likely
 from gmmtorch.linalg import inverse_factor, safe_cholesky, triangle_indices, unpack_symmetric
 
 SOFTMAX_DTYPES = {"float32": torch.float32, "float64": torch.float64}
@@ -62,8 +62,8 @@ def shift_features(features: Tensor, offset: Tensor) -> Tensor:
 def natural_parameters(parameters: Parameters) -> Tensor:
     """W (K, F) such that φ(x)·W_k = log π_k + log N(x | μ_k, Σ_k)."""
     dim, covariances = parameters.means.shape[1], parameters.covariances
-    if m_step.is_fused_on(dim, *parameters):
-        found, failed = m_step.fused_natural_parameters(*parameters)
+    if is_m_step_fused(dim, *parameters):
+        found, failed = fused_natural_parameters(*parameters)
         if not bool(failed):
             return found
     return _natural_parameters(parameters, safe_cholesky(covariances))
@@ -96,8 +96,8 @@ def unchecked_expectation(
     """`expectation` that does not wait for the device: the log-likelihood is NaN where the natural parameters
     need the checks of `natural_parameters`.
     """
-    if m_step.is_fused_on(parameters.means.shape[1], *parameters):
-        natural, failed = m_step.fused_natural_parameters(*parameters)
+    if is_m_step_fused(parameters.means.shape[1], *parameters):
+        natural, failed = fused_natural_parameters(*parameters)
     else:
         factors, info = torch.linalg.cholesky_ex(parameters.covariances)
         natural = _natural_parameters(parameters, factors)
@@ -106,9 +106,9 @@ def unchecked_expectation(
     return statistics, value.masked_fill(failed, math.nan)
 
 
-def most_likely(features: Tensor, parameters: Parameters) -> Tensor:
+def most_likely_component(features: Tensor, parameters: Parameters) -> Tensor:
     """The component (N,) with the largest responsibility for each row of features."""
-    return e_step.most_likely(features, natural_parameters(parameters))
+    return most_likely(features, natural_parameters(parameters))
 
 
 def maximization(statistics: Tensor, reg_covar: float, previous: Parameters | None = None) -> Parameters:
@@ -117,8 +117,8 @@ def maximization(statistics: Tensor, reg_covar: float, previous: Parameters | No
     A component that lost all its points keeps its `previous` mean and covariance, with weight 0.
     """
     dim = feature_dimension(statistics.shape[1])
-    if m_step.is_fused_on(dim, statistics, *(previous or ())):
-        return Parameters(*m_step.fused_maximization(statistics, dim, reg_covar, previous))
+    if is_m_step_fused(dim, statistics, *(previous or ())):
+        return Parameters(*fused_maximization(statistics, dim, reg_covar, previous))
     eps = 10 * torch.finfo(statistics.dtype).eps
     count = statistics[:, 0] + eps
     means = statistics[:, 1 : 1 + dim] / count[:, None]

@@ -17,13 +17,15 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gmmtorch.kernels.chunks import chunk_elements, chunked
-from gmmtorch.kernels.mixtures import m_step
-from gmmtorch.kernels.mixtures.truncated_e_step import (
+from gmmtorch.kernels import (
     GroupedRows,
+    chunk_elements,
+    chunked,
     fused_candidates,
     fused_expectation,
-    is_fused_on,
+    fused_natural_parameters,
+    is_m_step_fused,
+    is_truncated_e_step_fused,
 )
 from gmmtorch.linalg import argsort, largest_indices, pack_symmetric, unpack_symmetric
 from gmmtorch.mixture.em.exact import (
@@ -156,7 +158,7 @@ def choose_candidates(groups: Groups, parameters: Parameters, n_candidates: int)
     place = torch.cumsum(count, 0) - count + (2 * steps + 1) * count // (2 * n_samples)
     place = place.clamp_max_(groups.slot.shape[0] - 1)  # of empty groups, whose candidates are unused
     natural, rows = natural_parameters(parameters), groups.rows()
-    if is_fused_on(rows, natural):
+    if is_truncated_e_step_fused(rows, natural):
         bounds = _logit_bounds(parameters, natural)
         return fused_candidates(rows, groups.slot[place], natural, bounds, n_candidates)
     natural, samples = natural.T.contiguous(), rows.features[groups.slot[place]]
@@ -212,7 +214,7 @@ def truncated_expectation(
     `own`: the `centered_parameters`, if they are known.
     """
     rows, own = groups.rows(), centered_parameters(parameters) if own is None else own
-    if not compiled and is_fused_on(rows, own, candidates):
+    if not compiled and is_truncated_e_step_fused(rows, own, candidates):
         fused = fused_expectation(rows, candidates, own, parameters.means, want_owner)
         return Expectation(fused[0], float(fused[1]), _owner_of_rows(groups, fused[2]))
     n_groups, m = candidates.shape
@@ -255,8 +257,8 @@ def _owner_of_rows(groups: Groups, likeliest: Tensor | None) -> Tensor | None:
 def centered_parameters(parameters: Parameters) -> Tensor:
     """Natural parameters (K, F) of the components about their own means."""
     weights, means, covariances = parameters
-    if m_step.is_fused_on(means.shape[1], *parameters):
-        found, failed = m_step.fused_natural_parameters(weights, None, covariances)
+    if is_m_step_fused(means.shape[1], *parameters):
+        found, failed = fused_natural_parameters(weights, None, covariances)
         if not bool(failed):
             return found
     return natural_parameters(parameters._replace(means=torch.zeros_like(means)))

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import NumericalError
-from gmmtorch.kernels.mixtures.e_step import in_spatial_order
+from gmmtorch.kernels import in_spatial_order
 from gmmtorch.mixture.em import by_type, exact
 from gmmtorch.mixture.em.covariance_types import compact, constrain, expand
 from gmmtorch.mixture.em.exact import Parameters

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels.mixtures.piece_cuts import CutRule, is_fused_on, piece_cuts
+from gmmtorch.kernels import CutRule, are_piece_cuts_fused, piece_cuts
 from gmmtorch.linalg import on_cpu, unpack_symmetric
 from gmmtorch.mixture.em.exact import quadratic_features
 
@@ -106,7 +106,7 @@ def partition(
         points_cpu, weight_cpu, features_cpu = on_cpu(points, weight, features)
         found = partition(points_cpu, weight_cpu, rule, features_cpu)
         return found._replace(labels=found.labels.to(points.device))
-    if is_fused_on(points, weight, features):
+    if are_piece_cuts_fused(points, weight, features):
         return Partition(*piece_cuts(points, weight, features, _cut_rule(rule)))
     labels = torch.zeros(n, dtype=torch.int64, device=points.device)
     n_pieces = 1

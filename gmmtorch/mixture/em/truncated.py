@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels.mixtures.m_step import fused_steps, is_fused_on
+from gmmtorch.kernels import fused_steps, is_m_step_fused
 from gmmtorch.mixture.em.cells import pool_into_cells
 from gmmtorch.mixture.em.exact import Parameters, maximization, shift_features
 from gmmtorch.mixture.em.grouping import (
@@ -88,7 +88,7 @@ class Momentum:
         self._age += last is not None
         self.is_extrapolated = share > 0
         given = statistics, parameters, self._reg_covar, last if self.is_extrapolated else None, share
-        if is_fused_on(parameters.means.shape[1], statistics, *parameters):
+        if is_m_step_fused(parameters.means.shape[1], statistics, *parameters):
             em_step, ahead = fused_steps(*given)
         else:
             em_step, ahead = _steps(*given)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels.chunks import chunk_elements
+from gmmtorch.kernels import chunk_elements
 from gmmtorch.linalg import inverse_factor, safe_cholesky
 from gmmtorch.mixture.em import by_type, loop
 from gmmtorch.mixture.em import exact as em

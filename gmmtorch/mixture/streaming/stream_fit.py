@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike
-from gmmtorch.datasets.point_files.point_chunks import PointChunks, Survey, in_memory
+from gmmtorch.datasets import PointChunks, Survey, in_memory
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mixture.em import by_type, loop
 from gmmtorch.mixture.em import exact as em

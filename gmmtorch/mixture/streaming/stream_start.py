@@ -7,8 +7,8 @@ from typing import Any
 
 import torch
 
-from gmmtorch.datasets.point_files.point_chunks import PointChunks, Survey, merge_surveys
-from gmmtorch.datasets.point_files.point_chunks import survey as survey_source
+from gmmtorch.datasets import PointChunks, Survey, merge_surveys
+from gmmtorch.datasets import survey as survey_source
 from gmmtorch.errors import check_whole
 from gmmtorch.mixture.em.covariance_types import expand
 from gmmtorch.mixture.em.grouping import Rows

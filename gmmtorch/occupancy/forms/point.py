@@ -13,12 +13,12 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.chunks import chunked
-from gmmtorch.kernels.evidence.hull_test import Lists
-from gmmtorch.kernels.evidence.point_evidence import (
+from gmmtorch.kernels import (
+    Lists,
     PointTable,
+    chunked,
     compiled_pair_evidence,
+    is_fused,
     listed_evidence,
     pair_evidence,
 )

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import MemoryLimitError
-from gmmtorch.kernels.rays.ray_counting import BlockTable, count_in_blocks, packed_strides
-from gmmtorch.kernels.rays.ray_traversal import traverse
+from gmmtorch.kernels import BlockTable, count_in_blocks, packed_strides, traverse
 from gmmtorch.occupancy.grid import BYTES_PER_CELL
 
 if TYPE_CHECKING:

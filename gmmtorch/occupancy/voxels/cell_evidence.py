@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.kernels.rays.cell_counts import list_counted_cells
-from gmmtorch.kernels.rays.ray_traversal import row_major_strides
+from gmmtorch.kernels import list_counted_cells, row_major_strides
 
 
 class CellEvidence(NamedTuple):

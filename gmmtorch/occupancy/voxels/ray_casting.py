@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import MemoryLimitError
-from gmmtorch.kernels.rays.ray_counting import count_in_grid
+from gmmtorch.kernels import count_in_grid
 from gmmtorch.occupancy.grid import BYTES_PER_CELL, MEMORY_LIMIT
 from gmmtorch.occupancy.voxels.boxes import Box, flat_index, intersection, to_lattice
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence

@@ -7,9 +7,7 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
-from gmmtorch.kernels.rays.cell_counts import add_counts
-from gmmtorch.kernels.rays.cell_index import BlockKeys, cell_index
-from gmmtorch.kernels.rays.ray_traversal import CHUNK_VISITS
+from gmmtorch.kernels import CHUNK_VISITS, BlockKeys, add_counts, cell_index
 from gmmtorch.occupancy.evidence import checked_rays, occupancy_probability
 from gmmtorch.occupancy.grid import MEMORY_LIMIT
 from gmmtorch.occupancy.voxels.block_table import count_misses

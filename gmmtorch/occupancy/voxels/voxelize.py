@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.kernels.rays.ray_traversal import row_major_strides
+from gmmtorch.kernels import row_major_strides
 from gmmtorch.linalg import ragged_index
 from gmmtorch.occupancy.culling import cells_in_chunks
 from gmmtorch.occupancy.grid import check_resolution

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.calibration import Reliability
+from gmmtorch.occupancy import Reliability
 from gmmtorch.report import style
 
 _MAX_COLUMNS = 3

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.files import write_atomically
-from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping import GaussianMap
 from gmmtorch.report import style
 from gmmtorch.report.maps.map_figures import occupancy_colours
 from gmmtorch.report.maps.map_images import MapPanel, slice_image

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.occupancy.grid import check_resolution
+from gmmtorch.occupancy import check_resolution
 from gmmtorch.report.maps.map_regions import corner_of
 from gmmtorch.report.style import as_array
 from gmmtorch.scan import ArrayLike

@@ -13,7 +13,7 @@ from matplotlib.colors import ListedColormap, Normalize
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
-from gmmtorch.mapping.components import Components
+from gmmtorch.mapping import Components
 from gmmtorch.report import style
 from gmmtorch.report.scenes.scene_renderer import N_SIGMA, Camera
 from gmmtorch.scan import ArrayLike

@@ -12,8 +12,8 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from gmmtorch.mapping.components import Components
-from gmmtorch.occupancy.evidence import Thresholds
+from gmmtorch.mapping import Components
+from gmmtorch.occupancy import Thresholds
 from gmmtorch.report import style
 from gmmtorch.report.maps.map_images import is_unknown
 from gmmtorch.report.maps.map_regions import Corners, inside, robust_bounds

@@ -32,15 +32,15 @@ from cli.command_runs import (
 from cli.robot.robot_cases import LOG, SMALL
 from exploration.replays import content
 
-from gmmtorch.cli import robot
-from gmmtorch.cli.from_options import links
-from gmmtorch.exploration.mission.replay import ReplayMission
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.sharing.messages.message_registry import encode_plan
-from gmmtorch.sharing.replica.replica import Replica
-from gmmtorch.sharing.transport.frames import FramedTransport
-from gmmtorch.sharing.transport.security import TeamKey
-from gmmtorch.sharing.transport.udp import UdpTransport
+from gmmtorch.team.cli import robot
+from gmmtorch.team.cli.from_options import links
+from gmmtorch.team.exploration.mission.replay import ReplayMission
+from gmmtorch.team.sharing.messages.message_registry import encode_plan
+from gmmtorch.team.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.transport.frames import FramedTransport
+from gmmtorch.team.sharing.transport.security import TeamKey
+from gmmtorch.team.sharing.transport.udp import UdpTransport
 
 
 @contextmanager

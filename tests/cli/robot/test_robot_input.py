@@ -8,9 +8,9 @@ import pytest
 from cli.command_runs import as_it_was, composed, refused, room_mesh, succeeded
 from cli.robot.robot_cases import LOG
 
-from gmmtorch.cli.from_options import links
-from gmmtorch.cli.from_options.robots import facts_of
-from gmmtorch.sharing.store import Store
+from gmmtorch.team.cli.from_options import links
+from gmmtorch.team.cli.from_options.robots import facts_of
+from gmmtorch.team.sharing.store import Store
 
 
 @pytest.mark.parametrize(

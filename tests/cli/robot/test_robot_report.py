@@ -13,9 +13,9 @@ import pytest
 from cli.command_runs import Disk, as_it_was, composed
 
 from gmmtorch.cli import common
-from gmmtorch.cli.reporting.robot_report import Outputs, RobotReport, print_refusals, terse
 from gmmtorch.errors import OutputError
 from gmmtorch.files import write_bytes
+from gmmtorch.team.cli.reporting.robot_report import Outputs, RobotReport, print_refusals, terse
 
 
 class Toy:
@@ -61,7 +61,7 @@ def test_log_records_have_their_own_lines(log, tmp_path, monkeypatch):
         with report(tmp_path, "report.tensorboard=false") as shown:
             shown(0.0)
             shown(1.0)
-            logging.getLogger("gmmtorch.sharing.transport.udp").warning("one")
+            logging.getLogger("gmmtorch.team.sharing.transport.udp").warning("one")
             logging.getLogger("gmmtorch").warning("two")
             shown(2.0)
     finally:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gmmtorch.exploration.information.view_evaluator import ViewEvaluator
-from gmmtorch.exploration.robot.mapper import LocalMap
 from gmmtorch.kernels import kernels
+from gmmtorch.team.exploration.information.view_evaluator import ViewEvaluator
+from gmmtorch.team.exploration.robot.mapper import LocalMap
 
 FOV = (1.5184, 1.0123)
 

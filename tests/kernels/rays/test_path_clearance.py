@@ -7,10 +7,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmmtorch.exploration.planning.collision_checking import feasible, feasible_motions, local_map_of
-from gmmtorch.exploration.planning.coordination import PeerTrajectories
-from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
 from gmmtorch.kernels.compiler import compiler_failure
+from gmmtorch.team.exploration.planning.collision_checking import feasible, feasible_motions, local_map_of
+from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
+from gmmtorch.team.exploration.planning.primitives import Dynamics, Primitives
 
 pytestmark = [
     pytest.mark.cpu_only,

@@ -29,12 +29,12 @@ from gmmtorch.live.ros import Node
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule
-from gmmtorch.sharing import Replica
-from gmmtorch.sharing.messages.record_messages import CorrectionMessage
-from gmmtorch.sharing.shared_map import SharedMap
-from gmmtorch.sharing.store import Store
-from gmmtorch.sharing.transport.link_conditions import LinkConditions
-from gmmtorch.sharing.transport.simulated_network import Network
+from gmmtorch.team.sharing import Replica
+from gmmtorch.team.sharing.messages.record_messages import CorrectionMessage
+from gmmtorch.team.sharing.shared_map import SharedMap
+from gmmtorch.team.sharing.store import Store
+from gmmtorch.team.sharing.transport.link_conditions import LinkConditions
+from gmmtorch.team.sharing.transport.simulated_network import Network
 
 N_SCANS = 58
 NEAR = 0.15

@@ -32,9 +32,9 @@ from gmmtorch.live.ros import Node, Quality
 from gmmtorch.live.ros.quality import LATCHED
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.map_builder import MapBuilder
-from gmmtorch.sharing import Replica
-from gmmtorch.sharing.shared_map import SharedMap
-from gmmtorch.sharing.transport.simulated_network import Network
+from gmmtorch.team.sharing import Replica
+from gmmtorch.team.sharing.shared_map import SharedMap
+from gmmtorch.team.sharing.transport.simulated_network import Network
 
 LASER_TYPE, GRID = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/OccupancyGrid"
 

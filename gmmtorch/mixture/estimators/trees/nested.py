@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels.chunks import chunk_elements
+from gmmtorch.kernels import chunk_elements
 from gmmtorch.linalg import unpack_symmetric
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.exact import Parameters, feature_dimension, natural_parameters

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.kernels.chunks import chunked
+from gmmtorch.kernels import chunked
 from gmmtorch.occupancy.cones import dot
 
 TOLERANCE = 1e-4

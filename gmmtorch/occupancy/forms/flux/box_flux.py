@@ -16,9 +16,7 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.evidence.cell_mass import add_cell_mass
-from gmmtorch.kernels.evidence.face_flux import add_row_flux, whitened_rows
+from gmmtorch.kernels import add_cell_mass, add_row_flux, is_fused, whitened_rows
 from gmmtorch.occupancy.cones import CUTOFF, Cones, WhitenedCones, cross, dot, length, outside_cone
 from gmmtorch.occupancy.culling import (
     FaceRows,

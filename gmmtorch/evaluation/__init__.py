@@ -1,1 +1,0 @@
-"""How good a map is, on scans that it was never shown."""

@@ -1,1 +1,0 @@
-"""One file for each figure, table or comparison of the thesis."""

@@ -1,0 +1,1 @@
+"""Experiments: baselines, evaluation, studies, and their commands."""

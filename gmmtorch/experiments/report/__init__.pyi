@@ -1,0 +1,10 @@
+from .approximation_error_figures import approximation_figures as approximation_figures
+from .fit_study_figures import component_count_figures as component_count_figures
+from .fit_study_figures import initialization_figures as initialization_figures
+from .fit_study_figures import sensor_model_figures as sensor_model_figures
+from .map_study_figures import auc_memory_figures as auc_memory_figures
+from .map_study_figures import cells_figure as cells_figure
+from .map_study_figures import closest_look as closest_look
+from .map_study_figures import map_variants_figures as map_variants_figures
+from .map_study_figures import pose_correction_figures as pose_correction_figures
+from .map_study_figures import variance_threshold_figures as variance_threshold_figures

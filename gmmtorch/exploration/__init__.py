@@ -1,1 +1,0 @@
-"""Robots that choose where to look next: information, planning, teams, missions."""

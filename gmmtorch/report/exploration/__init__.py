@@ -1,1 +1,0 @@
-"""Figures and recordings of exploring teams."""

@@ -1,0 +1,1 @@
+"""Teams of robots: the replicated map, exploration, and their commands."""

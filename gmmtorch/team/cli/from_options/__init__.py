@@ -1,0 +1,1 @@
+"""Objects of a team from the options of a command."""

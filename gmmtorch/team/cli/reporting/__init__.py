@@ -1,0 +1,1 @@
+"""What the commands of a team write and show."""

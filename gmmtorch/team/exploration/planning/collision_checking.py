@@ -1,0 +1,257 @@
+"""Collision checking: where a robot's body fits in the known free space, and which paths are safe.
+
+The robot is a sphere. A cell is passable if a robot with its centre anywhere in the cell touches only
+cells that are known to be free, with a margin of half a cell. A path is therefore safe between checked
+points if points one cell apart are in passable cells.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.kernels import Motions, motions_are_clear
+from gmmtorch.team.exploration.planning.coordination import PeerTrajectories, clear_of
+from gmmtorch.team.exploration.robot.mapper import LocalMap
+from gmmtorch.team.exploration.world.navigable import widened
+
+_SPACING = 1.0
+"""Cells between the checked points of a path; half of it is the margin around the body."""
+_FINE_SPACING = 0.25
+"""The same for a robot that leaves a place where it does not fit, and has little room."""
+_STRUCK_RAYS, _STRUCK_SHARE = 1.0, 0.05
+"""A cell with at least this many hits and this share of hits among its rays is an obstacle. A rail of a
+twentieth of a cell's width is hit by no larger share."""
+_ROUNDING = 1e-9
+_CHUNK_PAIRS = 1 << 22
+
+
+def inflated(blocked: Tensor, radius: float, resolution: float) -> Tensor:
+    """Return cells (nx, ny, nz), bool, in which the centre of a sphere of `radius` metres may not be.
+
+    A sphere centred somewhere in such a cell reaches into a blocked cell. Cells outside the array are
+    blocked. A cell at offset (i, j, k) from a blocked cell is included if Σ max(|i| − 1, 0)² < (radius /
+    resolution)². That set is a union of boxes; each box is computed one axis after the other.
+    """
+    boxes = _covering_boxes((radius / resolution) ** 2 * (1 - _ROUNDING))
+    reach = max(max(box) for box in boxes)
+    padded = torch.nn.functional.pad(blocked, (reach,) * 6, value=True)
+    found = torch.zeros_like(padded)
+    for i, same in itertools.groupby(boxes, key=lambda box: box[0]):
+        slab = widened(padded, 0, i)
+        for _, j, k in same:
+            found |= widened(widened(slab, 1, j), 2, k)
+    inside = slice(reach, -reach)
+    return found[inside, inside, inside].contiguous()
+
+
+def passable_cells(free: Tensor, radius: float, resolution: float) -> Tensor:
+    """Return cells (nx, ny, nz), bool, in which the centre of a robot may be, given the free cells."""
+    return ~inflated(~free, radius + _SPACING / 2 * resolution, resolution)
+
+
+def cells_in_sphere(center: Tensor, radius: float, resolution: float) -> Tensor:
+    """Return lattice cells (K, 3) int64 that lie entirely in a sphere; centre (3,) and radius in metres."""
+    axes, squares = [], []
+    for x in center.tolist():
+        index = torch.arange(math.floor((x - radius) / resolution), math.floor((x + radius) / resolution) + 1)
+        near = index.double() * resolution - x
+        far = torch.maximum(near.abs(), (near + resolution).abs())  # of the cell's two faces
+        axes.append(index[far <= radius])
+        squares.append(far[far <= radius].square())
+    x, y, z = squares
+    within = (x[:, None, None] + y[:, None] + z <= radius**2).flatten()
+    return torch.cartesian_prod(*axes)[within]
+
+
+def local_map_of(
+    low: Tensor,
+    resolution: float,
+    hits: Tensor,
+    misses: Tensor,
+    *,
+    prior: float,
+    planning_prior: float,
+    free_below: float,
+    radius: float,
+    known_free: Tensor | None = None,
+    obstacles: Tensor | None = None,
+) -> LocalMap:
+    """Build the planner's local map from the hits H and misses M of dense cells (nx, ny, nz).
+
+    The map's occupancy is θ = (H + N_p)/(H + M + 2N_p); the planner's is (H + 2N_p π)/(H + M + 2N_p). A
+    cell is free if it is observed, θ is below `free_below`, and few of its rays are hits; or if it is in
+    `known_free`.
+
+    Args:
+        low: (3,) int64, lattice index of the lowest cell. resolution: side of a cell (m).
+        prior: N_p, rays. planning_prior: π, the planner's occupancy of unobserved cells.
+        radius: of the robot (m). known_free: (K, 3) int64, lattice cells known to be free; a sphere of them
+            with radius √3 (radius + 5/2 resolution) or more makes the cell of its centre passable.
+        obstacles: (C, 3) int64, lattice cells that are never free.
+    """
+    total = hits + misses
+    observed = total > 0
+    struck = (hits >= _STRUCK_RAYS) & (hits >= _STRUCK_SHARE * total)
+    total += 2 * prior
+    free = observed & ~struck & (hits + prior < free_below * total)
+    for cells, value in ((known_free, True), (obstacles, False)):
+        if cells is not None:
+            inside = ((cells >= low) & (cells < low + torch.tensor(free.shape))).all(1)
+            free[(cells[inside] - low).unbind(1)] = value
+    return LocalMap(
+        low=low,
+        resolution=resolution,
+        occupancy=((hits + 2 * prior * planning_prior) / total).float(),
+        observed=observed,
+        free=free,
+        passable=passable_cells(free, radius, resolution),
+    )
+
+
+def feasible(
+    rollout: Tensor,
+    braking: Tensor,
+    local_map: LocalMap,
+    peers: PeerTrajectories | None = None,
+    *,
+    start: Tensor,
+    radius: float | None = None,
+) -> Tensor:
+    """Flag (...,) the safe paths: states (..., S, 7), followed by braking states (..., B, 7) until rest.
+
+    Every point of a safe path is in a passable cell and clear of the peers (see `clear_of`). A path that
+    does not move, such as a turn in place or a wait, is always safe.
+
+    The map may change so that the robot's own cell is no longer passable. The robot may leave that cell
+    if `radius` is given. Its body, at its exact position, may then touch only free cells and
+    the cells that it touches at the start, and it must move away from every point q of those: (x − x₀)·(q
+    − x₀) ≤ 0. So no known obstacle comes closer than it is at the start, or than the radius.
+
+    Args:
+        start: (..., 7) or broadcastable: the states before the first step. radius: of the robot (m).
+    """
+    begin = start.to(rollout).expand(*rollout.shape[:-2], 7)
+    origin = begin[..., :3]
+    states = torch.cat([begin[..., None, :], rollout, braking], -2)
+    safe = local_map.is_passable(_points_along(states, _SPACING * local_map.resolution)).all(-1)
+    stuck = ~local_map.is_passable(origin)
+    safe &= ~stuck
+    if radius is not None:
+        for here in torch.unique(origin[stuck], dim=0):
+            rows = stuck & (origin == here).all(-1)
+            safe[rows] = _leaves(here, states[rows], local_map, radius)
+    if peers is not None:
+        places = torch.cat([rollout[..., :3], braking[..., :3]], -2)
+        safe &= clear_of(places, peers, origin)
+    still = (states[..., :3] == states[..., :1, :3]).flatten(-2).all(-1)
+    return safe | still
+
+
+def feasible_motions(
+    motions: Motions, longest: Tensor, local_map: LocalMap, peers: PeerTrajectories, after: int
+) -> Tensor:
+    """`feasible` of motions, (N, P), by the fused kernel.
+
+    Args:
+        longest: (2,), longest step (m) and largest turn (rad) in a step. after: steps of the peers before
+            the motions begin.
+    """
+    return motions_are_clear(
+        motions,
+        local_map.passable,
+        local_map.low,
+        local_map.resolution,
+        _points_of_a_step(float(longest[0]), float(longest[1]), _SPACING * local_map.resolution),
+        peers.paths,
+        min(after, peers.paths.shape[1] - 1),
+        peers.separation,
+    )
+
+
+def _covering_boxes(square: float) -> list[tuple[int, int, int]]:
+    """Return boxes of offsets up to (i, j, k), by rising i, whose union is Σ max(|·| − 1, 0)² < square."""
+
+    def largest(rest: float) -> int:
+        return math.ceil(math.sqrt(rest)) - 1
+
+    n = largest(square) + 1
+    depth = {
+        (i, j): largest(square - i * i - j * j) for i in range(n) for j in range(n) if i * i + j * j < square
+    }
+    return [
+        (i + 1, j + 1, k + 1)
+        for (i, j), k in depth.items()
+        if depth.get((i + 1, j), -1) < k and depth.get((i, j + 1), -1) < k
+    ]
+
+
+def _points_along(states: Tensor, spacing: float) -> Tensor:
+    """Sample points (..., n, 3) of paths (..., L, 7), at most `spacing` apart along each path.
+
+    The first state is left out. Steps are treated as straight; an arc of chord c that turns by φ deviates
+    from its chord by c φ/8.
+    """
+    place, yaw = states[..., :3], states[..., 3]
+    step = place[..., 1:, :] - place[..., :-1, :]
+    chord = step.square().sum(-1)
+    longest = math.sqrt(float(chord.max())) if chord.numel() else 0.0
+    turn = float((yaw[..., 1:] - yaw[..., :-1]).abs().max()) if chord.numel() else 0.0
+    n = _points_of_a_step(longest, turn, spacing)
+    return torch.cat([place[..., :-1, :] + step * (i / n) for i in range(1, n)] + [place[..., 1:, :]], -2)
+
+
+def _points_of_a_step(longest: float, turn: float, spacing: float) -> int:
+    """Number of points on each step; no step is longer than `longest` m or turns by more than `turn` rad."""
+    room = spacing - longest * turn / 4
+    if room <= 0:
+        raise InvalidArgumentError(
+            f"Steps of {longest:.3g} m and {turn:.3g} rad are too long to be checked in cells of "
+            f"{spacing:.3g} m; use a shorter step or coarser cells."
+        )
+    return max(1, math.ceil(longest / room))
+
+
+def _leaves(here: Tensor, states: Tensor, local_map: LocalMap, radius: float) -> Tensor:
+    """Flag (P,) the paths (P, L, 7) from a point (3,) that lead away from all cells touched there."""
+    resolution = local_map.resolution
+    if not bool(local_map.flat_index(here)[1]):
+        return torch.zeros(len(states), dtype=torch.bool)
+    points = _points_along(states, _FINE_SPACING * resolution)
+    radius = radius + _FINE_SPACING / 2 * resolution
+    reach = math.ceil(radius / resolution)
+    blocked = torch.nn.functional.pad(~local_map.free, (reach,) * 6, value=True)
+    low = local_map.low - reach
+    touched = _touched(here[None], blocked, low, resolution, radius)
+    cells = touched[1]
+    corners = torch.cartesian_prod(*[torch.tensor([0, 1])] * 3)
+    away = ((cells[:, None] + corners + low).double() * resolution - here).flatten(0, 1)
+    ok = ((points - here) @ away.T <= _ROUNDING).all(-1)
+    blocked[cells.unbind(1)] = False
+    flat = points.reshape(-1, 3)
+    inside = local_map.flat_index(flat)[1]
+    rows = inside.nonzero().squeeze(1)
+    for part in rows.split(max(1, _CHUNK_PAIRS // (2 * reach + 1) ** 3)):
+        inside[part[_touched(flat[part], blocked, low, resolution, radius)[0]]] = False
+    return (ok & inside.view(ok.shape)).all(-1)
+
+
+def _touched(
+    points: Tensor, blocked: Tensor, low: Tensor, resolution: float, radius: float
+) -> tuple[Tensor, Tensor]:
+    """Return the blocked cells (T, 3), relative to `low`, in spheres around points (N, 3); with rows (T,)."""
+    reach = math.ceil(radius / resolution)
+    offset = torch.arange(-reach, reach + 1)
+    cell = (points / resolution).floor().long()
+    near = (cell[..., None] + offset).double() * resolution - points[..., None]
+    gap = torch.maximum(near, -near - resolution).clamp_min(0).square()  # (N, 3, O), to the faces of each
+    x, y, z = gap.unbind(1)
+    within = x[:, :, None, None] + y[:, None, :, None] + z[:, None, None, :] < radius**2
+    row, *index = within.nonzero().unbind(1)
+    found = cell[row] - low + torch.stack([offset[i] for i in index], 1)
+    hit = blocked[found.unbind(1)]
+    return row[hit], found[hit]

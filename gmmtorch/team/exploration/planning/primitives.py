@@ -1,0 +1,213 @@
+"""Motion primitives of a quadrotor: short flights at commanded velocities, and the braking after them.
+
+A state (7,) is x, y, z, yaw, and the velocities v (along the heading), v_z (up) and ω (yaw rate); world
+frame, metres, radians, seconds. Yaw is not wrapped, so it has no jumps.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError, check_number
+from gmmtorch.kernels import Motions
+
+_ROUNDING = 1e-9
+
+_QUADRATURE = ((0.5 - math.sqrt(0.15), 5 / 18), (0.5, 8 / 18), (0.5 + math.sqrt(0.15), 5 / 18))
+"""Gauss–Legendre nodes and weights on [0, 1]."""
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """The limits of a robot's motion, in metres, radians and seconds.
+
+    Attributes:
+        speed, climb, yaw_rate: largest velocities along the heading, up or down, and of the yaw.
+        acceleration: largest acceleration along the heading and vertically, m/s².
+        yaw_acceleration: largest yaw acceleration, rad/s².
+        duration: of a primitive. step: time between two states of a path; it divides the duration.
+        radius: of a sphere around the body.
+
+    Raises `InvalidArgumentError` unless all are above zero and the step divides the duration.
+    """
+
+    speed: float = 1.5
+    climb: float = 0.75
+    yaw_rate: float = 1.2
+    acceleration: float = 1.5
+    yaw_acceleration: float = 3.0
+    duration: float = 2.0
+    step: float = 0.2
+    radius: float = 0.3
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            check_number(field.name, getattr(self, field.name), above=True)
+        if self.n_steps < 1 or abs(self.n_steps * self.step - self.duration) > 1e-6 * self.duration:
+            raise InvalidArgumentError(
+                f"step={self.step} s does not divide duration={self.duration} s; use a fraction of it."
+            )
+
+    @property
+    def n_steps(self) -> int:
+        """Number of states on the path of a primitive."""
+        return round(self.duration / self.step)
+
+    @property
+    def n_braking_steps(self) -> int:
+        """Number of states until rest from the largest velocities."""
+        return int(self._n_ramp_steps(self._limits).max())
+
+    @property
+    def _limits(self) -> Tensor:
+        return torch.tensor([self.speed, self.climb, self.yaw_rate], dtype=torch.float64)
+
+    def _n_ramp_steps(self, change: Tensor) -> Tensor:
+        """Number of whole steps that changes (..., 3) of the velocities take."""
+        rates = [self.acceleration, self.acceleration, self.yaw_acceleration]
+        per_step = torch.tensor(rates, dtype=torch.float64) * self.step
+        return (change.abs() / per_step - _ROUNDING).ceil()
+
+    def velocities(self, states: Tensor, commands: Tensor, n_steps: int) -> Tensor:
+        """Return velocities (..., n_steps + 1, 3) from those of states (..., 7) to the commands (..., 3).
+
+        Each velocity changes linearly over the whole steps that the acceleration limit needs, then stays
+        constant. It is therefore linear within every step. Raises `InvalidArgumentError` for states
+        beyond the limits.
+        """
+        now = states[..., 4:]
+        if not bool((now.abs() <= self._limits * (1 + _ROUNDING)).all()):  # also catches NaN
+            worst = now.reshape(-1, 3).abs().amax(0).tolist()
+            raise InvalidArgumentError(
+                f"states have velocities up to {worst}; speed, climb and yaw_rate allow "
+                f"{self._limits.tolist()}."
+            )
+        change = commands - now
+        n_ramp = self._n_ramp_steps(change).clamp_min(1)[..., None, :]
+        time = torch.arange(n_steps + 1, dtype=torch.float64)[:, None]
+        ramp = now[..., None, :] + change[..., None, :] * (time / n_ramp)
+        return torch.where(time < n_ramp, ramp, commands[..., None, :])
+
+
+class Primitives:
+    """The set of primitives: arcs, climbing arcs, slow arcs, turns in place, vertical motion, and a stop.
+
+    commands: (P, 3) float64, the final velocities v, v_z, ω of each primitive. stop: index of the
+    primitive that comes to rest.
+    """
+
+    def __init__(self, dynamics: Dynamics) -> None:
+        self.dynamics = dynamics
+        v, c, w = dynamics.speed, dynamics.climb, dynamics.yaw_rate
+        arcs = [(v, up, turn) for up in (0.0, c, -c) for turn in (0.0, w / 2, -w / 2, w, -w)]
+        slow = [(v / 2, 0.0, turn) for turn in (0.0, w, -w)]
+        turns = [(0.0, 0.0, turn) for turn in (w, -w, w / 2, -w / 2)]
+        vertical = [(0.0, c, 0.0), (0.0, -c, 0.0)]
+        library = [*arcs, *slow, *turns, *vertical, (0.0, 0.0, 0.0)]
+        self.commands = torch.tensor(library, dtype=torch.float64)
+        self.stop = len(library) - 1
+        # Nearly all queried states are ends of primitives, so their continuations are computed once.
+        ends = torch.cat([torch.zeros(len(library), 4, dtype=torch.float64), self.commands], 1)
+        self._paths = self._rollout(ends)
+        self._stops = self._braking(ends)
+        self._longest = self._longest_steps()
+
+    def __len__(self) -> int:
+        return len(self.commands)
+
+    @property
+    def reach(self) -> float:
+        """Largest distance (m) that a robot covers from rest by one primitive, until it is at rest again."""
+        paths = self._rollout(torch.zeros(1, 7, dtype=torch.float64))[0]
+        return float(self.braking(paths[:, -1])[..., :3].norm(dim=-1).max())
+
+    def rollout(self, states: Tensor) -> Tensor:
+        """Return states (N, P, S, 7) after 1, 2, …, S steps of every primitive from states (N, 7).
+
+        Velocities are linear within a step h:
+
+            z += h (v_z⁰ + v_z¹)/2,   ψ += h (ω⁰ + ω¹)/2,   (x, y) += ∫₀ʰ v(t) (cos ψ(t), sin ψ(t)) dt
+
+        The integral uses three Gauss–Legendre nodes. At constant velocities it equals the closed form
+        x += v/ω (sin(ψ + ωT) − sin ψ), y += v/ω (cos ψ − cos(ψ + ωT)) to better than 10⁻⁸ m.
+        """
+        states = states.double()
+        follows = self._follows(states)
+        if follows is None:
+            return self._rollout(states)
+        return _moved(self._paths[follows], states[:, None])
+
+    def braking(self, states: Tensor) -> Tensor:
+        """Return states (..., B, 7) of braking from states (..., 7); the last is at rest."""
+        flat = states.double().reshape(-1, 7)
+        follows = self._follows(flat)
+        if follows is None:
+            return self._braking(states)
+        return _moved(self._stops[follows], flat).view(*states.shape[:-1], *self._stops.shape[1:])
+
+    def continued(self, states: Tensor) -> tuple[Motions, Tensor] | None:
+        """Return the motions from states (N, 7) after primitives, and the longest step (m) and the largest
+        turn (rad) in a step, (2,); None if a state has velocities with which no primitive ends.
+        """
+        follows = self._follows(states)
+        if follows is None:
+            return None
+        ends = _moved(self._paths[follows, :, -1:], states[:, None])[:, :, 0]
+        return Motions(self._paths, self._stops, follows, states, ends), self._longest[follows].amax(0)
+
+    def _longest_steps(self) -> Tensor:
+        """Return the longest step (m) and largest turn (rad) of the motions after each primitive, (P, 2)."""
+        rest = _moved(self._stops.expand(len(self), *self._stops.shape), self._paths[:, :, -1])
+        states = torch.cat([torch.zeros_like(rest[..., :1, :]), self._paths, rest], -2)[..., :4]
+        step = states[..., 1:, :] - states[..., :-1, :]
+        length = step[..., :3].square().sum(-1).sqrt()
+        return torch.stack([length.flatten(1).amax(1), step[..., 3].abs().flatten(1).amax(1)], 1)
+
+    def _follows(self, states: Tensor) -> Tensor | None:
+        """Return the primitive (N,) with the velocities of each state (N, 7); None if a state has none."""
+        is_end = (states[:, None, 4:] == self.commands).all(-1)
+        which = is_end.int().argmax(1)
+        return which if bool(is_end.any(1).all()) else None
+
+    def _rollout(self, states: Tensor) -> Tensor:
+        return _integrated(states[:, None], self.commands, self.dynamics, self.dynamics.n_steps)
+
+    def _braking(self, states: Tensor) -> Tensor:
+        at_rest = torch.zeros(3, dtype=torch.float64)
+        return _integrated(states, at_rest, self.dynamics, self.dynamics.n_braking_steps)
+
+
+def _moved(paths: Tensor, states: Tensor) -> Tensor:
+    """Move paths (..., S, 7) that begin at the origin with yaw 0 to the poses of states (..., 7)."""
+    x, y, z, yaw = states[..., None, :4].unbind(-1)
+    along, across, up, turn, *velocities = paths.unbind(-1)
+    cos, sin = yaw.cos(), yaw.sin()
+    place = [x + cos * along - sin * across, y + sin * along + cos * across, up + z, turn + yaw]
+    return torch.stack(torch.broadcast_tensors(*place, *velocities), -1)
+
+
+def _integrated(states: Tensor, commands: Tensor, dynamics: Dynamics, n_steps: int) -> Tensor:
+    """Return states (..., n_steps, 7) while velocities change from states (..., 7) to commands (..., 3)."""
+    h = dynamics.step
+    velocity = dynamics.velocities(states.double(), commands, n_steps)
+    x, y, z, yaw = (states[..., i, None].double() for i in range(4))
+    v, climb, turn = velocity.movedim(-1, 0).contiguous()  # each (..., n_steps + 1)
+    yaw = yaw + _accumulated((turn[..., :-1] + turn[..., 1:]) * (h / 2))
+    z = z + _accumulated((climb[..., :-1] + climb[..., 1:]) * (h / 2))
+    dx, dy = torch.zeros_like(v[..., 1:]), torch.zeros_like(v[..., 1:])
+    for node, weight in _QUADRATURE:
+        heading = torch.lerp(turn[..., :-1], turn[..., 1:], node / 2) * (h * node) + yaw[..., :-1]
+        speed = torch.lerp(v[..., :-1], v[..., 1:], node) * (h * weight)
+        dx += speed * heading.cos()
+        dy += speed * heading.sin()
+    place = [x + dx.cumsum(-1), y + dy.cumsum(-1), z[..., 1:], yaw[..., 1:]]
+    return torch.stack([*place, v[..., 1:], climb[..., 1:], turn[..., 1:]], -1)
+
+
+def _accumulated(steps: Tensor) -> Tensor:
+    """Return cumulative sums (..., n + 1) of steps (..., n), starting with 0."""
+    return torch.nn.functional.pad(steps.cumsum(-1), (1, 0))

@@ -1,0 +1,297 @@
+"""Mixture maps of robots (framework E0): components learned from novel beams, and shared (thesis Fig 4.1).
+
+Components are immutable; points that they explain later become counts, which any robot may add. All robots,
+the owner included, hold components as they are decoded from datagrams, so all maps are equal to the bit.
+The voxels follow the mixture: each change of the mixture is cast into them once.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import math
+import operator
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
+from gmmtorch.mapping import (
+    Components,
+    MixtureTiles,
+    NoveltyRule,
+    SurfaceFit,
+    all_origins,
+    box_around,
+    cell_fit,
+    component_evidence,
+    count_explained,
+    explained_within,
+    fit_window,
+    regenerate,
+    summed,
+)
+from gmmtorch.occupancy import Box, CellEvidence, RollingWindow, intersection
+from gmmtorch.scan import Scan
+from gmmtorch.simulation import DepthFrame
+from gmmtorch.team.exploration.robot.mapper import FrameUpdate, Mapper, Memo, novel_beams
+from gmmtorch.team.exploration.world.scoring import BeliefMap
+from gmmtorch.team.sharing import Broadcast, ReceivedMessage, Replica
+
+_LEEWAY = 0.5  # cells
+_EMPTY_LENGTH = 0.75  # of the length of components of surfaces
+_EMPTY_RAYS = 0.75  # of the rays of components of surfaces: components of free space overlap far more
+_EMPTY_CUTOFF = 2.0
+"""Mahalanobis distance. Tails of components of free space reach through surfaces that beams just missed."""
+
+
+@dataclass(frozen=True)
+class FrameRule:
+    """How a frame becomes components; lengths in metres. See `IncrementalRule` for the first five.
+
+    rays: for each cell that a component covers; see `component_evidence`.
+    shell: cells in front of a component's surface that its rays do not count as free.
+    hits_per_ray: points drawn from a component of a surface for each of its rays.
+    novelty_block: pixels along the side of the blocks of the image whose novelty one beam decides.
+    update_novel: novel beams that components explain are counted to these, and only the others are learned.
+    update_stride: of the beams that are not novel, every `update_stride`-th is counted, with that weight, to
+        the components that explain it; null: none, they are discarded.
+    update_at: counts of a component are sent once they have grown by this factor; 1: always.
+    update_every: frames between two messages of counts: they are then few and large, and seldom change the
+        mixture.
+    """
+
+    noise: float = 0.03
+    length: float = 0.6
+    cell: float = 0.15
+    components: int = 200
+    iterations: int = 4
+    rays: float = 4.0
+    shell: float = 0.5
+    hits_per_ray: int = 8
+    novelty_block: int = 3
+    update_novel: bool = False
+    update_stride: int | None = 11
+    update_at: float = 3.0
+    update_every: int = 10
+
+    def __post_init__(self) -> None:
+        for name in ("noise", "length", "cell"):
+            if not getattr(self, name) > 0:
+                raise InvalidArgumentError(f"{name}={getattr(self, name)} must be above zero metres.")
+        check_number("rays", self.rays, above=True)
+        check_number("shell", self.shell)
+        for name in ("components", "iterations", "hits_per_ray", "novelty_block", "update_every"):
+            check_whole(name, getattr(self, name), 1)
+        if self.update_stride is not None:
+            check_whole("update_stride", self.update_stride, 1)
+        if not 1 <= self.update_at < math.inf:
+            raise InvalidArgumentError(f"update_at={self.update_at} must be at least 1, and finite.")
+
+    def surface_fit(self) -> SurfaceFit:
+        """How the returns of a frame become components."""
+        return cell_fit(self.noise, self.length, self.cell, self.components, self.iterations, 3)
+
+    def empty_fit(self) -> SurfaceFit:
+        """The same for no-return beams: finer, because they end at the edges of the field of view."""
+        return replace(self, length=_EMPTY_LENGTH * self.length).surface_fit()
+
+
+class GmmMapper(Mapper):
+    """The map of one robot of a team that shares mixtures.
+
+    Args:
+        shared: the empty mixture; a `Replica`, or a `Broadcast` for codecs other than "quantized".
+    """
+
+    shared: Replica | Broadcast
+
+    def __init__(
+        self,
+        local: RollingWindow,
+        belief: BeliefMap,
+        width: int,
+        novelty: NoveltyRule,
+        rule: FrameRule,
+        memo: Memo,
+        shared: Replica | Broadcast,
+    ) -> None:
+        super().__init__(local, belief, width, novelty, memo)
+        self.shared = shared
+        self.tiles = MixtureTiles()
+        self._rule = rule
+        self._gained: dict[tuple[int, int], float] = {}  # counts that have not grown enough, by id
+        self._due: dict[tuple[int, int], float] = {}  # counts that are sent with the next message
+        self._n_frames = 0
+        self._by_origin: dict[tuple[int, ...], list[Components]] = {}  # batches by the cell of their origins
+        self._by_place: list[tuple[Tensor, Components]] = []  # batches with the box (2, 3) that they explain
+        self._near: tuple[list[Components], Components] | None = None  # the last `_seen_from_near`
+
+    # -- sensing ----------------------------------------------------------------------------------
+
+    def center_on(self, position: Tensor) -> None:
+        uncovered = [intersection(box, self.belief.grid.box) for box in self.local.center_on(position)]
+        boxes = [box for box in uncovered if box is not None]
+        regenerate(self.local, boxes, self.tiles, self._evidence)
+
+    def sense(self, frame: DepthFrame) -> FrameUpdate:
+        rule = self._rule
+        novel = learned = self._novel(frame)
+        if rule.update_novel:
+            learned = novel & ~self._count(frame, novel.nonzero().squeeze(1), 1)
+        if rule.update_stride is not None:
+            self._count(frame, (~novel).nonzero().squeeze(1)[:: rule.update_stride], rule.update_stride)
+        components = self._learned(frame, learned)
+        self.shared.add(components.to("cpu"))  # where messages are encoded
+        self._n_frames += 1
+        if self._n_frames % rule.update_every == 0:
+            self.shared.count(self._due)
+            self._due = {}
+        return FrameUpdate(self._follow(), novel)
+
+    def _novel(self, frame: DepthFrame) -> Tensor:
+        """Which beams (N,) of a frame are novel."""
+        rule = self._rule
+        # Components do not count cells close to surfaces as free: this must not make beams novel.
+        short = (rule.shell + _LEEWAY) * self.local.resolution if rule.shell else 0.0
+        within, side = self.belief.grid.box, rule.novelty_block
+        return novel_beams(self.local, frame, self._width, self._novelty, within, short, side)
+
+    def _learned(self, frame: DepthFrame, novel: Tensor) -> Components:
+        """The components of the novel beams."""
+        scan = Scan(frame.ends[novel & frame.is_hit], frame.origin, frame.ends[novel & ~frame.is_hit])
+        return fit_window([scan], self._rule.surface_fit(), all_origins(), self._rule.empty_fit())
+
+    def _count(self, frame: DepthFrame, chosen: Tensor, weight: int) -> Tensor:
+        """Adds the beams `chosen` (M,) to the counts of the components that explain them, with a weight each;
+        returns which of all beams (N,) are explained."""
+        rule, found = self._novelty, torch.zeros_like(frame.is_hit)
+        is_near = rule.distance_for == "all"
+        nearby = self._seen_from_near(frame.origin) if is_near else self._around(frame.ends[chosen])
+        if nearby is None or len(chosen) == 0:
+            return found
+        # A beam whose way alone makes it novel contributes free space, and so does one without return.
+        way = replace(frame, is_hit=torch.zeros_like(frame.is_hit))
+        frees = None if is_near else self._novel(way) | ~frame.is_hit
+        counted = nearby
+        for max_range in (False, True):
+            beams = chosen[frame.is_hit[chosen] != max_range]
+            counted, found[beams] = count_explained(
+                counted,
+                frame.ends[beams],
+                frame.origin,
+                rule.distance,
+                rule.explained,
+                max_range,
+                weight,
+                None if frees is None else frees[beams],
+            )
+        self._gain(nearby, counted.support - nearby.support)
+        return found
+
+    def _gain(self, nearby: Components, gain: Tensor) -> None:
+        """Adds points (K,) to the counts of components; counts that have grown enough become due."""
+        rows = (gain > 0).nonzero().squeeze(1)
+        columns = (nearby.ids[rows], gain[rows], nearby.support[rows])
+        for (robot, sequence), gained, support in zip(*(c.tolist() for c in columns), strict=True):
+            key = (robot, sequence)
+            total = self._gained.pop(key, 0.0) + gained
+            if total >= (self._rule.update_at - 1) * support:
+                self._due[key] = self._due.get(key, 0.0) + total
+            else:
+                self._gained[key] = total
+
+    def _around(self, points: Tensor) -> Components | None:
+        """Components, with all counts, of the batches that may explain points (M, 3); None if none may."""
+        if not self._by_place or len(points) == 0:
+            return None
+        first, last = points.aminmax(dim=0)
+        low, high = torch.stack([box for box, _ in self._by_place], 1)
+        near = ((low <= last) & (high >= first)).all(1).nonzero().squeeze(1).tolist()
+        return summed(Components.concatenate([self._by_place[n][1] for n in near])) if near else None
+
+    def _seen_from_near(self, origin: Tensor) -> Components | None:
+        """Components with all their counts, of batches seen from near a place (3,); None: there are none."""
+        middle = self._origin_cell(origin)
+        near = [
+            batch
+            for offset in itertools.product((-1, 0, 1), repeat=3)
+            for batch in self._by_origin.get(tuple(a + b for a, b in zip(middle, offset, strict=True)), [])
+        ]
+        if not near:
+            return None
+        known = [] if self._near is None else self._near[0]
+        if self._near is None or len(known) != len(near) or any(map(operator.is_not, known, near)):
+            self._near = near, summed(Components.concatenate(near))
+        return self._near[1]
+
+    def _origin_cell(self, origin: Tensor) -> tuple[int, ...]:
+        """The cell of `_by_origin` that contains a place (3,)."""
+        return tuple((origin / self._novelty.distance).floor().long().tolist())
+
+    # -- the mixture ------------------------------------------------------------------------------
+
+    def receive(self, received: Sequence[ReceivedMessage]) -> list[bytes]:
+        merged = [item.datagram for item in received if self.shared.receive(item.datagram, item.message)]
+        self._follow()
+        return merged
+
+    def components(self) -> Components:
+        """All components with all their counts, sorted by id."""
+        return self.shared.components()
+
+    def _follow(self) -> list[CellEvidence]:
+        """Enters the changes of the mixture since the last call; returns their evidence, in parts."""
+        changes = self.shared.changes()
+        if changes.rebuilt:
+            self._rebuild()
+            return []
+        batches = [*changes.added, changes.gained]
+        return [self._enter(batch) for batch in batches if len(batch)]
+
+    def _rebuild(self) -> None:
+        """Casts the whole mixture again, after components were moved or replaced."""
+        self.local.clear()
+        self.belief.clear()
+        self.tiles, self._by_origin, self._by_place = MixtureTiles(), {}, []
+        everything = self.shared.components()
+        if len(everything):
+            self._enter(everything)
+
+    def _enter(self, batch: Components) -> CellEvidence:
+        """Enters a batch of components, or of counts added to some; returns its evidence."""
+        grid = self.belief.grid
+        there = batch.to(grid.device)
+        self.tiles.add(there)
+        for cell in {self._origin_cell(origin) for origin in batch.origins}:
+            self._by_origin.setdefault(cell, []).append(there)
+        low, high = box_around(there, explained_within(3, self._novelty.explained))
+        self._by_place.append((torch.stack([low.amin(0), high.amax(0)]), there))
+        evidence = self._memo(_key(batch), lambda: self._evidence(there, grid.resolution, grid.box))
+        self._add(evidence)
+        return evidence
+
+    def _evidence(self, batch: Components, resolution: float, box: Box) -> CellEvidence:
+        """The evidence of components for the cells of a box."""
+        rule = self._rule
+        return component_evidence(
+            batch,
+            resolution,
+            box,
+            rays_per_cell=rule.rays,
+            shell=rule.shell,
+            hits_per_ray=rule.hits_per_ray,
+            thinned=True,
+            empty_rays_per_cell=_EMPTY_RAYS * rule.rays,
+            empty_cutoff=_EMPTY_CUTOFF,
+        )
+
+
+def _key(batch: Components) -> bytes:
+    """A hash of all values of a batch: corrected components keep their ids and support."""
+    digest = hashlib.blake2b(digest_size=16)
+    for value in vars(batch).values():
+        digest.update(value.contiguous().numpy().tobytes())
+    return digest.digest()

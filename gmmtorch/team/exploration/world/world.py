@@ -1,0 +1,263 @@
+"""World: a mesh, what of it is occupied, can be seen and flown through: the truth a mission is scored by."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from gmmtorch.datasets import read_triangles
+from gmmtorch.errors import InvalidArgumentError, MemoryLimitError, MissingDataError, check_choice
+from gmmtorch.events import Event, ignore
+from gmmtorch.occupancy import Box, check_resolution
+from gmmtorch.simulation import MeshWorld, checked_triangles, tunnels, warehouse, warehouse_start
+from gmmtorch.team.exploration.world.navigable import (
+    ON_PLANE,
+    above_floor,
+    connected,
+    observable_cells,
+    occupied_and_clear,
+    view_directions,
+    viewpoints,
+)
+from gmmtorch.team.exploration.world.world_cache import cached_cells
+
+MAX_CELLS = 1 << 28
+"""Largest number of cells of a world; computing it takes about 2 GB."""
+
+_SHARP = 0.4
+"""Share of the camera's range at which the rays that find observable cells are one cell apart."""
+
+_FINEST = 0.01
+"""Smallest angle (rad) between those rays."""
+
+_CELLS = ("occupied", "observable", "navigable")
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """A mesh within bounds, on a lattice of cells.
+
+    Attributes:
+        name: used in messages and results.
+        mesh: the mesh; it casts rays.
+        resolution: side of a cell (m).
+        box: the lattice cells of the bounds.
+        occupied: (nx, ny, nz) bool, cells that the mesh meets.
+        navigable: bool, connected cells above a floor at whose centre a robot does not touch the mesh. Cells
+            without a surface below them are outside, such as the rock around a mine without a roof.
+        observable: bool, cells that a camera in the navigable space can see: occupied cells, and free cells
+            above a floor.
+        robot_radius: metres.
+        start: (3,), metres, the default start of the robots.
+    """
+
+    name: str
+    mesh: MeshWorld
+    resolution: float
+    box: Box
+    occupied: Tensor
+    observable: Tensor
+    navigable: Tensor
+    robot_radius: float
+    start: Tensor | None = None
+
+    @classmethod
+    def from_mesh(
+        cls,
+        triangles: Tensor,
+        resolution: float = 0.2,
+        bounds: Sequence[float] | Tensor | None = None,
+        *,
+        vertical_fov: float = 1.0123,
+        max_range: float = 6.0,
+        robot_radius: float = 0.3,
+        start: Sequence[float] | Tensor | None = None,
+        spacing: float = 1.0,
+        cache: bool = True,
+        on_event: Event = ignore,
+        name: str = "mesh",
+    ) -> World:
+        """Compute a world, or read it from the cache.
+
+        Args:
+            triangles: (T, 3, 3) corners, metres, z up.
+            bounds: x0, y0, z0, x1, y1, z1 (m); default: the box of the mesh. The world consists of the cells
+                that touch the closed box. Rays end where they leave it.
+            vertical_fov: of the camera (rad). The camera looks horizontally and turns about the vertical.
+            max_range: of the camera (m).
+            start: (3,), a point in the connected part to fly in. Default: the part with most places that are
+                surrounded by walls (`MeshWorld.standing_places`), else the largest part.
+            spacing: distance (m) between the viewpoints that determine the observable cells.
+            cache: read the result from disk, or store it there (see `world_cache`).
+            on_event: callback for the stages.
+
+        Raises `DataError` for a mesh in which no rays can be cast, `InvalidArgumentError` for bounds that
+        contain no surface, a camera that sees only the neighbouring cells, or a world without room for a
+        robot, and `MemoryLimitError` for more than `MAX_CELLS` cells.
+        """
+        _check_sizes(resolution, vertical_fov, max_range, robot_radius, spacing)
+        triangles = checked_triangles(triangles, name)
+        mesh = MeshWorld(triangles)
+        box = _lattice_box(mesh, bounds, resolution, name)
+        place = None if start is None else _point(start)
+        options = _CellOptions(
+            resolution,
+            box.low.tolist(),
+            box.high.tolist(),
+            vertical_fov,
+            max_range,
+            robot_radius,
+            None if place is None else place.tolist(),
+            spacing,
+        )
+
+        def compute() -> dict[str, Tensor]:
+            cells = _compute_cells(mesh, triangles, box, options, name, on_event)
+            if cells is None:
+                raise InvalidArgumentError(
+                    f"bounds={_listed(bounds)} contain no surface of {name}, which extends from "
+                    f"{_text(mesh.low, mesh.high)}; use wider bounds that include a floor."
+                )
+            return cells
+
+        cells = cached_cells(triangles, options._asdict(), _CELLS, box.shape, compute) if cache else compute()
+        return cls(name, mesh, resolution, box, **cells, robot_radius=robot_radius, start=place)
+
+    def centers(self, cells: Tensor) -> Tensor:
+        """Centres (..., 3), metres, of cells (..., 3) relative to the low corner of the box."""
+        return (cells + self.box.low + 0.5).double() * self.resolution
+
+
+class _CellOptions(NamedTuple):
+    """What the cells of a world depend on besides its triangles; the key of the cache."""
+
+    resolution: float
+    low: list[int]
+    high: list[int]
+    vertical_fov: float
+    max_range: float
+    robot_radius: float
+    start: list[float] | None
+    spacing: float
+
+
+def _compute_cells(
+    mesh: MeshWorld, triangles: Tensor, box: Box, options: _CellOptions, name: str, on_event: Event
+) -> dict[str, Tensor] | None:
+    """Return the occupied, observable and navigable cells; None if no cell is occupied."""
+    resolution, radius = options.resolution, options.robot_radius
+    grounded = above_floor(mesh, resolution, box)
+    occupied, clear = occupied_and_clear(mesh, triangles, resolution, box, grounded, radius, on_event)
+    if not bool(occupied.any()):
+        return None
+    start = None if options.start is None else _point(options.start)
+    navigable = connected(clear, mesh, resolution, box, start, radius, name)
+    places = viewpoints(navigable, max(1, round(options.spacing / resolution)))
+    angle = max(resolution / (_SHARP * options.max_range), _FINEST)
+    directions = view_directions(options.vertical_fov, angle)
+    seen = observable_cells(mesh, occupied, box, resolution, places, directions, options.max_range, on_event)
+    seen = (seen | navigable) & (grounded | occupied)
+    return {"occupied": occupied, "observable": seen, "navigable": navigable}
+
+
+def _check_sizes(
+    resolution: float, vertical_fov: float, max_range: float, robot_radius: float, spacing: float
+) -> None:
+    check_resolution(resolution)
+    if not 0 < vertical_fov <= math.pi:
+        raise InvalidArgumentError(f"vertical_fov={vertical_fov} must be above 0 and at most π rad.")
+    for key, value in {"max_range": max_range, "robot_radius": robot_radius, "spacing": spacing}.items():
+        if not (math.isfinite(value) and value > 0):
+            raise InvalidArgumentError(f"{key}={value} must be above zero metres.")
+    if max_range <= robot_radius + 2 * resolution:
+        raise InvalidArgumentError(
+            f"max_range={max_range} m ends within two cells of the robot (robot_radius={robot_radius} m, "
+            f"resolution={resolution} m); use a longer range or finer cells."
+        )
+
+
+def _point(start: Sequence[float] | Tensor) -> Tensor:
+    point = torch.as_tensor(start, dtype=torch.float64)
+    if point.shape != (3,) or not bool(torch.isfinite(point).all()):
+        raise InvalidArgumentError(f"start={start} must be three finite numbers: x, y, z in metres.")
+    return point
+
+
+def _listed(bounds: Sequence[float] | Tensor | None) -> list[float]:
+    """Return the bounds as the user wrote them, for messages."""
+    return torch.as_tensor(() if bounds is None else bounds, dtype=torch.float64).tolist()
+
+
+def _text(low: Tensor, high: Tensor) -> str:
+    return " to ".join(f"({', '.join(f'{x:.4g}' for x in end.tolist())})" for end in (low, high)) + " m"
+
+
+def _lattice_box(
+    mesh: MeshWorld, bounds: Sequence[float] | Tensor | None, resolution: float, name: str
+) -> Box:
+    low, high = mesh.low, mesh.high
+    if bounds is not None:
+        ends = torch.as_tensor(bounds, dtype=torch.float64)
+        if ends.shape != (6,) or not bool(torch.isfinite(ends).all()):
+            raise InvalidArgumentError(
+                f"bounds={_listed(bounds)} must be six finite numbers, x0, y0, z0, x1, y1, z1 (m)."
+            )
+        low, high = ends[:3], ends[3:]
+        if not bool((low < high).all()):
+            raise InvalidArgumentError(f"bounds={ends.tolist()} are empty; give the low corner first.")
+        if bool(((high < mesh.low) | (low > mesh.high)).any()):
+            raise InvalidArgumentError(
+                f"bounds={ends.tolist()} do not meet {name}, which extends from {_text(mesh.low, mesh.high)}."
+            )
+    first, last = ((end / resolution + ON_PLANE).floor() for end in (low, high))
+    n_cells = float((last - first + 1).prod())
+    if n_cells > MAX_CELLS:
+        raise MemoryLimitError(
+            f"{name}: {n_cells:.3g} cells of {resolution} m from {_text(low, high)} are more than "
+            f"{MAX_CELLS:.3g}. Use a coarser resolution (world.resolution) or tighter bounds (world.bounds); "
+            "check that the mesh is in metres, not millimetres."
+        )
+    return Box(first.long(), last.long() + 1)
+
+
+def open_world(
+    name: str,
+    *,
+    path: str | Path | None = None,
+    bounds: Sequence[float] | Tensor | None = None,
+    seed: int = 0,
+    size: Sequence[float] | None = None,
+    **options: Any,
+) -> World:
+    """Open the world `name`: "warehouse" or "tunnels" with a seed and a size (m), or the "mesh" in a file.
+
+    `options` are those of `World.from_mesh`, which also raises its errors. Raises `InvalidArgumentError`
+    for an unknown name or an option that the world does not have, and `MissingDataError` for a missing
+    file.
+    """
+    check_choice("world", name, ("warehouse", "tunnels", "mesh"))
+    if name == "mesh":
+        if size is not None:
+            raise InvalidArgumentError(f"size={size}: a mesh has its own size; give bounds instead.")
+        file = Path("" if path is None else path).expanduser()
+        if not file.is_file():
+            raise MissingDataError(
+                f"world.path={path} is not a file; give a triangle mesh (PLY, OBJ, STL) in metres, z up."
+            )
+        return World.from_mesh(read_triangles(file), bounds=bounds, name=file.stem, **options)
+    if path is not None:
+        raise InvalidArgumentError(f"path={path}: world={name} is generated and takes no path; drop it.")
+    extent = () if size is None else (size,)
+    if name == "warehouse":
+        triangles = warehouse(seed, *extent)
+        if bounds is None:
+            options.setdefault("start", warehouse_start(*extent))
+    else:
+        triangles = tunnels(seed, *extent)
+    return World.from_mesh(triangles, bounds=bounds, name=name, **options)

@@ -1,0 +1,17 @@
+from .mission_bars import deviations_figure as deviations_figure
+from .mission_bars import profile_figure as profile_figure
+from .mission_bars import summary_bars as summary_bars
+from .mission_curves import bandwidth_figure as bandwidth_figure
+from .mission_curves import entropy_figure as entropy_figure
+from .mission_curves import planner_comparison_figure as planner_comparison_figure
+from .mission_maps import TeamSnapshot as TeamSnapshot
+from .mission_maps import team_map_figure as team_map_figure
+from .mission_maps import trajectories_figure as trajectories_figure
+from .mission_summary import study_summary as study_summary
+from .mission_summary import write_exploration_board as write_exploration_board
+from .network_figures import loss_figure as loss_figure
+from .network_figures import team_run_figure as team_run_figure
+from .rerun_recording import RecordedMap as RecordedMap
+from .rerun_recording import load_rerun as load_rerun
+from .rerun_recording import record_rerun as record_rerun
+from .trial_groups import by_variant as by_variant

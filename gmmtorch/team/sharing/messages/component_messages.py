@@ -1,0 +1,279 @@
+"""Components as datagrams. See docs/messages.md."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.linalg import pack_symmetric, unpack_symmetric
+from gmmtorch.mapping import FARTHEST as THESIS_FARTHEST
+from gmmtorch.mapping import (
+    LARGEST_VARIANCE,
+    MOST_POINTS,
+    ORIGIN_STEP,
+    Components,
+    Quantized,
+    decode,
+    decode_thesis,
+    encode_quantized,
+    encode_thesis,
+    quantize,
+    scaled,
+)
+from gmmtorch.team.sharing.messages.envelope import (
+    FARTHEST,
+    LARGEST_NUMBER,
+    MAX_BYTES,
+    Kind,
+    check_codec,
+    check_places,
+    make_datagram,
+    split,
+)
+
+MOST_COMPONENTS_SENT = 1024
+"""Components, and viewpoints of them, in a datagram, as a receiver may cast hundreds of rays for each. A
+map's datagrams have about 170."""
+
+_SIZES = struct.Struct("<BIII")  # dimensions, components, origins, viewpoints
+_FIRST_GUESS = 128
+"""Components that are likely to fit into a datagram."""
+_FILL = 0.95
+"""Share of a datagram to fill, as components differ in size."""
+
+
+@dataclass(frozen=True, eq=False)
+class ComponentsMessage:
+    """Components, as the sender's decoder returns them."""
+
+    components: Components
+
+
+def encode_components(components: Components, codec: str = "quantized") -> list[bytes]:
+    """Datagrams of components in order, each with the sensor origins that it needs; empty without components.
+
+    Args:
+        codec: "quantized": 8 to 10 bytes per component, rounded as `mapping.codec.quantized` does.
+            "float": float64, unchanged. "thesis": 57 bytes for each component and sensor origin.
+
+    Raises `InvalidArgumentError` for values that the codec cannot store, for positions beyond
+    `envelope.FARTHEST`, and for a component with so many sensor origins that it does not fit into a datagram.
+    """
+    viewpoints = torch.bincount(components.seen_by, minlength=len(components)).cpu()
+    _check_viewpoints(viewpoints)
+    so_far = torch.cat([viewpoints.new_zeros(1), viewpoints.cumsum(0)]).tolist()
+    write = {"quantized": _quantized, "float": _float, "thesis": _thesis}[check_codec(codec)]
+
+    def part(begin: int, end: int) -> bytes:
+        rows = torch.arange(begin, end, device=components.means.device)
+        return write(components.selected(rows).with_used_origins())
+
+    def is_allowed(begin: int, end: int) -> bool:
+        return max(end - begin, so_far[end] - so_far[begin]) <= MOST_COMPONENTS_SENT
+
+    return split(len(components), part, "component", is_allowed=is_allowed)
+
+
+def fitted(values: Quantized, max_bytes: int = MAX_BYTES) -> Iterator[tuple[bytes, Quantized]]:
+    """Datagrams of quantised components in order, each with as many as fit; and the components of each.
+
+    The number of components is estimated from the size of the datagram before, which takes fewer attempts
+    than halving all of them.
+    """
+    _check_viewpoints(values.n_viewpoints)
+    _check_quantized(values)
+    so_far = values.n_viewpoints.cumsum(0)
+    begin, n = 0, _FIRST_GUESS
+    while begin < len(values):
+        before = int(so_far[begin - 1]) if begin else 0
+        n_allowed = int(torch.searchsorted(so_far, before + MOST_COMPONENTS_SENT, right=True)) - begin
+        n = min(n, MOST_COMPONENTS_SENT, n_allowed)
+        whole = begin == 0 and n >= len(values)
+        part = values if whole else values.arranged(torch.arange(begin, min(begin + n, len(values))))
+        datagram = make_datagram(Kind.COMPONENTS, encode_quantized(part))
+        room = int(_FILL * len(part) * max_bytes / len(datagram))
+        if len(datagram) <= max_bytes:
+            yield datagram, part
+            begin, n = begin + len(part), max(1, room)
+        elif len(part) > 1:
+            n = max(1, min(room, len(part) - 1))
+        else:
+            raise InvalidArgumentError(
+                f"A single component takes {len(datagram)} bytes; a datagram has room for {max_bytes}. "
+                "Give it fewer sensor origins."
+            )
+
+
+def _quantized(components: Components) -> bytes:
+    values = quantize(components)
+    _check_quantized(values)
+    return make_datagram(Kind.COMPONENTS, encode_quantized(values))
+
+
+def read_quantized(body: bytes) -> ComponentsMessage:
+    return _message(read_batch(body))
+
+
+def read_batch(data: bytes) -> Components:
+    """The components of a codec batch of any size. Raises `DataError` if they are damaged or out of range."""
+    components = decode(data)
+    try:
+        _check_range(components.means, components.origins, components.ids)
+    except InvalidArgumentError as error:
+        raise DataError(f"The batch is out of range: {error}") from error
+    return components
+
+
+def _float(components: Components) -> bytes:
+    c = _checked(components)
+    fields = [
+        _doubles(c.means),
+        _doubles(pack_symmetric(c.covariances)),
+        _doubles(c.support),
+        c.max_range.cpu().numpy().astype("u1"),
+        c.ids.cpu().numpy().astype("<i8"),
+        _doubles(c.origins),
+        c.seen_by.cpu().numpy().astype("<u2"),
+        c.seen_from.cpu().numpy().astype("<u2"),
+        _doubles(c.seen_count),
+    ]
+    sizes = (c.dim, len(c), len(c.origins), len(c.seen_by))  # indices beyond 16 bits do not fit anyway
+    return make_datagram(Kind.FLOAT_COMPONENTS, _SIZES.pack(*sizes) + b"".join(f.tobytes() for f in fields))
+
+
+def read_float(body: bytes) -> ComponentsMessage:
+    if len(body) < _SIZES.size:
+        raise DataError(f"{len(body)} bytes are too few for components.")
+    dim, k, s, e = _SIZES.unpack_from(body)
+    if dim not in (2, 3):
+        raise DataError(f"The components are {dim}-dimensional; a map has 2 or 3 dimensions.")
+    if max(k, s, e) > len(body) or not k:
+        raise DataError(f"{k} components, {s} origins and {e} viewpoints do not fit: it is damaged.")
+    layout = np.dtype(
+        [
+            ("means", "<f8", (k, dim)),
+            ("covariances", "<f8", (k, dim * (dim + 1) // 2)),
+            ("support", "<f8", (k,)),
+            ("max_range", "u1", (k,)),
+            ("ids", "<i8", (k, 2)),
+            ("origins", "<f8", (s, dim)),
+            ("seen_by", "<u2", (e,)),
+            ("seen_from", "<u2", (e,)),
+            ("seen_count", "<f8", (e,)),
+        ]
+    )
+    if len(body) != _SIZES.size + layout.itemsize:
+        raise DataError(f"{len(body)} bytes do not match {k} components, {s} origins, {e} viewpoints.")
+    row = np.frombuffer(body, layout, offset=_SIZES.size)[0]
+    if (row["max_range"] > 1).any() or (row["ids"] < 0).any():
+        raise DataError("A max_range flag or an id is out of range: it is damaged.")
+    values = {
+        name: torch.from_numpy(row[name].astype(_wide(layout[name].base))) for name in layout.names or ()
+    }
+    values["covariances"] = unpack_symmetric(values["covariances"], dim)
+    values["max_range"] = values["max_range"] != 0
+    return _message(_checked(Components(**values)))
+
+
+def _thesis(components: Components) -> bytes:
+    if components.dim != 3:
+        raise InvalidArgumentError(
+            f"codec=thesis stores 3D components, not {components.dim}D; use codec=quantized."
+        )
+    c = components
+    count = c.seen_count.float().double()
+    sent = replace(
+        c,
+        means=c.means.float().double(),
+        covariances=c.covariances.float().double(),
+        origins=c.origins.float().double(),
+        support=count.new_zeros(len(c)).index_add_(0, c.seen_by, count),
+        seen_count=count,
+    )
+    _checked(sent, THESIS_FARTHEST)
+    return make_datagram(Kind.THESIS_COMPONENTS, encode_thesis(components))
+
+
+def read_thesis(body: bytes) -> ComponentsMessage:
+    return _message(_checked(decode_thesis(body, 3), THESIS_FARTHEST))
+
+
+def _message(components: Components) -> ComponentsMessage:
+    """The message of components; raises `DataError` if there are none, or more than a datagram may have."""
+    k, e = len(components), len(components.seen_by)
+    if k == 0 or max(k, e) > MOST_COMPONENTS_SENT:
+        raise DataError(
+            f"{k} components and {e} viewpoints; a datagram has from 1 to {MOST_COMPONENTS_SENT} of each: "
+            "it is damaged."
+        )
+    return ComponentsMessage(components)
+
+
+# Encoders apply the decoder's checks, so that an encoded message is always accepted.
+
+
+def _check_viewpoints(viewpoints: Tensor) -> None:
+    """Raise `InvalidArgumentError` if one of the components (K,) has too many viewpoints."""
+    most = int(viewpoints.max()) if len(viewpoints) else 0
+    if most > MOST_COMPONENTS_SENT:
+        raise InvalidArgumentError(
+            f"A single component has {most} viewpoints; a datagram may have {MOST_COMPONENTS_SENT}. Keep "
+            "fewer of its origins: mapping.learning.viewpoints.limit_origins."
+        )
+
+
+def _check_quantized(values: Quantized) -> None:
+    means = scaled(values.places.mean, values.places.mean_exponents())
+    _check_range(means, values.origins.double() * ORIGIN_STEP, values.ids)
+
+
+def _check_range(means: Tensor, origins: Tensor, ids: Tensor, farthest: float = FARTHEST) -> None:
+    check_places("means", means, farthest)
+    check_places("origins", origins, farthest)
+    if len(ids) and not 0 <= int(ids.min()) <= int(ids.max()) <= LARGEST_NUMBER:
+        raise InvalidArgumentError(
+            f"ids reach from {int(ids.min())} to {int(ids.max())}; robots and numbers go from 0 to "
+            f"{LARGEST_NUMBER}."
+        )
+
+
+def _checked(components: Components, farthest: float = FARTHEST) -> Components:
+    """The components, if they are in range and their covariances positive definite, as codec=quantized
+    demands."""
+    c = components.checked()
+    _check_range(c.means, c.origins, c.ids, farthest)
+    for name, value, limit in (
+        ("covariances", c.covariances.diagonal(dim1=1, dim2=2), LARGEST_VARIANCE),
+        ("support", c.support, MOST_POINTS),
+        ("seen_count", c.seen_count, MOST_POINTS),
+    ):
+        if value.numel() and float(value.max()) > limit:
+            raise InvalidArgumentError(
+                f"{name} go up to {float(value.max()):g}; {limit:g} is the most. Are they in metres?"
+            )
+    _check_definite(unpack_symmetric(pack_symmetric(c.covariances), c.dim))  # only the upper half is sent
+    return c
+
+
+def _check_definite(covariances: Tensor) -> None:
+    info = torch.linalg.cholesky_ex(covariances).info
+    if bool((info != 0).any()):
+        first = int((info != 0).nonzero()[0])
+        raise InvalidArgumentError(
+            f"covariances[{first}] is not positive definite after rounding by this codec; use "
+            "codec=quantized, which keeps it positive definite, or a larger least variance."
+        )
+
+
+def _doubles(values: Tensor) -> np.ndarray:
+    return values.detach().cpu().numpy().astype("<f8")
+
+
+def _wide(kind: np.dtype) -> type:
+    return np.float64 if kind.kind == "f" else np.int64

@@ -1,0 +1,341 @@
+"""Author: writes the records of one incarnation of a robot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.mapping import NO_COUNT, Components, order_of, quantize, quantized
+from gmmtorch.occupancy import Calibration
+from gmmtorch.team.sharing.messages.component_messages import fitted
+from gmmtorch.team.sharing.messages.envelope import split
+from gmmtorch.team.sharing.messages.fields import pose_of
+from gmmtorch.team.sharing.messages.message_registry import decode
+from gmmtorch.team.sharing.messages.record_messages import (
+    RECORD_BYTES,
+    CalibrationMessage,
+    CorrectionMessage,
+    CountersMessage,
+    FrameMessage,
+    RecordMessage,
+    SupersessionMessage,
+    counters_message,
+    encode_record,
+)
+from gmmtorch.team.sharing.replica.anti_entropy import Packet
+from gmmtorch.team.sharing.replica.component_table import fingerprints, most_viewpoints
+from gmmtorch.team.sharing.replica.materialized_view import latest
+from gmmtorch.team.sharing.replica.moved_map import MovedMap
+from gmmtorch.team.sharing.replica.record_keys import (
+    MOST_RECORDS,
+    Intervals,
+    Ints,
+    author_of,
+    first_key,
+    ids_of,
+    keys_of_author,
+    keys_of_robot,
+)
+from gmmtorch.team.sharing.replica.records import MOST_VIEWPOINTS, Records
+
+_MOST_SUPERSESSIONS = 32
+"""Effective supersessions of this author before they are merged."""
+_MOST_OUTDATED = 64
+"""Outdated entries in records of counters, beyond as many as are current, before all are rewritten."""
+_MOST_SHORT = 16
+"""Records of counters shorter than half of `RECORD_BYTES` before they are merged."""
+_MOST_POINTS = 2.0**40
+_MORE_PREDICTIONS = 1.5
+"""Growth of the number of predictions after which a calibration is written again."""
+
+
+class Published(NamedTuple):
+    """keys (K,): of the given components; written: keys of all new records; packets: datagrams of the
+    components."""
+
+    keys: Ints
+    written: Intervals
+    packets: list[Packet]
+
+
+class Author:
+    """Writes the records of one incarnation of a robot, and adds them to `records`.
+
+    Attributes:
+        keys: all keys that this author can give.
+    """
+
+    def __init__(self, records: Records, robot: int, incarnation: int) -> None:
+        self._records, self._robot = records, robot
+        self._first = first_key(robot, incarnation)
+        self._last = self._first + MOST_RECORDS - 1  # no key of this author takes more bytes
+        self._keys_of_robot, self.keys = keys_of_robot(robot), keys_of_author(robot, incarnation)
+        self._n = 0
+        self._points: dict[int, float] = {}  # exact counters, by key of the component
+        self._written_steps: dict[int, int] = {}  # counters as written last
+        self._published: set[int] = set()  # keys of the components that `publish_map` keeps
+        self._merge_at = _MOST_SUPERSESSIONS
+
+    @property
+    def written(self) -> Intervals:
+        """The keys that this author has given."""
+        return Intervals.span(self._first, self._first + self._n)
+
+    # -- components -------------------------------------------------------------------------------
+
+    def publish(self, components: Components, old: Intervals, max_bytes: int) -> Published:
+        """Write new components, which supersede the records `old` of this robot."""
+        if most_viewpoints(components) > MOST_VIEWPOINTS:
+            raise InvalidArgumentError(
+                f"A component has {most_viewpoints(components)} viewpoints; a datagram has room for "
+                f"{MOST_VIEWPOINTS}. Keep fewer: mapping.learning.viewpoints.limit_origins."
+            )
+        if not self._keys_of_robot.covers(old):
+            raise InvalidArgumentError(f"A robot supersedes its own records only; robot={self._robot}.")
+        if not len(components) and not old:
+            return Published(np.zeros(0, np.int64), Intervals.empty(), [])
+        values = quantize(components)
+        order = order_of(values.places)
+        first = self._numbers(len(order))
+        numbered = np.arange(first, first + len(order))
+        values = replace(values.arranged(order), ids=ids_of(numbered))
+        # Components are added by datagrams here, too, so that all robots of a team have the same batches.
+        packets: list[Packet] = []
+        written = Intervals.empty()
+        for datagram, part in fitted(values, max_bytes):
+            packets.append((datagram, self._records.add_components(part.restored(), bounded=False)))
+            written |= packets[-1][1]
+        keys = np.empty_like(numbered)
+        keys[order.numpy()] = numbered
+        superseded = self._supersede((old & self._records.held) - self._records.dead, written)
+        return Published(keys, written | superseded, packets)
+
+    def publish_map(
+        self, components: Components, whole: bool, max_bytes: int, moved: MovedMap | None = None
+    ) -> Published:
+        """Write what is new in a map, and supersede what it no longer has. Components are compared by
+        content.
+
+        whole: whether the map continues those of earlier incarnations, whose records are superseded, too,
+        if the map lacks them.
+        moved: components that were published where they were before are corrected.
+        """
+        table, own = self._records.table, self._own_components()
+        published = self._published & set(own)
+        earlier = [key for key in own if key not in published and key not in self.keys]
+        candidates = [*earlier, *sorted(published)]
+        available: dict[bytes, list[int]] = {}
+        for key, print_ in zip(candidates, table.fingerprints(candidates), strict=True):
+            available.setdefault(print_, []).append(key)
+        keys, runs = np.full(len(components), -1), {}
+        if moved is not None:
+            _match(available, moved.before, keys)
+            runs = moved.corrected(keys, np.array(own, np.int64), self._corrections())
+        _match(available, components, keys)
+        gone = set(candidates if whole else published) - set(keys.tolist())
+        rows = np.flatnonzero(keys < 0)
+        new = components.selected(torch.from_numpy(rows))
+        made = self.publish(new, Intervals.of(np.array(sorted(gone), np.int64)), max_bytes)
+        self._published = {*keys[keys >= 0].tolist(), *made.keys.tolist()}
+        corrected = [] if moved is None else self._correct_map(runs, moved.motions)
+        return made._replace(written=Intervals.union([made.written, *corrected]))
+
+    def _correct_map(self, runs: Mapping[int, Intervals], motions: Sequence[Tensor]) -> list[Intervals]:
+        """Write the corrections of scans that have changed; returns the new records."""
+        live, before = Intervals.of(np.array(self._own_components(), np.int64)), self._corrections()
+        written = []
+        for scan, moved in runs.items():
+            record = before.get(scan)
+            is_same = record is not None and torch.equal(record.pose, pose_of(motions[scan]))
+            if record is None or not is_same or record.moved & live != moved & live:
+                written.append(self.correct(scan, motions[scan], moved))
+        return written
+
+    def _corrections(self) -> dict[int, CorrectionMessage]:
+        """The corrections of this robot that move a component, by scan."""
+        mine = Intervals.of(np.array(self._own_components(), np.int64))
+        records = latest(self._records.of(CorrectionMessage))
+        return {r.scan: r for r in records if r.key in self._keys_of_robot and r.moved & mine}
+
+    def _own_components(self) -> list[int]:
+        """The keys, rising, of this robot's components that count."""
+        keys = self._records.table.keys()
+        return keys[self._keys_of_robot.contains(keys)].tolist()
+
+    # -- counters and corrections -----------------------------------------------------------------
+
+    def count(self, gains: Mapping[int, float]) -> Intervals:
+        """Add points to this author's counters, by keys of components of any robot; returns the new
+        records."""
+        for key, gain in gains.items():
+            if not 0 <= gain <= _MOST_POINTS:
+                raise InvalidArgumentError(f"A component gained {gain} points; counts go from 0 to 2⁴⁰.")
+            self._points[key] = min(self._points.get(key, 0.0) + float(gain), _MOST_POINTS)
+        rounded = counters_message(self._first, {key: self._points[key] for key in gains})
+        is_dead = self._records.dead.contains(rounded.components)
+        risen = {
+            key: self._points[key]
+            for key, step, dead in zip(
+                rounded.components.tolist(), rounded.steps.tolist(), is_dead.tolist(), strict=True
+            )
+            if step > self._written_steps.get(key, NO_COUNT) and not dead
+        }
+        return self._write_counters(risen) | self._rewrite_counters()
+
+    def _rewrite_counters(self) -> Intervals:
+        """Rewrite all counters if most entries are outdated; else the short records if there are many."""
+        own = list(self._records.counters.of(author_of(self._first)).values())
+        if sum(len(record.components) for record in own) <= 2 * len(self._written_steps) + _MOST_OUTDATED:
+            own = [r for r in own if len(self._records.datagrams[r.key]) < RECORD_BYTES // 2]
+            if len(own) <= _MOST_SHORT:
+                return Intervals.empty()
+        keys = np.unique(np.concatenate([record.components for record in own]))
+        is_dead = self._records.dead.contains(keys)
+        for key in keys[is_dead].tolist():
+            self._written_steps.pop(key, None)
+        rewritten = self._write_counters({key: self._points[key] for key in keys[~is_dead].tolist()})
+        old = Intervals.of(np.array([record.key for record in own], np.int64))
+        return rewritten | self._supersede(old, rewritten)
+
+    def correct(self, scan: int, transform: Tensor, moved: Intervals) -> Intervals:
+        """Write a correction of a scan with the components `moved`; returns the new records."""
+        if not self._keys_of_robot.covers(moved):
+            raise InvalidArgumentError(f"A robot corrects its own components only; robot={self._robot}.")
+        before = [
+            record
+            for record in self._records.of(CorrectionMessage)
+            if record.scan == scan and record.key in self._keys_of_robot
+        ]
+        version = 1 + max((record.version for record in before), default=0)
+        record = CorrectionMessage(self._first + self._n, scan, version, moved, pose_of(transform))
+        if len(encode_record(record)) > RECORD_BYTES:
+            raise InvalidArgumentError(
+                f"The components of scan={scan} are {len(moved)} runs of ids, too many for a datagram. "
+                "Number a scan's components consecutively."
+            )
+        self._numbers(1)
+        written = self._records.add_record(record, bounded=False)
+        old = Intervals.of(np.array([r.key for r in before], np.int64))
+        return written | self._supersede(old, written)
+
+    def place_frame(self, frame: int, anchor: int, transform: Tensor | None) -> Intervals:
+        """Write where a frame of this robot is; returns the new records.
+
+        transform: anchor ← frame; None: the frame has no other anchor than itself.
+        """
+        before = [record for record in self._records.of(FrameMessage) if record.frame == frame]
+        version = 1 + max((record.version for record in before), default=0)
+        pose = None if transform is None else pose_of(transform)
+        written = self._write(FrameMessage(self._first + self._n, frame, version, anchor, pose))
+        old = Intervals.of(np.array([r.key for r in before], np.int64))
+        return written | self._supersede(old, written)
+
+    def calibrate(self, calibration: Calibration) -> Intervals:
+        """Write the calibration of this robot's map, if it rests on many more predictions than the one that
+        was written before; returns the new records."""
+        before = [r for r in self._records.of(CalibrationMessage) if r.key in self._keys_of_robot]
+        known = max((r.calibration.n_predicted for r in before), default=0)
+        if calibration.n_predicted <= _MORE_PREDICTIONS * known:
+            return Intervals.empty()
+        written = self._write(CalibrationMessage(self._first + self._n, calibration))
+        return written | self._supersede(Intervals.of(np.array([r.key for r in before], np.int64)), written)
+
+    def _write_counters(self, points: Mapping[int, float]) -> Intervals:
+        keys = sorted(points)
+
+        def part(begin: int, end: int) -> bytes:
+            return encode_record(counters_message(self._last, {key: points[key] for key in keys[begin:end]}))
+
+        written = Intervals.empty()
+        for datagram in split(len(keys), part, "counter", RECORD_BYTES):
+            message = decode(datagram)
+            assert isinstance(message, CountersMessage)  # `part` encoded it
+            written |= self._write(replace(message, key=self._first + self._n))
+            self._written_steps.update(zip(message.components.tolist(), message.steps.tolist(), strict=True))
+        return written
+
+    # -- superseding ------------------------------------------------------------------------------
+
+    def _supersede(self, old: Intervals, new: Intervals) -> Intervals:
+        """Write supersessions of `old` by `new`; returns their keys.
+
+        A supersession whose successors are all superseded is superseded with them, and its old records become
+        old records of the new supersession. So no robot needs the first one any more. See docs/replica.md.
+        """
+        if not old:
+            return Intervals.empty()
+        closed, dead = old, self._records.dead | old
+        for record in reversed(self._records.effective()):
+            if record.key in self._keys_of_robot and record.new and dead.covers(record.new):
+                closed |= record.old | Intervals.span(record.key, record.key + 1)
+                dead |= closed
+        written = Intervals.empty()
+        whole = self._supersession(closed, new)
+        if len(encode_record(whole)) <= RECORD_BYTES:
+            written = self._write(whole)
+        else:
+            # Parts do not supersede others: a robot with one part would drop the old records of the other.
+            def part(begin: int, end: int) -> bytes:
+                some = Intervals(old.edges[2 * begin : 2 * end])
+                return encode_record(SupersessionMessage(self._last, some, new))
+
+            for datagram in split(len(old), part, "supersession", RECORD_BYTES):
+                message = decode(datagram)
+                assert isinstance(message, SupersessionMessage)
+                written |= self._write(replace(message, key=self._first + self._n))
+        return written | self._merge_supersessions()
+
+    def _supersession(self, old: Intervals, new: Intervals) -> SupersessionMessage:
+        return SupersessionMessage(self._first + self._n, old, new)
+
+    def _merge_supersessions(self) -> Intervals:
+        """If this author has many effective supersessions, merge them, so that their memory stays bounded."""
+        own = [record for record in self._records.effective() if record.key in self.keys]
+        if len(own) <= self._merge_at:
+            return Intervals.empty()
+        written = self._merged(own)
+        left = sum(record.key in self.keys for record in self._records.effective())
+        self._merge_at = 2 * left + _MOST_SUPERSESSIONS
+        return written
+
+    def _merged(self, records: Sequence[SupersessionMessage]) -> Intervals:
+        if len(records) < 2:
+            return Intervals.empty()
+        old = new = Intervals.empty()
+        for record in records:
+            old |= record.old | Intervals.span(record.key, record.key + 1)
+            new |= record.new
+        # Dead successors are covered by other supersessions. So none waits for what it supersedes itself.
+        union = self._supersession(old, new - old - self._records.dead)
+        if len(encode_record(union)) <= RECORD_BYTES:
+            return self._write(union)
+        half = len(records) // 2
+        return self._merged(records[:half]) | self._merged(records[half:])
+
+    def _write(self, record: RecordMessage) -> Intervals:
+        assert record.key == self._first + self._n
+        self._numbers(1)
+        return self._records.add_record(record, bounded=False)
+
+    def _numbers(self, n: int) -> int:
+        """The first of n new keys."""
+        if self._n + n > MOST_RECORDS:
+            raise InvalidArgumentError(
+                f"{MOST_RECORDS} records are the most of one incarnation; make a new Replica."
+            )
+        self._n += n
+        return self._first + self._n - n
+
+
+def _match(available: Mapping[bytes, list[int]], components: Components, keys: Ints) -> None:
+    """Take a key with the content of each component (K,) that has none, −1, as far as there are some."""
+    prints = fingerprints(quantized(components))
+    for row in np.flatnonzero(keys < 0).tolist():
+        if available.get(prints[row]):
+            keys[row] = available[prints[row]].pop()  # of equal ones, those that this author published first
