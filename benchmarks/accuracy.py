@@ -13,12 +13,11 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from harness import Case, Row, held_out, recording, run
-
 from gmmtorch import GaussianMap, IncrementalRule, WindowedRule
 from gmmtorch.datasets import Dataset
 from gmmtorch.experiments.evaluation.held_out import Protocol, evaluate
 from gmmtorch.experiments.evaluation.mapping_methods import choose, methods
+from gmmtorch.experiments.harness import Case, Row, held_out, recording, run
 
 KEPT = (1.0, 0.3, 0.1, 0.05)
 METHODS = ("occupancy_grid", "occupancy_log_odds", "monte_carlo", "point")

@@ -24,7 +24,6 @@ from typing import Any, NamedTuple
 
 import torch
 from accuracy import BUDGETS, CELLS, NAMES, PLANAR
-from harness import Case, Row, cpu_seconds, held_out, recording, run
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from pages import ROOT
@@ -36,6 +35,7 @@ from gmmtorch.experiments.baselines import LogOdds, OccupancyGrid, OctoMapMap
 from gmmtorch.experiments.evaluation import metrics
 from gmmtorch.experiments.evaluation.held_out import Protocol, evaluate
 from gmmtorch.experiments.evaluation.mapping_methods import choose, methods
+from gmmtorch.experiments.harness import Case, Row, cpu_seconds, held_out, recording, run
 from gmmtorch.kernels.rays.ray_traversal import traverse
 from gmmtorch.report.style import PALETTE, label_axes, legend_below, new_figure, save_figure
 from gmmtorch.simulation import World3D, building_3d, poses_3d, spinning_lidar

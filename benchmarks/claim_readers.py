@@ -13,8 +13,9 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from harness import Table
 from pages import ROOT
+
+from gmmtorch.experiments.harness import Table
 
 _NUMBER = r"[-−+]?(?:\d+(?:,\d{3})*(?:\.\d+)?|\.\d+)"
 Interval = Callable[[float], tuple[float, float]]

@@ -43,8 +43,9 @@ from claim_readers import (
     times,
     within,
 )
-from harness import Table, markdown
 from pages import ROOT
+
+from gmmtorch.experiments.harness import Table, markdown
 
 
 class Claim(NamedTuple):

@@ -13,10 +13,10 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from harness import Case, Row, run
 from scipy.spatial import KDTree
 
 from gmmtorch import datasets
+from gmmtorch.experiments.harness import Case, Row, run
 
 APART, STRIDE = 2.0, 3  # seconds; every how many scans begin a pair
 OPTIONS: dict[str, dict[str, Any]] = {

@@ -17,10 +17,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import sklearn.mixture
-from harness import Case, Row, alone, clock, run
 from sklearn.datasets import load_digits, load_iris
 
 import gmmtorch
+from gmmtorch.experiments.harness import Case, Row, alone, clock, run
 from gmmtorch.mixture.em.covariance_types import COVARIANCE_TYPES, type_shape
 
 N_ITER = 3

@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from harness import Case, Row, cpu_seconds, recording, run
 from torch import Tensor
 
 from gmmtorch import GaussianMap
 from gmmtorch.experiments.evaluation.queries import hit_and_free, test_beams
+from gmmtorch.experiments.harness import Case, Row, cpu_seconds, recording, run
 from gmmtorch.kernels import kernels
 from gmmtorch.mapping.learning.rules import IncrementalRule, LearningRule, WindowedRule
 from gmmtorch.occupancy.cones import Cones

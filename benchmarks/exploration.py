@@ -19,8 +19,7 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-from harness import Case, Row, alone, run
-
+from gmmtorch.experiments.harness import Case, Row, alone, run
 from gmmtorch.mapping.map_builder import resident_bytes
 from gmmtorch.team.exploration.mission.driver import Stopwatch
 from gmmtorch.team.exploration.mission.mission import Mission

@@ -15,10 +15,10 @@ from collections.abc import Iterator
 from typing import Any
 
 import torch
-from harness import Case, Row, cpu_seconds, recording, run
 
 from gmmtorch import GaussianMap, IncrementalRule, Scan, datasets
 from gmmtorch.datasets.base import Dataset
+from gmmtorch.experiments.harness import Case, Row, cpu_seconds, recording, run
 from gmmtorch.kernels import kernels
 from gmmtorch.mapping.map_builder import resident_bytes
 

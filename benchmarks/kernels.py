@@ -20,12 +20,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from harness import Case, Row, least_seconds, recording, run
 from public_work import counted, large_works, prepare, works
 from torch import Tensor
 
 from gmmtorch import GaussianMap
 from gmmtorch.experiments.evaluation.queries import hit_and_free, test_beams
+from gmmtorch.experiments.harness import Case, Row, least_seconds, recording, run
 from gmmtorch.kernels import kernels
 from gmmtorch.kernels.mixtures.e_step import expectation
 from gmmtorch.kernels.rays.ray_traversal import traverse

@@ -21,11 +21,11 @@ from typing import Any, NamedTuple
 
 import sklearn.mixture
 import torch
-from harness import Case, Row, alone, clock, cpu_seconds, least_seconds, recording, run
 from torch import Tensor
 
 from gmmtorch import GaussianMixture, HierarchicalGaussianMixture
 from gmmtorch.experiments.evaluation.metrics import psnr2
+from gmmtorch.experiments.harness import Case, Row, alone, clock, cpu_seconds, least_seconds, recording, run
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em import loop
 

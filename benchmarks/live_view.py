@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from harness import Case, Row, cpu_seconds, run
+
+from gmmtorch.experiments.harness import Case, Row, cpu_seconds, run
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 

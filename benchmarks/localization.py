@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from harness import Case, Row, cpu_seconds, held_out, recording, run
 from torch import Tensor
 
 import gmmtorch as gt
 from gmmtorch.datasets import Dataset
+from gmmtorch.experiments.harness import Case, Row, cpu_seconds, held_out, recording, run
 from gmmtorch.localization import Tracker
 from gmmtorch.localization.rigid_motions import generators
 

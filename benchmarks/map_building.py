@@ -15,12 +15,12 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
-from harness import Case, Row, cpu_seconds, recording, run, score
 from torch import Tensor
 
 from gmmtorch import GaussianMap, GaussianMixture, IncrementalRule
 from gmmtorch.datasets.depth_frames import DepthFrames
 from gmmtorch.experiments.evaluation.queries import hit_and_free, split_indices, test_beams
+from gmmtorch.experiments.harness import Case, Row, cpu_seconds, recording, run, score
 from gmmtorch.mixture.depth_image import fit_depth_image
 from gmmtorch.pinhole import back_project
 

@@ -17,10 +17,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import open3d as o3d
 import torch
-from harness import Case, Row, run
 from torch import Tensor
 
 from gmmtorch import GaussianMap
+from gmmtorch.experiments.harness import Case, Row, run
 from gmmtorch.export.mesh import surface_mesh
 from gmmtorch.simulation import (
     DepthCamera,

@@ -21,12 +21,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from harness import Case, Row, cpu_seconds, held_out, recording, run
 
 import gmmtorch as gt
 from gmmtorch.datasets import Dataset
 from gmmtorch.experiments.evaluation.held_out import Protocol, evaluate
 from gmmtorch.experiments.evaluation.mapping_methods import choose, methods
+from gmmtorch.experiments.harness import Case, Row, cpu_seconds, held_out, recording, run
 from gmmtorch.localization import Odometry
 from gmmtorch.localization.odometry.recorded_poses import METHODS, with_odometry
 from gmmtorch.localization.trajectories import absolute_trajectory_error, relative_pose_error

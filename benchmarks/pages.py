@@ -13,8 +13,7 @@ import re
 import sys
 from pathlib import Path
 
-from harness import Table
-
+from gmmtorch.experiments.harness import Table
 from gmmtorch.files import write_bytes
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -27,13 +27,13 @@ from typing import Any, NamedTuple
 import joblib
 import torch
 from frames import RESOLUTIONS, SEED, Frame, material
-from harness import Case, Row, run, score
 from pages import ROOT
 from torch import Tensor
 
 from gmmtorch import GaussianMap, IncrementalRule
 from gmmtorch.experiments.evaluation.metrics import psnr_terms
 from gmmtorch.experiments.evaluation.queries import Queries
+from gmmtorch.experiments.harness import Case, Row, run, score
 from gmmtorch.experiments.report.rate_distortion_figures import QUALITIES, bytes_for, figures, leads
 from gmmtorch.mapping.codec.quantization import spatial_order
 from gmmtorch.mapping.components import Components

@@ -29,11 +29,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import open3d
 import torch
-from harness import Case, Row, run
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from gmmtorch.experiments.harness import Case, Row, run
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.mapping.components import Components
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame

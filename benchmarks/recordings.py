@@ -25,10 +25,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from harness import Case, Row, run, score
-
 from gmmtorch import GaussianMap, datasets
 from gmmtorch.experiments.evaluation.queries import hit_and_free, split_indices, test_beams
+from gmmtorch.experiments.harness import Case, Row, run, score
 from gmmtorch.mapping import TiledMap
 
 N_PARTS, N_POINTS = 16, 20_000

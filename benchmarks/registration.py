@@ -21,10 +21,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import open3d as o3d
 import torch
-from harness import Case, Row, cpu_seconds, recording, run
 from torch import Tensor
 
 from gmmtorch import WindowedRule
+from gmmtorch.experiments.harness import Case, Row, cpu_seconds, recording, run
 from gmmtorch.localization.registration.registration import register, yaw_starts
 from gmmtorch.localization.rigid_motions import generators
 from gmmtorch.mapping.codec import component_batch as codec

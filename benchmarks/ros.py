@@ -20,8 +20,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from harness import Case, Row, run
 from pages import ROOT
+
+from gmmtorch.experiments.harness import Case, Row, run
 
 _MEGABYTE = 1 << 20
 _ROUTER = "from gmmtorch.live.ros.zenoh_middleware import open_router; r = open_router(); input()"

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 import torch
 from frames import Frame, simulated
-from harness import Case, Row, run
 from torch import Tensor
 
+from gmmtorch.experiments.harness import Case, Row, run
 from gmmtorch.mapping.codec.quantization import spatial_order
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.fitting import fit_window

@@ -36,9 +36,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from harness import Case, Row, run
 
 from gmmtorch.errors import DataError
+from gmmtorch.experiments.harness import Case, Row, run
 from gmmtorch.processes import end_with_parent
 from gmmtorch.team.exploration.information.view_library import ViewLibrary
 from gmmtorch.team.sharing.messages.envelope import Kind

@@ -18,13 +18,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from harness import Case, Row, recording, run
 from pages import ROOT
 from torch import Tensor
 
 import gmmtorch as gt
 from gmmtorch.datasets import Dataset
 from gmmtorch.datasets.base import start_frame
+from gmmtorch.experiments.harness import Case, Row, recording, run
 from gmmtorch.mapping.components import Components
 from gmmtorch.report.style import PALETTE, save_figure
 from gmmtorch.team.sharing import FrameJoiner, Replica

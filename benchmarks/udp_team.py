@@ -25,8 +25,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from harness import Case, Row, run
-
+from gmmtorch.experiments.harness import Case, Row, run
 from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.team.cli.from_options.links import free_addresses

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from gmmtorch.experiments import harness
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -25,7 +27,6 @@ def loaded():
 @pytest.fixture
 def run(loaded, tmp_path, monkeypatch):
     """Runs cases with words of a command line; returns the tables that they write, by name."""
-    harness = loaded("harness")
     monkeypatch.setenv("GMMTORCH_TABLES", str(tmp_path))
     monkeypatch.delenv("GMMTORCH_DATA", raising=False)
 
@@ -45,7 +46,7 @@ def test_pages_have_the_tables_of_the_results(loaded):
 
 
 def test_tables_that_pages_show_in_part_have_the_rows(loaded):
-    pages, harness = loaded("pages"), loaded("harness")
+    pages = loaded("pages")
     for name, chosen in pages.SHOWN.items():
         texts = harness.Table.load(pages.RESULTS / f"{name}.json").texts()
         for column, values in chosen.items():
@@ -53,18 +54,18 @@ def test_tables_that_pages_show_in_part_have_the_rows(loaded):
 
 
 def test_a_table_comes_back_from_its_file_and_shows_its_cells(loaded, tmp_path):
-    table = loaded("harness").Table(
+    table = harness.Table(
         "µ", "c", "h", {"name": "", "n": "{:.1f} mm", "s": "3"}, [["a", 1.26, 12345.0], ["b", None, "–"]]
     )
     table.save(tmp_path / "t.json")
-    assert loaded("harness").Table.load(tmp_path / "t.json") == table
+    assert harness.Table.load(tmp_path / "t.json") == table
     rows = table.markdown().splitlines()[2:]
     assert rows == ["| a | 1.3 mm | 12,300 |", "| b |  | – |"]
     assert table.markdown({"name": ("b",)}).splitlines()[2:] == rows[1:]
 
 
 def test_a_part_that_is_measured_again_replaces_its_rows_only(loaded, run):
-    case = loaded("harness").Case
+    case = harness.Case
     values = iter((1.0, 2.0, 3.0, 4.0, 5.0))
 
     def measure(options):
@@ -87,14 +88,14 @@ def test_the_file_is_named_after_threads_and_its_rows_are_written_one_by_one(loa
         yield {"n": 1.0}
         raise ValueError("stopped")
 
-    case = loaded("harness").Case("some-{threads}{gpu}", measure, needs_data=False)
+    case = harness.Case("some-{threads}{gpu}", measure, needs_data=False)
     with pytest.raises(ValueError, match="stopped"):
         run(case, words="--threads 2")
     assert run(case._replace(measure=lambda options: ()))["some-2"]["rows"] == [[1.0]]
 
 
 def test_a_case_with_recordings_needs_their_folder(loaded, run, capsys):
-    case = loaded("harness").Case("some", lambda options: ())
+    case = harness.Case("some", lambda options: ())
     with pytest.raises(SystemExit):
         run(case)
     assert "GMMTORCH_DATA" in capsys.readouterr().err
@@ -105,6 +106,6 @@ def sixth(value):
 
 
 def test_work_in_a_process_of_its_own_returns_its_result_or_its_error(loaded):
-    alone = loaded("harness").alone
+    alone = harness.alone
     assert alone(sixth, 3.0) == {"value": 0.5}
     assert "TypeError" in alone(sixth, "x")["error"]

@@ -1,8 +1,10 @@
 """Cases: comparisons of the package with its peers on named data, and the tables of results that they write.
 
-A case names its data, its methods (ours and the peers) and its measure, which yields rows. `run` is the
-command of a script with some cases. It writes each table as JSON after each row, so that a killed run keeps
-what it has measured. `benchmarks/pages.py` makes the tables of the pages from these files.
+A case names its data, its methods (ours and the peers) and its measure, which yields rows. Two commands run
+cases. `run` is that of a script in benchmarks/: it writes each table as JSON after each row, so that a killed
+run keeps what it has measured, and `benchmarks/pages.py` makes the tables of the pages from these files. The
+experiments of gmmtorch-fit and gmmtorch-occupancy (`cli.studies`) take their options from Hydra, and draw
+figures.
 """
 
 from __future__ import annotations
@@ -17,7 +19,8 @@ import resource
 import shlex
 import sys
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -25,13 +28,25 @@ from typing import Any, NamedTuple, TypeVar
 import numpy
 import sklearn
 import torch
-from threadpoolctl import threadpool_limits
 
-from gmmtorch import datasets
-from gmmtorch.datasets import Dataset
-from gmmtorch.experiments.evaluation.metrics import roc
-from gmmtorch.experiments.evaluation.queries import FREE, OCCUPIED, Queries
+from gmmtorch.datasets import Dataset, load
+from gmmtorch.experiments.evaluation import FREE, OCCUPIED, Queries, roc
 from gmmtorch.files import write_bytes
+
+__all__ = [
+    "Case",
+    "Row",
+    "Table",
+    "alone",
+    "clock",
+    "cpu_seconds",
+    "held_out",
+    "least_seconds",
+    "markdown",
+    "recording",
+    "run",
+    "score",
+]
 
 Cell = float | str | None
 Row = Mapping[str, Cell] | Sequence[Cell]
@@ -131,24 +146,33 @@ class Case(NamedTuple):
     Attributes:
         name: of its file of results and of its table in a page. "{threads}" in it stands for the number of
             threads, "{gpu}" for nothing, or "-gpu" on a GPU.
-        measure: yields the rows for the options of the command. `options.names` and `options.methods` are
-            the chosen of `data` and `methods`; text in `options.about` is added to `about`.
+        measure: yields the rows for the options of the command. Of a script, `options.names` and
+            `options.methods` are the chosen of `data` and `methods`, and text in `options.about` is added to
+            `about`. An experiment gets a `cli.studies.Setting`.
         about: what the cells are.
         columns: with their formats, see `Table`. If rows are dictionaries, these name the columns, and only
             those with numbers have a format here.
         data: names of data sets. methods: names of ours and of the peers.
         key: the number of columns that name a row.
         needs_data: whether `options.data` must be a folder of recordings.
+        figures: makes the figures of the rows of an experiment, by file name.
+        shown: the rows of the printed table of an experiment.
+        line: the field that names the curve of a row in TensorBoard. step: the field with its step; "": the
+            index of the row.
     """
 
     name: str
-    measure: Callable[[Any], Iterable[Row]]
+    measure: Callable[[Any], Iterable[Any]]
     about: str = ""
     columns: Mapping[str, str] = {}
     data: tuple[str, ...] = ()
     methods: tuple[str, ...] = ()
     key: int = 1
     needs_data: bool = True
+    figures: Callable[[list[dict[str, Any]]], Mapping[str, Any]] = lambda rows: {}
+    shown: Callable[[list[dict[str, Any]]], list[dict[str, Any]]] = lambda rows: rows
+    line: str = "method"
+    step: str = ""
 
     def file(self, device: str, threads: int) -> str:
         """The name of its file of results."""
@@ -173,7 +197,7 @@ def run(text: str, *cases: Case, **arguments: dict[str, Any]) -> None:
     ):
         if len(values) > 1:
             parser.add_argument(option, nargs="+", choices=list(values), metavar="NAME", default=list(values))
-    common = {"threads": {"type": int, "default": 1}, "device": {"default": "cpu"}}
+    common: dict[str, dict[str, Any]] = {"threads": {"type": int, "default": 1}, "device": {"default": "cpu"}}
     for name, settings in {**common, **arguments}.items():
         parser.add_argument(f"--{name.replace('_', '-')}", **settings)
     options = parser.parse_args()
@@ -182,8 +206,7 @@ def run(text: str, *cases: Case, **arguments: dict[str, Any]) -> None:
     ]
     if any(case.needs_data for case in chosen) and options.data is None:
         parser.error("--data or the environment variable GMMTORCH_DATA must name the folder of recordings.")
-    torch.set_num_threads(options.threads)
-    with threadpool_limits(options.threads):
+    with _threads(options.threads):
         for case in chosen:
             result = measured(case, options)
             print(
@@ -251,8 +274,8 @@ def recording(data: Path, name: str, **options: Any) -> Dataset:
     """A 2D log, frames of a depth camera, or a folder of 3D scans, by its name below the folder."""
     log = data / "laser2d" / f"{name}.log.gz"
     if log.is_file():
-        return datasets.load("carmen", log, **options)
-    return datasets.load("depth_frames" if name == "kinect" else "scan_folder", data / name, **options)
+        return load("carmen", log, **options)
+    return load("depth_frames" if name == "kinect" else "scan_folder", data / name, **options)
 
 
 def held_out(dataset: Dataset) -> int:
@@ -267,6 +290,16 @@ def score(answer: Any, asked: Queries, resolution: float) -> float:
 
 
 # -- seconds and memory ----------------------------------------------------------------------------------
+
+
+@contextmanager
+def _threads(n: int) -> Iterator[None]:
+    """Limits torch, and the libraries of NumPy and scikit-learn, to n threads."""
+    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+
+    torch.set_num_threads(n)
+    with threadpool_limits(n):
+        yield
 
 
 def cpu_seconds(work: Callable[[], T]) -> tuple[float, T]:
@@ -314,8 +347,7 @@ def alone(work: Callable[..., dict[str, Any]], *arguments: Any, limit: int | Non
 def _child(work: Callable[..., Any], arguments: Any, threads: int, limit: int | None, pipe: Any) -> None:
     if limit:
         resource.setrlimit(resource.RLIMIT_CPU, (threads * limit, threads * limit))
-    torch.set_num_threads(threads)
-    with threadpool_limits(threads):
+    with _threads(threads):
         try:
             pipe.send(work(*arguments))
         except Exception as error:  # a peer's failure is a result, and is published
