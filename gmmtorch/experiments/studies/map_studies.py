@@ -1,12 +1,16 @@
-"""Accuracy of a map whose poses are corrected after it was built.
+"""Studies of maps: AUC against size, options of learning, and corrected poses.
 
-A grid from wrong poses must be built again. In a map that is learned scan by scan (`map=per_scan`) each
-component belongs to one scan, so it moves with the corrected pose of that scan.
+- AUC against map size in bytes (thesis Table 3.1): every method at several sizes, on one test.
+- Maps that differ in options of learning, on one test: `experiment=pruning` compares pruning, trees and
+  components of free space (thesis 2.1.2, 2.1.4, 3.5) with the map that has none of them.
+- Maps whose poses are corrected after they were built. A grid from wrong poses must be built again. In a map
+  that is learned scan by scan (`map=per_scan`) each component moves with the corrected pose of its scan.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,8 +18,13 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.events import Event, OnRows, Row, ignore
 from gmmtorch.experiments.evaluation import (
+    Built,
+    Form,
+    MapFactory,
     Protocol,
     Queries,
+    auc_gain,
+    evaluate,
     hit_and_free,
     keep_share,
     pose_perturbations,
@@ -24,7 +33,109 @@ from gmmtorch.experiments.evaluation import (
     test_beams,
 )
 from gmmtorch.mapping import GaussianMap
+from gmmtorch.mixture import GaussianMixture
 from gmmtorch.scan import Scan
+
+# -- AUC against size ----------------------------------------------------------------------------------
+
+
+class Sized(NamedTuple):
+    """A method with one size: its number of components or stored points; None if the method has one size."""
+
+    method: str
+    size: int | None
+    factory: MapFactory
+
+
+def run_auc_memory(
+    name: str,
+    scans: Sequence[Scan],
+    methods: Sequence[Sized],
+    protocol: Protocol,
+    seed: int = 0,
+    on_event: Event = ignore,
+    on_rows: OnRows = lambda rows: None,
+) -> list[Row]:
+    """A row of `held_out.evaluate` for each sized method, with the field `size`."""
+    by_label = {_label(sized): sized for sized in methods}
+
+    def with_size(rows: Sequence[Row]) -> list[Row]:
+        return [
+            {**row, "method": by_label[row["method"]].method, "size": by_label[row["method"]].size}
+            for row in rows
+        ]
+
+    factories = {label: sized.factory for label, sized in by_label.items()}
+    outcome = evaluate(
+        name, scans, factories, protocol, seed, on_event, lambda rows: on_rows(with_size(rows))
+    )
+    return with_size(outcome.rows)
+
+
+def _label(sized: Sized) -> str:
+    return sized.method if sized.size is None else f"{sized.method} {sized.size}"
+
+
+# -- options of learning -------------------------------------------------------------------------------
+
+_SCORED_POINTS = 5000
+
+
+def run_map_variants(
+    name: str,
+    scans: Sequence[Scan],
+    variants: Mapping[str, Form],
+    protocol: Protocol,
+    seed: int = 0,
+    on_event: Event = ignore,
+    on_rows: OnRows = lambda rows: None,
+) -> list[Row]:
+    """A row of `held_out.evaluate` for each variant, with the largest share of the data that is kept.
+
+    Further fields: `variant`; `n_free_components`, of no-return beams and free points; `auc_gain`,
+    `auc_gain_low`, `auc_gain_high`: the AUC minus that of the first variant, with its 95 % interval;
+    `held_out_log_likelihood`, of held-out returns under the components of surfaces, nats per point.
+    """
+    ends = held_out_points(scans, protocol.test_every)
+    rows: list[Row] = []
+    first: dict[float, Built] = {}
+    for variant, factory in variants.items():
+        outcome = evaluate(name, scans, {variant: factory}, protocol, seed, on_event)
+        for built in outcome.shown:
+            assert isinstance(built.map, GaussianMap)
+            base = first.setdefault(built.row["resolution"], built)
+            gain = auc_gain(base.asked.split(base.theta), built.asked.split(built.theta))
+            rows.append(
+                {
+                    **built.row,
+                    "variant": variant,
+                    "n_free_components": int(built.map.max_range.sum()),
+                    "auc_gain": gain.mean,
+                    "auc_gain_low": gain.low,
+                    "auc_gain_high": gain.high,
+                    "held_out_log_likelihood": surface_score(built.map, ends),
+                }
+            )
+        on_rows(rows)
+    return rows
+
+
+def held_out_points(scans: Sequence[Scan], test_every: int) -> Tensor:
+    """About 5000 points (N, D) of the held-out scans."""
+    points = torch.cat([scans[i].points for i in split_indices(len(scans), test_every)[1]])
+    return points[:: max(1, len(points) // _SCORED_POINTS)].double()
+
+
+def surface_score(built: GaussianMap, points: Tensor) -> float:
+    """Mean log-likelihood (nats) of points (N, D) under the surfaces of a map, before the codec rounds them,
+    weighted by their support.
+    """
+    hits = ~built.max_range
+    weight, means, covariances = built.support[hits], built.means[hits], built.covariances[hits]
+    return GaussianMixture.from_parameters(weight / weight.sum(), means, covariances).score(points)
+
+
+# -- corrected poses -----------------------------------------------------------------------------------
 
 
 def build_by_scan(empty: GaussianMap, scans: Sequence[Scan]) -> list[Tensor]:
