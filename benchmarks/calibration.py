@@ -16,10 +16,9 @@ from typing import Any
 
 from gmmtorch import GaussianMap
 from gmmtorch.errors import MemoryLimitError
-from gmmtorch.experiments.evaluation.calibration import accuracy
 from gmmtorch.experiments.evaluation.held_out import Built, Protocol, evaluate
 from gmmtorch.experiments.evaluation.mapping_methods import choose, methods
-from gmmtorch.experiments.evaluation.metrics import separating_threshold
+from gmmtorch.experiments.evaluation.metrics import accuracy, separating_threshold
 from gmmtorch.experiments.harness import Case, Row, held_out, recording, run
 
 METHODS = ("point", "occupancy_grid", "occupancy_log_odds", "octomap")

@@ -21,7 +21,7 @@ from sklearn.datasets import load_digits, load_iris
 
 import gmmtorch
 from gmmtorch.experiments.harness import Case, Row, alone, clock, run
-from gmmtorch.mixture.em.covariance_types import COVARIANCE_TYPES, type_shape
+from gmmtorch.mixture.em.exact import COVARIANCE_TYPES, type_shape
 
 N_ITER = 3
 SEED = 5

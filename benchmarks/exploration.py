@@ -24,7 +24,7 @@ from gmmtorch.mapping.map_builder import resident_bytes
 from gmmtorch.team.exploration.mission.driver import Stopwatch
 from gmmtorch.team.exploration.mission.mission import Mission
 from gmmtorch.team.exploration.mission.options import TeamOptions
-from gmmtorch.team.exploration.mission.team_setup import assemble
+from gmmtorch.team.exploration.mission.trials import assemble
 from gmmtorch.team.exploration.world.world import World, open_world
 
 

@@ -21,7 +21,7 @@ from gmmtorch import GaussianMap, GaussianMixture, IncrementalRule
 from gmmtorch.datasets.depth_frames import DepthFrames
 from gmmtorch.experiments.evaluation.queries import hit_and_free, split_indices, test_beams
 from gmmtorch.experiments.harness import Case, Row, cpu_seconds, recording, run, score
-from gmmtorch.mixture.depth_image import fit_depth_image
+from gmmtorch.mixture.estimators.depth_image import fit_depth_image
 from gmmtorch.pinhole import back_project
 
 FAST = {"cell": 0.05, "iterations": 4, "window": 16, "window_components": 200}

@@ -29,7 +29,7 @@ from gmmtorch.experiments.harness import Case, Row, run
 from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.team.cli.from_options.links import free_addresses
-from gmmtorch.team.sharing.replica.component_table import fingerprints
+from gmmtorch.team.sharing.replica.materialized_view import fingerprints
 
 _PAUSE = 0.1
 _SAMPLE = 10.0  # seconds between looks at the memory

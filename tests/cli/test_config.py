@@ -29,7 +29,7 @@ from gmmtorch.experiments.cli import studies as study_cases
 from gmmtorch.experiments.cli.experiment_schema import STUDIES
 from gmmtorch.experiments.cli.fits_of_options import fit_options
 from gmmtorch.experiments.evaluation import methods
-from gmmtorch.experiments.evaluation.fits.fit_comparison import ESTIMATORS
+from gmmtorch.experiments.evaluation.fits import ESTIMATORS
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
 from gmmtorch.simulation.worlds.tunnels import tunnels

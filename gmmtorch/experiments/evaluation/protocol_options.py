@@ -94,7 +94,7 @@ class FitOptions:
         max_iter: EM iterations, at most.
         n_init: initializations, of which the best is kept.
         dtype: type of the exponentials in EM, "float32" or "float64".
-        compiled: use torch.compile for truncated EM.
+        compiled: without effect, because the kernels are compiled anyway.
     """
 
     n_components: int | None = 100

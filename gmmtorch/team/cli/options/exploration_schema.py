@@ -59,7 +59,7 @@ class PlannerOptions:
 
     name: str = MISSING
     prior: float = _TEAM["planning_prior"]
-    rest: float = read_defaults("team.exploration.robot.robot_state", "StoppingRule")["share"]
+    rest: float = read_defaults("team.exploration.robot.agent", "StoppingRule")["share"]
 
 
 @dataclass
@@ -153,7 +153,7 @@ _TEAM_MAP = schema_of(
 
 _SIMULATED_NETWORK = schema_of(
     RobotNetwork,
-    read_dataclass("team.sharing.transport.link_conditions", "LinkConditions", partitions=list[Any]),
+    read_dataclass("team.sharing.transport.simulated_network", "LinkConditions", partitions=list[Any]),
     NetworkDelay,
     without=("latency",),
 )

@@ -11,7 +11,7 @@ from gmmtorch.team.cli.options import exploration_schema, robot_schema
 
 def _sensor_schema() -> type:
     """Options of a live sensor."""
-    return schema_of(robot_schema.SensorOptions, read_dataclass("live.mapper.live_scans", "LiveOptions"))
+    return schema_of(robot_schema.SensorOptions, read_dataclass("live.live_scans", "LiveOptions"))
 
 
 @functools.cache

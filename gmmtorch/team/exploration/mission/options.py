@@ -9,26 +9,23 @@ from typing import Any
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, check_whole
 from gmmtorch.mapping import NoveltyRule
 from gmmtorch.simulation import DepthCamera
-from gmmtorch.team.exploration.information.view_evaluator import INFORMATION
 from gmmtorch.team.exploration.planning.coordination import Coordination
 from gmmtorch.team.exploration.planning.planners import PLANNERS
 from gmmtorch.team.exploration.planning.primitives import Dynamics
+from gmmtorch.team.exploration.planning.view_evaluator import INFORMATION
+from gmmtorch.team.exploration.robot.agent import StoppingRule
 from gmmtorch.team.exploration.robot.gmm_mapper import FrameRule
-from gmmtorch.team.exploration.robot.robot_state import StoppingRule
 from gmmtorch.team.exploration.world.scoring import BeliefRule
 from gmmtorch.team.sharing import (
     POINT_CODECS,
-    AnnouncementSchedule,
     LinkConditions,
     Partition,
-    TokenBucket,
+    Radio,
     check_codec,
 )
 
-_MOST_ROBOTS = 31
-"""Bits of the integer that stores which robots saw a cell."""
-_LATE_JITTERS = 5
-"""Mean jitters. Less than 1 % of the datagrams arrive later."""
+_MOST_ROBOTS = 31  # bits of the integer that stores which robots saw a cell
+_LATE_JITTERS = 5  # mean jitters. Less than 1 % of the datagrams arrive later.
 
 FRAMEWORKS = ("gmm_shared", "grid_shared", "grid_isolated", "gmm_thesis")
 """E0, E1 and E2 of the thesis; and `gmm_shared` with the options of `THESIS`."""
@@ -63,7 +60,7 @@ class TeamOptions:
         for the planner. rest: when a robot stops exploring.
     codec: of components, see `sharing.messages`; losses are repaired for "quantized" only.
     latency … partitions: of the simulated network, see `LinkConditions`.
-    announce_every: seconds, see `AnnouncementSchedule`.
+    announce_every: seconds, see `Radio`.
     budget: bytes per second that a robot sends of its map and views; None: no limit.
     sample_every: simulated seconds between the values of curves, rounded to whole frames.
     codecs: other codecs whose bytes for the novel points are measured.
@@ -127,9 +124,7 @@ class TeamOptions:
         check_number("margin", self.margin)
         # These check their own arguments.
         Coordination(self.coordination, self.n_rounds)
-        AnnouncementSchedule(self.announce_every)
-        if self.budget is not None:
-            TokenBucket(self.budget)
+        Radio.check(self.announce_every, self.budget)
         self.conditions.check_team(self.size)
         if not 0 < self.planning_prior < 1:
             raise InvalidArgumentError(f"planner.prior={self.planning_prior} must be between 0 and 1.")

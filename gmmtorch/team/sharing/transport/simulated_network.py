@@ -1,18 +1,165 @@
-"""Transport, which carries datagrams between robots; and Network, a simulated one."""
+"""Transport, which carries datagrams between robots; and Network, a simulated one, with its conditions."""
 
 from __future__ import annotations
 
 import heapq
 import math
+import numbers
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import InitVar, dataclass
 from typing import Any, NamedTuple, Protocol
 
 import torch
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
-from gmmtorch.team.sharing.messages.envelope import check_datagram
-from gmmtorch.team.sharing.transport.link_conditions import LinkConditions
+from gmmtorch.team.sharing.messages.datagrams import check_datagram
+
+
+class Partition(NamedTuple):
+    """From `begin` until before `end` (s), robots of different groups do not receive each other's datagrams.
+
+    groups: robot numbers. Robots that no group contains form one more group.
+    """
+
+    begin: float
+    end: float
+    groups: tuple[tuple[int, ...], ...]
+
+    def divides(self, robot: int, other: int) -> bool:
+        """Whether two robots are in different groups."""
+        return self._group(robot) != self._group(other)
+
+    def _group(self, robot: int) -> int:
+        return next((number for number, group in enumerate(self.groups) if robot in group), -1)
+
+
+@dataclass(frozen=True)
+class LinkConditions:
+    """Conditions of all links of a network.
+
+    latency: seconds from the end of transmission to arrival, at least. jitter: mean (s) of an exponential
+    delay that is added for each receiver and each copy. bandwidth: bytes per second of each sender; None: no
+    limit. loss: share of the datagrams that each receiver loses, [0, 1). duplication: share of those not lost
+    that arrive twice, [0, 1]. reach: largest distance (m) between two robots that communicate; None: any.
+    partitions: each a `Partition`, or a mapping or triple of its fields; they may overlap in time. names:
+    field names to use in error messages, such as those of a command's options.
+
+    Raises `InvalidArgumentError` for values out of range.
+    """
+
+    latency: float = 0.05
+    jitter: float = 0.0
+    bandwidth: float | None = None
+    loss: float = 0.0
+    duplication: float = 0.0
+    reach: float | None = None
+    partitions: tuple[Partition, ...] = ()
+    names: InitVar[Mapping[str, str] | None] = None
+
+    def __post_init__(self, names: Mapping[str, str] | None) -> None:
+        names = names or {}
+        for field, (is_valid, requirement) in _REQUIREMENTS.items():
+            value = getattr(self, field)
+            if value is None and field in _OPTIONAL:
+                continue
+            if not (_is_number(value) and is_valid(value)):
+                raise InvalidArgumentError(f"{names.get(field, field)}={value!r} must be {requirement}.")
+            object.__setattr__(self, field, float(value))
+        name = names.get("partitions", "partitions")
+        if not isinstance(self.partitions, Sequence):
+            raise InvalidArgumentError(f"{name}={self.partitions!r} must be a list of partitions.")
+        partitions = tuple(_partition(f"{name}[{i}]", value) for i, value in enumerate(self.partitions))
+        object.__setattr__(self, "partitions", partitions)
+
+    def check_team(self, n_robots: int, names: Mapping[str, str] | None = None) -> None:
+        """Raise `InvalidArgumentError` unless the partitions fit a team of `n_robots`. names: as above."""
+        name = (names or {}).get("partitions", "partitions")
+        for i, partition in enumerate(self.partitions):
+            named = [robot for group in partition.groups for robot in group]
+            if max(named) >= n_robots:
+                raise InvalidArgumentError(
+                    f"{name}[{i}].groups={partition.groups} names robot {max(named)}; there are {n_robots}, "
+                    "numbered from 0."
+                )
+            if len(partition.groups) + (len(named) < n_robots) < 2:
+                raise InvalidArgumentError(
+                    f"{name}[{i}].groups={partition.groups} puts all {n_robots} robots into one group, and "
+                    "so divides nothing; leave it out, or give two groups."
+                )
+
+    def cut(self, sender: int, receiver: int, begin: float, end: float) -> bool:
+        """Whether a partition divides sender and receiver at any time from `begin` to `end` (s) inclusive."""
+        return any(
+            partition.begin <= end and begin < partition.end and partition.divides(sender, receiver)
+            for partition in self.partitions
+        )
+
+    def draw_losses(self, n: int, generator: torch.Generator) -> list[bool]:
+        """Which of n receivers lose a datagram."""
+        if self.loss == 0:
+            return [False] * n
+        return (torch.rand(n, generator=generator, dtype=torch.float64) < self.loss).tolist()
+
+    def draw_delays(self, n: int, generator: torch.Generator) -> list[list[float]]:
+        """For each of n receivers, the delays (s) of the one or two copies of a datagram."""
+        if self.jitter == self.duplication == 0:
+            return [[self.latency]] * n
+        first, second, chance = torch.rand(3, n, generator=generator, dtype=torch.float64).tolist()
+        return [
+            [self.latency - self.jitter * math.log1p(-u) for u in ((a, b) if c < self.duplication else (a,))]
+            for a, b, c in zip(first, second, chance, strict=True)
+        ]
+
+
+_OPTIONAL = ("bandwidth", "reach")  # None: no limit
+_REQUIREMENTS: dict[str, tuple[Callable[[float], bool], str]] = {
+    "latency": (lambda s: 0 <= s < math.inf, "a time of zero seconds or more, and finite"),
+    "jitter": (lambda s: 0 <= s < math.inf, "a mean time of zero seconds or more, and finite"),
+    "bandwidth": (lambda rate: 0 < rate < math.inf, "above zero bytes per second, and finite, or None"),
+    "loss": (lambda share: 0 <= share < 1, "a share of the datagrams in [0, 1)"),
+    "duplication": (lambda share: 0 <= share <= 1, "a share of the datagrams in [0, 1]"),
+    "reach": (lambda metres: 0 < metres < math.inf, "above zero metres, and finite, or None"),
+}
+
+
+def _partition(name: str, value: Any) -> Partition:
+    """The checked partition of a user's mapping or triple."""
+    if isinstance(value, Mapping) and set(value) == set(Partition._fields):
+        fields = [value[field] for field in Partition._fields]
+    else:
+        fields = list(value) if _is_list(value) else []
+    if (
+        len(fields) != 3
+        or not (_is_number(fields[0]) and _is_number(fields[1]))
+        or not -math.inf < fields[0] < fields[1] < math.inf
+        or not _are_groups(fields[2])
+    ):
+        raise InvalidArgumentError(
+            f"{name}={value!r} must have begin and end, finite seconds, the first before the second, and "
+            "groups, lists of robots that are each in one: {begin: 60, end: 120, groups: [[0], [1, 2]]}."
+        )
+    begin, end, groups = fields
+    return Partition(
+        float(begin), float(end), tuple(tuple(int(robot) for robot in group) for group in groups)
+    )
+
+
+def _are_groups(value: Any) -> bool:
+    if not (_is_list(value) and value and all(_is_list(group) and group for group in value)):
+        return False
+    robots: list[Any] = [robot for group in value for robot in group]
+    are_whole = all(_is_number(robot) and isinstance(robot, numbers.Integral) for robot in robots)
+    return are_whole and min(robots) >= 0 and len(set(robots)) == len(robots)
+
+
+def _is_list(value: Any) -> bool:
+    return isinstance(value, Sequence) and not isinstance(value, str | bytes)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, numbers.Real) and not isinstance(value, bool)
+
 
 HEADER_BYTES = 28
 """Headers of a datagram on the wire: 20 of IPv4, 8 of UDP."""
@@ -64,13 +211,8 @@ class Reception(NamedTuple):
     out_of_reach: int = 0
 
 
-class _Arrival(NamedTuple):
-    """A datagram in flight to one robot; sorted by time, then by the order of sending."""
-
-    time: float
-    order: int
-    sender: int
-    datagram: bytes
+_Arrival = tuple[float, int, int, bytes]
+"""A datagram in flight to one robot: time, order of sending, sender, datagram; sorted by the first two."""
 
 
 class Network:
@@ -85,9 +227,8 @@ class Network:
        second alone may be cut off; a datagram whose first copy is cut off has no second;
     3. the robot loses it, with probability `loss`.
 
-    Without jitter, a sender's datagrams arrive in order. With jitter, they overtake one another if their
-    delays differ by more than the time between them. Losses have a random generator of their own: the same
-    `seed` loses the same datagrams under all other conditions. Delivered datagrams are not stored.
+    Losses have a random generator of their own: the same `seed` loses the same datagrams under all other
+    conditions.
     """
 
     def __init__(self, n_robots: int, conditions: LinkConditions | None = None, seed: int = 0) -> None:
@@ -126,7 +267,7 @@ class Network:
             lost = self.conditions.draw_losses(len(others), self._losses)
             delays = self.conditions.draw_delays(len(others), self._delays)
             for robot, is_near, is_lost, times in zip(others, near, lost, delays, strict=True):
-                copies = [_Arrival(end + time, self._n_sent, sender, data) for time in times]
+                copies = [(end + time, self._n_sent, sender, data) for time in times]
                 self._carry(copies, robot, begin, is_near, is_lost)
             self._n_sent += 1
         before = self._traffic.get((sender, kind), Traffic())
@@ -137,9 +278,9 @@ class Network:
         """(sender, datagram) in the order of arrival, at equal times in that of sending; see `Transport`."""
         self._check("robot", robot, now)
         queue, delivered = self._queues[robot], []
-        while queue and queue[0].time <= now:
-            arrival = heapq.heappop(queue)
-            delivered.append((arrival.sender, arrival.datagram))
+        while queue and queue[0][0] <= now:
+            _, _, sender, datagram = heapq.heappop(queue)
+            delivered.append((sender, datagram))
         self._received[robot]["datagrams"] += len(delivered)
         self._received[robot]["bytes"] += sum(len(data) for _, data in delivered)
         return delivered
@@ -161,11 +302,6 @@ class Network:
         return Reception(*(sum(counts[field] for counts in chosen) for field in Reception._fields))
 
     @property
-    def n_bytes(self) -> int:
-        """Bytes of all datagrams, without headers."""
-        return self.traffic().bytes
-
-    @property
     def bytes_by_kind(self) -> dict[str, int]:
         """Bytes without headers, by the kinds that the senders gave, sorted."""
         return {kind: self.traffic(kind=kind).bytes for kind in sorted({k for _, k in self._traffic})}
@@ -185,11 +321,6 @@ class Network:
             "dropped": 0,
             "namesakes": {},
         }
-
-    @property
-    def n_in_flight(self) -> int:
-        """Datagrams in flight, one for each robot that will receive it."""
-        return sum(map(len, self._queues))
 
     def _near(self, sender: int, others: Sequence[int]) -> list[bool]:
         """Whether each of the others is in reach."""
@@ -215,7 +346,7 @@ class Network:
         counts, (first, *second) = self._received[receiver], copies
 
         def is_cut(copy: _Arrival) -> bool:
-            return self.conditions.cut(copy.sender, receiver, begin, copy.time)
+            return self.conditions.cut(copy[2], receiver, begin, copy[0])
 
         if not is_near:
             counts["out_of_reach"] += 1
