@@ -27,7 +27,7 @@ from gmmtorch import GaussianMap
 from gmmtorch.experiments.evaluation.queries import hit_and_free, test_beams
 from gmmtorch.experiments.harness import Case, Row, least_seconds, recording, run
 from gmmtorch.kernels import kernels
-from gmmtorch.kernels.mixtures.e_step import expectation
+from gmmtorch.kernels.mixtures.em_steps import expectation
 from gmmtorch.kernels.rays.ray_traversal import traverse
 from gmmtorch.mapping.learning.rules import IncrementalRule
 from gmmtorch.mixture.em.exact import quadratic_features

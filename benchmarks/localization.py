@@ -21,7 +21,7 @@ import gmmtorch as gt
 from gmmtorch.datasets import Dataset
 from gmmtorch.experiments.harness import Case, Row, cpu_seconds, held_out, recording, run
 from gmmtorch.localization import Tracker
-from gmmtorch.localization.rigid_motions import generators
+from gmmtorch.pose import generators
 
 _IN_ORDER = 300  # first scans of a log
 

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch import GaussianMap, GaussianMixture, IncrementalRule
-from gmmtorch.datasets.depth_frames import DepthFrames
+from gmmtorch.datasets.depth_images import DepthFrames
 from gmmtorch.experiments.evaluation.queries import hit_and_free, split_indices, test_beams
 from gmmtorch.experiments.harness import Case, Row, cpu_seconds, recording, run, score
 from gmmtorch.mixture.estimators.depth_image import fit_depth_image

@@ -28,8 +28,8 @@ from gmmtorch.experiments.evaluation.held_out import Protocol, evaluate
 from gmmtorch.experiments.evaluation.mapping_methods import choose, methods
 from gmmtorch.experiments.harness import Case, Row, cpu_seconds, held_out, recording, run
 from gmmtorch.localization import Odometry
-from gmmtorch.localization.odometry.recorded_poses import METHODS, with_odometry
-from gmmtorch.localization.trajectories import absolute_trajectory_error, relative_pose_error
+from gmmtorch.localization.odometry import METHODS, with_odometry
+from gmmtorch.localization.trajectory_errors import absolute_trajectory_error, relative_pose_error
 from gmmtorch.mapping.window_motions import WindowMotions
 from gmmtorch.team.sharing import Replica
 from gmmtorch.team.sharing.messages.datagrams import Kind, parse_datagram

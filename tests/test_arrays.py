@@ -15,7 +15,7 @@ from gmmtorch import baselines, simulation
 from gmmtorch.arrays import as_tensor
 from gmmtorch.datasets import Ranges
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
-from gmmtorch.localization.registration.registration import register
+from gmmtorch.localization.registration import register
 from gmmtorch.mapping.clearance import clearance, expected_returns
 from gmmtorch.mixture import DepthCameraModel, LaserModel, Parameters, merge, prune, score_stream, simplify
 from gmmtorch.occupancy import (
@@ -179,8 +179,8 @@ CASES = {
     "sensor deviations": Case(lambda x: DepthCameraModel().deviations(x).along, SUPPORT),
     "ray_segments": Case(lambda x: nearness(simulation.ray_segments(ORIGINS, MEANS - ORIGINS, x)), SEGMENTS),
     "ray_triangles": Case(
-        lambda x: nearness(simulation.ray_triangles(x, TETRAHEDRON[1:] + 0.25 - PLACES, TETRAHEDRON[FACES])),
-        PLACES,
+        lambda x: nearness(simulation.ray_triangles(x, TETRAHEDRON[1:] + 0.25, TETRAHEDRON[FACES])),
+        PLACES[0],
     ),
     "smooth_path": Case(lambda x: simulation.smooth_path(x), POLYGON),
     "poses_2d": Case(lambda x: simulation.poses_2d(x, 3), POLYGON),

@@ -23,6 +23,7 @@ GROUND = [
     "errors",
     "arrays",
     "linalg",
+    "pose",
     "files",
     "events",
     "scan",

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger("gmmtorch")
 _NAMES_ARGUMENTS = (InvalidArgumentError, MissingDataError)
-_ARGUMENT = re.compile(r"(?<![\w.])[\w.]+(?==| is not set)")
+_ARGUMENT = re.compile(r"(?<![\w.])[\w.]+(?=(?:\[\d+\][\w.]*)?=| is not set)")
 
 
 def conf_dir() -> str:

@@ -22,14 +22,14 @@ class _Source(NamedTuple):
 
 
 _SOURCES = {
-    "carmen": _Source("carmen", "CarmenLog", 50.0, 8.0),
-    "scan_folder": _Source("scan_folder", "ScanFolder"),
-    "pcd_viewpoint": _Source("scan_folder", "PcdViewpoint"),
-    "depth_frames": _Source("depth_frames", "DepthFrames"),
-    "octomap_log": _Source("octomap_log", "OctomapLog"),
-    "rosbag": _Source("recordings.ros.rosbag", "open_rosbag"),
-    "kitti": _Source("recordings.kitti", "Kitti"),
-    "tum": _Source("recordings.tum", "TumRgbd"),
+    "carmen": _Source("scan_logs", "CarmenLog", 50.0, 8.0),
+    "scan_folder": _Source("scan_folders", "ScanFolder"),
+    "pcd_viewpoint": _Source("scan_folders", "PcdViewpoint"),
+    "depth_frames": _Source("depth_images", "DepthFrames"),
+    "octomap_log": _Source("scan_logs", "OctomapLog"),
+    "rosbag": _Source("ros.rosbag", "open_rosbag"),
+    "kitti": _Source("scan_folders", "Kitti"),
+    "tum": _Source("depth_images", "TumRgbd"),
     "mesh": _Source("synthetic", "MeshSamples"),
     "mesh_scans": _Source("synthetic", "MeshScans", None, 8.0),
     "synthetic_building": _Source("synthetic", "SyntheticBuilding", None, 8.0, needs_path=False),
@@ -89,7 +89,7 @@ def load(
                 f"{option}={value!r} is not an option of dataset={name}, which {takes}."
             )
     if source.needs_path and poses is not None and "poses" not in known:
-        from gmmtorch.datasets.recordings.reposed import with_trajectory
+        from gmmtorch.datasets.trajectory import with_trajectory
 
         return with_trajectory(reader(path, ranges, 1, **options), poses, stride)
     for option, value in (("path", path), ("poses", poses)):

@@ -12,10 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.arrays import ArrayLike, as_tensor
+from gmmtorch.arrays import ArrayLike
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_whole
 from gmmtorch.files import write_bytes
-from gmmtorch.linalg import check_rigid
 from gmmtorch.mapping.codec import map_file
 from gmmtorch.mapping.codec.quantization import quantized_after
 from gmmtorch.mapping.components import Components
@@ -31,6 +30,7 @@ from gmmtorch.mapping.query_options import (
     check_method,
 )
 from gmmtorch.occupancy import Calibration, Evidence, VoxelGrid, check_queries, check_resolution, check_scan
+from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan, as_time, extent
 
 
@@ -61,7 +61,7 @@ class GaussianMap(MapState):
         n_samples: number of rays of method "monte_carlo", drawn from the whole map.
         sampling: sequence of these rays, "sobol", "stratified" or "plain".
         memory_limit: largest number of bytes of the evidence of a grid, and of Monte Carlo evidence.
-        compiled: use torch.compile where a compiled form exists.
+        compiled: has no effect; fused kernels answer queries.
         calibration: from which the map's own goes on, such as that of another map. None: that of the sensor
             model, for the ranges of the map's beams.
 
@@ -251,9 +251,8 @@ class GaussianMap(MapState):
         """
 
         def moved(components: Components) -> Components:
-            matrix = as_tensor(transform, "transform", torch.float64, components.means.device)
-            check_rigid(matrix, components.dim)
-            return components.transformed(matrix, components.has_id(ids))
+            pose = Pose.checked(transform, components.dim, device=components.means.device)
+            return components.transformed(pose.matrix, components.has_id(ids))
 
         self.revise(moved)
 

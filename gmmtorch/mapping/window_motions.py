@@ -17,6 +17,7 @@ from torch import Tensor
 
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.pose import Pose
 
 _LEAST = 0.02, math.radians(0.2)  # metres and radians: smaller corrections wait
 _SAME = 1e-6  # metres between an origin of the map and the position of its scan
@@ -71,12 +72,12 @@ class WindowMotions:
             middle = members[len(members) // 2]
             place = before[window] @ self._poses[middle]
             if members[0] >= first and _is_apart(place, poses[middle - first]):
-                after[window] = poses[middle - first] @ torch.linalg.inv(self._poses[middle])
+                after[window] = _motion(self._poses[middle], poses[middle - first])
         if all(one is other for one, other in zip(before, after, strict=True)):
             return None
         self.end()
         steps = [
-            identity if one is other else other @ torch.linalg.inv(one)
+            identity if one is other else _motion(one, other)
             for one, other in zip(before, after, strict=True)
         ]
         motions, find = torch.stack([*steps, identity]), self._finder()
@@ -89,7 +90,7 @@ class WindowMotions:
         (K,) of each; −1 for those that no scan here has seen."""
         components = Components(**{field.name: getattr(target, field.name) for field in fields(Components)})
         identity = torch.eye(components.dim + 1, dtype=torch.float64)
-        back = [one if _is_identity(one) else torch.linalg.inv(one) for one in self.motions]
+        back = [one if _is_identity(one) else _motion(one, identity) for one in self.motions]
         windows, of_origins = _members(components, self._finder())
         return _moved(components, torch.stack([*back, identity]), windows, of_origins), windows
 
@@ -134,10 +135,14 @@ def _is_identity(motion: Tensor) -> bool:
     return torch.equal(motion, torch.eye(len(motion), dtype=motion.dtype))
 
 
+def _motion(before: Tensor, after: Tensor) -> Tensor:
+    """after ← before (D+1, D+1) of a pose or motion that was replaced by another one."""
+    return (Pose.from_matrix(after) @ Pose.from_matrix(before).inverse()).matrix
+
+
 def _is_apart(place: Tensor, corrected: Tensor) -> bool:
-    off = torch.linalg.solve(place, corrected)
-    turn = torch.linalg.matrix_norm(off[:-1, :-1] - torch.eye(len(off) - 1)) / math.sqrt(2)
-    return bool(off[:-1, -1].norm() > _LEAST[0]) or bool(turn > _LEAST[1])
+    off = Pose.from_matrix(place).inverse() @ Pose.from_matrix(corrected)
+    return bool(off.translation.norm() > _LEAST[0]) or bool(off.chord() > _LEAST[1])
 
 
 def _members(components: Components, find: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
@@ -176,4 +181,4 @@ def _moved(components: Components, motions: Tensor, windows: Tensor, of_origins:
 
 def _at(motions: Tensor, points: Tensor) -> Tensor:
     """Points (N, D) moved by motions (N, D+1, D+1)."""
-    return (motions[:, :-1, :-1] @ points[:, :, None]).squeeze(2) + motions[:, :-1, -1]
+    return Pose.from_matrix(motions).apply(points[:, None])[:, 0]

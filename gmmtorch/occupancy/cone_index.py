@@ -76,14 +76,12 @@ class Hulls:
         )
         return made
 
-    def near(
-        self, given: Lists, lists: Tensor, centers: Tensor, radii: Tensor, compiled: bool = False
-    ) -> Lists:
+    def near(self, given: Lists, lists: Tensor, centers: Tensor, radii: Tensor) -> Lists:
         """For each ball (T,), those cones of its list that can give evidence to a cube centred in the ball;
         arguments as for `near_lists`."""
         chunks = chunks_of(given.lengths()[lists], _TESTS_AT_ONCE)
         parts = [
-            near_lists(self.table, given, lists[t], centers[t], radii[t], self.reach, self.spread, compiled)
+            near_lists(self.table, given, lists[t], centers[t], radii[t], self.reach, self.spread)
             for t in chunks
         ]
         if len(parts) == 1:

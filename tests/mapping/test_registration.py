@@ -14,12 +14,11 @@ from mapping.random_components import normal_components
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
-from gmmtorch.localization.registration.overlap import Ascent, Pairs, overlap
-from gmmtorch.localization.registration.registration import register, yaw_starts
-from gmmtorch.localization.rigid_motions import Motions, generators
+from gmmtorch.localization.registration import Ascent, Pairs, overlap, register, yaw_starts
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mixture.em.exact import Parameters
+from gmmtorch.pose import Pose, generators
 
 dims = pytest.mark.parametrize("dim", [2, 3])
 
@@ -70,9 +69,9 @@ def dense_log_score(f: Parameters, g: Parameters, rotation: Tensor, shift: Tenso
     return torch.logsumexp((normal.log_prob(there) + log_weight).flatten(), 0)
 
 
-def some_motions(dim: int, n: int) -> Motions:
+def some_motions(dim: int, n: int) -> Pose:
     poses = torch.stack([motion(dim, 0.5, 20, seed) for seed in range(n)])
-    return Motions(poses[:, :dim, :dim], poses[:, :dim, dim])
+    return Pose.from_matrix(poses)
 
 
 def assert_close(found: Tensor, expected: Tensor, metres: float = 1e-4, radians: float = 1e-4) -> None:
@@ -92,8 +91,8 @@ def test_score_and_gradient_equal_dense_sums_and_autograd(dim):
     n_free = found.gradient.shape[1]
 
     def moved_score(step: Tensor, b: int) -> Tensor:
-        moved = motions.at(torch.tensor([b])).moved(step[None])
-        return dense_log_score(f, g, moved.rotations[0], moved.translations[0])
+        moved = motions[[b]].moved(step[None])
+        return dense_log_score(f, g, moved.rotation[0], moved.translation[0])
 
     for b in range(3):
         step = torch.zeros(n_free, dtype=torch.float64, requires_grad=True)
@@ -108,12 +107,12 @@ def test_the_hessian_at_the_optimum_equals_autograd(dim):
     # One component on itself has no residual, so that Fisher's information equals the Hessian.
     f = Parameters(*(value[:1] for value in scene(dim, 3)))
     here = f._replace(means=f.means - f.means)
-    still = Motions(torch.eye(dim).double()[None], torch.zeros(1, dim).double())
+    still = Pose.identity(dim, 1)
     found = overlap(here, here, still, all_pairs(1, here, here))
 
     def score(step: Tensor) -> Tensor:
         moved = still.moved(step[None])
-        return dense_log_score(here, here, moved.rotations[0], moved.translations[0])
+        return dense_log_score(here, here, moved.rotation[0], moved.translation[0])
 
     step = torch.zeros(found.gradient.shape[1], dtype=torch.float64)
     expected = -torch.autograd.functional.hessian(score, step)
@@ -135,11 +134,11 @@ def test_the_score_does_not_depend_on_omitted_pairs(dim):
 def test_the_score_never_decreases(dim):
     f, g = scene(dim, 5), scene(dim, 5)
     starts = torch.stack([motion(dim, metres, degrees) for metres, degrees in ((0.3, 5), (1, 30), (3, 90))])
-    motions = Motions(starts[:, :dim, :dim], starts[:, :dim, dim])
+    motions = Pose.from_matrix(starts)
 
     def scores(n_steps: int) -> list[float]:
         reached = Ascent(f, g, 3.0).run(motions, n_steps, 1e-6)[0]
-        return [float(dense_log_score(f, g, r, t)) for r, t in zip(*reached, strict=True)]
+        return [float(dense_log_score(f, g, r, t)) for r, t in zip(*reached.parts, strict=True)]
 
     table = np.array([scores(n) for n in range(1, 25, 2)])
     rises = np.diff(table, axis=0)

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 import gmmtorch as gt
-from gmmtorch.localization.registration.registration import register
-from gmmtorch.localization.rigid_motions import generators
+from gmmtorch.localization.registration import register
 from gmmtorch.mapping.codec import component_batch as codec
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import WindowedRule
 from gmmtorch.mapping.learning.windows import learn_window
+from gmmtorch.pose import generators
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_data]
 

@@ -185,13 +185,6 @@ def test_point_evidence_does_not_depend_on_order_and_chunks(monkeypatch):
     same(point_evidence(cones, points.float().double(), 0.05), form(points.float()))
 
 
-@pytest.mark.slow
-def test_compiled_evidence_equals_eager_evidence():
-    cones = random_cones(3, 60, 0, room=True)
-    points = near_rays(cones, 500, 0)
-    same(PointForm(cones, 0.05, compiled=True)(points), PointForm(cones, 0.05)(points))
-
-
 def test_evidence_is_invariant_under_right_angle_rotations():
     cones = random_cones(3, 20, 0)
     points = near_rays(cones, 200, 0)

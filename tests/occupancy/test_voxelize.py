@@ -12,8 +12,8 @@ from torch import Tensor
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.voxelize import occupied_cells
-from gmmtorch.simulation.worlds.furniture import ball, box
-from gmmtorch.simulation.worlds.mesh_world import MeshWorld
+from gmmtorch.simulation.furniture import ball, box
+from gmmtorch.simulation.mesh_world import MeshWorld
 
 
 def lattice(low: tuple[int, ...], high: tuple[int, ...]) -> Box:

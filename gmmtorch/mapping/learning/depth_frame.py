@@ -10,12 +10,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.arrays import ArrayLike, as_tensor
+from gmmtorch.arrays import ArrayLike
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import DepthCells, DepthView, depth_cells
-from gmmtorch.linalg import check_rigid
 from gmmtorch.mixture import coarsest_allowed, shift_features
 from gmmtorch.pinhole import back_project, check_intrinsics, metric_depth
+from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 
 
@@ -51,7 +51,7 @@ class DepthFrame:
             intrinsics: (3, 3), of the whole image.
         """
         image = metric_depth(depth, depth_scale).detach()
-        rotation, translation = check_rigid(as_tensor(pose, "pose", torch.float64, image.device).detach(), 3)
+        rotation, translation = Pose.checked(pose, 3, "pose", device=image.device).parts
         scaled = check_intrinsics(intrinsics, tuple(image.shape)).to("cpu", copy=True)
         scaled[:2] /= pixel_stride
         taken = image[::pixel_stride, ::pixel_stride]

@@ -17,7 +17,6 @@ from gmmtorch.kernels import (
     Lists,
     PointTable,
     chunked,
-    compiled_pair_evidence,
     is_fused,
     listed_evidence,
     pair_evidence,
@@ -86,14 +85,12 @@ def point_evidence(
     points: ArrayLike,
     resolution: float,
     cutoff: float = CUTOFF,
-    *,
-    compiled: bool = False,
 ) -> PointEvidence:
     """Evidence of the cube of side `resolution` (m) centred at each point (M, D), world metres.
 
     For several calls with the same cones use a `PointForm`.
     """
-    return PointForm(cones, resolution, cutoff, compiled=compiled)(points)
+    return PointForm(cones, resolution, cutoff)(points)
 
 
 def listed_points(
@@ -149,7 +146,6 @@ class PointForm:
         cones: must not change afterwards.
         resolution: h (m).
         cutoff: Mahalanobis distance beyond which a component gives no evidence.
-        compiled: use torch.compile. It needs a C++ compiler, and tens of seconds for the first call.
     """
 
     def __init__(
@@ -157,14 +153,12 @@ class PointForm:
         cones: Cones,
         resolution: float,
         cutoff: float = CUTOFF,
-        *,
-        compiled: bool = False,
     ) -> None:
         self.resolution = check_resolution(resolution)
         cones = cones.checked()
         if not 0 < cutoff < math.inf:
             raise InvalidArgumentError(f"cutoff={cutoff} must be finite and above zero.")
-        self.dim, self.cutoff, self.compiled = cones.dim, float(cutoff), compiled
+        self.dim, self.cutoff = cones.dim, float(cutoff)
         safe_cholesky(cones.covariances.double().detach())  # raises if one is not positive definite
         spectrum = spectrum_of(cones.covariances)
         self._table = _table_of(cones, spectrum[1], self.resolution)
@@ -253,9 +247,7 @@ class PointForm:
     def _near_cones(self, blocks: PointBlocks, part: slice) -> tuple[Tensor, Tensor]:
         """Pairs of a block (R,), counted from the start of `part`, and a cone (R,) near it."""
         bucket, index = blocks.bucket[part], self.index
-        found = index.hulls.near(
-            index.lists, bucket, blocks.centers[part], blocks.radius[part], self.compiled
-        )
+        found = index.hulls.near(index.lists, bucket, blocks.centers[part], blocks.radius[part])
         return found.taken(torch.arange(len(bucket), device=bucket.device))
 
     def _of_blocks(self, blocks: PointBlocks, part: slice) -> Tensor:
@@ -264,10 +256,9 @@ class PointForm:
         points = blocks.points[..., part]
         hits = points.new_zeros(points.shape[2], points.shape[1])
         misses = hits.clone()
-        evaluate = compiled_pair_evidence() if self.compiled else pair_evidence
         n_rows = max(1, CHUNK_PAIRS // points.shape[1])
         for rows, cones in zip(block.split(n_rows), cone.split(n_rows), strict=True):
-            hit, miss = evaluate(points, rows, *self._table, cones, self.resolution, self.cutoff)
+            hit, miss = pair_evidence(points, rows, *self._table, cones, self.resolution, self.cutoff)
             hits, misses = hits.index_add(0, rows, hit.T), misses.index_add(0, rows, miss.T)
         return torch.stack([hits, misses])
 

@@ -40,7 +40,6 @@ def count_misses(
             ends.double() / store.resolution,
             weights,
             chunk_visits=chunk_visits,
-            compiled=store.compiled,
         )
     except MemoryLimitError:
         needed = _bytes_needed(store, origins, ends, store.resolution, earlier)

@@ -27,7 +27,6 @@ class SparseEvidence(SparseLattice):
         box: cells that can be stored; evidence outside is ignored. All cells if not given.
         dtype: of the counts. float32 counts rays exactly up to 2²⁴ in a cell.
         memory_limit: bytes that the blocks can take.
-        compiled: count rays by a compiled function, see `traverse`.
 
     Raises:
         InvalidArgumentError: a resolution that is not above zero, or a box without cells.
@@ -40,14 +39,12 @@ class SparseEvidence(SparseLattice):
         dim: int = 3,
         device: torch.device | str | None = None,
         memory_limit: int = MEMORY_LIMIT,
-        compiled: bool = False,
         *,
         box: Box | None = None,
         dtype: torch.dtype = torch.float64,
     ) -> None:
         device = box.low.device if device is None and box is not None else device
         super().__init__(resolution, dim, _AXIS_BITS[dim], device, memory_limit)
-        self.compiled = compiled
         self._box = box
         self._bounds: tuple[Tensor | None, Box | None, Tensor | None] = (None, None, None)
         if box is not None:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from kernels.twins import by_both
 from mapping.random_components import random_components
 
 from gmmtorch.errors import NumericalError
@@ -49,12 +50,8 @@ def cases() -> dict[str, Components]:
     }
 
 
-def both(components: Components, box: Box, **options) -> list:
-    found = []
-    for choice in ("torch", "fused"):
-        with kernels(choice):
-            found.append(in_order(component_evidence(components, 0.2, box, **options)))
-    return found
+def both(components: Components, box: Box, **options) -> tuple[CellEvidence, CellEvidence]:
+    return by_both(lambda: in_order(component_evidence(components, 0.2, box, **options)))
 
 
 def in_order(evidence: CellEvidence) -> CellEvidence:

@@ -183,8 +183,9 @@ def _network(config: DictConfig, variant: dict[str, Any]) -> dict[str, Any]:
     given |= {key: variant[key] for key in given if key in variant}
     if "delay" in given:  # a real network has its own
         given["latency"], names["latency"] = given.pop("delay"), names.pop("delay")
-    conditions = LinkConditions(**given, names=names)
-    conditions.check_team(config.team.size, names)
+    with naming(names):
+        conditions = LinkConditions(**given)
+        conditions.check_team(config.team.size)
     return {name: getattr(conditions, name) for name in given}
 
 

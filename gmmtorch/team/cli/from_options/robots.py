@@ -13,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from gmmtorch.cli import as_options, logger, map_factory, naming, open_dataset, run_dir
 from gmmtorch.datasets import DatasetShard, shard_indices, start_frame
 from gmmtorch.errors import check_choice, check_number, check_whole
+from gmmtorch.pose import Pose
 from gmmtorch.team.cli.from_options import links, missions
 from gmmtorch.team.exploration import (
     Drivable,
@@ -70,7 +71,7 @@ def replaying(config: DictConfig, transport: FramedTransport, stack: ExitStack) 
             replica.join(replica.earlier_frames[0], torch.eye(len(frame)))
     mission = ReplayMission(
         replica,
-        DatasetShard(scans, chosen, None if frame is None else torch.linalg.inv(frame)),
+        DatasetShard(scans, chosen, None if frame is None else Pose.from_matrix(frame).inverse().matrix),
         transport,
         map_factory(missions.log_map_options(config)),
         rate=config.log.rate,

@@ -132,7 +132,7 @@ class WorldRuntime:
     cache: bool = True
 
 
-_SENSOR = schema_of(read_dataclass("simulation.sensors.depth_camera", "DepthCamera"), SensorRate)
+_SENSOR = schema_of(read_dataclass("simulation.robot_camera", "DepthCamera"), SensorRate)
 
 
 _BODY = schema_of(read_dataclass("team.exploration.planning.primitives", "Dynamics"))

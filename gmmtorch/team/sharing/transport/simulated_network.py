@@ -7,7 +7,7 @@ import math
 import numbers
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import InitVar, dataclass
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -42,8 +42,7 @@ class LinkConditions:
     delay that is added for each receiver and each copy. bandwidth: bytes per second of each sender; None: no
     limit. loss: share of the datagrams that each receiver loses, [0, 1). duplication: share of those not lost
     that arrive twice, [0, 1]. reach: largest distance (m) between two robots that communicate; None: any.
-    partitions: each a `Partition`, or a mapping or triple of its fields; they may overlap in time. names:
-    field names to use in error messages, such as those of a command's options.
+    partitions: each a `Partition`, or a mapping or triple of its fields; they may overlap in time.
 
     Raises `InvalidArgumentError` for values out of range.
     """
@@ -55,36 +54,32 @@ class LinkConditions:
     duplication: float = 0.0
     reach: float | None = None
     partitions: tuple[Partition, ...] = ()
-    names: InitVar[Mapping[str, str] | None] = None
 
-    def __post_init__(self, names: Mapping[str, str] | None) -> None:
-        names = names or {}
+    def __post_init__(self) -> None:
         for field, (is_valid, requirement) in _REQUIREMENTS.items():
             value = getattr(self, field)
             if value is None and field in _OPTIONAL:
                 continue
             if not (_is_number(value) and is_valid(value)):
-                raise InvalidArgumentError(f"{names.get(field, field)}={value!r} must be {requirement}.")
+                raise InvalidArgumentError(f"{field}={value!r} must be {requirement}.")
             object.__setattr__(self, field, float(value))
-        name = names.get("partitions", "partitions")
         if not isinstance(self.partitions, Sequence):
-            raise InvalidArgumentError(f"{name}={self.partitions!r} must be a list of partitions.")
-        partitions = tuple(_partition(f"{name}[{i}]", value) for i, value in enumerate(self.partitions))
+            raise InvalidArgumentError(f"partitions={self.partitions!r} must be a list of partitions.")
+        partitions = tuple(_partition(i, value) for i, value in enumerate(self.partitions))
         object.__setattr__(self, "partitions", partitions)
 
-    def check_team(self, n_robots: int, names: Mapping[str, str] | None = None) -> None:
-        """Raise `InvalidArgumentError` unless the partitions fit a team of `n_robots`. names: as above."""
-        name = (names or {}).get("partitions", "partitions")
+    def check_team(self, n_robots: int) -> None:
+        """Raise `InvalidArgumentError` unless the partitions fit a team of `n_robots`."""
         for i, partition in enumerate(self.partitions):
             named = [robot for group in partition.groups for robot in group]
+            given = f"partitions[{i}].groups={partition.groups}"
             if max(named) >= n_robots:
                 raise InvalidArgumentError(
-                    f"{name}[{i}].groups={partition.groups} names robot {max(named)}; there are {n_robots}, "
-                    "numbered from 0."
+                    f"{given} names robot {max(named)}; there are {n_robots}, numbered from 0."
                 )
             if len(partition.groups) + (len(named) < n_robots) < 2:
                 raise InvalidArgumentError(
-                    f"{name}[{i}].groups={partition.groups} puts all {n_robots} robots into one group, and "
+                    f"{given} puts all {n_robots} robots into one group, and "
                     "so divides nothing; leave it out, or give two groups."
                 )
 
@@ -123,8 +118,8 @@ _REQUIREMENTS: dict[str, tuple[Callable[[float], bool], str]] = {
 }
 
 
-def _partition(name: str, value: Any) -> Partition:
-    """The checked partition of a user's mapping or triple."""
+def _partition(i: int, value: Any) -> Partition:
+    """The checked partition of a user's mapping or triple, the i-th one."""
     if isinstance(value, Mapping) and set(value) == set(Partition._fields):
         fields = [value[field] for field in Partition._fields]
     else:
@@ -136,8 +131,9 @@ def _partition(name: str, value: Any) -> Partition:
         or not _are_groups(fields[2])
     ):
         raise InvalidArgumentError(
-            f"{name}={value!r} must have begin and end, finite seconds, the first before the second, and "
-            "groups, lists of robots that are each in one: {begin: 60, end: 120, groups: [[0], [1, 2]]}."
+            f"partitions[{i}]={value!r} must have begin and end, finite seconds, the first before the "
+            "second, and groups, lists of robots that are each in one: "
+            "{begin: 60, end: 120, groups: [[0], [1, 2]]}."
         )
     begin, end, groups = fields
     return Partition(
