@@ -33,7 +33,7 @@ from gmmtorch.mapping.learning.rules import IncrementalRule
 from gmmtorch.mixture.em.exact import quadratic_features
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.evidence import Evidence
-from gmmtorch.occupancy.forms.flux.box_flux import flux_evidence
+from gmmtorch.occupancy.forms.flux import flux_evidence
 from gmmtorch.occupancy.forms.point import PointForm
 from gmmtorch.occupancy.grid import VoxelGrid
 from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence

@@ -30,7 +30,7 @@ from gmmtorch.experiments.harness import Case, Row, cpu_seconds, held_out, recor
 from gmmtorch.localization import Odometry
 from gmmtorch.localization.odometry import METHODS, with_odometry
 from gmmtorch.localization.trajectory_errors import absolute_trajectory_error, relative_pose_error
-from gmmtorch.mapping.window_motions import WindowMotions
+from gmmtorch.mapping.map_builder import WindowMotions
 from gmmtorch.team.sharing import Replica
 from gmmtorch.team.sharing.messages.datagrams import Kind, parse_datagram
 from gmmtorch.team.sharing.shared_map import SharedMap

@@ -121,8 +121,13 @@ def argsort(keys: Tensor) -> Tensor:
     if keys.device.type != "cpu":
         return keys.argsort(stable=True)
     array = keys.numpy()
-    if array.dtype == np.int64 and array.size and array.min() >= 0 and array.max() < 1 << 16:
-        array = array.astype(np.uint16)  # radix sort
+    if array.dtype == np.int64 and array.size and array.min() >= 0:
+        if array.max() < 1 << 16:
+            array = array.astype(np.uint16)  # radix sort
+        elif array.max() < 1 << 32 and (array[1:] < array[:-1]).any():  # two of them
+            order = np.argsort(array.astype(np.uint16), kind="stable")
+            high = (array >> 16).astype(np.uint16)
+            return torch.from_numpy(order[np.argsort(high[order], kind="stable")])
     return torch.from_numpy(np.argsort(array, kind="stable"))
 
 

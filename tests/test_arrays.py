@@ -16,7 +16,7 @@ from gmmtorch.arrays import as_tensor
 from gmmtorch.datasets import Ranges
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.localization.registration import register
-from gmmtorch.mapping.clearance import clearance, expected_returns
+from gmmtorch.mapping.surfaces import clearance, expected_returns
 from gmmtorch.mixture import DepthCameraModel, LaserModel, Parameters, merge, prune, score_stream, simplify
 from gmmtorch.occupancy import (
     Boundary,
@@ -166,7 +166,6 @@ CASES = {
     "cast_evidence ends": Case(lambda x: cast_rays(ends=x), PLACES),
     "cast_evidence is_hit": Case(lambda x: cast_rays(is_hit=x), FLAGS),
     "cast_evidence weights": Case(lambda x: cast_rays(weights=x), SUPPORT),
-    "cast_evidence free_until": Case(lambda x: cast_rays(free_until=x), PLACES),
     "cast_evidence hit_places": Case(lambda x: cast_rays(hit_places=(x, SUPPORT)), PLACES),
     "RollingWindow": Case(lambda x: window_at(x), PLACES[0]),
     "occupancy_probability": Case(lambda x: occupancy_probability(x, SUPPORT), SUPPORT),

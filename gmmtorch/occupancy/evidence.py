@@ -20,7 +20,7 @@ from gmmtorch.kernels import bernoulli_entropy as bernoulli_entropy
 from gmmtorch.kernels import occupancy_probability as occupancy_probability
 from gmmtorch.occupancy.calibrator import Calibration
 from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.voxels.boxes import flat_index
+from gmmtorch.occupancy.voxels.cells import flat_index
 
 Rule = Calibration | float
 """How a probability follows from evidence: calibrated, or with a count N_p by the thesis's (3.9)."""

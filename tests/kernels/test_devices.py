@@ -15,10 +15,10 @@ from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.truncated import Rows, group_rows, truncated_expectation
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.evidence import Evidence
-from gmmtorch.occupancy.forms.flux.box_flux import flux_evidence
+from gmmtorch.occupancy.forms.flux import flux_evidence
 from gmmtorch.occupancy.forms.point import point_evidence
 from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.cells import Box
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 

@@ -14,8 +14,7 @@ from scipy.ndimage import label
 from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
-from gmmtorch.occupancy.voxels.boxes import Box
-from gmmtorch.occupancy.voxels.voxelize import occupied_cells
+from gmmtorch.occupancy.voxels.cells import Box, occupied_cells
 from gmmtorch.simulation import (
     World2D,
     World3D,

@@ -3,7 +3,7 @@
 The twins are the loop of `flux_evidence`, and `box_mass` on all pairs of a cell and a component. The fused
 kernels work on rows, rectangles of faces in one plane of the grid with one cone, and on boxes of cells around
 a component. They drop panels outside the cone, cut panels on which the integrand varies much, and integrate
-the others by Gauss-Legendre rules, by the rules of `occupancy.forms.flux.adaptive_quadrature`. Panels that
+the others by Gauss-Legendre rules, by the rules of `occupancy.forms.quadrature`. Panels that
 share a vector share the order of the rule, the highest that one of them needs. So results differ from the
 twin within the tolerance.
 """

@@ -1,7 +1,7 @@
 """Components matched with components or points: near pairs, overlaps, alignment of a scan, explained points.
 
 The twins of `near_pairs` and `overlap_sums` are in `localization.registration.overlap`, and that of
-`explained_points` in `mapping.learning.association`. The kernel of pairs tests all of them, which is faster
+`explained_points` in `mapping.learning.novelty`. The kernel of pairs tests all of them, which is faster
 than a k-d tree for the few hundred components of a scan; it finds those of the twin, in another order. Sums
 of overlaps and of alignment differ from the twin's by at most 10⁻¹¹ of their largest entry, shares of points
 by rounding.

@@ -1,8 +1,8 @@
 """Evidence of components in the cells of a box, from rays that are drawn from them and cast.
 
 The fused kernel handles one viewpoint in one item, from its component to the cells, and keeps no list of
-rays. `mapping.rays.component_rays` has its twin, which draws with `truncated_normals` here and casts with
-`count_in_grid`.
+rays. Its twin, `component_rays` of the exploration's robots, draws with `truncated_normals` here and casts
+with `count_in_grid`.
 """
 
 from __future__ import annotations

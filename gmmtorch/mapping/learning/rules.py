@@ -18,7 +18,7 @@ from gmmtorch.errors import (
 from gmmtorch.mixture import PruneOptions
 
 if TYPE_CHECKING:
-    from gmmtorch.mapping.learning.depth_frame import DepthFrame
+    from gmmtorch.mapping.learning.fitting import DepthFrame
     from gmmtorch.scan import Scan
 
 FORGET_OFF, CONTRADICTION = "off", "contradiction"
@@ -76,7 +76,7 @@ class MixtureRule(PruneOptions):
     free_points: points at equal distances on each beam with a return, from which components of free space
         are learned, as from the ends of no-return beams (thesis 3.5).
     forget: what leaves the map. "off": nothing. "contradiction": surfaces that later beams pass through, see
-        `mapping.learning.forgetting`. A number: all evidence, with this half-life (s) of the scans' times.
+        `mapping.learning.windows`. A number: all evidence, with this half-life (s) of the scans' times.
     """
 
     learner: LearnerName = "flat_pieces"

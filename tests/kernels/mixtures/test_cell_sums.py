@@ -15,7 +15,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import kernels
 from gmmtorch.kernels.mixtures.cell_sums import distinct_keys
 from gmmtorch.linalg import dense_ranks
-from gmmtorch.mapping.learning.depth_frame import DepthFrame, PooledFrames, pool_frames
+from gmmtorch.mapping.learning.fitting import DepthFrame, PooledFrames, pool_frames
 from gmmtorch.mixture.em.exact import quadratic_features, shift_features
 from gmmtorch.mixture.em.partition import FlatnessRule, Partition, partition
 

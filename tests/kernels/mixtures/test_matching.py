@@ -13,7 +13,7 @@ from gmmtorch.kernels.compiler import compiler_failure
 from gmmtorch.localization.alignment import AlignmentTarget
 from gmmtorch.localization.registration import Ascent, overlap
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.association import count_explained
+from gmmtorch.mapping.learning.novelty import count_explained
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.pose import Pose
 

@@ -12,9 +12,8 @@ from mapping.random_components import random_components
 from gmmtorch.errors import NumericalError
 from gmmtorch.kernels import kernels
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.rays.component_evidence import component_evidence
-from gmmtorch.occupancy.voxels.boxes import Box
-from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
+from gmmtorch.occupancy.voxels.cells import Box, CellEvidence
+from gmmtorch.team.exploration.robot.component_rays import component_evidence
 
 OPTIONS = {
     "plain": {},

@@ -13,7 +13,7 @@ from gmmtorch.kernels import kernels
 from gmmtorch.kernels.rays.ray_traversal import count_in_grid, mark_cells_of_rays
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.cells import Box
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 

@@ -7,19 +7,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from exploration.ray_cases import EVERYTHING, dense, one
 from mapping.random_components import random_components
-from mapping.ray_cases import EVERYTHING, dense, one
 from scipy import stats
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
 from gmmtorch.kernels import kernels
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.rays import component_evidence as module
-from gmmtorch.mapping.rays.component_evidence import component_evidence
-from gmmtorch.mapping.rays.component_rays import RayDensity, counted_viewpoints, drawn_rays, ray_numbers
 from gmmtorch.occupancy.forms.monte_carlo import RayBundle
-from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.cells import Box
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
+from gmmtorch.team.exploration.robot import component_rays as module
+from gmmtorch.team.exploration.robot.component_rays import (
+    RayDensity,
+    component_evidence,
+    counted_viewpoints,
+    drawn_rays,
+    ray_numbers,
+)
 
 
 def sheet(thickness: float = 0.02, a: float = 0.3, b: float = 0.2) -> torch.Tensor:

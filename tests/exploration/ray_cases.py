@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.mapping.components import Components
-from gmmtorch.occupancy.voxels.boxes import Box
-from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
+from gmmtorch.occupancy.voxels.cells import Box, CellEvidence
 
 EVERYTHING = Box(torch.tensor([-4096] * 3), torch.tensor([4096] * 3))
 

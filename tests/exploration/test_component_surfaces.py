@@ -7,15 +7,14 @@ from dataclasses import replace
 
 import pytest
 import torch
+from exploration.ray_cases import EVERYTHING, dense, one
 from mapping.random_components import normal_components
-from mapping.ray_cases import EVERYTHING, dense, one
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.rays.component_evidence import component_evidence
-from gmmtorch.occupancy.voxels.boxes import Box
-from gmmtorch.occupancy.voxels.cell_evidence import sum_evidence
+from gmmtorch.occupancy.voxels.cells import Box, sum_evidence
+from gmmtorch.team.exploration.robot.component_rays import component_evidence
 
 RESOLUTION = 0.2
 

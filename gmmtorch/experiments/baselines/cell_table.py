@@ -11,8 +11,7 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, MemoryLimitError
 from gmmtorch.files import require
-from gmmtorch.occupancy.grid import MEMORY_LIMIT
-from gmmtorch.occupancy.voxels.sparse_lattice import SparseLattice
+from gmmtorch.occupancy import MEMORY_LIMIT, SparseLattice
 
 _AXIS_BITS = {2: 27, 3: 17}
 

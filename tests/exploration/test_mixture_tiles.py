@@ -8,10 +8,9 @@ from mapping.random_components import random_components
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.rays.component_evidence import component_evidence
-from gmmtorch.mapping.rays.mixture_tiles import MixtureTiles, regenerate
-from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.cells import Box
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
+from gmmtorch.team.exploration.robot.component_rays import MixtureTiles, component_evidence, regenerate
 
 RESOLUTION, SHAPE = 0.25, (24, 20, 12)
 
