@@ -3,8 +3,8 @@ what is lost that is. Writes its table and its picture into BENCHMARKS.md.
 
     OMP_NUM_THREADS=1 python benchmarks/changing_world.py --data FOLDER
 
-FOLDER holds recordings in which nothing moves for long, as for benchmarks/accuracy.py: the second table tells
-what forgetting costs them.
+FOLDER holds recordings in which nothing moves for long, as for benchmarks/accuracy.py: the second case tells
+what forgetting costs them. `--only changing-world` needs no folder.
 
 A lidar (32 × 160 beams, 10 m, noise 1 cm) walks through the hall twice. Between the passes boxes move; during
 both, people walk. Cells are 0.1 m wide. A *ghost* is a cell in which a person or a box was seen, that is free
@@ -14,21 +14,19 @@ is a cell on which beams of the second pass end at the end; it is lost if the ma
 
 from __future__ import annotations
 
-import argparse
 import math
 import statistics
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from accuracy import sources
+from accuracy import BUDGETS, CELLS, NAMES, PLANAR
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from tables import ROOT, hardware, markdown, publish
+from pages import ROOT
 from torch import Tensor
 
 import gmmtorch as gt
@@ -37,6 +35,7 @@ from gmmtorch.experiments.baselines import LogOdds, OccupancyGrid, OctoMapMap
 from gmmtorch.experiments.evaluation import metrics
 from gmmtorch.experiments.evaluation.held_out import Protocol, evaluate
 from gmmtorch.experiments.evaluation.mapping_methods import choose, methods
+from gmmtorch.experiments.harness import Case, Row, cpu_seconds, held_out, recording, run
 from gmmtorch.kernels.rays.ray_traversal import traverse
 from gmmtorch.report.style import PALETTE, label_axes, legend_below, new_figure, save_figure
 from gmmtorch.simulation import World3D, building_3d, poses_3d, spinning_lidar
@@ -166,29 +165,35 @@ def maps() -> dict[str, Callable[[], Any]]:
 
 def measured(made: Any, world: Recorded) -> list[float]:
     """Ghosts that stay, surfaces lost (shares of cells), AUC, kilobytes and CPU seconds of one map."""
-    begin = time.process_time()
-    for scan in world.scans:
-        made.insert(scan)
-    made.finish()
-    seconds = time.process_time() - begin
+
+    def build() -> None:
+        for scan in world.scans:
+            made.insert(scan)
+        made.finish()
+
+    seconds, _ = cpu_seconds(build)
     ghosts, surfaces = (torch.as_tensor(made.occupancy(c, CELL)) for c in (world.ghosts, world.surfaces))
     stays, lost = float((ghosts > 0.5).double().mean()), float((surfaces <= 0.5).double().mean())
     return [stays, lost, metrics.roc(surfaces, ghosts).auc, made.nbytes / 1e3, seconds]
 
 
-def row(name: str, by_seed: list[list[float]]) -> list[object]:
-    """Mean and range over the seeds, in the formats of the table's columns."""
-    formats = ("{:.1%}", "{:.1%}", "{:.4f}", "{:,.0f} kB", "{:.0f}")
-    cells: list[object] = [name]
-    for column, (form, values) in enumerate(zip(formats, zip(*by_seed, strict=True), strict=True)):
+COLUMNS = ("ghosts that stay", "surfaces lost", "AUC", "bytes", "CPU s")
+FORMATS = ("{:.1%}", "{:.1%}", "{:.4f}", "{:,.0f} kB", "{:.0f}")
+
+
+def row(name: str, by_seed: list[list[float]]) -> Row:
+    """Mean and range over the seeds."""
+    cells = [name]
+    for title, form, values in zip(COLUMNS, FORMATS, zip(*by_seed, strict=True), strict=True):
         text, low, high = (
             form.format(value) for value in (statistics.mean(values), min(values), max(values))
         )
-        cells.append(f"{text} ({low} to {high})" if column < 3 and low != high else text)
+        has_range = title in COLUMNS[:3] and low != high
+        cells.append(f"{text} ({low} to {high})" if has_range else text)
     return cells
 
 
-def draw(made: dict[str, Any], world: Recorded) -> None:
+def draw(made: dict[str, Any], world: Recorded, file: Path) -> None:
     """Slices of some maps at the height of people's chests, with the ghosts that stay."""
     x, y = (torch.arange(n) for n in SHAPE[:2])
     level = int(SLICE / CELL) - int(LOW[2])
@@ -214,34 +219,27 @@ def draw(made: dict[str, Any], world: Recorded) -> None:
         Patch(facecolor="white", edgecolor="0.5", label="free"),
     ]
     legend_below(figure, shown)
-    save_figure(figure, ROOT / "docs/images/changing_world.png", dpi=90)
+    save_figure(figure, file, dpi=90)
 
 
-def static_rows(folder: Path) -> list[list[object]]:
+def static(options: Any) -> Iterator[Row]:
     """AUC on held-out beams of recordings, without forgetting and with it."""
-    rows: list[list[object]] = []
-    for name, (dataset, test_every, resolutions, max_bytes) in sources(folder).items():
-        rules = [IncrementalRule(max_bytes=max_bytes, forget=forget) for forget in ("off", "contradiction")]
-        protocol = Protocol(test_every, (1.0,), "beams", resolutions[:1], max_beams=20_000)
+    for name in options.names:
+        dataset = recording(options.data, name, **({"pixel_stride": 2} if name == "kinect" else {}))
+        budget, cell = BUDGETS.get(name), CELLS.get(name, PLANAR)[0]
+        protocol = Protocol(held_out(dataset), (1.0,), "beams", (cell,), max_beams=20_000)
         found = []
-        for rule in rules:
+        for forget in ("off", "contradiction"):
+            rule = IncrementalRule(max_bytes=budget, forget=forget)
             make = methods(partial(GaussianMap, rule, cutoff=3.0))
             found += evaluate(name, list(dataset), choose(["point"], make), protocol).rows
         off, kept = found
-        budget = f"{max_bytes / 1e3:.0f} kB" if max_bytes else "none"
-        counts = [f"{value['auc']:.4f}, {value['n_components']:,}" for value in (off, kept)]
-        rows.append([name, f"{resolutions[0]:g}", budget, *counts, f"{kept['auc'] - off['auc']:+.4f}"])
-        print(*rows[-1], sep=" | ", flush=True)
-    return rows
+        counts = (f"{each['auc']:.4f}, {each['n_components']:,}" for each in (off, kept))
+        limit = f"{budget / 1e3:.0f} kB" if budget else "none"
+        yield name, cell, limit, *counts, kept["auc"] - off["auc"]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--scans", type=int, default=100, help="of a pass")
-    parser.add_argument("--seeds", type=int, default=5, help="halls, walks and noises")
-    parser.add_argument("--data", type=Path, help="recordings for the second table; not written without")
-    options = parser.parse_args()
-    torch.set_num_threads(1)
+def changing(options: Any) -> Iterator[Row]:
     values: dict[str, list[list[float]]] = {name: [] for name in maps()}
     for seed in range(options.seeds):
         world = recorded(options.scans, seed)
@@ -249,16 +247,40 @@ def main() -> None:
         made = {name: factory() for name, factory in maps().items()}
         for name, map_ in made.items():
             values[name].append(measured(map_, world))
-            print(*row(name, values[name][-1:]), sep=" | ", flush=True)
-        if seed == 0:
-            draw({name: made[name] for name in DRAWN}, world)
-    rows = [row(name, by_seed) for name, by_seed in values.items()]
-    header = ["map", "ghosts that stay", "surfaces lost", "AUC", "bytes", "CPU s"]
-    publish("changing-world", f"{markdown(header, rows)}\n\n{hardware()}")
-    if options.data:
-        header = ["data", "cell (m)", "budget", "`off`: AUC, components", "`contradiction`", "difference"]
-        publish("changing-world-static", markdown(header, static_rows(options.data)))
+        if seed == 0 and options.figure:
+            draw({name: made[name] for name in DRAWN}, world, options.figure)
+    yield from (row(name, by_seed) for name, by_seed in values.items())
 
+
+CASES = (
+    Case(
+        "changing-world",
+        changing,
+        "AUC compares surfaces with ghosts. Seconds are CPU time of building.",
+        dict.fromkeys(("map", *COLUMNS), ""),
+        needs_data=False,
+    ),
+    Case(
+        "changing-world-static",
+        static,
+        "Recordings in which little moves: all beams, 20,000 held-out beams.",
+        {
+            "data": "",
+            "cell (m)": "3",
+            "budget": "",
+            "`off`: AUC, components": "",
+            "`contradiction`": "",
+            "difference": "+.4f",
+        },
+        NAMES,
+    ),
+)
 
 if __name__ == "__main__":
-    main()
+    run(
+        __doc__,
+        *CASES,
+        scans={"type": int, "default": 100, "help": "of a pass"},
+        seeds={"type": int, "default": 5, "help": "halls, walks and noises"},
+        figure={"type": Path, "default": ROOT / "docs/images/changing_world.png"},
+    )

@@ -13,7 +13,9 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from tables import ROOT
+from pages import ROOT
+
+from gmmtorch.experiments.harness import Table
 
 _NUMBER = r"[-−+]?(?:\d+(?:,\d{3})*(?:\.\d+)?|\.\d+)"
 Interval = Callable[[float], tuple[float, float]]
@@ -42,13 +44,13 @@ def score(claimed: float) -> tuple[float, float]:
 
 
 def section(page: str) -> str:
-    """The text of a page, or of `page#part`, a part between markers or below a heading."""
+    """The text of a page, of `page#part`, the part below a heading, or of a table of results in a page."""
     path, _, part = page.partition("#")
+    if path.endswith(".json"):
+        return Table.load(ROOT / path).markdown()
     text = (ROOT / path).read_text(encoding="utf-8")
     if not part:
         return text
-    if part.startswith("<!--"):
-        return text.split(part)[1].split(part.replace("<!-- ", "<!-- /"))[0]
     found = re.search(rf"^(#+) {re.escape(part)}.*?(?=^\1 |\Z)", text, re.DOTALL | re.MULTILINE)
     return found[0] if found else ""
 
@@ -66,21 +68,6 @@ def _number(text: str) -> float:
     return float(text.replace(",", "").replace("−", "-"))
 
 
-def table_rows(text: str) -> list[dict[str, str]]:
-    """The rows of the Markdown tables in a text, by the header of their table."""
-    header: list[str] = []
-    rows = []
-    for line in text.splitlines():
-        cells = [cell.strip() for cell in line.strip("|").split("|")]
-        if not line.startswith("|"):
-            header = []
-        elif not header:
-            header = cells
-        elif not set(line) <= set("|-"):
-            rows.append(dict(zip(header, cells, strict=True)))
-    return rows
-
-
 def cell_texts(row: dict[str, str], keys: int, columns: Sequence[str]) -> str:
     """A row of a table as the text of a claim: its label, # for numbers of the columns, … for the rest."""
     cells = [re.sub(_NUMBER, "#", value) if header in columns else "…" for header, value in row.items()]
@@ -92,10 +79,10 @@ def count_of_numbers(text: str) -> int:
 
 
 def published(mark: str, label: Sequence[str], *columns: str) -> Reader:
-    """The numbers in cells of a table that a benchmark publishes, of the row that begins with a label."""
+    """The numbers in cells of a table that a run writes, of the row that begins with a label."""
 
     def read(out: Path) -> list[float]:
-        rows = table_rows((out / f"{mark}.md").read_text(encoding="utf-8"))
+        rows = Table.load(out / f"{mark}.json").texts()
         chosen = [row for row in rows if list(row.values())[: len(label)] == list(label)]
         if len(chosen) != 1:
             raise ValueError(f"the run writes {len(chosen)} rows {', '.join(label)}, not one")

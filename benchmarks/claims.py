@@ -40,17 +40,18 @@ from claim_readers import (
     result,
     score,
     section,
-    table_rows,
     times,
     within,
 )
-from tables import ROOT, markdown
+from pages import ROOT
+
+from gmmtorch.experiments.harness import Table, markdown
 
 
 class Claim(NamedTuple):
     """Numbers of a page, and how they are measured. Without a reader, the run itself checks them."""
 
-    page: str  # or page#part
+    page: str  # or page#part, or a table of results
     text: str
     read: Reader | None = None
     intervals: Interval | Sequence[Interval] = within(0)  # one for all numbers of the text, or one for each
@@ -64,15 +65,13 @@ class Run(NamedTuple):
     slow: bool = True  # over two minutes of one core
 
 
-def of_table(
-    page: str, mark: str, keys: int, columns: dict[str, Interval], *labels: Sequence[str]
-) -> list[Claim]:
-    """A claim for each row of a table between markers that a benchmark writes, or for those with the labels.
+def of_table(mark: str, keys: int, columns: dict[str, Interval], *labels: Sequence[str]) -> list[Claim]:
+    """A claim for each row of a table of results, or for those with the labels.
 
     The first `keys` cells of a row are its label; `columns` are those that are compared.
     """
-    place, claims = f"{page}#<!-- {mark} -->", []
-    for row in table_rows(section(place)):
+    place, claims = f"{RESULTS}/{mark}.json", []
+    for row in Table.load(ROOT / place).texts():
         label = tuple(list(row.values())[:keys])
         there = [name for name in columns if count_of_numbers(row.get(name, ""))]
         if not there or (labels and label not in labels):
@@ -110,7 +109,10 @@ def compact(name: str, components: str = "#") -> Claim:
     ours = (result("n_components", method="point"), size("point"), auc("point"), auc("flux"))
     text = f"| {name} | {components}, # kB | # | # | count grid # ("
     return Claim(
-        RESULTS, text, joined(*ours, auc("occupancy_grid")), [times(1.1), at_most(1.02), AUC, AUC, AUC]
+        f"{RESULTS}/compact-maps.json",
+        text,
+        joined(*ours, auc("occupancy_grid")),
+        [times(1.1), at_most(1.02), AUC, AUC, AUC],
     )
 
 
@@ -152,10 +154,10 @@ def few_beams_3d(name: str, data: str) -> Run:
 
 def of_mission(label: str, field: str, interval: Interval, scale: float = 1.0) -> Claim:
     """A row of the table of exploration."""
-    return Claim(f"{RESULTS}#<!-- exploration -->", f"| {label} | # (", team(field, scale=scale), interval)
+    return Claim(f"{RESULTS}/exploration.json", f"| {label} | # (", team(field, scale=scale), interval)
 
 
-FIGURES, RESULTS = "docs/experiments.md", "BENCHMARKS.md"
+FIGURES, RESULTS = "docs/experiments.md", "benchmarks/results"
 AUC, SIZE = within(0.003), times(1.05)
 SIX, FOUR = (1.0, 0.5, 0.3, 0.2, 0.1, 0.05), (1.0, 0.3, 0.1, 0.05)
 
@@ -175,7 +177,7 @@ PEAK = (
     "hydra.run.dir=$OUT', shell=True, check=True); "
     "print('peak', resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss // 1024, 'MiB')\""
 )
-ODOMETRY = "python benchmarks/odometry.py --data $DATA --runs $OUT/runs.jsonl --methods mixture"
+ODOMETRY = "python benchmarks/odometry.py --data $DATA --only odometry --methods mixture"
 SEEDS = "gmmtorch-explore hydra.run.dir=$OUT experiment=fig4_4_entropy 'study.seeds=[0,1,2,3,4]' "
 TEAMS = (
     "team.size=3 duration=1600 evaluation.every=10 "
@@ -225,9 +227,9 @@ RUNS = {
               at_most(1.1)),
     ], slow=False),
     "sharing_costs": Run("python benchmarks/sharing_costs.py", [
-        *of_table("docs/messages.md", "message-sizes", 1, {"bytes": SIZE}),
-        *of_table("docs/replica.md", "replica-costs", 1, dict.fromkeys(HELD, at_most(3))),
-        *of_table("docs/network.md", "frame-costs", 1, {"time": at_most(3)}),
+        *of_table("message-sizes", 1, {"bytes": SIZE}),
+        *of_table("replica-costs", 1, dict.fromkeys(HELD, at_most(3))),
+        *of_table("frame-costs", 1, {"time": at_most(3)}),
     ], slow=False),
     "viewing": Run("gmmtorch-map dataset=synthetic_building hydra.run.dir=$OUT && "
                    "gmmtorch-view $OUT --html $OUT/map.html", [
@@ -237,12 +239,12 @@ RUNS = {
               ratio(printed("map.html  # bytes"), lambda out: [1000.0]), SIZE),
     ], slow=False),
     "deskewing": Run("python benchmarks/deskewing.py --data $DATA",
-                     of_table("docs/recordings.md", "deskewing", 1, {"distance": within(0.3)}), slow=False),
+                     of_table("deskewing", 1, {"distance": within(0.3)}), slow=False),
     "large_cloud": Run(PEAK, [
         Claim("docs/large_clouds.md", "120 MB) needs # MiB of memory", printed("peak # MiB"), at_most(1.25)),
     ], slow=False),
-    "map_building": Run("python benchmarks/map_building.py --data $DATA", [
-        *of_table(RESULTS, "map-building", 2, BUILT),
+    "map_building": Run("python benchmarks/map_building.py --data $DATA --only map-building", [
+        *of_table("map-building", 2, BUILT),
         Claim("docs/maps.md", "[# frames of 640", published("map-building", FAST, "frames/s"), times(2)),
     ], slow=False),
     "compact_kinect": Run(COMPACT + KINECT + "'evaluation.resolution=[0.05]' map.max_bytes=8000",
@@ -251,34 +253,35 @@ RUNS = {
                         [compact("hall")], slow=False),
     "compact_courtyard": Run(COMPACT + COURTYARD + "'evaluation.resolution=[0.2]' map.max_bytes=16000",
                              [compact("courtyard")], slow=False),
-    "learning": Run("python benchmarks/learning.py --data $DATA --methods gmmtorch scikit-learn", [
+    "learning": Run("python benchmarks/learning.py --data $DATA --only learning-1 "
+                    "--methods gmmtorch scikit-learn", [
         Claim("README.md", "is [# to # times faster](",
               joined(reduced(min, FASTER), reduced(max, FASTER)), times(2)),
-        *of_table(RESULTS, "learning-1", 2, LEARNED, *PEERS),
+        *of_table("learning-1", 2, LEARNED, *PEERS),
     ]),
-    "accuracy": Run("python benchmarks/accuracy.py --data $DATA", [
-        *of_table("README.md", "readme-accuracy", 2, SHORT),
-        *of_table(RESULTS, "accuracy", 3, LONG),
+    "accuracy": Run("python benchmarks/accuracy.py --data $DATA --only accuracy readme-accuracy", [
+        *of_table("readme-accuracy", 2, SHORT),
+        *of_table("accuracy", 3, LONG),
         Claim("README.md", "keeps [a room or a hall in # kB]", largest(*SMALL), at_most()),
     ]),
     "rate_distortion": Run("python benchmarks/rate_distortion.py --data $DATA --figure $OUT/figure.png",
-                           of_table(RESULTS, "rate-distortion", 2, LEADS)),
+                           of_table("rate-distortion", 2, LEADS)),
     "localization": Run("python benchmarks/localization.py --data $DATA", [
-        *of_table(RESULTS, "localization", 1, FOUND),
+        *of_table("localization", 1, FOUND),
         Claim("README.md", "[# times a second in 3D]", RATES[0], at_least(0.5)),
         Claim("docs/registration.md", "3D scans at more than # Hz and 2D scans at more than # Hz",
               joined(*RATES), at_least(0.5)),
     ]),
     "registration": Run("python benchmarks/registration.py --data $DATA --draws 3", [
-        *of_table(RESULTS, "registration-hall", 1, ALIGNED),
-        *of_table(RESULTS, "registration-courtyard", 1, ALIGNED),
+        *of_table("registration-hall", 1, ALIGNED),
+        *of_table("registration-courtyard", 1, ALIGNED),
     ]),
     "odometry": Run(f"{ODOMETRY} --seeds 0 1 2 3 4 --names courtyard && "
                     f"{ODOMETRY} --seeds 0 --names street && "
                     f"{ODOMETRY} --seeds 0 1 --names hall && "
                     f"{ODOMETRY} --seeds 0 1 --names intel && "
                     f"{ODOMETRY} --seeds 0 --names freiburg-101 aces",
-                    of_table(RESULTS, "odometry", 3, FLOWN)),
+                    of_table("odometry", 3, FLOWN)),
     "fig3_4": Run(OCCUPANCY + "experiment=fig3_4_auc_sparsity_2d " + INTEL, [
         Claim(FIGURES, "1 cm Monte Carlo has # […] with all beams, # […] with 70 % removed and # […] with",
               auc("monte_carlo", (1.0, 0.3, 0.05), resolution=0.01), AUC),
@@ -333,7 +336,8 @@ RUNS = {
         of_mission("on the wire, with headers (kB)", "wire_bytes", times(1.08), 1e-3),
     ]),
     "soak": Run("python benchmarks/soak.py", [
-        Claim(RESULTS, "| schedules; all replicas equal at last; holding … | 1,000; 1,000; 1,000 |"),
+        Claim(f"{RESULTS}/soak.json",
+              "| schedules; all replicas equal at last; holding … | 1,000; 1,000; 1,000 |"),
     ]),
 }
 # fmt: on

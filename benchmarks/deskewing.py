@@ -4,20 +4,19 @@
 
 FOLDER holds bags/turtlebot4/bag, a laser on a robot that drives and turns. The distance is that from points
 of a scan to the nearest points of the scan `APART` seconds later: the mean over pairs of scans of the median.
-Writes its table into docs/recordings.md.
 """
 
 from __future__ import annotations
 
-import argparse
+from collections.abc import Iterator
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
 from scipy.spatial import KDTree
-from tables import ROOT, markdown, publish
 
 from gmmtorch import datasets
+from gmmtorch.experiments.harness import Case, Row, run
 
 APART, STRIDE = 2.0, 3  # seconds; every how many scans begin a pair
 OPTIONS: dict[str, dict[str, Any]] = {
@@ -27,19 +26,13 @@ OPTIONS: dict[str, dict[str, Any]] = {
 }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--data", type=Path, required=True)
-    folder = parser.parse_args().data / "bags" / "turtlebot4" / "bag"
-    rows = [[name, *distance(folder, options)] for name, options in OPTIONS.items()]
-    publish(
-        "deskewing",
-        markdown(["TurtleBot4's laser", "distance", "pairs"], rows),
-        ROOT / "docs" / "recordings.md",
-    )
+def measure(options: Any) -> Iterator[Row]:
+    folder = options.data / "bags" / "turtlebot4" / "bag"
+    for name, changes in OPTIONS.items():
+        yield name, *distance(folder, changes)
 
 
-def distance(folder: Path, options: dict[str, Any]) -> tuple[str, int]:
+def distance(folder: Path, options: dict[str, Any]) -> tuple[float, int]:
     scans = [scan for scan in datasets.load("rosbag", folder, **options) if scan.time is not None]
     found = []
     for first in scans[::STRIDE]:
@@ -47,8 +40,16 @@ def distance(folder: Path, options: dict[str, Any]) -> tuple[str, int]:
         if later:
             near, _ = KDTree(later[0].points.numpy()).query(first.points.numpy())
             found.append(float(sorted(near)[len(near) // 2]))
-    return f"{100 * fmean(found):.1f} cm", len(found)
+    return 100 * fmean(found), len(found)
 
+
+CASE = Case(
+    "deskewing",
+    measure,
+    "Mean over pairs of scans of the median distance from points of a scan to the nearest of the scan two "
+    "seconds later.",
+    {"TurtleBot4's laser": "", "distance": "{:.1f} cm", "pairs": ".0f"},
+)
 
 if __name__ == "__main__":
-    main()
+    run(__doc__, CASE)

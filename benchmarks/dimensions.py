@@ -1,34 +1,26 @@
 """Mixtures in many dimensions, beside scikit-learn: seconds, peak memory and log-likelihoods.
 
-    python benchmarks/dimensions.py [--threads 1] [--only TEXT …] [--most 6e10]
+    python benchmarks/dimensions.py [--threads 1] [--parts TEXT …] [--most 6e10]
 
 Both fit the same clouds from the same start for the same number of iterations; --most leaves out fits of
-more products of N, K and D (full covariances: D²). Whole fits start as each package does by itself. Every
-measurement is kept in outputs/dimensions-THREADS.jsonl; the table written into BENCHMARKS.md has the last
-of each, so that parts can be run again.
+more products of N, K and D (full covariances: D²). Whole fits start as each package does by itself.
 """
 
 from __future__ import annotations
 
-import argparse
 import ctypes
 import itertools
-import json
-import multiprocessing
-import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import sklearn.mixture
-import torch
 from sklearn.datasets import load_digits, load_iris
-from tables import OUTPUTS, hardware, markdown, publish
-from threadpoolctl import threadpool_limits
 
 import gmmtorch
+from gmmtorch.experiments.harness import Case, Row, alone, clock, run
 from gmmtorch.mixture.em.exact import COVARIANCE_TYPES, type_shape
 
 N_ITER = 3
@@ -119,7 +111,6 @@ def measured(ours: bool, cell: Cell) -> dict[str, Any]:
         options |= {"init_params": "kmeans"}
     made = gmmtorch.GaussianMixture if ours else sklearn.mixture.GaussianMixture
     seconds, scores, memory = [], [], []
-    clock = time.process_time if torch.get_num_threads() == 1 else time.perf_counter
     for _ in range(5):
         ctypes.CDLL(None).malloc_trim(0)
         Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew
@@ -142,61 +133,26 @@ def measured(ours: bool, cell: Cell) -> dict[str, Any]:
     }
 
 
-def _child(ours: bool, todo: list[Cell], threads: int, pipe: Any) -> None:
+def both(cells: list[Cell], ours: bool) -> dict[str, Any]:
+    """The measurements of one package for some cells, by the kind of covariances."""
     warnings.simplefilter("ignore")
-    torch.set_num_threads(threads)
-    with threadpool_limits(threads):
-        measured(ours, Cell("full", 2000, 3, 8))  # loads libraries and compiles
-        for cell in todo:
-            try:
-                pipe.send(measured(ours, cell))
-            except Exception as error:  # is a result, and is published
-                pipe.send({"error": f"{type(error).__name__}: {str(error).splitlines()[0][:60]}"})
+    measured(ours, Cell("full", 2000, 3, 8))  # loads libraries and compiles
+    return {cell.kind: measured(ours, cell) for cell in cells}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--only", nargs="*", help="cells whose names contain all of these")
-    parser.add_argument("--most", type=float, default=2e10, help="products of a cell's iteration")
-    parser.add_argument("--methods", nargs="*", default=["gmmtorch", "scikit-learn"])
-    options = parser.parse_args()
-    torch.set_num_threads(options.threads)
-    log = OUTPUTS / f"dimensions-{options.threads}.jsonl"
-    every = cells(options.most)
-    todo = [cell for cell in every if all(part in cell.name() for part in options.only or ())]
-    context = multiprocessing.get_context("spawn")
-    pipes = {}
-    for method in options.methods:
-        here, there = context.Pipe()
-        arguments = (method == "gmmtorch", todo, options.threads, there)
-        context.Process(target=_child, args=arguments, daemon=True).start()
-        there.close()
-        pipes[method] = here
-    for cell in todo:
-        for method, pipe in pipes.items():
-            found = pipe.recv()
-            print(cell.name(), method, found, flush=True)
-            with log.open("a") as file:
-                file.write(json.dumps({"cell": cell.name(), "method": method, "found": found}) + "\n")
-    kept = {}
-    for line in log.read_text().splitlines():
-        entry = json.loads(line)
-        kept[entry["cell"], entry["method"]] = entry["found"]
-    publish(f"dimensions-{options.threads}", f"{hardware()}\n\n{table(every, kept)}")
-
-
-def table(every: list[Cell], kept: dict[tuple[str, str], dict[str, Any]]) -> str:
+def measure(options: Any) -> Iterator[Row]:
     """A row for each size, with each covariance type's speed and memory relative to scikit-learn's."""
-    rows: dict[tuple[Any, ...], list[str]] = {}
-    for cell in every:
-        size = (cell.table or "blobs", f"{cell.n:,} × {cell.dim}", cell.k)
-        row = rows.setdefault(size, [""] * len(COVARIANCE_TYPES))
-        ours, peer = (kept.get((cell.name(), method), {}) for method in ("gmmtorch", "scikit-learn"))
-        if "seconds" in ours and "seconds" in peer:
-            row[COVARIANCE_TYPES.index(cell.kind)] = comparison(ours, peer, bool(cell.table))
-    lines = [[*size, *row] for size, row in rows.items() if any(row)]
-    return markdown(["cloud", "points", "K", *COVARIANCE_TYPES], lines)
+    sizes: dict[tuple[Any, ...], list[Cell]] = {}
+    for cell in cells(options.most):
+        if all(part in cell.name() for part in options.parts or ()):
+            sizes.setdefault((cell.table or "blobs", f"{cell.n:,} × {cell.dim}", cell.k), []).append(cell)
+    for (cloud, points, k), some in sizes.items():
+        ours, peer = alone(both, some, True), alone(both, some, False)
+        row: dict[str, Any] = {"cloud": cloud, "points": points, "K": k} | dict.fromkeys(COVARIANCE_TYPES)
+        for cell in some:
+            if cell.kind in ours and cell.kind in peer:
+                row[cell.kind] = comparison(ours[cell.kind], peer[cell.kind], bool(cell.table))
+        yield row
 
 
 def comparison(ours: dict[str, Any], peer: dict[str, Any], own_start: bool) -> str:
@@ -211,5 +167,21 @@ def comparison(ours: dict[str, Any], peer: dict[str, Any], own_start: bool) -> s
     return text if different < 1e-6 else f"{text}, nats differ by {different:.0e}"
 
 
+CASE = Case(
+    "dimensions-{threads}",
+    measure,
+    "Three iterations from the same start; the last rows are whole fits, each from its own start from "
+    "k-means, with the nats of both. A cell: our CPU seconds / those of scikit-learn, how many times faster "
+    "fit and score are, our share of its peak memory where either is above 10 MB.",
+    {"K": ".0f"},
+    key=3,
+    needs_data=False,
+)
+
 if __name__ == "__main__":
-    main()
+    run(
+        __doc__,
+        CASE,
+        parts={"nargs": "*", "help": "cells whose names contain all of these"},
+        most={"type": float, "default": 2e10, "help": "products of a cell's iteration"},
+    )

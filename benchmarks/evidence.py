@@ -4,26 +4,24 @@
 
 A map of the training frames (four of five) of a depth-camera room. Points are the hits of the other frames
 and as many free points. Copies of the map side by side make the world that grows. Seconds are of the
-processor, on one thread. Writes the tables `grid-evidence`, `point-queries` and `growing-queries` of
-BENCHMARKS.md.
+processor.
 """
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import torch
-from tables import hardware, markdown, publish
-from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-from gmmtorch import GaussianMap, datasets
+from gmmtorch import GaussianMap
 from gmmtorch.experiments.evaluation.queries import hit_and_free, test_beams
+from gmmtorch.experiments.harness import Case, Row, cpu_seconds, recording, run
 from gmmtorch.kernels import kernels
 from gmmtorch.mapping.learning.rules import IncrementalRule, LearningRule, WindowedRule
 from gmmtorch.occupancy.cones import Cones
@@ -54,12 +52,8 @@ def small_pieces(n_components: int, n_scans: int) -> WindowedRule:
 
 def timed(work: Callable[[], Any], repeats: int = 3) -> tuple[float, Any]:
     """Median of processor seconds after a first call, which compiles; and the result."""
-    result, seconds = work(), []
-    for _ in range(repeats):
-        begin = time.process_time()
-        work()
-        seconds.append(time.process_time() - begin)
-    return statistics.median(seconds), result
+    result = work()
+    return statistics.median(cpu_seconds(work)[0] for _ in range(repeats)), result
 
 
 def cast(cones: Cones, grid: VoxelGrid, n_samples: int) -> Evidence:
@@ -68,8 +62,14 @@ def cast(cones: Cones, grid: VoxelGrid, n_samples: int) -> Evidence:
     return evidence
 
 
-def on_a_grid(cones: Cones, grid: VoxelGrid) -> str:
+def on_a_grid(options: Any) -> Iterator[Row]:
     """Flux and Monte Carlo evidence of all cells."""
+    train, points = room(options.data, options.points)
+    cones = cones_of(train, IncrementalRule(max_bytes=8000))
+    low, high = points.amin(0), points.amax(0)
+    # Not on multiples of the resolution, where sensors lie on faces: either cell may count their rays.
+    grid = VoxelGrid(low.tolist(), RESOLUTION, ((high - low) / RESOLUTION).ceil().int().tolist())
+    options.about = f"{grid.n_cells:,} cells of {grid.resolution} m, {len(cones.counts)} cones."
     exact = flux_evidence(cones, grid, CUTOFF, tolerance=REFERENCE)
     n_points = float(cones.counts.sum())
     works: list[tuple[str, Callable[[], Evidence]]] = [
@@ -80,15 +80,11 @@ def on_a_grid(cones: Cones, grid: VoxelGrid) -> str:
         (f"flux, tolerance {name}", lambda t=t: flux_evidence(cones, grid, CUTOFF, tolerance=t))
         for name, t in (("0.1", 0.1), ("10⁻²", 1e-2), ("10⁻³", 1e-3), ("10⁻⁴ (default)", 1e-4))
     ]
-    rows = []
     for name, work in works:
         seconds, found = timed(work)
         misses = float((found.misses - exact.misses).square().mean().sqrt()) / n_points
         theta = float((found.probability() - exact.probability()).square().mean().sqrt())
-        rows.append([name, f"{seconds:.2f}", f"{misses:.1e}", f"{theta:.1e}"])
-    about = f"{grid.n_cells:,} cells of {grid.resolution} m, {len(cones.counts)} cones. {hardware()}"
-    header = ["", "CPU s", "rms error of misses, a point", "rms error of θ"]
-    return f"{about}\n\n{markdown(header, rows)}"
+        yield name, seconds, misses, theta
 
 
 def first_query(cones: Cones, points: Tensor, cutoff: float) -> tuple[PointForm, float]:
@@ -99,10 +95,13 @@ def first_query(cones: Cones, points: Tensor, cutoff: float) -> tuple[PointForm,
     return form, time.process_time() - begin
 
 
-def at_points(maps: Sequence[Cones], points: Tensor) -> str:
+def at_points(options: Any) -> Iterator[Row]:
     """Rates by the number of cones and the cutoff, and how many cones a point visits."""
-    rows = []
-    for cones in maps:
+    train, points = room(options.data, options.points)
+    rules = [small_pieces(n, len(train)) for n in (100, 300, 1000)]
+    rules.insert(2, IncrementalRule(max_bytes=8000))
+    options.about = f"{len(points):,} points."
+    for cones in (cones_of(train, rule) for rule in rules):
         for cutoff in (3.0, 5.0):
             form, first = first_query(cones, points, cutoff)
             few = points[:: max(1, len(points) // 20_000)]  # the twin is slow
@@ -111,24 +110,16 @@ def at_points(maps: Sequence[Cones], points: Tensor) -> str:
             fast, _ = timed(lambda form=form: form(points))
             number = form.index.buckets(points)
             listed = form.index.lists.lengths()[number[number >= 0]].double().mean()
-            rates = [f"{len(points) / fast / 1e6:.2f}", f"{len(few) / slow / 1e6:.2f}"]
+            rates = len(points) / fast / 1e6, len(few) / slow / 1e6
             visited = f"{form.visited(points):.0f} of {listed:.0f}"
-            rows.append([len(cones.counts), f"{cutoff:g}", *rates, visited, f"{first:.2f}"])
-    header = [
-        "cones",
-        "cutoff",
-        "fused, M points/s",
-        "tensor operations",
-        "cones visited of listed",
-        "first query, s",
-    ]
-    return f"{len(points):,} points. {hardware()}\n\n{markdown(header, rows)}"
+            yield len(cones.counts), cutoff, *rates, visited, first
 
 
-def as_it_grows(cones: Cones, points: Tensor) -> str:
+def as_it_grows(options: Any) -> Iterator[Row]:
     """1, 4 and 16 copies of the room side by side, each asked about a sixteenth of the points."""
+    train, points = room(options.data, options.points)
+    cones = cones_of(train, small_pieces(300, len(train)))
     step = float((points.amax(0) - points.amin(0)).amax()) + 2.0
-    rows = []
     for copies in (1, 4, 16):
         shift = torch.zeros(copies, 1, 3, dtype=torch.float64)
         shift[:, 0, 0] = step * torch.arange(copies)
@@ -143,32 +134,29 @@ def as_it_grows(cones: Cones, points: Tensor) -> str:
         form, first = first_query(world, asked, 3.0)
         seconds, _ = timed(lambda form=form, asked=asked: form(asked))
         entries = form.index.lists.entries.numel() / len(world.counts)
-        rows.append(
-            [copies, len(world.counts), f"{len(asked) / seconds / 1e6:.2f}", f"{entries:.0f}", f"{first:.2f}"]
-        )
-    return markdown(["rooms", "cones", "M points/s", "index entries a cone", "first query, s"], rows)
+        yield copies, len(world.counts), len(asked) / seconds / 1e6, entries, first
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--data", type=Path, required=True, help="folder with the folder kinect")
-    parser.add_argument("--points", type=int, default=500_000)
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-    with threadpool_limits(1):
-        scans = list(datasets.load("depth_frames", options.data / "kinect", pixel_stride=4))
-        train = [scan for number, scan in enumerate(scans) if number % 5]
-        beams = test_beams(scans[::5], options.points // 2, seed=0)
-        points = hit_and_free(*beams, "uniform", RESOLUTION, seed=0).points
-        small = cones_of(train, IncrementalRule(max_bytes=8000))
-        low, high = points.amin(0), points.amax(0)
-        # Not on multiples of the resolution, where sensors lie on faces: either cell may count their rays.
-        grid = VoxelGrid(low.tolist(), RESOLUTION, ((high - low) / RESOLUTION).ceil().int().tolist())
-        publish("grid-evidence", on_a_grid(small, grid))
-        maps = {n: cones_of(train, small_pieces(n, len(train))) for n in (100, 300, 1000)}
-        publish("point-queries", at_points([maps[100], maps[300], small, maps[1000]], points))
-        publish("growing-queries", as_it_grows(maps[300], points))
+@cache
+def room(data: Path, n_points: int) -> tuple[list[Scan], Tensor]:
+    """Four of five scans, and half hits, half free points of the others."""
+    scans = list(recording(data, "kinect", pixel_stride=4))
+    beams = test_beams(scans[::5], n_points // 2, seed=0)
+    train = [scan for number, scan in enumerate(scans) if number % 5]
+    return train, hit_and_free(*beams, "uniform", RESOLUTION, seed=0).points
 
+
+ERRORS = {"": "", "CPU s": ".2f", "rms error of misses, a point": ".1e", "rms error of θ": ".1e"}
+RATES = {"cones": ".0f", "cutoff": ".0f", "fused, M points/s": ".2f", "tensor operations": ".2f"}
+RATES |= {"cones visited of listed": "", "first query, s": ".2f"}
+GROWING = {"rooms": ".0f", "cones": ".0f", "M points/s": ".2f", "index entries a cone": ".0f"}
+CASES = (
+    Case("grid-evidence", on_a_grid, columns=ERRORS),
+    Case("point-queries", at_points, columns=RATES, key=2),
+    Case(
+        "growing-queries", as_it_grows, "Rooms side by side, cutoff 3.", {**GROWING, "first query, s": ".2f"}
+    ),
+)
 
 if __name__ == "__main__":
-    main()
+    run(__doc__, *CASES, points={"type": int, "default": 500_000})

@@ -15,17 +15,12 @@ not show.
 from __future__ import annotations
 
 import argparse
-import gc
-import resource
-import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
-from pathlib import Path
+from collections.abc import Iterator
+from typing import Any
 
-import torch
-
-from gmmtorch.report.text import format_table
+from gmmtorch.experiments.harness import Case, Row, alone, run
+from gmmtorch.mapping.map_builder import resident_bytes
 from gmmtorch.team.exploration.mission.driver import Stopwatch
 from gmmtorch.team.exploration.mission.mission import Mission
 from gmmtorch.team.exploration.mission.options import TeamOptions
@@ -33,20 +28,15 @@ from gmmtorch.team.exploration.mission.trials import assemble
 from gmmtorch.team.exploration.world.world import World, open_world
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--size", type=float, nargs=3, default=(50.0, 40.0, 8.0))
-    parser.add_argument("--mesh", default=None)
-    parser.add_argument("--team", nargs="+", default=["gmm_shared", "grid_shared", "grid_isolated"])
-    parser.add_argument("--robots", type=int, default=3)
-    parser.add_argument("--duration", type=float, default=120.0)
-    options = parser.parse_args()
+def measure(options: Any) -> Iterator[Row]:
     world = _world(options)  # now in the cache, so that no team's process has to work it out
-    print(f"{world.name}, {' x '.join(map(str, world.box.shape))} cells, {options.robots} robots", flush=True)
+    options.about = f"{world.name}, {' x '.join(map(str, world.box.shape))} cells, {options.robots} robots."
     del world
-    with ProcessPoolExecutor(1, get_context("spawn"), max_tasks_per_child=1) as fresh:
-        rows = [row for team in options.team for row in fresh.submit(_fly, options, team).result()]
-    print(format_table(rows, list(rows[0])))
+    for team in options.team:
+        rows = alone(_fly, options, team)
+        if "error" in rows:
+            raise SystemExit(f"{team}: {rows['error']}")
+        yield from rows["rows"]
 
 
 def _world(options: argparse.Namespace) -> World:
@@ -55,23 +45,22 @@ def _world(options: argparse.Namespace) -> World:
     return open_world("warehouse", size=tuple(options.size))
 
 
-def _fly(options: argparse.Namespace, team: str) -> list[dict[str, object]]:
+def _fly(options: argparse.Namespace, team: str) -> dict[str, list[Row]]:
     """The rows of a mission: its halves."""
-    torch.set_num_threads(1)
     about = TeamOptions(framework=team, size=options.robots, duration=options.duration)
     mission = assemble(_world(options), about, Stopwatch(time.process_time))
-    rows = []
+    rows: list[Row] = []
     for half in (1, 2):
-        before, memory = dict(mission.watch.seconds), _resident_bytes()
+        before, memory = dict(mission.watch.seconds), resident_bytes()
         begin, stop = time.process_time(), half * options.duration / 2
         while mission.elapsed < stop - 1e-9:
             mission.tick(mission.elapsed)
         row = _row(mission, half, before, time.process_time() - begin, options.duration / 2)
-        grown = _resident_bytes() - memory
+        grown = resident_bytes() - memory
         row["grown_mb"] = grown / 1e6
         row["kb_per_robot_second"] = grown / 1e3 / (len(mission.robots) * options.duration / 2)
         rows.append(row)
-    return rows
+    return {"rows": rows}
 
 
 def _row(
@@ -90,15 +79,18 @@ def _row(
     }
 
 
-def _resident_bytes() -> int:
-    """Memory of this process: now, or the most that it ever was."""
-    gc.collect()
-    statm = Path("/proc/self/statm")
-    if statm.exists():
-        return int(statm.read_text().split()[1]) * resource.getpagesize()
-    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return most if sys.platform == "darwin" else most * 1024
-
+FORMATS = dict.fromkeys(("rendering", "mapping", "scoring", "sharing", "planning", "all"), ".1f")
+FORMATS |= {"half": ".0f", "entropy_left": ".4f", "simulated_per_core_second": ".1f"}
+FORMATS |= {"grown_mb": ".0f", "kb_per_robot_second": ".0f"}
+CASE = Case("mission-seconds", measure, columns=FORMATS, key=2, needs_data=False)
 
 if __name__ == "__main__":
-    main()
+    run(
+        __doc__,
+        CASE,
+        size={"type": float, "nargs": 3, "default": (50.0, 40.0, 8.0)},
+        mesh={"default": None},
+        team={"nargs": "+", "default": ["gmm_shared", "grid_shared", "grid_isolated"]},
+        robots={"type": int, "default": 3},
+        duration={"type": float, "default": 120.0},
+    )

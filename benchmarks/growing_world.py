@@ -1,24 +1,24 @@
 """What a scan costs to learn as the world grows, and what a query after each scan costs.
 
-    python benchmarks/growing_world.py [--halls 1 4 16]
+    python benchmarks/growing_world.py --only growing-world [--halls 1 4 16]
     OMP_NUM_THREADS=1 python benchmarks/growing_world.py --data $GMMTORCH_DATA
 
-Without data, embedded halls side by side. With data, the scans of the folder `street`: after each one the map
-is asked about 500 points on its beams. Writes the table `growing-map` of BENCHMARKS.md.
+`growing-world` has embedded halls side by side. `growing-map` has the scans of the folder `street`: after
+each one the map is asked about 500 points on its beams.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
-from pathlib import Path
+from collections.abc import Iterator
+from typing import Any
 
 import torch
-from tables import hardware, markdown, publish
 
 from gmmtorch import GaussianMap, IncrementalRule, Scan, datasets
 from gmmtorch.datasets.base import Dataset
+from gmmtorch.experiments.harness import Case, Row, cpu_seconds, recording, run
 from gmmtorch.kernels import kernels
 from gmmtorch.mapping.map_builder import resident_bytes
 
@@ -40,9 +40,9 @@ def milliseconds(scans: list[Scan], n_halls: int, rule: IncrementalRule) -> tupl
     return 1e3 * (time.process_time() - begin) / (n_halls * len(scans)), built.n_components
 
 
-def asked_after_each_scan(scans: Dataset, choice: str) -> list[list[object]]:
-    """Rows of the table, for every sixth of the scans."""
-    built, rows, spent = GaussianMap(), [], []
+def asked_after_each_scan(scans: Dataset, choice: str) -> Iterator[Row]:
+    """A row for every sixth of the scans."""
+    built, spent = GaussianMap(), []
     generator = torch.Generator().manual_seed(0)
     before = resident_bytes()
     with kernels(choice):
@@ -58,51 +58,56 @@ def asked_after_each_scan(scans: Dataset, choice: str) -> list[list[object]]:
             spent.append((learned - begin, time.process_time() - learned))
             if number % -(-len(scans) // 6) == 0 or number == len(scans):
                 part = 1e3 * torch.tensor(spent)
-                memory = (resident_bytes() - before) / 1e6
-                worst = [f"{value:.0f}" for value in (*part.mean(0).tolist(), float(part[:, 1].max()))]
-                rows.append([choice, number, built.n_components, *worst, f"{memory:.0f}"])
+                learning, query = part.mean(0).tolist()
+                worst, memory = float(part[:, 1].max()), (resident_bytes() - before) / 1e6
+                yield choice, number, built.n_components, learning, query, worst, memory
                 spent = []
-    return rows
 
 
-def growing_map(data: Path) -> str:
-    scans = datasets.load("scan_folder", data / "street")
-    rows = [row for choice in ("fused", "torch") for row in asked_after_each_scan(scans, choice)]
+def growing_map(options: Any) -> Iterator[Row]:
+    scans = recording(options.data, "street")
+    for choice in ("fused", "torch"):
+        yield from asked_after_each_scan(scans, choice)
     built = GaussianMap()
     for scan in scans:
         built.insert(scan)
     built.finish()
     points = torch.cat([0.5 * (s.origin + s.points[:: len(s.points) // 88][:88]) for s in scans])[:20_000]
-    times = []
-    for _ in range(2):
-        begin = time.process_time()
-        built.occupancy(points)
-        times.append(f"{time.process_time() - begin:.2f}")
-    header = ["kernels", "scans", "components", "learning, ms a scan", "query, ms", "longest query, ms", "MB"]
-    about = f"First query of {len(points):,} points over the whole map: {times[0]} s; again: {times[1]} s."
-    return f"{hardware()}\n\n{markdown(header, rows)}\n\n{about}"
+    first, again = (cpu_seconds(lambda: built.occupancy(points))[0] for _ in range(2))
+    options.about = (
+        f"First query of {len(points):,} points over the whole map: {first:.2f} s; again: {again:.2f} s."
+    )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--halls", type=int, nargs="+", default=[1, 4, 16], help="square numbers")
-    parser.add_argument("--data", type=Path, help="folder with the folder street")
-    options = parser.parse_args()
-    halls = options.halls
-    torch.set_num_threads(1)
-    if options.data:
-        publish("growing-map", growing_map(options.data))
-        return
+def growing_world(options: Any) -> Iterator[Row]:
     scans = list(datasets.load("synthetic_building", n_scans=N_SCANS))
     milliseconds(scans, 1, IncrementalRule())  # what is loaded but once
-    rows = []
-    for n_halls in halls:
+    for n_halls in options.halls:
         free, n_components = milliseconds(scans, n_halls, IncrementalRule())
         held, _ = milliseconds(scans, n_halls, IncrementalRule(n_components=PER_HALL * n_halls))
-        rows.append([n_halls, n_components, f"{free:.0f}", f"{held:.0f}"])
-    header = ["halls", "components", "no budget, ms a scan", f"{PER_HALL} components a hall, ms a scan"]
-    print(f"{hardware()}\n\n{markdown(header, rows)}")
+        yield n_halls, n_components, free, held
 
+
+COSTS = {"halls": ".0f", "components": ",.0f", "no budget": ".0f", f"{PER_HALL:,} components a hall": ".0f"}
+SPENT = ("scans", "components", "learning, ms a scan", "query, ms", "longest query, ms", "MB")
+CASES = (
+    Case(
+        "growing-world",
+        growing_world,
+        f"Copies of the embedded hall side by side, {N_SCANS} scans of 5,120 beams each, CPU ms a scan.",
+        COSTS,
+        needs_data=False,
+    ),
+    Case(
+        "growing-map",
+        growing_map,
+        "A street of 410 m, 228 scans of 19,000 points each. Each row is the mean of the scans since the row "
+        "before. MB are the memory of the process above that before the first scan.",
+        {"kernels": "", **dict.fromkeys(SPENT, ".0f")},
+        key=2,
+    ),
+)
 
 if __name__ == "__main__":
-    main()
+    halls = {"type": int, "nargs": "+", "default": [1, 4, 16], "help": "square numbers"}
+    run(__doc__, *CASES, halls=halls)

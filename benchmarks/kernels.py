@@ -1,31 +1,31 @@
 """Fused kernels against their twins in tensor operations, in the same run; and the operations of each.
 
     python benchmarks/kernels.py --data $GMMTORCH_DATA [--threads 1] [--device cuda]
-    python benchmarks/kernels.py --data $GMMTORCH_DATA --against FOLDER_OF_ANOTHER_VERSION
+    python benchmarks/kernels.py --data $GMMTORCH_DATA --only against --against FOLDER_OF_ANOTHER_VERSION
+    python benchmarks/kernels.py --data $GMMTORCH_DATA --only devices --device cuda --threads 16
 
-Writes the tables `kernels` and `operations` of BENCHMARKS.md, on a GPU the table `kernels-gpu`, or with
---against the table `against`: the work of `public_work.py` by both versions in turn, on one thread. A time is
-the least of several runs.
+`against` has the work of `public_work.py` by both versions in turn, on one thread; `devices` has it on a CPU
+and on a GPU. A time is the least of several runs.
 """
 
 from __future__ import annotations
 
-import argparse
+import itertools
 import json
 import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import torch
-from public_work import counted, least_seconds
-from tables import ROOT, hardware, markdown, publish, three_digits
-from threadpoolctl import threadpool_limits
+from public_work import counted, large_works, prepare, works
 from torch import Tensor
 
-from gmmtorch import GaussianMap, datasets
+from gmmtorch import GaussianMap
 from gmmtorch.experiments.evaluation.queries import hit_and_free, test_beams
+from gmmtorch.experiments.harness import Case, Row, least_seconds, recording, run
 from gmmtorch.kernels import kernels
 from gmmtorch.kernels.mixtures.em_steps import expectation
 from gmmtorch.kernels.rays.ray_traversal import traverse
@@ -78,8 +78,7 @@ def map_and_points(
     data: Path, name: str, n_bytes: int, resolution: float, n_points: int, device: str
 ) -> tuple[Cones, Tensor]:
     """Cones of a map of four scans of five, and half hits, half free points of the others."""
-    options = {"pixel_stride": 4} if name == "depth_frames" else {}
-    scans = list(datasets.load(name, data, **options))
+    scans = list(recording(data, name, **({"pixel_stride": 4} if name == "kinect" else {})))
     built = GaussianMap(learning=IncrementalRule(max_bytes=n_bytes))
     for number, scan in enumerate(scans):
         if number % 5:
@@ -91,12 +90,9 @@ def map_and_points(
 
 
 def map_work(data: Path, n_points: int, device: str) -> Iterator[Work]:
-    places = (
-        ("kinect, 8 kB", "kinect", "depth_frames", 8000, 0.05),
-        ("hall, 26 kB", "hall", "scan_folder", 26000, 0.2),
-    )
-    for label, folder, name, n_bytes, resolution in places:
-        cones, points = map_and_points(data / folder, name, n_bytes, resolution, n_points, device)
+    for name, n_bytes, resolution in (("kinect", 8000, 0.05), ("hall", 26000, 0.2)):
+        label = f"{name}, {n_bytes // 1000} kB"
+        cones, points = map_and_points(data, name, n_bytes, resolution, n_points, device)
         form = PointForm(cones, resolution, 3.0)
 
         def ask_first(cones: Cones = cones, h: float = resolution, points: Tensor = points) -> object:
@@ -108,7 +104,7 @@ def map_work(data: Path, n_points: int, device: str) -> Iterator[Work]:
         size = f"{label}, {len(cones.counts)} cones"
         yield f"point queries, {size}, cutoff 3", ask, len(points) / 1e6, "M points/s"
         yield f"the first of these queries, {size}", ask_first, 0, "s"
-        if folder == "kinect":
+        if name == "kinect":
             low, high = (points.quantile(q, 0, interpolation="nearest") for q in (0.01, 0.99))
             grid = VoxelGrid.covering(low, high, 0.05)
 
@@ -142,78 +138,116 @@ def small_work(device: str) -> Iterator[tuple[str, Callable[[], object]]]:
     yield "flux on 36,000 cells", lambda: flux_evidence(cones, room, 3.0)
 
 
-def operations_table(device: str) -> str:
-    rows = []
-    for name, function in small_work(device):
-        cells = []
+def fused(options: Any) -> Iterator[Row]:
+    """Each work with both choices of kernels, of which the least time counts."""
+    options.about = f"{options.rays:,} rays."
+    listed = itertools.chain(
+        ray_work(options.rays, options.device), map_work(options.data, options.points, options.device)
+    )
+    for name, function, size, unit in listed:
+        seconds = []
         for choice in ("torch", "fused"):
             with kernels(choice):
-                cells.append("{:,} ({:,})".format(*counted(function)))
-        rows.append([name, *cells])
-    return markdown(["work", "tensor operations", "fused"], rows)
+                seconds.append(least_seconds(function, options.repeats, options.device))
+        slow, fast = (size / each if size else each for each in seconds)
+        yield name, unit, slow, fast, seconds[0] / seconds[1]
 
 
-def against(other: Path, data: Path, repeats: int) -> str:
-    """The table of the work of another version, in a folder, and of this one; processor seconds."""
-    found: dict[str, dict[str, list[float]]] = {}
-    for _ in range(repeats):  # in turn, because the load of a shared machine changes
-        for folder in (other, ROOT):
-            command = [sys.executable, str(ROOT / "benchmarks/public_work.py"), "--data", str(data)]
+def operations(options: Any) -> Iterator[Row]:
+    for name, function in small_work(options.device):
+        counts = []
+        for choice in ("torch", "fused"):
+            with kernels(choice):
+                function()
+                counts.append("{:,} ({:,})".format(*counted(function)))
+        yield name, *counts
+
+
+def against(options: Any) -> Iterator[Row]:
+    """The work of another version, in a folder, and of this one; processor seconds."""
+    if options.against is None:
+        return
+    found: dict[str, dict[Path, list[float]]] = {}
+    this, other = Path(__file__).resolve().parent.parent, options.against.resolve()
+    for _ in range(options.repeats):  # in turn, because the load of a shared machine changes
+        for folder in (other, this):
+            command = [sys.executable, str(this / "benchmarks/public_work.py"), "--data", str(options.data)]
             environment = {**os.environ, "PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1"}
             done = subprocess.run(command, cwd=folder, env=environment, check=True, stdout=subprocess.PIPE)
             for name, result in json.loads(done.stdout.splitlines()[-1]).items():
-                best = found.setdefault(name, {}).setdefault(str(folder), result)
+                best = found.setdefault(name, {}).setdefault(folder, result)
                 best[0] = min(best[0], result[0])
-    rows = []
     for name, by_folder in found.items():
-        before, after = by_folder[str(other)], by_folder[str(ROOT)]
-        counts = [f"{int(result[1]):,} ({int(result[2]):,})" for result in (before, after)]
-        rows.append([name, f"{before[0]:.3g}", f"{after[0]:.3g}", f"{before[0] / after[0]:.1f}", *counts])
-    return markdown(["work", "s before", "s now", "times faster", "operations before", "now"], rows)
+        (before, *were), (after, *are) = by_folder[other], by_folder[this]
+        counts = ("{:,.0f} ({:,.0f})".format(*each) for each in (were, are))
+        yield name, before, after, before / after, *counts
 
 
-def compared(work: Work, repeats: int, device: str) -> list[str]:
-    name, function, size, unit = work
-    seconds = []
-    for choice in ("torch", "fused"):
-        with kernels(choice):
-            seconds.append(least_seconds(function, repeats, device))
-    shown = [three_digits(size / s if size else s) for s in seconds]
-    return [name, unit, *shown, three_digits(seconds[0] / seconds[1])]
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, help="folder of real scans, for the rows about maps")
-    parser.add_argument("--against", type=Path, help="folder of another version, such as a git worktree")
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--rays", type=int, default=1_000_000)
-    parser.add_argument("--points", type=int, default=200_000)
-    parser.add_argument("--repeats", type=int, default=3)
-    options = parser.parse_args()
-    torch.set_num_threads(options.threads)
-    if options.against:
-        if not options.data:
-            parser.error("--against needs --data")
-        table = against(options.against.resolve(), options.data.resolve(), options.repeats)
-        publish("against", f"{hardware()}\n\n{table}")
+def devices(options: Any) -> Iterator[Row]:
+    """The work of `public_work.py` on the CPU and on the GPU."""
+    if options.device == "cpu":
         return
-    with threadpool_limits(options.threads):
-        rows = [
-            compared(work, options.repeats, options.device) for work in ray_work(options.rays, options.device)
-        ]
-        if options.data:
-            work_on_maps = map_work(options.data, options.points, options.device)
-            rows += [compared(work, options.repeats, options.device) for work in work_on_maps]
-        header = ["work", "", "tensor operations", "fused", "times faster"]
-        facts = f"{options.rays:,} rays. {hardware(options.device)}"
-        publish(
-            "kernels" if options.device == "cpu" else "kernels-gpu", f"{facts}\n\n{markdown(header, rows)}"
-        )
-        if options.device == "cpu":
-            publish("operations", operations_table(options.device))
+    prepare(options.data)
+    both = ("cpu", options.device)
+    listed = {device: {**works(options.data, device), **large_works(options.data, device)} for device in both}
+    for name in listed["cpu"]:
+        if options.works and not any(part in name for part in options.works):
+            continue
+        seconds, counts = [], (0, 0)
+        for device in both:
+            work = listed[device][name]()
+            counts = counted(work)  # and what is compiled or loaded once
+            seconds.append(least_seconds(work, options.repeats, device))
+        yield name, *seconds, seconds[0] / seconds[1], "{:,} ({:,})".format(*counts)
 
+
+CASES = (
+    Case(
+        "kernels{gpu}",
+        fused,
+        columns={"work": "", "": "", "tensor operations": "3", "fused": "3", "times faster": "3"},
+    ),
+    Case(
+        "operations{gpu}",
+        operations,
+        "Tensor operations and kernel launches. In parentheses: those that wait for the device.",
+        {"work": "", "tensor operations": "", "fused": ""},
+        needs_data=False,
+    ),
+    Case(
+        "against",
+        against,
+        "CPU seconds of another version and of this one.",
+        {
+            "work": "",
+            "s before": "3",
+            "s now": "3",
+            "times faster": ".1f",
+            "operations before": "",
+            "now": "",
+        },
+    ),
+    Case(
+        "devices",
+        devices,
+        "In parentheses: operations that wait for the device.",
+        {
+            "work": "",
+            "s on the CPU": "3",
+            "s on the GPU": "3",
+            "times faster": "3",
+            "operations (waits)": "",
+        },
+    ),
+)
 
 if __name__ == "__main__":
-    main()
+    run(
+        __doc__,
+        *CASES,
+        against={"type": Path, "help": "folder of another version, such as a git worktree"},
+        rays={"type": int, "default": 1_000_000},
+        points={"type": int, "default": 200_000},
+        repeats={"type": int, "default": 3},
+        works={"nargs": "*", "help": "of the devices: parts of names"},
+    )

@@ -1,58 +1,70 @@
 """Learning a mixture, beside scikit-learn, tgmm and torchgmm: seconds at equal quality.
 
     pip install 'gmmtorch[benchmarks]'
-    python benchmarks/learning.py --data FOLDER [--threads 1] [--only CASE …] [--methods METHOD …]
+    python benchmarks/learning.py --data FOLDER [--threads 1] [--names CLOUD …] [--methods METHOD …]
+    python benchmarks/learning.py --only em ten-million
 
-FOLDER holds hall/ and kinect/. All methods see the same clouds, drawn with other seeds than the
-warm-up's. Every run is kept in outputs/learning-THREADS.jsonl; the table written into BENCHMARKS.md has
-the last of each case and method there, so that parts can be run again.
+FOLDER holds hall/ and kinect/. All methods see the same clouds, drawn with other seeds than the warm-up's.
+`em` has one iteration of EM. `ten-million` has ten million points and ten thousand components.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import logging
-import multiprocessing
 import resource
 import statistics
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import sklearn.mixture
 import torch
-from speed import noisy_room
-from tables import OUTPUTS, hardware, markdown, publish
-from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-from gmmtorch import GaussianMixture, HierarchicalGaussianMixture, datasets
+from gmmtorch import GaussianMixture, HierarchicalGaussianMixture
 from gmmtorch.experiments.evaluation.metrics import psnr2
+from gmmtorch.experiments.harness import Case, Row, alone, clock, cpu_seconds, least_seconds, recording, run
+from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em import loop
 
 REG_COVAR = 1e-5
 TIME_LIMIT = 240  # seconds of the processor, for one run
 
 
-class Case(NamedTuple):
-    """K components for a cloud (of a seed), and how it is asked of ours: options, repeats."""
+class Cloud(NamedTuple):
+    """K components for a cloud, and the tolerance of ours.
+
+    drawn: (folder, seed) → train, held out, and a fresh sample if there is one.
+    """
 
     n_components: int
-    cloud: Callable[[int], tuple[Tensor, Tensor, Tensor | None]]  # → train, held out, fresh
+    drawn: Callable[[Path, int], tuple[Tensor, Tensor, Tensor | None]]
     tol: float
-    peers: tuple[str, ...]
+    peers: tuple[str, ...] = ("scikit-learn", "tgmm", "torchgmm")
 
 
-def room(n: int) -> Callable[[int], tuple[Tensor, Tensor, Tensor | None]]:
-    return lambda seed: (noisy_room(n, seed), noisy_room(20_000, 1000 + seed), noisy_room(n, 2000 + seed))
+def noisy_room(n: int, seed: int) -> Tensor:
+    """Points (n, 3) on the walls, floor and ceiling of an 8 × 6 × 3 m room, with 1 cm noise."""
+    generator = torch.Generator().manual_seed(seed)
+    size = torch.tensor([8.0, 6.0, 3.0], dtype=torch.float64)
+    points = torch.rand(n, 3, generator=generator, dtype=torch.float64) * size
+    axis = torch.multinomial(torch.tensor([18.0, 24.0, 48.0]), n, True, generator=generator)
+    side = torch.randint(2, (n,), generator=generator)
+    points[torch.arange(n), axis] = side * size[axis]
+    return points + 0.01 * torch.randn(n, 3, generator=generator, dtype=torch.float64)
 
 
-def scan(name: str, folder: Path, stride: int = 1) -> Callable[[int], tuple[Tensor, Tensor, Tensor | None]]:
+def room(n: int) -> Callable[[Path, int], tuple[Tensor, Tensor, Tensor | None]]:
+    return lambda _, seed: (noisy_room(n, seed), noisy_room(20_000, 1000 + seed), noisy_room(n, 2000 + seed))
+
+
+def scan(name: str, stride: int = 1) -> Callable[[Path, int], tuple[Tensor, Tensor, Tensor | None]]:
     """Scan number `seed` of a data set; every tenth of its points is held out."""
 
-    def cloud(seed: int) -> tuple[Tensor, Tensor, Tensor | None]:
-        points = datasets.load(name, folder)[seed % 40].points[::stride].double()
+    def cloud(folder: Path, seed: int) -> tuple[Tensor, Tensor, Tensor | None]:
+        points = recording(folder, name)[seed % 40].points[::stride].double()
         shuffled = points[torch.randperm(len(points), generator=torch.Generator().manual_seed(seed))]
         n_test = len(points) // 10
         return shuffled[n_test:], shuffled[:n_test], None
@@ -91,9 +103,8 @@ def ours_tree(points: Tensor, k: int, tol: float) -> Learned:
 
 
 def scikit_learn(points: Tensor, k: int, tol: float) -> Learned:
-    from sklearn.mixture import GaussianMixture as Peer
-
-    peer = Peer(k, tol=1e-3, reg_covar=REG_COVAR, random_state=0).fit(points.numpy())
+    options: dict[str, Any] = {"tol": 1e-3, "reg_covar": REG_COVAR, "random_state": 0}
+    peer = sklearn.mixture.GaussianMixture(k, **options).fit(points.numpy())
     weights, means, covariances = (
         torch.from_numpy(x) for x in (peer.weights_, peer.means_, peer.covariances_)
     )
@@ -149,16 +160,25 @@ METHODS = {
 }
 
 
-def measured(name: str, case: Case, seed: int, warm: int) -> dict[str, Any]:
+CLOUDS = {
+    "room, 20k points, K = 1000": Cloud(1000, room(20_000), 5e-3),
+    "room, 100k points, K = 64": Cloud(64, room(100_000), 1.5e-3),
+    "room, 100k points, K = 1000": Cloud(1000, room(100_000), 2e-3, ()),
+    "a hall scan, K = 256": Cloud(256, scan("hall"), 2e-3),
+    "a kinect frame, K = 50": Cloud(50, scan("kinect", 3), 2e-3),
+}
+SEED, WARM = 11, 500  # of the first cloud; from a cloud's to its warm-up's
+
+
+def measured(name: str, cloud_name: str, folder: Path, seed: int) -> dict[str, Any]:
     """One run of a method: seconds, and how good its mixture is."""
-    method, k = METHODS[name], case.n_components
-    train, held_out, _ = case.cloud(seed)
+    warnings.simplefilter("ignore")
+    method, cloud = METHODS[name], CLOUDS[cloud_name]
+    train, held_out, _ = cloud.drawn(folder, seed)
     if name.startswith("gmmtorch"):
-        method(case.cloud(warm)[0], k, case.tol)
-    # Other programs on the machine do not add to the processor's seconds of one thread.
-    clock = time.process_time if torch.get_num_threads() == 1 else time.perf_counter
+        method(cloud.drawn(folder, seed + WARM)[0], cloud.n_components, cloud.tol)
     begin = clock()
-    found = method(train, k, case.tol)
+    found = method(train, cloud.n_components, cloud.tol)
     seconds = clock() - begin
     weights = found.weights.double() / found.weights.double().sum()
     mixture = GaussianMixture.from_parameters(weights, found.means, found.covariances, random_state=0)
@@ -172,112 +192,139 @@ def measured(name: str, case: Case, seed: int, warm: int) -> dict[str, Any]:
     }
 
 
-def _child(name: str, case_name: str, folder: str, seed: int, warm: int, threads: int, pipe: Any) -> None:
-    warnings.simplefilter("ignore")
-    resource.setrlimit(resource.RLIMIT_CPU, (threads * TIME_LIMIT, threads * TIME_LIMIT))
-    torch.set_num_threads(threads)
-    with threadpool_limits(threads):
-        try:
-            pipe.send(measured(name, cases(Path(folder))[case_name], seed, warm))
-        except Exception as error:  # a peer's failure is a result, and is published
-            pipe.send({"error": f"{type(error).__name__}: {str(error).splitlines()[0][:60]}"})
-
-
-def in_process(name: str, case_name: str, folder: Path, seed: int, threads: int) -> dict[str, Any]:
-    """The same in a process of its own, which is stopped at the time limit."""
-    context = multiprocessing.get_context("spawn")
-    here, there = context.Pipe()
-    arguments = (name, case_name, str(folder), seed, seed + 500, threads, there)
-    process = context.Process(target=_child, args=arguments)
-    process.start()
-    there.close()
-    try:
-        found = here.recv()
-    except EOFError:  # the system has ended it
-        found = {"error": f"over {TIME_LIMIT} s"}
-    process.join()
-    return dict(found)
-
-
-def cases(folder: Path) -> dict[str, Case]:
-    every = ("scikit-learn", "tgmm", "torchgmm")
-    return {
-        "room, 20k points, K = 1000": Case(1000, room(20_000), 5e-3, every),
-        "room, 100k points, K = 64": Case(64, room(100_000), 1.5e-3, every),
-        "room, 100k points, K = 1000": Case(1000, room(100_000), 2e-3, ()),
-        "a hall scan, K = 256": Case(256, scan("scan_folder", folder / "hall"), 2e-3, every),
-        "a kinect frame, K = 50": Case(50, scan("depth_frames", folder / "kinect", 3), 2e-3, every),
-    }
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--only", nargs="*", help="cases whose names contain one of these")
-    parser.add_argument("--repeats", type=int, default=3, help="clouds for ours; peers see the first")
-    parser.add_argument("--methods", nargs="*", help="methods of these names only")
-    options = parser.parse_args()
-    torch.set_num_threads(options.threads)
-    log = OUTPUTS / f"learning-{options.threads}.jsonl"
-    every = cases(options.data)
-    seed = 11
-    for case_name, case in every.items():
-        if options.only and not any(part in case_name for part in options.only):
-            continue
-        for name in METHODS:
-            is_peer = not name.startswith("gmmtorch")
-            if (is_peer and name not in case.peers) or (options.methods and name not in options.methods):
+def measure(options: Any) -> Iterator[Row]:
+    """Seconds of ours are medians over clouds; quality is on the first cloud, which all methods see."""
+    for cloud_name in options.names:
+        cloud, reference = CLOUDS[cloud_name], None
+        for name in sorted(options.methods, key=lambda name: name != "scikit-learn"):
+            if not name.startswith("gmmtorch") and name not in cloud.peers:
                 continue
             repeats = options.repeats if name in ("gmmtorch", "gmmtorch, hierarchical") else 1
             runs = [
-                in_process(name, case_name, options.data, seed + i, options.threads) for i in range(repeats)
+                alone(measured, name, cloud_name, options.data, SEED + i, limit=TIME_LIMIT)
+                for i in range(repeats)
             ]
-            print(case_name, name, runs, flush=True)
-            with log.open("a") as file:
-                file.write(json.dumps({"case": case_name, "method": name, "runs": runs}) + "\n")
-    kept = {}
-    for line in log.read_text().splitlines():
-        entry = json.loads(line)
-        kept[entry["case"], entry["method"]] = entry["runs"]
-    rows = []
-    for case_name, case in every.items():
-        runs_of = {name: kept[case_name, name] for name in METHODS if (case_name, name) in kept}
-        rows += table(case_name, runs_of)
-        train, _, fresh = case.cloud(seed)
-        if fresh is not None and runs_of:
-            ceiling = f"{psnr2(train, fresh):.1f}"
-            rows.append([case_name, "(a fresh sample of the room)", "", "", "", "", "", ceiling])
-    header = ["", "method", "seconds", "times faster", "iterations, tol", "K", "held-out nats", "PSNR2 dB"]
-    mark = f"learning-{options.threads}"
-    publish(mark, f"{hardware()}\n\n{markdown(header, rows)}")
+            if "error" in runs[0]:
+                yield {"": cloud_name, "method": name, "seconds": runs[0]["error"]}
+                continue
+            first, seconds = runs[0], statistics.median(run["seconds"] for run in runs)
+            reference = seconds if name == "scikit-learn" else reference
+            yield {
+                "": cloud_name,
+                "method": name,
+                "seconds": seconds,
+                "times faster": reference / seconds if reference and seconds < reference else None,
+                "iterations, tol": f"{first['iterations']}, {first['tol']}",
+                "K": first["k"],
+                "held-out nats": first["held_out"],
+                "PSNR2 dB": first["psnr2"],
+            }
+        train, _, fresh = cloud.drawn(options.data, SEED)
+        if fresh is not None:
+            row = {"": cloud_name, "method": "(a fresh sample of the room)"}
+            yield {**row, "PSNR2 dB": f"{psnr2(train, fresh):.1f}"}
 
 
-def table(case_name: str, runs: dict[str, list[dict[str, Any]]]) -> list[list[str]]:
-    """A row for each method: seconds are medians, quality is on the first cloud, which all methods saw."""
-    reference = runs.get("scikit-learn", [{}])[0].get("seconds")
-    rows = []
-    for name, found in runs.items():
-        if "error" in found[0]:
-            rows.append([case_name, name, found[0]["error"], "", "", "", "", ""])
-            continue
-        first = found[0]
-        seconds = statistics.median(run["seconds"] for run in found)
-        ratio = f"{reference / seconds:.0f}" if reference and seconds < reference else ""
-        rows.append(
-            [
-                case_name,
-                name,
-                f"{seconds:.2f}",
-                ratio,
-                f"{first['iterations']}, {first['tol']}",
-                f"{first['k']}",
-                f"{first['held_out']:.4f}",
-                f"{first['psnr2']:.2f}",
-            ]
+def em_iteration(options: Any) -> Iterator[Row]:
+    """Seconds an iteration, from the same start, over the same number of iterations."""
+    n, k, iterations, repeats = 100_000, 100, 10, 5
+    points = noisy_room(n, seed=1)
+    means = points[torch.randperm(n, generator=torch.Generator().manual_seed(2))[:k]]
+    covariances = 0.25 * torch.eye(3, dtype=torch.float64).expand(k, 3, 3)
+    weights = torch.full((k,), 1 / k, dtype=torch.float64)
+
+    def ours(dtype: torch.dtype) -> tuple[float, float]:
+        center = points.mean(0)
+        step = loop.natural_step(em.quadratic_features(points - center), torch.ones(n).double(), 1e-6, dtype)
+        state = em.Parameters(weights, means - center, covariances)
+        begin = time.perf_counter()
+        found = loop.run_em(step, state, tol=0, max_iter=iterations)
+        return (time.perf_counter() - begin) / iterations, found.lower_bounds[-1]
+
+    def theirs() -> tuple[float, float]:
+        def run(max_iter: int) -> tuple[float, sklearn.mixture.GaussianMixture]:
+            peer = sklearn.mixture.GaussianMixture(
+                k,
+                tol=0,
+                max_iter=max_iter,
+                weights_init=weights.numpy(),
+                means_init=means.numpy(),
+                precisions_init=torch.linalg.inv(covariances).numpy(),
+                init_params="random_from_data",
+                random_state=0,
+            )
+            return least_seconds(lambda: peer.fit(points.numpy()), 1), peer
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            short, long = run(1)[0], run(iterations + 1)[0]
+            bound = run(iterations)[1].lower_bounds_[-1]
+        # What is not iteration (start, last E-step) is in both, and drops out.
+        return (long - short) / iterations, float(bound)
+
+    # Turn about, so that a change of the machine's speed meets all alike.
+    runs = [(ours(torch.float32), ours(torch.float64), theirs()) for _ in range(repeats)]
+    for index, name in enumerate(("gmmtorch, float32 exponentials", "gmmtorch, float64", "scikit-learn")):
+        times = [1e3 * run[index][0] for run in runs]
+        spent = f"{statistics.median(times):.0f} ({min(times):.0f}–{max(times):.0f})"
+        ratio = statistics.median(run[2][0] / run[index][0] for run in runs)
+        yield name, spent, ratio, runs[0][index][1]
+
+
+def ten_million(options: Any) -> Iterator[Row]:
+    """Fits that end on the points, and on cells."""
+    parts = [noisy_room(1_000_000, seed).float() for seed in range(-(-options.points // 1_000_000))]
+    points = torch.cat(parts)[: options.points]
+    del parts
+    held_out = noisy_room(20_000, 12345)
+    options.about = f"{len(points):,} points, K = {options.components:,}."
+    for name, max_cells in (("points", None), ("cells only", options.points // 16)):
+        mixture = GaussianMixture(
+            options.components, tol=2e-3, reg_covar=1e-5, max_cells=max_cells, random_state=0
         )
-    return rows
+        seconds, _ = cpu_seconds(lambda mixture=mixture: mixture.fit(points))
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+        yield name, seconds, mixture.n_iter_, peak, mixture.score(held_out)
 
+
+SCORES = {"held-out nats": ".4f", "PSNR2 dB": ".2f"}
+PEAK = {"peak memory of the process": "{:.1f} GiB", "held-out nats": ".4f"}
+CASES = (
+    Case(
+        "learning-{threads}",
+        measure,
+        "",
+        {"seconds": ".2f", "times faster": ".0f", "K": ".0f", **SCORES},
+        tuple(CLOUDS),
+        tuple(METHODS),
+        key=2,
+    ),
+    Case(
+        "em",
+        em_iteration,
+        "100,000 points on the surfaces of a room, 1 cm noise, 100 components; ten iterations from the same "
+        "parameters.",
+        {
+            "": "",
+            "ms an iteration, median (range)": "",
+            "times faster": ".1f",
+            "mean log-likelihood": ".6f",
+        },
+        needs_data=False,
+    ),
+    Case(
+        "ten-million",
+        ten_million,
+        columns={"EM ends on": "", "CPU s": ".0f", "iterations": ".0f", **PEAK},
+        needs_data=False,
+    ),
+)
 
 if __name__ == "__main__":
-    main()
+    run(
+        __doc__,
+        *CASES,
+        repeats={"type": int, "default": 3, "help": "clouds for ours; peers see the first"},
+        points={"type": int, "default": 10_000_000, "help": "of ten-million"},
+        components={"type": int, "default": 10_000, "help": "of ten-million"},
+    )

@@ -7,9 +7,13 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import torch
+
+from gmmtorch.experiments.harness import Case, Row, cpu_seconds, run
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
@@ -39,20 +43,22 @@ def pictures(view: LiveView, shown: GaussianMap) -> tuple[int, float]:
     return n_bytes, seconds
 
 
-def main() -> None:
-    torch.set_num_threads(1)
-    generator = torch.Generator().manual_seed(0)
-    view = LiveView(port=8460)
-    begin = time.process_time()
+def offer(view: LiveView) -> None:
     for _ in range(_OFFERS):
         view.offer(lambda: Moment(GaussianMap()))
-    print(f"an offer without a browser: {1e6 * (time.process_time() - begin) / _OFFERS:.2f} us")
+
+
+def measure(options: Any) -> Iterator[Row]:
+    generator = torch.Generator().manual_seed(0)
+    view = LiveView(port=8460)
+    seconds, _ = cpu_seconds(lambda: offer(view))
+    options.about = f"An offer without a browser takes {1e6 * seconds / _OFFERS:.2f} µs."
     for n in (300, 1000, 3000, 10_000):
         means = torch.rand(n, 3, generator=generator, dtype=torch.float64) * torch.tensor([20.0, 15.0, 3.0])
         axes = torch.randn(n, 3, 3, generator=generator, dtype=torch.float64) * 0.08
         shown = GaussianMap.of(_components(means, axes @ axes.mT + 1e-4 * torch.eye(3)))
         n_bytes, seconds = pictures(view, shown)
-        print(f"{n:6,} components: {n_bytes / 1e3:6.0f} kB, {1e3 * seconds:5.0f} ms of the processor")
+        yield n, n_bytes / 1e3, 1e3 * seconds
     view.stop()
 
 
@@ -66,5 +72,8 @@ def _components(means: torch.Tensor, covariances: torch.Tensor) -> Components:
     )  # fmt: skip
 
 
+FORMATS = {"components": ",.0f", "to each browser": "{:.0f} kB", "processor, drawing": "{:.0f} ms"}
+CASE = Case("live-view", measure, "CPU time of all threads; one browser.", FORMATS, needs_data=False)
+
 if __name__ == "__main__":
-    main()
+    run(__doc__, CASE)

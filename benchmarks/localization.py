@@ -1,27 +1,25 @@
-"""Localises real scans in maps of the others, and in maps of other places. Writes the table of BENCHMARKS.md.
+"""Localises real scans in maps of the others, and in maps of other places.
 
     OMP_NUM_THREADS=1 python benchmarks/localization.py --data $GMMTORCH_DATA
 
 The folder holds hall/ and laser2d/ (intel, aces). Every fifth scan of the hall and every tenth of the logs is
-held out. One thread.
+held out.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
 import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
-from tables import hardware, markdown, publish
 from torch import Tensor
 
 import gmmtorch as gt
 from gmmtorch.datasets import Dataset
+from gmmtorch.experiments.harness import Case, Row, cpu_seconds, held_out, recording, run
 from gmmtorch.localization import Tracker
 from gmmtorch.pose import generators
 
@@ -29,15 +27,14 @@ _IN_ORDER = 300  # first scans of a log
 
 
 class Place(NamedTuple):
-    """A data set, every how many scans one is held out, and a map of the others."""
+    """A data set, and a map of the scans that are not held out."""
 
     scans: Dataset
-    every: int
     map: gt.GaussianMap
 
     def held_out(self) -> Iterator[tuple[Tensor, Tensor]]:
         """Points in the sensor frame, and the true pose, of the held-out scans."""
-        return (self.scan(number) for number in range(0, len(self.scans), self.every))
+        return (self.scan(number) for number in range(0, len(self.scans), held_out(self.scans)))
 
     def scan(self, number: int) -> tuple[Tensor, Tensor]:
         pose = self.scans.pose(number)
@@ -45,15 +42,15 @@ class Place(NamedTuple):
         return self.scans[number].transformed(torch.linalg.inv(pose)).points, pose
 
 
-def mapped(scans: Dataset, every: int, rule: gt.IncrementalRule) -> Place:
-    m = gt.GaussianMap(rule)
+def mapped(scans: Dataset, max_bytes: int | None = None) -> Place:
+    m, every = gt.GaussianMap(gt.IncrementalRule(max_bytes=max_bytes)), held_out(scans)
     for number, scan in enumerate(scans):
         if number % every:
             m.insert(scan)
     with tempfile.TemporaryDirectory() as folder:  # as a robot has it: rounded by the codec
         m.save(Path(folder) / "map.safetensors")
         m = gt.GaussianMap.load(Path(folder) / "map.safetensors")
-    return Place(scans, every, m)
+    return Place(scans, m)
 
 
 def moved(pose: Tensor, distance: float, angle: float, generator: torch.Generator) -> Tensor:
@@ -80,9 +77,8 @@ class Outcome(NamedTuple):
 
 
 def located(tracker: Tracker, points: Tensor, truth: Tensor) -> Outcome:
-    begin = time.process_time()
-    location = tracker.locate(points)
-    seconds, dim = time.process_time() - begin, len(truth) - 1
+    seconds, location = cpu_seconds(lambda: tracker.locate(points))
+    dim = len(truth) - 1
     turn = location.pose[:dim, :dim].T @ truth[:dim, :dim] - torch.eye(dim)
     error = location.pose[:dim, dim] - truth[:dim, dim]
     square = float(error @ torch.linalg.solve(location.covariance[:dim, :dim], error)) / dim
@@ -90,20 +86,20 @@ def located(tracker: Tracker, points: Tensor, truth: Tensor) -> Outcome:
     return Outcome(float(error.norm()), angle, location.found, seconds, square)
 
 
-def row(name: str, outcomes: list[Outcome]) -> dict[str, object]:
+def row(name: str, outcomes: list[Outcome]) -> Row:
     right = [o for o in outcomes if o.distance <= 0.1 and o.angle <= 1]
     middle = sorted(outcomes)[len(outcomes) // 2]
-    return {
-        "scans": name,
-        "n": len(outcomes),
-        "within 0.1 m, 1°": f"{len(right) / len(outcomes):.1%}",
-        "found": f"{sum(o.found for o in outcomes) / len(outcomes):.1%}",
-        "found, but over 0.1 m or 1°": sum(o.found and o not in right for o in outcomes),
-        "found, but over 0.5 m or 5°": sum(o.found and (o.distance > 0.5 or o.angle > 5) for o in outcomes),
-        "median error": f"{1e3 * middle.distance:.0f} mm",
-        "square": f"{sum(o.square for o in right) / max(len(right), 1):.2f}",
-        "scans/s": f"{len(outcomes) / sum(o.seconds for o in outcomes):.1f}",
-    }
+    return (
+        name,
+        len(outcomes),
+        100 * len(right) / len(outcomes),
+        100 * sum(o.found for o in outcomes) / len(outcomes),
+        sum(o.found and o not in right for o in outcomes),
+        sum(o.found and (o.distance > 0.5 or o.angle > 5) for o in outcomes),
+        1e3 * middle.distance,
+        sum(o.square for o in right) / max(len(right), 1),
+        len(outcomes) / sum(o.seconds for o in outcomes),
+    )
 
 
 def from_a_rough_pose(place: Place) -> list[Outcome]:
@@ -129,33 +125,30 @@ def one_after_the_other(place: Place) -> list[Outcome]:
     return [located(tracker, *place.scan(number)) for number in range(min(len(place.scans), _IN_ORDER))]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, required=True)
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-    hall = mapped(
-        gt.datasets.load("scan_folder", path=options.data / "hall"), 5, gt.IncrementalRule(max_bytes=8000)
-    )
-    intel, aces = (
-        mapped(
-            gt.datasets.load("carmen", path=options.data / f"laser2d/{name}.log.gz"), 10, gt.IncrementalRule()
-        )
-        for name in ("intel", "aces")
-    )
+def measure(options: Any) -> Iterator[Row]:
+    hall = mapped(recording(options.data, "hall"), 8000)
+    intel, aces = (mapped(recording(options.data, name)) for name in ("intel", "aces"))
     for place in (hall, intel):  # loads the kernels
         points, pose = place.scan(0)
         located(Tracker(place.map, pose), points, pose)
-    rows = []
     for name, place in (("hall", hall), ("intel", intel)):
-        rows.append(row(f"{name}, from 0.5 m and 10° off", from_a_rough_pose(place)))
-        rows.append(row(f"{name}, without a pose", without_a_pose(place, place.map, 20)))
-        rows.append(row(f"{name}, scans in order", one_after_the_other(place)))
-    rows.append(row("aces in the map of intel, without a pose", without_a_pose(aces, intel.map, 20)))
-    rows.append(row("intel in the map of aces, without a pose", without_a_pose(intel, aces.map, 20)))
-    table = markdown(list(rows[0]), [list(row.values()) for row in rows])
-    publish("localization", f"{table}\n\n{hardware()}")
+        yield row(f"{name}, from 0.5 m and 10° off", from_a_rough_pose(place))
+        yield row(f"{name}, without a pose", without_a_pose(place, place.map, 20))
+        yield row(f"{name}, scans in order", one_after_the_other(place))
+    yield row("aces in the map of intel, without a pose", without_a_pose(aces, intel.map, 20))
+    yield row("intel in the map of aces, without a pose", without_a_pose(intel, aces.map, 20))
 
+
+COLUMNS = {"scans": "", "n": ".0f", "within 0.1 m, 1°": "{:.1f}%", "found": "{:.1f}%"}
+COLUMNS |= {"found, but over 0.1 m or 1°": ".0f", "found, but over 0.5 m or 5°": ".0f"}
+COLUMNS |= {"median error": "{:.0f} mm", "square": ".2f", "scans/s": ".1f"}
+CASE = Case(
+    "localization",
+    measure,
+    "Square: the mean squared position error in standard deviations of the reported covariance, of the scans "
+    "within 0.1 m and 1°. Scans per second of CPU time.",
+    COLUMNS,
+)
 
 if __name__ == "__main__":
-    main()
+    run(__doc__, CASE)

@@ -4,23 +4,23 @@
 
 A camera with noise moves through the simulated building and a small warehouse. Accuracy: share of points on
 the mesh within 5 cm of the true surface. Completeness: share of the observed true surface within 5 cm of the
-mesh. Chamfer: the mean of both mean distances. Writes its table into BENCHMARKS.md.
+mesh. Chamfer: the mean of both mean distances.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 import open3d as o3d
 import torch
-from tables import hardware, markdown, publish
 from torch import Tensor
 
 from gmmtorch import GaussianMap
+from gmmtorch.experiments.harness import Case, Row, run
 from gmmtorch.export.mesh import surface_mesh
 from gmmtorch.simulation import (
     DepthCamera,
@@ -124,7 +124,7 @@ def distances(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np
     return scene.compute_distance(o3d.core.Tensor(points.astype(np.float32))).numpy()
 
 
-def scores(seen: Views, vertices: np.ndarray, faces: np.ndarray) -> list[str]:
+def scores(seen: Views, vertices: np.ndarray, faces: np.ndarray) -> tuple[float, float, float]:
     mesh = o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces.astype(np.int32))
     )
@@ -133,21 +133,12 @@ def scores(seen: Views, vertices: np.ndarray, faces: np.ndarray) -> list[str]:
     flat = seen.triangles.reshape(-1, 3).numpy()
     to_truth = distances(flat, np.arange(len(flat)).reshape(-1, 3), sampled)
     to_mesh = distances(vertices, faces, seen.surface)
-    return [
-        f"{100 * (to_truth < NEAR).mean():.1f} %",
-        f"{100 * (to_mesh < NEAR).mean():.1f} %",
-        f"{500 * (to_truth.mean() + to_mesh.mean()):.1f} mm",
-    ]
+    shares = (100 * float((each < NEAR).mean()) for each in (to_truth, to_mesh))
+    return *shares, 500 * float(to_truth.mean() + to_mesh.mean())
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--worlds", nargs="+", default=["building", "warehouse"])
-    parser.add_argument("--side", nargs="+", type=float, default=[0.05, 0.1])
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-    rows: list[list[object]] = []
-    for name in options.worlds:
+def measure(options: Any) -> Iterator[Row]:
+    for name in options.names:
         seen = views(name)
         begin = time.process_time()
         built = GaussianMap()
@@ -159,20 +150,29 @@ def main() -> None:
             for label, reconstruct in (("map", None), ("TSDF", tsdf), ("Poisson", poisson)):
                 begin = time.process_time()
                 if reconstruct is None:
-                    found = surface_mesh(components, side)
-                    vertices, faces = found.vertices.numpy(), found.faces.numpy()
-                    kept = f"{built.nbytes / 1000:,.0f} kB"
-                    seconds = f"{learning:.0f} + {time.process_time() - begin:.1f}"
+                    made = surface_mesh(components, side)
+                    vertices, faces = made.vertices.numpy(), made.faces.numpy()
                 else:
                     vertices, faces = reconstruct(seen, side)
-                    kept = f"{(12 * len(vertices) + 12 * len(faces)) / 1000:,.0f} kB"
-                    seconds = f"{time.process_time() - begin:.1f}"
-                cells = [name, f"{side:g} m", label, *scores(seen, vertices, faces)]
-                rows.append([*cells, f"{len(faces):,}", kept, seconds])
-                print(*rows[-1], flush=True)
-    header = ["world", "cells", "from", "accuracy", "completeness", "chamfer", "triangles", "bytes", "CPU s"]
-    publish("mesh", f"{hardware()}\n\n{markdown(header, rows)}")
+                seconds = time.process_time() - begin
+                n_bytes = 12 * len(vertices) + 12 * len(faces) if reconstruct else built.nbytes
+                spent = f"{seconds:.1f}" if reconstruct else f"{learning:.0f} + {seconds:.1f}"
+                found = scores(seen, vertices, faces)
+                yield name, f"{side:g} m", label, *found, len(faces), n_bytes / 1e3, spent
 
+
+COLUMNS = {"world": "", "cells": "", "from": "", "accuracy": "{:.1f} %", "completeness": "{:.1f} %"}
+COLUMNS |= {"chamfer": "{:.1f} mm", "triangles": ",.0f", "bytes": "{:,.0f} kB", "CPU s": ""}
+CASE = Case(
+    "mesh",
+    measure,
+    f"{N_FRAMES} noisy depth images of {CAMERA.width} × {CAMERA.height} pixels. Accuracy and completeness "
+    "within 5 cm; CPU s of the map: learning + making the mesh.",
+    COLUMNS,
+    ("building", "warehouse"),
+    key=3,
+    needs_data=False,
+)
 
 if __name__ == "__main__":
-    main()
+    run(__doc__, CASE, side={"nargs": "+", "type": float, "default": [0.05, 0.1]})

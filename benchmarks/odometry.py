@@ -1,42 +1,49 @@
-"""Poses estimated from scans alone, against true ones, beside KISS-ICP. Writes a table of BENCHMARKS.md.
+"""Poses estimated from scans alone, against true ones, beside KISS-ICP.
 
-    OMP_NUM_THREADS=1 python benchmarks/odometry.py --data FOLDER [--names hall] [--most 150] [--seeds 0 1]
+    python benchmarks/odometry.py --data FOLDER --only odometry [--names hall] [--most 150] [--seeds 0 1]
+    python benchmarks/odometry.py --data FOLDER --only live-loops --most 450
 
 FOLDER holds hall/, courtyard/, street/ and laser2d/. `--most` limits the scans of each. Each run moves all
 points by noise of 1 mm, because a step that is nearly ambiguous may change with it. The first run also scores
-the map of the scans with the given and with the estimated poses, as gmmtorch-occupancy does. Every run is a
-line of the file `--runs`, which may hold runs of other calls; the table has all of them. One thread.
+the map of the scans with the given and with the estimated poses, as gmmtorch-occupancy does.
+
+In `live-loops` scans go through odometry into a map, one by one, as in gmmtorch-ros with
+sensor.poses=mixture; loops are closed meanwhile, and the windows of the map are published to a replica.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import statistics
-import time
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
-from tables import OUTPUTS, hardware, markdown, publish
 
 import gmmtorch as gt
 from gmmtorch.datasets import Dataset
 from gmmtorch.experiments.evaluation.held_out import Protocol, evaluate
 from gmmtorch.experiments.evaluation.mapping_methods import choose, methods
+from gmmtorch.experiments.harness import Case, Row, cpu_seconds, held_out, recording, run
+from gmmtorch.localization import Odometry
 from gmmtorch.localization.odometry import METHODS, with_odometry
 from gmmtorch.localization.trajectory_errors import absolute_trajectory_error, relative_pose_error
+from gmmtorch.mapping.map_builder import WindowMotions
+from gmmtorch.team.sharing import Replica
+from gmmtorch.team.sharing.messages.datagrams import Kind, parse_datagram
+from gmmtorch.team.sharing.shared_map import SharedMap
+from gmmtorch.team.sharing.transport.simulated_network import Network
 
 NOISE = 1e-3  # metres of standard deviation that move every point of a run
 WRONG = 0.2  # metres of a step
-HELD_OUT = {"hall": 5, "courtyard": 5, "street": 5}  # every n-th scan; 10 of the others
 RESOLUTION = {2: 0.1, 3: 0.2}  # metres of a cell
 
 
-def opened(data: Path, name: str, most: int | None) -> Dataset:
-    log = data / f"laser2d/{name}.log.gz"
-    found = gt.datasets.load("carmen", log) if log.is_file() else gt.datasets.load("scan_folder", data / name)
+def first(most: int | None, data: Path, name: str) -> Dataset:
+    """The first scans of a recording."""
+    found = recording(data, name)
     if most is not None and most < len(found):
         found._count = lambda: most  # type: ignore[method-assign]
     return found
@@ -64,95 +71,159 @@ class Jittered(Dataset):
         return self._source.times
 
 
-def measured(scans: Dataset, method: str, seed: int, name: str) -> dict[str, object]:
+def measured(scans: Dataset, method: str, seed: int) -> dict[str, Any]:
     """The figures of one run."""
-    begin = time.process_time()
-    posed, trajectory = with_odometry(Jittered(scans, seed), method)
-    seconds = time.process_time() - begin
+    jittered = Jittered(scans, seed)
+    seconds, (posed, trajectory) = cpu_seconds(lambda: with_odometry(jittered, method))
     true = torch.stack([posed.own_pose(index) for index in range(len(posed))])
     steps, found = relative_pose_error(trajectory.poses, true).distances, trajectory.found
     is_wrong, is_lost = steps > WRONG, ~(found[1:] & found[:-1])
-    figures = {
-        "data": name,
-        "method": method,
-        "seed": seed,
-        "n_scans": len(posed),
-        "ate": absolute_trajectory_error(trajectory.poses, true).rmse,
+    return {
+        "ate": f"{absolute_trajectory_error(trajectory.poses, true).rmse:.2f}",
         "step": float(steps.median()),
-        "n_wrong": int(is_wrong.sum()),
-        "n_noticed": int((is_wrong & is_lost).sum()),
-        "n_lost": int((~found).sum()),
-        "n_closures": trajectory.n_closures,
-        "seconds": seconds,
+        "wrong": str(int(is_wrong.sum())),
+        "noticed": str(int((is_wrong & is_lost).sum())),
+        "lost": str(int((~found).sum())),
+        "closures": str(trajectory.n_closures),
+        "rate": len(posed) / seconds,
+        "posed": posed,
     }
-    if method == "mixture" and seed == 0:
-        figures["auc"] = [map_score(each, name) for each in (scans, posed)]
-    return figures
 
 
 def map_score(scans: Dataset, name: str) -> float:
     """AUC of the map of the scans that are not held out, without a budget of bytes."""
     resolution = RESOLUTION[scans[0].dim]
     factories = choose(("point",), methods(partial(gt.GaussianMap, cutoff=3.0)))
-    protocol = Protocol(HELD_OUT.get(name, 10), (1.0,), "beams", (resolution,), max_beams=50_000)
+    protocol = Protocol(held_out(scans), (1.0,), "beams", (resolution,), max_beams=50_000)
     return float(evaluate(name, list(scans), factories, protocol).rows[0]["auc"])
 
 
-def row(runs: list[dict]) -> dict[str, object]:
-    """The row of the table of one data set and method, of runs by seed."""
-    mixture = runs[0]["method"] == "mixture"
-    auc = next((run["auc"] for run in runs if "auc" in run), None)
+def measure(options: Any) -> Iterator[Row]:
+    """A row for each recording and method, of runs by seed."""
+    for name in options.names:
+        scans = first(options.most, options.data, name)
+        for method in options.methods:
+            runs = [measured(scans, method, seed) for seed in options.seeds]
+            each = {part: ", ".join(r[part] for r in runs) for part in ("ate", "wrong")}
+            if method == "mixture":
+                each |= {part: ", ".join(r[part] for r in runs) for part in ("noticed", "lost", "closures")}
+            row: dict[str, Any] = {
+                "data": name,
+                "scans": len(scans),
+                "odometry": method,
+                "ATE": each["ate"] + " m",
+                "median step error": 1e3 * statistics.median(r["step"] for r in runs),
+                f"steps off by over {WRONG} m": each["wrong"],
+                "of these, called lost": each.get("noticed"),
+                "lost scans": each.get("lost"),
+                "closures": each.get("closures"),
+                "scans/s": statistics.median(r["rate"] for r in runs),
+            }
+            if method == "mixture":
+                scores = [f"{map_score(which, name):.3f}" for which in (scans, runs[0]["posed"])]
+                row["AUC given → estimated poses"] = " → ".join(scores)
+            yield row
+
+
+class Robot:
+    """Odometry, a map and a replica, and the seconds that each part takes."""
+
+    def __init__(self) -> None:
+        self.odometry, self.map, self.windows = Odometry(), gt.GaussianMap(), WindowMotions()
+        self.shared = SharedMap(Replica(0), Network(1))
+        self.seconds: dict[str, list[float]] = {"pose": [], "search": [], "move": []}
+        self.n_bytes = {"components": 0, "corrections": 0}
+        self.kept: list[int] = []  # scans in the map
+
+    def take(self, points: torch.Tensor) -> None:
+        """Maps a scan (N, D) in the frame of the sensor."""
+        location = self.timed("pose", lambda: self.odometry.add(points))
+        if self.timed("search", self.odometry.close_loops):
+            self.timed("move", self.correct)
+        if location.found:
+            pose = self.odometry.poses[-1]
+            self.kept.append(len(self.odometry.poses) - 1)
+            self.map.insert(gt.Scan(points, torch.zeros(points.shape[1])).transformed(pose))
+            self.windows.add(pose)
+            if self.map.n_pending == 0:
+                self.windows.end()
+                self.publish()
+
+    def timed(self, part: str, call: Callable[[], Any]) -> Any:
+        seconds, result = cpu_seconds(call)
+        self.seconds[part].append(seconds)
+        return result
+
+    def correct(self) -> None:
+        if self.windows.correct(self.map, self.odometry.poses[self.kept]) is not None:
+            self.publish()
+
+    def publish(self) -> None:
+        self.shared.publish(self.map, self.windows)
+        for datagram in self.shared.replica.datagrams():
+            is_correction = parse_datagram(datagram)[0] is Kind.CORRECTION
+            self.n_bytes["corrections" if is_correction else "components"] += len(datagram)
+
+
+def looped(data: Path, name: str, most: int | None) -> Row:
+    """The row of one recording."""
+    scans, robot, true = first(most, data, name), Robot(), []
+    for number in range(len(scans)):
+        true.append(scans.pose(number))
+        robot.take(scans[number].transformed(torch.linalg.inv(true[-1])).points)
+    chain = robot.odometry.trajectory(loops=False).poses
+    errors = [
+        absolute_trajectory_error(poses, torch.stack(true), align="first").rmse
+        for poses in (chain, robot.odometry.poses)
+    ]
+    pose, search, move = (robot.seconds[part] for part in ("pose", "search", "move"))
+    searched = [seconds for seconds in search if seconds > 0.01] or [0.0]  # other scans are no keyframes
     return {
-        "data": runs[0]["data"],
-        "scans": runs[0]["n_scans"],
-        "odometry": runs[0]["method"],
-        "ATE": ", ".join(f"{run['ate']:.2f}" for run in runs) + " m",
-        "median step error": f"{1e3 * statistics.median(run['step'] for run in runs):.0f} mm",
-        f"steps off by over {WRONG} m": _each(runs, "n_wrong"),
-        "of these, called lost": _each(runs, "n_noticed") if mixture else "",
-        "lost scans": _each(runs, "n_lost") if mixture else "",
-        "closures": _each(runs, "n_closures") if mixture else "",
-        "scans/s": f"{statistics.median(run['n_scans'] / run['seconds'] for run in runs):.1f}",
-        "AUC given → estimated poses": "" if auc is None else " → ".join(f"{score:.3f}" for score in auc),
+        "data": name,
+        "scans": len(true),
+        "ATE without → with loops": " → ".join(f"{error:.2f}" for error in errors) + " m",
+        "corrections": len(move),
+        "seconds of a pose": statistics.mean(pose),
+        "of a search (mean, largest)": f"{statistics.mean(searched):.2f}, {max(searched):.2f}",
+        "to move and publish the map (largest)": max(move, default=0.0),
+        "searches and moves, relative to the poses": 100 * (sum(search) + sum(move)) / sum(pose),
+        "components": len(robot.map.components()),
+        "sent: components, corrections": ", ".join(f"{n / 1e3:.0f} kB" for n in robot.n_bytes.values()),
     }
 
 
-def _each(runs: list[dict], name: str) -> str:
-    return ", ".join(str(run[name]) for run in runs)
+def live_loops(options: Any) -> Iterator[Row]:
+    return (looped(options.data, name, options.most) for name in options.names)
 
 
-def table(file: Path) -> str:
-    """All runs of a file; a later run replaces an earlier one of the same data, method and seed."""
-    lines = [json.loads(line) for line in file.read_text().splitlines()]
-    kept = {(run["data"], run["method"], run["seed"]): run for run in lines}
-    rows = []
-    for name, method in dict.fromkeys((name, method) for name, method, _ in kept):
-        runs = [kept[key] for key in sorted(kept) if key[:2] == (name, method)]
-        rows.append(row(runs))
-    return markdown(list(rows[0]), [list(one.values()) for one in rows])
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, required=True)
-    names = ["hall", "courtyard", "street", "intel", "freiburg-101", "aces"]
-    parser.add_argument("--names", nargs="*", default=names)
-    parser.add_argument("--methods", nargs="+", default=METHODS)
-    parser.add_argument("--most", type=int)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--runs", type=Path, default=OUTPUTS / "odometry_runs.jsonl")
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-    for name in options.names:
-        scans = opened(options.data, name, options.most)
-        for method in options.methods:
-            for seed in options.seeds:
-                line = json.dumps(measured(scans, method, seed, name))
-                print(line, flush=True)
-                with options.runs.open("a") as file:
-                    file.write(line + "\n")
-    publish("odometry", f"{table(options.runs)}\n\n{hardware()}")
-
+FORMATS = {"scans": ".0f", "median step error": "{:.0f} mm", "scans/s": ".1f"}
+SECONDS = ("seconds of a pose", "to move and publish the map (largest)")
+LOOPS = dict.fromkeys(SECONDS, ".2f") | dict.fromkeys(("scans", "corrections", "components"), ".0f")
+LOOPS["searches and moves, relative to the poses"] = "{:.0f}%"
+NAMES = ("intel", "freiburg-101", "hall", "courtyard", "aces", "street")
+CASES = (
+    Case(
+        "odometry",
+        measure,
+        "A cell with several numbers has one for each run.",
+        FORMATS,
+        NAMES,
+        tuple(METHODS),
+        key=3,
+    ),
+    Case(
+        "live-loops",
+        live_loops,
+        "Errors are those of all poses at the end, with the first pose at the truth. CPU seconds.",
+        LOOPS,
+        ("intel", "hall"),
+    ),
+)
 
 if __name__ == "__main__":
-    main()
+    run(
+        __doc__,
+        *CASES,
+        most={"type": int, "help": "scans of each recording"},
+        seeds={"type": int, "nargs": "+", "default": [0, 1, 2]},
+    )

@@ -73,18 +73,6 @@ def counted(work: Callable[[], object]) -> tuple[int, int]:
     return operations.n + launches[0], operations.n_waits
 
 
-def least_seconds(work: Callable[[], object], repeats: int, device: str) -> float:
-    """The least time of several runs of the work, each until the device has ended it."""
-    times = []
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        work()
-        if device != "cpu":
-            torch.cuda.synchronize()
-        times.append(time.perf_counter() - begin)
-    return min(times)
-
-
 def uniform(*shape: int) -> Tensor:
     return torch.rand(*shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 

@@ -1,6 +1,6 @@
 """Bytes of a frame against what comes back of it: mixtures and codecs of points.
 
-    OMP_NUM_THREADS=1 python benchmarks/rate_distortion.py --data FOLDER [--jobs 2] [--rows FILE.json]
+    OMP_NUM_THREADS=1 python benchmarks/rate_distortion.py --data FOLDER [--jobs 2]
 
 FOLDER holds kinect/ and hall/; the warehouse is simulated. Every frame is a message by itself: encoded,
 decoded, and only what was decoded is measured.
@@ -11,32 +11,30 @@ best receiver: who has points counts their beams on a grid of once, twice or fou
 or of the codec's own cells, or learns a mixture from them; mixtures are asked about cubes of once or
 twice the resolution.
 
-Needs the extra [baselines]. Writes its table into BENCHMARKS.md and docs/images/rate_distortion.png.
+Needs the extra [baselines]. Draws docs/images/rate_distortion.png.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import statistics
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import joblib
 import torch
 from frames import RESOLUTIONS, SEED, Frame, material
-from tables import ROOT, hardware, markdown, publish
+from pages import ROOT
 from torch import Tensor
 
 from gmmtorch import GaussianMap, IncrementalRule
-from gmmtorch.experiments.evaluation.metrics import psnr_terms, roc
-from gmmtorch.experiments.evaluation.queries import FREE, OCCUPIED, Queries
+from gmmtorch.experiments.evaluation.metrics import psnr_terms
+from gmmtorch.experiments.evaluation.queries import Queries
+from gmmtorch.experiments.harness import Case, Row, run, score
 from gmmtorch.experiments.report.rate_distortion_figures import QUALITIES, bytes_for, figures, leads
-from gmmtorch.files import write_bytes
 from gmmtorch.mapping.codec.quantization import spatial_order
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.fitting import SurfaceFit, fit_points
@@ -213,11 +211,7 @@ def drawn(components: Components, n: int) -> Tensor:
 
 def answers(built: OccupancyMap, asked: Queries, name: str, resolutions: Sequence[float]) -> dict[str, float]:
     """AUC of a map's answers about cells of each side (m)."""
-    scores = {}
-    for r in resolutions:
-        theta = torch.as_tensor(built.occupancy(asked.points, r))
-        scores[f"{name}, {r:g} m"] = roc(theta[asked.of(OCCUPIED)], theta[asked.of(FREE)]).auc
-    return scores
+    return {f"{name}, {r:g} m": score(built, asked, r) for r in resolutions}
 
 
 def row(
@@ -246,12 +240,9 @@ def row(
     }
 
 
-def measure(task: Task) -> tuple[Rows, float]:
-    """Rows, and seconds of the processor."""
+def measure(task: Task) -> Rows:
     torch.set_num_threads(1)
-    begin = time.process_time()
-    rows = measure_mixtures(task) if task.codec == "ours" else measure_points(task)
-    return rows, time.process_time() - begin
+    return measure_mixtures(task) if task.codec == "ours" else measure_points(task)
 
 
 def tasks_of(name: str, folder: Path | None, n_frames: int | None) -> list[Task]:
@@ -272,20 +263,48 @@ RIVALS = ("octree", "draco", "quantized", "depth_image", "depth_image_thinned", 
 SHOWN = (8, 32, 128, 384)  # components
 
 
-def equal_rows(rows: Rows) -> list[list[object]]:
+@cache
+def measured(names: tuple[str, ...], data: Path, n_frames: int | None, jobs: int, figure: Path) -> Rows:
+    """The rows of all settings, and their figure."""
+    tasks = [task for name in names for task in tasks_of(name, data, n_frames)]
+    rows: Rows = []
+    for found in joblib.Parallel(jobs, batch_size=1, return_as="generator")(
+        joblib.delayed(measure)(task) for task in tasks
+    ):
+        rows += found
+        for r in found:
+            print(
+                f"{r['dataset']} {r['codec']} {r['setting']:g}: {r['nbytes']:,.0f} B, "
+                f"{r['psnr2_db']:.1f} dB, AUC {r['auc']:.4f} ({r['receiver']})",
+                flush=True,
+            )
+    save_figure(figures(rows)["rate_distortion"], figure, dpi=100)
+    return rows
+
+
+def settings(options: Any) -> Rows:
+    return measured(tuple(options.names), options.data, options.frames, options.jobs, options.figure)
+
+
+def equal_rows(options: Any) -> Iterator[Row]:
     """Ours, and what every other codec takes for the same PSNR2 and for the same AUC."""
-    found = []
+    rows = settings(options)
     for r in (r for r in rows if r["codec"] == "ours" and r["setting"] in SHOWN):
         own = [other for other in rows if other["dataset"] == r["dataset"]]
-        cells: list[object] = [r["dataset"], f"{r['setting']:g}", f"{r['nbytes']:,.0f}"]
-        cells += [f"{r['psnr2_db']:.1f} ({r['psnr_forward_db']:.1f}, {r['psnr_backward_db']:.1f})"]
-        cells += [f"{r['auc']:.4f}"]
+        cells: dict[str, Any] = {
+            "": r["dataset"],
+            "components at most": r["setting"],
+            "bytes a frame": r["nbytes"],
+            "PSNR2 (its terms), dB": (
+                f"{r['psnr2_db']:.1f} ({r['psnr_forward_db']:.1f}, {r['psnr_backward_db']:.1f})"
+            ),
+            "AUC": r["auc"],
+        }
         for codec in RIVALS:
             sizes = [other["nbytes"] for other in own if other["codec"] == codec]
             needed = [bytes_for(own, codec, field, r[field]) for field in ("psnr2_db", "auc")]
-            cells.append(" / ".join(size(n, min(sizes)) for n in needed) if sizes else "")
-        found.append(cells)
-    return found
+            cells[label_of(codec)] = " / ".join(size(n, min(sizes)) for n in needed) if sizes else ""
+        yield cells
 
 
 def size(needed: float, coarsest: float) -> str:
@@ -295,76 +314,52 @@ def size(needed: float, coarsest: float) -> str:
     return f"{'≤ ' if needed <= coarsest * (1 + 1e-9) else ''}{needed:,.0f}"
 
 
-def lead_rows(rows: Rows) -> list[list[object]]:
+def lead_rows(options: Any) -> Iterator[Row]:
     """Per data set and quality: over which rates ours is at or below every other, and who ends it."""
-    found = []
-    for name in dict.fromkeys(r["dataset"] for r in rows):
+    rows = settings(options)
+    for name in options.names:
         own = [r for r in rows if r["dataset"] == name]
         for quality, title in QUALITIES.items():
-            cells: list[object] = [name, title]
-            for left_out in (("depth_image_thinned",), ()):
+            cells: dict[str, Any] = {"": name, "quality": title}
+            for left_out, columns in zip((("depth_image_thinned",), ()), LEADS, strict=True):
                 lead = leads(own, quality, left_out)
                 there = lead.octaves >= 0.05
                 span = f"{lead.low:,.0f} to {lead.high:,.0f}: {lead.octaves:.1f}" if there else "none"
                 end = f", then {label_of(lead.ended_by)}" if lead.ended_by else ""
-                cells += [span + end, f"{lead.most:.1f}" if there else ""]
-            found.append(cells)
-    return found
+                cells |= dict(zip(columns, (span + end, lead.most if there else None), strict=True))
+            yield cells
 
 
-def printed(r: dict[str, Any]) -> str:
-    return (
-        f"{r['dataset']} {r['codec']} {r['setting']:g}: {r['nbytes']:,.0f} B, {r['psnr2_db']:.1f} dB, "
-        f"AUC {r['auc']:.4f} ({r['receiver']})"
-    )
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--data", type=Path)
-    parser.add_argument("--names", nargs="+", default=list(RESOLUTIONS), choices=list(RESOLUTIONS))
-    parser.add_argument("--jobs", type=int, default=2, help="processes, of a thread each")
-    parser.add_argument("--frames", type=int, help="of each data set at most, for a quick look")
-    parser.add_argument("--rows", type=Path, help="where to write all rows as JSON")
-    parser.add_argument("--again", type=Path, help="draw and write what such a file has; measure nothing")
-    parser.add_argument("--figure", type=Path, default=ROOT / "docs" / "images" / "rate_distortion.png")
-    options = parser.parse_args()
-    if options.again:
-        write(json.loads(options.again.read_text()), options.figure, whole=True)
-        return
-    if options.data is None and set(options.names) - {"warehouse"}:
-        parser.error("kinect and hall need --data; --names warehouse needs none.")
-    torch.set_num_threads(1)
-    tasks = [task for name in options.names for task in tasks_of(name, options.data, options.frames)]
-    rows, seconds = [], 0.0
-    parallel = joblib.Parallel(n_jobs=options.jobs, batch_size=1, return_as="generator")
-    for found, taken in parallel(joblib.delayed(measure)(task) for task in tasks):
-        rows += found
-        seconds += taken
-        for r in found:
-            print(printed(r), flush=True)
-    if options.rows:
-        write_bytes(options.rows, json.dumps(rows, indent=1).encode())
-    print(f"{seconds / 60:.1f} minutes of the processor")
-    write(rows, options.figure, options.frames is None and set(options.names) == set(RESOLUTIONS))
-
-
-def write(rows: Rows, figure: Path, whole: bool) -> None:
-    """The figure; and the tables into the page, if they are of all data sets, else on the screen."""
-    save_figure(figures(rows)["rate_distortion"], figure, dpi=100)
-    leads_header = ["", "quality", "ours ahead, bytes a frame: octaves", "times fewer, at most"]
-    leads_header += ["of thinned depth images, too", "times fewer, at most"]
-    header = ["", "components at most", "bytes a frame", "PSNR2 (its terms), dB", "AUC"]
-    tables = [
-        markdown(leads_header, lead_rows(rows)),
-        markdown([*header, *(label_of(codec) for codec in RIVALS)], equal_rows(rows)),
-    ]
-    text = "\n\n".join([hardware(), *tables])
-    if whole:
-        publish("rate-distortion", text)
-    else:
-        print(text)
-
+LEADS = (
+    ("ours ahead, bytes a frame: octaves", "times fewer, at most"),
+    ("of thinned depth images, too", "times fewer of these"),
+)
+CASES = (
+    Case(
+        "rate-distortion",
+        lead_rows,
+        "The longest range of rates over which ours takes no more bytes than any other codec for the same "
+        "quality.",
+        {column: ".1f" for _, column in LEADS},
+        tuple(RESOLUTIONS),
+        key=2,
+    ),
+    Case(
+        "rate-distortion-bytes",
+        equal_rows,
+        'Bytes that the others need for our PSNR2 / AUC: "≤" if their coarsest setting is already better, '
+        '"–" if their finest is worse.',
+        {"components at most": ".0f", "bytes a frame": ",.0f", "AUC": ".4f"},
+        tuple(RESOLUTIONS),
+        key=2,
+    ),
+)
 
 if __name__ == "__main__":
-    main()
+    run(
+        __doc__,
+        *CASES,
+        jobs={"type": int, "default": 2, "help": "processes, of a thread each"},
+        frames={"type": int, "help": "of each data set at most, for a quick look"},
+        figure={"type": Path, "default": ROOT / "docs" / "images" / "rate_distortion.png"},
+    )

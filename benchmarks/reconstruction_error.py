@@ -20,10 +20,10 @@ Then, for every measure, the bytes of Draco and of octrees that are as far off a
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,9 +33,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from gmmtorch.experiments.harness import Case, Row, run
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.mapping.components import Components
-from gmmtorch.report.text import format_table
 from gmmtorch.simulation.mesh_world import MeshWorld
 from gmmtorch.simulation.robot_camera import DepthFrame
 from gmmtorch.simulation.warehouses import warehouse
@@ -53,7 +53,12 @@ RIVALS: Mapping[str, Mapping[float, PointCodec]] = {
     "draco": {error: Draco(error) for error in (0.01, 0.02, 0.03, 0.045, 0.06, 0.08, 0.1, 0.15)},
 }
 """By family, and metres: the side of the cells, or the root mean square error."""
-MEASURES = ("off_surface", "across", "to_cloud", "from_cloud")
+MEASURES = {
+    "off_surface": "off the surface",
+    "across": "across",
+    "to_cloud": "return to the cloud",
+    "from_cloud": "cloud to a return",
+}
 QUANTILES = (0.5, 0.9, 0.95)
 NEIGHBOURS = 32
 SAMPLE = 200_000  # points of a cloud that are looked at
@@ -154,44 +159,38 @@ class Found(NamedTuple):
         """Centimetres."""
         return 100 * math.sqrt(float(np.square(self.distances[measure]).mean()))
 
-    def row(self) -> dict[str, object]:
+    def row(self) -> Row:
         """A line of the table: of each measure the root mean square, and quantiles."""
-        row: dict[str, object] = {"family": self.family, "metres": self.metres or None}
-        row |= {"bytes": self.n_bytes, "bytes_of_returns": self.n_of_returns}
+        title = f"{self.family}, {self.metres:g} m" if self.metres else self.family
+        row: dict[str, Any] = {"": title, "bytes": self.n_bytes, "of returns": self.n_of_returns}
         for measure, distances in self.distances.items():
             quantiles = ", ".join(f"{100 * x:.1f}" for x in np.quantile(distances, QUANTILES))
-            row[measure] = f"{self.rms(measure):.2f} ({quantiles})"
+            row[MEASURES[measure]] = f"{self.rms(measure):.1f} ({quantiles})"
         return row
 
 
-def as_far_off(tried: Sequence[Found], own: Found, measure: str) -> dict[str, object]:
+def as_far_off(tried: Sequence[Found], own: Found, measure: str) -> str:
     """Where a family, from fine to coarse, is as far off as `own`, between two tried, log-linearly; if more
-    than once, as what a lattice does to walls depends on where in it they are, with the fewest bytes."""
+    than once, as what a lattice does to walls depends on where in it they are, with the fewest bytes. The
+    bytes are multiples of those of `own`, in brackets of returns alone."""
     wanted = own.rms(measure)
-    row: dict[str, object] = {"measure": measure, "cm": wanted, "family": tried[0].family}
     for far, near in itertools.pairwise(reversed(tried)):
         low, high = near.rms(measure), far.rms(measure)
         if low <= wanted <= high:
             share = math.log(wanted / low) / math.log(high / low)
-            row["metres"] = near.metres * (far.metres / near.metres) ** share
+            metres = near.metres * (far.metres / near.metres) ** share
             n_bytes = near.n_bytes * (far.n_bytes / near.n_bytes) ** share
             of_returns = near.n_of_returns * (far.n_of_returns / near.n_of_returns) ** share
-            row |= {"bytes": n_bytes, "bytes_of_returns": of_returns}
-            row |= {"times_E0": n_bytes / own.n_bytes, "times_of_returns": of_returns / own.n_of_returns}
-            break
-    return row
+            times, of = n_bytes / own.n_bytes, of_returns / own.n_of_returns
+            return f"{times:.1f} ({of:.1f}), at {metres:.3f} m"
+    return ""
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--duration", type=float, default=120.0, help="simulated seconds")
-    parser.add_argument("--robots", type=int, default=3)
-    parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
-    torch.set_num_threads(1)
+@cache
+def measured(duration: float, robots: int, seed: int) -> tuple[str, list[Found], list[list[Found]]]:
+    """What the mission saw; the points as seen, and E0; and each family, from fine to coarse."""
     world = open_world("warehouse")
-    options = TeamOptions(size=given.robots, duration=given.duration, seed=given.seed)
-    mission = assemble(world, options)
+    mission = assemble(world, TeamOptions(size=robots, duration=duration, seed=seed))
     recorder = Recorder(mission)
     drive(mission, SimulatedClock())
     mixture = mission.robots[0].mapper.components()
@@ -200,12 +199,11 @@ def main() -> None:
     frames = [frame.numpy() for frame in recorder.returns]
     truth, n_points = Truth(world.mesh, warehouse(), frames), sum(map(len, frames))
     kinds = mission.network.bytes_by_kind
-    print(
+    about = (
         f"{n_points:,} novel returns and {sum(map(len, recorder.ends)):,} ends of beams without one, "
-        f"{len(frames)} frames\n{len(surfaces):,} components of surfaces, "
+        f"{len(frames)} frames; {len(surfaces):,} components of surfaces, "
         f"{len(mixture) - len(surfaces):,} of empty beams, {kinds['components']:,} B; "
-        f"{sum(kinds.values()):,} B were sent in all",
-        flush=True,
+        f"{sum(kinds.values()):,} B were sent in all."
     )
     n_raw = 12 * sum(map(len, (*recorder.returns, *recorder.ends)))
     distances = truth.distances(np.concatenate(frames), truth.across(frames))
@@ -213,18 +211,53 @@ def main() -> None:
     n_bytes = kinds["components"]
     distances = truth.distances(drawn(surfaces, n_points), across_components(surfaces, truth.points))
     own = Found("E0", 0, n_bytes, round(n_bytes * len(surfaces) / len(mixture)), distances)
-    rows, equal = [seen.row(), own.row()], []
+    families = []
     for family, codecs in RIVALS.items():
-        tried = []
+        families.append([])
         for metres, codec in codecs.items():
             of_returns, decoded = sent_and_decoded(codec, recorder.returns)
             n_bytes = of_returns + sent_and_decoded(codec, recorder.ends)[0]
             distances = truth.distances(np.concatenate(decoded), truth.across(decoded))
-            tried.append(Found(family, metres, n_bytes, of_returns, distances))
-        rows += [found.row() for found in tried]
-        equal += [as_far_off(tried, own, measure) for measure in MEASURES]
-    print(f"{format_table(rows)}\n\nAs far off as E0:\n{format_table(equal)}")
+            families[-1].append(Found(family, metres, n_bytes, of_returns, distances))
+    return about, [seen, own], families
 
+
+def errors(options: Any) -> Iterator[Row]:
+    options.about, first, families = measured(options.duration, options.robots, options.seed)
+    yield from (found.row() for found in itertools.chain(first, *families))
+
+
+def equal(options: Any) -> Iterator[Row]:
+    _, (_, own), families = measured(options.duration, options.robots, options.seed)
+    for tried in families:
+        yield {
+            "": tried[0].family,
+            **{f"{title}, {own.rms(m):.1f} cm": as_far_off(tried, own, m) for m, title in MEASURES.items()},
+        }
+
+
+CASES = (
+    Case(
+        "equal-error",
+        errors,
+        "Centimetres, RMS (median, 90 %, 95 %).",
+        {"bytes": ",.0f", "of returns": ",.0f"},
+        needs_data=False,
+    ),
+    Case(
+        "equal-bytes",
+        equal,
+        "Bytes at the RMS error of E0, as multiples of the bytes of E0's components. In brackets: the same "
+        "for returns alone.",
+        needs_data=False,
+    ),
+)
 
 if __name__ == "__main__":
-    main()
+    run(
+        __doc__,
+        *CASES,
+        duration={"type": float, "default": 120.0, "help": "simulated seconds"},
+        robots={"type": int, "default": 3},
+        seed={"type": int, "default": 0},
+    )

@@ -1,16 +1,15 @@
 """Sixteen recordings on two workers, one of which is killed, beside one process.
 
-    python benchmarks/recordings.py --data FOLDER [--write]
+    python benchmarks/recordings.py --data FOLDER
 
 FOLDER holds street/ and laser2d/freiburg-campus.log.gz. The scans that are not held out are cut into
 sixteen recordings. gmmtorch-map runs on all of them as one recording, and as sixteen. Every map answers about
-the same points of the held-out scans, by the point form. --write puts the tables into BENCHMARKS.md. Needs
-the extra [cluster].
+the same points of the held-out scans, by the point form. Needs the
+extra [cluster].
 """
 
 from __future__ import annotations
 
-import argparse
 import gzip
 import itertools
 import json
@@ -20,23 +19,15 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-import torch
-from tables import hardware, markdown, publish
-
 from gmmtorch import GaussianMap, datasets
-from gmmtorch.experiments.evaluation.metrics import roc
-from gmmtorch.experiments.evaluation.queries import (
-    FREE,
-    OCCUPIED,
-    Queries,
-    hit_and_free,
-    split_indices,
-    test_beams,
-)
+from gmmtorch.experiments.evaluation.queries import hit_and_free, split_indices, test_beams
+from gmmtorch.experiments.harness import Case, Row, run, score
 from gmmtorch.mapping import TiledMap
 
 N_PARTS, N_POINTS = 16, 20_000
@@ -117,11 +108,6 @@ def kill_a_worker(parent: int) -> bool:
     return False
 
 
-def auc(answer: Any, asked: Queries, resolution: float) -> float:
-    theta = torch.as_tensor(answer.occupancy(asked.points, resolution))
-    return roc(theta[asked.of(OCCUPIED)], theta[asked.of(FREE)]).auc
-
-
 def memory(rows: list[Any]) -> str:
     """Memory (MB) of each worker after its first and after its last recording."""
     workers: dict[str, list[float]] = {}
@@ -130,116 +116,90 @@ def memory(rows: list[Any]) -> str:
     return ", ".join(f"{values[0]:.0f} to {values[-1]:.0f}" for values in workers.values() if len(values) > 1)
 
 
-def measure(name: str, data: Path, work: Path) -> tuple[list[list[object]], list[object]]:
-    """Rows of the table of runs, and the row of the table of a city."""
+@cache
+def measured(name: str, data: Path) -> tuple[list[Row], dict[str, Any]]:
+    """Rows of the runs, and what the last of them says of its merged map."""
     source = SOURCES[name]
-    path = data / source.path
+    path = data.resolve() / source.path
     dataset = datasets.load(source.name, path)
     train, test = split_indices(len(dataset), source.test_every)
     beams = test_beams([dataset[i] for i in test], N_POINTS, 0)
     asked = hit_and_free(*beams, "uniform", source.resolution, 0)
-    whole = cut(source, path, train, work / "whole")
-    edges = [round(i * len(train) / N_PARTS) for i in range(N_PARTS + 1)]
-    pieces = [train[a:b] for a, b in itertools.pairwise(edges)]
-    parts = [cut(source, path, piece, work / f"part{i:02}") for i, piece in enumerate(pieces)]
 
-    seconds, (row,) = run_map(work / "one", source, [f"dataset.path={whole}"])
-    built = GaussianMap.load(work / "one" / "map.safetensors")
-    first, last = (row["history"][i]["memory_bytes"] / 1e6 for i in (0, -1))
-    table: list[list[object]] = [
-        [
-            name,
-            "one recording, one process",
-            f"{seconds:.0f}",
-            f"{row['cpu_seconds']:.0f}",
-            f"{auc(built, asked, source.resolution):.4f}",
-            f"{row['n_components']:,}",
-            f"{row['nbytes'] / 1e3:.0f}",
-            f"{first:.0f} to {last:.0f}",
-            "",
-        ]
-    ]
-    inputs = "inputs=[" + ",".join(f'"{part}"' for part in parts) + "]"
-    runs = {
-        "16 recordings, one process": ([], False),
-        "16 recordings, two workers": (["workers=2"], False),
-        "16 recordings, two workers, one killed": (["workers=2"], True),
-    }
-    files: list[dict[str, bytes]] = []
-    for number, (about, (options, kill)) in enumerate(runs.items()):
-        folder = work / f"many{number}"
-        seconds, (*rows, merged) = run_map(folder, source, [inputs, *options], kill)
-        tiled = TiledMap(folder / "tiles")
-        files.append({file.name: file.read_bytes() for file in tiled.folder.iterdir()})
-        if kill and not merged["n_lost"]:
-            raise SystemExit("no worker was lost; the run was too short")
-        table.append(
-            [
-                name,
-                about,
-                f"{seconds:.0f}",
-                f"{merged['cpu_seconds'] + merged['merge_cpu_seconds']:.0f}",
-                f"{auc(tiled, asked, source.resolution):.4f}",
-                f"{merged['n_components']:,}",
-                f"{merged['nbytes'] / 1e3:.0f}",
-                memory(rows),
-                f"{merged['memory_bytes'] / 1e6:.0f}",
-            ]
-        )
+    def row(about: str, seconds: float, cpu: float, built: Any, found: Any, used: str, merge: Any) -> Row:
+        auc, n_bytes = score(built, asked, source.resolution), found["nbytes"] / 1e3
+        return name, about, seconds, cpu, auc, found["n_components"], n_bytes, used, merge
+
+    with tempfile.TemporaryDirectory() as folder:
+        work = Path(folder)
+        whole = cut(source, path, train, work / "whole")
+        edges = [round(i * len(train) / N_PARTS) for i in range(N_PARTS + 1)]
+        pieces = [train[a:b] for a, b in itertools.pairwise(edges)]
+        parts = [cut(source, path, piece, work / f"part{i:02}") for i, piece in enumerate(pieces)]
+        seconds, (found,) = run_map(work / "one", source, [f"dataset.path={whole}"])
+        built = GaussianMap.load(work / "one" / "map.safetensors")
+        first, last = (found["history"][i]["memory_bytes"] / 1e6 for i in (0, -1))
+        used = f"{first:.0f} to {last:.0f}"
+        rows = [row("one recording, one process", seconds, found["cpu_seconds"], built, found, used, None)]
+        inputs = "inputs=[" + ",".join(f'"{part}"' for part in parts) + "]"
+        files: list[dict[str, bytes]] = []
+        for number, (about, options, kill) in enumerate(RUNS):
+            target = work / f"many{number}"
+            seconds, (*each, merged) = run_map(target, source, [inputs, *options], kill)
+            tiled = TiledMap(target / "tiles")
+            files.append({file.name: file.read_bytes() for file in tiled.folder.iterdir()})
+            if kill and not merged["n_lost"]:
+                raise SystemExit("no worker was lost; the run was too short")
+            cpu = merged["cpu_seconds"] + merged["merge_cpu_seconds"]
+            rows.append(row(about, seconds, cpu, tiled, merged, memory(each), merged["memory_bytes"] / 1e6))
     if any(each != files[0] for each in files):
         raise SystemExit("the tiles of the runs differ")
-    metre_bytes = merged["nbytes"] / merged["metres"]
-    metre_seconds = (merged["cpu_seconds"] + merged["merge_cpu_seconds"]) / merged["metres"]
-    city: list[object] = [
-        name,
-        f"{merged['metres']:,.0f} m",
-        f"{metre_bytes:.0f} B",
-        f"{1e3 * metre_seconds:.0f} ms",
-        f"{CITY * metre_bytes / 1e9:.1f} GB",
-        f"{CITY * metre_seconds / 3600:.0f} h",
-    ]
-    return table, city
+    return rows, merged
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--write", action="store_true", help="put the tables into BENCHMARKS.md")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    rows, cities = [], []
-    for name in SOURCES:
-        with tempfile.TemporaryDirectory() as work:
-            table, city = measure(name, arguments.data.resolve(), Path(work))
-        rows += table
-        cities.append(city)
-        print(markdown([""] * len(table[0]), table), city, flush=True)
-    header = [
-        "data",
-        "how",
-        "wall s",
-        "CPU s",
-        "AUC",
-        "components",
-        "kB",
-        "memory of a worker, MB",
-        "merging, MB",
-    ]
-    text = f"{hardware()}\n\n{markdown(header, rows)}"
-    per_metre = [
-        "data",
-        "path",
-        "bytes a metre",
-        "CPU a metre",
-        "bytes, 10,000 km",
-        "core hours, 10,000 km",
-    ]
-    text += f"\n\n{markdown(per_metre, cities)}"
-    if arguments.write:
-        publish("recordings", text)
-    else:
-        print(text)
+RUNS: tuple[tuple[str, list[str], bool], ...] = (
+    ("16 recordings, one process", [], False),
+    ("16 recordings, two workers", ["workers=2"], False),
+    ("16 recordings, two workers, one killed", ["workers=2"], True),
+)
 
+
+def runs(options: Any) -> Iterator[Row]:
+    for name in options.names:
+        yield from measured(name, options.data)[0]
+
+
+def costs(options: Any) -> Iterator[Row]:
+    """By the last run, a metre, and for a city."""
+    for name in options.names:
+        merged = measured(name, options.data)[1]
+        n_bytes = merged["nbytes"] / merged["metres"]
+        seconds = (merged["cpu_seconds"] + merged["merge_cpu_seconds"]) / merged["metres"]
+        city = CITY * n_bytes / 1e9, CITY * seconds / 3600
+        yield name, merged["metres"], n_bytes, 1e3 * seconds, *city
+
+
+RUN = {"data": "", "how": "", "wall s": ".0f", "CPU s": ".0f", "AUC": ".4f", "components": ",.0f"}
+RUN |= {"kB": ".0f", "memory of a worker, MB": "", "merging, MB": ".0f"}
+COSTS = {"data": "", "path": "{:,.0f} m", "bytes a metre": "{:.0f} B", "CPU a metre": "{:.0f} ms"}
+COSTS |= {"bytes, 10,000 km": "{:.1f} GB", "core hours, 10,000 km": "{:.0f} h"}
+CASES = (
+    Case(
+        "recordings",
+        runs,
+        "Merging: the peak memory of the process that merges.",
+        RUN,
+        tuple(SOURCES),
+        key=2,
+    ),
+    Case(
+        "recordings-costs",
+        costs,
+        "Of the last run; the CPU seconds are extrapolated to 10,000 km of roads.",
+        COSTS,
+        tuple(SOURCES),
+    ),
+)
 
 if __name__ == "__main__":
-    main()
+    run(__doc__, *CASES)

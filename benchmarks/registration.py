@@ -1,32 +1,30 @@
 """Two scans laid over each other: mixtures against Open3D's ICP, by start, error, time and bytes.
 
-    OMP_NUM_THREADS=1 python benchmarks/registration.py --data FOLDER [--draws 1] [--names hall courtyard]
+    OMP_NUM_THREADS=1 python benchmarks/registration.py --data FOLDER [--draws 1] [--only registration-hall]
 
 FOLDER holds hall/ (single scans of a spinning lidar, some 5 m apart) and courtyard/ (five frames of a
 narrow one each, some 5 m apart). All methods get the same clouds and the same starts: the true pose,
 shifted and turned about the sensor in a direction at random. ICP narrows its correspondences from 3 m to
 1 m to 0.3 m. What is sent is one of the two: points at 12 B, or the encoded mixture. Seconds are of the
 processor, all threads together; what is prepared once for each cloud (normals; the mixture) is a column of
-its own. Prints Markdown tables.
+its own.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
 import statistics
-import time
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import open3d as o3d
 import torch
-from tables import hardware, markdown, publish
 from torch import Tensor
 
-from gmmtorch import WindowedRule, datasets
+from gmmtorch import WindowedRule
+from gmmtorch.experiments.harness import Case, Row, cpu_seconds, recording, run
 from gmmtorch.localization.registration import register, yaw_starts
 from gmmtorch.mapping.codec import component_batch as codec
 from gmmtorch.mapping.learning.windows import learn_window
@@ -130,42 +128,21 @@ def cloud(scans: Sequence[Scan], first: int, n: int) -> Cloud:
     return Cloud(chosen, chosen[n // 2].origin)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--draws", type=int, default=1, help="directions of each start")
-    parser.add_argument("--names", nargs="+", default=list(PAIRS), choices=list(PAIRS))
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-    print(f"{hardware()}; Open3D {o3d.__version__}")
-    for name in options.names:
-        pairs = PAIRS[name]
-        scans = datasets.load("scan_folder", options.data / name)
-        clouds = [[cloud(scans, i, FRAMES[name]) for i in pair] for pair in pairs]
-        apart = [float((source.origin - target.origin).norm()) for target, source in clouds]
-        print(f"\n{name}: {len(pairs)} pairs, sensors {min(apart):.1f} to {max(apart):.1f} m apart\n")
-        header = [
-            "",
-            *(f"{m:g} m, {d:g}°" for m, d in STARTS),
-            "error (m)",
-            "(°)",
-            "prepare (s)",
-            "align (s)",
-            "bytes",
-        ]
-        rows = []
-        for label, method in METHODS.items():
-            rows.append(row(label, method, clouds, options.draws))
-            print(*rows[-1], sep=" | ", flush=True)
-        publish(f"registration-{name}", markdown(header, rows))
-        print(f"\nmixtures, unknown pose, 12 headings: {unknown(clouds)}")
+def measure(name: str, options: Any) -> Iterator[Row]:
+    scans = recording(options.data, name)
+    clouds = [[cloud(scans, i, FRAMES[name]) for i in pair] for pair in PAIRS[name]]
+    apart = [float((source.origin - target.origin).norm()) for target, source in clouds]
+    options.about = (
+        f"{len(clouds)} pairs, sensors {min(apart):.1f} to {max(apart):.1f} m apart; "
+        f"Open3D {o3d.__version__}. Mixtures without a pose, from 12 headings: {unknown(clouds)}."
+    )
+    for label in options.methods:
+        yield row(label, METHODS[label], clouds, options.draws)
 
 
-def row(label: str, method: Method, clouds: list[list[Cloud]], n_draws: int) -> list[object]:
+def row(label: str, method: Method, clouds: list[list[Cloud]], n_draws: int) -> Row:
     """Successes of each start; medians of the errors of successes, of seconds and of bytes."""
-    begin = time.process_time()
-    made = [[method.prepare(one) for one in pair] for pair in clouds]
-    preparing = (time.process_time() - begin) / (2 * len(clouds))
+    preparing, made = cpu_seconds(lambda: [[method.prepare(one) for one in pair] for pair in clouds])
     cells, good, seconds = [], [], []
     for metres, degrees in STARTS:
         generator = torch.Generator().manual_seed(0)
@@ -173,45 +150,49 @@ def row(label: str, method: Method, clouds: list[list[Cloud]], n_draws: int) -> 
         for (_, source), ((reference, _), (moved, _)) in zip(clouds, made, strict=True):
             for _ in range(n_draws):
                 start = perturbation(source.origin, metres, degrees, generator)
-                begin = time.process_time()
-                found = method.align(moved, reference, start)
-                seconds.append(time.process_time() - begin)
+                spent, found = cpu_seconds(partial(method.align, moved, reference, start))
+                seconds.append(spent)
                 errors = error(found, source.origin)
                 if errors[0] < SUCCESS[0] and errors[1] < SUCCESS[1]:
                     n_good += 1
                     good.append(errors)
         cells.append(f"{n_good}/{n_draws * len(clouds)}")
-    middle = [statistics.median(column) for column in zip(*good, strict=True)] if good else [math.nan] * 2
+    middle = [statistics.median(column) for column in zip(*good, strict=True)] if good else []
     n_bytes = statistics.median(size for pair in made for _, size in pair)
-    return [
-        label,
-        *cells,
-        f"{middle[0]:.3f}" if good else "–",
-        f"{middle[1]:.2f}" if good else "–",
-        f"{preparing:.2f}",
-        f"{statistics.median(seconds):.2f}",
-        f"{n_bytes:,.0f}",
-    ]
+    errors = middle if good else ["–", "–"]
+    return label, *cells, *errors, preparing / (2 * len(clouds)), statistics.median(seconds), n_bytes
 
 
 def unknown(clouds: list[list[Cloud]]) -> str:
     """Successes of mixtures in frames of their own, from twelve headings; and which were called reliable."""
     n_good = n_reliable = n_wrong = 0
-    begin = time.process_time()
+    seconds = 0.0
     for target, source in clouds:
         (reference, _), (moved, _) = (METHODS["mixtures"].prepare(one) for one in (target, source))
-        found = register(moved, reference, yaw_starts(moved, reference, 12))
+        spent, found = cpu_seconds(
+            lambda moved=moved, reference=reference: register(
+                moved, reference, yaw_starts(moved, reference, 12)
+            )
+        )
+        seconds += spent / len(clouds)
         metres, degrees = error(found.transform, source.origin)
         good = metres < SUCCESS[0] and degrees < SUCCESS[1]
         n_good += good
         n_reliable += found.reliable
         n_wrong += found.reliable and not good
-    seconds = (time.process_time() - begin) / len(clouds)
     return (
         f"{n_good}/{len(clouds)} found, {n_reliable} called reliable, {n_wrong} of them wrong; "
-        f"{seconds:.1f} s each, mixtures included"
+        f"{seconds:.1f} s each"
     )
 
 
+COLUMNS = {"": "", **dict.fromkeys((f"{metres:g} m, {degrees:g}°" for metres, degrees in STARTS), "")}
+COLUMNS |= {"error (m)": ".3f", "(°)": ".2f", "prepare (s)": ".2f", "align (s)": ".2f", "bytes": ",.0f"}
+ABOUT = "Results within 0.2 m and 2° of the truth, and median errors of those. CPU seconds, medians."
+CASES = [
+    Case(f"registration-{name}", partial(measure, name), ABOUT, COLUMNS, methods=tuple(METHODS))
+    for name in PAIRS
+]
+
 if __name__ == "__main__":
-    main()
+    run(__doc__, *CASES, draws={"type": int, "default": 1, "help": "directions of each start"})

@@ -1,7 +1,7 @@
-"""Plays a recording to gmmtorch-ros at its own speed, over DDS and Zenoh. Writes the table of BENCHMARKS.md.
+"""Plays a recording to gmmtorch-ros at its own speed, over DDS and Zenoh.
 
     OMP_NUM_THREADS=1 python benchmarks/ros.py --data $GMMTORCH_DATA
-    OMP_NUM_THREADS=1 python benchmarks/ros.py --data $GMMTORCH_DATA --minutes 10   # one map of 16 kB
+    OMP_NUM_THREADS=1 python benchmarks/ros.py --data $GMMTORCH_DATA --only ros-long   # one map of 16 kB
 
 The player, the mapper and Zenoh's router are processes of their own on loopback. The map is compared with the
 one that gmmtorch-map makes of the same recording.
@@ -9,7 +9,6 @@ one that gmmtorch-map makes of the same recording.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import signal
@@ -17,10 +16,13 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from tables import ROOT, hardware, markdown, publish
+from pages import ROOT
+
+from gmmtorch.experiments.harness import Case, Row, run
 
 _MEGABYTE = 1 << 20
 _ROUTER = "from gmmtorch.live.ros.zenoh_middleware import open_router; r = open_router(); input()"
@@ -83,70 +85,65 @@ def played(
     return row, usage, share
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--minutes", type=float, help="play the recording again and again to one map")
-    given = parser.parse_args()
-    bag = given.data / "bags" / "turtlebot4" / "bag"
-    if given.minutes:
-        long_run(bag, given.minutes)
-    else:
-        one_play(bag)
+def recorded(options: Any) -> Path:
+    folder: Path = options.data / "bags" / "turtlebot4" / "bag"
+    return folder
 
 
-def long_run(bag: Path, minutes: float) -> None:
+def long_run(options: Any) -> Iterator[Row]:
     """The row of a map with a budget to which the recording is played again and again over DDS."""
     with tempfile.TemporaryDirectory() as name:
-        row, usage, share = played("dds", bag, Path(name), ["map.max_bytes=16000"], 60 * minutes)
+        budget, seconds = ["map.max_bytes=16000"], 60 * options.minutes
+        row, usage, share = played("dds", recorded(options), Path(name), budget, seconds)
     n = len(usage.memory)
-    header = ["minutes", "scans", "dropped", "median latency", "99 %", "of a core"]
-    cells = [
-        f"{minutes:g}",
-        row["n_scans"],
-        row["n_dropped"],
-        f"{row['latency_median']:.2f} s",
-        f"{row['latency_p99']:.2f} s",
-        f"{100 * share:.0f} %",
-        ", ".join(f"{usage.memory[min(n - 1, n * k // 5)] / _MEGABYTE:.0f}" for k in range(1, 6)) + " MB",
-    ]
-    publish("ros-long", markdown([*header, "memory after each fifth"], [cells]) + f"\n\n{hardware()}")
+    fifths = [f"{usage.memory[min(n - 1, n * k // 5)] / _MEGABYTE:.0f}" for k in range(1, 6)]
+    yield options.minutes, row["n_scans"], *latencies(row, share), ", ".join(fifths) + " MB"
 
 
-def one_play(bag: Path) -> None:
-    """The table of maps with and without a budget, over both middlewares."""
-    rows = []
+def latencies(row: dict[str, Any], share: float) -> list[float]:
+    return [row["n_dropped"], row["latency_median"], row["latency_p99"], 100 * share]
+
+
+def one_play(options: Any) -> Iterator[Row]:
+    """Maps with and without a budget, over both middlewares."""
+    bag, quiet = recorded(options), ["report.figures=false", "report.tensorboard=false"]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        quiet = ["report.figures=false", "report.tensorboard=false"]
         for budget in ("null", "16000"):
-            options = [f"map.max_bytes={budget}"]
-            known = command("map", folder / budget, "dataset=rosbag", f"dataset.path={bag}", *quiet, *options)
+            limit = [f"map.max_bytes={budget}"]
+            known = command("map", folder / budget, "dataset=rosbag", f"dataset.path={bag}", *quiet, *limit)
             subprocess.run(known, check=True, stdout=subprocess.DEVNULL)
             expected = (folder / budget / "map.safetensors").read_bytes()
-            for middleware in ("dds", "zenoh"):
+            for middleware in options.methods:
                 router = subprocess.Popen([sys.executable, "-c", _ROUTER], stdin=subprocess.PIPE)
                 place = folder / f"{middleware}-{budget}"
-                row, usage, share = played(middleware, bag, place, options)
+                row, usage, share = played(middleware, bag, place, limit)
                 router.communicate(b"\n")
                 same = (place / "mapper" / "map.safetensors").read_bytes() == expected
-                half = len(usage.memory) // 2
-                rows.append(
-                    [
-                        f"{middleware}, {'no budget' if budget == 'null' else '16 kB'}",
-                        f"{row['n_scans']} of 356",
-                        row["n_dropped"],
-                        "yes" if same else "no",
-                        f"{row['latency_median']:.2f} s",
-                        f"{row['latency_p99']:.2f} s",
-                        f"{100 * share:.0f} %",
-                        f"{usage.memory[half] / _MEGABYTE:.0f}, {usage.memory[-1] / _MEGABYTE:.0f} MB",
-                    ]
-                )
-    header = ["middleware, map", "scans", "dropped", "same map", "median latency", "99 %", "of a core"]
-    table = markdown([*header, "memory at half time, at the end"], rows)
-    publish("ros", f"{table}\n\n{hardware()}")
+                half, last = (usage.memory[i] / _MEGABYTE for i in (len(usage.memory) // 2, -1))
+                label = f"{middleware}, {'no budget' if budget == 'null' else '16 kB'}"
+                done = f"{row['n_scans']} of 356", "yes" if same else "no"
+                yield label, *done, *latencies(row, share), f"{half:.0f}, {last:.0f} MB"
 
+
+LATENCY = {"dropped": ".0f", "median latency": "{:.2f} s", "99 %": "{:.2f} s", "of a core": "{:.0f} %"}
+PLAYED = dict.fromkeys(("middleware, map", "scans", "same map"), "")
+CASES = (
+    Case(
+        "ros",
+        one_play,
+        "The latency is from the stamp of a scan to a published grid (0.1 m) that includes it.",
+        {**PLAYED, **LATENCY, "memory at half time, at the end": ""},
+        methods=("dds", "zenoh"),
+    ),
+    Case(
+        "ros-long",
+        long_run,
+        "The same recording repeated, one map with a budget of 16 kB, over DDS.",
+        {"minutes": ".0f", "scans": ".0f", **LATENCY, "memory after each fifth": ""},
+    ),
+)
 
 if __name__ == "__main__":
-    main()
+    minutes = {"type": float, "default": 10.0, "help": "of ros-long"}
+    run(__doc__, *CASES, minutes=minutes)

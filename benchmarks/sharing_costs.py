@@ -3,24 +3,24 @@
     OMP_NUM_THREADS=1 python benchmarks/sharing_costs.py [--repeats 5]
 
 Needs no data: a simulated depth camera of 160 × 120 pixels walks through the embedded warehouse, and every
-pixel is learned. Times are of the processor, the least of some repeats. Writes its tables into
-docs/messages.md, docs/replica.md and docs/network.md.
+pixel is learned. Times are of the processor, the least of some repeats.
 """
 
 from __future__ import annotations
 
-import argparse
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cache
+from typing import Any
 
 import numpy as np
 import torch
 from frames import Frame, simulated
-from tables import ROOT, hardware, markdown, publish
 from torch import Tensor
 
+from gmmtorch.experiments.harness import Case, Row, run
 from gmmtorch.mapping.codec.quantization import spatial_order
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.fitting import fit_window
@@ -51,30 +51,32 @@ from gmmtorch.team.sharing.transport.security import Opener, Sealer, TeamKey
 N_FRAMES, N_HELD, PER_FRAME, INCARNATION = 6, 20_000, 70, 9_876_543
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--repeats", type=int, default=5)
-    repeats = parser.parse_args().repeats
-    torch.set_num_threads(1)
+@cache
+def learned() -> tuple[list[Frame], list[Components]]:
+    """Frames, and the components of each."""
     logging.disable()  # of what is refused
-    frames = simulated()[:N_FRAMES]
-    rule = FrameRule()
-    learned = [
-        numbered(fit_window([frame.scan], rule.surface_fit(), all_origins(), rule.empty_fit()))
-        for frame in frames
-    ]
-    docs = ROOT / "docs"
-    note = f"{N_FRAMES} frames, {sum(map(len, learned)):,} components, "
-    note += f"{sum(len(frame.scan.points) for frame in frames):,} points."
-    table = markdown(["content", "bytes"], [*frame_sizes(frames, learned), *record_sizes()])
-    publish("message-sizes", f"{note}\n\n{table}", docs / "messages.md")
-    header = ["operation", "ms", f"ms with {N_HELD:,} components held"]
-    frame = Components.concatenate(learned).selected(torch.arange(PER_FRAME))
-    small, large = (replica_times(frame, n, repeats) for n in (40 * PER_FRAME, N_HELD))
-    rows = [[name, f"{small[name]:.2f}", f"{large[name]:.2f}"] for name in small]
-    publish("replica-costs", f"{hardware()}\n\n{markdown(header, rows)}", docs / "replica.md")
-    rows = [[name, f"{value:.1f} µs"] for name, value in frame_times(repeats).items()]
-    publish("frame-costs", f"{hardware()}\n\n{markdown(['1200 bytes', 'time'], rows)}", docs / "network.md")
+    frames, rule = simulated()[:N_FRAMES], FrameRule()
+    fits = rule.surface_fit(), all_origins(), rule.empty_fit()
+    return frames, [numbered(fit_window([frame.scan], *fits)) for frame in frames]
+
+
+def message_sizes(options: Any) -> Iterator[Row]:
+    frames, made = learned()
+    n_points = sum(len(frame.scan.points) for frame in frames)
+    options.about = f"{N_FRAMES} frames, {sum(map(len, made)):,} components, {n_points:,} points."
+    for content, n_bytes in (*frame_sizes(frames, made), *record_sizes()):
+        yield str(content), str(n_bytes)
+
+
+def replica_costs(options: Any) -> Iterator[Row]:
+    frame = Components.concatenate(learned()[1]).selected(torch.arange(PER_FRAME))
+    small, large = (replica_times(frame, n, options.repeats) for n in (40 * PER_FRAME, N_HELD))
+    for name in small:
+        yield name, small[name], large[name]
+
+
+def frame_costs(options: Any) -> Iterator[Row]:
+    yield from frame_times(options.repeats).items()
 
 
 def numbered(components: Components) -> Components:
@@ -226,5 +228,24 @@ def frame_times(repeats: int, n: int = 2000) -> dict[str, float]:
     return {name: min(values) for name, values in found.items()}
 
 
+HELD = f"ms with {N_HELD:,} components held"
+CASES = (
+    Case("message-sizes", message_sizes, columns={"content": "", "bytes": ""}, needs_data=False),
+    Case(
+        "replica-costs",
+        replica_costs,
+        f"Processor time of each operation, for a frame of {PER_FRAME} components.",
+        {"operation": "", "ms": ".2f", HELD: ".2f"},
+        needs_data=False,
+    ),
+    Case(
+        "frame-costs",
+        frame_costs,
+        "Processor time of a frame with the longest datagram.",
+        {"1200 bytes": "", "time": "{:.1f} µs"},
+        needs_data=False,
+    ),
+)
+
 if __name__ == "__main__":
-    main()
+    run(__doc__, *CASES, repeats={"type": int, "default": 5})

@@ -21,7 +21,6 @@ with values in range is accepted; only a key keeps it out.
 
 from __future__ import annotations
 
-import argparse
 import concurrent.futures
 import gc
 import logging
@@ -31,7 +30,7 @@ import tempfile
 import tracemalloc
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -39,8 +38,8 @@ from typing import Any
 import torch
 
 from gmmtorch.errors import DataError
+from gmmtorch.experiments.harness import Case, Row, run
 from gmmtorch.processes import end_with_parent
-from gmmtorch.report.text import format_table
 from gmmtorch.team.sharing.messages.datagrams import Kind
 from gmmtorch.team.sharing.messages.message_registry import decode
 from gmmtorch.team.sharing.messages.mission_messages import ViewsMessage
@@ -54,35 +53,25 @@ _MOST_HELD_KB = 8 * 1024  # by a replica of `_COMPONENTS` and a set of views
 _COMPONENTS = 2000
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--schedules", type=int, default=1000)
-    parser.add_argument("--kills", type=int, default=500)
-    parser.add_argument("--packets", type=int, default=1_000_000)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
+def measure(options: Any) -> Iterator[Row]:
     with concurrent.futures.ProcessPoolExecutor(options.workers, initializer=_alone) as pool:
         seeds = range(options.seed, options.seed + options.schedules)
         team = _schedules(list(pool.map(_schedule, seeds, chunksize=5)))
         killed = _summed(pool.map(_kills, *_shares(options.kills, options.workers, options.seed)))
         parts = list(pool.map(_packets, *_shares(options.packets, options.workers, 0)))
-    print(format_table([team], list(team)))
-    print(format_table([killed], list(killed)))
-    rows = [
-        {"to": listener, **{what: sum(part.outcomes[listener][what] for part in parts) for what in _OUTCOMES}}
-        for listener in parts[0].outcomes
-    ]
-    memory = {
-        "grown_kb": max(part.grown_kb for part in parts),
-        "held_kb": max(part.held_kb for part in parts),
+    heard = {
+        to: {what: sum(part.outcomes[to][what] for part in parts) for what in _OUTCOMES}
+        for to in parts[0].outcomes
     }
-    print(format_table(rows, list(rows[0])))
-    print(format_table([memory], list(memory)))
+    memory = {name: max(getattr(part, name) for part in parts) for name in ("grown_kb", "held_kb")}
+    for about, found in {"schedules": team, "kills": killed, **heard, "memory": memory}.items():
+        for name, value in found.items():
+            yield about, name.replace("_", " "), value
     sound = team["converged"] == team["complete"] == options.schedules
     sound = sound and not any(killed[what] for what in ("lost", "unequal", "refused", "failed"))
-    sound = sound and not any(row["raised"] + row["believed"] for row in rows)
-    return 0 if sound and memory["grown_kb"] <= _ALLOWED_KB and memory["held_kb"] <= _MOST_HELD_KB else 1
+    sound = sound and not any(row["raised"] + row["believed"] for row in heard.values())
+    if not sound or memory["grown_kb"] > _ALLOWED_KB or memory["held_kb"] > _MOST_HELD_KB:
+        raise SystemExit("A schedule, a kill or a packet had an outcome that it must not have.")
 
 
 def _shares(n: int, workers: int, seed: int) -> tuple[range, list[int]]:
@@ -235,5 +224,15 @@ def _opened(opener: Opener, frame: bytes) -> str:
         return "raised"
 
 
+CASE = Case("soak-numbers", measure, columns={"": "", "what": "", "number": ",.0f"}, key=2, needs_data=False)
+
 if __name__ == "__main__":
-    sys.exit(main())
+    run(
+        __doc__,
+        CASE,
+        schedules={"type": int, "default": 1000},
+        kills={"type": int, "default": 500},
+        packets={"type": int, "default": 1_000_000},
+        workers={"type": int, "default": 2},
+        seed={"type": int, "default": 0},
+    )

@@ -1,5 +1,5 @@
 """Two robots that map two parts of one log, each in a frame of its own, and join one frame; and robots whose
-teammate is in another place. Writes the tables of BENCHMARKS.md and docs/images/team_frames.png.
+teammate is in another place. Draws docs/images/team_frames.png.
 
     OMP_NUM_THREADS=1 python benchmarks/team_frames.py --data $GMMTORCH_DATA
 
@@ -10,19 +10,21 @@ places are left. Errors are those of the places of robot 1's components in the f
 
 from __future__ import annotations
 
-import argparse
+import itertools
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
-from tables import ROOT, hardware, markdown, publish
+from pages import ROOT
 from torch import Tensor
 
 import gmmtorch as gt
 from gmmtorch.datasets import Dataset
 from gmmtorch.datasets.base import start_frame
+from gmmtorch.experiments.harness import Case, Row, recording, run
 from gmmtorch.mapping.components import Components
 from gmmtorch.report.style import PALETTE, save_figure
 from gmmtorch.team.sharing import FrameJoiner, Replica
@@ -39,12 +41,6 @@ PARTS = (
 )
 FLAT, DEEP = ("intel", "aces", "freiburg-101"), ("hall", "courtyard", "street")
 PLACES = 40  # scans of a foreign log that are searched for
-
-
-def opened(data: Path, name: str) -> Dataset:
-    if name in FLAT:
-        return gt.datasets.load("carmen", path=data / f"laser2d/{name}.log.gz")
-    return gt.datasets.load("scan_folder", path=data / name)
 
 
 class Robot:
@@ -105,22 +101,19 @@ def joined(scans: Dataset, split: str) -> tuple[Robot, Robot, str, float]:
     return one, two, when, seconds / max(1, two.joiner.n_searches)
 
 
-def row(name: str, split: str, one: Robot, two: Robot, when: str, seconds: float) -> list[object]:
-    placement = two.replica.placement
-    places = two.map.components().means
-    transform = placement.transform
-    if transform is None:
-        rms = turn = worst = "–"
-    else:
+def row(name: str, split: str, one: Robot, two: Robot, when: str, seconds: float) -> Row:
+    places, transform = two.map.components().means, two.replica.placement.transform
+    errors = ["–", "–", "–"]
+    if transform is not None:
         error = torch.linalg.inv(two.frame) @ one.frame @ transform
         dim = len(error) - 1
         off = (places @ error[:dim, :dim].T + error[:dim, dim] - places).norm(dim=1)
         angle = torch.linalg.matrix_norm(error[:dim, :dim] - torch.eye(dim)) / math.sqrt(2)
-        rms, worst = f"{float(off.square().mean().sqrt()):.3f}", f"{float(off.max()):.3f}"
-        turn = f"{math.degrees(float(angle)):.2f}"
+        metres = (float(each) for each in (off.square().mean().sqrt(), off.max()))
+        errors = [*(f"{each:.3f}" for each in metres), f"{math.degrees(float(angle)):.2f}"]
     located = f"{two.joiner.n_located} of {two.joiner.n_searches}"
-    components, frames = (one.sent[kind] + two.sent[kind] for kind in ("all", "frames"))
-    return [name, split, when, located, rms, worst, turn, f"{components:,}", frames, f"{seconds:.2f}"]
+    n_bytes = (one.sent[kind] + two.sent[kind] for kind in ("all", "frames"))
+    return name, split, when, located, *errors, *n_bytes, seconds
 
 
 def foreign(source: Dataset, target: Dataset) -> tuple[int, int, int]:
@@ -137,7 +130,7 @@ def foreign(source: Dataset, target: Dataset) -> tuple[int, int, int]:
     return ours.joiner.n_searches, ours.joiner.n_located, n_joined
 
 
-def picture(one: Robot, two: Robot) -> None:
+def picture(one: Robot, two: Robot, file: Path) -> None:
     """Both maps in their own frames, laid over each other as they are, and after joining."""
     import matplotlib.pyplot as plt
 
@@ -156,7 +149,7 @@ def picture(one: Robot, two: Robot) -> None:
         axis.set_xlabel("x (m)")
         axis.set_ylabel("y (m)")
     axes[0].legend(loc="best")
-    save_figure(figure, ROOT / "docs/images/team_frames.png")
+    save_figure(figure, file)
 
 
 def drawn(components: Components) -> Tensor:
@@ -168,36 +161,49 @@ def drawn(components: Components) -> Tensor:
     return (solid.means[:, None, :, None] + roots @ noise).reshape(-1, 2)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--only", choices=("joined", "foreign"))
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-    if options.only != "foreign":
-        rows = []
-        for name, split in PARTS:
-            outcome = joined(opened(options.data, name), split)
-            rows.append(row(name, split, *outcome))
-            print(*rows[-1], sep=" | ", flush=True)
-            if name == "freiburg-101":
-                picture(*outcome[:2])
-        header = ["log", "parts", "joined at scan", "scans located", "error (m)", "at most (m)", "turn (°)"]
-        header += ["bytes", "of frames", "CPU s a search"]
-        publish("team-frames", f"{markdown(header, rows)}\n\n{hardware()}")
-    if options.only != "joined":
-        rows = []
-        for names in (DEEP, FLAT):
-            logs = {name: opened(options.data, name) for name in names}
-            for source in names:
-                for target in names:
-                    if source != target:
-                        found = foreign(logs[source], logs[target])
-                        rows.append([f"{source} in {target}", *found])
-                        print(*rows[-1], sep=" | ", flush=True)
-        table = markdown(["scans of … in the map of …", "searched", "located", "frames joined"], rows)
-        publish("foreign-frames", f"{table}\n\n{hardware()}")
+def own_places(options: Any) -> Iterator[Row]:
+    for name, split in PARTS:
+        if name not in options.names:
+            continue
+        outcome = joined(recording(options.data, name), split)
+        if name == "freiburg-101":
+            picture(*outcome[:2], options.figure)
+        yield row(name, split, *outcome)
 
+
+def other_places(options: Any) -> Iterator[Row]:
+    for names in (DEEP, FLAT):
+        logs = {name: recording(options.data, name) for name in names}
+        for source, target in itertools.permutations(names, 2):
+            yield f"{source} in {target}", *foreign(logs[source], logs[target])
+
+
+CASES = (
+    Case(
+        "team-frames",
+        own_places,
+        "Errors are those of the places of robot 1's components in the frame of robot 0. Bytes are those of "
+        "both robots.",
+        {
+            **dict.fromkeys(("log", "parts", "joined at scan", "scans located"), ""),
+            **dict.fromkeys(("error (m)", "at most (m)", "turn (°)"), ""),
+            "bytes": ",.0f",
+            "of frames": ".0f",
+            "CPU s a search": ".2f",
+        },
+        tuple(dict.fromkeys(name for name, _ in PARTS)),
+        key=2,
+    ),
+    Case(
+        "foreign-frames",
+        other_places,
+        "About forty scans of one log are searched for in the whole map of another.",
+        {
+            "scans of … in the map of …": "",
+            **dict.fromkeys(("searched", "located", "frames joined"), ".0f"),
+        },
+    ),
+)
 
 if __name__ == "__main__":
-    main()
+    run(__doc__, *CASES, figure={"type": Path, "default": ROOT / "docs/images/team_frames.png"})

@@ -21,13 +21,13 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from gmmtorch.experiments.harness import Case, Row, run
 from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.report.text import format_table
 from gmmtorch.team.cli.from_options.links import free_addresses
 from gmmtorch.team.sharing.replica.materialized_view import fingerprints
 
@@ -38,29 +38,17 @@ _KILLED_WITHIN = 12.0  # seconds after its store is open
 _LONG, _GROWTH = 300.0, 1.1  # seconds of a run in which memory is to be level; and how much that allows
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--robots", type=int, default=3)
-    parser.add_argument("--runs", type=int, default=1)
-    parser.add_argument("--seconds", type=float, default=None, help="then they are told to stop")
-    parser.add_argument("--rate", type=float, default=10.0, help="scans a second")
-    parser.add_argument("--settle", type=float, default=25.0, help="seconds without news until a robot ends")
-    parser.add_argument("--loss", type=float, default=0.0)
-    parser.add_argument("--kill", action="store_true")
-    parser.add_argument("--dataset", default="synthetic_building_2d")
-    parser.add_argument("--path", default=None)
-    parser.add_argument("--scans", type=int, default=None, help="of a synthetic log, in all")
-    parser.add_argument("--part", default="consecutive")
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
-    rows = []
+def measure(options: Any) -> Iterator[Row]:
+    n_sound = 0
     for seed in range(options.seed, options.seed + options.runs):
         with tempfile.TemporaryDirectory() as folder:
-            rows.append(run(options, seed, Path(folder)))
-        print(format_table(rows, list(rows[0])), flush=True)
-    sound = [row for row in rows if _is_sound(row)]
-    print(f"{len(sound)} of {len(rows)} runs: all maps equal, nothing lost, nothing refused, memory level")
-    return 0 if len(sound) == len(rows) else 1
+            row = played(options, seed, Path(folder))
+        n_sound += _is_sound(row)
+        yield {"seed": seed, **row}
+    if n_sound < options.runs:
+        raise SystemExit(
+            f"Only {n_sound} of {options.runs} runs have equal maps, lose nothing, refuse nothing."
+        )
 
 
 def _is_sound(row: dict[str, Any]) -> bool:
@@ -69,7 +57,7 @@ def _is_sound(row: dict[str, Any]) -> bool:
     return bool(row["same_map"]) and level and not any(row[what] for what in wrong)
 
 
-def run(options: argparse.Namespace, seed: int, folder: Path) -> dict[str, Any]:
+def played(options: argparse.Namespace, seed: int, folder: Path) -> dict[str, Any]:
     """One team, from start to end."""
     rng = random.Random(seed)
     addresses = free_addresses(options.robots)
@@ -205,5 +193,22 @@ def _resident_kb(pid: int) -> int:
     return next((int(line.split()[1]) for line in status.splitlines() if line.startswith("VmRSS")), 0)
 
 
+CASE = Case("udp-numbers", measure, key=2, needs_data=False)
+
 if __name__ == "__main__":
-    sys.exit(main())
+    run(
+        __doc__,
+        CASE,
+        robots={"type": int, "default": 3},
+        runs={"type": int, "default": 1},
+        seconds={"type": float, "help": "then they are told to stop"},
+        rate={"type": float, "default": 10.0, "help": "scans a second"},
+        settle={"type": float, "default": 25.0, "help": "seconds without news until a robot ends"},
+        loss={"type": float, "default": 0.0},
+        kill={"action": "store_true"},
+        dataset={"default": "synthetic_building_2d"},
+        path={},
+        scans={"type": int, "help": "of a synthetic log, in all"},
+        part={"default": "consecutive"},
+        seed={"type": int, "default": 0},
+    )

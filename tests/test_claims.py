@@ -51,8 +51,8 @@ def test_a_claim_holds_within_its_interval_only(claims, tmp_path):
 
 def test_numbers_of_a_text_a_table_and_rows_of_results(claims, tmp_path):
     assert claims.numbers("costs # dB … of # kB", "it costs −1,234.5 dB (most) of .25 kB") == [-1234.5, 0.25]
-    (tmp_path / "sizes.md").write_text(
-        "note\n\n| map | AUC (kB) |\n|---|---|\n| a | 0.98 (8 kB) |\n| b | 0.99 (9) |\n"
+    claims.Table("", "", "", {"map": "", "AUC (kB)": ""}, [["a", "0.98 (8 kB)"], ["b", "0.99 (9)"]]).save(
+        tmp_path / "sizes.json"
     )
     assert claims.published("sizes", ["b"], "AUC (kB)")(tmp_path) == [0.99, 9.0]
     rows = [

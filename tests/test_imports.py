@@ -49,6 +49,7 @@ ROOMS = [
     "team.cli",
     "experiments.baselines",
     "experiments.evaluation",
+    "experiments.harness",
     "experiments.studies",
     "experiments.report",
     "experiments.cli",
@@ -147,7 +148,11 @@ def test_a_door_offers_names_that_exist_and_that_others_use(room):
     door = importlib.import_module(f"gmmtorch.{room}")
     folder = PACKAGE.joinpath(*room.split("."))
     readers = [path for path in PACKAGE.rglob("*.py") if folder not in path.parents]
-    readers += [path for top in ("docs", "tests", "examples") for path in (PACKAGE.parent / top).rglob("*.*")]
+    readers += [
+        path
+        for top in ("docs", "tests", "examples", "benchmarks")
+        for path in (PACKAGE.parent / top).rglob("*.*")
+    ]
     text = "\n".join(path.read_text("utf-8") for path in readers if path.suffix in (".py", ".md", ".rst"))
     for name in getattr(door, "__all__", []):
         is_type = isinstance(getattr(door, name), type)  # the result of a function of the door, perhaps

@@ -25,9 +25,9 @@ from gmmtorch.cli.from_options.scans import open_dataset
 from gmmtorch.datasets import sources
 from gmmtorch.errors import InvalidArgumentError, MissingDataError
 from gmmtorch.experiments.cli import methods_of_options
+from gmmtorch.experiments.cli import studies as study_cases
 from gmmtorch.experiments.cli.experiment_schema import STUDIES
 from gmmtorch.experiments.cli.fits_of_options import fit_options
-from gmmtorch.experiments.cli.studies import fit_studies, occupancy_studies
 from gmmtorch.experiments.evaluation import methods
 from gmmtorch.experiments.evaluation.fits import ESTIMATORS
 from gmmtorch.mapping.gaussian_map import GaussianMap
@@ -104,7 +104,7 @@ def test_every_experiment_composes_and_its_methods_and_study_exist(command, name
         known = ESTIMATORS if command == "fit" else methods(GaussianMap)
         assert set(config.method) <= set(known)
         return
-    studies = fit_studies.STUDIES if command == "fit" else occupancy_studies.STUDIES
+    studies = study_cases.STUDIES[command]
     assert config.study.name in studies
     expected = OmegaConf.structured(stored("study", config.study.name))
     assert set(differences(config.study, expected)) <= {"others", "sensor_options"}
@@ -118,7 +118,7 @@ def test_every_experiment_composes_and_its_methods_and_study_exist(command, name
 def test_every_study_has_an_experiment():
     configs = [composed(command, f"experiment={name}") for command, name in EXPERIMENTS]
     assert {config.study.name for config in configs if config.study is not None} == STUDIES.keys()
-    assert STUDIES.keys() == {*fit_studies.STUDIES, *occupancy_studies.STUDIES}
+    assert STUDIES.keys() == {name for cases in study_cases.STUDIES.values() for name in cases}
 
 
 @pytest.mark.parametrize("name", listed("explore")["experiment"])

@@ -11,7 +11,7 @@ from scipy import integrate
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.studies.angular_reference import angular_evidence
-from gmmtorch.experiments.studies.error_scenes import Scene, cast_rays, random_scene
+from gmmtorch.experiments.studies.approximation_error import Scene, cast_rays, random_scene
 from gmmtorch.occupancy.cones import Cones
 
 

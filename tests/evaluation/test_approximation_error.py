@@ -12,8 +12,15 @@ from pillar_room import timeless
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.report.approximation_error_figures import approximation_figures
-from gmmtorch.experiments.studies.approximation_error import map_rows, run_approximation_error, sweep_rows
-from gmmtorch.experiments.studies.error_scenes import Scene, cast_rays, methods, random_scene
+from gmmtorch.experiments.studies.approximation_error import (
+    Scene,
+    cast_rays,
+    map_rows,
+    methods,
+    random_scene,
+    run_approximation_error,
+    sweep_rows,
+)
 from gmmtorch.experiments.studies.study_options import ApproximationErrorStudy
 
 SMALL = ApproximationErrorStudy(

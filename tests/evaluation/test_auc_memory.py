@@ -6,8 +6,8 @@ from evaluation.pillar_room import room_scans
 
 from gmmtorch.experiments.evaluation.held_out import Protocol, evaluate
 from gmmtorch.experiments.evaluation.mapping_methods import Form, MapFactory, methods
-from gmmtorch.experiments.studies import auc_memory
-from gmmtorch.experiments.studies.auc_memory import Sized
+from gmmtorch.experiments.studies import map_studies
+from gmmtorch.experiments.studies.map_studies import Sized
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import WindowedRule
 
@@ -27,7 +27,7 @@ def test_every_sized_method_has_a_row():
         Sized("grid", None, grid),
     ]
     counts: list[int] = []
-    rows = auc_memory.run_auc_memory(
+    rows = map_studies.run_auc_memory(
         "room", scans, sized, PROTOCOL, on_rows=lambda rows: counts.append(len(rows))
     )
     assert [(row["method"], row["size"]) for row in rows] == [("point", 4), ("point", 12), ("grid", None)]

@@ -14,8 +14,8 @@ from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.evaluation.fits import FitData, Row, split
 from gmmtorch.experiments.evaluation.protocol_options import FitOptions
-from gmmtorch.experiments.studies import component_count
-from gmmtorch.experiments.studies.component_count import (
+from gmmtorch.experiments.studies import fit_studies
+from gmmtorch.experiments.studies.fit_studies import (
     RULES,
     component_bytes,
     count_modes,
@@ -114,7 +114,7 @@ def test_modes_match_scikit_learn_mean_shift(generator):
 
 def test_map_row_matches_a_map_with_that_rule(rows, scans):
     first = of(rows, "map_flat_pieces")[0]
-    rule = component_count.WindowedRule(noise=0.02, window=5)
+    rule = fit_studies.WindowedRule(noise=0.02, window=5)
     built = GaussianMap(rule, n_samples=20_000, cutoff=5.0, prior=1.0)  # as the study's maps
     for number, scan in enumerate(scans):
         if number % 4:

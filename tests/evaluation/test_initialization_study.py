@@ -13,8 +13,8 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.events import ignore
 from gmmtorch.experiments.evaluation.fits import FitData, Row, compare, split
 from gmmtorch.experiments.evaluation.protocol_options import FitOptions
-from gmmtorch.experiments.studies import initialization_study as initialization
-from gmmtorch.experiments.studies.initialization_study import box_covariances, fit_timed, run_initialization
+from gmmtorch.experiments.studies import fit_studies as initialization
+from gmmtorch.experiments.studies.fit_studies import box_covariances, fit_timed, run_initialization
 from gmmtorch.experiments.studies.study_options import InitializationStudy
 from gmmtorch.mixture.em.initialization import INITIALIZATIONS
 

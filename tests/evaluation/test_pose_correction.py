@@ -12,7 +12,7 @@ from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.evaluation.protocol_options import Protocol
 from gmmtorch.experiments.evaluation.queries import perturb_poses, pose_perturbations
-from gmmtorch.experiments.studies.pose_correction import build_by_scan, correct_poses, evaluate_correction
+from gmmtorch.experiments.studies.map_studies import build_by_scan, correct_poses, evaluate_correction
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import WindowedRule
 from gmmtorch.scan import Scan

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.experiments.studies.railing import Railing
 from gmmtorch.experiments.studies.study_options import COUNTS, VarianceThresholdStudy
 from gmmtorch.experiments.studies.variance_threshold import (
+    Railing,
     cells_by_setting,
     decided,
     run_variance_threshold,

@@ -46,8 +46,7 @@ def run(config: DictConfig) -> float | None:
 
     Workers of a streamed fit return None.
     """
-    from gmmtorch.experiments.cli import fit_outputs, fit_stream
-    from gmmtorch.experiments.cli.studies import fit_studies, study
+    from gmmtorch.experiments.cli import fit_outputs, fit_stream, studies
 
     folder = run_dir()
     if fit_stream.is_wanted(config):
@@ -60,7 +59,7 @@ def run(config: DictConfig) -> float | None:
             if config.study is None:
                 row = _compare(config, device, folder, bars)[-1]
             else:
-                row = study.run("fit", fit_studies.STUDIES, config, device, folder, bars)[-1]
+                row = studies.run("fit", config, device, folder, bars)[-1]
     print_files(folder)
     return fit_outputs.log_likelihood(row)
 

@@ -25,7 +25,7 @@ def main() -> None:
 
 def run(config: DictConfig) -> float | None:
     """Run the command; returns the AUC of the last row, which a sweep can optimize."""
-    from gmmtorch.experiments.cli.studies import occupancy_studies, study
+    from gmmtorch.experiments.cli import studies
 
     device = set_up(config)
     folder = run_dir()
@@ -33,7 +33,7 @@ def run(config: DictConfig) -> float | None:
         if config.study is None:
             rows = _compare(config, device, folder, bars)
         else:
-            rows = study.run("occupancy", occupancy_studies.STUDIES, config, device, folder, bars)
+            rows = studies.run("occupancy", config, device, folder, bars)
     print_files(folder)
     return rows[-1].get("auc")
 

@@ -194,7 +194,7 @@ def component_count_figures(rows: Rows) -> dict[str, Figure]:
     Fixed numbers of components form a line; the choices of each rule are marks, labelled with its setting.
 
     Args:
-        rows: of `gmmtorch.experiments.studies.component_count`.
+        rows: of `gmmtorch.experiments.studies.fit_studies`.
     """
     figure = new_figure(12.0, 9.4)
     grid = figure.subplots(2, 2)

@@ -83,7 +83,7 @@ class ApproximationErrorStudy:
 
 @dataclass(frozen=True)
 class AucMemoryStudy:
-    """Options of `studies.auc_memory`.
+    """Options of `studies.map_studies`.
 
     Attributes:
         forms: forms of evidence that are computed from our map.
@@ -109,7 +109,7 @@ class AucMemoryStudy:
 
 @dataclass(frozen=True)
 class MapVariantsStudy:
-    """Options of `studies.map_variants`.
+    """Options of `studies.map_studies`.
 
     Attributes:
         variants: for each variant, its options of the map that differ, such as {prune: support}. The first
@@ -132,7 +132,7 @@ class MapVariantsStudy:
 
 @dataclass(frozen=True)
 class PoseCorrectionStudy:
-    """Options of `studies.pose_correction`. methods: forms of evidence."""
+    """Options of `studies.map_studies`. methods: forms of evidence."""
 
     methods: Sequence[str] = ("point",)
 
@@ -206,7 +206,7 @@ class VarianceThresholdStudy:
 
 @dataclass(frozen=True)
 class InitializationStudy:
-    """Options of `studies.initialization_study`.
+    """Options of `studies.fit_studies`.
 
     Attributes:
         n_components: numbers of components.
@@ -235,7 +235,7 @@ class InitializationStudy:
 
 @dataclass(frozen=True)
 class ComponentCountStudy:
-    """Options of `studies.component_count`.
+    """Options of `studies.fit_studies`.
 
     Attributes:
         n_components: numbers K of the curve; numbers above the number of training points are left out.

@@ -8,8 +8,8 @@ of pieces is limited, pieces with many points, large extent and above all large 
 
 Nothing is random, and only the noise has a unit: points and noise in millimetres give the same pieces.
 For points that are not on surfaces, or noise in another unit than the points, the result is one piece
-if the noise explains all points, and otherwise as many pieces as have enough points. BENCHMARKS.md
-compares this rule with BIC and mean shift.
+if the noise explains all points, and otherwise as many pieces as have enough points.
+docs/decisions.md compares this rule with BIC and mean shift.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _MAX_LEVELS = 64
 _MOST_ON_CPU = 1 << 17  # cells of another device: each level of cuts waits for the one before it
 _THICKNESS_PRIORITY = 30.0
 """Weight of a piece's smallest variance, relative to its largest, in the priority of halving it. Thick
-pieces span several surfaces, and so put matter into free space (BENCHMARKS.md, "Where EM starts")."""
+pieces span several surfaces, and so put matter into free space (docs/decisions.md, "Where EM starts")."""
 _FLAT = 2.0  # largest thickness of a flat piece, in standard deviations of the noise
 _OUTLIER_GAP = 100.0  # from which on a few stray points form a piece, in standard deviations
 _MAX_CELLS_ALONG = (1 << KEY_BITS) - 2  # along the longest side

@@ -1,1 +1,0 @@
-"""The studies that gmmtorch-fit and gmmtorch-occupancy run."""
