@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
+import functools
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from omegaconf import DictConfig
+from omegaconf import MISSING, DictConfig
 
-from gmmtorch.cli import app, common
-from gmmtorch.cli.options import schema
+from gmmtorch.cli import app, common, schema
+from gmmtorch.cli.view import BOUNDS
 from gmmtorch.errors import InvalidArgumentError, check_choice
+from gmmtorch.options import group, option
 from gmmtorch.report import ProgressBars
 
 if TYPE_CHECKING:
@@ -22,39 +23,68 @@ _STAGE = "localising"
 TABLE = "dataset n_scans n_found n_lost_runs ate rpe ate_degrees deviation scans_per_second"
 
 
+@dataclass
+class LocalizeOptions:
+    """Options of gmmtorch-localize."""
+
+    dataset: Any = option(MISSING, "where the scans come from")
+    map: str | None = option(None, "map file, run directory of gmmtorch-map, or folder of tiles")
+    bounds: list[float] | None = option(None, BOUNDS)
+    pose: Any = option(
+        None,
+        "first pose, [x,y,yaw], in 3D [x,y,z,yaw] or [x,y,z,qx,qy,qz,qw] (m, rad), within 0.5 m and 0.175 "
+        "rad; dataset: that of the data set; null: unknown, the whole map is searched",
+    )
+    motion: str = option(
+        "constant",
+        "constant: as between the last two scans; dataset: as between the poses of the data set, such as an "
+        "odometry's; imu: with the rotation of the IMU of a ROS bag",
+    )
+    n_points: int = option(1000, "points of a scan that are used at most")
+    least_explained: float = option(
+        0.9, "share of the points that must lie on surfaces of the map; less where much has changed"
+    )
+    truth: str | None = option("none", "true poses, for scores: dataset, none, or a TUM or KITTI file")
+    align: str = option(
+        "none",
+        "before scoring. none: the truth is in the frame of the map; first: the first poses coincide; rigid: "
+        "least squares",
+    )
+    report: common.Report = group(common.Report)
+    runtime: common.Memory = group(common.Memory)
+
+
+@functools.cache
+def register() -> None:
+    """Stores the options of the command."""
+    schema.register()
+    schema.store({"localize": schema.schema_of(LocalizeOptions)})
+
+
 def main() -> None:
     """Entry point of the command."""
-    sys.argv[1:] = overrides(sys.argv[1:])
-    app.start("localize", run, schema.register)
-
-
-def overrides(words: Sequence[str]) -> list[str]:
-    """The arguments as Hydra's overrides: map=FILE becomes map.path=FILE."""
-    return [f"map.path={word.removeprefix('map=')}" if word.startswith("map=") else word for word in words]
+    app.start("localize", run, register)
 
 
 def run(config: DictConfig) -> None:
     """Run the command."""
-    from gmmtorch.cli.from_options import maps
-    from gmmtorch.cli.from_options.scans import open_dataset
-    from gmmtorch.cli.reporting import localization_outputs
+    from gmmtorch.cli import inputs
+    from gmmtorch.cli.outputs import localization_outputs
     from gmmtorch.localization import ALIGNMENTS, MOTIONS, Tracker
 
-    if not config.map.path:
+    if not config.map:
         raise InvalidArgumentError("map is not set; give map=FILE, a map file or a run directory.")
     check_choice("motion", config.motion, MOTIONS)
     check_choice("align", config.align, ALIGNMENTS)
     common.use_runtime(config.runtime)
     folder = common.run_dir()
-    built = maps.open_map(Path(config.map.path).expanduser(), config.runtime, config.map.bounds)
-    dataset = open_dataset(config.dataset)
+    built = inputs.open_map(Path(config.map).expanduser(), config.runtime, config.bounds)
+    dataset = inputs.open_dataset(config.dataset)
     truth = localization_outputs.true_poses(config, dataset, built.dim or 3)
-    with common.naming({"surfaces": "map", "points": "dataset"}):
+    with schema.naming({"surfaces": "map", "points": "dataset"}):
         tracker = Tracker(
             built,
             localization_outputs.first_pose(config, dataset, built.dim or 3),
-            distance=config.distance,
-            angle=config.angle,
             n_points=config.n_points,
             least_explained=config.least_explained,
         )
@@ -63,7 +93,7 @@ def run(config: DictConfig) -> None:
     row = localization_outputs.result_row(config, dataset, located, truth)
     localization_outputs.write(config, built, located, truth, row, folder)
     common.write_results("localize", config, [row], folder)
-    common.print_table([row], TABLE.split(), f"{dataset.name} in {config.map.path}")
+    common.print_table([row], TABLE.split(), f"{dataset.name} in {config.map}")
     for message in row["messages"]:
         print(message)
     print(f"\ntrajectory  {folder}/{{{localization_outputs.FOUND}, {localization_outputs.ALL}}}")
@@ -76,7 +106,7 @@ def _locate(config: DictConfig, dataset: Dataset, tracker: Tracker, bars: Progre
 
     if len(dataset) and dataset[0].dim != tracker.dim:
         raise InvalidArgumentError(
-            f"map={config.map.path} is {tracker.dim}D, and the scans of {dataset.name} are "
+            f"map={config.map} is {tracker.dim}D, and the scans of {dataset.name} are "
             f"{dataset[0].dim}D; give a map of scans of the same kind."
         )
     located = []

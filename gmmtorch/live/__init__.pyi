@@ -14,7 +14,7 @@ from .mapper.live_localizer import MAP as MAP
 from .mapper.live_localizer import LiveLocalizer as LiveLocalizer
 from .mapper.live_mapper import LiveMapper as LiveMapper
 from .mapper.live_mapper import warm_up as warm_up
-from .mapper.live_scans import LiveOptions as LiveOptions
+from .mapper.live_options import LiveOptions as LiveOptions
 from .mapper.live_scans import LiveScans as LiveScans
 from .mapper.map_publisher import MapPublisher as MapPublisher
 from .mapper.sensor_topics import find_sensor as find_sensor

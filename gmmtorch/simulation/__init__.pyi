@@ -1,3 +1,4 @@
+from .sensors.camera_options import CameraOptions as CameraOptions
 from .sensors.depth_camera import DepthCamera as DepthCamera
 from .sensors.depth_camera import DepthFrame as DepthFrame
 from .sensors.mesh_raycasting import ray_segments as ray_segments

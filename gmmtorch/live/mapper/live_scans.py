@@ -34,7 +34,8 @@ from gmmtorch.datasets import (
     in_space,
     stamp_of,
 )
-from gmmtorch.errors import DataError, check_choice, check_number
+from gmmtorch.errors import DataError
+from gmmtorch.live.mapper.live_options import LiveOptions
 from gmmtorch.localization import METHODS, Location, Odometry, Tracker, composed, odometry_of
 from gmmtorch.mapping import GaussianMap
 from gmmtorch.scan import FARTHEST, Scan
@@ -45,46 +46,6 @@ _PATIENCE = 10.0  # s that a scan waits for its pose if there is no limit of the
 _WAITING_BYTES = 1 << 28
 _BACKWARDS = 30 * NANOSECONDS  # a clock that is set back further starts again
 _N_FIRST = 101  # messages whose stamps and receipt show how the sensor keeps time
-
-
-@dataclass(frozen=True)
-class LiveOptions:
-    """How live messages become scans.
-
-    poses: tf; standing for a sensor that does not move; mixture or kiss_icp for odometry from the scans.
-    frame: the fixed frame of TF, such as odom; None: the root of the sensor's tree. Of odometry: the name of
-        its frame; None: odom.
-    sensor_frame: the frame of the sensor; None: that of the messages.
-    loops: whether odometry by mixtures closes loops, which moves earlier poses and the present one.
-    max_gap: longest time (s) between two poses that are interpolated.
-    clock: header, stamps of the messages; or received, times of receipt.
-    deskew: each point with a time gets the pose of its own time.
-    stride: use every n-th scan.
-    pixel_stride: every n-th pixel of every n-th row of depth images.
-    depth_scale: metres per unit of depth images; None: 0.001 for whole numbers, 1 for floating ones.
-    intrinsics: [fx,fy,cx,cy] in pixels of depth images without distortion; None: of the CameraInfo.
-    max_latency: seconds after which a scan that waits is dropped; None: scans wait.
-    """
-
-    poses: str = "tf"
-    frame: str | None = None
-    sensor_frame: str | None = None
-    loops: bool = True
-    max_gap: float = 2.0
-    clock: str = "header"
-    deskew: bool = True
-    stride: int = 1
-    pixel_stride: int = 1
-    depth_scale: float | None = None
-    intrinsics: list[float] | None = None
-    max_latency: float | None = 2.0
-
-    def __post_init__(self) -> None:
-        check_choice("poses", self.poses, ("tf", "standing", *METHODS))
-        check_choice("clock", self.clock, ("header", "received"))
-        check_number("max_gap", self.max_gap)
-        if self.max_latency is not None:
-            check_number("max_latency", self.max_latency)
 
 
 @dataclass

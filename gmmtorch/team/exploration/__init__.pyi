@@ -10,7 +10,11 @@ from .mission.mission_moments import AgentMoments as AgentMoments
 from .mission.mission_moments import MissionMoments as MissionMoments
 from .mission.mission_moments import ReplayMoments as ReplayMoments
 from .mission.options import THESIS as THESIS
+from .mission.options import Dynamics as Dynamics
+from .mission.options import FrameRule as FrameRule
+from .mission.options import StoppingRule as StoppingRule
 from .mission.options import TeamOptions as TeamOptions
+from .mission.options import WorldOptions as WorldOptions
 from .mission.paired_statistics import Band as Band
 from .mission.paired_statistics import Interval as Interval
 from .mission.paired_statistics import mean_band as mean_band
@@ -34,15 +38,11 @@ from .mission.team_setup import start_poses as start_poses
 from .mission.trials import STAGE as STAGE
 from .mission.trials import TRAJECTORIES as TRAJECTORIES
 from .mission.trials import Trial as Trial
-from .mission.trials import WorldOptions as WorldOptions
 from .mission.trials import keep_row as keep_row
 from .mission.trials import kept_row as kept_row
 from .mission.trials import run_mission as run_mission
 from .mission.trials import run_trials as run_trials
 from .mission.trials import save_trajectories as save_trajectories
-from .planning.primitives import Dynamics as Dynamics
 from .robot.agent import Agent as Agent
-from .robot.gmm_mapper import FrameRule as FrameRule
-from .robot.robot_state import StoppingRule as StoppingRule
 from .world.scoring import BeliefRule as BeliefRule
 from .world.world import World as World

@@ -7,7 +7,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gmmtorch.cli import as_options, build, naming
+from gmmtorch.cli import build, naming
 from gmmtorch.events import Event, OnRows, Row
 from gmmtorch.experiments.cli import fit_outputs
 from gmmtorch.experiments.cli.fits_of_options import fit_data, fit_data_of, fit_options, selected_scans
@@ -29,7 +29,7 @@ Figures = Callable[[list[Row]], Mapping[str, Any]]
 
 
 def _initialization(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
-    study = build(InitializationStudy, as_options(config.study), "study")
+    study = build(InitializationStudy, config, "study")
     data = fit_data(config, device, on_event)
     rows = run_initialization(data, study, fit_options(config), config.seed, on_event, on_rows)
     return _found(
@@ -42,7 +42,7 @@ def _initialization(config: DictConfig, device: str, on_event: Event, on_rows: O
 
 def _sensor_model(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
     """Fields of a fit that this study does not measure are None."""
-    study = build(SensorModelStudy, as_options(config.study), "study")
+    study = build(SensorModelStudy, config, "study")
     with naming({name: f"study.{name}" for name in ("sensor", "sensor_options")}):
         sensor_model(study)  # an invalid option fails before the scans are read
     dataset, scans = selected_scans(config, device, on_event)
@@ -65,7 +65,7 @@ def _sensor_model(config: DictConfig, device: str, on_event: Event, on_rows: OnR
 
 
 def _component_count(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
-    study = build(ComponentCountStudy, as_options(config.study), "study")
+    study = build(ComponentCountStudy, config, "study")
     dataset, scans = selected_scans(config, device, on_event)
     data = fit_data_of(config, dataset, middle(scans, study.window))
     options = fit_options(config)

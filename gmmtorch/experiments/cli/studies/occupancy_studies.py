@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any
 
 from omegaconf import DictConfig
 
-from gmmtorch.cli import all_scans, as_options, build, limits, map_factory
+from gmmtorch.cli import all_scans, build, limits, map_factory
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.events import Event, OnRows, Row
 from gmmtorch.experiments.cli import methods_of_options
@@ -37,13 +38,13 @@ from gmmtorch.experiments.studies import (
     run_map_variants,
     run_variance_threshold,
 )
-from gmmtorch.mapping import METHODS, GaussianMap
+from gmmtorch.mapping import METHODS, GaussianMap, MixtureRule
 
 
 def _auc_memory(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
     """Our map and the BGK map at each of their sizes, and `study.others` at their only size."""
     protocol = methods_of_options.protocol_of(config)
-    study = build(AucMemoryStudy, as_options(config.study), "study")
+    study = build(AucMemoryStudy, config, "study")
     sized = [
         Sized(form, n, Form(map_factory(config, n_components=n), form))
         for form in study.forms
@@ -66,7 +67,7 @@ def _auc_memory(config: DictConfig, device: str, on_event: Event, on_rows: OnRow
 
 def _variance_threshold(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
     """Thin structures with several forms, sizes, cells, priors and thresholds."""
-    study = build(VarianceThresholdStudy, as_options(config.study), "study")
+    study = build(VarianceThresholdStudy, config, "study")
     if study.railing is None:
         (name, scans), is_thin = all_scans(config, device, on_event), None
     else:
@@ -101,7 +102,7 @@ def _variance_threshold(config: DictConfig, device: str, on_event: Event, on_row
 
 def _approximation_error(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
     """Every form of evidence against the exact angular form; needs no data set."""
-    study = build(ApproximationErrorStudy, as_options(config.study), "study")
+    study = build(ApproximationErrorStudy, config, "study")
     rows = run_approximation_error(study, config.seed, on_event, on_rows)
     swept = [row for row in rows if row["study"] == "sweep"]
     table = "method dim hits_max hits_p99 hits_median misses_max misses_p99 misses_median probability_max"
@@ -117,7 +118,7 @@ def _approximation_error(config: DictConfig, device: str, on_event: Event, on_ro
 def _pose_correction(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
     """Maps from perturbed poses, before and after the correction of the poses."""
     protocol = methods_of_options.protocol_of(config)
-    study = build(PoseCorrectionStudy, as_options(config.study), "study")
+    study = build(PoseCorrectionStudy, config, "study")
     new_map = map_factory(config)
     name, scans = all_scans(config, device, on_event)
     rows = evaluate_correction(name, scans, new_map, protocol, study.methods, config.seed, on_event, on_rows)
@@ -128,11 +129,11 @@ def _pose_correction(config: DictConfig, device: str, on_event: Event, on_rows: 
 def _map_variants(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
     """Maps with changed options, such as pruning."""
     protocol = methods_of_options.protocol_of(config)
-    study = build(MapVariantsStudy, as_options(config.study), "study")
+    study = build(MapVariantsStudy, config, "study")
     form = next((method for method in config.method if method in METHODS), "point")
     variants = {}
     for name, changes in study.variants.items():
-        if unknown := set(changes) - set(as_options(config.map)):
+        if unknown := set(changes) - {*config.map, *(item.name for item in fields(MixtureRule))}:
             raise InvalidArgumentError(
                 f"study.variants.{name}.{min(unknown)} is not an option of map={config.map.name}."
             )

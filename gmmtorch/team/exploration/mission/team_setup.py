@@ -47,7 +47,7 @@ def assemble(world: World, options: TeamOptions, watch: Stopwatch | None = None)
     watch: times the stages of all robots together; None: wall time.
     """
     poses = start_poses(world, options)
-    network = Network(options.size, options.conditions, seed=options.seed)
+    network = Network(options.size, options, seed=options.seed)
     memo, evidence = Memo(_CACHED_MESSAGES), Memo(_CACHED_EVIDENCE * options.size)
     watch = Stopwatch() if watch is None else watch
     agents = [

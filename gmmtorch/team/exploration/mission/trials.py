@@ -23,10 +23,10 @@ from gmmtorch.files import check_writable, write_json, write_npz
 from gmmtorch.processes import end_with_parent
 from gmmtorch.team.exploration.mission.driver import SimulatedClock, drive
 from gmmtorch.team.exploration.mission.mission import Mission
-from gmmtorch.team.exploration.mission.options import TeamOptions
+from gmmtorch.team.exploration.mission.options import TeamOptions, WorldOptions
 from gmmtorch.team.exploration.mission.results import mission_row
 from gmmtorch.team.exploration.mission.team_setup import assemble
-from gmmtorch.team.exploration.world.world import World, open_world
+from gmmtorch.team.exploration.world.world import World
 
 ROW = "row.json"
 STAGE = "simulated seconds"
@@ -35,38 +35,6 @@ _CONVERGENCE = 120.0
 """Simulated seconds after a mission in which the maps may become equal."""
 
 OnMission = Callable[[Mission], object]
-
-
-@dataclass(frozen=True)
-class WorldOptions:
-    """Which world; see `world.open_world`.
-
-    size (m), seed: of generated worlds. path, bounds: of a mesh. cache: keep computed properties on disk.
-    """
-
-    name: str = "warehouse"
-    path: str | None = None
-    bounds: tuple[float, ...] | None = None
-    size: tuple[float, ...] | None = None
-    seed: int = 0
-    resolution: float = 0.2
-    cache: bool = True
-
-    def open(self, team: TeamOptions, on_event: Event = ignore) -> World:
-        """The world for robots with this camera and this body."""
-        return open_world(
-            self.name,
-            path=self.path,
-            bounds=self.bounds,
-            seed=self.seed,
-            size=self.size,
-            resolution=self.resolution,
-            vertical_fov=team.camera.vertical_fov,
-            max_range=team.camera.max_range,
-            robot_radius=team.dynamics.radius,
-            cache=self.cache,
-            on_event=on_event,
-        )
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 import numbers
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import InitVar, dataclass
-from typing import Any, NamedTuple
-
-import torch
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.options import option
+
+if TYPE_CHECKING:
+    import torch
 
 
 class Partition(NamedTuple):
@@ -33,56 +35,58 @@ class Partition(NamedTuple):
 
 @dataclass(frozen=True)
 class LinkConditions:
-    """Conditions of all links of a network.
+    """Conditions of all links of a network. Raises `InvalidArgumentError` for values out of range."""
 
-    latency: seconds from the end of transmission to arrival, at least. jitter: mean (s) of an exponential
-    delay that is added for each receiver and each copy. bandwidth: bytes per second of each sender; None: no
-    limit. loss: share of the datagrams that each receiver loses, [0, 1). duplication: share of those not lost
-    that arrive twice, [0, 1]. reach: largest distance (m) between two robots that communicate; None: any.
-    partitions: each a `Partition`, or a mapping or triple of its fields; they may overlap in time. names:
-    field names to use in error messages, such as those of a command's options.
+    latency: float = option(
+        0.05, "seconds from the end of transmission to arrival, at least", "network.delay"
+    )
+    jitter: float = option(
+        0.0,
+        "mean (s) of an exponential delay that is added for each receiver and each copy; reorders datagrams",
+        "network.jitter",
+    )
+    bandwidth: float | None = option(
+        None, "bytes per second that each robot can send; null: no limit", "network.bandwidth"
+    )
+    loss: float = option(0.0, "share of the datagrams that each receiver loses, [0, 1)", "network.loss")
+    duplication: float = option(
+        0.0, "share of the received datagrams that arrive twice, [0, 1]", "network.duplication"
+    )
+    reach: float | None = option(
+        None, "largest distance (m) between two robots that communicate; null: any", "network.reach"
+    )
+    partitions: tuple[Partition, ...] = option(
+        (),
+        "as in [{begin: 60, end: 120, groups: [[0], [1, 2]]}]; simulated seconds, robots by id",
+        "network.partitions",
+    )
 
-    Raises `InvalidArgumentError` for values out of range.
-    """
-
-    latency: float = 0.05
-    jitter: float = 0.0
-    bandwidth: float | None = None
-    loss: float = 0.0
-    duplication: float = 0.0
-    reach: float | None = None
-    partitions: tuple[Partition, ...] = ()
-    names: InitVar[Mapping[str, str] | None] = None
-
-    def __post_init__(self, names: Mapping[str, str] | None) -> None:
-        names = names or {}
+    def __post_init__(self) -> None:
         for field, (is_valid, requirement) in _REQUIREMENTS.items():
             value = getattr(self, field)
             if value is None and field in _OPTIONAL:
                 continue
             if not (_is_number(value) and is_valid(value)):
-                raise InvalidArgumentError(f"{names.get(field, field)}={value!r} must be {requirement}.")
+                raise InvalidArgumentError(f"{field}={value!r} must be {requirement}.")
             object.__setattr__(self, field, float(value))
-        name = names.get("partitions", "partitions")
         if not isinstance(self.partitions, Sequence):
-            raise InvalidArgumentError(f"{name}={self.partitions!r} must be a list of partitions.")
-        partitions = tuple(_partition(f"{name}[{i}]", value) for i, value in enumerate(self.partitions))
+            raise InvalidArgumentError(f"partitions={self.partitions!r} must be a list of partitions.")
+        partitions = tuple(_partition(f"partitions[{i}]", value) for i, value in enumerate(self.partitions))
         object.__setattr__(self, "partitions", partitions)
 
-    def check_team(self, n_robots: int, names: Mapping[str, str] | None = None) -> None:
-        """Raise `InvalidArgumentError` unless the partitions fit a team of `n_robots`. names: as above."""
-        name = (names or {}).get("partitions", "partitions")
+    def check_team(self, n_robots: int) -> None:
+        """Raise `InvalidArgumentError` unless the partitions fit a team of `n_robots`."""
         for i, partition in enumerate(self.partitions):
             named = [robot for group in partition.groups for robot in group]
             if max(named) >= n_robots:
                 raise InvalidArgumentError(
-                    f"{name}[{i}].groups={partition.groups} names robot {max(named)}; there are {n_robots}, "
-                    "numbered from 0."
+                    f"partitions[{i}].groups={partition.groups} names robot {max(named)}; there are "
+                    f"{n_robots}, numbered from 0."
                 )
             if len(partition.groups) + (len(named) < n_robots) < 2:
                 raise InvalidArgumentError(
-                    f"{name}[{i}].groups={partition.groups} puts all {n_robots} robots into one group, and "
-                    "so divides nothing; leave it out, or give two groups."
+                    f"partitions[{i}].groups={partition.groups} puts all {n_robots} robots into one "
+                    "group, and so divides nothing; leave it out, or give two groups."
                 )
 
     def cut(self, sender: int, receiver: int, begin: float, end: float) -> bool:
@@ -94,6 +98,8 @@ class LinkConditions:
 
     def draw_losses(self, n: int, generator: torch.Generator) -> list[bool]:
         """Which of n receivers lose a datagram."""
+        import torch  # options are shown without it
+
         if self.loss == 0:
             return [False] * n
         drawn = torch.rand(n, generator=generator, dtype=torch.float64) < self.loss
@@ -101,6 +107,8 @@ class LinkConditions:
 
     def draw_delays(self, n: int, generator: torch.Generator) -> list[list[float]]:
         """For each of n receivers, the delays (s) of the one or two copies of a datagram."""
+        import torch
+
         if self.jitter == self.duplication == 0:
             return [[self.latency]] * n
         first, second, chance = torch.rand(3, n, generator=generator, dtype=torch.float64).tolist()

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 from omegaconf import DictConfig
 
-from gmmtorch.cli import as_options, logger, naming, print_table, run_dir, write_results
+from gmmtorch.cli import as_options, logger, print_table, run_dir, write_results
 from gmmtorch.errors import check_whole
 from gmmtorch.events import Row
 from gmmtorch.live import LiveView
 from gmmtorch.report import ProgressBars
-from gmmtorch.team.cli.from_options import missions
-from gmmtorch.team.cli.reporting.explore_pictures import MissionRecorder, save_comparison
+from gmmtorch.team.cli import missions
+from gmmtorch.team.cli.explore_pictures import MissionRecorder, save_comparison
 from gmmtorch.team.exploration import (
     NETWORK,
     STAGE,
@@ -41,7 +41,7 @@ def explore(config: DictConfig, bars: ProgressBars, view: LiveView | None) -> Ro
         logger.info("%s has this mission already; nothing is run.", folder)
         write_results("explore", config, [row], folder)
         return row
-    world = missions.open_world(trial.world, trial.team, bars)
+    world = trial.world.open(trial.team, bars)
     recorder = MissionRecorder(config, folder, world)
     moments: MissionMoments | None = None
 
@@ -59,8 +59,7 @@ def explore(config: DictConfig, bars: ProgressBars, view: LiveView | None) -> Ro
                 moments.note()
             (view.finish if mission.is_over else view.offer)(moments)
 
-    with naming(missions.NAMES):
-        mission, row = run_mission(trial, world, on_tick)
+    mission, row = run_mission(trial, world, on_tick)
     (row,) = compared([row])
     write_results("explore", config, [row], folder)
     recorder.finish(mission, row)
@@ -99,7 +98,7 @@ def compare(config: DictConfig, bars: ProgressBars) -> list[Row]:
         for variant in variants
     ]
     # Fills the cache before several processes need the world.
-    missions.open_world(trials[0].world, trials[0].team, bars)
+    trials[0].world.open(trials[0].team, bars)
     done: list[Row] = []
 
     def on_row(row: Row) -> None:
@@ -109,8 +108,7 @@ def compare(config: DictConfig, bars: ProgressBars) -> list[Row]:
     def on_sample(mission: Mission) -> None:
         bars.note(STAGE, _status(mission))
 
-    with naming(missions.NAMES):
-        rows = compared(run_trials(trials, config.runtime.workers, on_row, bars, on_sample))
+    rows = compared(run_trials(trials, config.runtime.workers, on_row, bars, on_sample))
     write_results("explore", config, rows, folder)
     save_comparison(config, rows, folder)
     return rows

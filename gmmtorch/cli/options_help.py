@@ -1,13 +1,13 @@
 """What a command can run: its options, with a line on each, and the choices of its groups.
 
-The lines come from the docstrings of the dataclasses that make the schema. `--help`, completion and the
-errors for mistyped options use this file. It composes configurations, and imports nothing heavy.
+The lines come from the dataclasses that make the schema. `--help`, completion, the errors for mistyped
+options and the tables of docs/commands.md use this file. It composes configurations, and imports nothing
+heavy.
 """
 
 from __future__ import annotations
 
 import functools
-import inspect
 import re
 from collections.abc import Collection, Iterator, Sequence
 from difflib import SequenceMatcher
@@ -26,7 +26,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gmmtorch.cli import common
-from gmmtorch.cli.options.structured import DOCUMENTED
+from gmmtorch.cli.schema import about_of
 from gmmtorch.errors import InvalidArgumentError
 
 _NEAR = 0.6
@@ -62,10 +62,10 @@ def configuration(command: str, overrides: Sequence[str] = ()) -> DictConfig:
 def options_of(config: DictConfig) -> list[Option]:
     """The options of a composed configuration that the command line can set, in its order.
 
-    Without those of Hydra, options that were removed, and the study, which `experiment=` sets.
+    Without those of Hydra, and the study, which `experiment=` sets.
     """
     found = [option for name in config if name != "hydra" for option in _options(config, str(name), "")]
-    return [one for one in found if one.name != "study" and "removed:" not in one.about]
+    return [one for one in found if one.name != "study"]
 
 
 def _options(node: DictConfig, name: str, prefix: str) -> Iterator[Option]:
@@ -75,10 +75,7 @@ def _options(node: DictConfig, name: str, prefix: str) -> Iterator[Option]:
             if inner != "name":  # set by the choice of a group
                 yield from _options(value, str(inner), f"{prefix}{name}.")
         return
-    about = ""
-    for kind in inspect.getmro(OmegaConf.get_type(node) or object):
-        documented = {*node, *getattr(kind, DOCUMENTED, ())}
-        about = about or descriptions(kind.__doc__ or "", documented).get(name, "")
+    about = about_of(node, name).replace("None", "null")
     shown = "???" if OmegaConf.is_missing(node, name) else node[name]
     yield Option(f"{prefix}{name}", shown, about)
 
@@ -88,36 +85,14 @@ def _is_dict(node: DictConfig) -> bool:
     return OmegaConf.get_type(node) is dict
 
 
-def descriptions(doc: str, names: Collection[Any]) -> dict[str, str]:
-    """What a docstring says about each of the names, from `name: text` and `name, other: text`."""
-    found: dict[str, str] = {}
-    for paragraph in inspect.cleandoc(doc).split("\n\n"):
-        found |= _described(" ".join(paragraph.split()), names)
-    return found
-
-
-def _described(text: str, names: Collection[Any]) -> dict[str, str]:
-    heads = [
-        match
-        for match in re.finditer(r"(?:(?<=[.:;)…] )|^)(\w+(?:, \w+)*)(?: \([^)]*\))?: ", text)
-        if all(name in names for name in match[1].split(", "))
-    ]
-    ends = [match.start() for match in heads[1:]] + [len(text)] * bool(heads)
-    return {
-        name: _brief(text[head.end() : end].strip())
-        for head, end in zip(heads, ends, strict=True)
-        for name in head[1].split(", ")
-    }
-
-
 def _brief(text: str) -> str:
-    """The first sentences of a text that fit a line, with the words of the command line."""
+    """The first sentences of a text that fit a line."""
     kept, *others = re.split(r"(?<=\.) (?=[A-Z])", text)
     for other in others:
         if len(kept) + len(other) > _LINE:
             break
         kept += f" {other}"
-    return kept.replace("None", "null").rstrip(".")
+    return kept.rstrip(".")
 
 
 # -- groups ---------------------------------------------------------------------------------------
@@ -150,7 +125,7 @@ def help_text(command: str, overrides: Sequence[str] = ()) -> str:
 
 def _line(option: Option) -> str:
     head = f"{option.name}={_text(option.value)}"
-    return f"{head:<{_VALUES}}  {option.about}".rstrip()
+    return f"{head:<{_VALUES}}  {_brief(option.about)}".rstrip()
 
 
 def _text(value: Any) -> str:

@@ -162,8 +162,7 @@ def localize(config: DictConfig, node: Node, device: str) -> None:
 
 def _scans(config: DictConfig, node: Node) -> LiveScans:
     """The scans of the sensor's topic, which is found by itself if it is not given."""
-    options = as_options(config.sensor)
-    live = build(LiveOptions, options, "sensor")
+    live = build(LiveOptions, config, "sensor")
     with naming({name: f"sensor.{name}" for name in ("max_range", "no_return_range")}):
         ranges = Ranges(config.sensor.max_range, config.sensor.no_return_range)
     sensor = find_sensor(node, config.sensor.topic, config.wait)
