@@ -28,6 +28,11 @@ def told(text: str, names: Mapping[str, str] | None = None) -> str:
     return _MARKED.sub(lambda found: (names or {}).get(found[1], found[1]), text)
 
 
+def text_of(error: Exception) -> str:
+    """The text of an error with its marks, for `told`."""
+    return str(error.args[0]) if error.args else ""
+
+
 class GmmTorchError(Exception):
     """Base class of all errors that gmmtorch raises deliberately.
 
@@ -43,7 +48,7 @@ class GmmTorchError(Exception):
     @property
     def argument(self) -> str | None:
         """The argument's name in Python; None if the error is of something else."""
-        found = _HEAD.match(self._text)
+        found = _HEAD.match(text_of(self))
         return (found[1] or found[2]) if found else None
 
     @property
@@ -62,23 +67,19 @@ class GmmTorchError(Exception):
         return self._part("remedy")
 
     def _part(self, name: str) -> str | None:
-        head = _HEAD.match(self._text)
-        found = _REST.fullmatch(self._text, head.end()) if head else None
+        head = _HEAD.match(text_of(self))
+        found = _REST.fullmatch(text_of(self), head.end()) if head else None
         return told(found[name]) if found and found[name] else None
 
     def told(self, names: Mapping[str, str]) -> Self:
         """The same error with other names for its argument and for the marked ones, such as options."""
-        text, argument = self._text, self.argument
+        text, argument = text_of(self), self.argument
         if argument is not None and not text.startswith("‹"):
             text = arg(argument) + text.removeprefix(argument)
         return type(self)(told(text, names))
 
-    @property
-    def _text(self) -> str:
-        return str(self.args[0]) if self.args else ""
-
     def __str__(self) -> str:  # also because OSError would print a bare tuple
-        return "".join(c if c.isprintable() else repr(c)[1:-1] for c in told(self._text))
+        return "".join(c if c.isprintable() else repr(c)[1:-1] for c in told(text_of(self)))
 
 
 class InvalidArgumentError(GmmTorchError, ValueError):

@@ -28,6 +28,7 @@ from .outputs.map_outputs import Checkpoint as Checkpoint
 from .outputs.map_outputs import print_skipped as print_skipped
 from .outputs.map_outputs import surfaces_of as surfaces_of
 from .outputs.map_outputs import write_trajectory as write_trajectory
+from .schema import argument_names as argument_names
 from .schema import build as build
 from .schema import naming as naming
 from .schema import part_of as part_of

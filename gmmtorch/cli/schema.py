@@ -178,7 +178,6 @@ def build(cls: type[T], config: Any, prefix: str = "", **others: Any) -> T:
     """
     hints = _hints(cls)
     arguments: dict[str, Any] = {}
-    names: dict[str, str] = {}
     for item, about in declared(cls):
         name = item.name if about.name is None else about.name
         place = f"{prefix}.{name}".strip(".") if prefix else name
@@ -187,22 +186,30 @@ def build(cls: type[T], config: Any, prefix: str = "", **others: Any) -> T:
         if about.options is not None:
             made = type(default_of(item))
             arguments[item.name] = build(made, config, place, **_of_python(made, about.defaults))
-            names |= {f"{item.name}.{one}": f"{place}.{one}" for one, _ in _leaves(made)}
         elif (value := _selected(config, place)) is not MISSING:
             arguments[item.name] = _converted(hints[item.name], value, place)
-            names[item.name] = place
-    with naming(names):
+    with naming(argument_names(cls, prefix)):
         return cls(**arguments, **others)
+
+
+def argument_names(cls: Any, prefix: str = "") -> dict[str, str]:
+    """The options of a dataclass by its fields; by `field.field` for those of a group."""
+    found: dict[str, str] = {}
+    for item, about in declared(cls):
+        name = item.name if about.name is None else about.name
+        place = f"{prefix}.{name}".strip(".") if prefix else name
+        if about.options is None:
+            found[item.name] = place
+        else:
+            inner = argument_names(about.options, place)
+            found = {**inner, **{f"{item.name}.{one}": option for one, option in inner.items()}, **found}
+    return found
 
 
 def _of_python(cls: Any, defaults: Mapping[str, Any] | None) -> dict[str, Any]:
     """Those defaults that are no options."""
     options = {item.name for item, _ in declared(cls)}
     return {name: value for name, value in (defaults or {}).items() if name not in options}
-
-
-def _leaves(cls: Any) -> Iterator[tuple[str, About]]:
-    return ((about.name or item.name, about) for item, about in declared(cls))
 
 
 def _selected(config: Any, place: str) -> Any:

@@ -22,9 +22,8 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
 
 from gmmtorch.cli import common, export, localize, map, view
-from gmmtorch.experiments.cli import experiment_schema, fit, occupancy
+from gmmtorch.experiments.cli import fit, occupancy
 from gmmtorch.team.cli import explore, robot, ros, team
-from gmmtorch.team.cli.options import team_schema
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 CONF = Path(common.conf_dir())
@@ -32,8 +31,8 @@ CONF = Path(common.conf_dir())
 
 def register_schemas() -> None:
     """Stores the options of all commands in Hydra's config store."""
-    experiment_schema.register()
-    team_schema.register()
+    for command in COMMANDS.values():
+        command.register()
 
 
 COMMANDS = {

@@ -16,8 +16,7 @@ from command_runs import COMMANDS, QUIET, Finished, refused, register_schemas, r
 from omegaconf import DictConfig
 
 import gmmtorch
-from gmmtorch.cli import common
-from gmmtorch.cli.options import command_options
+from gmmtorch.cli import common, options_help
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.cli import occupancy
 from gmmtorch.kernels import compiler
@@ -88,9 +87,9 @@ def test_a_launcher_that_is_not_installed_names_its_extra(launcher, has_other_pl
         if not has_other_plugins:
             raise ModuleNotFoundError("No module named 'hydra_plugins'")
 
-    monkeypatch.setattr(command_options, "find_spec", find_spec)
+    monkeypatch.setattr(options_help, "find_spec", find_spec)
     overrides = [f"hydra/launcher={launcher}", "seed=0,1"]
-    message = command_options.explained("occupancy", overrides, RuntimeError("not found"))
+    message = options_help.explained("occupancy", overrides, RuntimeError("not found"))
     assert f"hydra-{launcher}-launcher" in message
     assert "gmmtorch[sweep]" in message
 
@@ -145,11 +144,11 @@ def test_every_option_of_every_choice_is_described():
     register_schemas()
     seen = set()  # a choice has the same options in every command
     for command in COMMANDS:
-        groups = command_options.groups_of(command)
+        groups = options_help.groups_of(command)
         chosen = {(group, choice) for group, choices in groups.items() for choice in choices}
         for group, choice in sorted(chosen - seen):
-            made = command_options.configuration(command, [f"{group}={choice}"])
-            options = command_options.options_of(made)
+            made = options_help.configuration(command, [f"{group}={choice}"])
+            options = options_help.options_of(made)
             assert not [one for one in options if len(one.about) < 4 or one.about[-1] in ",;:"], choice
         seen |= chosen
 
@@ -170,7 +169,7 @@ def test_descriptions_are_read_from_docstrings():
     first: one. Second sentence. third,
         fourth (m): two; see first: not here. fifth: five.
     """
-    found = command_options.descriptions(doc, ["first", "third", "fourth", "sixth"])
+    found = options_help.descriptions(doc, ["first", "third", "fourth", "sixth"])
     assert found["first"] == "one. Second sentence"
     assert found["third"] == found["fourth"]
 

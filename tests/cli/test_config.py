@@ -20,9 +20,8 @@ from hydra.errors import ConfigCompositionException
 from omegaconf import DictConfig, OmegaConf
 
 from gmmtorch import datasets
-from gmmtorch.cli import common, export, localize
-from gmmtorch.cli.from_options import maps
-from gmmtorch.cli.from_options.scans import open_dataset
+from gmmtorch.cli import common, export, inputs, localize
+from gmmtorch.cli.inputs import open_dataset
 from gmmtorch.errors import InvalidArgumentError, MissingDataError
 from gmmtorch.experiments.cli import methods_of_options
 from gmmtorch.experiments.cli.experiment_schema import STUDIES
@@ -34,7 +33,7 @@ from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
 from gmmtorch.simulation.worlds.tunnels import tunnels
 from gmmtorch.simulation.worlds.warehouse import warehouse
-from gmmtorch.team.cli.from_options import missions
+from gmmtorch.team.cli import missions
 from gmmtorch.team.exploration.mission.options import FRAMEWORKS, THESIS, TeamOptions
 from gmmtorch.team.exploration.mission.trials import WorldOptions
 from gmmtorch.team.exploration.planning.planners import PLANNERS
@@ -275,7 +274,7 @@ def test_the_files_of_a_group_repeat_the_defaults_of_the_schema(choice, kind):
 def test_a_map_of_the_options_has_the_default_rule_and_answers(name):
     config = composed("occupancy", f"map={name}")
     assert config.map.name == name
-    made = maps.map_factory(config)()
+    made = inputs.map_factory(config)()
     assert made.learning == MAPS[name]
     assert made.codec == GaussianMap().codec
 
@@ -292,7 +291,7 @@ def test_a_map_of_the_options_has_the_default_rule_and_answers(name):
 def test_the_map_has_the_options_of_its_group(name, more, expected):
     options = ["map.noise=0.02", "map.prior=0.5", "map.sampling=plain", "runtime.dtype=float64", "seed=7"]
     options += ["map.cutoff=4", "map.codec=float", "map.n_samples=1000"]
-    made = maps.map_factory(composed("occupancy", f"map={name}", *more.split(), *options))()
+    made = inputs.map_factory(composed("occupancy", f"map={name}", *more.split(), *options))()
     assert made.learning.noise == 0.02
     assert {option: getattr(made.learning, option) for option in expected} == expected
     how = made.query_options

@@ -10,7 +10,7 @@ import pytest
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gmmtorch.cli.options.structured import build, schema_of
+from gmmtorch.cli.schema import build, schema_of
 from gmmtorch.errors import InvalidArgumentError, check_number
 
 

@@ -15,7 +15,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import kernels
 from gmmtorch.mapping.components import Components
 from gmmtorch.simulation.worlds.furniture import box
-from gmmtorch.team.cli.reporting.explore_pictures import _coverage, _team_view
+from gmmtorch.team.cli.explore_pictures import _coverage, _team_view
 from gmmtorch.team.exploration.mission.driver import SimulatedClock, drive
 from gmmtorch.team.exploration.mission.mission import Mission
 from gmmtorch.team.exploration.mission.options import FRAMEWORKS, THESIS, TeamOptions

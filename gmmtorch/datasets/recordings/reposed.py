@@ -32,7 +32,7 @@ def with_trajectory(source: Dataset, path: str | Path, stride: int) -> Dataset:
     path = Path(path).expanduser()
     if len(source) == 0 or source.pose(0) is None:
         raise InvalidArgumentError(
-            f"dataset.poses={path} cannot be used: the data set does not state its own poses, from which its "
+            f"‹poses›={path} cannot be used: the data set does not state its own poses, from which its "
             "points would be moved."
         )
     trajectory = read_trajectory(path, len(source))
@@ -41,7 +41,7 @@ def with_trajectory(source: Dataset, path: str | Path, stride: int) -> Dataset:
     else:
         if source.times is None:
             raise InvalidArgumentError(
-                f"dataset.poses={path} has poses at times, but the scans have no times; give a KITTI "
+                f"‹poses›={path} has poses at times, but the scans have no times; give a KITTI "
                 "trajectory, one row for each scan."
             )
         matrices, known = trajectory.at(to_nanoseconds(source.times.numpy()), _MAX_GAP)

@@ -138,7 +138,7 @@ def read_trajectory(path: str | Path, n_scans: int | None = None) -> Trajectory:
     """
     path = Path(path).expanduser()
     if not path.is_file():
-        raise MissingDataError(f"dataset.poses={path} does not exist; give a TUM or KITTI trajectory file.")
+        raise MissingDataError(f"‹poses›={path} does not exist; give a TUM or KITTI trajectory file.")
     rows = read_rows(path)
     if rows.shape[1] == 8:
         return _tum(path, rows)

@@ -64,8 +64,8 @@ class TumRgbd(Dataset):
             "The TUM RGB-D benchmark publishes sequences in this layout.",
         )
         super().__init__(path.resolve().name, ranges, stride)
-        self.pixel_stride = check_whole("dataset.pixel_stride", pixel_stride, 1)
-        check_number("dataset.depth_scale", depth_scale, above=True)
+        self.pixel_stride = check_whole("pixel_stride", pixel_stride, 1)
+        check_number("depth_scale", depth_scale, above=True)
         self._scale = depth_scale
         self.intrinsics = pinhole_matrix(_INTRINSICS if intrinsics is None else intrinsics)
         times, files = _listed(path / "depth.txt")

@@ -36,8 +36,8 @@ class Diagnostics:
             self._node.warn(
                 "clock",
                 f"stamps are {seconds:.0f} s away from the clock of this node. For a recording that is "
-                "played set node.use_sim_time=true; for a sensor with a clock of its own "
-                "sensor.clock=received.",
+                "played set use_sim_time=true; for a sensor with a clock of its own "
+                "clock=received.",
             )
             return
         self._latencies.append(seconds)

@@ -34,7 +34,7 @@ from gmmtorch.datasets import (
     in_space,
     stamp_of,
 )
-from gmmtorch.errors import DataError
+from gmmtorch.errors import DataError, arg, text_of
 from gmmtorch.live.mapper.live_options import LiveOptions
 from gmmtorch.localization import METHODS, Location, Odometry, Tracker, composed, odometry_of
 from gmmtorch.mapping import GaussianMap
@@ -195,7 +195,7 @@ class LiveScans(Dataset):
                 self.trouble = self._tree.unknown_step(chain, item.stamp, self._options.max_gap)
             return is_ready
         except DataError as error:
-            self.trouble = _of_live(error)
+            self.trouble = text_of(error)
             return False
 
     def _last_needed(self, item: _Waiting) -> int:
@@ -219,7 +219,7 @@ class LiveScans(Dataset):
             if not self._tree.is_moving(chain):
                 self.trouble = (
                     f"TF has only static transforms from frame {chain[0]} up to {chain[-1]}; choose "
-                    "sensor.poses=standing for a sensor that does not move"
+                    f"{arg('poses')}=standing for a sensor that does not move"
                 )
                 return None
             if chain != self._candidate[0]:
@@ -252,7 +252,7 @@ class LiveScans(Dataset):
                 return False
             found = conversion.points(item.message)
         except (DataError, ValueError, KeyError, OverflowError) as error:
-            self.trouble = _of_live(error)
+            self.trouble = text_of(error)
             self._note("message that cannot be decoded")
             return False
         self._n_posed += 1
@@ -365,11 +365,6 @@ class LiveScans(Dataset):
 
     def _known_times(self) -> Tensor | None:
         return None if self._first else torch.tensor(self._stamps, dtype=torch.float64)
-
-
-def _of_live(error: Exception) -> str:
-    """The text of an error with the names of live options."""
-    return str(error).replace("dataset.", "sensor.")
 
 
 def _size(message: dict[str, Any]) -> int:

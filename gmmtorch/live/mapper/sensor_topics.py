@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 from gmmtorch.datasets import CLOUD, COMPRESSED, DEPTH, INFO_TYPE, LASER, Ranges, Sensor, Topic, nearest_names
-from gmmtorch.errors import GmmTorchError, InvalidArgumentError
+from gmmtorch.errors import GmmTorchError, InvalidArgumentError, arg
 from gmmtorch.live.mapper.live_scans import LiveOptions, LiveScans
 from gmmtorch.live.ros import Node
 from gmmtorch.live.ros.node import reading
@@ -37,12 +37,12 @@ def find_sensor(node: Node, wanted: str | None, wait: float) -> Sensor:
         what = "no topic of a range sensor" if name is None else f"no topic {name}"
         if name in topics:
             raise InvalidArgumentError(
-                f"sensor.topic={name} has messages of type {', '.join(topics[name])}; give a topic of a "
+                f"{arg('topic')}={name} has messages of type {', '.join(topics[name])}; give a topic of a "
                 f"PointCloud2, a LaserScan or a depth Image. Published topics: {listed}."
             )
         raise GmmTorchError(
             f"there is {what} after {wait:g} s. Published topics: {listed}. If it is published, check "
-            "ROS_DOMAIN_ID, node.middleware, and that it is published on node.interface."
+            "ROS_DOMAIN_ID, the middleware, and that it is published on the interface of this node."
         )
     best = min(_RANKS.index(sensor.topic.type) for sensor in found)
     found = [sensor for sensor in found if _RANKS.index(sensor.topic.type) == best]
@@ -50,7 +50,7 @@ def find_sensor(node: Node, wanted: str | None, wait: float) -> Sensor:
         names = ", ".join(sensor.topic.name for sensor in found)
         raise InvalidArgumentError(
             f"there are {len(found)} topics of a range sensor: {names}. Choose one: "
-            f"sensor.topic={found[0].topic.name}."
+            f"{arg('topic')}={found[0].topic.name}."
         )
     return found[0]
 
@@ -91,8 +91,8 @@ def _camera_info(node: Node, image: str) -> str:
     best = nearest_names(infos, image) if infos else []
     if len(best) != 1:
         raise InvalidArgumentError(
-            f"sensor.camera_info is not clear for the images of {image}; topics of type CameraInfo are "
-            f"{', '.join(infos) or 'none'}. Choose one, or state sensor.intrinsics=[fx,fy,cx,cy] in pixels, "
-            "without distortion."
+            f"{arg('camera_info')} is not clear for the images of {image}; topics of type CameraInfo are "
+            f"{', '.join(infos) or 'none'}. Choose one, or state {arg('intrinsics')}=[fx,fy,cx,cy] in "
+            "pixels, without distortion."
         )
     return best[0]

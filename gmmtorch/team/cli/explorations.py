@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from omegaconf import DictConfig
 
-from gmmtorch.cli import as_options, logger, print_table, run_dir, write_results
+from gmmtorch.cli import argument_names, as_options, logger, naming, print_table, run_dir, write_results
 from gmmtorch.errors import check_whole
 from gmmtorch.events import Row
 from gmmtorch.live import LiveView
@@ -18,6 +18,7 @@ from gmmtorch.team.exploration import (
     STAGE,
     Mission,
     MissionMoments,
+    TeamOptions,
     compared,
     differing,
     keep_row,
@@ -41,7 +42,7 @@ def explore(config: DictConfig, bars: ProgressBars, view: LiveView | None) -> Ro
         logger.info("%s has this mission already; nothing is run.", folder)
         write_results("explore", config, [row], folder)
         return row
-    world = trial.world.open(trial.team, bars)
+    world = missions.open_world(trial.world, trial.team, bars)
     recorder = MissionRecorder(config, folder, world)
     moments: MissionMoments | None = None
 
@@ -59,7 +60,8 @@ def explore(config: DictConfig, bars: ProgressBars, view: LiveView | None) -> Ro
                 moments.note()
             (view.finish if mission.is_over else view.offer)(moments)
 
-    mission, row = run_mission(trial, world, on_tick)
+    with naming(argument_names(TeamOptions)):
+        mission, row = run_mission(trial, world, on_tick)
     (row,) = compared([row])
     write_results("explore", config, [row], folder)
     recorder.finish(mission, row)
@@ -98,7 +100,7 @@ def compare(config: DictConfig, bars: ProgressBars) -> list[Row]:
         for variant in variants
     ]
     # Fills the cache before several processes need the world.
-    trials[0].world.open(trials[0].team, bars)
+    missions.open_world(trials[0].world, trials[0].team, bars)
     done: list[Row] = []
 
     def on_row(row: Row) -> None:
@@ -108,7 +110,8 @@ def compare(config: DictConfig, bars: ProgressBars) -> list[Row]:
     def on_sample(mission: Mission) -> None:
         bars.note(STAGE, _status(mission))
 
-    rows = compared(run_trials(trials, config.runtime.workers, on_row, bars, on_sample))
+    with naming(argument_names(TeamOptions)):
+        rows = compared(run_trials(trials, config.runtime.workers, on_row, bars, on_sample))
     write_results("explore", config, rows, folder)
     save_comparison(config, rows, folder)
     return rows

@@ -63,7 +63,7 @@ def _of_world(
 ) -> tuple[Callable[[float], object], AgentMoments]:
     """A listener that maps what it hears as the robots do."""
     options = missions.team_options(config, config.seed, {})
-    world = missions.world_options(config).open(options)
+    world = missions.open_world(missions.world_options(config), options)
     agent: Agent = make_agent(number, start_poses(world, options)[0], world, options, transport)
     agent.robot.mapper.center_on(agent.robot.position)
 

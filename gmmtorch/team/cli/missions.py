@@ -10,9 +10,10 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gmmtorch.cli import as_options, build, naming
+from gmmtorch.cli import argument_names, as_options, build, naming
 from gmmtorch.errors import InvalidArgumentError, check_choice
-from gmmtorch.team.exploration import PLANNING, THESIS, FrameRule, TeamOptions, Trial, WorldOptions
+from gmmtorch.events import Event, ignore
+from gmmtorch.team.exploration import PLANNING, THESIS, FrameRule, TeamOptions, Trial, World, WorldOptions
 
 _OF_VARIANTS = {
     "team": "team.name",
@@ -71,6 +72,12 @@ def world_options(config: DictConfig) -> WorldOptions:
             "world=mesh needs world.path=FILE: a triangle mesh (PLY, OBJ, STL) in metres, z up."
         )
     return build(WorldOptions, config)
+
+
+def open_world(world: WorldOptions, team: TeamOptions, on_event: Event = ignore) -> World:
+    """The world for this team; errors name options."""
+    with naming(argument_names(WorldOptions)):
+        return world.open(team, on_event)
 
 
 def team_options(config: DictConfig, seed: int, variant: dict[str, Any]) -> TeamOptions:

@@ -11,7 +11,16 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from gmmtorch.cli import as_options, chosen_map, logger, map_factory, naming, open_dataset, run_dir
+from gmmtorch.cli import (
+    argument_names,
+    as_options,
+    chosen_map,
+    logger,
+    map_factory,
+    naming,
+    open_dataset,
+    run_dir,
+)
 from gmmtorch.datasets import DatasetShard, shard_indices, start_frame
 from gmmtorch.errors import check_choice, check_number, check_whole
 from gmmtorch.mapping import GaussianMap
@@ -24,6 +33,7 @@ from gmmtorch.team.exploration import (
     ReplayMission,
     RobotView,
     Stopwatch,
+    TeamOptions,
     make_agent,
     start_poses,
 )
@@ -40,8 +50,9 @@ def flying(config: DictConfig, transport: FramedTransport, stack: ExitStack) -> 
     """A robot with a simulated camera in a simulated world."""
     store = _opened_store(config, transport, stack)
     options = missions.team_options(config, config.seed, {})
-    world = missions.world_options(config).open(options)
-    pose, watch = start_poses(world, options)[config.id], Stopwatch()
+    world = missions.open_world(missions.world_options(config), options)
+    with naming(argument_names(TeamOptions)):
+        pose, watch = start_poses(world, options)[config.id], Stopwatch()
     agent = make_agent(
         config.id, pose, world, options, transport, watch=watch, incarnation=drawn_incarnation()
     )

@@ -19,7 +19,17 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from gmmtorch.cli import open_live_view, print_files, print_table, run_dir, serve, start, write_results
+from gmmtorch.cli import (
+    argument_names,
+    naming,
+    open_live_view,
+    print_files,
+    print_table,
+    run_dir,
+    serve,
+    start,
+    write_results,
+)
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.report import ProgressBars
 from gmmtorch.team.cli.robot import TEAM_VARIABLE, check_options, register
@@ -160,11 +170,13 @@ def run(config: DictConfig) -> None:
 def _prepare(config: DictConfig, bars: ProgressBars) -> None:
     """Computes the world's properties once for all robots, and raises errors of the options once."""
     from gmmtorch.team.cli import missions
-    from gmmtorch.team.exploration import start_poses
+    from gmmtorch.team.exploration import TeamOptions, start_poses
 
     if config.source == "world":
         options = missions.team_options(config, config.seed, {})
-        start_poses(missions.world_options(config).open(options, bars), options)
+        world = missions.open_world(missions.world_options(config), options, bars)
+        with naming(argument_names(TeamOptions)):
+            start_poses(world, options)
 
 
 # -- the processes --------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from cli.command_runs import (
 )
 from cli.explore.explore_cases import SMALL
 
-from gmmtorch.team.cli.runs.explorations import warn_of_robots_at_their_start
+from gmmtorch.team.cli.explorations import warn_of_robots_at_their_start
 
 
 @pytest.mark.parametrize(

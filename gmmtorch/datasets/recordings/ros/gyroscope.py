@@ -121,7 +121,7 @@ def read_gyroscope(reader: BagReader, topic: str | None, clock: str) -> Gyroscop
         raise _unusable(
             f"{where} has {len(kept)} usable angular velocities in {faults.total() + len(times)} messages "
             f"({reasons})",
-            "Choose another dataset.imu_topic",
+            "Choose another ‹imu_topic›",
         )
     if len(frames) > 1:
         counts = ", ".join(f"{frame or '(unnamed)'} ({n} messages)" for frame, n in frames.most_common(5))
@@ -164,7 +164,7 @@ def sensor_turns(
             f"{gyroscope.topic} has rotations from {first:.3f} to {last:.3f} s, with gaps of at most "
             f"{MAX_GAP} s, and none between two scans, which are from {stamps[0] / NANOSECONDS:.3f} to "
             f"{stamps[-1] / NANOSECONDS:.3f} s",
-            "If the sensors have clocks of their own, use the times of recording: dataset.clock=received",
+            "If the sensors have clocks of their own, use the times of recording: ‹clock›=received",
         )
     if n_unknown or gyroscope.n_bad:
         _log.warning(

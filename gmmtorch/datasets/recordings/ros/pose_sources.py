@@ -60,7 +60,7 @@ class TfPoses:
                 raise DataError(
                     f"{self._where}: TF has no frame {frame or '(unnamed)'}, in which the sensor measures; "
                     f"its frames are {self._tree.describe()}. State which of them is the sensor's: "
-                    "dataset.sensor_frame=NAME, or choose other poses: dataset.poses=TOPIC, FILE or standing."
+                    "‹sensor_frame›=NAME, or choose other poses: ‹poses›=TOPIC, FILE or standing."
                 )
             try:
                 self._chains[frame] = self._tree.chain(frame, self._top)
@@ -171,6 +171,5 @@ def mount_matrix(extrinsic: list[float] | None) -> np.ndarray | None:
         return pose_matrix(numbers[:3], numbers[3:])
     except (TypeError, ValueError) as error:
         raise InvalidArgumentError(
-            f"dataset.extrinsic={extrinsic} is not the sensor's pose on the body: give x, y, z (m), qx, qy, "
-            "qz, qw."
+            f"‹extrinsic›={extrinsic} is not the sensor's pose on the body: give x, y, z (m), qx, qy, qz, qw."
         ) from error

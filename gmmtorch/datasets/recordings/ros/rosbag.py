@@ -68,9 +68,9 @@ def open_rosbag(
     """
     source = "A bag of ROS 1 is a file; one of ROS 2 is a file or its folder."
     file = require_path(path, "file or folder", "a ROS bag (.bag, .mcap, .db3)", source)
-    check_choice("dataset.clock", clock, ("header", "received"))
+    check_choice("clock", clock, ("header", "received"))
     if not max_gap > 0:
-        raise InvalidArgumentError(f"dataset.max_gap={max_gap} must be a time above zero seconds.")
+        raise InvalidArgumentError(f"‹max_gap›={max_gap} must be a time above zero seconds.")
     reader = BagReader(file)
     sensor = bag_topics.choose_sensor(reader, topic)
     info = None
@@ -170,8 +170,8 @@ class RosBag(Dataset):
                 f"{self._where}: no scan has a pose. Frame {first.frame or '(unnamed)'}, stamps from "
                 f"{first.stamp / NANOSECONDS:.3f} to {last.stamp / NANOSECONDS:.3f} s; "
                 f"{self._source.explain(first.stamp, first.frame)}. If the sensor has a clock of its own, "
-                "use the times of recording: dataset.clock=received; if poses are rare, raise "
-                "dataset.max_gap."
+                "use the times of recording: ‹clock›=received; if poses are rare, raise "
+                "‹max_gap›."
             )
         unknown = (records[i].number for i in np.flatnonzero(~known))
         self._skip("no pose at the time of the scan", *unknown)

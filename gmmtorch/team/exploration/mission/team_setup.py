@@ -66,7 +66,7 @@ def start_poses(world: World, options: TeamOptions) -> Tensor:
     poses = torch.tensor(options.start, dtype=torch.float64)
     if poses.shape != (options.size, 4):
         raise InvalidArgumentError(
-            f"team.start has shape {tuple(poses.shape)}; expected a pose x, y, z, yaw for each of "
+            f"‹start› has shape {tuple(poses.shape)}; expected a pose x, y, z, yaw for each of "
             f"{options.size} robots."
         )
     return starts.check_start(world, poses, primitives)
@@ -134,9 +134,9 @@ def _check_window(options: TeamOptions, resolution: float) -> None:
         sight = (n / 2 - _ROUNDING) * resolution
         if sight < needed:
             raise InvalidArgumentError(
-                f"map.window={list(options.window)} cells of {resolution} m reaches {max(sight, 0):.3g} m "
+                f"‹window›={list(options.window)} cells of {resolution} m reaches {max(sight, 0):.3g} m "
                 f"around the robot along {axis}, less than the {needed:.3g} m that a camera of "
-                f"sensor.max_range={camera.max_range} m sees; take a larger window."
+                f"‹max_range›={camera.max_range} m sees; take a larger window."
             )
 
 

@@ -196,9 +196,9 @@ def _run_in_parallel(trials: dict[int, Trial], workers: int) -> Iterator[tuple[i
                     yield i, outcome
         except concurrent.futures.process.BrokenProcessPool as broken:
             raise GmmTorchError(
-                "A process that ran a mission was killed, perhaps because memory ran out. The same command "
-                "with hydra.run.dir=RUN continues with the missions that are missing; runtime.workers=1 "
-                "takes least memory."
+                "A process that ran a mission was killed, perhaps because memory ran out. The same trials in "
+                "the same folders continue with the missions that are missing; ‹workers›=1 takes least "
+                "memory."
             ) from broken
     if error is not None:
         raise error

@@ -220,7 +220,7 @@ def _lattice_box(
     if n_cells > MAX_CELLS:
         raise MemoryLimitError(
             f"{name}: {n_cells:.3g} cells of {resolution} m from {_text(low, high)} are more than "
-            f"{MAX_CELLS:.3g}. Use a coarser resolution (world.resolution) or tighter bounds (world.bounds); "
+            f"{MAX_CELLS:.3g}. Use a coarser ‹resolution› or tighter ‹bounds›; "
             "check that the mesh is in metres, not millimetres."
         )
     return Box(first.long(), last.long() + 1)
@@ -248,7 +248,7 @@ def open_world(
         file = Path("" if path is None else path).expanduser()
         if not file.is_file():
             raise MissingDataError(
-                f"world.path={path} is not a file; give a triangle mesh (PLY, OBJ, STL) in metres, z up."
+                f"‹path›={path} is not a file; give a triangle mesh (PLY, OBJ, STL) in metres, z up."
             )
         return World.from_mesh(read_triangles(file), bounds=bounds, name=file.stem, **options)
     if path is not None:
