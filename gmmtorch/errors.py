@@ -79,7 +79,11 @@ class GmmTorchError(Exception):
         return type(self)(told(text, names))
 
     def __str__(self) -> str:  # also because OSError would print a bare tuple
-        return "".join(c if c.isprintable() else repr(c)[1:-1] for c in told(text_of(self)))
+        return told(format(self))
+
+    def __format__(self, spec: str) -> str:
+        """The text for another error, with its marks."""
+        return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text_of(self))
 
 
 class InvalidArgumentError(GmmTorchError, ValueError):

@@ -162,7 +162,7 @@ def _hydra_main(name: str, run: Callable[[DictConfig], Any]) -> None:
             with _raising():
                 hydra.main(version_base="1.3", config_path=common.conf_dir(), config_name=name)(task)()
     except GmmTorchError as error:
-        sys.exit(f"gmmtorch: error: {error}")
+        sys.exit(f"gmmtorch: error: {error!s}")
     except (HydraException, OmegaConfBaseException) as error:
         if is_running:
             raise

@@ -153,7 +153,7 @@ def map_recording(facts: dict[str, Any], options: dict[str, Any]) -> Mapped:
     except GmmTorchError as error:
         return Mapped({}, {}, str(error))
     except Exception as error:
-        return Mapped({}, {}, f"{traceback.format_exc()}{type(error).__name__}: {error}")
+        return Mapped({}, {}, f"{traceback.format_exc()}{type(error).__name__}: {error!s}")
 
 
 def _mapped(config: DictConfig, path: Path) -> Mapped:
@@ -217,7 +217,7 @@ def _show(
     try:
         built = tiled.open()
     except MemoryLimitError as error:
-        return [f"pictures  none: {error}"], [str(error)] if config.export else []
+        return [f"pictures  none: {error!s}"], [str(error)] if config.export else []
     exported, errors = map_outputs.write_exports(config, built, folder, bars)
     paths = [map_outputs.positions(place / map_outputs.TRAJECTORY, tiled.dim) for place in places]
     map_outputs.draw(config, built, paths, row, folder)

@@ -31,7 +31,7 @@ def test_load_states_the_expected_content_of_a_missing_path(name, tmp_path):
 
 @pytest.mark.parametrize("path", [None, ""])
 def test_load_requires_a_path(path):
-    with pytest.raises(InvalidArgumentError, match=r"dataset\.path is not set"):
+    with pytest.raises(InvalidArgumentError, match=r"path is not set"):
         load("carmen", path)
 
 

@@ -96,7 +96,7 @@ class MapPublisher:
             theta = probability(*evidence, self._resolution, grid.dim, query.rule)
             return grid, theta.cpu()
         except (InvalidArgumentError, MemoryLimitError) as error:  # no floor yet, or too large
-            self._node.warn("grid", f"topic map is not published: {error}")
+            self._node.warn("grid", f"topic map is not published: {error!s}")
             return None, torch.empty(0)
 
     def _box(self, shown: GaussianMap) -> tuple[list[float], list[float]]:

@@ -65,7 +65,7 @@ class PosePublisher:
                 self._robot = child = fixed[-1]
                 below = tree.lookup(fixed, np.array([newest.stamp]), 0.0).matrices[0]
         except DataError as error:
-            self._node.warn("odometry", f"{error}; only the topic pose is published.")
+            self._node.warn("odometry", f"{error!s}; only the topic pose is published.")
         self.publish(location, newest, child, below)
 
 

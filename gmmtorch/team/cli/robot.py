@@ -74,6 +74,7 @@ class RobotCommand(schema.MissionCommand):
 
     id: int = option(0, "this robot's id; unique in the team")
     source: str = option("world", "world: a simulated camera in a simulated world; log: recorded scans")
+    clock: str | None = option("wall", "wall: each robot runs by its own clock")
     speed: float = option(1.0, "seconds of the robot's time per second")
     settle: float = option(10.0, "seconds without news after the last work, until the robot stops")
     transport: str = option("udp", "udp or zenoh")
@@ -118,6 +119,11 @@ def check_options(config: DictConfig) -> None:
     if set_up(config) != "cpu" and config.source == "log":
         raise InvalidArgumentError(
             f"runtime.device={config.runtime.device} is not available for source=log; use cpu."
+        )
+    if config.clock not in ("wall", None):
+        raise InvalidArgumentError(
+            f"clock={config.clock} is not available: each robot runs by its own clock. Use clock=wall, with "
+            "speed=2 for twice real time."
         )
     check_choice("source", config.source, ("world", "log"))
     check_choice("transport", config.transport, links.TRANSPORTS)

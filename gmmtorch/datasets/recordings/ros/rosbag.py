@@ -235,7 +235,7 @@ class RosBag(Dataset):
         except (DataError, ValueError, KeyError, OverflowError) as error:
             raise DataError(
                 f"{self._where}, frame {record.frame}, stamp {record.stamp / NANOSECONDS:.3f} s: "
-                f"{str(error).removesuffix('.')}."
+                f"{f'{error}'.removesuffix('.')}."
             ) from error
 
     def _message(self, index: int) -> dict[str, Any]:
