@@ -77,9 +77,9 @@ _REPLACED_GROUPS = (
     (
         "study.",
         "bandwidths bgk_points dims forms init_params max_beams max_iter max_origins method methods "
-        "multiples n_cells n_large_samples n_neighbors n_pixels n_points n_rays n_samples n_scans noise others prior "
-        "railing_scans resolution sensor support test_every thin_width tol tolerance variance_threshold "
-        "window window_components",
+        "multiples n_cells n_large_samples n_neighbors n_pixels n_points n_rays n_samples n_scans noise "
+        "others prior railing_scans resolution sensor support test_every thin_width tol "
+        "tolerance variance_threshold window window_components",
         _CONSTANT % "the class of the study has it",
     ),
 )
@@ -279,7 +279,6 @@ def explained(command: str, overrides: Sequence[str], error: Exception) -> str:
 
 def _instead_of(name: str) -> str | None:
     """What replaces an option of an earlier version; None if there was none of this name."""
-    name = "map@log.map" if name.startswith("log.map.") else name
     for start, ends, text in _REPLACED_GROUPS:
         if name.startswith(start) and name.removeprefix(start) in ends.split():
             return text

@@ -12,7 +12,7 @@ import resource
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +59,15 @@ def composed(command: str, *overrides: str) -> DictConfig:
     register_schemas()
     with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
         return compose(command, overrides=list(overrides))
+
+
+def shrink(monkeypatch: pytest.MonkeyPatch, study: type, **values: Any) -> None:
+    """Gives fields of a study that are no options other defaults."""
+    made: Any = study.__init__
+    names = [item.name for item in fields(study)]
+    changed = {**dict(zip(names, made.__defaults__, strict=True)), **values}
+    assert len(changed) == len(names)
+    monkeypatch.setattr(made, "__defaults__", tuple(changed.values()))
 
 
 def room_mesh(path: Path) -> Path:

@@ -73,7 +73,6 @@ def test_an_interrupt_that_python_drops_ends_the_command(monkeypatch, tmp_path):
         ("explore", "network.los=0.1", "did you mean network.loss?"),
         ("map", "map.hit_length=2", "map.hit_length is no longer an option: map.prior=1"),
         ("map", "map.min_points=2", "map.min_points is no longer an option: it is a constant;learning rule"),
-        ("robot", "log.map.window=2", "log.map.window is no longer an option: give options;log.map={"),
         ("explore", "checkpoint.every=60", "checkpoint.every is no longer;continues;hydra.run.dir=RUN"),
     ],
 )
@@ -158,7 +157,9 @@ def test_every_option_of_every_choice_is_described():
 
 def test_the_help_shows_the_options_of_the_chosen_data_set(run):
     shown = succeeded(run("occupancy", "--help", "dataset=depth_frames")).stdout
-    assert re.search(r"^dataset\.pixel_stride=1 +every n-th pixel of every n-th row$", shown, re.MULTILINE)
+    assert re.search(
+        r"^dataset\.pixel_stride=1 +every n-th pixel of every n-th row of depth images$", shown, re.MULTILINE
+    )
     shown = succeeded(run("map", "--help", "dataset=rosbag")).stdout
     assert re.search(r"^dataset\.deskew=true +each point with a time gets", shown, re.MULTILINE)
 

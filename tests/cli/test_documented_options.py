@@ -14,7 +14,7 @@ from command_runs import CHECKOUT, as_it_was, composed
 PAGE = (CHECKOUT / "docs" / "commands.md").read_text(encoding="utf-8")
 PAGES = [CHECKOUT / "README.md", CHECKOUT / "BENCHMARKS.md", *sorted((CHECKOUT / "docs").rglob("*.md"))]
 MOST_OPTIONS = 203
-"""Distinct options of all commands and all choices. A new one needs a document or an experiment that uses it."""
+"""Distinct options of all commands and choices. A new one needs a document or an experiment that uses it."""
 
 
 @pytest.fixture(autouse=True)

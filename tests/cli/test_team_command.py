@@ -252,7 +252,7 @@ def test_a_signal_ends_all_robots(before, name, run, robots, monkeypatch):
             "transport=zenoh link.connect_endpoints=[tcp/127.0.0.1:7447]",
             "link.connect_endpoints gmmtorch-robot",
         ),
-        ("clock=sun", "clock='sun'"),
+        ("clock=sun", "clock=sun"),
         ("clock=lockstep", "clock=lockstep clock=wall speed=2"),
         ("speed=0", "speed=0.0"),
         ("settle=-1", "settle=-1.0"),
