@@ -128,9 +128,9 @@ def check_inputs(config: DictConfig) -> None:
         from gmmtorch.datasets import point_path
 
         point_path(points)
-    for name in ("path", "map", "world.path"):
+    for name in ("path", "map.path", "world.path"):
         path = OmegaConf.select(config, name)
-        if isinstance(path, str) and path and not Path(path).expanduser().exists():
+        if path and not Path(path).expanduser().exists():
             raise MissingDataError(f"{name}={path} does not exist; give a file or folder that exists.")
     path = OmegaConf.select(config, "dataset.path")
     is_read = points is None and not OmegaConf.select(config, "inputs")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,11 +26,20 @@ TABLE = "dataset n_scans n_found n_lost_runs ate rpe ate_degrees deviation scans
 
 
 @dataclass
+class SavedMap:
+    """A saved map."""
+
+    path: str | None = option(
+        None, "map file, run directory of gmmtorch-map, or folder of tiles; map=FILE is short for it"
+    )
+
+
+@dataclass
 class LocalizeOptions:
     """Options of gmmtorch-localize."""
 
     dataset: Any = option(MISSING, "where the scans come from")
-    map: str | None = option(None, "map file, run directory of gmmtorch-map, or folder of tiles")
+    map: SavedMap = group(SavedMap)
     bounds: list[float] | None = option(None, BOUNDS)
     pose: Any = option(
         None,
@@ -63,7 +74,13 @@ def register() -> None:
 
 def main() -> None:
     """Entry point of the command."""
+    sys.argv[1:] = overrides(sys.argv[1:])
     app.start("localize", run, register)
+
+
+def overrides(words: Sequence[str]) -> list[str]:
+    """The arguments as Hydra's overrides: map=FILE becomes map.path=FILE, because map is a group."""
+    return [f"map.path={word.removeprefix('map=')}" if word.startswith("map=") else word for word in words]
 
 
 def run(config: DictConfig) -> None:
@@ -72,13 +89,13 @@ def run(config: DictConfig) -> None:
     from gmmtorch.cli.outputs import localization_outputs
     from gmmtorch.localization import ALIGNMENTS, MOTIONS, Tracker
 
-    if not config.map:
+    if not config.map.path:
         raise InvalidArgumentError("map is not set; give map=FILE, a map file or a run directory.")
     check_choice("motion", config.motion, MOTIONS)
     check_choice("align", config.align, ALIGNMENTS)
     common.use_runtime(config.runtime)
     folder = common.run_dir()
-    built = inputs.open_map(Path(config.map).expanduser(), config.runtime, config.bounds)
+    built = inputs.open_map(Path(config.map.path).expanduser(), config.runtime, config.bounds)
     dataset = inputs.open_dataset(config.dataset)
     truth = localization_outputs.true_poses(config, dataset, built.dim or 3)
     with schema.naming({"surfaces": "map", "points": "dataset"}):
@@ -93,7 +110,7 @@ def run(config: DictConfig) -> None:
     row = localization_outputs.result_row(config, dataset, located, truth)
     localization_outputs.write(config, built, located, truth, row, folder)
     common.write_results("localize", config, [row], folder)
-    common.print_table([row], TABLE.split(), f"{dataset.name} in {config.map}")
+    common.print_table([row], TABLE.split(), f"{dataset.name} in {config.map.path}")
     for message in row["messages"]:
         print(message)
     print(f"\ntrajectory  {folder}/{{{localization_outputs.FOUND}, {localization_outputs.ALL}}}")
@@ -106,7 +123,7 @@ def _locate(config: DictConfig, dataset: Dataset, tracker: Tracker, bars: Progre
 
     if len(dataset) and dataset[0].dim != tracker.dim:
         raise InvalidArgumentError(
-            f"map={config.map} is {tracker.dim}D, and the scans of {dataset.name} are "
+            f"map={config.map.path} is {tracker.dim}D, and the scans of {dataset.name} are "
             f"{dataset[0].dim}D; give a map of scans of the same kind."
         )
     located = []

@@ -34,7 +34,6 @@ _NEAR = 0.6
 _CONSTANT = "it is a constant; in Python, %s."
 _REPLACED = {
     "map.hit_length": "map.prior=1 gives the probabilities of counts; without it they are calibrated.",
-    "map.path": "give map=FILE.",
     "map.bounds": "give bounds=[…].",
     "map@log.map": "give options of the map as in 'log.map={name: windowed, window: 20}'.",
     "log.every": "use log.dataset.stride.",

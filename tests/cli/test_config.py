@@ -393,7 +393,7 @@ def test_inputs_that_do_not_exist_are_refused_without_heavy_imports(tmp_path):
         cwd=tmp_path,
     )
     assert not _HEAVY & set(done.stderr.split())
-    options = ("points", "points", "path", "path", "output", "map", "world.path")
+    options = ("points", "points", "path", "path", "output", "map.path", "world.path")
     for option, line in zip(options, done.stdout.splitlines(), strict=True):
         assert line.startswith(f"gmmtorch: error: {option}=")
 
@@ -423,7 +423,7 @@ def test_the_examples_of_the_help_compose(command):
         overrides = [word for word in words if not word.startswith("-") and word != "job"]
         if "-m" in words:  # of a sweep, the first value of each
             overrides = [re.sub(r"=([^,\[]*),.*", r"=\1", word) for word in overrides]
-        composed(command, *overrides)
+        composed(command, *(localize.overrides(overrides) if command == "localize" else overrides))
 
 
 def test_help_names_every_choice_of_every_group():

@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 from command_runs import CHECKOUT, as_it_was, composed
 
+from gmmtorch.cli import localize
+
 PAGE = (CHECKOUT / "docs" / "commands.md").read_text(encoding="utf-8")
 PAGES = [CHECKOUT / "README.md", CHECKOUT / "BENCHMARKS.md", *sorted((CHECKOUT / "docs").rglob("*.md"))]
 MOST_OPTIONS = 203
@@ -60,7 +62,7 @@ def overrides(arguments: str) -> list[str]:
 def test_documented_command_lines_compose(page):
     for command, arguments in command_lines(page):
         given = overrides(arguments)
-        composed(command, *given)
+        composed(command, *(localize.overrides(given) if command == "localize" else given))
 
 
 def test_command_lines_are_found_in_the_pages():

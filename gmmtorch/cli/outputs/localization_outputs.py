@@ -107,7 +107,7 @@ def result_row(
     seconds = sum(scan.seconds for scan in located)
     return {
         "dataset": dataset.name,
-        "map": str(config.map),
+        "map": str(config.map.path),
         "n_scans": len(located),
         "n_found": len(found),
         "n_lost_runs": len(lost),
