@@ -20,10 +20,9 @@ from tables import hardware, markdown, publish
 from gmmtorch import GaussianMap, datasets
 from gmmtorch.datasets import Dataset
 from gmmtorch.errors import MemoryLimitError
-from gmmtorch.experiments.evaluation.calibration import accuracy
 from gmmtorch.experiments.evaluation.held_out import Built, Protocol, evaluate
 from gmmtorch.experiments.evaluation.mapping_methods import choose, methods
-from gmmtorch.experiments.evaluation.metrics import separating_threshold
+from gmmtorch.experiments.evaluation.metrics import accuracy, separating_threshold
 
 METHODS = ("point", "occupancy_grid", "occupancy_log_odds", "octomap")
 PLANAR = ("intel", "aces", "freiburg-101", "freiburg-campus", "orebro", "seattle")

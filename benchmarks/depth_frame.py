@@ -23,7 +23,7 @@ from gmmtorch import GaussianMap, GaussianMixture, datasets
 from gmmtorch.datasets.depth_frames import DepthFrames
 from gmmtorch.experiments.evaluation.metrics import roc
 from gmmtorch.experiments.evaluation.queries import hit_and_free, test_beams
-from gmmtorch.mixture.depth_image import fit_depth_image
+from gmmtorch.mixture.estimators.depth_image import fit_depth_image
 from gmmtorch.pinhole import back_project
 
 N_COMPONENTS = 50

@@ -29,7 +29,7 @@ from tables import OUTPUTS, hardware, markdown, publish
 from threadpoolctl import threadpool_limits
 
 import gmmtorch
-from gmmtorch.mixture.em.covariance_types import COVARIANCE_TYPES, type_shape
+from gmmtorch.mixture.em.exact import COVARIANCE_TYPES, type_shape
 
 N_ITER = 3
 SEED = 5

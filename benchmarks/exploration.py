@@ -25,11 +25,11 @@ from pathlib import Path
 
 import torch
 
-from gmmtorch.report.table import format_table
+from gmmtorch.report.text import format_table
 from gmmtorch.team.exploration.mission.driver import Stopwatch
 from gmmtorch.team.exploration.mission.mission import Mission
 from gmmtorch.team.exploration.mission.options import TeamOptions
-from gmmtorch.team.exploration.mission.team_setup import assemble
+from gmmtorch.team.exploration.mission.trials import assemble
 from gmmtorch.team.exploration.world.world import World, open_world
 
 

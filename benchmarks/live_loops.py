@@ -25,7 +25,7 @@ from gmmtorch.localization import Odometry
 from gmmtorch.localization.trajectories import absolute_trajectory_error
 from gmmtorch.mapping.window_motions import WindowMotions
 from gmmtorch.team.sharing import Replica
-from gmmtorch.team.sharing.messages.envelope import Kind, parse_datagram
+from gmmtorch.team.sharing.messages.datagrams import Kind, parse_datagram
 from gmmtorch.team.sharing.shared_map import SharedMap
 from gmmtorch.team.sharing.transport.simulated_network import Network
 

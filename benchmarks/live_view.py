@@ -18,7 +18,7 @@ from live.viser_client import Client, wait_until
 from gmmtorch.live.live_view import LiveView, Moment, ViewedRobot
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.team.exploration.mission.mission_moments import camera_rotation
+from gmmtorch.team.exploration.mission.robot_view import camera_rotation
 
 _OFFERS = 1_000_000
 

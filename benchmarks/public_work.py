@@ -193,7 +193,7 @@ def registration(data: Path, device: str) -> Work:
     try:
         from gmmtorch import register
     except ImportError:
-        from gmmtorch.mapping.registration import register  # type: ignore[no-redef]
+        from gmmtorch.mapping.registration import register
     scans = list(gt.datasets.load("scan_folder", data / "hall"))
     made = []
     for place in (10, 14):

@@ -47,16 +47,17 @@ from gmmtorch.occupancy.occupancy_grid import OccupancyGrid
 from gmmtorch.occupancy.protocol import OccupancyMap
 from gmmtorch.report.style import label_of, save_figure
 from gmmtorch.scan import Scan
-from gmmtorch.team.sharing.codecs.point_bytes import compressed
-from gmmtorch.team.sharing.codecs.point_codecs import (
+from gmmtorch.team.sharing.messages.component_messages import ComponentsMessage, encode_components
+from gmmtorch.team.sharing.messages.message_registry import decode
+from gmmtorch.team.sharing.point_codecs import (
     DepthImage,
     Draco,
     Octree,
     PointCodec,
     QuantizedPoints,
     RawPoints,
+    compressed,
 )
-from gmmtorch.team.sharing.messages.message_registry import ComponentsMessage, decode, encode_components
 
 COMPONENTS = (8, 16, 32, 64, 128, 256, 384)  # of a frame at most: our knob
 FINER = 3  # than a map's rule: a frame by itself has more components than its share of a window

@@ -35,18 +35,18 @@ from torch import Tensor
 
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.mapping.components import Components
-from gmmtorch.report.table import format_table
+from gmmtorch.report.text import format_table
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld
 from gmmtorch.simulation.worlds.warehouse import warehouse
 from gmmtorch.team.exploration.mission.driver import SimulatedClock, drive
 from gmmtorch.team.exploration.mission.mission import Mission
 from gmmtorch.team.exploration.mission.options import TeamOptions
-from gmmtorch.team.exploration.mission.team_setup import assemble
+from gmmtorch.team.exploration.mission.trials import assemble
+from gmmtorch.team.exploration.robot.agent import Robot
 from gmmtorch.team.exploration.robot.mapper import FrameUpdate
-from gmmtorch.team.exploration.robot.robot_state import Robot
 from gmmtorch.team.exploration.world.world import open_world
-from gmmtorch.team.sharing.codecs.point_codecs import Draco, Octree, PointCodec
+from gmmtorch.team.sharing.point_codecs import Draco, Octree, PointCodec
 
 RIVALS: Mapping[str, Mapping[float, PointCodec]] = {
     "octree": {side: Octree(side) for side in (0.05, 0.07, 0.1, 0.14, 0.2, 0.3)},

@@ -26,14 +26,11 @@ from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.fitting import fit_window
 from gmmtorch.mapping.learning.viewpoints import all_origins
 from gmmtorch.team.exploration.robot.gmm_mapper import FrameRule
-from gmmtorch.team.sharing.codecs.point_codecs import bytes_of_points
-from gmmtorch.team.sharing.messages.fields import pose_of
-from gmmtorch.team.sharing.messages.message_registry import (
-    CODECS,
+from gmmtorch.team.sharing.messages.component_messages import encode_components, encode_counts
+from gmmtorch.team.sharing.messages.datagrams import CODECS, pose_of
+from gmmtorch.team.sharing.messages.message_registry import decode
+from gmmtorch.team.sharing.messages.mission_messages import (
     ViewsMessage,
-    decode,
-    encode_components,
-    encode_counts,
     encode_plan,
     encode_points,
     encode_views,
@@ -46,6 +43,7 @@ from gmmtorch.team.sharing.messages.record_messages import (
     encode_announcements,
     encode_record,
 )
+from gmmtorch.team.sharing.point_codecs import bytes_of_points
 from gmmtorch.team.sharing.replica.record_keys import Intervals, first_key
 from gmmtorch.team.sharing.replica.replica import Replica
 from gmmtorch.team.sharing.transport.security import Opener, Sealer, TeamKey

@@ -40,12 +40,13 @@ import torch
 
 from gmmtorch.errors import DataError
 from gmmtorch.processes import end_with_parent
-from gmmtorch.report.table import format_table
-from gmmtorch.team.exploration.information.view_library import ViewLibrary
-from gmmtorch.team.sharing.messages.envelope import Kind
-from gmmtorch.team.sharing.messages.message_registry import ViewsMessage, decode
+from gmmtorch.report.text import format_table
+from gmmtorch.team.sharing.messages.datagrams import Kind
+from gmmtorch.team.sharing.messages.message_registry import decode
+from gmmtorch.team.sharing.messages.mission_messages import ViewsMessage
 from gmmtorch.team.sharing.replica.replica import Replica
 from gmmtorch.team.sharing.transport.security import Opener, Sealer, TeamKey
+from gmmtorch.team.sharing.view_library import ViewLibrary
 
 _LIFE = 20_000  # packets that a replica and a set of views hear
 _ALLOWED_KB = 256  # of growth, in each process, from the end of the first life on: caches of Python's own

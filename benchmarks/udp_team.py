@@ -27,9 +27,9 @@ from typing import Any
 
 from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.report.table import format_table
+from gmmtorch.report.text import format_table
 from gmmtorch.team.cli.links import free_addresses
-from gmmtorch.team.sharing.replica.component_table import fingerprints
+from gmmtorch.team.sharing.replica.materialized_view import fingerprints
 
 _PAUSE = 0.1
 _SAMPLE = 10.0  # seconds between looks at the memory

@@ -10,9 +10,7 @@ import sys
 from pathlib import Path
 
 import gmmtorch as gt
-from gmmtorch.export.bag import write_bag
-from gmmtorch.export.mesh import surface_mesh
-from gmmtorch.export.mesh_formats import write_mesh
+from gmmtorch.export import surface_mesh, write_bag, write_mesh
 from gmmtorch.mapping.map_builder import MapBuilder
 
 output = Path("outputs/examples")

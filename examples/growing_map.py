@@ -11,7 +11,7 @@ import torch
 
 import gmmtorch as gt
 from gmmtorch.mapping.map_builder import MapBuilder
-from gmmtorch.report.maps.growth_animation import GrowthFrame, save_growth
+from gmmtorch.report.map_figures import GrowthFrame, save_growth
 
 N_FRAMES = 20
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 import gmmtorch as gt
-from gmmtorch.export.map_server import write_map_server
+from gmmtorch.export import write_map_server
 
 if len(sys.argv) > 1:
     scans = gt.datasets.load("carmen", path=sys.argv[1])

@@ -9,16 +9,16 @@ from .mapping.gaussian_map import GaussianMap as GaussianMap
 from .mapping.learning.rules import IncrementalRule as IncrementalRule
 from .mapping.learning.rules import NoveltyRule as NoveltyRule
 from .mapping.learning.rules import WindowedRule as WindowedRule
-from .mixture.depth_image import fit_depth_image as fit_depth_image
 from .mixture.estimators.deconvolved import DeconvolvedGaussianMixture as DeconvolvedGaussianMixture
+from .mixture.estimators.depth_image import fit_depth_image as fit_depth_image
+from .mixture.estimators.hierarchical import HierarchicalGaussianMixture as HierarchicalGaussianMixture
 from .mixture.estimators.riemannian import RiemannianGaussianMixture as RiemannianGaussianMixture
 from .mixture.estimators.sliced_wasserstein import (
     SlicedWassersteinGaussianMixture as SlicedWassersteinGaussianMixture,
 )
-from .mixture.estimators.trees.hierarchical import HierarchicalGaussianMixture as HierarchicalGaussianMixture
 from .mixture.estimators.variational import VariationalGaussianMixture as VariationalGaussianMixture
 from .mixture.gaussian_mixture import GaussianMixture as GaussianMixture
-from .mixture.streaming.stream_fit import fit_stream as fit_stream
+from .mixture.streaming import fit_stream as fit_stream
 from .occupancy.evidence import Evidence as Evidence
 from .occupancy.grid import VoxelGrid as VoxelGrid
 from .occupancy.occupancy_grid import OccupancyGrid as OccupancyGrid

@@ -15,7 +15,7 @@ mkdir -p "$OUT"
 import sys
 
 from gmmtorch import datasets
-from gmmtorch.export.bag import write_bag
+from gmmtorch.export import write_bag
 
 hall = datasets.load("synthetic_building")
 print("recording", write_bag(sys.argv[1], list(hall), [hall.pose(i) for i in range(len(hall))]))

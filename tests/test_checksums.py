@@ -13,7 +13,7 @@ from gmmtorch import baselines, mixture
 from gmmtorch.errors import DataError
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.streaming.checkpoints import State, read_state, write_state
+from gmmtorch.mixture.streaming import State, read_state, write_state
 from gmmtorch.scan import Scan
 
 N_FLIPS = 200

@@ -58,13 +58,13 @@ def viewer(folder: Path) -> object:
 
 
 def recording(folder: Path) -> object:
-    from gmmtorch.team.report.rerun_recording import load_rerun
+    from gmmtorch.team.report.mission_maps import load_rerun
 
     return load_rerun()
 
 
 def codec(name: str) -> Callable[[Path], object]:
-    from gmmtorch.team.sharing.codecs.point_codecs import bytes_of_points
+    from gmmtorch.team.sharing.point_codecs import bytes_of_points
 
     return lambda folder: bytes_of_points(torch.rand(50, 3), 0.1, 0.01, names=(name,))
 

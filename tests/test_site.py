@@ -59,8 +59,10 @@ def arguments(api: str, name: str) -> list[str]:
 
 
 def names(module: str) -> list[str]:
-    """The public names of a module that are no modules themselves."""
-    public = importlib.import_module(module).__all__
+    """The public names of a module that are no modules themselves: those that the reference lists, or all."""
+    section = (DOCS / "api.rst").read_text("utf-8").partition(f"automodule:: {module}\n")[2]
+    listed = re.match(r"   :members: (.*)", section)
+    public = listed[1].split(", ") if listed else importlib.import_module(module).__all__
     return [name for name in public if importlib.util.find_spec(f"{module}.{name}") is None]
 
 

@@ -72,8 +72,8 @@ class Runtime(Memory):
     )
     compile: bool = option(
         False,
-        "torch.compile for truncated EM and for ray casting where no fused kernel runs; the same result, "
-        "faster in very large runs",
+        "torch.compile for ray casting where no fused kernel runs; the same result, faster in very large "
+        "runs; without effect in gmmtorch-fit",
     )
 
 

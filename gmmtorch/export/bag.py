@@ -1,4 +1,4 @@
-"""Writes ROS bags, which gmmtorch and ROS read: ROS 2 (.mcap, .db3) and ROS 1 (.bag)."""
+"""ROS bags that gmmtorch and ROS read, and the contents of their messages, which live topics share."""
 
 from __future__ import annotations
 
@@ -11,11 +11,106 @@ from typing import Any
 
 import numpy as np
 
-from gmmtorch.datasets import in_space, to_nanoseconds
+from gmmtorch.datasets import NANOSECONDS, in_space, to_nanoseconds
 from gmmtorch.errors import InvalidArgumentError, OutputError
-from gmmtorch.export.message_fields import built_message, cloud_fields, odometry_fields, transform_fields
 from gmmtorch.optional_packages import needs_extra
 from gmmtorch.scan import ArrayLike, Scan
+
+_BASE, _NAME, _ARRAY = 1, 2, 3
+_POINT_TYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+
+
+def built_message(store: Any, name: str, fields: Mapping[str, Any], stamp: int) -> Any:
+    """An object of message type `name` of a type store of rosbags.
+
+    A header without a stamp gets `stamp` (ns). Fields that are not given are zero or empty.
+    """
+    values: dict[str, Any] = {}
+    for field, (kind, content) in store.fielddefs[name][1]:
+        given = fields.get(field)
+        if kind == _NAME:
+            if content == "builtin_interfaces/msg/Time" and given is None and name.endswith("/Header"):
+                given = time_fields(stamp)
+            values[field] = built_message(store, content, given or {}, stamp)
+        elif kind == _BASE:
+            values[field] = given if given is not None else "" if content[0] == "string" else 0
+        elif content[0][0] == _NAME:
+            values[field] = [built_message(store, content[0][1], item, stamp) for item in given or []]
+        elif content[0][1][0] == "string":
+            values[field] = list(given or [])
+        else:
+            code = {"bool": "u1", "byte": "u1", "char": "u1", "octet": "u1"}.get(content[0][1][0])
+            size = content[1] if kind == _ARRAY else 0
+            array = np.zeros(size) if given is None else given
+            values[field] = np.asarray(array, dtype=np.dtype(code or content[0][1][0]))
+    return store.types[name](**values)
+
+
+def time_fields(stamp: int) -> dict[str, int]:
+    """A Time from nanoseconds."""
+    return {"sec": stamp // NANOSECONDS, "nanosec": stamp % NANOSECONDS}
+
+
+def pose_fields(matrix: ArrayLike) -> tuple[dict[str, float], dict[str, float]]:
+    """Translation and rotation of a pose (4, 4) as fields of messages."""
+    from scipy.spatial.transform import Rotation
+
+    pose = np.asarray(matrix, dtype=np.float64)
+    turn = Rotation.from_matrix(pose[:3, :3]).as_quat()
+    return dict(zip("xyz", pose[:3, 3].tolist(), strict=True)), dict(zip("xyzw", turn.tolist(), strict=True))
+
+
+def transform_fields(edges: Mapping[tuple[str, str], ArrayLike]) -> dict[str, Any]:
+    """A TFMessage from transforms (parent, child) → parent ← child, (4, 4)."""
+    entries = [
+        {
+            "header": {"frame_id": parent},
+            "child_frame_id": child,
+            "transform": dict(zip(("translation", "rotation"), pose_fields(matrix), strict=True)),
+        }
+        for (parent, child), matrix in edges.items()
+    ]
+    return {"transforms": entries}
+
+
+def odometry_fields(frame: str, child: str, matrix: ArrayLike) -> dict[str, Any]:
+    """An Odometry message: the pose (4, 4) of `child` in `frame`."""
+    position, orientation = pose_fields(matrix)
+    pose = {"pose": {"position": position, "orientation": orientation}}
+    return {"header": {"frame_id": frame}, "child_frame_id": child, "pose": pose}
+
+
+def cloud_fields(frame: str, table: np.ndarray) -> dict[str, Any]:
+    """A PointCloud2 from a structured array (N,) or (H, W): its fields, in its byte order.
+
+    Raises `InvalidArgumentError` for other arrays, and for types of fields that PointCloud2 does not have.
+    """
+    dtypes = {name: (entry[0], entry[1]) for name, entry in (table.dtype.fields or {}).items()}
+    unknown = [f"{name} {dtype}" for name, (dtype, _) in dtypes.items() if dtype.str[1:] not in _POINT_TYPES]
+    if unknown or not dtypes or table.ndim not in (1, 2):
+        raise InvalidArgumentError(
+            f"table of shape {table.shape} with fields {', '.join(unknown or dtypes) or 'none'} cannot be a "
+            "PointCloud2; give a structured array (N,) or (H, W) whose fields are float32, float64, or whole "
+            "numbers of at most 32 bits."
+        )
+    is_big = any(dtype.str[0] == ">" for dtype, _ in dtypes.values())
+    rows = np.atleast_2d(table.astype(table.dtype.newbyteorder(">" if is_big else "<"), copy=False))
+    point_fields = [
+        {"name": name, "offset": offset, "datatype": _POINT_TYPES[dtype.str[1:]], "count": 1}
+        for name, (dtype, offset) in dtypes.items()
+    ]
+    step = table.dtype.itemsize
+    return {
+        "header": {"frame_id": frame},
+        "height": rows.shape[0],
+        "width": rows.shape[1],
+        "fields": point_fields,
+        "is_bigendian": is_big,
+        "point_step": step,
+        "row_step": step * rows.shape[1],
+        "is_dense": True,
+        "data": np.frombuffer(rows.tobytes(), np.uint8),
+    }
 
 
 def write_bag(
@@ -135,70 +230,11 @@ class BagWriter:
         topic = "/tf_static" if static else "/tf"
         self.message(topic, "tf2_msgs/msg/TFMessage", time, transform_fields(edges))
 
-    def odometry(self, topic: str, time: float, frame: str, child: str, matrix: ArrayLike) -> None:
-        """Writes an Odometry message: the pose of `child` in `frame`."""
-        self.message(topic, "nav_msgs/msg/Odometry", time, odometry_fields(frame, child, matrix))
-
-    def cloud(
-        self, topic: str, time: float, frame: str, points: ArrayLike, offsets: ArrayLike | None = None
-    ) -> None:
-        """Writes points (N, 3) of the sensor frame as PointCloud2 in float32.
-
-        offsets: (N,) times of the points in seconds after `time`, stored in a field t (uint32, ns).
-        """
-        columns = np.asarray(points, dtype=np.float32).reshape(-1, 3)
-        fields = [(axis, "<f4") for axis in "xyz"] + ([] if offsets is None else [("t", "<u4")])
-        table = np.zeros(len(columns), np.dtype(fields))
-        table["x"], table["y"], table["z"] = columns.T
-        if offsets is not None:
-            table["t"] = np.round(np.asarray(offsets) * 1e9)
-        self.cloud_table(topic, time, frame, table)
-
-    def cloud_table(self, topic: str, time: float, frame: str, table: np.ndarray) -> None:
-        """Writes a structured array (N,) or (H, W) as PointCloud2: its fields, in its byte order."""
+    def cloud(self, topic: str, time: float, frame: str, points: ArrayLike) -> None:
+        """Writes points (N, 3) of the sensor frame as PointCloud2 in float32."""
+        columns = np.ascontiguousarray(np.asarray(points, dtype="<f4").reshape(-1, 3))
+        table = columns.view([(axis, "<f4") for axis in "xyz"]).reshape(-1)
         self.message(topic, "sensor_msgs/msg/PointCloud2", time, cloud_fields(frame, table))
-
-    def laser(
-        self,
-        topic: str,
-        time: float,
-        frame: str,
-        ranges: ArrayLike,
-        angle_min: float,
-        angle_increment: float,
-        range_max: float,
-        time_increment: float = 0.0,
-    ) -> None:
-        """Writes ranges (N,) in metres as LaserScan, which stores float32. Angles in radians."""
-        values = np.asarray(ranges, dtype=np.float32)
-        fields = {
-            "header": {"frame_id": frame},
-            "angle_min": angle_min,
-            "angle_max": angle_min + angle_increment * (len(values) - 1),
-            "angle_increment": angle_increment,
-            "time_increment": time_increment,
-            "range_min": 0.0,
-            "range_max": range_max,
-            "ranges": values,
-        }
-        self.message(topic, "sensor_msgs/msg/LaserScan", time, fields)
-
-    def depth(
-        self, topic: str, time: float, frame: str, millimetres: ArrayLike, intrinsics: ArrayLike
-    ) -> None:
-        """Writes a depth image (H, W) in whole millimetres as 16UC1, and its CameraInfo beside it.
-
-        intrinsics: pinhole matrix (3, 3) in pixels.
-        """
-        image = np.asarray(millimetres, dtype="<u2")
-        header, (height, width) = {"header": {"frame_id": frame}}, image.shape
-        size = {"height": height, "width": width}
-        data = np.frombuffer(image.tobytes(), np.uint8)
-        content = {**header, **size, "encoding": "16UC1", "step": 2 * width, "data": data}
-        self.message(topic, "sensor_msgs/msg/Image", time, content)
-        matrix = np.asarray(intrinsics, dtype=np.float64).ravel()
-        info = {**header, **size, ("K" if self._is_ros1 else "k"): matrix}
-        self.message(f"{topic.rpartition('/')[0]}/camera_info", "sensor_msgs/msg/CameraInfo", time, info)
 
 
 def _nanoseconds(time: float) -> int:

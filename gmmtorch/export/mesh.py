@@ -1,22 +1,21 @@
-"""Triangle meshes of the surfaces of a map: the zero level of a signed distance to its flat components.
-
-Near a component with mean μ_k and normal n_k, which points to the sensors, the signed distance is
-n_k·(x − μ_k). Where components overlap, the distance is their average with weights that fall with the
-distance from μ_k along the surface (implicit moving least squares, Kolluri 2008). The zero level is found on
-a lattice by surface nets (Gibson 1998): one vertex in each cell that the surface crosses.
-"""
+"""Triangle meshes of the surfaces of a map, and their PLY, OBJ and GLB files."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
-from dataclasses import dataclass
+import json
+import struct
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
+from gmmtorch.export.point_cloud import ply_bytes
+from gmmtorch.files import write_bytes
 from gmmtorch.linalg import ragged_index
 from gmmtorch.mapping import Components
 from gmmtorch.occupancy import check_resolution
@@ -57,8 +56,7 @@ class _Field(NamedTuple):
     normal: Tensor
 
 
-@dataclass(frozen=True, eq=False)
-class _Sheets:
+class _Sheets(NamedTuple):
     """Flat components: means (K, 3), axes (K, 3, 3) as columns with the normal first, deviations (K, 2) along
     the surface, weights (K,)."""
 
@@ -119,16 +117,20 @@ def _windows(sheets: _Sheets, side: float, memory_limit: int) -> _Windows:
     """The rectangles around all sheets, cut so that the boxes around oblique ones stay small."""
     reach = _EXTENT * sheets.deviations
     n = (2 * reach / (_WINDOW * side)).ceil().clamp_min(1)
-    if float(n.prod(1).sum()) * _POINT_BYTES > memory_limit:
-        raise MemoryLimitError(
-            f"resolution={side:g} m needs more than {memory_limit:,} bytes of lattice points; use larger "
-            "cells."
-        )
+    _check_memory(float(n.prod(1).sum()), side, memory_limit)
     n = n.long()
     sheet, number = ragged_index(n.prod(1))
     place = torch.stack([number // n[sheet, 1], number % n[sheet, 1]], 1)
     half = reach[sheet] / n[sheet]
     return _Windows(sheet, (2 * place + 1) * half - reach[sheet], half)
+
+
+def _check_memory(n_points: float, side: float, memory_limit: int) -> None:
+    if _POINT_BYTES * n_points > memory_limit:
+        raise MemoryLimitError(
+            f"resolution={side:g} m needs more than {memory_limit:,} bytes of lattice points; use larger "
+            "cells."
+        )
 
 
 def _field(sheets: _Sheets, side: float, memory_limit: int) -> _Field:
@@ -154,11 +156,7 @@ def _field(sheets: _Sheets, side: float, memory_limit: int) -> _Field:
         starts.append(max(starts[-1] + 1, end))
     keys, sums = [first.new_zeros(0)], [sheets.means.new_zeros(0, 5)]
     for begin, end in itertools.pairwise(starts):
-        if _POINT_BYTES * sum(map(len, keys)) > memory_limit:
-            raise MemoryLimitError(
-                f"resolution={side:g} m needs more than {memory_limit:,} bytes of lattice points; use larger "
-                "cells."
-            )
+        _check_memory(sum(map(len, keys)), side, memory_limit)
         rows = slice(begin, end)
         part = _Windows(*(value[rows] for value in windows))
         for kept, found in zip((keys, sums), _near(sheets, part, first[rows], size[rows], side), strict=True):
@@ -259,3 +257,89 @@ def _compact(points: Tensor, normals: Tensor, faces: Tensor) -> TriangleMesh:
     """The mesh without unused vertices."""
     used, place = torch.unique(faces, return_inverse=True)
     return TriangleMesh(points[used], normals[used], place.view(-1, 3))
+
+
+_GLTF_FLOAT, _GLTF_UINT = 5126, 5125  # component types
+_ARRAY, _ELEMENTS = 34962, 34963  # buffer targets
+_UPRIGHT = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]  # quaternion that turns z up, ours, to y up, glTF's
+
+
+def write_mesh(path: str | Path, mesh: TriangleMesh) -> Path:
+    """Writes a mesh with its normals, atomically; the suffix `.ply`, `.obj` or `.glb` selects the format.
+
+    PLY, binary: vertices x, y, z (double, m) and nx, ny, nz (float). OBJ: text, with six decimals. GLB:
+    float32 relative to the middle of the mesh, whose place is the node's translation; y is up, as glTF
+    demands.
+
+    Raises `InvalidArgumentError` for another suffix or a mesh without triangles.
+    """
+    path = Path(path)
+    writer = _WRITERS.get(path.suffix.lower())
+    if writer is None:
+        raise InvalidArgumentError(f"path={path} must end in {', '.join(_WRITERS)}.")
+    if len(mesh.faces) == 0:
+        raise InvalidArgumentError(f"The mesh for {path} has no triangle; use smaller cells.")
+    vertices, normals, faces = (part.detach().cpu().numpy() for part in mesh)
+    return write_bytes(path, writer(vertices, normals, faces))
+
+
+def _ply(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> bytes:
+    names = ("x", "y", "z", "nx", "ny", "nz")
+    rows = np.empty(len(vertices), [(name, "<f8" if i < 3 else "<f4") for i, name in enumerate(names)])
+    for i, name in enumerate(names):
+        rows[name] = (vertices if i < 3 else normals)[:, i % 3]
+    return ply_bytes(rows, faces=faces)
+
+
+def _obj(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> bytes:
+    lines = ["v {:.6f} {:.6f} {:.6f}".format(*row) for row in vertices.tolist()]
+    lines += ["vn {:.4f} {:.4f} {:.4f}".format(*row) for row in normals.tolist()]
+    lines += ["f {0}//{0} {1}//{1} {2}//{2}".format(*row) for row in (faces + 1).tolist()]
+    return ("\n".join(lines) + "\n").encode("ascii")
+
+
+def _glb(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> bytes:
+    middle = (vertices.min(0) + vertices.max(0)) / 2
+    local = (vertices - middle).astype("<f4")
+    parts = [local.tobytes(), normals.astype("<f4").tobytes(), faces.astype("<u4").tobytes()]
+    begins = np.cumsum([0, *map(len, parts)]).tolist()
+    x, y, z = middle.tolist()
+    kinds = (
+        (_GLTF_FLOAT, len(local), "VEC3"),
+        (_GLTF_FLOAT, len(normals), "VEC3"),
+        (_GLTF_UINT, faces.size, "SCALAR"),
+    )
+    accessors: list[dict[str, object]] = [
+        {"bufferView": view, "componentType": kind, "count": count, "type": shape}
+        for view, (kind, count, shape) in enumerate(kinds)
+    ]
+    accessors[0] |= {"min": local.min(0).tolist(), "max": local.max(0).tolist()}
+    grey = {"baseColorFactor": [0.75, 0.75, 0.78, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.9}
+    content = {
+        "asset": {"version": "2.0", "generator": "gmmtorch"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "rotation": _UPRIGHT, "translation": [x, z, -y]}],
+        "meshes": [
+            {"primitives": [{"attributes": {"POSITION": 0, "NORMAL": 1}, "indices": 2, "material": 0}]}
+        ],
+        "materials": [{"doubleSided": True, "pbrMetallicRoughness": grey}],
+        "buffers": [{"byteLength": begins[-1]}],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": begin, "byteLength": len(part), "target": target}
+            for begin, part, target in zip(begins, parts, (_ARRAY, _ARRAY, _ELEMENTS), strict=False)
+        ],
+        "accessors": accessors,
+    }
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    data = b"".join(parts)  # every part is a multiple of four bytes long
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+_WRITERS: dict[str, Callable[[np.ndarray, np.ndarray, np.ndarray], bytes]] = {
+    ".ply": _ply,
+    ".obj": _obj,
+    ".glb": _glb,
+}

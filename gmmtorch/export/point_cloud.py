@@ -1,4 +1,4 @@
-"""Observed cells as points with occupancy probabilities, and their PLY and PCD files."""
+"""Observed cells as points with occupancy probabilities, and their PLY, PCD and OctoMap files."""
 
 from __future__ import annotations
 
@@ -9,9 +9,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import InvalidArgumentError, OutputError
 from gmmtorch.files import write_bytes
-from gmmtorch.occupancy import SparseEvidence, VoxelGrid, check_resolution, occupancy_probability
+from gmmtorch.occupancy import (
+    CellClass,
+    SparseEvidence,
+    Thresholds,
+    VoxelGrid,
+    check_resolution,
+    occupancy_probability,
+)
+from gmmtorch.optional_packages import load_pyoctomap
 
 _MIN_STEPS = 16  # least number of float32 values per cell side; with fewer, centres would be too inexact
 
@@ -76,19 +84,23 @@ class CellCloud:
 
 def write_ply(path: str | Path, cells: CellCloud) -> Path:
     """Writes the cells, atomically, as binary PLY: vertices x, y, z (double) and intensity = θ (float)."""
-    kind = [("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("intensity", "<f4")]
-    header = "\n".join(
-        [
-            "ply",
-            "format binary_little_endian 1.0",
-            f"comment centres of cells of {cells.resolution!r} m; intensity is the probability of occupancy",
-            f"element vertex {len(cells)}",
-            *(f"property double {axis}" for axis in "xyz"),
-            "property float intensity",
-            "end_header\n",
-        ]
-    )
-    return write_bytes(path, header.encode("ascii") + _records(cells, kind))
+    comment = f"centres of cells of {cells.resolution!r} m; intensity is the probability of occupancy"
+    return write_bytes(path, ply_bytes(_records(cells, "<f8"), comment))
+
+
+def ply_bytes(vertices: np.ndarray, comment: str = "", faces: np.ndarray | None = None) -> bytes:
+    """Binary PLY of vertices, a structured array (V,) of float32 and float64, and of triangles (F, 3)."""
+    names = {"<f8": "double", "<f4": "float"}
+    header = ["ply", "format binary_little_endian 1.0"] + [f"comment {comment}"] * bool(comment)
+    header += [f"element vertex {len(vertices)}"]
+    header += [f"property {names[vertices.dtype[name].str]} {name}" for name in vertices.dtype.names or ()]
+    content = vertices.tobytes()
+    if faces is not None:
+        triangles = np.empty(len(faces), [("n", "u1"), ("corners", "<i4", 3)])
+        triangles["n"], triangles["corners"] = 3, faces
+        header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+        content += triangles.tobytes()
+    return "\n".join([*header, "end_header\n"]).encode("ascii") + content
 
 
 def write_pcd(path: str | Path, cells: CellCloud) -> Path:
@@ -104,7 +116,6 @@ def write_pcd(path: str | Path, cells: CellCloud) -> Path:
             f"cells of {cells.resolution} m lie {far:.6g} m from the origin, where the float32 numbers of a "
             "PCD file are too coarse; write PLY, which has doubles, or move the map closer to its origin."
         )
-    kind = [(name, "<f4") for name in ("x", "y", "z", "intensity")]
     header = "\n".join(
         [
             "# .PCD v0.7 - Point Cloud Data file format",
@@ -120,13 +131,71 @@ def write_pcd(path: str | Path, cells: CellCloud) -> Path:
             "DATA binary\n",
         ]
     )
-    return write_bytes(path, header.encode("ascii") + _records(cells, kind))
+    return write_bytes(path, header.encode("ascii") + _records(cells, "<f4").tobytes())
 
 
-def _records(cells: CellCloud, kind: list[tuple[str, str]]) -> bytes:
-    """One packed record per cell: x, y, z, intensity."""
-    rows = np.empty(len(cells), dtype=kind)
+def _records(cells: CellCloud, kind: str) -> np.ndarray:
+    """A structured array of cells: x, y, z of this type, and intensity."""
+    rows = np.empty(len(cells), [*((axis, kind) for axis in "xyz"), ("intensity", "<f4")])
     for axis, values in zip("xyz", cells.positions().T, strict=True):
         rows[axis] = values
     rows["intensity"] = cells.probability.detach().cpu().numpy()
-    return rows.tobytes()
+    return rows
+
+
+_REACH = 1 << 15  # cells on either side of the origin, because OctoMap's keys have 16 bits
+_MIN_PROBABILITY = 1e-6  # least distance of a probability from 0 and 1: log-odds of ±13.8
+
+
+def write_octomap(path: str | Path, cells: CellCloud, thresholds: Thresholds | None = None) -> Path:
+    """Writes the cells, atomically, as an OctoMap: `.ot` with log-odds, or `.bt` with two classes.
+
+    A `.ot` file contains every cell, with its probability clamped to [10⁻⁶, 1 − 10⁻⁶]. A `.bt` file
+    contains the cells that `thresholds` classify as occupied or free. Other space is absent, which means
+    unknown in OctoMap. Eight equal siblings are merged into one node. A 2D map becomes the layer of cells
+    above z = 0.
+
+    Raises `InvalidArgumentError` for another suffix, for cells that are not aligned to multiples of the
+    resolution, and for cells beyond the range of OctoMap's keys; `GmmTorchError` without pyoctomap.
+    """
+    path = Path(path)
+    if path.suffix not in (".bt", ".ot"):
+        raise InvalidArgumentError(f"path={path} must end in .bt (two classes) or .ot (probabilities).")
+    pyoctomap = load_pyoctomap()
+    centers = _lattice_centers(cells)
+    theta = cells.probability.detach().cpu().double().clamp(_MIN_PROBABILITY, 1 - _MIN_PROBABILITY)
+    tree = pyoctomap.OcTree(cells.resolution)
+    tree.setClampingThresMin(_MIN_PROBABILITY)
+    tree.setClampingThresMax(1 - _MIN_PROBABILITY)
+    if path.suffix == ".ot":
+        for center, value in zip(centers, theta.logit().tolist(), strict=True):
+            tree.updateNode(center, value)
+        data = tree.write()
+    else:
+        label = (thresholds or Thresholds()).classify(cells.probability.detach().cpu()).numpy()
+        for kind, value in ((CellClass.FREE, -1.0), (CellClass.OCCUPIED, 1.0)):
+            tree.updateNodes(centers[label == kind], value)
+        data = tree.writeBinary()
+    if not data:
+        raise OutputError(f"{path} was not written, because pyoctomap could not serialize the octree.")
+    return write_bytes(path, data)
+
+
+def _lattice_centers(cells: CellCloud) -> np.ndarray:
+    """Cell centres (M, 3) on OctoMap's grid, whose cells reach from i·resolution to (i+1)·resolution."""
+    units = cells.positions() / cells.resolution
+    units[:, cells.centers.shape[1] :] = 0.5
+    index = np.floor(units)
+    if len(units) and not (index.min() >= -_REACH and index.max() < _REACH):
+        far = float(np.abs(index).max()) * cells.resolution
+        raise InvalidArgumentError(
+            f"cells of {cells.resolution} m lie {far:.6g} m from the origin; OctoMap reaches "
+            f"{_REACH * cells.resolution:.6g} m. Move the map closer to its origin, or use a resolution of "
+            f"{far / (_REACH - 1):.3g} m or more."
+        )
+    if len(units) and float(np.abs(units - index - 0.5).max()) > 1e-3:
+        raise InvalidArgumentError(
+            f"the cells of {cells.resolution} m are not aligned to multiples of that size, which OctoMap "
+            "requires; create their grid with VoxelGrid.covering."
+        )
+    return (index + 0.5) * cells.resolution

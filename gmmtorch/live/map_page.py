@@ -70,7 +70,7 @@ def write_page(
         **_ellipsoids(components, solid, frame),
         "paths": _encoded(viewer_scene.segments(paths) - frame.shift, "<f4"),
         "slice": _slice(shown, frame),
-        "mesh": _mesh(components, shown.resolution, frame) if shape == "surfaces" else None,
+        "mesh": _mesh(shown, frame) if shape == "surfaces" and shown.dim == 3 else None,
     }
     text = json.dumps(scene).replace("</", "<\\/")  # a closing tag would end the element with the data
     return write_bytes(path, _TEMPLATE.read_text(encoding="utf-8").replace(_PLACE, text).encode())
@@ -122,11 +122,9 @@ def _slice(shown: GaussianMap, frame: Frame) -> dict[str, Any]:
     }
 
 
-def _mesh(components: Components, resolution: float, frame: Frame) -> dict[str, str] | None:
-    """The triangles of the surfaces; None in 2D."""
-    if components.dim == 2:
-        return None
-    found = surface_mesh(components, resolution)
+def _mesh(shown: GaussianMap, frame: Frame) -> dict[str, str]:
+    """The triangles of the surfaces."""
+    found = surface_mesh(shown.components(), shown.resolution)
     return {
         "vertices": _encoded(found.vertices.cpu() - frame.shift, "<f4"),
         "faces": _encoded(found.faces, "<u4"),

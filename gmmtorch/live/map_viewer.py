@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_whole
 from gmmtorch.export import surface_mesh
-from gmmtorch.live import scene_nodes, viewer_scene
+from gmmtorch.live import viewer_scene
 from gmmtorch.live.map_page import write_page
 from gmmtorch.mapping import Components, GaussianMap
 from gmmtorch.optional_packages import needs_extra
@@ -79,7 +79,7 @@ class MapViewer:
         self._path_colours: Sequence[Rgb] = ()
         self._is_lit = False
         self._chosen: dict[str, float] = {}  # by control, the value that was set here last
-        self._camera = scene_nodes.FollowingCamera(self.server)
+        self._camera = viewer_scene.FollowingCamera(self.server)
         self._add_controls(shape, colour)
         self.update(shown, trajectories)
 
@@ -129,7 +129,7 @@ class MapViewer:
             self._fit(viewer_scene.frame_of(centres, self._paths), flat=False)
             shades = viewer_scene.height_shades(centres)
             moved = (centres - self.shift).numpy()
-            self._nodes["components"] = scene_nodes.add_cells(self.server.scene, moved, side, shades)
+            self._nodes["components"] = viewer_scene.add_cells(self.server.scene, moved, side, shades)
             self._draw_paths()
 
     def save_html(self, path: str | Path) -> Path:
@@ -145,7 +145,7 @@ class MapViewer:
         """Fits the camera to a frame; the first one moves the origin. flat: the camera looks from above."""
         if not self._is_lit:
             self._is_lit, self.shift = True, view.shift
-            scene_nodes.add_lights(self.server.scene, view.distance)
+            viewer_scene.add_lights(self.server.scene, view.distance)
         middle = ((view.low + view.high) / 2 - self.shift).numpy()
         offset = np.array([-0.02, -0.1, 1.0]) if flat else np.array([-0.45, -0.65, 0.6])
         self._camera.show(middle, middle + _ROOM * view.distance * offset)
@@ -199,11 +199,11 @@ class MapViewer:
             mesh = surface_mesh(self._components, self._resolution.value)
             if below < math.inf:
                 mesh = mesh.inside((-math.inf,) * 3, (math.inf, math.inf, below))
-            self._nodes["components"] = scene_nodes.add_mesh(scene, mesh, self.shift)
+            self._nodes["components"] = viewer_scene.add_mesh(scene, mesh, self.shift)
         elif shape == "splats":
-            self._nodes["components"] = scene_nodes.add_splats(scene, solid, colours)
+            self._nodes["components"] = viewer_scene.add_splats(scene, solid, colours)
         else:
-            self._nodes["components"] = scene_nodes.add_ellipsoids(scene, solid, colours)
+            self._nodes["components"] = viewer_scene.add_ellipsoids(scene, solid, colours)
 
     def _draw_paths(self) -> None:
         given = self._path_colours or [_PATH_COLOUR] * len(self._paths)
@@ -226,7 +226,7 @@ class MapViewer:
             return
         sides = self._resolution.value, self._height.value
         picture = viewer_scene.occupancy_slice(self._map, *sides, self._view)
-        self._nodes["slice"] = scene_nodes.add_slice(self.server.scene, picture, self.shift)
+        self._nodes["slice"] = viewer_scene.add_slice(self.server.scene, picture, self.shift)
 
     def _remove(self, name: str) -> None:
         if name in self._nodes:
@@ -284,8 +284,7 @@ class MapViewer:
                 return
             resolution = self._resolution.value
             position = (start + nearest * along)[:dim]
-            known = viewer_scene.place_at(self._map, position, resolution)
-            self._place.content = viewer_scene.place_text(known, resolution)
+            self._place.content = viewer_scene.place_text(self._map, position, resolution)
             spot = torch.nn.functional.pad(position, (0, 3 - dim)) - self.shift
             self._remove("place")
             self._nodes["place"] = self.server.scene.add_icosphere(

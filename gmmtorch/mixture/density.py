@@ -21,8 +21,7 @@ from gmmtorch.kernels import chunk_elements
 from gmmtorch.linalg import inverse_factor, safe_cholesky
 from gmmtorch.mixture.em import by_type
 from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em.covariance_types import compact, count_free_entries, expand
-from gmmtorch.mixture.em.exact import Parameters
+from gmmtorch.mixture.em.exact import Parameters, compact, count_free_entries, expand
 from gmmtorch.mixture.validation import Array, RandomState, as_generator, checked_tensor
 
 _FAR = 1e4  # distance from the centre (m) beyond which products of features lose digits
@@ -99,20 +98,19 @@ class MixtureDensity(DensityMixin, BaseEstimator, DeviceModule):
         """log π_k + log N(x|k), in chunks (K, n)."""
         (k, dim), kind = self.means.shape, self._fitted_type
         center = (self.weights[:, None] * self.means).sum(0)
+        parameters = Parameters(self.weights, self.means - center, self._typed_covariances())
         if dim > 3:
-            parameters = Parameters(self.weights, self.means - center, self._typed_covariances())
             joint = by_type.log_joint(parameters, kind)
             rows = by_type.rows_of_chunk(k, dim, kind, points.device)
-            yield from (joint(part - center) for part in points.split(rows))
-            return
-        centered = points - center
-        parameters = Parameters(self.weights, self.means - center, self.covariances)
-        rows = max(64, chunk_elements(points.device) // k)
-        if em.is_ill_conditioned(parameters) or bool((centered.abs() > _FAR).any()):
-            yield from (em.log_joint(part, parameters).T for part in centered.split(rows))
-            return
-        natural = em.natural_parameters(parameters)
-        yield from (natural @ em.quadratic_features(part).T for part in centered.split(rows))
+        else:
+            full = parameters._replace(covariances=self.covariances)
+            rows = max(64, chunk_elements(points.device) // k)
+            if not em.is_ill_conditioned(full) and not bool(((points - center).abs() > _FAR).any()):
+                natural = em.natural_parameters(full)
+                yield from (natural @ em.quadratic_features(p - center).T for p in points.split(rows))
+                return
+            joint = by_type.Factors(full, "full").direct()
+        yield from (joint(part - center) for part in points.split(rows))
 
     def n_parameters(self) -> int:
         """Number of free parameters: for full covariances K(1 + D + D(D+1)/2) − 1."""

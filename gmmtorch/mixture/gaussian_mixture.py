@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import KW_ONLY, dataclass
 from numbers import Integral
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import torch
 from sklearn.utils._param_validation import Interval, StrOptions
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mixture.em import by_type, loop, stepwise
+from gmmtorch.mixture.em import by_type, loop
 from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em.cells import pool_into_cells
-from gmmtorch.mixture.em.covariance_types import COVARIANCE_TYPES
-from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.em.grouping import Rows, nearest
+from gmmtorch.mixture.em.distributed import SINGLE_PROCESS, Processes
+from gmmtorch.mixture.em.exact import COVARIANCE_TYPES, Parameters
 from gmmtorch.mixture.em.initialization import (
     INITIALIZATIONS,
     flat_pieces,
@@ -25,9 +24,9 @@ from gmmtorch.mixture.em.initialization import (
     surface_pieces,
 )
 from gmmtorch.mixture.em.loop import EMResult, OnIteration
-from gmmtorch.mixture.em.truncated import Settings, fit_truncated
-from gmmtorch.mixture.estimator import ABOVE_ZERO, COUNT, MixtureEstimator
-from gmmtorch.mixture.streaming.distributed import SINGLE_PROCESS, Processes
+from gmmtorch.mixture.em.partition import pool_into_cells
+from gmmtorch.mixture.em.truncated import Rows, Settings, fit_truncated, nearest
+from gmmtorch.mixture.estimator import ABOVE_ZERO, COUNT, Cloud, MixtureEstimator
 from gmmtorch.mixture.validation import (
     Array,
     RandomState,
@@ -42,6 +41,7 @@ _MANY_COMPONENTS, _MANY_PAIRS = 48, 4_000_000  # truncated EM is faster from her
 _FEW_DIMENSIONS = 8  # up to which clouds have flat pieces, and truncated EM is faster
 
 
+@dataclass(eq=False, repr=False)
 class GaussianMixture(MixtureEstimator):
     """Weighted EM (thesis 2.1.1), on any device, with the interface of scikit-learn's class.
 
@@ -76,9 +76,7 @@ class GaussianMixture(MixtureEstimator):
             `cells`; 2D and 3D): much faster for many points per component, at a slightly lower likelihood.
         dtype: of the exponentials in exact EM, whose products are always float64, and of the whole E-step
             in truncated EM. With "float64" all computation is in float64.
-        compiled: run the E-step of truncated EM through torch.compile. The result is the same to rounding.
-            Worthwhile from about 10⁵ points and 10³ components on (a tenth of the time), after about five
-            seconds for the first use in a process. Needs a C++ compiler. No effect on exact EM.
+        compiled: accepted for older scripts; without effect, because the kernels are compiled anyway.
         warm_start: `fit` continues from the parameters and the lower bound of the last fit.
         verbose, verbose_interval: 1 prints every `verbose_interval`-th iteration, 2 adds time and change.
 
@@ -103,69 +101,37 @@ class GaussianMixture(MixtureEstimator):
         "verbose": ["verbose"],
         "verbose_interval": [COUNT],
     }
-    n_samples_seen_: float | None
 
-    def __init__(
-        self,
-        n_components: int | None = 1,
-        *,
-        covariance_type: str = "full",
-        noise: float = 0.01,
-        tol: float = 1e-3,
-        reg_covar: float = 1e-6,
-        max_iter: int = 100,
-        n_init: int = 1,
-        init_params: str = "auto",
-        algorithm: str = "auto",
-        max_cells: int | None = None,
-        weights_init: Array | None = None,
-        means_init: Array | None = None,
-        precisions_init: Array | None = None,
-        random_state: RandomState = None,
-        dtype: str = "float32",
-        compiled: bool = False,
-        warm_start: bool = False,
-        verbose: int = 0,
-        verbose_interval: int = 10,
-    ) -> None:
-        self.n_components = n_components
-        self.covariance_type = covariance_type
-        self.noise = noise
-        self.tol = tol
-        self.reg_covar = reg_covar
-        self.max_iter = max_iter
-        self.n_init = n_init
-        self.init_params = init_params
-        self.algorithm = algorithm
-        self.max_cells = max_cells
-        self.weights_init = weights_init
-        self.means_init = means_init
-        self.precisions_init = precisions_init
-        self.random_state = random_state
-        self.dtype = dtype
-        self.compiled = compiled
-        self.warm_start = warm_start
-        self.verbose = verbose
-        self.verbose_interval = verbose_interval
+    n_components: int | None = 1
+    _: KW_ONLY
+    covariance_type: str = "full"
+    noise: float = 0.01
+    tol: float = 1e-3
+    reg_covar: float = 1e-6
+    max_iter: int = 100
+    n_init: int = 1
+    init_params: str = "auto"
+    algorithm: str = "auto"
+    max_cells: int | None = None
+    weights_init: Array | None = None
+    means_init: Array | None = None
+    precisions_init: Array | None = None
+    random_state: RandomState = None
+    dtype: str = "float32"
+    compiled: bool = False
+    warm_start: bool = False
+    verbose: int = 0
+    verbose_interval: int = 10
 
     # -- learning ---------------------------------------------------------------------------------
 
-    def fit(
-        self,
-        X: Array,
-        y: Any = None,
-        sample_weight: Array | None = None,
-        on_iteration: OnIteration | None = None,
-    ) -> GaussianMixture:
-        """Fit the mixture to points X (N, D) by EM. Arguments and errors: see `MixtureEstimator.fit`."""
-        points, weight, center = self._prepare(X, sample_weight)
+    def _learn(self, cloud: Cloud, on_iteration: OnIteration | None) -> None:
+        points, weight, center = cloud
         rows = self._rows(points, weight)
         generator = as_generator(self.random_state)
         best = self._best_start(lambda report: self._run(rows, center, generator, report), on_iteration)
         seen = {"n_samples_seen": weight.sum()}
         self._store_fit(best.parameters, center, best.lower_bounds, best.converged, seen)
-        self._warn_unless_converged()
-        return self
 
     def partial_fit(
         self,
@@ -176,7 +142,7 @@ class GaussianMixture(MixtureEstimator):
         kappa: float = 0.6,
         memory: float | None = None,
     ) -> GaussianMixture:
-        """Update the mixture with a batch of points X (N, D), by a step of stepwise EM (see `stepwise`).
+        """Update the mixture with a batch of points X (N, D), by a step of stepwise EM (see `loop.blend`).
 
         The first batch gets one EM step from the starting point of `fit`. Later batches may have any size. A
         fitted or loaded mixture continues from its parameters. A batch of weight n after points of weight m
@@ -184,19 +150,17 @@ class GaussianMixture(MixtureEstimator):
         `max_cells` apply to `fit` only.
 
         Args:
-            X, y, sample_weight: as in `fit`.
             kappa: above 0.5, at most 1. With 1 all points count equally. Smaller values forget early batches,
                 whose responsibilities were poor, and suit small batches and many passes.
             memory: upper limit of m, so that the mixture follows a changing scene. Required if m is unknown:
                 for a mixture of given parameters.
 
-        Raises:
-            InvalidArgumentError: as in `fit`; another dimension or n_components than the mixture; an
-                invalid kappa or memory. NumericalError: as in `fit`.
+        Raises `InvalidArgumentError` and `NumericalError` as in `fit`; also for another dimension or
+        n_components than the mixture, and an invalid kappa or memory.
         """
-        stepwise.check_kappa(kappa)
+        loop.check_kappa(kappa)
         started = hasattr(self, "means")
-        past = stepwise.weight_of_past(getattr(self, "n_samples_seen_", None) if started else 0.0, memory)
+        past = loop.weight_of_past(getattr(self, "n_samples_seen_", None) if started else 0.0, memory)
         points, weight, center = self._prepare(X, sample_weight, reset=not started)
         if started:
             previous = self._current_parameters(points, center)
@@ -206,8 +170,8 @@ class GaussianMixture(MixtureEstimator):
         kind, dtype = self.covariance_type, em.SOFTMAX_DTYPES[self.dtype]
         step = loop.em_step(Rows(points, weight), float(self.reg_covar), dtype, kind)
         update, bound = step(previous)
-        eta = stepwise.step_size(float(weight.sum()), past, kappa)
-        blended = stepwise.blend(previous, update, eta, kind)
+        eta = loop.step_size(float(weight.sum()), past, kappa)
+        blended = loop.blend(previous, update, eta, kind)
         self._store_fit(blended, center, [bound], False, {"n_samples_seen": past + weight.sum()})
         return self
 
@@ -267,7 +231,6 @@ class GaussianMixture(MixtureEstimator):
             em.SOFTMAX_DTYPES[self.dtype],
             on_iteration=on_iteration,
             processes=processes,
-            compiled=bool(self.compiled),
             previous_bound=self._previous_bound(),
         )
 
@@ -296,7 +259,7 @@ class GaussianMixture(MixtureEstimator):
 
     def _given_start(self, dim: int, center: Tensor) -> dict[str, Tensor]:
         """Those of the initial `Parameters` that were given, in the centred frame."""
-        k, kind, device = self.n_components, self.covariance_type, center.device
+        k, kind, device = cast(int, self.n_components), self.covariance_type, center.device
         given = {}
         if self.weights_init is not None:
             given["weights"] = checked_mixing_weights(self.weights_init, k, device)

@@ -11,7 +11,7 @@ from torch import Tensor
 from gmmtorch.arrays import as_tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.linalg import inverse_factor
-from gmmtorch.mixture.em.covariance_types import type_shape
+from gmmtorch.mixture.em.exact import type_shape
 
 _LEAST_MEAN_WEIGHT, _LARGEST_MEAN_WEIGHT = 1e-6, 1e12
 
@@ -39,16 +39,6 @@ def as_generator(random_state: RandomState) -> torch.Generator:
             "a numpy RandomState or a torch Generator."
         )
     return generator
-
-
-def check_component_count(n_components: int, n_points: int | None) -> None:
-    """Raise `InvalidArgumentError` if there are more components than points, if that number is known."""
-    if n_points is not None and n_points < n_components:
-        raise InvalidArgumentError(
-            f"n_components={n_components} is more than the n_samples={n_points} points of non-zero weight; "
-            "use fewer components or more points. Expected n_samples >= n_components but got n_components = "
-            f"{n_components}, n_samples = {n_points}."
-        )
 
 
 def warn_if_coarse(X: Array, points: Tensor) -> None:

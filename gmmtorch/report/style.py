@@ -1,4 +1,4 @@
-"""The common style of all figures: colours, line styles, sizes, axes, legends and colour bars."""
+"""The common elements of all figures: colours, sizes, axes, legends, colour bars, and text labels."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -18,8 +18,11 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.path import Path as MarkPath
 from matplotlib.patheffects import Normal, Stroke
+from matplotlib.text import Annotation
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
+from matplotlib.transforms import Bbox
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
@@ -75,10 +78,9 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def save_figure(figure: Figure, path: str | Path, dpi: float = SAVED_DPI) -> Path:
-    """Writes the figure atomically in the format of the suffix, and returns the path.
+    """Writes the figure atomically as .png, with `dpi` pixels per inch, .pdf or .svg, and returns the path.
 
-    `dpi` is the number of pixels per inch of PNG. Raises `InvalidArgumentError` for other suffixes than .png,
-    .pdf and .svg.
+    Raises `InvalidArgumentError` for other suffixes.
     """
     path = Path(path)
     if path.suffix.lower() not in _SUFFIXES:
@@ -112,10 +114,7 @@ def draw_grid(axes: Axes, axis: Literal["both", "x", "y"] = "both") -> None:
 def legend_below(figure: Figure, handles: Iterable[Artist] | None = None, max_columns: int = 6) -> None:
     """Draws one legend below the panels, with as many columns as the width of the figure allows.
 
-    Args:
-        figure: the figure, with all its panels.
-        handles: labelled artists; if None, one for each label that occurs in the panels.
-        max_columns: largest number of columns.
+    handles: labelled artists; if None, one for each label that occurs in the panels of the figure.
     """
     if handles is None:
         by_label: dict[str, Any] = {}
@@ -125,13 +124,8 @@ def legend_below(figure: Figure, handles: Iterable[Artist] | None = None, max_co
         handles = by_label.values()
     entries = list(handles)
     for columns in range(min(len(entries), max_columns), 0, -1):
-        legend = figure.legend(
-            handles=entries,
-            loc="outside lower center",
-            ncols=columns,
-            frameon=False,
-            fontsize=LABEL_SIZE,
-        )
+        look: dict[str, Any] = {"ncols": columns, "frameon": False, "fontsize": LABEL_SIZE}
+        legend = figure.legend(handles=entries, loc="outside lower center", **look)
         if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
             return
         legend.remove()
@@ -198,9 +192,7 @@ def line_style(index: int) -> str:
 def line_look(index: int, with_marker: bool = True) -> dict[str, Any]:
     """Returns the options for `Axes.plot` that make the index-th line distinct: colour, style and marker."""
     look: dict[str, Any] = {"color": colour(index), "linestyle": line_style(index), "linewidth": 2}
-    if with_marker:
-        look |= {"marker": marker(index), "markersize": 6}
-    return look
+    return {**look, "marker": marker(index), "markersize": 6} if with_marker else look
 
 
 def marker(index: int) -> str:
@@ -256,3 +248,100 @@ def metres(value: float) -> str:
     """Formats a length with up to four digits if that is short, else to the centimetre: 0.025 m, −0.03 m."""
     text = f"{value:.4g}" if len(f"{abs(value):.4g}") <= 5 else f"{value:.2f}"
     return f"{text} m".replace("-", "\N{MINUS SIGN}")
+
+
+_OVER_TEXT, _OUTSIDE, _OVER_MARK, _OVER_LINE = 8.0, 8.0, 4.0, 1.0  # costs of a place
+_MARK_RADIUS = 5.0  # pixels
+_SIDES = {1: "left", 0: "center", -1: "right"}
+_HEIGHTS = {1: "bottom", 0: "center", -1: "top"}
+_DIRECTIONS = ((1, -1), (1, 1), (-1, 1), (-1, -1), (0, -1), (0, 1), (1, 0), (-1, 0))
+_GAPS = ((7, 4), (12, 8))  # points between mark and text, straight and diagonal: near, then farther
+_LINE_HEIGHT = 1.25  # of a line of text, in font sizes
+
+
+class Label(NamedTuple):
+    """A label for the mark at (x, y), in data coordinates, with the text properties `look`."""
+
+    axes: Axes
+    text: str
+    x: float
+    y: float
+    look: dict[str, Any]
+
+
+class LineEnd(NamedTuple):
+    """A label for a line: the value at its right end, text and colour."""
+
+    value: float
+    text: str
+    colour: str
+
+
+_PLACES: list[dict[str, Any]] = [
+    {"position": (gap * right, gap * up), "ha": _SIDES[right], "va": _HEIGHTS[up]}
+    for straight, diagonal in _GAPS
+    for right, up in _DIRECTIONS
+    for gap in (diagonal if right and up else straight,)
+]
+"""Places of a label relative to its mark: offset in points, and alignment."""
+
+
+def place_labels(figure: Figure, labels: Sequence[Label]) -> None:
+    """Writes each label beside its mark, at the place where it covers the fewest labels, marks and lines; the
+    lower right is preferred.
+
+    Call this last: limits, scales, legends and titles must be final.
+    """
+    figure.draw_without_rendering()
+    texts: list[Bbox] = []
+    for label in labels:
+        axes = label.axes
+        note = axes.annotate(label.text, (label.x, label.y), (0, 0), textcoords="offset points", **label.look)
+        note.set_in_layout(False)
+        paths = [line.get_path().transformed(line.get_transform()) for line in axes.lines]
+        boxes = [_moved(note, place) for place in _PLACES]
+        costs = [_cost(box, axes.get_window_extent(), texts, paths) for box in boxes]
+        texts.append(_moved(note, _PLACES[int(np.argmin(costs))]))
+
+
+def label_ends(axes: Axes, ends: Sequence[LineEnd], size: float = LABEL_SIZE) -> None:
+    """Writes labels to the right of the axes, beside the ends of their lines, and moves them apart as little
+    as possible (least squares).
+
+    Limits and scale of the axes must be final.
+    """
+    from sklearn.isotonic import isotonic_regression
+
+    if not ends:
+        return
+    ends = sorted(ends, key=lambda end: end.value)
+    to_share = axes.transScale + axes.transLimits  # from data to shares of the axes
+    left = axes.get_xlim()[0]
+    wanted = np.array([to_share.transform((left, end.value))[1] for end in ends])
+    line = _LINE_HEIGHT * size / 72 * cast(Figure, axes.figure).dpi / axes.bbox.height
+    heights = np.array([line * (end.text.count("\n") + 1.3) for end in ends])
+    # Least squares under the constraint "no label begins below the end of the previous one" is an isotonic
+    # regression.
+    offsets = np.cumsum(heights) - heights / 2
+    room = max(1 - float(heights.sum()), 0.0)
+    placed = np.asarray(isotonic_regression(wanted - offsets, y_min=0.0, y_max=room)) + offsets
+    for share, target, end in zip(placed, wanted, ends, strict=True):
+        look: dict[str, Any] = {"color": end.colour, "transform": axes.transAxes}
+        axes.plot([1.0, 1.025], [target, share], linewidth=0.9, clip_on=False, **look)
+        axes.text(1.032, share, end.text, fontsize=size, va="center", linespacing=1.15, **look)
+
+
+def _moved(note: Annotation, place: dict[str, Any]) -> Bbox:
+    """Moves the text to the place, and returns the pixels that it covers there."""
+    note.set(**place)
+    return note.get_window_extent()
+
+
+def _cost(box: Bbox, frame: Bbox, texts: Sequence[Bbox], paths: Sequence[MarkPath]) -> float:
+    """Adds up what a label in this box covers, and whether it leaves the axes; all in pixels."""
+    n_texts = sum(bool(other.overlaps(box)) for other in texts)
+    padded = box.padded(_MARK_RADIUS)
+    n_marks = sum(bool(padded.count_contains(path.vertices)) for path in paths)
+    n_lines = sum(bool(path.intersects_bbox(box, filled=False)) for path in paths)
+    outside = frame.count_contains(box.corners()) < 4
+    return _OUTSIDE * outside + _OVER_TEXT * n_texts + _OVER_MARK * n_marks + _OVER_LINE * n_lines

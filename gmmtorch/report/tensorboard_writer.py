@@ -14,9 +14,9 @@ from matplotlib.colors import to_rgb
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.report.scenes.ellipsoids import checked_components, ellipsoid_mesh
+from gmmtorch.report.ellipsoids import checked_components, ellipsoid_mesh
 from gmmtorch.report.style import as_array, colour, even_sample
-from gmmtorch.report.table import format_value
+from gmmtorch.report.text import format_value
 from gmmtorch.scan import ArrayLike
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ class Board:
             return
         from sklearn.metrics import roc_auc_score, roc_curve
 
-        from gmmtorch.report.maps.accuracy_figures import roc_figure
+        from gmmtorch.report.accuracy_figures import roc_figure
 
         false_rate, true_rate, _ = roc_curve(truth, theta)
         name = tag.rsplit("/", 1)[-1]

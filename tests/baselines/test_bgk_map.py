@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from occupancy.protocol_contract import RESOLUTION, lattice, wall_scan
 
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
-from gmmtorch.experiments.baselines.bgk_map import BGKMap, kernel_offsets, sparse_kernel
-from gmmtorch.experiments.baselines.bgk_points_map import BGKPointsMap
+from gmmtorch.experiments.baselines.bgk_map import BGKMap, BGKPointsMap, kernel_offsets, sparse_kernel
 from gmmtorch.experiments.baselines.samples import thinned_samples
 from gmmtorch.files import read_tensors
 from gmmtorch.scan import Scan

@@ -10,13 +10,7 @@ import numpy as np
 import pytest
 import torch
 from baselines.tensor_file_contract import TensorFileContract
-from occupancy.protocol_contract import (
-    RESOLUTION,
-    lattice,
-    move,
-    shifted,
-    wall_scan,
-)
+from occupancy.protocol_contract import RESOLUTION, lattice, move, shifted, wall_scan
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import ConstantKernel, Matern
 

@@ -10,11 +10,9 @@ import pytest
 from command_runs import QUIET, Finished, refused, run_here, succeeded
 
 from gmmtorch import datasets
-from gmmtorch.experiments.baselines.bgk_map import BGKMap
-from gmmtorch.experiments.baselines.bgk_points_map import BGKPointsMap
+from gmmtorch.experiments.baselines.bgk_map import BGKMap, BGKPointsMap
 from gmmtorch.experiments.baselines.gp_map import GPMap
-from gmmtorch.experiments.baselines.hilbert.bayesian_hilbert_map import BayesianHilbertMap
-from gmmtorch.experiments.baselines.hilbert.hilbert_map import HilbertMap
+from gmmtorch.experiments.baselines.hilbert_map import BayesianHilbertMap, HilbertMap
 from gmmtorch.experiments.baselines.ndt_map import NDTMap
 from gmmtorch.experiments.baselines.octomap_map import OctoMapMap
 from gmmtorch.experiments.evaluation import methods

@@ -20,7 +20,7 @@ from hydra.errors import ConfigCompositionException
 from omegaconf import DictConfig, OmegaConf
 
 from gmmtorch import datasets
-from gmmtorch.cli import common, export, inputs
+from gmmtorch.cli import common, export, inputs, localize
 from gmmtorch.cli.inputs import open_dataset
 from gmmtorch.errors import InvalidArgumentError, MissingDataError
 from gmmtorch.experiments.cli import methods_of_options
@@ -28,7 +28,7 @@ from gmmtorch.experiments.cli.experiment_schema import STUDIES
 from gmmtorch.experiments.cli.fits_of_options import fit_options
 from gmmtorch.experiments.cli.studies import fit_studies, occupancy_studies
 from gmmtorch.experiments.evaluation import methods
-from gmmtorch.experiments.evaluation.fits.fit_comparison import ESTIMATORS
+from gmmtorch.experiments.evaluation.fits import ESTIMATORS
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
 from gmmtorch.simulation.worlds.tunnels import tunnels

@@ -15,7 +15,7 @@ import torch
 from command_runs import CHECKOUT, QUIET, TINY, Finished, environment, run_here, run_python
 
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
-from gmmtorch.mixture.streaming.checkpoints import read_state
+from gmmtorch.mixture.streaming import read_state
 
 Run = Callable[..., Finished]
 SIX = ["mixture.n_components=6", "runtime.dtype=float64", "stream.chunk_points=200"]

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 from command_runs import QUIET, Finished, refused, run_here, succeeded
+from sensor_bags import BagWriter
 
 from gmmtorch.datasets import Dataset, load
 from gmmtorch.datasets.recordings.trajectory import read_trajectory
-from gmmtorch.export.bag import BagWriter
 from gmmtorch.export.trajectory_files import write_tum
 from gmmtorch.mapping.gaussian_map import GaussianMap
 

@@ -95,7 +95,7 @@ def test_an_export_whose_package_is_missing_is_refused_before_any_work(run, monk
 
 def test_scans_of_a_bag_that_cannot_be_used_are_counted_and_printed(monkeypatch, tmp_path):
     pytest.importorskip("rosbags")
-    from gmmtorch.export.bag import BagWriter
+    from sensor_bags import BagWriter
 
     room = np.random.default_rng(0).uniform(-4, 4, (400, 3))
     with BagWriter(tmp_path / "a.mcap") as bag:

@@ -15,15 +15,15 @@ from torch import Tensor
 
 from gmmtorch.datasets import load
 from gmmtorch.live import viewer_scene
-from gmmtorch.live.mapper.map_publisher import MapPublisher
+from gmmtorch.live.publishers import MapPublisher
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.tile_merging import tile_files
 from gmmtorch.mapping.tiles import TiledMap
 from gmmtorch.occupancy.calibrator import Calibration
 from gmmtorch.occupancy.evidence import Thresholds
 from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.report.maps import map_images
-from gmmtorch.report.maps.map_images import MapPanel
+from gmmtorch.report import map_images
+from gmmtorch.report.map_images import MapPanel
 
 SIDE = 0.25
 UNUSUAL = Calibration.of_bytes(np.array([1, 8, 1, 0, 0, -1, 0, 0, -0.5, 0, 0, 0.5, 0, 0], "<f2").tobytes())

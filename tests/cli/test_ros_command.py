@@ -23,6 +23,7 @@ pytest.importorskip("rosbags", reason="needs the extra [ros]: rosbags")
 
 from exploration.replays import content
 from mapping.random_components import random_components
+from sensor_bags import BagWriter
 
 from gmmtorch.cli import common
 from gmmtorch.datasets.base import Ranges
@@ -30,8 +31,7 @@ from gmmtorch.datasets.recordings.ros.bag_reader import Topic
 from gmmtorch.datasets.recordings.ros.bag_topics import LASER as LASERS
 from gmmtorch.datasets.recordings.ros.bag_topics import Sensor
 from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree
-from gmmtorch.export.bag import BagWriter
-from gmmtorch.live.mapper.live_scans import LiveOptions, LiveScans
+from gmmtorch.live.live_scans import LiveOptions, LiveScans
 from gmmtorch.live.ros import Node
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.map_builder import MapBuilder

@@ -15,14 +15,14 @@ from cli.robot.robot_cases import LOG, SMALL
 from command_runs import QUIET, Disk, Finished, refused, room_mesh, run_here, succeeded
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
-from sharing.test_publish import everything
+from sharing.replica_histories import everything
 
 from gmmtorch.team.cli import team
 from gmmtorch.team.cli.robots import facts_of
 from gmmtorch.team.cli.team import RobotProcess
 from gmmtorch.team.sharing.replica.replica import Replica
 from gmmtorch.team.sharing.store import Store
-from gmmtorch.team.sharing.transport.team_key import KEY_VARIABLE
+from gmmtorch.team.sharing.transport.security import KEY_VARIABLE
 
 Run = Callable[..., Finished]
 

@@ -91,8 +91,7 @@ def all_scans(name: str, path: str) -> Callable[[Path], list[torch.Tensor]]:
 def bag(folder: Path, name: str, pack: bool) -> None:
     from rosbags.rosbag1 import Writer
     from rosbags.rosbag2 import CompressionFormat, CompressionMode
-
-    from gmmtorch.export.bag import BagWriter
+    from sensor_bags import BagWriter
 
     writer = BagWriter(folder / name)
     if pack and name.endswith(".bag"):

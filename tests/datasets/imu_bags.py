@@ -6,8 +6,7 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-
-from gmmtorch.export.bag import BagWriter
+from sensor_bags import BagWriter
 
 Motion = Callable[[float], Rotation]
 """World ← body at a time (s)."""

@@ -16,7 +16,7 @@ from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
 
 pytest.importorskip("rosbags")
 
-from gmmtorch.export.bag import BagWriter
+from sensor_bags import BagWriter
 
 FORMATS = pytest.mark.parametrize("suffix", ["mcap", "db3", "bag"])
 

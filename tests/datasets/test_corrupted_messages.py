@@ -16,8 +16,9 @@ from gmmtorch.errors import GmmTorchError
 
 pytest.importorskip("rosbags")
 
-from gmmtorch.export.bag import BagWriter
-from gmmtorch.export.message_fields import cloud_fields
+from sensor_bags import BagWriter
+
+from gmmtorch.export.bag import cloud_fields
 
 CLOUD, IMAGE, INFO = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
 N_MESSAGES = 3

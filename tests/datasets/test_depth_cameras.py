@@ -16,7 +16,7 @@ from gmmtorch.pinhole import back_project
 
 pytest.importorskip("rosbags")
 
-from gmmtorch.export.bag import BagWriter
+from sensor_bags import BagWriter
 
 SHAPE = 48, 64
 OWN = [60.0, 55.0, 30.0, 25.0]

@@ -22,8 +22,7 @@ from gmmtorch.localization.odometry.odometry import Odometry
 pytest.importorskip("rosbags")
 
 from imu_bags import rate, write_imu
-
-from gmmtorch.export.bag import BagWriter
+from sensor_bags import BagWriter
 
 FORMATS = pytest.mark.parametrize("suffix", ["mcap", "db3", "bag"])
 POINTS = np.array([[1.0, 2.0, 3.0], [-4.0, 5.0, 0.5]])

@@ -20,8 +20,9 @@ from gmmtorch.datasets.base import Dataset
 
 pytest.importorskip("rosbags")
 
+from sensor_bags import BagWriter
+
 from gmmtorch.datasets.recordings.ros.point_times import PointTimes, Rate
-from gmmtorch.export.bag import BagWriter
 
 WALLS = np.array([6.0, 4.0, 1.25])  # half of the room
 SWEEP = 0.1  # s

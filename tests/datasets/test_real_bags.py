@@ -20,7 +20,9 @@ from gmmtorch.scan import Scan
 
 pytest.importorskip("rosbags")
 
-from gmmtorch.export.bag import BagWriter, write_bag
+from sensor_bags import BagWriter
+
+from gmmtorch.export.bag import write_bag
 
 pytestmark = pytest.mark.real_data
 

@@ -15,7 +15,7 @@ from gmmtorch.errors import DataError, InvalidArgumentError
 
 pytest.importorskip("rosbags")
 
-from gmmtorch.export.bag import BagWriter
+from sensor_bags import BagWriter
 
 TIMES = (0.0, 0.5, 1.0)
 ROOM = np.random.default_rng(0).uniform(-5, 5, (40, 3)).astype(np.float32)

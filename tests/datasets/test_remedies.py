@@ -18,8 +18,9 @@ from gmmtorch.errors import GmmTorchError, text_of
 
 pytest.importorskip("rosbags")
 
-from gmmtorch.export.bag import BagWriter
-from gmmtorch.export.message_fields import cloud_fields
+from sensor_bags import BagWriter
+
+from gmmtorch.export.bag import cloud_fields
 
 TIMES = (0.0, 1.0, 2.0)
 TRAJECTORY = "".join(f"{time} {time} 0 0 0 0 0 1\n" for time in TIMES)

@@ -17,7 +17,7 @@ from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
 
 pytest.importorskip("rosbags")
 
-from gmmtorch.export.bag import BagWriter
+from sensor_bags import BagWriter
 
 POINTS = np.array([[1.0, 2.0, 3.0], [-4.0, 5.0, 0.5]])
 LIVOX = """std_msgs/Header header

@@ -46,9 +46,7 @@ def room_scan(number: int, n_beams: int = 90, dim: int = 2, noise: float = 0.01,
     length += noise * torch.randn(n_beams, generator=generator, dtype=torch.float64)
     empty = torch.arange(n_beams) % 10 == 9
     return Scan(
-        (origin + direction * length[:, None])[~empty],
-        origin,
-        (origin + direction * NO_RETURN_RANGE)[empty],
+        (origin + direction * length[:, None])[~empty], origin, (origin + direction * NO_RETURN_RANGE)[empty]
     )
 
 

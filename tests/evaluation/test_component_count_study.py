@@ -12,7 +12,7 @@ from sklearn.cluster import MeanShift
 
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.experiments.evaluation.fits.fit_comparison import FitData, Row, split
+from gmmtorch.experiments.evaluation.fits import FitData, Row, split
 from gmmtorch.experiments.evaluation.protocol_options import FitOptions
 from gmmtorch.experiments.studies import component_count
 from gmmtorch.experiments.studies.component_count import (

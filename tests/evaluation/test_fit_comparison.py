@@ -17,13 +17,12 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.events import ignore
-from gmmtorch.experiments.evaluation.fits.fit_comparison import ESTIMATORS, FitOutcome, compare, means, split
-from gmmtorch.experiments.evaluation.fits.fit_pruning import Views
+from gmmtorch.experiments.evaluation.fits import ESTIMATORS, FitOutcome, Views, compare, means, split
 from gmmtorch.experiments.evaluation.metrics import psnr2
 from gmmtorch.experiments.evaluation.protocol_options import FitOptions
 from gmmtorch.mixture.estimators.sensor_model import measured_sensor
-from gmmtorch.mixture.reduction.prune_options import PruneOptions
-from gmmtorch.mixture.reduction.pruning import prune
+from gmmtorch.mixture.prune_options import PruneOptions
+from gmmtorch.mixture.pruning import prune
 
 SMALL = FitOptions(n_components=6, max_iter=60)
 

@@ -192,19 +192,6 @@ def test_chosen_methods_are_known_and_keep_their_order():
         choose([], known)
 
 
-def test_a_data_set_with_one_scan_raises():
-    with pytest.raises(InvalidArgumentError, match="1 scans; at least 2 are needed"):
-        evaluate("room", room_scans(1), small_methods(), SMALL)
-
-
-def test_held_out_scans_without_returns_raise():
-    scans = room_scans(8)
-    for i in (0, 4):
-        scans[i] = Scan(torch.empty(0, 2), scans[i].origin, scans[i].no_return)
-    with pytest.raises(InvalidArgumentError, match="no return beams"):
-        evaluate("room", scans, small_methods(), SMALL)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [

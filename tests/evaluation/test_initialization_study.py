@@ -11,7 +11,7 @@ from pillar_room import timeless
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.events import ignore
-from gmmtorch.experiments.evaluation.fits.fit_comparison import FitData, Row, compare, split
+from gmmtorch.experiments.evaluation.fits import FitData, Row, compare, split
 from gmmtorch.experiments.evaluation.protocol_options import FitOptions
 from gmmtorch.experiments.studies import initialization_study as initialization
 from gmmtorch.experiments.studies.initialization_study import box_covariances, fit_timed, run_initialization

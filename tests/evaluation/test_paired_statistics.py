@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.team.exploration.mission.paired_statistics import (
+from gmmtorch.team.exploration.mission.results import (
     mean_band,
     on_common_times,
     paired_interval,

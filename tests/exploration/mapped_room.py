@@ -19,7 +19,8 @@ from gmmtorch.team.exploration.robot.gmm_mapper import FrameRule, GmmMapper
 from gmmtorch.team.exploration.robot.mapper import Memo
 from gmmtorch.team.exploration.world.scoring import BeliefMap, BeliefRule
 from gmmtorch.team.sharing.broadcast import Broadcast
-from gmmtorch.team.sharing.messages.message_registry import ComponentsMessage, CountsMessage, decode
+from gmmtorch.team.sharing.messages.component_messages import ComponentsMessage, CountsMessage
+from gmmtorch.team.sharing.messages.message_registry import decode
 from gmmtorch.team.sharing.radio import ReceivedMessage
 from gmmtorch.team.sharing.replica.replica import Replica
 

@@ -17,28 +17,22 @@ from sharing.message_examples import examples, frame_of_components, views
 
 from gmmtorch.errors import DataError
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
-from gmmtorch.team.exploration.information.view_evaluator import ViewEvaluator
-from gmmtorch.team.exploration.information.view_library import ViewLibrary
 from gmmtorch.team.exploration.mission.driver import Stopwatch
 from gmmtorch.team.exploration.mission.options import TeamOptions
 from gmmtorch.team.exploration.planning.collision_checking import cells_in_sphere
 from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
+from gmmtorch.team.exploration.planning.journeys import Roadmap
 from gmmtorch.team.exploration.planning.planner_interface import Plan, PlanningTask
 from gmmtorch.team.exploration.planning.primitives import Primitives
-from gmmtorch.team.exploration.planning.roadmap import Roadmap
-from gmmtorch.team.exploration.robot.agent import Agent
-from gmmtorch.team.exploration.robot.grid_mapper import GridMapper
-from gmmtorch.team.exploration.robot.mapper import Mapper, Memo
-from gmmtorch.team.exploration.robot.robot_state import Robot, StoppingRule
+from gmmtorch.team.exploration.planning.view_evaluator import ViewEvaluator
+from gmmtorch.team.exploration.robot.agent import Agent, Robot, StoppingRule
+from gmmtorch.team.exploration.robot.mapper import GridMapper, Mapper, Memo
 from gmmtorch.team.exploration.world.starts import InitialFreeSpace
-from gmmtorch.team.sharing.messages.message_registry import (
-    PlanMessage,
-    decode,
-    encode_components,
-    encode_plan,
-    kind_of,
-)
+from gmmtorch.team.sharing.messages.component_messages import encode_components
+from gmmtorch.team.sharing.messages.message_registry import decode, kind_of
+from gmmtorch.team.sharing.messages.mission_messages import PlanMessage, encode_plan
 from gmmtorch.team.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.view_library import ViewLibrary
 
 START = torch.tensor([*PLACES[0][0], PLACES[0][1]], dtype=torch.float64)
 LAUNCH = InitialFreeSpace(cells_in_sphere(START[:3], 1.4, 0.2), START[None, :3])

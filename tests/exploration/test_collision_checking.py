@@ -125,14 +125,6 @@ def test_cells_in_sphere_lie_entirely_inside(seed, radius, far):
     assert not bool(found.observed.any())
 
 
-def test_start_sphere_makes_the_start_passable():
-    for radius in (0.2, 0.3, 0.5):
-        for seed in range(5):
-            center = torch.rand(3, generator=seeded(seed), dtype=torch.float64)
-            sphere = cells_in_sphere(center, math.sqrt(3) * (radius + 2.5 * CELL), CELL)
-            assert bool(unseen(radius=radius, known_free=sphere).is_passable(center))
-
-
 def test_obstacle_cells_are_never_free():
     obstacles = torch.tensor([[-20, -20, -8], [0, 3, 2], [0, 3, 2], [-25, 0, 0], [24, 0, 0], [0, 0, 99]])
     sphere = cells_in_sphere(torch.tensor([0.1, 0.7, 0.5]), 1.0, CELL)
@@ -150,13 +142,6 @@ def test_passable_cells_have_a_margin_of_half_a_cell():
     nearest = float(gap.amin(1).min())
     assert len(passable) > 1000
     assert RADIUS + CELL / 2 - 1e-6 <= nearest < RADIUS + CELL
-
-
-def test_all_primitives_are_feasible_in_open_space():
-    state = torch.tensor([0.05, 0.1, 0.0, 0.3, 1.2, 0.4, -0.8], dtype=torch.float64)
-    local_map = known(torch.zeros(60, 60, 40, dtype=torch.bool), torch.tensor([-30, -30, -20]))
-    rollout, braking, _ = with_start(state)
-    assert feasible(rollout, braking, local_map, start=state).tolist() == [True] * 25
 
 
 def test_only_staying_is_feasible_in_unknown_space():

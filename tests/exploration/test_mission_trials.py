@@ -22,8 +22,6 @@ from gmmtorch.team.exploration.mission.trials import (
     STAGE,
     Trial,
     WorldOptions,
-    keep_row,
-    kept_row,
     run_mission,
     run_trials,
 )
@@ -100,17 +98,17 @@ def test_a_kept_row_counts_for_equal_facts_only(
     mesh_file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one = trial(mesh_file, tmp_path / "row")
-    assert kept_row(one) is None
-    keep_row(one, {"seed": 0}, report={"figures": True})
-    assert kept_row(one, report={"figures": True}) == {"seed": 0}
-    assert kept_row(one) is kept_row(one, report={"figures": False}) is None
-    assert kept_row(replace(one, team=replace(one.team, seed=1)), report={"figures": True}) is None
+    assert one.kept_row() is None
+    one.keep_row({"seed": 0}, report={"figures": True})
+    assert one.kept_row(report={"figures": True}) == {"seed": 0}
+    assert one.kept_row() is one.kept_row(report={"figures": False}) is None
+    assert replace(one, team=replace(one.team, seed=1)).kept_row(report={"figures": True}) is None
     with monkeypatch.context() as patch:
         patch.setattr(trials_module, "__version__", "0.0")
-        assert kept_row(one, report={"figures": True}) is None
+        assert one.kept_row(report={"figures": True}) is None
     (tmp_path / "row" / ROW).write_text("{}")
     with pytest.raises(DataError, match=r"row\.json is damaged"):
-        kept_row(one)
+        one.kept_row()
 
 
 def test_a_folder_that_cannot_be_written_is_found_before_the_first_tick(

@@ -63,21 +63,6 @@ def test_primitives_contain_arcs_turns_climbs_and_stop():
     assert kinds == {**arcs, (0, False, True): 4, (0, True, False): 2, (0, False, False): 1}
 
 
-def test_rollout_at_constant_velocity_equals_the_closed_form():
-    for index, (v, climb, turn) in enumerate(LIBRARY.commands.tolist()):
-        state = torch.tensor([[2.0, -1.0, 1.5, 0.7, v, climb, turn]], dtype=torch.float64)
-        path = LIBRARY.rollout(state)[0, index]
-        for k, found in enumerate(path.tolist()):
-            t = 0.2 * (k + 1)
-            end = 0.7 + turn * t
-            if turn:
-                x = 2 + v / turn * (math.sin(end) - math.sin(0.7))
-                y = -1 + v / turn * (math.cos(0.7) - math.cos(end))
-            else:
-                x, y = 2 + v * t * math.cos(0.7), -1 + v * t * math.sin(0.7)
-            assert found == pytest.approx([x, y, 1.5 + climb * t, end, v, climb, turn], abs=1e-8)
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_rollout_of_ramps_equals_an_ode_solver(seed):
     dynamics = Dynamics(acceleration=0.9, yaw_acceleration=1.7)
@@ -142,12 +127,6 @@ def test_limits_hold_at_every_step_and_braking_reaches_rest(
     assert float(moved.max()) <= math.hypot(speed, 0.75) * step * (1 + 1e-9)
     assert torch.equal(braking[..., -1, 4:], torch.zeros(3, 25, 3, dtype=torch.float64))
     assert bool(torch.isfinite(whole).all())
-
-
-def test_rollout_of_no_states_is_empty():
-    none = torch.zeros(0, 7, dtype=torch.float64)
-    assert LIBRARY.rollout(none).shape == (0, 25, 10, 7)
-    assert LIBRARY.braking(none).shape == (0, 5, 7)
 
 
 @pytest.mark.parametrize("velocity", [(1.6, 0, 0), (0, -0.8, 0), (0, 0, 1.3), (math.nan, 0, 0)])

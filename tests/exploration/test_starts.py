@@ -15,7 +15,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.simulation.worlds.furniture import box
 from gmmtorch.team.exploration.mission.driver import SimulatedClock, drive
 from gmmtorch.team.exploration.mission.mission import Mission
-from gmmtorch.team.exploration.mission.team_setup import assemble, start_poses
+from gmmtorch.team.exploration.mission.trials import assemble, start_poses
 from gmmtorch.team.exploration.planning.collision_checking import cells_in_sphere
 from gmmtorch.team.exploration.planning.primitives import Dynamics, Primitives
 from gmmtorch.team.exploration.world import starts

@@ -9,14 +9,12 @@ import pytest
 import torch
 from exploration.voxel_worlds import EVALUATOR, PRIMITIVES, Explorer, surroundings_from, task_of
 
-from gmmtorch.team.exploration.information.view_cache import ViewCache
-from gmmtorch.team.exploration.information.view_evaluator import ViewValues
 from gmmtorch.team.exploration.planning.collision_checking import feasible
 from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
-from gmmtorch.team.exploration.planning.geodesic import DistanceField
-from gmmtorch.team.exploration.planning.global_planner import Goal
+from gmmtorch.team.exploration.planning.journeys import DistanceField, Goal
 from gmmtorch.team.exploration.planning.planner_interface import PlanningTask
 from gmmtorch.team.exploration.planning.tree_search import SearchRule, search_tree
+from gmmtorch.team.exploration.planning.view_evaluator import ViewCache, ViewValues
 
 N_BLOCKS = 6
 

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.team.exploration.information.view_evaluator import ViewEvaluator, ViewValues
+from gmmtorch.team.exploration.planning.view_evaluator import ViewEvaluator, ViewValues
 from gmmtorch.team.exploration.robot.mapper import LocalMap
 
 FOV = (1.5184, 1.0123)
@@ -261,20 +261,6 @@ def test_view_values_do_not_depend_on_the_number_of_beams():
             ratio = (many / few)[big]
             assert float(ratio.min()) > 0.85
             assert float(ratio.max()) < 1.15
-
-
-@given(st.lists(st.integers(-4, 4), min_size=3, max_size=3), st.integers(0, 10**6))
-def test_view_values_are_translation_invariant(shift, seed):
-    evaluator = ViewEvaluator(*FOV, 2.0, RESOLUTION, n_beams=30, n_yaws=4)
-    here = random_map((15, 14, 9), seed)
-    cells = tuple(2 * 10**6 * s for s in shift)  # 1600 km away at most
-    there = LocalMap(
-        torch.tensor(cells), here.resolution, here.occupancy, here.observed, here.free, here.passable
-    )
-    keys = torch.tensor([[3, 3, 2, 0], [4, 3, 2, 1], [0, 0, 0, 2], [9, 3, 2, 3]])
-    moved = keys + torch.tensor([*(c // 2 for c in cells), 0])
-    for one, other in zip(evaluator.evaluate(here, keys), evaluator.evaluate(there, moved), strict=True):
-        assert torch.equal(one, other)
 
 
 def test_local_maps_are_cached_by_identity_and_released():

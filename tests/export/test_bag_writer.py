@@ -12,7 +12,9 @@ from gmmtorch.scan import Scan
 
 pytest.importorskip("rosbags")
 
-from gmmtorch.export.bag import BagWriter, write_bag
+from sensor_bags import BagWriter
+
+from gmmtorch.export.bag import write_bag
 
 SCAN = Scan(torch.tensor([[3.0, 5.0, 1.0], [2.0, 7.0, 1.5]], dtype=torch.float64), [2.0, 5.0, 1.0])
 POSE = np.array([[0.0, -1, 0, 2], [1, 0, 0, 5], [0, 0, 1, 1], [0, 0, 0, 1]])

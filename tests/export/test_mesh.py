@@ -11,8 +11,7 @@ import pytest
 import torch
 
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
-from gmmtorch.export.mesh import TriangleMesh, surface_mesh
-from gmmtorch.export.mesh_formats import write_mesh
+from gmmtorch.export.mesh import TriangleMesh, surface_mesh, write_mesh
 from gmmtorch.mapping.gaussian_map import GaussianMap
 
 

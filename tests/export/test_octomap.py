@@ -10,8 +10,7 @@ import torch
 from export.map_examples import example_grid, random_probabilities
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.export.octomap import write_octomap
-from gmmtorch.export.point_cloud import CellCloud
+from gmmtorch.export.point_cloud import CellCloud, write_octomap
 from gmmtorch.occupancy.evidence import CellClass, Thresholds
 from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 

@@ -17,7 +17,7 @@ from gmmtorch.kernels.compiler import FusedKernel, compiler_failure
 from gmmtorch.kernels.rays.ray_traversal import traverse
 from gmmtorch.linalg import on_cpu
 from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.em.grouping import Rows, group_rows, truncated_expectation
+from gmmtorch.mixture.em.truncated import Rows, group_rows, truncated_expectation
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.forms.flux.box_flux import flux_evidence

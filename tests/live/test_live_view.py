@@ -16,9 +16,8 @@ pytest.importorskip("viser")
 
 from viser_client import Client, wait_until
 
-from gmmtorch.live.live_moments import CurveRecord
-from gmmtorch.live.live_view import LiveView, Moment, ViewedCells, ViewedRobot
-from gmmtorch.team.exploration.mission.mission_moments import camera_rotation
+from gmmtorch.live.live_view import CurveRecord, LiveView, Moment, ViewedCells, ViewedRobot
+from gmmtorch.team.exploration.mission.robot_view import camera_rotation
 
 
 @pytest.fixture(scope="module")

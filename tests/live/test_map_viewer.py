@@ -15,7 +15,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.live import viewer_scene
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.query import Query
-from gmmtorch.report.scenes.ellipsoids import unit_sphere
+from gmmtorch.report.ellipsoids import unit_sphere
 
 pytest.importorskip("viser")
 
@@ -127,13 +127,14 @@ def test_first_hit_is_where_a_dense_walk_along_the_ray_enters_an_ellipsoid(maps)
 def test_a_place_has_the_evidence_from_which_its_occupancy_follows(dim, maps):
     built, _ = maps[dim]
     position = built.components().means[3]
-    known = viewer_scene.place_at(built, position, 0.1)
-    hits, misses = (torch.tensor(value).double() for value in (known.hits, known.misses))
-    expected = float(
-        Query(built.components().cones(), built.query_options).rule.probability(hits, misses, 0.1, dim)
+    text = viewer_scene.place_text(built, position, 0.1)
+    theta, hits, misses = (
+        float(re.search(rf"{name} \| (\S+) \|", text)[1]) for name in ("occupancy θ", "hits", "misses")
     )
-    assert known.hits > 0
-    assert known.occupancy == pytest.approx(expected)
+    given = (torch.tensor(value).double() for value in (hits, misses))
+    expected = Query(built.components().cones(), built.query_options).rule.probability(*given, 0.1, dim)
+    assert hits > 0
+    assert theta == pytest.approx(float(expected), abs=0.01)
 
 
 # -- the page -------------------------------------------------------------------------------------

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from sensor_bags import BagWriter
 from torch import Tensor
 
 from gmmtorch.datasets import Dataset, Ranges, load
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.export.bag import BagWriter
 from gmmtorch.localization import Odometry, Tracker, with_odometry
 from gmmtorch.localization.odometry.odometry import Trajectory
 from gmmtorch.localization.rigid_motions import continued, turns

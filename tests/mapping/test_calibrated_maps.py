@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.experiments.evaluation import queries
-from gmmtorch.experiments.evaluation.calibration import scores
+from gmmtorch.experiments.evaluation.metrics import scores
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.tile_merging import merge, tile_files
 from gmmtorch.mapping.tiles import TiledMap

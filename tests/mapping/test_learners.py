@@ -18,7 +18,7 @@ from gmmtorch.mapping.learning.viewpoints import all_origins
 from gmmtorch.mapping.learning.windows import surface_fit
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.estimators.sensor_model import measured_sensor
-from gmmtorch.mixture.reduction.pruning import density_share
+from gmmtorch.mixture.pruning import density_share
 from gmmtorch.scan import Scan
 
 dims = pytest.mark.parametrize("dim", [2, 3])

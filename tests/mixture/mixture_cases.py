@@ -11,7 +11,7 @@ from torch.utils._pytree import tree_leaves
 
 from gmmtorch.mixture import GaussianMixture
 from gmmtorch.mixture.em.exact import Parameters, quadratic_features
-from gmmtorch.mixture.em.grouping import Rows
+from gmmtorch.mixture.em.truncated import Rows
 
 
 def cloud(n: int, dim: int, seed: int = 0) -> Tensor:

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mixture import GaussianMixture
-from gmmtorch.mixture.depth_image import fit_depth_image, pool_depth_image
 from gmmtorch.mixture.em.exact import quadratic_features
+from gmmtorch.mixture.estimators.depth_image import fit_depth_image, pool_depth_image
 from gmmtorch.pinhole import back_project
 
 INTRINSICS = torch.tensor([[80.0, 0.0, 47.3], [0.0, 75.0, 30.9], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -47,15 +47,6 @@ def bad_pixels(depth: Tensor, seed: int, share: float) -> Tensor:
     return torch.where(
         torch.from_numpy(rng.random(tuple(depth.shape)) < share), torch.from_numpy(values), depth
     )
-
-
-def step(height: int, width: int, at: float, turn: float, near: float, far: float) -> Tensor:
-    """Two walls across the optical axis; the nearer one ends at a slanted edge `at` pixels from the
-    middle.
-    """
-    v, u = np.mgrid[:height, :width]
-    beyond = (u - width / 2) * math.cos(turn) + (v - height / 2) * math.sin(turn) > at
-    return torch.from_numpy(np.where(beyond, far, near))
 
 
 # -- cells -----------------------------------------------------------------------------------------
@@ -174,25 +165,6 @@ def test_flat_wall_at_any_angle_gives_the_largest_cells(normal, distance, dtype)
     assert cells.weight.tolist() == [32.0 * 32.0] * 6
 
 
-@given(
-    at=st.floats(-60, 60),
-    turn=st.floats(0, math.pi),
-    near=st.floats(0.5, 6),
-    gap=st.floats(1.2, 4),
-    center=st.floats(-120, 120),
-)
-def test_only_the_smallest_cells_cross_a_step(at, turn, near, gap, center):
-    intrinsics = INTRINSICS.clone()
-    intrinsics[0, 2] += center  # also far off the optical axis
-    far = near + gap * 0.1 * max(1.0, near**2)  # many standard deviations
-    depth = step(96, 128, at, turn, near, far)
-    cells = pool_depth_image(depth, intrinsics, noise=0.005)
-    spread = cells.values[:, 9] - cells.values[:, 3] ** 2
-    mixed = cells.weight[spread > 1e-4]
-    # The root mean square over 256 pixels tolerates a single pixel beyond the step.
-    assert mixed.numel() == 0 or float(mixed.max()) <= 64
-
-
 def test_a_step_in_one_column_of_pixels_splits_cells():
     depth = torch.full((50, 1), 1.5)
     assert len(pool_depth_image(depth, INTRINSICS).weight) == 2
@@ -284,14 +256,6 @@ def test_more_iterations_increase_the_likelihood():
     assert many.score(points) > few.score(points)
     assert many.lower_bound_ < many.score(points)
     assert few.reg_covar == pytest.approx(1e-4)
-
-
-def test_mixture_is_nearly_as_likely_as_a_fit_of_points():
-    depth = corner()[0] * (1 + 0.002 * torch.randn(128, 160, generator=torch.Generator().manual_seed(1)))
-    points = points_of(depth)
-    image = fit_depth_image(depth, INTRINSICS, 40, noise=0.01)
-    cloud = GaussianMixture(40, reg_covar=1e-4, init_params="flat_pieces", max_iter=30).fit(points)
-    assert image.score(points) > cloud.score(points) - 0.25
 
 
 @pytest.mark.parametrize(("noise", "distance"), [(0.01, 3.0), (0.01, 60.0), (0.001, 8.0), (1e-4, 1.0)])

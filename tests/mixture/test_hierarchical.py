@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -12,13 +11,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mixture.estimator_contract import MixtureContract
-from mixture.fit_contract import FitContract, check_mixture
-from mixture.tree_cases import exact, room
-from torch import Tensor
+from mixture.fit_contract import FAR, FitContract, blobs, check_mixture, rigid_motion
+from mixture.tree_cases import exact, room, split_nodes
 
-from gmmtorch import datasets
-from gmmtorch.errors import NumericalError
-from gmmtorch.mixture import GaussianMixture, HierarchicalGaussianMixture
+from gmmtorch.errors import DataError, InvalidArgumentError, NumericalError
+from gmmtorch.files import pack_tensors, read_tensors
+from gmmtorch.mixture import GaussianMixture, HierarchicalGaussianMixture, LaserModel, prune
+from gmmtorch.mixture.estimators.hierarchical import check_tree
+from gmmtorch.mixture.estimators.tree_growth import Children, Tree, keep_children
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 
@@ -139,26 +139,284 @@ def test_fit_without_regularisation_is_valid_or_rejected():
         exact(reg_covar=0.0).fit(np.ones((20, 3)))
 
 
-# -- real scans ------------------------------------------------------------------------------------
+# -- levels ----------------------------------------------------------------------------------------
 
 
-def held_out(points: Tensor, n: int) -> tuple[Tensor, Tensor]:
-    order = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))
-    return points[order[:n]], points[order[n : n + n // 4]]
+@st.composite
+def trees(draw: st.DrawFn) -> list[int]:
+    """Parents, level by level."""
+    levels = [[-1] * draw(st.integers(1, 3))]
+    for _ in range(draw(st.integers(0, 4))):
+        first = sum(map(len, levels[:-1]))
+        counts = [draw(st.integers(0, 3)) for _ in levels[-1]]
+        below = [first + i for i, n in enumerate(counts) for _ in range(n)]
+        if not below:
+            break
+        levels.append(below)
+    return [parent for level in levels for parent in level]
 
 
-@pytest.mark.real_data
-@pytest.mark.parametrize("name", ["hall", "bunny"])
-def test_real_surfaces_are_nearly_as_likely_as_flat_em(real_data: Path, name: str):
-    if name == "hall":
-        cloud = datasets.load("scan_folder", path=real_data / "hall")[0].points
-    else:
-        cloud = datasets.load("mesh", path=real_data / "meshes" / "bunny.ply")[0].points
-    points, fresh = held_out(cloud.double(), 15_000)
-    tree = HierarchicalGaussianMixture(64, random_state=0).fit(points)
-    assert len(tree.weights) > 56
-    flat = GaussianMixture(len(tree.weights), random_state=0).fit(points)
-    scores = [tree.level(level).score(fresh) for level in range(1, tree.n_levels_ + 1)]
+@given(parents=trees())
+def test_levels_and_leaves_of_random_trees(parents):
+    def depth(node: int) -> int:
+        return 1 if parents[node] < 0 else 1 + depth(parents[node])
+
+    n = len(parents)
+    tree = Tree(torch.tensor(parents), *(torch.zeros(n, *shape) for shape in ((), (2,), (2, 2))))
+    assert tree.levels().tolist() == [depth(node) for node in range(n)]
+    leaves = [node for node in range(n) if node not in parents]
+    assert tree.leaves().tolist() == leaves
+    for level in range(1, 6):
+        expected = [i for i in range(n) if depth(i) == level or (i in leaves and depth(i) < level)]
+        assert tree.at_level(level).tolist() == expected
+
+
+@pytest.mark.parametrize("kind", [np.asarray, torch.from_numpy])
+def test_every_level_is_a_mixture_of_the_whole_cloud(kind):
+    points, fresh = kind(room(4000)), kind(room(1000, seed=1))
+    tree = HierarchicalGaussianMixture(branching=5, max_levels=3, random_state=0).fit(points)
+    assert tree.n_levels_ == 3
+    sizes, scores = [], []
+    for level in range(1, 4):
+        mixture = tree.level(level)
+        assert type(mixture) is GaussianMixture
+        assert type(mixture.means_) is type(points)
+        check_mixture(mixture, np.asarray(points), at_most=5**level)
+        sizes.append(mixture.n_components)
+        scores.append(mixture.score(fresh))
+        np.testing.assert_allclose(mixture.weights @ mixture.means, np.asarray(points).mean(0), atol=0.02)
+    assert sizes == sorted(set(sizes))
     assert scores == sorted(scores)
-    assert tree.score(fresh) > flat.score(fresh) - 0.3
-    assert tree.score(fresh) > GaussianMixture(8, random_state=0).fit(points).score(fresh) + 0.3
+    assert sizes[0] == 5
+    assert torch.equal(tree.level(3).means, tree.means)
+    weights, parents = np.asarray(tree.node_weights_), np.asarray(tree.node_parents_)
+    for node in split_nodes(HierarchicalGaussianMixture().fit(np.asarray(points))):
+        if (parents == node).any():
+            assert weights[parents == node].sum() == pytest.approx(weights[node], rel=1e-9)
+    assert len(weights) == len(tree.node_means_) == len(tree.node_covariances_) == len(tree.node_levels_)
+    for level, message in ((0, "at least 1"), (4, "n_levels_=3"), (1.5, "whole number")):
+        with pytest.raises(InvalidArgumentError, match=f"^level={level}.*{message}"):
+            tree.level(level)
+
+
+def test_tree_of_one_node_is_one_gaussian():
+    tree = exact(1).fit(blobs(2))
+    assert tree.n_levels_ == 1
+    assert tree.node_parents_.tolist() == [-1]
+    np.testing.assert_allclose(tree.means_[0], blobs(2).mean(0))
+    np.testing.assert_allclose(tree.covariances_[0], np.cov(blobs(2).T, bias=True) + 1e-6 * np.eye(2))
+    assert tree.lower_bound_ == pytest.approx(tree.score(blobs(2)))
+
+
+def test_mixture_of_given_parameters_has_one_level():
+    whole = exact(branching=3, max_levels=2).fit(blobs(2))
+    tree = HierarchicalGaussianMixture.from_parameters(whole.weights_, whole.means_, whole.covariances_)
+    assert tree.n_levels_ == 1
+    assert torch.equal(tree.level(1).means, whole.means)
+    assert (tree.node_parents_ == -1).all()
+    pruned, kept = prune(whole, 240, min_support=20.0)
+    assert pruned.n_levels_ == 1
+    assert len(pruned.weights_) == int(kept.sum())
+
+
+# -- motions, copies and files ---------------------------------------------------------------------
+
+
+def deep() -> HierarchicalGaussianMixture:
+    return HierarchicalGaussianMixture(branching=3, max_levels=3, random_state=0).fit(room(600) + FAR[:3])
+
+
+def assert_same_tree(one: HierarchicalGaussianMixture, other: HierarchicalGaussianMixture) -> None:
+    assert one.n_levels_ == other.n_levels_ > 1
+    assert (one.node_parents_ == other.node_parents_).all()
+    for level in range(1, one.n_levels_ + 1):
+        assert torch.equal(one.level(level).covariances, other.level(level).covariances)
+
+
+def test_files_and_states_keep_the_tree(tmp_path):
+    path = tmp_path / "tree.safetensors"
+    for tree in (deep(), exact(100).fit(room(600))):
+        assert len(tree.weights_) < 100
+        tree.save(path)
+        loaded = HierarchicalGaussianMixture.load(path)
+        assert loaded.get_params() == tree.get_params()
+        restored = HierarchicalGaussianMixture(2).fit(blobs(2))
+        restored.load_state_dict(tree.state_dict())
+        for other in (loaded, restored):
+            assert_same_tree(other, tree)
+        assert torch.equal(GaussianMixture.load(path).means, tree.means)
+
+
+def test_moved_moves_the_tree():
+    tree, motion = deep(), rigid_motion(3)
+    moved = tree.moved(motion)
+    points = room(50, seed=2) + FAR[:3]
+    at = points @ motion[:3, :3].T + motion[:3, 3]
+    for level in range(1, tree.n_levels_ + 1):
+        expected = tree.level(level).score_samples(points)
+        np.testing.assert_allclose(moved.level(level).score_samples(at), expected, atol=1e-6)
+    assert_same_tree(tree, deep())
+
+
+def broken(change: str, tree: Tree) -> Tree:
+    parents, weights, means, covariances = (value.clone() for value in tree)
+    if change == "cycle":
+        parents[0] = len(parents) - 1
+    elif change == "self":
+        parents[3] = 3
+    elif change == "negative":
+        parents[0] = -2
+    elif change == "beyond":
+        parents[-1] = len(parents)
+    elif change == "leaves":
+        parents[-1] = -1
+        weights[-1] = 0.5
+    elif change == "type":
+        parents = parents.double()
+    elif change == "short":
+        means = means[:-1]
+    elif change == "single":
+        covariances = covariances.float()
+    elif change == "shape":
+        parents = parents[None]
+    return Tree(parents, weights, means, covariances)
+
+
+@pytest.mark.parametrize(
+    "change", ["cycle", "self", "negative", "beyond", "leaves", "type", "short", "single", "shape", "missing"]
+)
+def test_file_with_an_invalid_tree_is_rejected(tmp_path, change):
+    tree, path = deep(), tmp_path / "tree.safetensors"
+    tree.save(path)
+    tensors, facts = read_tensors(path, "gmmtorch.mixture", 1)
+    check_tree(tree._tree(), tree.weights)
+    names = HierarchicalGaussianMixture._extra_names
+    tensors |= {f"extra.{n}": v for n, v in zip(names, broken(change, tree._tree()), strict=True)}
+    if change == "missing":
+        del tensors["extra.node_means"]
+    path.write_bytes(pack_tensors(tensors, "gmmtorch.mixture", 1, **facts))
+    with pytest.raises(DataError, match=r"tree\.safetensors"):
+        HierarchicalGaussianMixture.load(path)
+
+
+# -- limits of the splits --------------------------------------------------------------------------
+
+
+def test_flat_or_thin_nodes_are_not_split():
+    points = room(2500)
+    n_free = len(exact(min_gain=0.0).fit(points).weights_)
+    for options in ({"planarity_threshold": 3e-3}, {"thickness": 0.02}):
+        tree = exact(min_gain=0.0, **options).fit(points)
+        variance = np.linalg.eigvalsh(tree.node_covariances_)
+        flat = variance[:, 0] < options.get("planarity_threshold", 0.0) * variance.sum(1)
+        flat |= variance[:, 0] < options.get("thickness", 0.0) ** 2
+        assert flat.any()
+        assert not flat[split_nodes(tree)].any()
+        assert len(tree.weights_) < n_free / 2
+    assert len(exact(planarity_threshold=1.0).fit(points).weights_) == 1
+
+
+def test_weak_children_are_removed_in_favour_of_siblings():
+    weights = torch.tensor([[0.7, 0.25, 0.05], [0.04, 0.03, 0.93], [0.5, 0.5, 0.0]]).double()
+    children = Children(weights, torch.zeros(3, 3, 2), torch.zeros(3, 3, 2, 2))
+    support = weights * torch.tensor([[100.0], [100.0], [3.0]])
+    found = keep_children(children, support >= 6.0).weights
+    expected = [[0.7 / 0.95, 0.25 / 0.95, 0.0], [0.0, 0.0, 1.0], [0.5, 0.5, 0.0]]
+    torch.testing.assert_close(found, torch.tensor(expected).double())
+
+
+def test_split_must_gain_min_gain_per_parameter():
+    points = np.random.default_rng(0).normal(size=(3000, 3))  # one Gaussian
+    assert len(exact().fit(points).weights_) == 1
+    assert len(exact(min_gain=0.0).fit(points).weights_) > 20
+    few, many = exact(min_gain=math.log(3000) / 2).fit(room(3000)), exact().fit(room(3000))
+    assert 4 <= len(few.weights_) < len(many.weights_) < 300
+
+
+def test_split_must_gain_tol_a_point():
+    points = np.random.default_rng(0).uniform(size=(2000, 1))
+    assert len(exact(min_gain=0.0, branching=2, max_levels=1, tol=1e-3).fit(points).weights_) == 2
+    assert len(exact(min_gain=0.0, branching=2, max_levels=1, tol=0.2).fit(points).weights_) == 1
+
+
+@pytest.mark.parametrize("places", [1, 2, 5])
+def test_number_of_leaves_is_limited_by_distinct_points(places):
+    at = np.random.default_rng(0).normal(size=(places, 3))
+    points = np.repeat(at, 20, axis=0)
+    tree = exact().fit(points)
+    assert len(tree.weights_) == places
+    order = np.lexsort(tree.means_.T), np.lexsort(at.T)
+    np.testing.assert_allclose(tree.means_[order[0]], at[order[1]], atol=1e-9)
+    np.testing.assert_allclose(tree.weights_, 1 / places)
+
+
+# -- the largest number of leaves ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("branching", [2, 3, 8])
+@pytest.mark.parametrize("n_components", [1, 2, 3, 7, 9, 20, 100])
+def test_number_of_leaves_is_close_below_n_components(n_components, branching):
+    tree = exact(n_components, branching=branching, max_levels=9, min_support=1.0, min_gain=0.0)
+    k = len(tree.fit(room(1500)).weights_)
+    assert 0.9 * n_components <= k <= n_components
+
+
+def test_limited_splits_go_where_they_gain_most():
+    """Two clusters of equal weight and width: one evenly filled, the other with dots on a grid."""
+    rng = np.random.default_rng(0)
+    even = rng.uniform(-2, 2, size=(1000, 2)) + np.array([20.0, 0.0])
+    dots = rng.integers(-2, 3, size=(1000, 2)) * 0.8 + 0.02 * rng.normal(size=(1000, 2))
+    points = np.concatenate([even, dots])
+    few, all_of_it = (exact(n, branching=2, max_levels=8, min_gain=0.0).fit(points) for n in (24, None))
+    assert (all_of_it.means_[:, 0] > 10).sum() > 50
+    assert (few.means_[:, 0] > 10).sum() == 8  # of sixteen nodes on the fourth level
+    assert (few.means_[:, 0] < 10).sum() == 16
+
+
+# -- pruning by density (thesis 2.1.4) -------------------------------------------------------------
+
+
+def two_walls() -> tuple[np.ndarray, LaserModel]:
+    """Points of two far apart walls around the origin, and a few stray points between them; the sensor."""
+    laser = LaserModel(angular_step=0.002)
+    along = np.linspace(-0.8, 0.8, 800)
+    walls = [np.stack([np.full(800, side * 4.0), 4 * np.tan(along)], 1) for side in (-1, 1)]
+    stray = np.stack([np.linspace(-3, 3, 9), np.full(9, 3.0)], 1)
+    noise = np.random.default_rng(0).normal(0, 0.01, (1609, 2))
+    return np.concatenate([*walls, stray]) + noise, laser
+
+
+def test_sparse_children_lose_their_points_to_their_siblings():
+    points, laser = two_walls()
+    options: dict[str, Any] = {"branching": 3, "max_levels": 1, "min_gain": 0.0, "min_support": 2.0}
+    plain = exact(**options).fit(points)
+    assert len(plain.weights_) == 3
+    least = float(np.min(plain.weights_))
+    assert least < 0.02  # the stray points
+    pruned = exact(min_density_share=0.2, sensor=laser, **options).fit(points, origins=np.zeros(2))
+    assert len(pruned.weights_) == 2
+    assert np.sum(pruned.weights_) == pytest.approx(1)
+    assert np.min(pruned.weights_) > 0.4
+    again = exact(min_density_share=1e-9, sensor=laser, **options).fit(points, origins=np.zeros((1, 2)))
+    np.testing.assert_array_equal(again.means_, plain.means_)
+
+
+def test_a_tree_of_sparse_children_is_one_node():
+    points, laser = two_walls()
+    found = exact(min_density_share=1e6, sensor=laser).fit(points, origins=np.zeros(2))
+    assert len(found.weights_) == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "origins", "said"),
+    [
+        ({"min_density_share": 0.1}, np.zeros(2), "min_density_share=0.1 needs .* sensor"),
+        ({"min_density_share": 0.1, "sensor": LaserModel()}, None, "origins in fit"),
+        ({"min_density_share": 0.1, "sensor": LaserModel()}, np.zeros(3), r"origins has shape \(3,\)"),
+        ({"min_density_share": -1.0}, None, "min_density_share=-1"),
+        ({"sensor": "lidar"}, None, "sensor='lidar'"),
+    ],
+)
+def test_invalid_options_of_density_are_named(options, origins, said):
+    with pytest.raises(InvalidArgumentError, match=said):
+        exact(**options).fit(two_walls()[0], origins=origins)

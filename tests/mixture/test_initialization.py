@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+import warnings
+
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from mixture.fit_contract import check_mixture, degenerate_clouds, move, rigid_motion
 from mixture.mixture_cases import cloud, thin_wall
+from sklearn.base import clone
 from torch import Tensor
 
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.mixture import GaussianMixture
 from gmmtorch.mixture.em import initialization
-from gmmtorch.mixture.em.cells import pool_into_cells
 from gmmtorch.mixture.em.exact import Parameters, quadratic_features
 from gmmtorch.mixture.em.initialization import (
     INITIALIZATIONS,
@@ -18,7 +27,9 @@ from gmmtorch.mixture.em.initialization import (
     initialize,
     moments_of,
     replicated,
+    surface_pieces,
 )
+from gmmtorch.mixture.em.partition import least_support, pool_into_cells
 
 METHODS = sorted(INITIALIZATIONS)
 SEEDED = [method for method in METHODS if method != "flat_pieces"]
@@ -170,3 +181,213 @@ def test_replicated_components_share_the_weight(k):
     assert torch.equal(many.means, found.means[copy])
     sums = torch.zeros(3, dtype=torch.float64).index_add_(0, copy, many.weights)
     torch.testing.assert_close(sums, weights)
+
+
+NOISE = 0.01
+
+
+def wall(n: int, center: tuple[float, ...], axis: int, seed: int, noise: float = NOISE) -> Tensor:
+    """A square of 4 m that is thin along one axis."""
+    generator = torch.Generator().manual_seed(seed)
+    points = 4 * torch.rand(n, 3, generator=generator, dtype=torch.float64) - 2
+    points[:, axis] = noise * torch.randn(n, generator=generator, dtype=torch.float64)
+    return points + torch.tensor(center, dtype=torch.float64)
+
+
+def room(n_wall: int = 500, seed: int = 0) -> Tensor:
+    """Six walls of a cube around the origin."""
+    sides = [
+        wall(
+            n_wall, tuple(2.0 * sign * (axis == a) for a in range(3)), axis, 10 * seed + 2 * axis + (sign > 0)
+        )
+        for axis in range(3)
+        for sign in (-1, 1)
+    ]
+    return torch.cat(sides)
+
+
+def sphere(n: int, seed: int = 0) -> Tensor:
+    """The surface of a sphere of radius 1 m, with 2 mm of noise."""
+    generator = torch.Generator().manual_seed(seed)
+    points = torch.randn(n, 3, generator=generator, dtype=torch.float64)
+    points /= points.norm(dim=1, keepdim=True)
+    return points * (1 + 0.002 * torch.randn(n, 1, generator=generator, dtype=torch.float64))
+
+
+def count(points: Tensor, noise: float = NOISE, weight: Tensor | None = None) -> int:
+    weight = points.new_ones(len(points)) if weight is None else weight
+    found, labels = surface_pieces(points - points.mean(0), weight, noise, 1e-6)
+    assert labels.unique().tolist() == list(range(len(found.weights)))
+    return len(found.weights)
+
+
+def fitted(points: Tensor | np.ndarray, **options) -> GaussianMixture:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return GaussianMixture(None, random_state=0, **options).fit(points)
+
+
+# -- the count ------------------------------------------------------------------------------------
+
+
+def test_flat_wall_is_one_component_and_clutter_many():
+    assert [count(wall(n, (0, 0, 0), 1, 0)) for n in (10, 1000, 30_000)] == [1, 1, 1]
+    assert count(cloud(1000, 3)) > 15
+
+
+def test_room_has_large_pieces_on_walls_and_small_ones_at_edges():
+    points = room(2000)
+    found, labels = surface_pieces(points, torch.ones(len(points)).double(), NOISE, 0.0)
+    size = torch.bincount(labels)
+    flat = torch.linalg.eigvalsh(found.covariances)[:, 0].sqrt() <= 2 * NOISE
+    # Pieces across two walls have too few points to be halved, and are along an edge.
+    assert bool((flat | (size < 4 * least_support(3))).all())
+    from_edge = (2 - points.abs()).sort(1).values[:, 1]
+    assert float(from_edge[~flat[labels]].max()) < 1
+    inside = from_edge > 0.6
+    assert float(size[labels][inside].double().mean()) > 6 * least_support(3)
+    assert len(size) < 0.6 * count(cloud(12_000, 3))
+
+
+def test_less_noise_gives_more_pieces_of_a_curved_surface():
+    counts = [count(sphere(20_000), noise) for noise in (0.16, 0.08, 0.04, 0.02, 0.01)]
+    assert counts == sorted(counts)
+    # A cap of radius a on a unit ball is about a²/4 thick in standard deviations over √3: pieces grow
+    # with the noise, so their number is inversely proportional to it.
+    for fewer, more in itertools.pairwise(counts[1:]):
+        assert 1.4 < more / fewer < 3
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e-3, 1e3])
+def test_number_does_not_depend_on_the_unit(unit):
+    for points in (room(200), sphere(3000), cloud(500, 3)):
+        assert count(unit * points, unit * NOISE) == count(points)
+
+
+def test_noise_in_another_unit_gives_one_or_the_most_components():
+    assert count(1e-3 * cloud(2000, 3)) == 1
+    n = count(1e3 * cloud(2000, 3))
+    assert 2000 / (4 * least_support(3)) <= n <= 2000 / least_support(3)
+
+
+@given(seed=st.integers(0, 10**6), n=st.integers(1, 400), dim=st.integers(1, 6), noise=st.floats(1e-4, 10))
+def test_number_is_limited_by_the_points(seed, n, dim, noise):
+    points = torch.rand(n, dim, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    assert 1 <= count(points, noise) <= max(1, n // least_support(dim))
+
+
+def test_least_support_is_twice_the_parameters_from_3d_on():
+    assert [least_support(dim) for dim in (1, 2, 3)] == [6, 6, 20]
+    for dim in range(3, 8):
+        assert least_support(dim) == 2 * (1 + dim + dim * (dim + 1) // 2)
+
+
+def test_weights_count_as_points():
+    points = room(100)
+    weight = torch.randint(1, 4, (len(points),), generator=torch.Generator().manual_seed(1)).double()
+    assert count(points, weight=weight) == count(points.repeat_interleave(weight.long(), 0))
+    # Ten times the weight supports more components; a thousandth of it supports a single one.
+    assert count(cloud(300, 3), weight=torch.full((300,), 10.0).double()) > 2 * count(cloud(300, 3))
+    assert count(cloud(300, 3), weight=torch.full((300,), 1e-3).double()) == 1
+
+
+@pytest.mark.parametrize("dim", [2, 3, 5])
+def test_number_does_not_depend_on_motion_or_order(dim):
+    points = cloud(600, dim).numpy() * np.array([3.0, 1.0, 0.02, 0.5, 1.0])[:dim]
+    moved = move(rigid_motion(dim, seed=1), points)
+    shuffled = np.random.default_rng(0).permutation(points)
+    counts = {count(torch.from_numpy(points)) for points in (points, moved, shuffled, points + 5e5)}
+    assert len(counts) == 1
+
+
+def test_cells_give_nearly_the_number_of_points(monkeypatch):
+    points = torch.cat([room(3000), sphere(10_000)])
+    exact = count(points)
+    monkeypatch.setattr(initialization, "_SURFACE_CELLS", 8000)
+    assert count(points) == pytest.approx(exact, rel=0.1)
+
+
+# -- GaussianMixture without a number ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("algorithm", ["exact", "truncated", "auto"])
+def test_em_starts_from_the_pieces(algorithm):
+    points = room()
+    weight = torch.ones(len(points)).double()
+    center = points.mean(0)
+    first, _ = surface_pieces(points - center, weight, NOISE, 1e-6)
+    with pytest.warns(match="did not converge"):
+        mixture = GaussianMixture(None, noise=NOISE, max_iter=1, algorithm=algorithm).fit(points)
+    assert mixture.n_components is None
+    assert mixture.means_.shape == first.means.shape
+    given = GaussianMixture.from_parameters(*first)
+    assert mixture.lower_bound_ == pytest.approx(given.score(points - center), abs=0.01)
+    done = fitted(points, algorithm=algorithm)
+    assert done.score(points) > given.score(points - center) + 0.05
+
+
+def test_number_depends_on_the_noise():
+    points = sphere(4000)
+    assert len(fitted(points, noise=0.08).means_) == count(points, 0.08)
+    assert len(fitted(points, noise=0.02).means_) == count(points, 0.02)
+    # Without effect if the number is given.
+    assert len(GaussianMixture(3, noise=0.02, random_state=0).fit(points).means_) == 3
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3, 5])
+@pytest.mark.parametrize("algorithm", ["exact", "truncated"])
+def test_degenerate_clouds_are_fitted(dim, algorithm):
+    for name, points in degenerate_clouds(dim).items():
+        mixture = fitted(points, algorithm=algorithm)
+        check_mixture(mixture, points, at_most=len(points))
+        if name != "huge":
+            assert len(mixture.means_) <= max(1, len(points) // least_support(dim)) + 1, name
+
+
+def test_n_components_none_is_kept_by_files_states_and_copies(tmp_path):
+    points = room(200)
+    mixture = fitted(points, noise=0.02)
+    k = len(mixture.means_)
+    mixture.save(tmp_path / "m.safetensors")
+    loaded = GaussianMixture.load(tmp_path / "m.safetensors")
+    taken = GaussianMixture(None)
+    taken.load_state_dict(mixture.state_dict())
+    numbered = GaussianMixture(2)
+    numbered.load_state_dict(mixture.state_dict())
+    assert numbered.n_components == k
+    for other in (loaded, taken, mixture.moved(np.eye(4))):
+        assert other.n_components is None
+        assert torch.equal(other.means, mixture.means)
+    assert loaded.get_params() == mixture.get_params()
+    copy = clone(mixture)
+    assert copy.n_components is None
+    assert torch.equal(copy.fit(points).means, mixture.means)
+    # A new fit determines a new number.
+    assert len(loaded.fit(wall(500, (0, 0, 0), 2, 0)).means_) == 1
+
+
+def test_warm_start_and_partial_fit_keep_the_number():
+    points, other = room(300), sphere(2000)
+    mixture = fitted(points, warm_start=True)
+    k = len(mixture.means_)
+    before = mixture.lower_bound_
+    assert len(mixture.fit(points).means_) == k
+    assert mixture.lower_bound_ >= before - 1e-6
+    assert len(mixture.fit(other).means_) == k
+    batches = GaussianMixture(None, noise=NOISE)
+    batches.partial_fit(points)  # the first batch decides
+    assert len(batches.means_) == count(points)
+    batches.partial_fit(other)
+    assert len(batches.means_) == count(points)
+
+
+@pytest.mark.parametrize("name", ["weights_init", "means_init", "precisions_init"])
+def test_given_start_is_rejected(name):
+    with pytest.raises(InvalidArgumentError, match=f"{name}.*n_components=None"):
+        GaussianMixture(None, **{name: np.ones(1)}).fit(room(10))
+
+
+@pytest.mark.parametrize("noise", [0, -1.0, math.nan, math.inf, "low", None])
+def test_invalid_noise_is_rejected(noise):
+    with pytest.raises(InvalidArgumentError, match=r"^noise"):
+        GaussianMixture(None, noise=noise).fit(room(10))

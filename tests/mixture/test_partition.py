@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from mixture.mixture_cases import cloud, thin_wall
+from mixture.mixture_cases import cloud
 from torch import Tensor
 
+from gmmtorch.kernels import kernels
+from gmmtorch.mixture import GaussianMixture
 from gmmtorch.mixture.em.exact import quadratic_features
-from gmmtorch.mixture.em.partition import FlatnessRule, Partition, partition
+from gmmtorch.mixture.em.partition import FlatnessRule, Partition, partition, pool_into_cells
 
 RULE = FlatnessRule(thickness=0.02, length=0.5, min_weight=5)
 
@@ -58,13 +62,6 @@ def test_remaining_pieces_are_flat_and_short_or_cannot_be_halved(seed, dim):
         assert (flat and short) or too_light
 
 
-def test_thin_pieces_keep_min_weight():
-    rule = FlatnessRule(thickness=0.02, length=0.05, min_weight=40, min_weight_thick=1)
-    labels, n_pieces = cut(thin_wall(1000, 3.0, noise=0.005), rule)
-    assert n_pieces > 4
-    assert int(torch.bincount(labels).min()) >= 40
-
-
 def test_integer_weights_equal_repeated_points():
     points = cloud(120, 2, 4)
     weight = torch.randint(1, 4, (120,), generator=torch.Generator().manual_seed(0)).double()
@@ -79,13 +76,6 @@ def test_integer_weights_equal_repeated_points():
 @pytest.mark.parametrize("n", [1, 2, 100])
 def test_equal_points_are_one_piece(n):
     assert cut(torch.zeros(n, 3, dtype=torch.float64), RULE).n_pieces == 1
-
-
-def test_line_is_cut_only_along_its_length():
-    along = torch.linspace(-4, 4, 801, dtype=torch.float64)
-    labels, n_pieces = cut(torch.stack([along, 0 * along], 1), RULE)
-    assert 4 <= n_pieces <= 16
-    assert (labels[1:] != labels[:-1]).sum() == n_pieces - 1  # pieces are intervals
 
 
 @pytest.mark.parametrize(("n_strays", "distance"), [(9, 200.0), (9, 1000.0), (1, 500.0)])
@@ -171,3 +161,110 @@ def test_pieces_that_cannot_be_halved_do_not_use_up_the_levels():
     features[:90, 5] += 100.0
     found = partition(points - center, weight, FlatnessRule(**ALL, max_components=125), features)
     assert found.n_pieces == 125
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    n=st.integers(1, 300),
+    dim=st.integers(2, 3),
+    limit=st.integers(1, 300),
+    finest=st.sampled_from([1e-3, 0.1, 1.0]),
+)
+def test_cells_conserve_moments_within_the_limit(seed, n, dim, limit, finest):
+    points = cloud(n, dim, seed)
+    cells = pool_into_cells(points, limit, finest)
+    assert cells.weight.shape[0] <= limit
+    assert float(cells.weight.min()) >= 1
+    assert float(cells.weight.sum()) == n
+    torch.testing.assert_close(
+        (cells.features * cells.weight[:, None]).sum(0),
+        quadratic_features(points).sum(0),
+        rtol=1e-11,
+        atol=1e-11,
+    )
+
+
+def test_each_cell_is_the_exact_mean_of_its_points():
+    points = (cloud(200, 3, 0) * 1024).round() / 1024
+    cells = pool_into_cells(points, 40, 0.01)
+    for cell in range(cells.weight.shape[0]):
+        own = [[Fraction(x) for x in row] for row in points[cells.member == cell].tolist()]
+        assert len(own) == int(cells.weight[cell])
+        products = [(i, j) for i in range(3) for j in range(i, 3)]
+        expected = [Fraction(1)]
+        expected += [sum(row[i] for row in own) / len(own) for i in range(3)]
+        expected += [sum(row[i] * row[j] for row in own) / len(own) for i, j in products]
+        # Sums of these numbers are exact in float64, so only the division may round.
+        assert cells.features[cell].tolist() == [float(x) for x in expected]
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_cells_have_the_finest_side(dim):
+    points = cloud(3000, dim, 1)
+    cells = pool_into_cells(points, 2999, 0.3)
+    assert cells.weight.shape[0] < 2999
+    low = points.amin(0).numpy()
+    keys = {tuple(k) for k in np.floor((points.numpy() - low) / 0.3).astype(int)}
+    assert cells.weight.shape[0] == len(keys)
+    for cell in range(cells.weight.shape[0]):
+        own = points[cells.member == cell]
+        assert float((own.amax(0) - own.amin(0)).max()) <= 0.3 + 1e-12
+
+
+def test_distant_outlier_gets_its_own_cell():
+    points = torch.cat([cloud(500, 3, 0), torch.full((1, 3), 5e5, dtype=torch.float64)])
+    cells = pool_into_cells(points, 100, 0.01)
+    assert int(cells.weight[cells.member[-1]]) == 1  # the outlier has its own cell
+    assert float(cells.weight.sum()) == 501
+    torch.testing.assert_close(
+        (cells.features * cells.weight[:, None]).sum(0), quadratic_features(points).sum(0), rtol=1e-12, atol=0
+    )
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+@pytest.mark.parametrize("limit", [30, 1000])
+def test_cells_of_integer_weights_equal_those_of_repeated_points(dim, limit):
+    points = cloud(200, dim, 5)
+    weight = torch.randint(1, 4, (200,), generator=torch.Generator().manual_seed(0)).double()
+    weighted = pool_into_cells(points, min(limit, 199), 1e-3, weight)
+    repeated = pool_into_cells(points.repeat_interleave(weight.long(), 0), min(limit, 199), 1e-3)
+    torch.testing.assert_close(weighted.features, repeated.features, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(weighted.weight, repeated.weight)
+    assert torch.equal(weighted.member.repeat_interleave(weight.long()), repeated.member)
+
+
+def test_equal_points_share_one_cell():
+    cells = pool_into_cells(torch.zeros(50, 3, dtype=torch.float64), 5, 0.0)
+    assert cells.weight.tolist() == [50.0]
+    assert cells.member.tolist() == [0] * 50
+    assert cells.features.tolist() == [[1.0] + [0.0] * 9]
+
+
+@pytest.mark.parametrize("algorithm", ["exact", "truncated"])
+@pytest.mark.parametrize("init", ["kmeans", "flat_pieces"])
+def test_fit_with_one_cell_per_point_equals_fit_of_points(algorithm, init):
+    points = cloud(300, 3, 1).numpy()
+    options = {"algorithm": algorithm, "init_params": init, "random_state": 0, "dtype": "float64"}
+    plain = GaussianMixture(20, **options).fit(points)
+    for limit in (300, 5000):
+        pooled = GaussianMixture(20, max_cells=limit, **options).fit(points)
+        np.testing.assert_allclose(pooled.lower_bounds_, plain.lower_bounds_, rtol=1e-9)
+        np.testing.assert_allclose(pooled.means_, plain.means_, atol=1e-6)
+        np.testing.assert_allclose(pooled.covariances_, plain.covariances_, atol=1e-6)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+@pytest.mark.parametrize("kind", ["any", "equal", "lattice"])
+@pytest.mark.parametrize("limit", [1, 40, 1500])
+def test_fused_cells_are_those_of_the_twin(dim, kind, limit):
+    points = cloud(2000, dim, 5)
+    if kind == "equal":
+        points[:] = points[0].clone()
+    if kind == "lattice":  # points on the planes between cells
+        points = (points * 4).round() / 4
+    weight, found = 1 + torch.arange(2000).double() % 3, []
+    for choice in ("torch", "fused"):
+        with kernels(choice):
+            found.append(pool_into_cells(points, limit, 0.25, weight))
+    assert torch.equal(found[1].member, found[0].member)
+    torch.testing.assert_close(found[1], found[0], rtol=1e-12, atol=1e-12)

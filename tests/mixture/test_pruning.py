@@ -15,7 +15,7 @@ from gmmtorch.mixture import DeconvolvedGaussianMixture, GaussianMixture, prune
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.partition import FlatnessRule, partition
 from gmmtorch.mixture.estimators.sensor_model import DepthCameraModel, LaserModel, LidarModel, SensorModel
-from gmmtorch.mixture.reduction.pruning import expected_density, support_density
+from gmmtorch.mixture.pruning import expected_density, support_density
 from gmmtorch.simulation import RangeSensor, laser_2d, simulate_scan, spinning_lidar
 from gmmtorch.simulation.sensors.range_sensors import depth_camera
 

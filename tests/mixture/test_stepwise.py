@@ -18,8 +18,6 @@ from scipy.stats import multivariate_normal
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.files import pack_tensors
 from gmmtorch.mixture import GaussianMixture
-from gmmtorch.mixture.em import stepwise
-from gmmtorch.mixture.em.exact import Parameters
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 
@@ -111,39 +109,6 @@ def test_statistics_follow_their_recursion(dim, kappa):
         for mine, expected in zip((gmm.weights_, gmm.means_, gmm.covariances_), theta, strict=True):
             np.testing.assert_allclose(mine, expected, rtol=1e-9, atol=1e-10)
     assert gmm.n_samples_seen_ == pytest.approx(weight.sum())
-
-
-@pytest.mark.parametrize("kappa", [0.55, 0.7, 1.0])
-def test_step_sizes_of_equal_batches_equal_liang_and_klein(kappa):
-    steps = [stepwise.step_size(50.0, 50.0 * t, kappa) for t in range(6)]
-    np.testing.assert_allclose(steps, [1.0, *((t + 2) ** -kappa for t in range(5))], rtol=1e-14)
-
-
-@settings(max_examples=50)
-@given(
-    seed=st.integers(0, 10**6), dim=st.integers(1, 5), step=st.floats(0, 1), offset=st.sampled_from([0, 5e5])
-)
-def test_blend_has_the_blended_moments(seed, dim, step, offset):
-    rng = np.random.default_rng(seed)
-
-    def random() -> Parameters:
-        root = rng.normal(size=(4, dim, dim))
-        weights, means = rng.dirichlet(np.ones(4)), rng.normal(size=(4, dim))
-        return Parameters(*map(torch.from_numpy, (weights, means, root @ root.transpose(0, 2, 1))))
-
-    old, new = random(), random()
-    found = stepwise.blend(
-        old._replace(means=old.means + offset), new._replace(means=new.means + offset), step
-    )
-
-    def raw(p: Parameters) -> torch.Tensor:
-        second = p.covariances + p.means[:, :, None] * p.means[:, None, :]
-        return torch.cat([torch.ones(4, 1), p.means, second.flatten(1)], 1).double() * p.weights[:, None]
-
-    expected = (1 - step) * raw(old) + step * raw(new)
-    torch.testing.assert_close(
-        raw(found._replace(means=found.means - offset)), expected, rtol=1e-7, atol=1e-8
-    )
 
 
 # -- where it leads -------------------------------------------------------------------------------------
@@ -267,25 +232,6 @@ def test_partial_fit_far_from_the_origin_is_the_shifted_fit(dim, dtype):
         far.partial_fit(x + offset)
     np.testing.assert_allclose(far.means_ - offset, near.means_, atol=1e-6)
     np.testing.assert_allclose(far.covariances_, near.covariances_, rtol=1e-5, atol=1e-7)
-
-
-def test_batches_500_km_apart_keep_thin_components():
-    rng = np.random.default_rng(0)
-    pieces = [np.array([x, 4096.0]) for x in (-250_000.0, 250_000.0)]
-
-    def batch(piece: np.ndarray) -> np.ndarray:
-        flat = np.stack([rng.normal(size=100) * 1e-3, rng.uniform(-1, 1, 100)], 1)
-        return piece + np.round(flat * 2**24) / 2**24
-
-    gmm = exact(n_components=2, reg_covar=1e-8).partial_fit(np.concatenate([batch(p) for p in pieces]))
-    for turn in range(20):
-        gmm.partial_fit(batch(pieces[turn % 2]), kappa=1.0)
-    for piece in pieces:
-        k = np.abs(gmm.means_ - piece).sum(1).argmin()
-        assert gmm.weights_[k] == pytest.approx(0.5, abs=1e-6)
-        np.testing.assert_allclose(gmm.means_[k] - piece, 0, atol=0.06)
-        np.testing.assert_allclose(gmm.covariances_[k], np.diag([1e-6, 1 / 3]), rtol=0.15, atol=3e-5)
-        assert gmm.covariances_[k][0, 0] == pytest.approx(1.01e-6, rel=0.1)
 
 
 # -- awkward batches --------------------------------------------------------------------------------------

@@ -3,25 +3,34 @@
 from __future__ import annotations
 
 import math
+import os
 import signal
+import socket
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from torch import Tensor
 
 from gmmtorch.datasets.point_files.point_chunks import PointChunks, in_memory, open_points
 from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.mixture.em.distributed import SINGLE_PROCESS, LostProcessError, Processes, is_launched, joined
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
-from gmmtorch.mixture.streaming.checkpoints import Checkpoint, State, read_state, write_state
-from gmmtorch.mixture.streaming.distributed import Processes
-from gmmtorch.mixture.streaming.stream_fit import Accumulate, ExactEStep, fit_stream, score_stream
+from gmmtorch.mixture.streaming import (
+    Accumulate,
+    Checkpoint,
+    ExactEStep,
+    State,
+    fit_stream,
+    read_state,
+    score_stream,
+    write_state,
+)
 
 pytestmark = pytest.mark.filterwarnings("ignore:EM did not converge")
 
@@ -166,31 +175,6 @@ def test_processes_exchange_k_by_f_numbers_per_iteration():
 # -- degenerate clouds ----------------------------------------------------------------------------
 
 
-@given(
-    n=st.integers(1, 12),
-    k=st.integers(1, 5),
-    kind=st.sampled_from(["one place", "line", "plane", "few places"]),
-    chunk_points=st.integers(1, 13),
-)
-def test_degenerate_clouds_equal_fit(n, k, kind, chunk_points):
-    points = torch.from_numpy(np.random.default_rng(n).normal(size=(n, 3)))
-    if kind == "one place":
-        points[:] = points[0]
-    elif kind == "few places":
-        points = points[torch.arange(n) % 2]
-    else:
-        points[:, 1 if kind == "line" else 2 :] = 1.0
-    source = in_memory(points, chunk_points=chunk_points)
-    if k > n:
-        with pytest.raises(InvalidArgumentError, match="n_components"):
-            fit_stream(exact(k), source)
-        return
-    found = fit_stream(exact(k), source)
-    assert all(bool(torch.isfinite(value).all()) for value in found.state_dict().values())
-    expected = exact(k).fit(points)
-    assert found.score(points) == pytest.approx(expected.score(points), rel=1e-6)
-
-
 @pytest.mark.parametrize("points", [np.empty((0, 3)), np.full((5, 3), np.nan)])
 def test_source_without_points_is_rejected(points):
     with pytest.raises(DataError, match="no valid points"):
@@ -325,35 +309,122 @@ def test_invalid_checkpoint_options_are_rejected(tmp_path, options):
         Checkpoint(tmp_path / "state.safetensors", **options)
 
 
-KILLED = """
-import os, signal, sys
+@pytest.fixture
+def cloud(tmp_path: Path) -> Path:
+    rng = np.random.default_rng(0)
+    points = 4 * rng.normal(size=(5, 3))[rng.integers(5, size=3001)] + rng.normal(size=(3001, 3))
+    points[::50] = np.nan
+    np.save(tmp_path / "cloud.npy", points)
+    return tmp_path / "cloud.npy"
+
+
+def environment(**more: str) -> dict[str, str]:
+    return {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": "", "MPLBACKEND": "agg", **more}
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def test_single_process_is_the_whole_group(monkeypatch):
+    monkeypatch.delenv("WORLD_SIZE", raising=False)
+    assert not is_launched()
+    with joined() as processes:
+        assert processes is SINGLE_PROCESS
+    value = torch.arange(3.0)
+    assert torch.equal(SINGLE_PROCESS.sum(value), value)
+    assert torch.equal(SINGLE_PROCESS.broadcast(value), value)
+    assert len(SINGLE_PROCESS.gather(value[None])) == 1
+
+
+@pytest.mark.parametrize("timeout", [0.0, -1.0, float("inf"), float("nan")])
+def test_invalid_timeout_is_rejected(timeout):
+    with pytest.raises(InvalidArgumentError, match="timeout"), joined(timeout=timeout):
+        pass
+
+
+needs_distributed = pytest.mark.skipif(
+    not torch.distributed.is_available(), reason="torch is built without distributed"
+)
+WORKER = """
+import os, signal, sys, time
 from pathlib import Path
 import torch
 torch.set_num_threads(1)
 from gmmtorch.datasets.point_files.point_chunks import open_points
-from gmmtorch.mixture.streaming.checkpoints import Checkpoint
+from gmmtorch.mixture.streaming import Checkpoint
+from gmmtorch.mixture.em.distributed import LostProcessError, joined
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
-from gmmtorch.mixture.streaming.stream_fit import fit_stream
+from gmmtorch.mixture.streaming import fit_stream
 
-def kill(iteration, bound):
-    if iteration == 6:
-        os.kill(os.getpid(), signal.SIGKILL)
-
-fit_stream(
-    GaussianMixture(4, dtype="float64", tol=0, max_iter=10, random_state=0),
-    open_points(sys.argv[1], chunk_points=90),
-    checkpoint=Checkpoint(Path(sys.argv[2]), every=2),
-    on_iteration=kill,
-)
+cloud, checkpoint, how = sys.argv[1:]
+ready = [Path(f"{checkpoint}.{rank}") for rank in (0, 1)]
+ready[int(os.environ["RANK"])].touch()
+while not all(path.exists() for path in ready):  # imports may take longer than the timeout
+    time.sleep(0.05)
+with joined(timeout=3.0) as processes:
+    def fail(iteration, bound):
+        if processes.rank == 1 and iteration == 5:
+            os.kill(os.getpid(), signal.SIGKILL if how == "killed" else signal.SIGSTOP)
+    try:
+        fit_stream(
+            GaussianMixture(6, dtype="float64", tol=0, max_iter=12, random_state=0),
+            open_points(cloud, chunk_points=200).shard(processes.rank, processes.size),
+            sample_points=500,
+            processes=processes,
+            checkpoint=Checkpoint(Path(checkpoint), every=2),
+            on_iteration=fail,
+        )
+    except LostProcessError as error:
+        sys.exit(f"lost: {error}")
 """
 
 
+@needs_distributed
 @pytest.mark.slow
-def test_killed_run_resumes_to_the_same_result(tmp_path):
-    cloud, path = tmp_path / "cloud.npy", tmp_path / "state.safetensors"
-    np.save(cloud, blobs(400, 3).numpy())
-    done = subprocess.run([sys.executable, "-c", KILLED, str(cloud), str(path)], timeout=120, check=False)
-    assert done.returncode == -signal.SIGKILL
-    source = open_points(cloud, chunk_points=90)
-    found = fit_stream(exact(4), source, checkpoint=Checkpoint(path, every=2, resume=True))
-    assert_same(found, fit_stream(exact(4), source), 1e-12)
+@pytest.mark.parametrize("how", ["killed", "stopped"])
+def test_lost_process_is_reported_and_the_checkpoint_continues(cloud, tmp_path, how):
+    path = tmp_path / "state.safetensors"
+    group = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port())}
+    arguments = [sys.executable, "-c", WORKER, str(cloud), str(path), how]
+    workers = [
+        subprocess.Popen(
+            arguments, env=environment(RANK=str(rank), **group), stderr=subprocess.PIPE, text=True
+        )
+        for rank in (0, 1)
+    ]
+    try:
+        # The timeout of three seconds, plus the time to start and stop.
+        _, stderr = workers[0].communicate(timeout=90)
+    finally:
+        workers[1].kill()
+        workers[1].communicate()
+        workers[0].kill()
+    assert workers[0].returncode == 1
+    assert workers[1].returncode == -signal.SIGKILL
+    assert "lost: rank 0 of 2" in stderr
+    assert "in iteration 6" in stderr
+    assert f"{path}, is of iteration 4; start the run again with resume=true" in stderr
+    assert len(read_state(path)[0].lower_bounds) == 4
+    options = {"dtype": "float64", "tol": 0, "max_iter": 12, "random_state": 0}
+    source = open_points(cloud, chunk_points=200)
+    going_on = Checkpoint(path, every=2, resume=True)
+    found = fit_stream(GaussianMixture(6, **options), source, sample_points=500, checkpoint=going_on)
+    whole = fit_stream(GaussianMixture(6, **options), source, sample_points=500)
+    np.testing.assert_allclose(found.lower_bounds_, whole.lower_bounds_, rtol=1e-9)
+    torch.testing.assert_close(found.means, whole.means, rtol=0, atol=1e-8)
+
+
+@needs_distributed
+def test_processes_that_do_not_connect_raise(monkeypatch):
+    group = {"WORLD_SIZE": "2", "RANK": "0", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port())}
+    for name, value in group.items():
+        monkeypatch.setenv(name, value)
+    assert is_launched()
+    with (
+        pytest.raises(LostProcessError, match="rank 0 of 2 did not find the other processes"),
+        joined(timeout=1.0),
+    ):
+        pass

@@ -8,22 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from mixture.fit_contract import blobs
 from mixture.tree_cases import exact, room
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 from torch import Tensor
 
-from gmmtorch.mixture import GaussianMixture
-from gmmtorch.mixture.estimators.trees.nested import (
+from gmmtorch.mixture.estimators.tree_growth import (
     Children,
     Members,
-    assign_members,
-    pack,
-    principal_axes_start,
-    run_em,
+    fit_children,
 )
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
@@ -166,29 +160,6 @@ def rows_of(nodes: list[tuple[int, float, np.ndarray, np.ndarray]]) -> list[np.n
     return sorted(rows, key=lambda row: tuple(np.round(row, 4)))
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.parametrize("k", [5, 8])
-def test_one_level_equals_flat_em_from_the_same_start(dim, k):
-    points = torch.from_numpy(room(500)[:, :dim])
-    center = points.mean(0)
-    members = Members(torch.arange(500), torch.zeros(500, dtype=torch.int64), torch.ones(500).double())
-    packed = pack(points, members, center[None], torch.float64)
-    start = principal_axes_start(packed, 1, k, 1e-6)
-    flat = GaussianMixture(
-        k,
-        weights_init=start.weights[0],
-        means_init=start.means[0] + center,
-        precisions_init=torch.linalg.inv(start.covariances[0]),
-        dtype="float64",
-    ).fit(points)
-    tree = exact(branching=k, max_levels=1, min_support=0.0).fit(points)
-    assert tree.n_levels_ == 1
-    # The first bound is that of one Gaussian, the last that of the accepted level.
-    np.testing.assert_allclose(tree.lower_bounds_[1:-1], flat.lower_bounds_, atol=1e-9)
-    for name in ("weights", "means", "covariances"):
-        torch.testing.assert_close(getattr(tree, name), getattr(flat, name), rtol=1e-6, atol=1e-9)
-
-
 def present(children: Children, node: int) -> Children:
     """The children of a node with weight above zero, from left to right."""
     order = children.means[node, :, 0].argsort()
@@ -203,14 +174,11 @@ def test_nodes_of_a_batch_are_fitted_independently():
     node = torch.repeat_interleave(torch.arange(5), torch.tensor([30, 30, 40, 250, 50]))
     shuffle = torch.randperm(400, generator=torch.Generator().manual_seed(0))
     members = Members(shuffle, node[shuffle], 0.5 + torch.arange(400).double() % 7)
-    options: dict[str, Any] = {"reg_covar": 1e-4, "tol": 1e-4, "max_iter": 40, "worst_error": math.inf}
+    rule = exact(reg_covar=1e-4, tol=1e-4, max_iter=40)
 
     def learn(members: Members, centers: Tensor) -> tuple[Children, list[Tensor]]:
-        packed = pack(points, members, centers, torch.float64)
-        start, values = principal_axes_start(packed, len(centers), 6, 1e-4), []
-        mass = members.mass(len(centers))
-        found = run_em(packed, start, mass, on_values=lambda v: values.append(v.clone()), **options)
-        return found.children, values
+        values: list[Tensor] = []
+        return fit_children(points, members, centers, 6, rule, lambda v: values.append(v.clone()))[1], values
 
     centers = torch.stack([points[node == i].mean(0) for i in range(5)])
     together, values = learn(members, centers)
@@ -222,48 +190,3 @@ def test_nodes_of_a_batch_are_fitted_independently():
     rises = torch.stack(values).diff(dim=0)
     assert bool((rises > -1e-3).all())
     assert int((rises[-1] == 0).sum()) >= 3  # the nodes converge independently
-
-
-# -- assignment of points to children --------------------------------------------------------------
-
-
-@given(seed=st.integers(0, 99), threshold=st.sampled_from([0.0, 0.01, 0.3, 0.9, 1.0]), dim=st.integers(1, 3))
-def test_points_are_assigned_by_responsibility_and_keep_their_weight(seed, threshold, dim):
-    rng = np.random.default_rng(seed)
-    points, weight = rng.normal(size=(40, dim)), rng.uniform(0.1, 2.0, 40)
-    node = rng.integers(0, 3, 40)
-    centers = rng.normal(size=(3, dim))
-    roots = rng.normal(size=(3, 4, dim, dim)) + np.eye(dim)
-    weights = rng.dirichlet(np.ones(4), size=3)
-    weights[1] = [0.5, 0.0, 0.5, 0.0]  # with two absent children
-    means = rng.normal(size=(3, 4, dim))
-    covariances = roots @ roots.swapaxes(2, 3) + 0.1 * np.eye(dim)
-    members = Members(torch.arange(40), torch.from_numpy(node), torch.from_numpy(weight))
-    packed = pack(torch.from_numpy(points), members, torch.from_numpy(centers), torch.float64)
-    children = Children(*(torch.from_numpy(value) for value in (weights, means, covariances)))
-    found = assign_members(packed, children, members, threshold)
-    shares = np.zeros((40, 12))
-    shares[found.members.point, found.members.node] = found.members.weight
-    values = np.zeros(3)
-    for i, (x, p, g) in enumerate(zip(points, weight, node, strict=True)):
-        density = [
-            w * multivariate_normal(centers[g] + m, c).pdf(x)
-            for w, m, c in zip(weights[g], means[g], covariances[g], strict=True)
-        ]
-        gamma = np.array(density) / sum(density)
-        gamma[gamma <= max(threshold, 1e-30) * gamma.max()] *= (
-            gamma.argmax() == np.arange(4)[gamma <= max(threshold, 1e-30) * gamma.max()]
-        )
-        expected = np.zeros(12)
-        expected[4 * g : 4 * g + 4] = p * gamma / gamma.sum()
-        np.testing.assert_allclose(shares[i], expected, rtol=1e-7, atol=1e-12)
-        values[g] += p * math.log(sum(density))
-    np.testing.assert_allclose(found.value, values, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(shares.sum(1), weight, rtol=1e-14)
-    at = [
-        multivariate_normal(
-            (centers[:, None] + means).reshape(12, dim)[c], covariances.reshape(12, dim, dim)[c]
-        ).logpdf(points[i])
-        for i, c in zip(found.members.point, found.members.node, strict=True)
-    ]
-    np.testing.assert_allclose(found.log_density, at, rtol=1e-9, atol=1e-9)

@@ -12,19 +12,37 @@ import numpy as np
 import pytest
 import torch
 from mixture.fit_contract import FitContract, check_mixture
-from mixture.mixture_cases import DtypeRecorder, beads, cloud, room
+from mixture.mixture_cases import (
+    beads,
+    cloud,
+    random_parameters,
+    random_weight,
+    room,
+    rows_of,
+    scipy_log_joint,
+)
+from scipy.special import logsumexp
 from torch import Tensor
 
 from gmmtorch.datasets.point_files.point_chunks import in_memory
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.kernels import chunks
 from gmmtorch.mixture import GaussianMixture, gaussian_mixture
-from gmmtorch.mixture.em import loop
-from gmmtorch.mixture.em.grouping import Rows
+from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em import loop, truncated
+from gmmtorch.mixture.em.distributed import Processes
+from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.initialization import flat_pieces
-from gmmtorch.mixture.em.truncated import Settings, fit_truncated
-from gmmtorch.mixture.streaming.checkpoints import Checkpoint
-from gmmtorch.mixture.streaming.distributed import Processes
-from gmmtorch.mixture.streaming.stream_fit import fit_stream
+from gmmtorch.mixture.em.truncated import (
+    Rows,
+    Settings,
+    choose_candidates,
+    fit_truncated,
+    group_rows,
+    nearest,
+    truncated_expectation,
+)
+from gmmtorch.mixture.streaming import Checkpoint, fit_stream
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 
@@ -82,24 +100,6 @@ def test_component_without_points_gets_weight_zero():
     assert fit.weights_[3] < 1e-12
 
 
-@pytest.mark.parametrize("init", ["random_points", "flat_pieces"])
-@pytest.mark.parametrize("max_cells", [None, 300])
-def test_float64_fit_creates_no_float32_tensor(init, max_cells):
-    x = room(500)
-    with DtypeRecorder() as recorder:
-        gmm = GaussianMixture(
-            20,
-            random_state=0,
-            dtype="float64",
-            init_params=init,
-            algorithm="truncated",
-            max_cells=max_cells,
-            max_iter=8,
-        )
-        gmm.fit(x, sample_weight=np.linspace(0.5, 2, 500))
-    assert recorder.seen.keys() == {torch.float64}, recorder.seen
-
-
 @pytest.mark.parametrize("algorithm", ["exact", "truncated"])
 def test_cells_in_more_than_three_dimensions_are_rejected(algorithm):
     with pytest.raises(InvalidArgumentError, match=r"^max_cells=20 .* 4\b"):
@@ -145,15 +145,6 @@ class TestGaussianMixtureOnCells(FitContract):
     def make(self, n_components: int = 3, **options: Any) -> GaussianMixture:
         usual = {"random_state": 0, "max_cells": 50, "init_params": "flat_pieces"}
         return GaussianMixture(n_components, **{**usual, **options})
-
-
-@pytest.mark.slow
-def test_compiled_fit_equals_the_uncompiled_fit():
-    points = torch.from_numpy(beads(3000, 60)[0])
-    options = {"algorithm": "truncated", "init_params": "flat_pieces", "tol": 1e-4}
-    plain, compiled = (GaussianMixture(60, compiled=value, **options).fit(points) for value in (False, True))
-    torch.testing.assert_close(compiled.means, plain.means, rtol=1e-3, atol=1e-3)
-    assert compiled.lower_bound_ == pytest.approx(plain.lower_bound_, abs=1e-4)
 
 
 class Halves(Processes):
@@ -207,3 +198,86 @@ def test_streamed_truncated_em_is_as_good_as_exact_em():
     assert streamed.score(torch.from_numpy(points)) == pytest.approx(exact.score(points), abs=0.02)
     with pytest.raises(InvalidArgumentError, match="checkpoint"):
         fit_stream(GaussianMixture(60, algorithm="truncated"), source, checkpoint=Checkpoint(Path("never")))
+
+
+dims = pytest.mark.parametrize("dim", [1, 2, 3, 5])
+
+
+# -- the E-step ------------------------------------------------------------------------------------
+
+
+@dims
+@pytest.mark.parametrize("m", [1, 3, 8])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("are_points", [True, False])
+def test_e_step_over_candidates_equals_brute_force(dim, m, dtype, are_points, monkeypatch):
+    monkeypatch.setattr(chunks, "CHUNK_ELEMENTS", 500)  # several chunks
+    monkeypatch.setattr(truncated, "_BUILD_ROWS", 70)
+    k, n = 8, 300
+    tolerance = {torch.float64: 1e-10, torch.float32: 1e-4}[dtype]
+    points, weight, parameters = cloud(n, dim), random_weight(n), random_parameters(k, dim, seed=2)
+    generator = torch.Generator().manual_seed(1)
+    owner = torch.randint(0, k, (n,), generator=generator)
+    candidates = torch.stack([torch.randperm(k, generator=generator)[:m] for _ in range(k)])
+    groups = group_rows(rows_of(points, weight, are_points), owner, parameters.means, dtype)
+    found = truncated_expectation(groups, candidates, parameters, want_owner=True)
+
+    joint = scipy_log_joint(points, parameters)
+    offered = np.zeros((n, k), dtype=bool)
+    np.put_along_axis(offered, candidates[owner].numpy(), True, axis=1)
+    allowed = np.where(offered, joint, -np.inf)
+    norm = logsumexp(allowed, axis=1)
+    value = (weight.numpy() * norm).sum()
+    assert found.value == pytest.approx(value, rel=tolerance)
+    assert m == k or found.value < (weight.numpy() * logsumexp(joint, axis=1)).sum()
+    assert found.owner is not None
+    assert (found.owner.numpy() == allowed.argmax(1)).all()
+    gamma = np.exp(allowed - norm[:, None]) * weight.numpy()[:, None]
+    for component in range(k):
+        local = em.quadratic_features(points - parameters.means[component]).numpy()
+        expected = (gamma[:, component, None] * local).sum(0)
+        np.testing.assert_allclose(found.statistics[component], expected, atol=tolerance * n)
+
+
+# -- candidates ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_candidates_are_the_owner_and_the_most_likely_components(dtype):
+    k, m, n = 40, 5, 250  # few rows in each group, so that the sample has all of them
+    points, parameters = 2 * cloud(n, 2), random_parameters(k, 2)
+    joint = scipy_log_joint(points, parameters)
+    owner = torch.from_numpy(joint.argmax(1))
+    groups = group_rows(rows_of(points), owner, parameters.means, dtype)
+    assert int(groups.n_rows.max()) <= 64
+    candidates = choose_candidates(groups, parameters, m)
+    assert candidates.shape == (k, m)
+    relative = joint - joint.max(1, keepdims=True)
+    for group in range(k):
+        assert group in candidates[group]
+        assert len(set(candidates[group].tolist())) == m
+        own = relative[(owner == group).numpy()]
+        if len(own) == 0:
+            continue
+        score = own.max(0)
+        score[group] = np.inf
+        assert set(candidates[group].tolist()) == set(np.argsort(score)[-m:].tolist())
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+def test_candidate_sample_covers_a_group_in_any_row_order(reverse):
+    along = torch.linspace(-10, 10, 5000, dtype=torch.float64)
+    points = torch.stack([along.flip(0) if reverse else along, 0 * along], 1)
+    means = torch.zeros(20, 2, dtype=torch.float64)
+    means[1, 0], means[2, 0] = -11.0, 11.0
+    means[3:, 0], means[3:, 1] = torch.tensor([-11.0, 11.0]).repeat(9)[:17], 5.0 + torch.arange(17)
+    covariances = torch.eye(2, dtype=torch.float64).repeat(20, 1, 1)
+    covariances[0, 0, 0] = 16.0
+    parameters = Parameters(torch.full((20,), 0.05, dtype=torch.float64), means, covariances)
+    groups = group_rows(rows_of(points), torch.zeros(5000, dtype=torch.int64), means, torch.float32)
+    assert sorted(choose_candidates(groups, parameters, 3)[0].tolist()) == [0, 1, 2]
+
+
+def test_nearest_equals_brute_force():
+    points, means = cloud(200, 3), cloud(11, 3, seed=1)
+    assert torch.equal(nearest(points, means), torch.cdist(points, means).argmin(1))

@@ -10,23 +10,25 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from mixture.fit_contract import check_mixture
-from mixture.mixture_cases import beads, cloud, random_parameters, random_weight, room, rows_of, thin_wall
+from mixture.mixture_cases import beads, cloud, random_parameters, random_weight, rows_of, thin_wall
 from torch import Tensor
 
 from gmmtorch.mixture import GaussianMixture
 from gmmtorch.mixture.em import by_type, loop, truncated
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.em.grouping import (
+from gmmtorch.mixture.em.initialization import flat_pieces, moments_of
+from gmmtorch.mixture.em.truncated import (
     Rows,
+    Settings,
     centered_parameters,
+    fit_truncated,
     group_rows,
     nearest,
     rounding,
+    run_truncated,
     truncated_expectation,
 )
-from gmmtorch.mixture.em.initialization import flat_pieces, moments_of
-from gmmtorch.mixture.em.truncated import Settings, fit_truncated, run_truncated
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 
@@ -92,7 +94,7 @@ def test_result_is_at_least_as_good_as_the_last_bound(seed, dim, k, n_candidates
     found, owner, candidates = run_truncated(
         rows_of(points, weight), nearest(points, parameters.means), parameters, setup
     )
-    joint = em.log_joint(points, found.parameters)
+    joint = by_type.Factors(found.parameters, "full").direct()(points).T
     allowed = torch.full_like(joint, -torch.inf).scatter(1, candidates[owner], 0.0)
     bound, score = (torch.logsumexp(j, 1) @ weight / weight.sum() for j in (joint + allowed, joint))
     assert found.lower_bounds[-1] - 1e-7 <= float(bound) <= float(score) + 1e-12
@@ -209,7 +211,7 @@ def test_components_that_become_thin_switch_to_float64(monkeypatch):
     found, *_ = run_truncated(rows, owner, parameters, Settings(1e-6, 0.0, 2))
     assert spy.dtypes == [torch.float32, torch.float64]
     for at, bound in zip(spy.given, found.lower_bounds, strict=True):
-        score = torch.logsumexp(em.log_joint(points, at), 1).mean()
+        score = torch.logsumexp(by_type.Factors(at, "full").direct()(points), 0).mean()
         assert bound == pytest.approx(float(score), abs=1e-4)
     thinnest = torch.linalg.eigvalsh(found.parameters.covariances)[:, 0]
     torch.testing.assert_close(thinnest, torch.full_like(thinnest, 1.01e-6), rtol=0.01, atol=0)
@@ -312,16 +314,6 @@ def test_few_points_or_many_dimensions_are_not_pooled(monkeypatch):
         )
     cells = Rows(em.quadratic_features(cloud(1200, 2)), torch.ones(1200, dtype=torch.float64), False)
     fit_truncated(cells, torch.zeros(1200, dtype=torch.int64), random_parameters(2, 2), Settings())
-
-
-def test_fit_through_cells_is_as_good(monkeypatch):
-    x = room(6000)
-    options: dict[str, Any] = {"algorithm": "truncated", "init_params": "flat_pieces", "tol": 1e-4}
-    direct = GaussianMixture(30, **options).fit(x)
-    monkeypatch.setattr(truncated, "_MANY_POINTS", 1000)
-    pooled = GaussianMixture(30, **options).fit(x)
-    assert pooled.lower_bounds_ != direct.lower_bounds_
-    assert pooled.score(x) == pytest.approx(direct.score(x), abs=0.05)
 
 
 def test_many_points_start_on_a_sample_without_its_bounds(monkeypatch):

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gmmtorch.team.exploration.mission.paired_statistics import time_to_share
+from gmmtorch.team.exploration.mission.results import time_to_share
 
 OBSERVABLE_BITS, REFERENCE_BITS = 1.6e6, 1.43e6
 _PACE = {"gmm_shared": 330.0, "grid_shared": 335.0, "grid_isolated": 470.0, "gmm_thesis": 350.0}

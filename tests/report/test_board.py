@@ -12,7 +12,7 @@ from tensorboard.util.tensor_util import make_ndarray
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.report import tensorboard_writer
-from gmmtorch.report.maps.accuracy_figures import roc_figure
+from gmmtorch.report.accuracy_figures import roc_figure
 from gmmtorch.report.tensorboard_writer import Board
 
 

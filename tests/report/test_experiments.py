@@ -10,7 +10,7 @@ from gmmtorch.experiments.report.fit_study_figures import (
     initialization_figures,
     sensor_model_figures,
 )
-from gmmtorch.report.maps.accuracy_figures import comparison_figure
+from gmmtorch.report.accuracy_figures import comparison_figure
 
 
 def study_row(init: str, k: int, seed: int, **more: object) -> dict[str, object]:

@@ -8,7 +8,7 @@ from shown import read
 from tensorboard.util.tensor_util import make_ndarray
 
 from gmmtorch.report.tensorboard_writer import Board
-from gmmtorch.team.report.mission_summary import write_exploration_board
+from gmmtorch.team.report.trial_groups import write_exploration_board
 
 
 def test_trials_are_written_with_their_tags(tmp_path):

@@ -10,9 +10,8 @@ from matplotlib.colors import to_hex
 from shown import texts
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.report.labels import LineEnd, label_ends
-from gmmtorch.report.style import PALETTE, new_figure
-from gmmtorch.team.exploration.mission.paired_statistics import mean_band, paired_interval
+from gmmtorch.report.style import PALETTE, LineEnd, label_ends, new_figure
+from gmmtorch.team.exploration.mission.results import mean_band, paired_interval
 from gmmtorch.team.report.mission_bars import (
     deviations_figure,
     profile_figure,
@@ -23,12 +22,12 @@ from gmmtorch.team.report.mission_curves import (
     entropy_figure,
     planner_comparison_figure,
 )
-from gmmtorch.team.report.mission_summary import study_summary
 from gmmtorch.team.report.trial_groups import (
     FRAMEWORKS,
     framework_colour,
     framework_name,
     seeds_note,
+    study_summary,
 )
 
 

@@ -12,7 +12,7 @@ import torch
 from exploration_rows import flights, trial
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
-from gmmtorch.team.report.rerun_recording import (
+from gmmtorch.team.report.mission_maps import (
     RecordedMap,
     _log_robot,
     load_rerun,

@@ -1,4 +1,4 @@
-"""Figures of mixtures and of classification results, and saving them."""
+"""Figures of mixtures, of accuracy and of calibration, and saving them."""
 
 from __future__ import annotations
 
@@ -10,8 +10,14 @@ import pytest
 import torch
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.report.maps.accuracy_figures import auc_against_kept_figure, convergence_figure, roc_figure
-from gmmtorch.report.scenes.mixture_figures import mixture_figure
+from gmmtorch.experiments.evaluation.metrics import Reliability
+from gmmtorch.report.accuracy_figures import (
+    auc_against_kept_figure,
+    convergence_figure,
+    reliability_figure,
+    roc_figure,
+)
+from gmmtorch.report.mixture_figures import mixture_figure
 from gmmtorch.report.style import save_figure
 
 
@@ -117,10 +123,10 @@ import sys, torch
 import gmmtorch.report
 assert "matplotlib" not in sys.modules and "tensorboard" not in sys.modules
 from gmmtorch.report.tensorboard_writer import Board
-from gmmtorch.report.maps.accuracy_figures import roc_figure
-from gmmtorch.report.maps.map_figures import map_figure
-from gmmtorch.report.maps.map_images import MapPanel
-from gmmtorch.report.scenes.mixture_figures import mixture_figure
+from gmmtorch.report.accuracy_figures import roc_figure
+from gmmtorch.report.map_figures import map_figure
+from gmmtorch.report.map_images import MapPanel
+from gmmtorch.report.mixture_figures import mixture_figure
 from gmmtorch.report.style import save_figure
 eye, panel = torch.eye(2)[None], MapPanel("m", lambda x: x[:, 0] * 0 + 0.2, 0.5, (0, 0, 0), (1, 1, 1))
 with Board(sys.argv[1]) as board:
@@ -136,3 +142,32 @@ assert "matplotlib.pyplot" not in sys.modules
 def test_figures_never_import_pyplot(tmp_path):
     done = subprocess.run([sys.executable, "-c", PROGRAM, str(tmp_path)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+CURVE = Reliability(np.array([0.1, 0.4, 0.9]), np.array([0.0, 0.5, 1.0]), np.array([50, 25, 25]))
+
+
+def test_reliability_draws_each_method_in_both_panels():
+    curves = {"point": CURVE, "occupancy_grid": CURVE._replace(observed=CURVE.predicted)}
+    figure = reliability_figure(curves, title="Kinect, 0.05 m")
+    upper, lower = figure.axes
+    drawn = [line for line in upper.lines if len(line.get_xdata()) == 3]
+    np.testing.assert_array_equal(drawn[0].get_ydata(), CURVE.observed)
+    np.testing.assert_array_equal(drawn[1].get_ydata(), CURVE.predicted)
+    for line in lower.lines:
+        np.testing.assert_allclose(line.get_ydata(), [0.5, 0.25, 0.25])
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels == ["calibrated", "point, ECE 0.100", "occupancy grid, ECE 0.000"]
+    assert figure.get_suptitle() == "Kinect, 0.05 m"
+
+
+def test_reliability_markers_grow_with_the_share_of_points():
+    figure = reliability_figure({"point": CURVE})
+    (markers,) = [c for c in figure.axes[0].collections if len(c.get_sizes()) == 3]
+    sizes = markers.get_sizes()
+    assert sizes[0] > sizes[1] == sizes[2]
+
+
+def test_reliability_needs_a_curve():
+    with pytest.raises(InvalidArgumentError, match="curves is empty"):
+        reliability_figure({})

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gmmtorch.experiments.report import map_study_figures
-from gmmtorch.report.maps.map_regions import busiest_regions
+from gmmtorch.report.map_images import busiest_regions
 
 
 def memory_rows() -> list[dict]:

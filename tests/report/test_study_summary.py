@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.team.report.mission_summary import study_summary
+from gmmtorch.team.report.trial_groups import study_summary
 
 AUC = {"gmm_shared": [0.979, 0.98, 0.9755], "grid_shared": [0.979, 0.976, 0.975]}
 T90 = {"gmm_shared": [198.0, 232.0, 240.0], "grid_shared": [249.0, 229.0, None]}

@@ -9,7 +9,7 @@ import pytest
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.report.style import save_figure
-from gmmtorch.team.report.network_figures import team_run_figure
+from gmmtorch.team.report.mission_curves import team_run_figure
 
 
 def row(robot: int, explores: bool = True, **changes: Any) -> dict[str, Any]:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gmmtorch.report.progress import ProgressBars
-from gmmtorch.report.table import byte_text, format_table, format_value, ratio_text
+from gmmtorch.report.text import ProgressBars, byte_text, format_table, format_value, ratio_text
 
 
 def test_table_is_aligned():

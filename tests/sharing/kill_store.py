@@ -31,7 +31,7 @@ from pathlib import Path
 import torch
 from sharing.schedules import act
 
-from gmmtorch.team.sharing import store, store_file
+from gmmtorch.team.sharing import store
 from gmmtorch.team.sharing.replica.replica import Replica
 from gmmtorch.team.sharing.store import Store
 
@@ -139,7 +139,7 @@ def die_after_steps(steps: int | None) -> None:
     """Kill this process after so many steps of SQLite's virtual machine; None: never."""
     if steps is None:
         return
-    left, connect = steps, store_file.connect
+    left, connect = steps, store.connect
 
     def step() -> None:
         nonlocal left
@@ -152,7 +152,7 @@ def die_after_steps(steps: int | None) -> None:
         db.set_progress_handler(step, 1)
         return db
 
-    store_file.connect = watched
+    store.connect = watched
 
 
 def _live(rng: random.Random, home: Path, pipe: int) -> None:

@@ -14,12 +14,10 @@ from mapping.random_components import random_components
 from gmmtorch.mapping.codec.quantization import spatial_order
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.calibrator import Calibration, Calibrator
-from gmmtorch.team.sharing.messages.fields import pose_of
-from gmmtorch.team.sharing.messages.message_registry import (
-    CODECS,
+from gmmtorch.team.sharing.messages.component_messages import encode_components, encode_counts
+from gmmtorch.team.sharing.messages.datagrams import CODECS, pose_of
+from gmmtorch.team.sharing.messages.mission_messages import (
     ViewsMessage,
-    encode_components,
-    encode_counts,
     encode_plan,
     encode_points,
     encode_views,

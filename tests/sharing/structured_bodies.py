@@ -23,7 +23,7 @@ from gmmtorch.mapping.codec.component_batch import encode_quantized
 from gmmtorch.mapping.codec.lattice import Lattice
 from gmmtorch.mapping.codec.quantization import Quantized, quantize
 from gmmtorch.mapping.codec.thesis_message import UPDATE_TYPE, message_type
-from gmmtorch.team.sharing.messages.envelope import MAX_BYTES, VERSION, Kind
+from gmmtorch.team.sharing.messages.datagrams import MAX_BYTES, VERSION, Kind
 from gmmtorch.team.sharing.replica.record_keys import END
 
 WIDE = 1 << 62

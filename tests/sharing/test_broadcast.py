@@ -11,19 +11,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapping.random_components import random_components
 from sharing.message_examples import codecs, frame_of_components
-from sharing.replica_histories import told
-from sharing.replica_model import rows
+from sharing.replica_histories import rows, told
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.components import Components
 from gmmtorch.team.sharing.broadcast import Broadcast
-from gmmtorch.team.sharing.messages.message_registry import (
+from gmmtorch.team.sharing.messages.component_messages import (
     ComponentsMessage,
     CountsMessage,
-    decode,
     encode_components,
     encode_counts,
 )
+from gmmtorch.team.sharing.messages.message_registry import decode
 from gmmtorch.team.sharing.messages.record_messages import encode_announcements
 from gmmtorch.team.sharing.replica.record_keys import Intervals
 

@@ -24,32 +24,36 @@ from gmmtorch.mapping.codec.bitstream import BitWriter
 from gmmtorch.mapping.codec.lattice import LARGEST_VARIANCE
 from gmmtorch.mapping.codec.quantization import MOST_POINTS
 from gmmtorch.mapping.components import Components
-from gmmtorch.team.exploration.information.view_library import ViewLibrary
-from gmmtorch.team.sharing.messages import message_registry as messages
-from gmmtorch.team.sharing.messages.component_messages import MOST_COMPONENTS_SENT
-from gmmtorch.team.sharing.messages.envelope import FARTHEST, Kind
-from gmmtorch.team.sharing.messages.message_registry import (
-    AnnouncementMessage,
-    CalibrationMessage,
+from gmmtorch.team.sharing.messages import message_registry
+from gmmtorch.team.sharing.messages.component_messages import (
+    MOST_COMPONENTS_SENT,
     ComponentsMessage,
-    CorrectionMessage,
-    CountersMessage,
     CountsMessage,
-    FrameMessage,
-    Message,
-    PlanMessage,
-    PointsMessage,
-    SupersessionMessage,
-    ViewsMessage,
-    decode,
     encode_components,
     encode_counts,
+)
+from gmmtorch.team.sharing.messages.datagrams import CODECS, FARTHEST, Kind
+from gmmtorch.team.sharing.messages.message_registry import Message, decode
+from gmmtorch.team.sharing.messages.mission_messages import (
+    PlanMessage,
+    PointsMessage,
+    ViewsMessage,
     encode_plan,
     encode_points,
     encode_views,
 )
-from gmmtorch.team.sharing.messages.record_messages import encode_announcements, encode_record
+from gmmtorch.team.sharing.messages.record_messages import (
+    AnnouncementMessage,
+    CalibrationMessage,
+    CorrectionMessage,
+    CountersMessage,
+    FrameMessage,
+    SupersessionMessage,
+    encode_announcements,
+    encode_record,
+)
 from gmmtorch.team.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.view_library import ViewLibrary
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +149,7 @@ def encoded_again(message: Message, kind: Kind) -> list[bytes]:
 _CODEC = {
     kind: codec
     for kinds in ((1, 2, 3), (4, 5, 6))
-    for kind, codec in zip(map(Kind, kinds), messages.CODECS, strict=True)
+    for kind, codec in zip(map(Kind, kinds), CODECS, strict=True)
 }
 
 
@@ -322,6 +326,6 @@ def test_unexpected_errors_of_a_reader_refuse_the_datagram(sound, monkeypatch):
         def careless(body: bytes, error: type[Exception] = error) -> Message:
             raise error("oh")
 
-        monkeypatch.setitem(messages._KINDS, Kind.PLAN, ("plans", careless))
+        monkeypatch.setitem(message_registry._KINDS, Kind.PLAN, ("plans", careless))
         with pytest.raises(DataError, match="oh"):
             decode(sound[8])

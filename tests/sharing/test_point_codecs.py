@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import itertools
 import math
 
 import numpy as np
@@ -15,7 +14,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
-from gmmtorch.team.sharing.codecs.point_codecs import (
+from gmmtorch.team.sharing.point_codecs import (
     POINT_CODECS,
     DepthImage,
     Draco,
@@ -83,32 +82,6 @@ def test_an_octree_holds_each_cell_once(points, resolution):
     found = codec.decode(codec.encode(points)).numpy()
     expected = (np.unique(cells_of(points, resolution), axis=0).reshape(-1, 3) + 0.5) * resolution
     np.testing.assert_array_equal(sorted_rows(found), sorted_rows(expected))
-
-
-def test_octree_bytes_equal_a_recursion():
-    import zstandard
-
-    points = cloud(200)
-    cells = cells_of(points, 0.2)
-    cells -= cells.min(0)
-    depth = int(cells.max()).bit_length()
-    levels: list[list[int]] = [[] for _ in range(depth)]
-
-    def walk(low: np.ndarray, side: int, level: int) -> bool:
-        inside = ((cells >= low) & (cells < low + side)).all(1)
-        if not inside.any() or side == 1:
-            return bool(inside.any())
-        place = len(levels[level])
-        levels[level].append(0)
-        for child, corner in enumerate(itertools.product((0, 1), repeat=3)):
-            levels[level][place] |= walk(low + np.array(corner) * side // 2, side // 2, level + 1) << child
-        return True
-
-    walk(np.zeros(3, int), 1 << depth, 0)
-    data = Octree(0.2).encode(points)
-    reader = zstandard.ZstdDecompressor(format=zstandard.FORMAT_ZSTD1_MAGICLESS)
-    unfolded = reader.decompress(data[4:], max_output_size=1 << 20)  # a byte each of corner and levels
-    assert list(unfolded) == [byte for level in levels for byte in level]
 
 
 @settings(max_examples=60)

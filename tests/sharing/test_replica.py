@@ -11,8 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapping.random_components import random_components
-from sharing.replica_histories import exchange, history, motion, replica_of
-from sharing.replica_model import Model, rows
+from sharing.replica_histories import Model, exchange, history, motion, replica_of, rows
 from sharing.schedules import components, run_schedule
 
 import gmmtorch as gt
@@ -39,20 +38,6 @@ def test_order_and_repetition_do_not_matter(seed, order):
     assert one.digest() == other.digest()
     for name, value in vars(one.components()).items():
         assert torch.equal(value, getattr(other.components(), name)), name
-
-
-@settings(max_examples=3, deadline=None)
-@given(seed=seeds, order=st.randoms(use_true_random=False))
-def test_grouping_does_not_matter(seed, order):
-    """Three replicas that received parts and then exchange them equal one that received everything."""
-    sent = history(seed)
-    parts: list[list[bytes]] = [[], [], []]
-    for datagram in sent:
-        order.choice(parts).append(datagram)
-    robots = [replica_of(part, robot=9 + number) for number, part in enumerate(parts)]
-    order.shuffle(robots)
-    exchange(robots)
-    assert {robot.digest() for robot in robots} == {replica_of(sent).digest()}
 
 
 @settings(max_examples=8, deadline=None)
@@ -87,25 +72,6 @@ def test_all_replicas_agree_once_the_network_heals(seed):
 
 
 # -- sending ---------------------------------------------------------------------------------------
-
-
-def test_the_example_of_the_docs():
-    """The example at the top of docs/replica.md."""
-    scan = gt.datasets.load("synthetic_building_2d")[0]
-    m = gt.GaussianMap(window=1)
-    m.insert(scan)
-    r = gt.sharing.Replica(robot=0)
-    r.add(m)
-    other = gt.sharing.Replica(robot=1)
-    sent = r.datagrams(max_bytes=1200)
-    assert sent
-    assert all(len(datagram) <= 1200 for datagram in sent)
-    assert all(other.receive(datagram) for datagram in sent)
-    assert r.digest() == other.digest()
-    assert other.map().n_components == m.n_components
-    points = torch.rand(50, 2, dtype=torch.float64) * 4
-    assert torch.allclose(other.map().occupancy(points), m.occupancy(points), atol=1e-9)
-    assert r.datagrams() == []
 
 
 def test_a_changed_map_sends_only_its_changes():

@@ -15,8 +15,8 @@ from mapping.random_components import random_components
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.occupancy.calibrator import Calibration, Calibrator
-from gmmtorch.team.sharing.messages.message_registry import CalibrationMessage, decode
-from gmmtorch.team.sharing.messages.record_messages import encode_record
+from gmmtorch.team.sharing.messages.message_registry import decode
+from gmmtorch.team.sharing.messages.record_messages import CalibrationMessage, encode_record
 from gmmtorch.team.sharing.replica.record_keys import first_key
 from gmmtorch.team.sharing.replica.replica import Replica
 

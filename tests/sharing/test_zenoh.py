@@ -1,26 +1,71 @@
-"""Zenoh transport: real sessions on loopback without scouting, and foreign datagrams."""
+"""Zenoh transport: real sessions on loopback without scouting; endpoints, settings and foreign datagrams."""
 
 from __future__ import annotations
 
+import datetime
+import ipaddress
 import json
-import random
+import socket
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
-from sharing.schedules import components
-from sharing.transport_cases import KEY, heard, hostile_frames, until
-from sharing.zenoh_cases import Opening, endpoint, greet, wait_until_connected, zenoh
+from sharing.transport_cases import KEY, Heard, heard, hostile_frames, until
 
-from gmmtorch.errors import GmmTorchError
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError
 from gmmtorch.team.sharing.radio import Radio
-from gmmtorch.team.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.transport import zenoh_transport
 from gmmtorch.team.sharing.transport.security import Sealer
 from gmmtorch.team.sharing.transport.simulated_network import Traffic, Transport
 from gmmtorch.team.sharing.transport.zenoh_transport import ZenohTransport
+
+zenoh = pytest.importorskip("zenoh")
+Opening = Callable[..., ZenohTransport]
+
+
+def endpoint(protocol: str = "tcp") -> str:
+    """An endpoint with a free port."""
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def greet(transports: list[ZenohTransport]) -> None:
+    """Waits until each robot has received from all others."""
+    met: dict[int, set[int]] = {transport.robot: set() for transport in transports}
+
+    def all_met() -> bool:
+        for transport in transports:
+            transport.send(transport.robot, [b"hello"], 0.0, "greetings")
+            met[transport.robot] |= {who for who, _ in transport.deliver(transport.robot, 0.0)}
+        return all(len(others) == len(transports) - 1 for others in met.values())
+
+    until(all_met)
+
+
+def wait_until_connected(transports: list[ZenohTransport]) -> None:
+    """Until each has received all others' greetings; links keep the order."""
+    greet(transports)
+    for transport in transports:
+        transport.send(transport.robot, [b"met"], 0.0, "greetings")
+    for transport in transports:
+        said: Heard = []
+        until(lambda t=transport, s=said: s.extend(t.deliver(t.robot, 0.0)) or ends(s, len(transports) - 1))
+
+
+def ends(said: Heard, n: int) -> bool:
+    return sum(what == b"met" for _, what in said) == n
+
+
+@pytest.fixture
+def opening() -> Iterator[Callable[..., ZenohTransport]]:
+    """Opens Zenoh transports, which are closed after the test."""
+    with ExitStack() as stack:
+        yield lambda robot, *a, **options: stack.enter_context(ZenohTransport(robot, *a, **options))
 
 
 @pytest.fixture
@@ -82,42 +127,6 @@ def test_sent_counts_each_frame_once(opening, stranger, key):
     assert sizes[n_before:] == [len(datagram) + a.overhead for datagram in datagrams]
     assert a.sent == Traffic(before.datagrams + 4, before.bytes + sum(sizes[n_before:]))
     assert (a.received, a.failures) == (Traffic(), {})
-
-
-def test_replicas_converge_and_one_that_comes_late_catches_up(opening):
-    endpoints = [endpoint() for _ in range(3)]
-    first, second = team(opening, endpoints[:2], key=KEY)
-    replicas = {first: Replica(0), second: Replica(1)}
-
-    def exchange() -> None:
-        for transport, replica in replicas.items():
-            for _, datagram in transport.deliver(transport.robot, 0.0):
-                replica.receive(datagram)
-            transport.send(transport.robot, replica.datagrams(), 0.0, "components")
-            transport.send(transport.robot, replica.announcements(), 0.0, "announcements")
-
-    def agree() -> bool:
-        exchange()
-        return len({replica.digest() for replica in replicas.values()}) == 1
-
-    replicas[first].add(components(random.Random(0), 300))
-    replicas[second].add(components(random.Random(1), 200))
-    until(agree)
-    assert replicas[first].n_components == 500
-    third = opening(2, listen=endpoints[2:], connect=endpoints[:2], key=KEY)
-    replicas[third] = Replica(2)
-    until(agree)
-    assert replicas[third].n_components == 500
-
-
-def test_robots_connect_through_a_common_peer(opening):
-    endpoints = [endpoint() for _ in range(3)]
-    transports = [
-        opening(robot, listen=[where], connect=endpoints[:1], key=KEY)
-        for robot, where in enumerate(endpoints)
-    ]
-    wait_until_connected(transports)
-    assert [transport.n_neighbours for transport in transports] == [2, 2, 2]
 
 
 def test_robots_relay_between_robots_out_of_reach(opening, tmp_path):
@@ -206,46 +215,6 @@ def test_a_restarted_robot_is_received_again(opening):
     assert sum(a.refused.values()) == 0
 
 
-OTHER_ROBOT = """
-import json, os, sys, time, zenoh
-from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
-aead = ChaCha20Poly1305(bytes(range(32)))
-config = zenoh.Config()
-config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))
-config.insert_json5("scouting/multicast/enabled", "false")
-session, life, number = zenoh.open(config), os.urandom(8), 0
-subscriber = session.declare_subscriber("gmmtorch/team/0")
-for sample in subscriber:
-    frame = sample.payload.to_bytes()
-    datagram = aead.decrypt(frame[3:15], frame[15:], frame[:15])
-    header = b"\\xf1" + (7).to_bytes(2, "little") + life + number.to_bytes(4, "little")
-    session.put("gmmtorch/team/7", header + aead.encrypt(header[3:], datagram[::-1], header))
-    number += 1
-    if datagram == b"end":
-        break
-session.close()
-"""
-
-
-def test_a_program_written_from_the_docs_takes_part(opening):
-    """It follows docs/network.md and has none of our code."""
-    where = endpoint()
-    a = opening(0, listen=[where], key=KEY)
-    with subprocess.Popen([sys.executable, "-c", OTHER_ROBOT, where]) as other:
-        until(lambda: a.send(0, [b"hello"], 0.0, "maps") or len(a.deliver(0, 0.0)) > 0)
-        sent = [f"datagram {i}".encode() for i in range(50)]
-        a.send(0, [*sent, b"end"], 0.0, "maps")
-        answers = [datagram for datagram in said_until(a, b"dne") if datagram != b"olleh"]
-        assert answers == [datagram[::-1] for datagram in [*sent, b"end"]]
-        assert other.wait(20) == 0
-
-
-def said_until(transport: ZenohTransport, last: bytes) -> list[bytes]:
-    said: list[bytes] = []
-    until(lambda: said.extend(d for _, d in transport.deliver(transport.robot, 0.0)) or said[-1:] == [last])
-    return said
-
-
 FORGETFUL = """
 import sys
 from gmmtorch.team.sharing.transport.zenoh_transport import ZenohTransport
@@ -290,3 +259,162 @@ def test_datagrams_that_zenoh_refuses_are_counted(opening, caplog):
     assert a.failures == {"ZError": 6}
     assert (a.sent, a.traffic()) == (Traffic(), Traffic(6, 6))
     assert len(caplog.messages) == 1
+
+
+def test_without_a_key_only_loopback_is_allowed(opening, tmp_path):
+    (tmp_path / "zenoh.json5").write_text("{ listen: { endpoints: ['tcp/0.0.0.0:0'] } }")
+    for options in (
+        {"listen": ["tcp/0.0.0.0:0"]},
+        {"listen": ["tcp/[::]:0"]},
+        {"listen": ["udp/224.0.0.224:7446"]},
+        {"connect": ["tcp/127.0.0.1:7447", "tcp/198.51.100.7:7447"]},
+        {"connect": ["tls/localhost.example:7447"]},
+        {"connect": ["serial/dev/ttyUSB0"]},
+        {"scouting": True},
+        {"config": tmp_path / "zenoh.json5"},
+    ):
+        with pytest.raises(InvalidArgumentError, match=r"no key.*insecure=True"):
+            opening(0, **options)
+    for options in ({"key": KEY}, {"insecure": True}):
+        opening(0, listen=["tcp/0.0.0.0:0"], **options)
+        opening(0, config=tmp_path / "zenoh.json5", **options)
+    opening(0, connect=["tcp/127.0.0.2:7447", "udp/[::1]:7447", "tcp/localhost:7447"])
+
+
+def test_a_port_in_use_is_reported_with_the_remedy(opening):
+    where = endpoint()
+    opening(0, listen=[where])
+    with pytest.raises(InvalidArgumentError, match=rf"{where}.*another process.*another port"):
+        opening(1, listen=[where])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"robot": -1}, "sender=-1"),
+        ({"robot": 65536}, "sender=65536"),
+        ({"team": ""}, "team=''"),
+        ({"team": "a/b"}, "team='a/b'"),
+        ({"team": "*"}, "team="),
+        ({"listen": "tcp/127.0.0.1:0"}, "list of endpoints"),
+        ({"listen": ["127.0.0.1:7447"]}, "must be an endpoint"),
+        ({"listen": [7447]}, "listen=7447"),
+        ({"listen": ["tcp/127.0.0.1"]}, "must be an endpoint"),
+        ({"listen": ["tcp/127.0.0.1:65536"]}, "65535"),
+        ({"listen": ["tcp/198.51.100.7:0"], "key": KEY}, "no such address"),
+        ({"listen": ["pigeon/home"], "key": KEY}, "pigeon"),
+        ({"connect": ["tcp/127.0.0.1:0"]}, "port 1"),
+        ({"connect": [""]}, "connect=''"),
+        ({"listen": []}, "No robot is reached"),
+        ({"max_waiting": 0}, "max_waiting=0"),
+    ],
+)
+def test_invalid_options_are_named(options, message):
+    n_threads = threading.active_count()
+    with pytest.raises(InvalidArgumentError, match=message):
+        ZenohTransport(**{"robot": 0, "listen": ["tcp/127.0.0.1:0"], **options})
+    assert threading.active_count() == n_threads
+
+
+def test_invalid_configurations_are_named(tmp_path):
+    with pytest.raises(MissingDataError, match="nowhere"):
+        ZenohTransport(0, config=tmp_path / "nowhere.json5", key=KEY)
+    for text, message in (
+        ("{ mode: 'peer'", "no configuration"),
+        ("{ mode: 'peer', wings: 2 }", "wings"),
+        ("{ mode: 'client' }", "mode 'client'.*router"),
+    ):
+        (tmp_path / "zenoh.json5").write_text(text)
+        with pytest.raises(DataError, match=message):
+            ZenohTransport(0, config=tmp_path / "zenoh.json5", key=KEY)
+
+
+def test_zenoh_configuration_may_use_tls(opening, tmp_path):
+    certify(tmp_path)
+    names = {"root_ca_certificate": "cert.pem", "enable_mtls": True}
+    for side in ("listen", "connect"):
+        names |= {f"{side}_certificate": "cert.pem", f"{side}_private_key": "key.pem"}
+    tls = {name: value if value is True else str(tmp_path / value) for name, value in names.items()}
+    (tmp_path / "zenoh.json5").write_text(json.dumps({"transport": {"link": {"tls": tls}}}))
+    where = endpoint("tls")
+    a = opening(0, listen=[where], config=tmp_path / "zenoh.json5", key=KEY)
+    b = opening(1, connect=[where], config=tmp_path / "zenoh.json5", key=KEY)
+    wait_until_connected([a, b])
+    assert {link.dst.partition("/")[0] for link in b._session.info.links()} == {"tls"}
+    with socket.create_connection(("127.0.0.1", int(where.rpartition(":")[2]))) as without_certificate:
+        without_certificate.sendall(b"hello")
+    a.send(0, [b"x"], 0.0, "maps")
+    assert heard(b, 1) == [(0, b"x")]
+
+
+def certify(folder: Path) -> None:
+    """A key, and a self-signed certificate for 127.0.0.1."""
+    x509 = pytest.importorskip("cryptography.x509")
+    from cryptography.hazmat.primitives import hashes, serialization
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+    private, now = ec.generate_private_key(ec.SECP256R1()), datetime.datetime.now(datetime.UTC)
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "robots")])
+    address = x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address("127.0.0.1"))])
+    builder = x509.CertificateBuilder(
+        name, name, private.public_key(), 1, now, now + datetime.timedelta(days=1)
+    )
+    certificate = builder.add_extension(address, critical=False).sign(private, hashes.SHA256())
+    (folder / "cert.pem").write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
+    (folder / "key.pem").write_bytes(
+        private.private_bytes(
+            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+        )
+    )
+
+
+class Listening:
+    """A publisher that records its frames."""
+
+    def __init__(self, publisher: zenoh.Publisher) -> None:
+        self.reliability, self.frames = publisher.reliability, list[bytes]()
+        self.put = self.frames.append
+
+
+def test_only_repeated_kinds_are_best_effort(opening):
+    a = opening(0, listen=[endpoint()])
+    ways = a._best_effort, a._reliable = Listening(a._best_effort), Listening(a._reliable)
+    for kind in ("plans", "announcements", "components", "counts", "points", "views", "anything"):
+        a.send(0, [kind.encode()], 0.0, kind)
+    said = {str(way.reliability): [frame[a.overhead :] for frame in way.frames] for way in ways}
+    assert said == {
+        str(zenoh.Reliability.BEST_EFFORT): [b"plans", b"announcements"],
+        str(zenoh.Reliability.RELIABLE): [b"components", b"counts", b"points", b"views", b"anything"],
+    }
+
+
+def test_without_the_package_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "zenoh", None)
+    with pytest.raises(GmmTorchError, match=r"pip install 'gmmtorch\[zenoh\]'"):
+        ZenohTransport(0, listen=["tcp/127.0.0.1:0"])
+
+
+@pytest.mark.parametrize("name", ["declare_publisher", "declare_subscriber"])
+def test_an_unusable_session_is_closed(monkeypatch, name):
+    sessions = []
+
+    class Refusing:
+        """A session that cannot publish or subscribe."""
+
+        def __init__(self, session: zenoh.Session) -> None:
+            self._session = session
+            sessions.append(session)
+
+        def __getattr__(self, asked: str) -> object:
+            return self._refuse if asked == name else getattr(self._session, asked)
+
+        def _refuse(self, *_: object, **__: object) -> None:
+            raise zenoh.ZError("denied")
+
+    opened = zenoh_transport.open_session
+    monkeypatch.setattr(zenoh_transport, "open_session", lambda *a: Refusing(opened(*a)))
+    n_threads = threading.active_count()
+    with pytest.raises(GmmTorchError, match=r"robot 3 publish at gmmtorch/team/3.*denied.*config"):
+        ZenohTransport(3, listen=[endpoint()], key=KEY)
+    assert [session.is_closed() for session in sessions] == [True]
+    assert threading.active_count() == n_threads

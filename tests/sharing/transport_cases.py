@@ -7,8 +7,7 @@ import time
 from collections.abc import Callable
 
 from gmmtorch.team.sharing.transport.frames import FramedTransport
-from gmmtorch.team.sharing.transport.security import Sealer
-from gmmtorch.team.sharing.transport.team_key import TeamKey
+from gmmtorch.team.sharing.transport.security import Sealer, TeamKey
 
 SECRET = bytes(range(32))
 KEY = TeamKey(SECRET)

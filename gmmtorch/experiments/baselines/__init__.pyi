@@ -1,9 +1,9 @@
 from .bgk_map import BGKMap as BGKMap
-from .bgk_points_map import BGKPointsMap as BGKPointsMap
+from .bgk_map import BGKPointsMap as BGKPointsMap
 from .gp_map import GPMap as GPMap
 from .grids import LogOdds as LogOdds
 from .grids import OccupancyGrid as OccupancyGrid
-from .hilbert.bayesian_hilbert_map import BayesianHilbertMap as BayesianHilbertMap
-from .hilbert.hilbert_map import HilbertMap as HilbertMap
+from .hilbert_map import BayesianHilbertMap as BayesianHilbertMap
+from .hilbert_map import HilbertMap as HilbertMap
 from .ndt_map import NDTMap as NDTMap
 from .octomap_map import OctoMapMap as OctoMapMap

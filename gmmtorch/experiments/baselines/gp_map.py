@@ -49,14 +49,9 @@ def gp_regression(
     """Mean (B, M) and variance (B, M) of M predictions of each of B separate zero-mean Gaussian processes
     (Rasmussen & Williams 2006, algorithm 2.1).
 
-    Args:
-        points: (B, N, D) positions of the samples, padded to N.
-        values: (B, N) measured values.
-        is_sample: (B, N) bool, False for padding, which has no influence.
-        query: (B, M, D) positions of the predictions.
-        length: of the Matérn-3/2 kernel (m).
-        variance: of the process.
-        noise: variance of a measurement.
+    Samples have positions (B, N, D) and values (B, N); padding, where is_sample (B, N) is False, has no
+    influence. Predictions are at the query (B, M, D). length: of the Matérn-3/2 kernel (m); variance: of the
+    process; noise: variance of a measurement.
     """
     both = is_sample[:, :, None] & is_sample[:, None, :]
     covariance = torch.where(both, matern_kernel(points, points, length, variance), 0.0)
@@ -217,14 +212,9 @@ class GPMap(TensorFileMap):
         if self._table.keys.shape[0] == 0:
             return query.new_full((query.shape[0],), 0.5)
         rows, stored = self._table.find(query)
-        weighted = self._table.values[rows, 0].double()
-        theta = torch.sigmoid(self.gain * self.min_variance * weighted)
-        return torch.where(stored & self._known()[rows], theta, 0.5)
-
-    def _known(self) -> Tensor:
-        """Whether the variance of each cell (N,) is low enough."""
-        precision = self._table.values[:, 1].double() + 1 / self.max_variance
-        return precision >= 1 / self.known_variance
+        weighted, precision = self._table.values[rows].double().unbind(1)
+        known = stored & (precision + 1 / self.max_variance >= 1 / self.known_variance)
+        return torch.where(known, torch.sigmoid(self.gain * self.min_variance * weighted), 0.5)
 
     # -- files ------------------------------------------------------------------------------------
 

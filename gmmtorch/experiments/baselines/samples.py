@@ -19,29 +19,15 @@ _MAX_SAMPLES = 1 << 27
 
 
 def beam_samples(
-    scan: Scan,
-    spacing: float,
-    *,
-    generator: torch.Generator,
-    gap: float = 0.0,
-    thin: float | None = None,
+    scan: Scan, spacing: float, *, generator: torch.Generator, gap: float = 0.0, thin: float | None = None
 ) -> tuple[Tensor, Tensor]:
     """Points (S, D), float64, on the beams of a scan, and whether each (S,) is a hit; hits come first.
 
     The free part of a beam is the whole beam, without the last `gap` metres if it has a return. It is divided
     into equal segments of at most `spacing`, with one free point in each, at a uniformly random position
     (Ramos & Ott 2016; Senanayake & Ramos 2017). A beam without return gives free points only. A beam of zero
-    length gives no point.
-
-    Args:
-        scan: world frame.
-        spacing: of the free points of one beam (m).
-        generator: on the CPU.
-        gap: distance (m) before a hit without free points.
-        thin: side of cubes (m); the beam ends in one cube are first replaced by their mean. None: no
-            thinning.
-
-    Raises `MemoryLimitError` for too many points.
+    length gives no point. With `thin`, the beam ends in one cube of that side (m) are first replaced by their
+    mean. The generator is on the CPU. Raises `MemoryLimitError` for too many points.
     """
     origin, hits, no_return = scan.origin.double(), scan.points.double(), scan.no_return.double()
     if thin is not None:

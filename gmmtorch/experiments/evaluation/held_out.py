@@ -13,9 +13,9 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.events import Event, OnRows, Row, ignore
-from gmmtorch.experiments.evaluation import calibration, metrics, queries
-from gmmtorch.experiments.evaluation.calibration import SeenPredictions
+from gmmtorch.experiments.evaluation import metrics, queries
 from gmmtorch.experiments.evaluation.mapping_methods import Form, MapFactory
+from gmmtorch.experiments.evaluation.metrics import SeenPredictions
 from gmmtorch.experiments.evaluation.protocol_options import Protocol
 from gmmtorch.experiments.evaluation.queries import UNKNOWN, Queries
 from gmmtorch.files import check_writable
@@ -95,19 +95,13 @@ def evaluate(
         for method, resolution, built, seconds, answer, seen in _built_maps(
             factories, shown, kept, protocol, on_event
         ):
-            made = _score(built, answer, asked[resolution], resolution, seed, protocol.unknown)
-            made.row.update(_calibrated_scores(made, seen))
-            made.row.update(
-                dataset=name,
-                method=method,
-                removal=protocol.removal,
-                kept=float(kept),
-                n_train_points=sum(scan.points.shape[0] for scan in shown),
-                build_seconds=seconds,
-            )
+            case = {"dataset": name, "method": method, "resolution": float(resolution)}
+            case |= {"removal": protocol.removal, "kept": float(kept)}
+            effort = {"build_seconds": seconds, "n_train_points": sum(len(scan.points) for scan in shown)}
+            made = _score(built, answer, asked[resolution], seen, seed, protocol.unknown, case, effort)
             if protocol.save_map:
                 built.save(Path(protocol.save_map) / f"{method}_{kept:g}_{resolution:g}{built.suffix}")
-            outcome.rows.append({key: made.row[key] for key in sorted(made.row, key=_column)})
+            outcome.rows.append(made.row)
             on_row(outcome.rows)
             if kept == largest:
                 outcome.shown.append(made)
@@ -131,22 +125,17 @@ def _built_maps(
             built, seconds, seen = cache[shared]
             if not built.any_resolution:
                 del cache[shared]
-            _set_defaults(built, factory, resolution)
             yield method, resolution, built, seconds, _answerer(built, factory, resolution), seen
 
 
 def _answerer(built: OccupancyMap, factory: MapFactory, resolution: float) -> Answer:
-    """Occupancy by the factory's method at a resolution (m)."""
-    if isinstance(factory, Form) and isinstance(built, GaussianMap):
-        return lambda points: torch.as_tensor(built.occupancy(points, resolution, factory.form))
-    return lambda points: torch.as_tensor(built.occupancy(points, resolution))
-
-
-def _set_defaults(built: OccupancyMap, factory: MapFactory, resolution: float) -> None:
-    """Set the default method and resolution of the map, which its file stores."""
+    """Occupancy by the factory's method at a resolution (m), which become defaults of the map."""
     if isinstance(built, GaussianMap):
         built.resolution = resolution
-        built.method = factory.form if isinstance(factory, Form) else built.method
+        if isinstance(factory, Form):
+            built.method = factory.form
+            return lambda points: torch.as_tensor(built.occupancy(points, resolution, factory.form))
+    return lambda points: torch.as_tensor(built.occupancy(points, resolution))
 
 
 def _questions(
@@ -181,19 +170,17 @@ def _build(
     return empty, seconds + time.perf_counter() - begin, seen
 
 
-def _calibrated_scores(made: Built, seen: SeenPredictions | None) -> Row:
-    """The scores of a map that has no calibration of its own, with one."""
-    names = ("ece", "log_loss_bits", "accuracy")
-    if seen is None:
-        return {f"calibrated_{name}": None for name in names}
-    known = made.asked.labels != UNKNOWN
-    found = calibration.scores(seen.calibrated(made.theta)[known], made.asked.labels[known])
-    return {f"calibrated_{name}": found[name] for name in names}
-
-
 def _score(
-    built: OccupancyMap, answer: Answer, asked: Queries, resolution: float, seed: int, unknown: bool
+    built: OccupancyMap,
+    answer: Answer,
+    asked: Queries,
+    seen: SeenPredictions | None,
+    seed: int,
+    unknown: bool,
+    case: Row,
+    effort: Row,
 ) -> Built:
+    """The map with its row: the case, the scores, and the effort, in the order of the documentation."""
     begin = time.perf_counter()
     theta = answer(asked.points).cpu()
     seconds = time.perf_counter() - begin
@@ -201,47 +188,24 @@ def _score(
     known = asked.labels != UNKNOWN
     curve = metrics.roc(occupied, free)
     low, high = metrics.auc_interval(occupied, free, curve.auc, seed)
+    scores = metrics.scores(theta[known], asked.labels[known])
+    # The scores of a map that has no calibration of its own, with one.
+    calibrated = {} if seen is None else metrics.scores(seen.calibrated(theta)[known], asked.labels[known])
     row: Row = {
-        "resolution": float(resolution),
+        **case,
         "auc": curve.auc,
         "auc_low": low,
         "auc_high": high,
-        **calibration.scores(theta[known], asked.labels[known]),
+        "brier": scores["brier"],
+        **scores,
+        **{f"calibrated_{name}": calibrated.get(name) for name in ("ece", "log_loss_bits", "accuracy")},
+        "n_train_points": effort["n_train_points"],
         "n_components": built.n_components if isinstance(built, GaussianMap) else None,
         "nbytes": built.nbytes,
+        "build_seconds": effort["build_seconds"],
         "query_seconds": seconds,
         "n_queries": theta.shape[0],
     }
     if unknown:
         row |= metrics.unknown_scores(theta[asked.of(UNKNOWN)], free)
     return Built(built, answer, row, asked, theta, curve)
-
-
-_COLUMNS = [
-    "dataset",
-    "method",
-    "resolution",
-    "removal",
-    "kept",
-    "auc",
-    "auc_low",
-    "auc_high",
-    "brier",
-    "ece",
-    "log_loss_bits",
-    "accuracy",
-    "calibrated_ece",
-    "calibrated_log_loss_bits",
-    "calibrated_accuracy",
-    "n_train_points",
-    "n_components",
-    "nbytes",
-    "build_seconds",
-    "query_seconds",
-    "n_queries",
-]
-
-
-def _column(name: str) -> tuple[int, str]:
-    """Sort key of a row's fields: documented fields first, in their order."""
-    return (_COLUMNS.index(name) if name in _COLUMNS else len(_COLUMNS), name)

@@ -52,9 +52,7 @@ class Form:
 
 
 def methods(
-    new_map: Callable[[], GaussianMap],
-    options: Mapping[str, Mapping[str, Any]] | None = None,
-    **limits: Any,
+    new_map: Callable[[], GaussianMap], options: Mapping[str, Mapping[str, Any]] | None = None, **limits: Any
 ) -> dict[str, MapFactory]:
     """Every method by name.
 

@@ -83,7 +83,7 @@ class FitOptions:
         max_cells: sum the points into at most this many cells; None: learn from the points.
         reg_covar: added to the variances (m²).
         dtype: type of the exponentials in EM, "float32" or "float64".
-        compiled: use torch.compile for truncated EM.
+        compiled: without effect, because the kernels are compiled anyway.
     """
 
     n_components: int | None = option(100, "number of components; null (em): chosen from the surfaces")

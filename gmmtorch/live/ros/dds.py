@@ -10,9 +10,7 @@ from xml.sax.saxutils import quoteattr
 
 from gmmtorch.datasets import ARRAY, BASE, NAME
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
-from gmmtorch.live.ros.message_types import MessageTypes, dds_type, ros_type
-from gmmtorch.live.ros.middleware import Endpoint
-from gmmtorch.live.ros.quality import Quality
+from gmmtorch.live.ros.topics import Endpoint, MessageTypes, Quality, dds_type, ros_type
 from gmmtorch.optional_packages import needs_extra
 
 LOOPBACK = "127.0.0.1"
@@ -32,13 +30,10 @@ _LOCK = threading.Lock()
 
 
 class DdsMiddleware:
-    """One participant of a DDS domain, with Cyclone DDS.
+    """One participant of a DDS domain, 0 … 232, with Cyclone DDS.
 
-    Args:
-        types: of the messages.
-        domain: number of the domain, 0 … 232.
-        interface: name or address of the network interface; 127.0.0.1: only this machine, without multicast.
-        peers: addresses of machines that are contacted besides this one.
+    interface: name or address of the network interface; 127.0.0.1: only this machine, without multicast.
+    peers: addresses of machines that are contacted besides this one.
 
     Raises `InvalidArgumentError` if the domain or interface cannot be used, and `GmmTorchError` if cyclonedds
     is not installed.
@@ -94,29 +89,30 @@ class DdsMiddleware:
         qos = _policies(quality)
         reader: Any = DataReader(self._participant, self._topic(topic, message_type), qos=qos)
 
-        def receive() -> None:
-            for sample in reader.take(N=_MOST_SAMPLES):
-                cdr = getattr(sample, "cdr", None)  # absent if a publisher has ended
-                if cdr is not None:
-                    on_message(cdr)
-
         class Receiver(Listener):
             def on_data_available(self, _: Any) -> None:
-                receive()
+                for sample in reader.take(N=_MOST_SAMPLES):
+                    cdr = getattr(sample, "cdr", None)  # absent if a publisher has ended
+                    if cdr is not None:
+                        on_message(cdr)
 
         listener = Receiver()
         reader.set_listener(listener)
-        receive()  # what came before the listener
+        listener.on_data_available(reader)  # what came before the listener
         self._entities += [reader, listener]
 
     def endpoints(self) -> list[Endpoint]:
+        from cyclonedds.core import InstanceState
+
         found = []
         for reader, is_publisher in self._known:
             for sample in reader.read(N=10 * _MOST_SAMPLES):
                 # Both are None for an endpoint of a process that was killed.
                 name = getattr(sample, "topic_name", None) or ""
                 kind = ros_type(getattr(sample, "type_name", None) or "")
-                if name.startswith(f"{_TOPIC_PREFIX}/") and kind is not None and _is_alive(sample):
+                info = getattr(sample, "sample_info", None)
+                is_alive = info is None or info.instance_state == InstanceState.Alive
+                if name.startswith(f"{_TOPIC_PREFIX}/") and kind is not None and is_alive:
                     quality = _quality(sample.qos)
                     found.append(Endpoint(name[len(_TOPIC_PREFIX) :], kind, quality, is_publisher))
         return found
@@ -148,8 +144,7 @@ class DdsMiddleware:
 
 def _settings(interface: str, peers: Sequence[str]) -> str:
     """The configuration of Cyclone DDS."""
-    is_address = interface.replace(".", "").isdigit()
-    kind = "address" if is_address else "name"
+    kind = "address" if interface.replace(".", "").isdigit() else "name"
     local = interface.startswith("127.") or interface == "lo"
     multicast = "false" if local else "default"
     named = "".join(f"<Peer address={quoteattr(peer)}/>" for peer in [LOOPBACK] * local + list(peers))
@@ -205,13 +200,6 @@ def _quality(qos: Any) -> Quality:
     )
 
 
-def _is_alive(sample: Any) -> bool:
-    from cyclonedds.core import InstanceState
-
-    info = getattr(sample, "sample_info", None)
-    return info is None or info.instance_state == InstanceState.Alive
-
-
 def _text(error: Exception) -> str:
     return str(getattr(error, "msg", "") or error).strip(" .")
 
@@ -220,10 +208,9 @@ def _text(error: Exception) -> str:
 
 
 class IdlTypes:
-    """Types of cyclonedds for ROS messages.
+    """Types of cyclonedds for ROS messages, whose structure Cyclone DDS checks and tells others.
 
-    Cyclone DDS needs the structure of a type to check what it receives and to tell others. The conversion
-    from and to fields is `MessageTypes`'s: a sample has one attribute, `cdr`, the encoded message.
+    `MessageTypes` converts from and to fields: a sample has one attribute, `cdr`, the encoded message.
     """
 
     def __init__(self, definitions: dict[str, Any]) -> None:

@@ -9,15 +9,22 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from types import TracebackType
 from typing import Any, NamedTuple
 
 from gmmtorch.datasets import TransformTree
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice
-from gmmtorch.live.ros import dds, quality, zenoh_middleware
-from gmmtorch.live.ros.message_types import MessageTypes
-from gmmtorch.live.ros.middleware import MAX_MESSAGE_BYTES, Endpoint, Middleware
-from gmmtorch.live.ros.topic_names import TopicNames
+from gmmtorch.live.ros import dds, zenoh_middleware
+from gmmtorch.live.ros.topics import (
+    MAX_MESSAGE_BYTES,
+    Endpoint,
+    MessageTypes,
+    Middleware,
+    Quality,
+    TopicNames,
+    mismatch,
+    published,
+    subscribed,
+)
 
 logger = logging.getLogger("gmmtorch")
 MIDDLEWARE = ("dds", "zenoh")
@@ -126,9 +133,7 @@ class Node:
     def __enter__(self) -> Node:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -137,9 +142,7 @@ class Node:
 
     # -- topics ---------------------------------------------------------------------------------------
 
-    def publisher(
-        self, topic: str, message_type: str, offered: quality.Quality | None = None
-    ) -> Callable[..., None]:
+    def publisher(self, topic: str, message_type: str, offered: Quality | None = None) -> Callable[..., None]:
         """Declares a publisher; the result publishes a message from nested fields and a stamp (ns).
 
         The stamp goes into headers that have none; without one it is `now`. Fields that are not given are
@@ -147,9 +150,7 @@ class Node:
         """
         name = self.names.resolve(topic)
         self.types.check(message_type)
-        send = self._middleware.publisher(
-            name, message_type, offered or quality.published(name, message_type)
-        )
+        send = self._middleware.publisher(name, message_type, offered or published(name, message_type))
 
         def publish(message: Mapping[str, Any] | bytes, stamp: int | None = None) -> None:
             if not isinstance(message, bytes):
@@ -159,16 +160,12 @@ class Node:
         return publish
 
     def subscribe(
-        self,
-        topic: str,
-        message_type: str,
-        callback: Callback,
-        requested: quality.Quality | None = None,
+        self, topic: str, message_type: str, callback: Callback, requested: Quality | None = None
     ) -> Subscription:
         """Calls `callback` with each message of a topic."""
         name = self.names.resolve(topic)
         self.types.check(message_type)
-        asked = requested or quality.subscribed(name, message_type)
+        asked = requested or subscribed(name, message_type)
         made = Subscription(name, message_type, callback, max(asked.depth, 1))
         self.subscriptions.append(made)
         self._middleware.subscribe(name, message_type, asked, lambda data: self._receive(made, data))
@@ -199,9 +196,9 @@ class Node:
         if all(endpoint.type != subscription.type for endpoint in named):
             types = ", ".join(sorted({endpoint.type for endpoint in named}))
             return f"topic {subscription.topic} has messages of type {types}, not {subscription.type}"
-        asked = quality.subscribed(subscription.topic, subscription.type)
+        asked = subscribed(subscription.topic, subscription.type)
         for endpoint in named:
-            if reason := quality.mismatch(endpoint.quality, asked):
+            if reason := mismatch(endpoint.quality, asked):
                 return f"topic {subscription.topic} cannot be received: {reason}"
         return f"topic {subscription.topic} has a publisher, which sends nothing"
 
@@ -278,8 +275,7 @@ class Node:
                 size = f"{len(data):,} bytes are more than {MAX_MESSAGE_BYTES:,}, the most of a message"
                 self._note_malformed(subscription, DataError(size))
                 return
-            arrival = Arrival(self._n_arrived, self.now(), time.monotonic(), data)
-            subscription.waiting.append(arrival)
+            subscription.waiting.append(Arrival(self._n_arrived, self.now(), time.monotonic(), data))
             subscription.waiting_bytes += len(data)
             while (
                 len(subscription.waiting) > subscription.depth or subscription.waiting_bytes > _WAITING_BYTES

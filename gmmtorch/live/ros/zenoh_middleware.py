@@ -15,10 +15,15 @@ from collections.abc import Callable
 from typing import Any
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
-from gmmtorch.live.ros.message_types import MessageTypes, dds_type, ros_type
-from gmmtorch.live.ros.middleware import MAX_MESSAGE_BYTES, Endpoint
-from gmmtorch.live.ros.quality import Quality
-from gmmtorch.live.ros.topic_names import TopicNames
+from gmmtorch.live.ros.topics import (
+    MAX_MESSAGE_BYTES,
+    Endpoint,
+    MessageTypes,
+    Quality,
+    TopicNames,
+    dds_type,
+    ros_type,
+)
 from gmmtorch.optional_packages import needs_extra
 
 ROUTER = "tcp/127.0.0.1:7447"
@@ -32,13 +37,9 @@ _N_PARTS = 13
 
 
 class ZenohMiddleware:
-    """One client of a Zenoh router. The router is the only address that is contacted.
+    """One client of a Zenoh router, whose endpoint is the only address that is contacted.
 
-    Args:
-        types: of the messages.
-        domain: number of the domain, ROS_DOMAIN_ID.
-        names: name and namespace of the node, which others can list.
-        router: endpoint of the router, such as that of `ros2 run rmw_zenoh_cpp rmw_zenohd`.
+    names: name and namespace of the node, which others can list.
 
     Raises `InvalidArgumentError` if the router does not answer, and `GmmTorchError` if eclipse-zenoh is not
     installed.
@@ -57,12 +58,12 @@ class ZenohMiddleware:
         self._id = str(self._session.zid())
         self._numbers = itertools.count(1)
         self._entities: list[Any] = []
-        token = node_token(domain, self._id, names.namespace, names.node)
+        token = f"{_SPACE}/{domain}/{self._id}/0/0/{_NODE}/%/{names.namespace.replace('/', '%')}/{names.node}"
         self._entities.append(self._session.liveliness().declare_token(token))
 
     def publisher(self, topic: str, message_type: str, quality: Quality) -> Callable[[bytes], None]:
         ext = self._zenoh.ext
-        key = self._key(topic, message_type, self._types.type_hash(message_type))
+        key = message_key(self._domain, topic, message_type, self._types.type_hash(message_type))
         blocking = self._zenoh.CongestionControl.BLOCK if quality.reliable else None
         if quality.latched:
             publisher: Any = ext.declare_advanced_publisher(
@@ -89,7 +90,7 @@ class ZenohMiddleware:
     def subscribe(
         self, topic: str, message_type: str, quality: Quality, on_message: Callable[[bytes], None]
     ) -> None:
-        key = self._key(topic, message_type, _ANY_VERSION)
+        key = message_key(self._domain, topic, message_type, _ANY_VERSION)
 
         def receive(sample: Any) -> None:
             on_message(sample.payload.to_bytes())
@@ -103,7 +104,7 @@ class ZenohMiddleware:
         self._declared(subscriber, Endpoint(topic, message_type, quality, False))
 
     def endpoints(self) -> list[Endpoint]:
-        tokens = self._session.liveliness().get(all_tokens(self._domain), timeout=_TIMEOUT)
+        tokens = self._session.liveliness().get(f"{_SPACE}/{self._domain}/**", timeout=_TIMEOUT)
         found = [parsed_token(str(reply.ok.key_expr)) for reply in tokens if reply.ok is not None]
         return [endpoint for endpoint in found if endpoint is not None]
 
@@ -111,21 +112,10 @@ class ZenohMiddleware:
         self._session.close()
         self._entities.clear()
 
-    def _key(self, topic: str, message_type: str, type_hash: str) -> str:
-        self._types.check(message_type)
-        return message_key(self._domain, topic, message_type, type_hash)
-
     def _declared(self, entity: Any, endpoint: Endpoint) -> None:
         """Announces an endpoint to other nodes."""
-        token = endpoint_token(
-            self._domain,
-            self._id,
-            next(self._numbers),
-            self._names.namespace,
-            self._names.node,
-            endpoint,
-            self._types.type_hash(endpoint.type),
-        )
+        who = self._domain, self._id, next(self._numbers), self._names.namespace, self._names.node
+        token = endpoint_token(*who, endpoint, self._types.type_hash(endpoint.type))
         self._entities += [entity, self._session.liveliness().declare_token(token)]
 
 
@@ -176,16 +166,6 @@ def _settings(
 def message_key(domain: int, topic: str, message_type: str, type_hash: str) -> str:
     """The key of a topic's messages; hash "*": of any version of the type."""
     return f"{domain}/{topic.strip('/')}/{dds_type(message_type)}/{type_hash}"
-
-
-def all_tokens(domain: int) -> str:
-    """A key that matches all liveliness tokens of a domain."""
-    return f"{_SPACE}/{domain}/**"
-
-
-def node_token(domain: int, session: str, namespace: str, name: str) -> str:
-    """The liveliness token of a node."""
-    return f"{_SPACE}/{domain}/{session}/0/0/{_NODE}/%/{namespace.replace('/', '%')}/{name}"
 
 
 def endpoint_token(

@@ -17,6 +17,8 @@ again in the direct form, ‖L⁻¹x − L⁻¹μ‖² for every type.
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 import torch
@@ -25,8 +27,8 @@ from torch import Tensor
 from gmmtorch.errors import NumericalError
 from gmmtorch.kernels import chunk_elements, chunked, softmax
 from gmmtorch.linalg import safe_cholesky, unpack_symmetric
-from gmmtorch.mixture.em.covariance_types import compact, constrain, type_shape
-from gmmtorch.mixture.em.exact import LOG_2PI, MIN_LOG_WEIGHT, Parameters, natural_of_precisions, products
+from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em.exact import Parameters
 
 _MOST_LOST = 1e-6  # nats a dimension that the log-density of the linear form may lose
 _MOST_LOST_VARIANCE = 1e-5  # share of a variance that the moments of the linear form may lose
@@ -51,8 +53,8 @@ def has_linear_form(n_components: int, dim: int, kind: str) -> bool:
 
 def compacted(parameters: Parameters, kind: str) -> Parameters:
     """The nearest covariances of the type, in its shape, to those (K, D, D)."""
-    covariances = constrain(parameters.covariances, kind, parameters.weights)
-    return parameters._replace(covariances=compact(covariances, kind))
+    covariances = em.constrain(parameters.covariances, kind, parameters.weights)
+    return parameters._replace(covariances=em.compact(covariances, kind))
 
 
 # -- log-densities --------------------------------------------------------------------------------
@@ -87,8 +89,8 @@ class Factors:
             self.whiten = covariances.rsqrt()
             half_log_det = 0.5 * covariances.log() * (self.dim if kind == "spherical" else 1)
             half_log_det = half_log_det.sum(-1) if kind == "diag" else half_log_det
-        log_weight = self.weights.log().clamp_min(MIN_LOG_WEIGHT)
-        self.constant = log_weight - half_log_det - 0.5 * self.dim * LOG_2PI
+        log_weight = self.weights.log().clamp_min(em.MIN_LOG_WEIGHT)
+        self.constant = log_weight - half_log_det - 0.5 * self.dim * em.LOG_2PI
 
     def whitened_means(self) -> Tensor:
         """L⁻¹ μ (K, D)."""
@@ -107,7 +109,7 @@ class Factors:
         """The linear form."""
         kind, means, dim = self.kind, self.means, self.dim
         if kind == "full":
-            weights = natural_of_precisions(self.whiten.mT @ self.whiten, means, self.constant)
+            weights = em.natural_of_precisions(self.whiten.mT @ self.whiten, means, self.constant)
             constant, slope, curve = weights[:, 0], weights[:, 1 : 1 + dim], weights[:, 1 + dim :]
         elif kind == "tied":
             slope = self.whitened_means()
@@ -145,9 +147,8 @@ class Factors:
             if self.kind == "tied":
                 z = points - middle[part, None, :]
             else:
-                z = (points - self.means[part, None, :]) * self.whiten[part].view(
-                    -1, 1, self.whiten[0].numel()
-                )
+                scale = self.whiten[part].view(-1, 1, self.whiten[0].numel())
+                z = (points - self.means[part, None, :]) * scale
             return (z * z).sum(2)
 
         def joint(points: Tensor, square: Tensor | None = None) -> Tensor:
@@ -178,7 +179,7 @@ def squares(points: Tensor, kind: str) -> Tensor:
     """The quadratic features of a type: |x|² (n, 1), x² (n, D), or x_i x_j (i ≤ j)."""
     if kind == "spherical":
         return (points * points).sum(1, keepdim=True)
-    return points * points if kind == "diag" else products(points, points)
+    return points * points if kind == "diag" else em.products(points, points)
 
 
 def log_joint(parameters: Parameters, kind: str) -> Joint:
@@ -270,7 +271,8 @@ class Sums:
             if self._kind == "spherical":
                 second, square = second / dim, square.mean(1, keepdim=True)
             covariances = (second - square).clamp_min_(0)
-            return Parameters(self._count, means, covariances.view(self._type_shape())), second
+            shape = em.type_shape(self._kind, *means.shape)
+            return Parameters(self._count, means, covariances.view(shape)), second
         # In place, because the matrices may be most of the memory.
         covariances = self._second
         if self._kind == "tied":
@@ -284,9 +286,6 @@ class Sums:
             covariances.baddbmm_(shift[:, :, None], shift[:, None, :], alpha=-1)
         covariances.diagonal(dim1=-2, dim2=-1).clamp_min_(0)
         return Parameters(self._count, means, covariances), second
-
-    def _type_shape(self) -> tuple[int, ...]:
-        return type_shape(self._kind, *self._first.shape)
 
 
 def have_cancelled(second: Tensor, covariances: Tensor, kind: str, linear: bool) -> Tensor:
@@ -381,25 +380,20 @@ class Moved(NamedTuple):
     lost: Tensor
 
 
+Gather = Callable[[bool, Tensor | None], tuple[Sums, Tensor]]
+"""An E-step, linear or not, with second moments about given points (K, D): see `expected_moments`."""
+
+
 def em_step(
-    points: Tensor,
-    sample_weight: Tensor,
+    gather: Gather,
     factors: Factors,
-    softmax_dtype: torch.dtype,
     reg_covar: float,
     previous: Parameters | None,
     linear: bool,
     about: Tensor | None = None,
 ) -> Moved:
-    """E- and M-step in one of the forms: `expected_moments`, `moved`. Does not wait for the device."""
-    sums, value = expected_moments(points, sample_weight, factors, softmax_dtype, linear, about)
-    return moved(sums, value, factors, reg_covar, previous, linear)
-
-
-def moved(
-    sums: Sums, value: Tensor, factors: Factors, reg_covar: float, previous: Parameters | None, linear: bool
-) -> Moved:
-    """The M-step from the sums of an E-step, see `maximized`."""
+    """E- and M-step in one of the forms: `gather`, `maximized`. Does not wait for the device."""
+    sums, value = gather(linear, about)
     moments, second = sums.moments()
     new = maximized(moments, reg_covar, previous, factors.kind)
     lost = have_cancelled(second, new.covariances, factors.kind, linear)
@@ -408,17 +402,19 @@ def moved(
 
 
 def exact_step(
-    points: Tensor,
-    sample_weight: Tensor,
-    factors: Factors,
-    softmax_dtype: torch.dtype,
-    reg_covar: float,
-    previous: Parameters | None,
+    gather: Gather, factors: Factors, reg_covar: float, previous: Parameters | None, linear: bool = False
 ) -> Moved:
-    """`em_step` in the direct form; if a component moves far, once more with moments about its new mean."""
-    given = (points, sample_weight, factors, softmax_dtype, reg_covar, previous, False)
-    found = em_step(*given)
-    return em_step(*given, about=found.parameters.means) if bool(found.lost) else found
+    """`em_step` in the direct form; if a component moves far, once more with moments about its new mean.
+
+    With `linear`, the linear form is tried first, if that is the fastest.
+    """
+    given = (gather, factors, reg_covar, previous)
+    if linear and has_linear_form(len(factors.means), factors.dim, factors.kind):
+        found = em_step(*given, linear=True)
+        if not bool(found.lost):
+            return found
+    found = em_step(*given, linear=False)
+    return em_step(*given, False, found.parameters.means) if bool(found.lost) else found
 
 
 def direct_step(
@@ -426,5 +422,6 @@ def direct_step(
 ) -> tuple[Parameters, Tensor]:
     """`exact_step` of full covariances in float64: new parameters and Σ_n p_n log p(x_n)."""
     factors = Factors(parameters, "full")
-    found = exact_step(points, sample_weight, factors, torch.float64, reg_covar, parameters)
+    gather = functools.partial(expected_moments, points, sample_weight, factors, torch.float64)
+    found = exact_step(gather, factors, reg_covar, parameters)
     return found.parameters, found.value

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import expectation as expectation
 from gmmtorch.kernels import exponent_floor as exponent_floor
 from gmmtorch.kernels import fused_maximization, fused_natural_parameters, is_m_step_fused, most_likely
@@ -125,10 +126,7 @@ def maximization(statistics: Tensor, reg_covar: float, previous: Parameters | No
     second = unpack_symmetric(statistics[:, 1 + dim :] / count[:, None], dim)
     covariances = second - means[:, :, None] * means[:, None, :]
     covariances.diagonal(dim1=-2, dim2=-1).clamp_min_(0).add_(reg_covar)
-    return _keep_empty(Parameters(count / count.sum(), means, covariances), statistics[:, 0] > eps, previous)
-
-
-def _keep_empty(new: Parameters, alive: Tensor, previous: Parameters | None) -> Parameters:
+    new, alive = Parameters(count / count.sum(), means, covariances), statistics[:, 0] > eps
     if previous is None:
         return new
     return Parameters(
@@ -143,7 +141,7 @@ def feature_dimension(n_features: int) -> int:
     return int(((8 * n_features + 1) ** 0.5 - 3) / 2 + 0.5)
 
 
-# -- the direct form: slower, without cancellation ------------------------------------------------
+# -- lost digits ----------------------------------------------------------------------------------
 
 
 def is_ill_conditioned(parameters: Parameters) -> bool:
@@ -169,13 +167,69 @@ def has_cancelled(statistics: Tensor, parameters: Parameters) -> bool:
     return bool((lost & alive).any())
 
 
-def log_joint(points: Tensor, parameters: Parameters) -> Tensor:
-    """log π_k + log N(x_n | μ_k, Σ_k), (N, K), from ‖L⁻¹(x − μ)‖², without cancellation at any distance."""
-    weights, means, covariances = parameters
-    factors = safe_cholesky(covariances)
-    whiten = inverse_factor(factors)
-    offset = points[:, None, :] - means
-    squared = torch.einsum("nkd,kde->nke", offset, whiten).square().sum(-1)
-    half_log_det = torch.log(factors.diagonal(dim1=-2, dim2=-1)).sum(-1)
-    constant = torch.log(weights).clamp_min(MIN_LOG_WEIGHT) - half_log_det - 0.5 * means.shape[1] * LOG_2PI
-    return constant - 0.5 * squared
+# -- covariance types -----------------------------------------------------------------------------
+
+
+COVARIANCE_TYPES = ("full", "tied", "diag", "spherical")
+"""Those of scikit-learn: which covariances a mixture may have."""
+
+
+def constrain(matrices: Tensor, covariance_type: str, weights: Tensor | None = None) -> Tensor:
+    """The nearest matrices (K, D, D) of the type; tied: their mean, weighted by `weights` (K,).
+
+    The M-step of a type is this projection of the full M-step, because the likelihood depends on the scatter
+    only through its product with precisions of the type.
+    """
+    if covariance_type == "full":
+        return matrices
+    if covariance_type == "tied":
+        share = torch.ones_like(matrices[:, 0, 0]) if weights is None else weights
+        mean = (matrices * (share / share.sum())[:, None, None]).sum(0)
+        return mean.expand_as(matrices).clone()
+    diagonal = matrices.diagonal(dim1=-2, dim2=-1)
+    if covariance_type == "spherical":
+        diagonal = diagonal.mean(-1, keepdim=True).expand_as(diagonal)
+    return torch.diag_embed(diagonal)
+
+
+def compact(matrices: Tensor, covariance_type: str) -> Tensor:
+    """The distinct entries of matrices (K, D, D) of the type, in the shape of scikit-learn's attributes."""
+    if covariance_type == "full":
+        return matrices
+    if covariance_type == "tied":
+        return matrices[0]
+    diagonal = matrices.diagonal(dim1=-2, dim2=-1)
+    return (diagonal if covariance_type == "diag" else diagonal[:, 0]).clone()
+
+
+def expand(values: Tensor, covariance_type: str, n_components: int, dim: int) -> Tensor:
+    """Matrices (K, D, D) from their distinct entries: the inverse of `compact`."""
+    if covariance_type == "full":
+        return values
+    if covariance_type == "tied":
+        return values.expand(n_components, dim, dim).clone()
+    columns = values if covariance_type == "diag" else values[:, None]
+    return torch.diag_embed(columns.expand(n_components, dim))
+
+
+def type_shape(covariance_type: str, n_components: int, dim: int) -> tuple[int, ...]:
+    """The shape of `compact`."""
+    k = n_components
+    return {"full": (k, dim, dim), "tied": (dim, dim), "diag": (k, dim), "spherical": (k,)}[covariance_type]
+
+
+def count_free_entries(covariance_type: str, n_components: int, dim: int) -> int:
+    """Number of free parameters of the covariances."""
+    k, symmetric = n_components, dim * (dim + 1) // 2
+    return {"full": k * symmetric, "tied": symmetric, "diag": k * dim, "spherical": k}[covariance_type]
+
+
+def check_type(covariances: Tensor, covariance_type: str) -> Tensor:
+    """Returns covariances (K, D, D). Raises `InvalidArgumentError` unless they are of the type."""
+    difference = (constrain(covariances, covariance_type) - covariances).abs()
+    if bool((difference > 1e-9 * covariances.abs().amax()).any()):
+        raise InvalidArgumentError(
+            f"covariance_type={covariance_type!r}, but the covariances are not {covariance_type}; "
+            "set covariance_type='full'."
+        )
+    return covariances

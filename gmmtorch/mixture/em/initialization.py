@@ -16,16 +16,9 @@ from torch import Tensor
 
 from gmmtorch.linalg import argsort
 from gmmtorch.mixture.em import by_type
-from gmmtorch.mixture.em.cells import pool_into_cells
-from gmmtorch.mixture.em.covariance_types import type_shape
-from gmmtorch.mixture.em.exact import (
-    Parameters,
-    feature_dimension,
-    maximization,
-    quadratic_features,
-    shift_features,
-)
-from gmmtorch.mixture.em.partition import FlatnessRule, partition, pool, surface_rule
+from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em.exact import Parameters
+from gmmtorch.mixture.em.partition import FlatnessRule, partition, pool, pool_into_cells, surface_rule
 
 _FEWEST_CELLS, _CELLS_OF_A_COMPONENT = 4096, 8  # lower limits of the cells for flat pieces
 _FINEST_CELLS = 1 << 14  # along the longest side
@@ -79,9 +72,8 @@ def from_kmeans(
     if points.shape[1] > 3:
         found = by_type.moments_of_labels(points, weight, labels, n_components, kind)
         return by_type.maximized(found, reg_covar, None, kind)
-    return by_type.compacted(
-        moments_of(quadratic_features(points), weight, labels, n_components, reg_covar, points), kind
-    )
+    found = moments_of(em.quadratic_features(points), weight, labels, n_components, reg_covar, points)
+    return by_type.compacted(found, kind)
 
 
 def from_random_points(
@@ -153,7 +145,7 @@ def _isotropic(means: Tensor, variance: Tensor | float, kind: str) -> Parameters
     """Components of equal weight and variance at the means (K, D)."""
     k, dim = means.shape
     weights = means.new_full((k,), 1 / k)
-    values = means.new_ones(type_shape(kind, k, dim)) * variance
+    values = means.new_ones(em.type_shape(kind, k, dim)) * variance
     if kind in ("full", "tied"):
         values *= torch.eye(dim, dtype=means.dtype, device=means.device)
     return Parameters(weights, means, values)
@@ -189,14 +181,9 @@ def surface_pieces(
 ) -> tuple[Parameters, Tensor]:
     """As many components as the cloud has flat pieces, and the component (N,) of each point (N, D).
 
-    The cloud is partitioned by `surface_rule`. Outliers aside, there are at most as many components as
-    the total weight divided by `least_support`.
-
-    Args:
-        points: (N, D), centred, float64; or the means of cells with mean `features` (N, F).
-        weight: (N,) number of points that each row stands for; a component needs enough of them.
-        noise: standard deviation of the sensor, in the unit of the points.
-        reg_covar: added to each variance, in the squared unit of the points.
+    The cloud, centred, is partitioned by `surface_rule`. Outliers aside, there are at most as many
+    components as the total weight divided by `least_support`. `noise`: standard deviation of the sensor, in
+    the unit of the points. The points may be the means of cells, with mean `features` (N, F).
     """
     rule = surface_rule(noise, points.shape[1])
     return partition_components(rule, points, weight, reg_covar, _SURFACE_CELLS, noise, features)
@@ -220,7 +207,7 @@ def partition_components(
     if features is not None:
         mass, member = weight, None
     elif dim > 3 or points.shape[0] < 2 * n_cells:
-        features, mass, member, exact = quadratic_features(points), weight, None, points
+        features, mass, member, exact = em.quadratic_features(points), weight, None, points
     else:
         features, mass, member = pool_into_cells(points, n_cells, finest, weight)
     pieces = partition(features[:, 1 : 1 + dim].contiguous(), mass, rule, features)
@@ -241,13 +228,13 @@ def moments_of(
     Pass `points` (N, D) if the features are those of points: far from the origin, points have digits that
     their products lack.
     """
-    dim = feature_dimension(features.shape[1])
+    dim = em.feature_dimension(features.shape[1])
     sums = pool(features[:, : 1 + dim], weight, labels, n_components)
     means = sums[:, 1:] / sums[:, :1].clamp_min(1e-300)
     # Second moments are taken about each piece's own mean, because pieces may be thin and far apart.
     center = means.index_select(0, labels)
-    local = shift_features(features, -center) if points is None else quadratic_features(points - center)
-    found = maximization(pool(local, weight, labels, n_components), reg_covar)
+    local = em.shift_features(features, -center) if points is None else em.quadratic_features(points - center)
+    found = em.maximization(pool(local, weight, labels, n_components), reg_covar)
     return Parameters(found.weights, means + found.means, found.covariances)
 
 

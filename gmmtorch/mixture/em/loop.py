@@ -1,9 +1,10 @@
-"""The loop of EM, and its exact steps."""
+"""The loop of EM, its exact steps, and steps that take a batch of points each."""
 
 from __future__ import annotations
 
 import functools
 import math
+import numbers
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Generic, TypeVar
@@ -11,14 +12,14 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import NumericalError
+from gmmtorch.errors import InvalidArgumentError, NumericalError, check_number
 from gmmtorch.kernels import in_spatial_order
 from gmmtorch.mixture.em import by_type, exact
-from gmmtorch.mixture.em.covariance_types import compact, constrain, expand
-from gmmtorch.mixture.em.exact import Parameters
+from gmmtorch.mixture.em.exact import Parameters, compact, constrain, expand
+from gmmtorch.mixture.reduction import merge_pairs
 
 if TYPE_CHECKING:
-    from gmmtorch.mixture.em.grouping import Rows
+    from gmmtorch.mixture.em.truncated import Rows
 
 _STEPS_AHEAD = 8  # on a GPU: steps between two waits for their bounds
 State = TypeVar("State")  # what an iteration improves: `Parameters`, or a posterior
@@ -108,22 +109,22 @@ def _typed_step(
     points: Tensor, sample_weight: Tensor, reg_covar: float, softmax_dtype: torch.dtype, kind: str
 ) -> Step[Parameters]:
     """EM steps with the arithmetic of the covariance type; direct ones from the first that loses digits."""
-    total = sample_weight.sum()
-    direct = [False]
+    total, direct = sample_weight.sum(), [False]
 
-    given = points, sample_weight
+    def gather(factors: by_type.Factors) -> by_type.Gather:
+        return functools.partial(by_type.expected_moments, points, sample_weight, factors, softmax_dtype)
 
     def step(parameters: Parameters) -> tuple[Parameters, Tensor]:
         k, dim = parameters.means.shape
         linear = by_type.has_linear_form(k, dim, kind) and not direct[0]
         factors = by_type.Factors(parameters, kind, check=False)
-        found = by_type.em_step(*given, factors, softmax_dtype, reg_covar, parameters, linear)
+        found = by_type.em_step(gather(factors), factors, reg_covar, parameters, linear)
         return found.parameters, (found.value / total).masked_fill(found.lost, math.nan)
 
     def checked(parameters: Parameters) -> tuple[Parameters, float]:
         direct[0] = True
         factors = by_type.Factors(parameters, kind)
-        found = by_type.exact_step(*given, factors, softmax_dtype, reg_covar, parameters)
+        found = by_type.exact_step(gather(factors), factors, reg_covar, parameters)
         bound = float(found.value / total)
         if not math.isfinite(bound):
             raise NumericalError(
@@ -227,3 +228,67 @@ def of_type(parameters: Parameters, covariance_type: str) -> Parameters:
     """The parameters with the nearest covariances (K, D, D) of the type (see `covariance_types`)."""
     covariances = constrain(parameters.covariances, covariance_type, parameters.weights)
     return parameters._replace(covariances=covariances)
+
+
+# -- stepwise EM ----------------------------------------------------------------------------------
+
+
+def step_size(batch: float, seen: float, kappa: float) -> float:
+    """η = (n / (m + n))^κ, for a batch of weight n after points of weight m.
+
+    For batches of equal size η is (t + 1)^−κ, t = 0, 1, …: Liang & Klein's (t + 2)^−κ after a first batch
+    with η = 1. With κ = 1 every point counts equally, in batches of any size.
+    """
+    return float((batch / (seen + batch)) ** kappa)
+
+
+def blend(previous: Parameters, update: Parameters, step: float, kind: str = "full") -> Parameters:
+    """The M-step on (1 − η) S + η s, η = `step`, where `previous` and `update` are the parameters of S and s.
+
+    S are the running statistics, and s those of the batch, a point (Cappé & Moulines, 2009; Liang & Klein,
+    2009). Weights, means and covariances are equivalent to S, so no statistics are stored: each update
+    merges, component by component, the mixture with the result of one EM step on the batch. Nothing
+    cancels at any distance from the origin, and covariances stay positive definite.
+
+    `update` is an EM step from `previous`, in the same frame. The regularisation variance, which is part
+    of both, is in the result once. Covariances have the shape of their type, `kind`.
+    """
+    first = previous._replace(weights=(1 - step) * previous.weights)
+    second = update._replace(weights=step * update.weights)
+    if kind == "full":
+        return merge_pairs(first, second)
+    weights = first.weights + second.weights
+    share = torch.where(weights > 0, second.weights / weights, 0.5)[:, None]
+    offset = second.means - first.means
+    means = first.means + share * offset
+    if kind == "tied":
+        between = (weights[:, None] * share * (1 - share) * offset).T @ offset
+        within = first.weights.sum() * first.covariances + second.weights.sum() * second.covariances
+        return Parameters(weights, means, (within + between) / weights.sum())
+    square = offset.square()
+    if kind == "spherical":
+        share, square = share[:, 0], square.mean(1)
+    covariances = (1 - share) * first.covariances + share * second.covariances + (1 - share) * share * square
+    return Parameters(weights, means, covariances)
+
+
+def weight_of_past(seen: float | None, memory: float | None) -> float:
+    """Number of points that the current mixture counts as: `seen` (None: unknown), at most `memory`.
+
+    Raises `InvalidArgumentError` for an invalid memory, or memory=None if `seen` is unknown.
+    """
+    if memory is None:
+        if seen is None:
+            raise InvalidArgumentError(
+                "memory=None, but the number of points that this mixture stands for is unknown; pass memory, "
+                "the number of points that it counts as."
+            )
+        return seen
+    check_number("memory", memory)
+    return float(memory) if seen is None else min(seen, float(memory))
+
+
+def check_kappa(kappa: object) -> None:
+    """Raise `InvalidArgumentError` unless 0.5 < κ ≤ 1, for which the steps of `step_size` converge."""
+    if not isinstance(kappa, numbers.Real) or not 0.5 < float(kappa) <= 1:
+        raise InvalidArgumentError(f"kappa={kappa!r} must be above 0.5 and at most 1.")

@@ -1,4 +1,4 @@
-"""Partition of a cloud into flat pieces: the number of components, and the start of EM.
+"""A cloud in parts: flat pieces, which give the number of components and the start of EM, and cells.
 
 A piece is halved at its mean, across its longest direction, while it is thicker than the sensor's
 noise explains, or longer than a component may be, and both halves keep enough points. All pieces of
@@ -15,28 +15,27 @@ compares this rule with BIC and mean shift.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels import CutRule, are_piece_cuts_fused, piece_cuts
-from gmmtorch.linalg import on_cpu, unpack_symmetric
+from gmmtorch.kernels import KEY_BITS, CutRule, are_piece_cuts_fused, cell_moments, is_fused, piece_cuts
+from gmmtorch.linalg import dense_ranks, on_cpu, unpack_symmetric
 from gmmtorch.mixture.em.exact import quadratic_features
 
 _MAX_LEVELS = 64
-_MOST_ON_CPU = 1 << 17
-"""Cells of another device that are cut on the CPU: each level of cuts waits for the one before it."""
+_MOST_ON_CPU = 1 << 17  # cells of another device: each level of cuts waits for the one before it
 _THICKNESS_PRIORITY = 30.0
 """Weight of a piece's smallest variance, relative to its largest, in the priority of halving it. Thick
 pieces span several surfaces, and so put matter into free space (BENCHMARKS.md, "Where EM starts")."""
-
-_FLAT = 2.0
-"""Largest thickness of a flat piece, in standard deviations of the noise."""
-
-_OUTLIER_GAP = 100.0
-"""Distance from which on a few stray points form a piece, in standard deviations of the noise."""
+_FLAT = 2.0  # largest thickness of a flat piece, in standard deviations of the noise
+_OUTLIER_GAP = 100.0  # from which on a few stray points form a piece, in standard deviations
+_MAX_CELLS_ALONG = (1 << KEY_BITS) - 2  # along the longest side
+_CHUNK_POINTS = 1 << 17
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ class FlatnessRule:
     largest standard deviation is larger is too long. min_weight: smallest weight of a half.
     min_weight_thick: smallest weight of a half of a piece of over twice the thickness, which spans several
     surfaces. max_components: largest number of pieces; then at most half of the pieces are halved per
-    level, in the order of `_split_priority`. outlier_gap: a half may have any weight if it is farther
+    level, heavy, long and above all thick ones first. outlier_gap: a half may have any weight if farther
     than this from the other half (m), as outliers are.
     """
 
@@ -107,7 +106,10 @@ def partition(
         found = partition(points_cpu, weight_cpu, rule, features_cpu)
         return found._replace(labels=found.labels.to(points.device))
     if are_piece_cuts_fused(points, weight, features):
-        return Partition(*piece_cuts(points, weight, features, _cut_rule(rule)))
+        limit = -1 if rule.max_components is None else rule.max_components
+        given = vars(rule) | {"n_levels": _MAX_LEVELS, "max_components": limit}
+        cuts = CutRule(**given, thickness_priority=_THICKNESS_PRIORITY)
+        return Partition(*piece_cuts(points, weight, features, cuts))
     labels = torch.zeros(n, dtype=torch.int64, device=points.device)
     n_pieces = 1
     for _ in range(_MAX_LEVELS):
@@ -127,7 +129,8 @@ def partition(
         beyond = along > 0
         supported = _is_supported(along, labels, weight, n_pieces, least, rule.outlier_gap)
         cut = wanted & supported & (count >= 2 * least) & (deviation[:, -1] > 0)
-        cut = _limit_splits(cut, _split_priority(count, variances), n_pieces, rule.max_components)
+        priority = count * (variances[:, -1] + _THICKNESS_PRIORITY * variances[:, 0].clamp_min(0))
+        cut = _limit_splits(cut, priority, n_pieces, rule.max_components)
         n_new = int(cut.sum())
         if n_new == 0:
             break
@@ -135,24 +138,6 @@ def partition(
         labels = torch.where(cut[labels] & beyond, new_label[labels], labels)
         n_pieces += n_new
     return Partition(labels, n_pieces)
-
-
-def _cut_rule(rule: FlatnessRule) -> CutRule:
-    return CutRule(
-        n_levels=_MAX_LEVELS,
-        max_components=-1 if rule.max_components is None else rule.max_components,
-        thickness=rule.thickness,
-        length=rule.length,
-        min_weight=rule.min_weight,
-        min_weight_thick=rule.min_weight_thick,
-        outlier_gap=rule.outlier_gap,
-        thickness_priority=_THICKNESS_PRIORITY,
-    )
-
-
-def _split_priority(count: Tensor, variances: Tensor) -> Tensor:
-    """Priority (n,) of halving pieces with weights (n,) and ascending variances (n, D)."""
-    return count * (variances[:, -1] + _THICKNESS_PRIORITY * variances[:, 0].clamp_min(0))
 
 
 def _limit_splits(cut: Tensor, priority: Tensor, n_pieces: int, limit: int | None) -> Tensor:
@@ -189,3 +174,80 @@ def _is_supported(
     gap = mean[:, 1] - mean[:, 0]
     is_outlier = (gap > outlier_gap) & (gap > 6 * deviation)
     return (count.amin(1) > 0) & ((count.amin(1) >= least) | is_outlier)
+
+
+# -- cells ----------------------------------------------------------------------------------------
+
+
+class Cells(NamedTuple):
+    """features (C, F): mean feature of each cell; weight (C,): its points; member (N,): cell of each
+    point.
+    """
+
+    features: Tensor
+    weight: Tensor
+    member: Tensor
+
+
+def pool_into_cells(points: Tensor, max_cells: int, finest: float, weight: Tensor | None = None) -> Cells:
+    """Sum centred points (N, D), float64, D ≤ 3, into at most `max_cells` cubic cells of one size.
+
+    The cost of EM on cells depends on their number, not on that of the points (see `exact`).
+
+    The cells have side `finest` (m; the sensor's noise is a good choice). If that gives too many cells,
+    the side grows in steps of a third of an octave until the limit holds. At most `max_cells` points are
+    not pooled. `weight` (N,): number of points that each row stands for, above zero; default one.
+    """
+    n = points.shape[0]
+    weight = points.new_ones(n) if weight is None else weight
+    if n <= max_cells:
+        return Cells(quadratic_features(points), weight, torch.arange(n, device=points.device))
+    low = points.amin(0)
+    extent = (points.amax(0) - low).max()
+    side = (extent / _MAX_CELLS_ALONG).clamp_min(finest)
+    side = torch.where(side > 0, side, 1.0)  # equal points share one cell
+
+    def pooled(thirds: int) -> tuple[Tensor, Tensor] | None:
+        """Sums and members of cells of side · 2^(thirds/3); None if there are too many cells."""
+        factor = 2 ** (-thirds / 3)
+        if points.device.type == "cpu" and is_fused(points, weight):
+            return cell_moments(points, weight, low, float(side), factor, max_cells)
+        return _sums_by_key(points, weight, ((points - low) / side * factor).long(), max_cells)
+
+    found = pooled(0)
+    if found is None:
+        one_cell = 3 * math.ceil(math.log2(float(extent / side) + 2))
+        found = coarsest_allowed(pooled, one_cell)[1]
+    sums, member = found
+    return Cells(sums / sums[:, :1], sums[:, 0].clone(), member)
+
+
+def coarsest_allowed(pooled: Callable[[int], T | None], enough: int) -> tuple[int, T]:
+    """The least step from 1 to `enough` that has a result, and the result, by bisection. Step 0 has none."""
+    too_fine, best = 0, None
+    while enough - too_fine > 1:
+        middle = (too_fine + enough) // 2
+        found = pooled(middle)
+        if found is None:
+            too_fine = middle
+        else:
+            enough, best = middle, found
+    best = best or pooled(enough)
+    assert best is not None
+    return enough, best
+
+
+def _sums_by_key(
+    points: Tensor, weight: Tensor, cells: Tensor, max_cells: int
+) -> tuple[Tensor, Tensor] | None:
+    """The twin of `kernels.mixtures.cell_moments`: sums (C, F) over equal cells, and each point's cell."""
+    key = cells[:, 0]
+    for axis in range(1, cells.shape[1]):
+        key = key << KEY_BITS | cells[:, axis]
+    member, n_cells = dense_ranks(key)
+    if n_cells > max_cells:
+        return None
+    sums = points.new_zeros(n_cells, quadratic_features(points[:1]).shape[1])
+    for part, cell, p in zip(*(t.split(_CHUNK_POINTS) for t in (points, member, weight)), strict=True):
+        sums.index_add_(0, cell, quadratic_features(part) * p[:, None])
+    return sums, member

@@ -1,36 +1,73 @@
-"""VariationalGaussianMixture: a posterior over mixtures, in which unneeded components lose their weight."""
+"""VariationalGaussianMixture: a posterior over mixtures, in which unneeded components lose their weight.
+
+    p(μ_k, Λ_k) = N(μ_k | m₀, (β₀Λ_k)⁻¹) Wishart(Λ_k | W₀, ν₀)
+    p(π)        = Dirichlet(γ₀, …, γ₀), or for a Dirichlet process π_k = v_k Π_{j<k} (1 − v_j) with
+                  sticks v_k ~ Beta(1, γ₀)
+
+Given the moments of each component's points, the posterior has the same form (`update`). Its expected
+log-density is that of Gaussians with modified weights (`expected_log_density`), so variational Bayes
+uses the E-step of EM, see `variational_step` (Bishop, 2006, section 10.2; Blei & Jordan, 2006).
+"""
 
 from __future__ import annotations
 
+import functools
+import math
 from collections.abc import Mapping
+from dataclasses import KW_ONLY, dataclass
 from numbers import Integral
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from sklearn.utils._param_validation import Interval, StrOptions
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.linalg import check_symmetric, safe_cholesky
+from gmmtorch.kernels import chunk_elements
+from gmmtorch.linalg import check_symmetric, inverse_factor, safe_cholesky
 from gmmtorch.mixture.density import NotFittedError
+from gmmtorch.mixture.em import by_type, loop
 from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em.covariance_types import COVARIANCE_TYPES, compact, constrain, expand, type_shape
-from gmmtorch.mixture.em.exact import Parameters
+from gmmtorch.mixture.em.exact import (
+    COVARIANCE_TYPES,
+    LOG_2PI,
+    Parameters,
+    compact,
+    constrain,
+    expand,
+    type_shape,
+)
 from gmmtorch.mixture.em.initialization import initialize
 from gmmtorch.mixture.em.loop import EMResult, OnIteration, run_em
 from gmmtorch.mixture.estimator import ABOVE_ZERO, COUNT, Cloud, MixtureEstimator
-from gmmtorch.mixture.estimators.gaussian_wishart import (
-    Posterior,
-    Prior,
-    expected_weights,
-    log_predictive,
-    unbiased_covariance,
-    update,
-    variational_step,
-)
 from gmmtorch.mixture.validation import Array, RandomState, as_generator, checked_parameter
 
 WEIGHT_PRIORS = ("dirichlet_process", "dirichlet_distribution")
+
+
+class Prior(NamedTuple):
+    """γ₀ (), β₀ (), m₀ (D,), ν₀ () and W₀⁻¹ (D, D); a typical covariance is W₀⁻¹/ν₀."""
+
+    concentration: Tensor
+    mean_precision: Tensor
+    mean: Tensor
+    degrees_of_freedom: Tensor
+    covariance: Tensor
+
+
+class Posterior(NamedTuple):
+    """Posterior of K components.
+
+    concentration: (2, K) the Beta parameters of the sticks, or (1, K) the Dirichlet parameters.
+    mean_precision: β (K,), the number of points that determine each mean. means: m (K, D).
+    degrees_of_freedom: ν (K,). covariances: W⁻¹/ν (K, D, D), the inverse of the expected precision.
+    """
+
+    concentration: Tensor
+    mean_precision: Tensor
+    means: Tensor
+    degrees_of_freedom: Tensor
+    covariances: Tensor
 
 
 def _posterior_attribute(buffer: str, doc: str) -> Any:
@@ -44,6 +81,7 @@ def _posterior_attribute(buffer: str, doc: str) -> Any:
     return property(read, doc=doc)
 
 
+@dataclass(eq=False, repr=False)
 class VariationalGaussianMixture(MixtureEstimator):
     """Variational Bayes of a mixture (thesis 2.1.5; Bishop, 2006, section 10.2).
 
@@ -111,64 +149,35 @@ class VariationalGaussianMixture(MixtureEstimator):
         "verbose": ["verbose"],
         "verbose_interval": [COUNT],
     }
-    concentration: Tensor
-    mean_precision: Tensor
-    degrees_of_freedom: Tensor
-    prior_covariance: Tensor
-    prior_mean_precision: Tensor
+    concentration: ClassVar[Tensor]  # buffers, which only a fitted mixture has
+    mean_precision: ClassVar[Tensor]
+    degrees_of_freedom: ClassVar[Tensor]
+    prior_covariance: ClassVar[Tensor]
+    prior_mean_precision: ClassVar[Tensor]
 
-    def __init__(
-        self,
-        n_components: int = 1,
-        *,
-        covariance_type: str = "full",
-        tol: float = 1e-3,
-        reg_covar: float = 1e-6,
-        max_iter: int = 100,
-        n_init: int = 1,
-        init_params: str = "kmeans",
-        weight_concentration_prior_type: str = "dirichlet_process",
-        weight_concentration_prior: float | None = None,
-        mean_precision_prior: float | None = None,
-        mean_prior: Array | None = None,
-        degrees_of_freedom_prior: float | None = None,
-        covariance_prior: Array | None = None,
-        random_state: RandomState = None,
-        dtype: str = "float32",
-        warm_start: bool = False,
-        verbose: int = 0,
-        verbose_interval: int = 10,
-    ) -> None:
-        self.n_components = n_components
-        self.covariance_type = covariance_type
-        self.tol = tol
-        self.reg_covar = reg_covar
-        self.max_iter = max_iter
-        self.n_init = n_init
-        self.init_params = init_params
-        self.weight_concentration_prior_type = weight_concentration_prior_type
-        self.weight_concentration_prior = weight_concentration_prior
-        self.mean_precision_prior = mean_precision_prior
-        self.mean_prior = mean_prior
-        self.degrees_of_freedom_prior = degrees_of_freedom_prior
-        self.covariance_prior = covariance_prior
-        self.random_state = random_state
-        self.dtype = dtype
-        self.warm_start = warm_start
-        self.verbose = verbose
-        self.verbose_interval = verbose_interval
+    n_components: int = 1
+    _: KW_ONLY
+    covariance_type: str = "full"
+    tol: float = 1e-3
+    reg_covar: float = 1e-6
+    max_iter: int = 100
+    n_init: int = 1
+    init_params: str = "kmeans"
+    weight_concentration_prior_type: str = "dirichlet_process"
+    weight_concentration_prior: float | None = None
+    mean_precision_prior: float | None = None
+    mean_prior: Array | None = None
+    degrees_of_freedom_prior: float | None = None
+    covariance_prior: Array | None = None
+    random_state: RandomState = None
+    dtype: str = "float32"
+    warm_start: bool = False
+    verbose: int = 0
+    verbose_interval: int = 10
 
     # -- learning ---------------------------------------------------------------------------------
 
-    def fit(
-        self,
-        X: Array,
-        y: Any = None,
-        sample_weight: Array | None = None,
-        on_iteration: OnIteration | None = None,
-    ) -> VariationalGaussianMixture:
-        """Compute the posterior given points X (N, D). Arguments and errors: see `MixtureEstimator.fit`."""
-        cloud = self._prepare(X, sample_weight)
+    def _learn(self, cloud: Cloud, on_iteration: OnIteration | None) -> None:
         prior = self._prior(cloud)
         generator = as_generator(self.random_state)
         step = variational_step(
@@ -193,15 +202,12 @@ class VariationalGaussianMixture(MixtureEstimator):
 
         best = self._best_start(run, on_iteration)
         posterior = best.parameters
-        mixture = Parameters(
-            expected_weights(posterior.concentration), posterior.means, posterior.covariances
-        )
+        weights = expected_weights(posterior.concentration)
+        mixture = Parameters(weights, posterior.means, posterior.covariances)
         extra = {name: getattr(posterior, name) for name in self._extra_names[:3]}
         extra |= {f"prior_{name}": value for name, value in prior._asdict().items()}
         extra["prior_mean"] = prior.mean + cloud.center
         self._store_fit(mixture, cloud.center, best.lower_bounds, best.converged, extra)
-        self._warn_unless_converged()
-        return self
 
     def _continues(self) -> bool:
         return super()._continues() and "concentration" in self._buffers
@@ -316,12 +322,8 @@ class VariationalGaussianMixture(MixtureEstimator):
 
     def _set_extra(self, tensors: Mapping[str, Tensor]) -> None:
         k, dim = self.means.shape
-        shapes = {
-            "mean_precision": (k,),
-            "degrees_of_freedom": (k,),
-            "prior_mean": (dim,),
-            "prior_covariance": (dim, dim),
-        }
+        shapes: dict[str, tuple[int, ...]] = {"mean_precision": (k,), "degrees_of_freedom": (k,)}
+        shapes |= {"prior_mean": (dim,), "prior_covariance": (dim, dim)}
         for name in self._extra_names if tensors else ():
             if name not in tensors:
                 raise InvalidArgumentError(f"The posterior lacks {name}; pass all of its tensors, or none.")
@@ -343,3 +345,235 @@ class VariationalGaussianMixture(MixtureEstimator):
             extra["prior_mean"] = rotation @ extra["prior_mean"] + translation
             extra["prior_covariance"] = rotation @ extra["prior_covariance"] @ rotation.T
         return extra
+
+
+# -- the posterior, given moments -----------------------------------------------------------------
+
+
+def unbiased_covariance(points: Tensor, weight: Tensor, thickness: float) -> Tensor:
+    """Covariance (D, D) of points whose mean is the origin.
+
+    In directions in which the points are flat, the variance is `thickness` (m²) instead of zero.
+    """
+    total = float(weight.sum())
+    # No unbiased estimate exists below two points; W/2 continues W − 1 continuously.
+    covariance = (points * weight[:, None]).T @ points / max(total - 1, total / 2)
+    variances, directions = torch.linalg.eigh(covariance)
+    if float(variances[0]) > 1e-14 * float(variances[-1]):
+        return covariance
+    return (directions * variances.clamp_min(thickness)) @ directions.T
+
+
+def update(prior: Prior, moments: Parameters, process: bool, covariance_type: str = "full") -> Posterior:
+    """The posterior given the points N_k (K,) of each component, their means and their covariances.
+
+    `moments` has N_k in place of weights. process: whether the weights have a Dirichlet process prior.
+    Bishop (10.58)–(10.63); Blei & Jordan (18)–(19). For other types than full covariances, the Wishart
+    factors are the best ones whose scale matrix is of the type: tied ones are equal.
+    """
+    count, mean, covariance = moments
+    mean_precision = prior.mean_precision + count
+    degrees_of_freedom = prior.degrees_of_freedom + count
+    offset = mean - prior.mean
+    pull = count * prior.mean_precision / mean_precision
+    scatter = prior.covariance + count[:, None, None] * covariance
+    scatter = scatter + pull[:, None, None] * offset[:, :, None] * offset[:, None, :]
+    scatter = constrain(scatter, covariance_type)
+    if covariance_type == "tied":
+        degrees_of_freedom = degrees_of_freedom.mean().expand_as(degrees_of_freedom).clone()
+    if process:  # 1 + N_k for taking stick k, and γ₀ + Σ_{j>k} N_j for passing it
+        later = torch.cat([count.flip(0).cumsum(0).flip(0)[1:], count.new_zeros(1)])
+        concentration = torch.stack([1 + count, prior.concentration + later])
+    else:
+        concentration = (prior.concentration + count)[None]
+    return Posterior(
+        concentration,
+        mean_precision,
+        (prior.mean_precision * prior.mean + count[:, None] * mean) / mean_precision[:, None],
+        degrees_of_freedom,
+        scatter / degrees_of_freedom[:, None, None],
+    )
+
+
+def expected_weights(concentration: Tensor) -> Tensor:
+    """E[π] (K,). For a Dirichlet process, the expected weights of the K sticks, scaled to add up to one."""
+    if concentration.shape[0] == 1:
+        return concentration[0] / concentration.sum()
+    share = concentration / concentration.sum(0)
+    passed = torch.cat([share.new_ones(1), share[1].cumprod(0)[:-1]])
+    return share[0] * passed / (share[0] * passed).sum()
+
+
+def expected_log_weights(concentration: Tensor) -> Tensor:
+    """E[log π] (K,). Bishop (10.66); for sticks E[log v_k] + Σ_{j<k} E[log(1 − v_j)]."""
+    expected = torch.digamma(concentration)
+    if concentration.shape[0] == 1:
+        return expected[0] - torch.digamma(concentration.sum())
+    expected = expected - torch.digamma(concentration.sum(0))
+    return expected[0] + torch.cat([expected.new_zeros(1), expected[1].cumsum(0)[:-1]])
+
+
+def expected_log_density(posterior: Posterior) -> tuple[Tensor, Parameters]:
+    """ω (K,) and Gaussians such that E[log π_k + log N(x | μ_k, Λ_k⁻¹)] = ω_k + log N(x | m_k, Σ_k).
+
+    Σ = E[Λ]⁻¹, and ω is E[log π] + ½(E[log|Λ|] − log|E[Λ]|) − D/2β. Bishop (10.64)–(10.66).
+    """
+    dim = posterior.means.shape[1]
+    dof = posterior.degrees_of_freedom
+    steps = torch.arange(dim, dtype=dof.dtype, device=dof.device)
+    log_det = torch.digamma(0.5 * (dof[:, None] - steps)).sum(1) - dim * torch.log(0.5 * dof)
+    weight = expected_log_weights(posterior.concentration)
+    weight = weight + 0.5 * (log_det - dim / posterior.mean_precision)
+    # Log-weights a million nats below the largest have no effect, but must not be infinite.
+    weight = weight.clamp_min(float(weight.max()) - 1e6)
+    return weight, Parameters(torch.ones_like(weight), posterior.means, posterior.covariances)
+
+
+def assigned_log_density(moments: Parameters, log_weight: Tensor, gaussians: Parameters) -> Tensor:
+    """Σ_n Σ_k γ_nk (ω_k + log N(x_n | m_k, Σ_k)), a scalar, of points with moments (N_k, x̄_k, S_k)."""
+    count, mean, covariance = moments
+    factors = safe_cholesky(gaussians.covariances)
+    whiten = inverse_factor(factors)
+    offset = mean - gaussians.means
+    second = covariance + offset[:, :, None] * offset[:, None, :]
+    squared = (whiten @ whiten.transpose(-2, -1) * second).sum((1, 2))
+    half_log_det = torch.log(factors.diagonal(dim1=-2, dim2=-1)).sum(1)
+    return (count * (log_weight - half_log_det - 0.5 * (mean.shape[1] * LOG_2PI + squared))).sum()
+
+
+def log_evidence(prior: Prior, posterior: Posterior, n_points: float) -> Tensor:
+    """log p(X | assignments) + log p(assignments), nats, of the points that `posterior` includes.
+
+    The ratio of the normalisers of posterior and prior, times (2π)^(−ND/2). Plus the entropy of the
+    responsibilities, it is the lower bound of log p(X) once q(θ) is optimal for them. For sticks it is that
+    of the whole process: components beyond the K-th have no points and equal the prior.
+    """
+    dim = prior.mean.shape[0]
+    scatter = posterior.covariances * posterior.degrees_of_freedom[:, None, None]
+    components = _log_wishart(posterior.degrees_of_freedom, scatter)
+    components = components - _log_wishart(prior.degrees_of_freedom[None], prior.covariance[None])
+    components = components + 0.5 * dim * torch.log(prior.mean_precision / posterior.mean_precision)
+    sticks = posterior.concentration
+    if sticks.shape[0] == 2:
+        first = torch.stack([torch.ones_like(prior.concentration), prior.concentration])[:, None]
+        weights = (_log_dirichlet(sticks) - _log_dirichlet(first)).sum()
+    else:
+        weights = _log_dirichlet(sticks[0]) - _log_dirichlet(prior.concentration.expand(sticks.shape[1]))
+    return components.sum() + weights - 0.5 * n_points * dim * LOG_2PI
+
+
+def _log_wishart(degrees_of_freedom: Tensor, scatter: Tensor) -> Tensor:
+    """log ∫ |Λ|^((ν−D−1)/2) exp(−½ tr W⁻¹Λ) dΛ (K,), with scatter W⁻¹ (K, D, D). Bishop (B.79)."""
+    dim = scatter.shape[-1]
+    log_det = 2 * torch.log(safe_cholesky(scatter).diagonal(dim1=-2, dim2=-1)).sum(1)
+    half = 0.5 * degrees_of_freedom
+    return half * (dim * math.log(2) - log_det) + torch.mvlgamma(half, dim)
+
+
+def _log_dirichlet(concentration: Tensor) -> Tensor:
+    """Logarithm of the multivariate beta function, over the first axis."""
+    return torch.lgamma(concentration).sum(0) - torch.lgamma(concentration.sum(0))
+
+
+def log_predictive(points: Tensor, posterior: Posterior) -> Tensor:
+    """log p(x | X) (N,) of new points (N, D): Σ_k E[π_k] Student-t(x | m_k, L_k⁻¹, ν_k + 1 − D).
+
+    The scale L_k⁻¹ is W_k⁻¹ (1 + β_k) / (β_k (ν_k + 1 − D)). Bishop (10.81)–(10.82).
+    """
+    k, dim = posterior.means.shape
+    dof = posterior.degrees_of_freedom + 1 - dim
+    ratio = posterior.degrees_of_freedom / dof * (1 + 1 / posterior.mean_precision)
+    factors = safe_cholesky(posterior.covariances * ratio[:, None, None])
+    whiten = inverse_factor(factors)
+    constant = (
+        torch.lgamma(0.5 * (dof + dim)) - torch.lgamma(0.5 * dof) - 0.5 * dim * torch.log(math.pi * dof)
+    )
+    constant = constant - torch.log(factors.diagonal(dim1=-2, dim2=-1)).sum(1)
+    constant = constant + torch.log(expected_weights(posterior.concentration))
+
+    def joint(part: Tensor) -> Tensor:
+        offset = part[:, None, :] - posterior.means
+        squared = torch.einsum("nkd,kde->nke", offset, whiten).square().sum(-1)
+        return constant - 0.5 * (dof + dim) * torch.log1p(squared / dof)
+
+    rows = max(1, chunk_elements(points.device) // k)
+    return torch.cat([torch.logsumexp(joint(part), 1) for part in points.split(rows)])
+
+
+def variational_step(
+    points: Tensor,
+    sample_weight: Tensor,
+    prior: Prior,
+    process: bool,
+    reg_covar: float,
+    softmax_dtype: torch.dtype,
+    covariance_type: str = "full",
+) -> loop.Step[Posterior]:
+    """One iteration for `loop.run_em`: responsibilities given a posterior, and their posterior.
+
+    The bound (nats per point) is that of the returned posterior. Covariances of the points of a component
+    include `reg_covar` (m²).
+    """
+    features = em.quadratic_features(points) if points.shape[1] <= 3 else None
+    total = float(sample_weight.sum())
+    eye = torch.eye(points.shape[1], dtype=points.dtype, device=points.device)
+
+    def step(posterior: Posterior) -> tuple[Posterior, float]:
+        log_weight, gaussians = expected_log_density(posterior)
+        given = (points, sample_weight, log_weight, gaussians, reg_covar, softmax_dtype)
+        if features is None:
+            found, value = _typed_moments(*given, covariance_type)
+        else:
+            found, value = _expected_moments(features, *given)
+        new = update(prior, found, process, covariance_type)
+        plain = found._replace(covariances=found.covariances - reg_covar * eye)
+        entropy = value - assigned_log_density(plain, log_weight, gaussians)
+        return new, float(entropy + log_evidence(prior, new, total)) / total
+
+    return step
+
+
+def _expected_moments(
+    features: Tensor,
+    points: Tensor,
+    sample_weight: Tensor,
+    log_weight: Tensor,
+    gaussians: Parameters,
+    reg_covar: float,
+    softmax_dtype: torch.dtype,
+) -> tuple[Parameters, Tensor]:
+    """Moments of γ_nk ∝ exp(ω_k) N(x_n | m_k, Σ_k), and Σ_n p_n times the log of their normaliser.
+
+    Computed as two products with `features`, or directly from `points` if the products would cancel.
+    """
+    weights = torch.exp(log_weight - log_weight.max())
+    unnormalised = gaussians._replace(weights=weights)
+    if not em.is_ill_conditioned(unnormalised):
+        natural = em.natural_parameters(gaussians)
+        natural[:, 0] += log_weight
+        sums, value = em.expectation(features, sample_weight, natural, softmax_dtype)
+        found = em.maximization(sums, reg_covar)._replace(weights=sums[:, 0])
+        if not em.has_cancelled(sums, found._replace(weights=(sums[:, 0] > 1e-9).to(sums))):
+            return found, value
+    found, value = by_type.direct_step(points, sample_weight, unnormalised, reg_covar)
+    total = sample_weight.sum()
+    return found._replace(weights=found.weights * total), value + log_weight.max() * total
+
+
+def _typed_moments(
+    points: Tensor,
+    sample_weight: Tensor,
+    log_weight: Tensor,
+    gaussians: Parameters,
+    reg_covar: float,
+    softmax_dtype: torch.dtype,
+    kind: str,
+) -> tuple[Parameters, Tensor]:
+    """The same with the arithmetic of the covariance type, for many dimensions."""
+    k, dim = gaussians.means.shape
+    factors = by_type.Factors(by_type.compacted(gaussians, kind), kind)
+    factors.constant = factors.constant + log_weight
+    gather = functools.partial(by_type.expected_moments, points, sample_weight, factors, softmax_dtype)
+    found = by_type.exact_step(gather, factors, reg_covar, None, linear=True)
+    covariances = expand(found.parameters.covariances, kind, k, dim)
+    return Parameters(found.points, found.parameters.means, covariances), found.value

@@ -21,8 +21,6 @@ from gmmtorch.team.exploration import (
     TeamOptions,
     compared,
     differing,
-    keep_row,
-    kept_row,
     run_mission,
     run_trials,
 )
@@ -38,7 +36,7 @@ def explore(config: DictConfig, bars: ProgressBars, view: LiveView | None) -> Ro
     folder = run_dir()
     trial = missions.trial_of(config, folder)
     report = as_options(config.report)
-    if (row := kept_row(trial, report=report)) is not None:
+    if (row := trial.kept_row(report=report)) is not None:
         logger.info("%s has this mission already; nothing is run.", folder)
         write_results("explore", config, [row], folder)
         return row
@@ -65,7 +63,7 @@ def explore(config: DictConfig, bars: ProgressBars, view: LiveView | None) -> Ro
     (row,) = compared([row])
     write_results("explore", config, [row], folder)
     recorder.finish(mission, row)
-    keep_row(trial, row, report=report)
+    trial.keep_row(row, report=report)
     warn_of_robots_at_their_start(mission)
     return row
 

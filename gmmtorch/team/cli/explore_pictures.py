@@ -18,13 +18,11 @@ from gmmtorch.report import Board, MapImage, first_viewpoints, highest_occupancy
 from gmmtorch.team.exploration import (
     NETWORK,
     THESIS,
-    TRAJECTORIES,
     Mission,
     Snapshot,
     Snapshots,
     World,
     differing,
-    save_trajectories,
     variant_of,
 )
 from gmmtorch.team.report import (
@@ -80,7 +78,7 @@ class MissionRecorder:
         """
         paths = [torch.stack(path) for path in mission.trajectories]
 
-        save_trajectories(mission, self._folder / TRAJECTORIES)
+        mission.save_trajectories(self._folder)
         components = self._components
         if components is not None and len(components):
             made = GaussianMap.of(components, resolution=self._world.resolution, codec="quantized")

@@ -46,7 +46,7 @@ from gmmtorch.live import (
 )
 from gmmtorch.mapping import GaussianMap
 from gmmtorch.report import ProgressBars
-from gmmtorch.team.exploration import WallClock, settle, sharing_row
+from gmmtorch.team.exploration import WallClock, settle
 from gmmtorch.team.sharing import SharedMap
 
 _TABLE = "topic n_scans n_dropped n_malformed latency_median latency_p99 n_components nbytes"
@@ -215,7 +215,7 @@ def _write(
         write_trajectory(builder, folder)
         row |= {"n_components": builder.map.n_components, "nbytes": builder.map.nbytes}
     if shared is not None:
-        row["team"] = sharing_row(shared)
+        row["team"] = shared.row()
         if n_scans:
             made["team_map"] = mapper.snapshot(builder.map.codec)
     for name, one in made.items():

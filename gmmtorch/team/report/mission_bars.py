@@ -30,7 +30,7 @@ from gmmtorch.report import (
     stacked_bars,
     tick_text,
 )
-from gmmtorch.team.exploration import Interval, mean_band
+from gmmtorch.team.exploration import mean_band
 from gmmtorch.team.report.trial_groups import (
     about,
     by_framework,
@@ -52,8 +52,7 @@ class _Measure(NamedTuple):
     by_ratio: bool = False
 
 
-_MOST_ALL_PAIRS = 3
-"""Frameworks that are all compared with each other; more are compared with the first only."""
+_MOST_ALL_PAIRS = 3  # frameworks that are all compared with each other; more are compared with the first only
 _MEASURES = (
     _Measure("bytes_sent", "bytes sent", by_ratio=True),
     _Measure("t90", "t90", "s"),
@@ -71,11 +70,9 @@ def summary_bars(rows: Rows) -> Figure:
     geometric mean of the ratio, and a line at one. "none" if a seed has no value. With more than three
     frameworks, only the first is compared with the others.
 
-    Args:
-        rows: explore rows of `results.json`.
+    rows: explore rows of `results.json`.
 
-    Raises:
-        InvalidArgumentError: no row.
+    Raises `InvalidArgumentError`: no row.
     """
     groups = by_framework(rows)
     pairs = list(itertools.combinations(groups, 2))
@@ -109,8 +106,7 @@ def deviations_figure(rows: Rows) -> Figure:
     An interval that does not contain the line of no difference has the variant's colour, others are grey. A
     variant without a value for some seed has none.
 
-    Raises:
-        InvalidArgumentError: no row, or only one variant.
+    Raises `InvalidArgumentError`: no row, or only one variant.
     """
     (usual, first), *others = by_variant(rows, otherwise="framework").items()
     if not others:
@@ -156,11 +152,9 @@ def profile_figure(rows: Rows) -> Figure:
 
     The end of a bar gives the ratio of simulated to computing time.
 
-    Args:
-        rows: explore rows with `stage_seconds`.
+    rows: explore rows with `stage_seconds`.
 
-    Raises:
-        InvalidArgumentError: no row.
+    Raises `InvalidArgumentError`: no row.
     """
     costs = {framework: _milliseconds(trials) for framework, trials in by_framework(rows).items()}
     names = list(dict.fromkeys(stage for cost in costs.values() for stage in cost))
@@ -209,10 +203,11 @@ def _draw_group(
         axes.annotate(f"{len(values)} of {n_trials}", (place, values.max()), (0, 6), **look)
         axes.margins(y=0.14)  # room for the text above the highest dot
         return
-    _draw_interval(axes, place, Interval(*(float(part[0]) for part in mean_band(values[:, None]))), hue)
+    _draw_interval(axes, place, [float(part[0]) for part in mean_band(values[:, None])], hue)
 
 
-def _draw_interval(axes: Axes, place: float, interval: Interval, hue: str) -> None:
+def _draw_interval(axes: Axes, place: float, interval: Sequence[float], hue: str) -> None:
+    """Draws mean, low and high."""
     mean, low, high = interval
     axes.plot([place - 0.24, place + 0.24], [mean, mean], color=hue, linewidth=2.4)
     if math.isfinite(low):

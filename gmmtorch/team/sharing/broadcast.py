@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 import bisect
+import itertools
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from gmmtorch.errors import check_whole
 from gmmtorch.mapping import Components, spatial_order, summed
-from gmmtorch.team.sharing.messages.envelope import check_codec, within
-from gmmtorch.team.sharing.messages.message_registry import (
+from gmmtorch.simulation import DepthFrame
+from gmmtorch.team.sharing.messages.component_messages import (
     ComponentsMessage,
     CountsMessage,
-    Message,
-    decode,
     encode_components,
     encode_counts,
 )
+from gmmtorch.team.sharing.messages.datagrams import check_codec
+from gmmtorch.team.sharing.messages.message_registry import Message, decode
+from gmmtorch.team.sharing.messages.mission_messages import MOST_PARTS, PointsMessage, encode_points
 from gmmtorch.team.sharing.replica.materialized_view import Changes
 from gmmtorch.team.sharing.replica.record_keys import Intervals
 
@@ -39,7 +42,8 @@ class SendOnce:
 
     def datagrams(self, *, budget: int | None = None) -> list[bytes]:
         """The datagrams that are due, at most `budget` bytes together; the rest stays due."""
-        n = within(self._due, budget)
+        sizes = itertools.accumulate(map(len, self._due))
+        n = len(self._due) if budget is None else sum(size <= budget for size in sizes)
         sent, self._due = self._due[:n], self._due[n:]
         return sent
 
@@ -55,11 +59,9 @@ class SendOnce:
 class Broadcast(SendOnce):
     """The counterpart of `Replica` without repair of losses: for networks without losses, and to compare.
 
-    The sender holds the decoded values of its datagrams. Repeated components count once. Repeated counts are
-    added again, because nothing distinguishes them; counts of unknown components are ignored.
-
-    A robot numbers its components from 0 in each session. So teammates ignore a restarted robot until it has
-    sent more components than before.
+    The sender holds the decoded values of its datagrams. Repeated components count once; repeated counts are
+    added again, because nothing distinguishes them; counts of unknown components are ignored. A robot numbers
+    its components from 0 in each session, so teammates ignore a restarted one until it has sent more.
 
     Attributes:
         refused: number of messages that were refused: "other" (neither components nor counts), "unfit"
@@ -105,19 +107,15 @@ class Broadcast(SendOnce):
         message: the result of `decode(datagram)`, if the caller has it. Raises `DataError` for damaged data.
         """
         message = decode(datagram) if message is None else message
-        if self._is_full(message):
-            self.refused["full"] += 1
-            return False
-        return self._merge(message)
-
-    def _is_full(self, message: Message) -> bool:
-        """Whether there is no room for a message."""
         if isinstance(message, ComponentsMessage):
             n = len(message.components)
         else:
             n = len(message.counts) if isinstance(message, CountsMessage) else 0
         n_batches = len(self._batches) + len(self._gained)
-        return n > 0 and (self._n_rows + n > MOST_ROWS or n_batches >= MOST_BATCHES)
+        if n and (self._n_rows + n > MOST_ROWS or n_batches >= MOST_BATCHES):
+            self.refused["full"] += 1
+            return False
+        return self._merge(message)
 
     def _merge(self, message: Message) -> bool:
         if isinstance(message, ComponentsMessage) and not _is_fit(message.components):
@@ -185,3 +183,64 @@ def _is_fit(batch: Components) -> bool:
     """Whether a batch is 3D, of one robot, and numbered consecutively."""
     following = batch.ids[:1] + torch.stack([torch.zeros(len(batch)), torch.arange(len(batch))], 1).long()
     return batch.dim == 3 and torch.equal(batch.ids, following)
+
+
+MOST_INTERVALS = 1 << 14
+"""Intervals of received parts kept for a teammate; beyond, the oldest gaps count as received."""
+
+
+class SharedPoints(SendOnce):
+    """The points that a robot sends, and which parts of its teammates' frames have arrived. No losses are
+    repaired, so nothing is announced.
+
+    A robot numbers its frames from 0 in each session. So teammates ignore a restarted robot until its frames
+    have higher numbers than before.
+
+    Args:
+        robot: its id. size: robots of the team.
+
+    Attributes:
+        refused: messages of points that were not merged: "stranger" (not from a teammate), "repeated"
+            (received before, or so late that this is no longer known).
+    """
+
+    def __init__(self, robot: int, size: int) -> None:
+        super().__init__()
+        self.refused: Counter[str] = Counter()
+        self._robot, self._size = robot, size
+        self._n_frames = 0
+        self._received: dict[int, Intervals] = {}  # parts of frames, by sender
+
+    def add(self, frame: DepthFrame, novel: Tensor) -> list[bytes]:
+        """Queues the novel beams (N,) bool of the next frame; returns the datagrams."""
+        datagrams = []
+        if bool(novel.any()):
+            datagrams = encode_points(
+                self._robot,
+                self._n_frames,
+                frame.origin.cpu(),
+                frame.ends[novel].cpu(),
+                frame.is_hit[novel].cpu(),
+            )
+        self._n_frames += 1
+        self._due += datagrams
+        return datagrams
+
+    def accept(self, message: PointsMessage) -> bool:
+        """Whether this part of a teammate's frame is new; from now on it counts as received."""
+        if message.sender == self._robot or message.sender >= self._size:
+            self.refused["stranger"] += 1
+            return False
+        number = message.frame * MOST_PARTS + message.part
+        received = self._received.get(message.sender, Intervals.empty())
+        if number in received:
+            self.refused["repeated"] += 1
+            return False
+        self._received[message.sender] = _bounded(received | Intervals.span(number, number + 1))
+        return True
+
+
+def _bounded(numbers: Intervals) -> Intervals:
+    """The same set, with its first gaps closed if it has more than `MOST_INTERVALS` intervals."""
+    excess = max(0, len(numbers) - MOST_INTERVALS)
+    return Intervals(np.concatenate([numbers.edges[:1], numbers.edges[1 + 2 * excess :]]))

@@ -4,27 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
 from gmmtorch.team.sharing.messages.message_registry import Message, decode, kind_of
 from gmmtorch.team.sharing.transport.simulated_network import Transport
 
-_BURST = 1.0
-"""Seconds of the rate that may be sent in one burst."""
-_LEAST_BURST = 1200.0
-"""Bytes: one datagram."""
+if TYPE_CHECKING:
+    from gmmtorch.team.sharing.store import Store
+
+_BURST, _LEAST_BURST = 1.0, 1200.0
+"""Seconds of the rate that may be sent in one burst; and bytes, at least: one datagram."""
 
 
 class TokenBucket:
-    """In any t seconds at most `rate` · t bytes are taken, and one burst: a second of the rate, or a
-    datagram.
-
-    The times may come from any clock. If it is set back, that step adds nothing.
-
-    Args:
-        rate: bytes per second.
-    """
+    """In any t seconds at most `rate` (bytes per second) · t bytes are taken, and one burst: a second of the
+    rate, or a datagram. The times may come from any clock; if it is set back, that step adds nothing."""
 
     def __init__(self, rate: float) -> None:
         if not 0 < rate < math.inf:
@@ -46,8 +41,7 @@ class TokenBucket:
         self._tokens -= n_bytes
 
 
-_LONGEST_PAUSE = 16
-"""Announcement periods between two announcements of the same content, at most."""
+_LONGEST_PAUSE = 16  # announcement periods between two announcements of the same content, at most
 
 
 class ReceivedMessage(NamedTuple):
@@ -58,28 +52,10 @@ class ReceivedMessage(NamedTuple):
     message: Message
 
 
-class RecordStore(Protocol):
-    """Keeps the records of a map on disk.
-
-    n_failed: batches of records that could not be kept.
-    """
-
-    @property
-    def n_failed(self) -> int: ...
-
-    def keep(self, datagrams: Sequence[bytes]) -> object:
-        """Stores the records of datagrams that the robot is about to send, or has merged."""
-
-
 class AnnouncementSchedule:
-    """When a robot announces which records it holds: every period while they change or some are missing.
-
-    A lost announcement must be repeated, but a team at rest would send little else. So the pause doubles
-    after each announcement without news, up to 16 periods.
-
-    Args:
-        period: seconds.
-    """
+    """When a robot announces which records it holds: every `period` (s) while they change or some are
+    missing. A lost announcement must be repeated, but a team at rest would send little else. So the pause
+    doubles after each announcement without news, up to 16 periods."""
 
     def __init__(self, period: float) -> None:
         if not 0 < period < math.inf:
@@ -93,8 +69,7 @@ class AnnouncementSchedule:
 
         The first call starts the first period, and so does a clock that was set back.
 
-        Args:
-            content: changes whenever what is announced changes. urgent: whether records are missing.
+        content: changes whenever what is announced changes. urgent: whether records are missing.
         """
         if self._last is None or now < self._last:
             self._last, self._announced, self._pause = now, content, self._period
@@ -132,11 +107,18 @@ class Radio:
         decode: Callable[[bytes], Message] = decode,
     ) -> None:
         self.robot, self.transport = robot, transport
-        self.store: RecordStore | None = None
+        self.store: Store | None = None
         self.announcements = AnnouncementSchedule(announce_every)
         self.n_received = self.n_damaged = 0
         self._budget = None if budget is None else TokenBucket(budget)
         self._decode = decode
+
+    @staticmethod
+    def check(announce_every: float, budget: float | None) -> None:
+        """Raises `InvalidArgumentError` unless these are arguments of a radio."""
+        AnnouncementSchedule(announce_every)
+        if budget is not None:
+            TokenBucket(budget)
 
     def within_budget(
         self, make: Callable[[int | None], list[bytes]], now: float, spare: int = 0
@@ -183,6 +165,12 @@ class Radio:
         if self.store is not None:
             self.store.keep(datagrams)
 
+    def row(self) -> dict[str, Any]:
+        """What was sent, received, and not stored, as a part of a row of results.json."""
+        received = {"heard": self.n_received, "damaged": self.n_damaged}
+        unkept = {"unkept": 0 if self.store is None else self.store.n_failed}  # batches of records
+        return {**self.transport.books(self.robot), **received, **unkept}
+
     def duplicate_id(self, n_conflicts: int) -> str | None:
         """An error message if another robot uses this robot's id, else None.
 
@@ -196,6 +184,11 @@ class Radio:
             f"Another robot uses the id of robot {self.robot}{address}: give each robot its own id (id=…) "
             "and its own folder."
         )
+
+    def check_id(self, n_conflicts: int) -> None:
+        """Raises `GmmTorchError` if another robot uses this robot's id; see `duplicate_id`."""
+        if (message := self.duplicate_id(n_conflicts)) is not None:
+            raise GmmTorchError(message)
 
     def warnings(self, n_conflicts: int) -> str:
         """The end of a status line: what is wrong with the network, or nothing."""

@@ -8,7 +8,7 @@ import pytest
 from cli.command_runs import QUIET, Finished, run_here
 from cli.robot.robot_cases import Run
 
-from gmmtorch.team.sharing.transport.team_key import KEY_VARIABLE
+from gmmtorch.team.sharing.transport.security import KEY_VARIABLE
 
 
 @pytest.fixture

@@ -35,7 +35,7 @@ from exploration.replays import content
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.team.cli import links, robot
 from gmmtorch.team.exploration.mission.replay import ReplayMission
-from gmmtorch.team.sharing.messages.message_registry import encode_plan
+from gmmtorch.team.sharing.messages.mission_messages import encode_plan
 from gmmtorch.team.sharing.replica.replica import Replica
 from gmmtorch.team.sharing.transport.frames import FramedTransport
 from gmmtorch.team.sharing.transport.security import TeamKey

@@ -11,8 +11,7 @@ from kernels.mixtures.test_e_step import mixture
 from gmmtorch.errors import NumericalError
 from gmmtorch.kernels import kernels
 from gmmtorch.mixture.em.exact import Parameters, maximization, natural_parameters, quadratic_features
-from gmmtorch.mixture.em.grouping import centered_parameters
-from gmmtorch.mixture.em.truncated import Momentum
+from gmmtorch.mixture.em.truncated import Momentum, centered_parameters
 
 K = 40
 

@@ -8,7 +8,7 @@ from kernels.mixtures.test_e_step import mixture
 
 from gmmtorch.kernels import kernels
 from gmmtorch.mixture.em.exact import Parameters, quadratic_features
-from gmmtorch.mixture.em.grouping import (
+from gmmtorch.mixture.em.truncated import (
     Groups,
     Rows,
     choose_candidates,

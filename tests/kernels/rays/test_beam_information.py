@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gmmtorch.kernels import kernels
-from gmmtorch.team.exploration.information.view_evaluator import ViewEvaluator
+from gmmtorch.team.exploration.planning.view_evaluator import ViewEvaluator
 from gmmtorch.team.exploration.robot.mapper import LocalMap
 
 FOV = (1.5184, 1.0123)

@@ -9,23 +9,13 @@ from typing import NamedTuple, Protocol
 
 from gmmtorch.errors import check_number
 
-_LONGEST_SLEEP = 0.02
-"""Seconds between two calls of `idle` at most."""
+_LONGEST_SLEEP = 0.02  # seconds between two calls of `idle` at most
 _SHORTEST_SLEEP = 1e-4
 """Seconds. Rounding of shorter sleeps could keep the clock from ever reaching its target."""
 
 
-class Clock(Protocol):
-    """The time of a mission in seconds since its start. It never decreases."""
-
-    def now(self) -> float: ...
-
-    def wait(self, until: float, idle: Callable[[], object], stopped: Callable[[], bool]) -> None:
-        """Returns at the time `until`, or as soon as `stopped` returns True; calls `idle` meanwhile."""
-
-
 class SimulatedClock:
-    """Waiting takes no time: the clock jumps to the time waited for, and never calls `idle`."""
+    """Simulated seconds. Waiting takes no time: the clock jumps to the time waited for, without `idle`."""
 
     def __init__(self) -> None:
         self._now = 0.0
@@ -62,20 +52,21 @@ class WallClock:
         return self._elapsed * self._speed
 
     def wait(self, until: float, idle: Callable[[], object], stopped: Callable[[], bool]) -> None:
+        """Returns at the time `until`, or as soon as `stopped` returns True; calls `idle` meanwhile."""
         while not stopped() and self.now() < until:
             idle()
             seconds = (until - self.now()) / self._speed
             self._sleep(min(max(seconds, _SHORTEST_SLEEP), _LONGEST_SLEEP))
 
 
+Clock = SimulatedClock | WallClock
+"""The time of a mission in seconds since its start. It never decreases."""
+
+
 class Stopwatch:
-    """Sums the time of stages. A nested stage counts for itself only, not for the stage around it.
+    """Sums the time of stages in `seconds`. A nested stage counts for itself only, not for that around it.
 
-    Attributes:
-        seconds: total by stage.
-
-    Args:
-        clock: seconds since any moment: wall time, or `time.process_time`, which excludes other processes.
+    clock: seconds since any moment: wall time, or `time.process_time`, which excludes other processes.
     """
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
@@ -93,8 +84,7 @@ class Stopwatch:
         self._inner = outer + spent
 
 
-_LOOK = 0.2
-"""Mission seconds between two checks for news while a team settles, at most."""
+_LOOK = 0.2  # mission seconds between two checks for news while a team settles, at most
 
 
 class Exchanging(Protocol):
@@ -143,12 +133,10 @@ def drive(
     """Ticks until the mission is over or `stop` returns True.
 
     Tick n is due `n * tick_seconds` after the start. While the clock waits, the robots exchange messages.
-    A tick that takes longer than `tick_seconds` delays all later ticks by the excess; none is skipped or
-    shortened.
+    A tick that takes longer than `tick_seconds` delays all later ticks by the excess; none is skipped.
 
-    Args:
-        stop: checked before each tick, and at least every 20 ms of a `WallClock`.
-        on_step: called after every tick and every exchange.
+    stop: checked before each tick, and at least every 20 ms of a `WallClock`. on_step: called after every
+    tick and every exchange.
     """
     begin, ticks, late = 0.0, 0, 0
 
@@ -178,9 +166,7 @@ def settle(
     on_step: Callable[[], object] = lambda: None,
 ) -> None:
     """Exchanges messages until `mission.content` has not changed for `quiet` seconds, or `stop` returns True.
-
-    Raises `InvalidArgumentError` if `quiet` is negative or infinite.
-    """
+    Raises `InvalidArgumentError` if `quiet` is negative or infinite."""
     check_number("settle", quiet)
 
     def idle() -> None:

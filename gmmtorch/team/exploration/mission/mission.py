@@ -1,33 +1,33 @@
-"""Mission: robots explore a simulated world, tick by tick; and MissionScore, which measures them."""
+"""Mission: robots explore a simulated world, tick by tick, and plan together; MissionScore measures them."""
 
 from __future__ import annotations
 
 import functools
 import math
 import operator
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from gmmtorch.files import write_npz
 from gmmtorch.kernels import mark_cells_of_rays
 from gmmtorch.occupancy import Box, to_lattice
 from gmmtorch.simulation import DepthFrame
 from gmmtorch.team.exploration.mission.driver import Stopwatch
 from gmmtorch.team.exploration.mission.options import TeamOptions
-from gmmtorch.team.exploration.mission.planning_round import plan_alone, plan_together
-from gmmtorch.team.exploration.planning.coordination import Coordination
-from gmmtorch.team.exploration.robot.agent import Agent
+from gmmtorch.team.exploration.planning.coordination import Coordination, PeerTrajectories, predicted_path
+from gmmtorch.team.exploration.planning.planner_interface import Plan
+from gmmtorch.team.exploration.robot.agent import Agent, Robot
 from gmmtorch.team.exploration.robot.mapper import FrameUpdate
-from gmmtorch.team.exploration.robot.robot_state import Robot
 from gmmtorch.team.exploration.world.navigable import collides, finely, meets_others
 from gmmtorch.team.exploration.world.scoring import BeliefMap
 from gmmtorch.team.exploration.world.world import World
 from gmmtorch.team.sharing import Network, bytes_of_points
 
-_SEEN_STRIDE = 4
-"""Pixels between the beams, along rows and columns, that mark cells as seen."""
+_SEEN_STRIDE = 4  # pixels between the beams, along rows and columns, that mark cells as seen
 
 
 class MissionScore:
@@ -217,9 +217,7 @@ class Mission:
 
     def converge(self, limit: float) -> float | None:
         """Lets robots of a simulated team exchange messages without moving until all have the same digest.
-
-        Returns the simulated seconds that it takes, or None if it takes more than `limit` seconds.
-        """
+        Returns the simulated seconds that it takes, or None if it takes more than `limit` seconds."""
         with torch.inference_mode():
             for tick in range(math.floor(limit * self.options.rate) + 1):
                 if len({agent.digest() for agent in self.agents}) == 1:
@@ -230,6 +228,11 @@ class Mission:
                     agent.send_views(now)
                 self._listen(now + self.tick_seconds)
         return None
+
+    def save_trajectories(self, folder: Path) -> None:
+        """Writes poses (T, 4) of each robot, one per tick, as arrays robot_0, … of trajectories.npz."""
+        poses = {f"robot_{n}": torch.stack(path).numpy() for n, path in enumerate(self.trajectories)}
+        write_npz(folder / "trajectories.npz", **poses)
 
     # -- the stages of a tick ---------------------------------------------------------------------
 
@@ -271,3 +274,93 @@ class Mission:
             for robot, positions, has_met in zip(self.robots, flown, met.tolist(), strict=True):
                 touched = bool(collides(self.world.mesh, positions, options.dynamics.radius).any())
                 robot.collisions += int(touched) + int(has_met)
+
+
+def plan_together(
+    agents: Sequence[Agent],
+    coordination: Coordination,
+    options: TeamOptions,
+    now: float,
+    number: int,
+    generator: torch.Generator,
+) -> dict[int, Plan]:
+    """Makes and follows the next plan of every robot of a simulated team.
+
+    A robot sends its final plan before the robots that plan after it listen; they wait for it as long as the
+    network takes.
+
+    agents: sorted by robot id. number: of the planning round. generator: for the coordination's draws.
+
+    Returns the plans by robot id, in the order in which they became final.
+    """
+    for agent in agents:
+        agent.begin_planning(now)
+    sent: set[int] = set()
+    proposed: dict[int, Plan] = {}
+
+    def send(final: Collection[int]) -> None:
+        for robot in final:
+            if robot not in sent:
+                sent.add(robot)
+                agents[robot].send_plan(now, number)
+
+    def plan_of(robot: int, final: dict[int, Plan]) -> Plan:
+        send(final)
+        agent = agents[robot]
+        agent.listen(now + options.plan_slack * len(final))
+        peers = _peer_trajectories(agents, robot, final, proposed, coordination, options)
+        proposed[robot] = agent.propose(now, final, peers)
+        return proposed[robot]
+
+    plans = coordination.coordinate(range(len(agents)), plan_of, generator)
+    for robot in plans:
+        agents[robot].follow()
+    send(plans)
+    for agent in agents:
+        agent.send_views(now)
+    return plans
+
+
+def plan_alone(agent: Agent, options: TeamOptions, now: float, number: int) -> None:
+    """Makes and follows the next plan of a robot whose teammates run in other processes. The robot avoids the
+    paths of the plans that it has heard, and discounts the views of those heard in the last planning
+    period."""
+    agent.begin_planning(now)
+    heard = agent.robot.plans
+    step = options.dynamics.step
+    paths = [
+        predicted_path(plan, now - agent.heard_at[peer], step)
+        for peer, plan in sorted(heard.items())
+        if len(plan.path)
+    ]
+    agent.propose(
+        now,
+        list(heard),
+        PeerTrajectories.of(paths, options.separation),
+        since=now - options.dynamics.duration,
+    )
+    agent.follow()
+    agent.send_plan(now, number)
+    agent.send_views(now)
+
+
+def _peer_trajectories(
+    agents: Sequence[Agent],
+    robot: int,
+    final: Mapping[int, Plan],
+    proposed: Mapping[int, Plan],
+    coordination: Coordination,
+    options: TeamOptions,
+) -> PeerTrajectories:
+    """Where the other robots may be: on their final or proposed plan, and braking if that may change."""
+    stays_final = coordination.name != "distributed_greedy"
+    paths = []
+    for other in agents:
+        if other.number == robot:
+            continue
+        plan = final.get(other.number, proposed.get(other.number))
+        if plan is not None:
+            paths.append(torch.cat([plan.path, plan.braking])[:, :3])
+        if plan is None or not (stays_final or other.number in final):
+            paths.append(other.robot.braking[:, :3])
+    return PeerTrajectories.of(paths, options.separation)

@@ -268,10 +268,10 @@ class TeamOptions(LinkConditions):
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        from gmmtorch.team.exploration.information.view_evaluator import INFORMATION
         from gmmtorch.team.exploration.planning.coordination import Coordination
         from gmmtorch.team.exploration.planning.planners import PLANNERS
-        from gmmtorch.team.sharing import POINT_CODECS, AnnouncementSchedule, TokenBucket, check_codec
+        from gmmtorch.team.exploration.planning.view_evaluator import INFORMATION
+        from gmmtorch.team.sharing import POINT_CODECS, Radio, check_codec
 
         super().__post_init__()
         check_choice("team", self.framework, FRAMEWORKS)
@@ -290,9 +290,7 @@ class TeamOptions(LinkConditions):
         check_number("margin", self.margin)
         # These check their own arguments.
         Coordination(self.coordination, self.n_rounds)
-        AnnouncementSchedule(self.announce_every)
-        if self.budget is not None:
-            TokenBucket(self.budget)
+        Radio.check(self.announce_every, self.budget)
         self.check_team(self.size)
         if not 0 < self.planning_prior < 1:
             raise InvalidArgumentError(f"planning_prior={self.planning_prior} must be between 0 and 1.")

@@ -23,22 +23,16 @@ class ReplayMission:
     The map is published whenever the components of a window are final, and at the end of the log. With a
     store, records are kept before they are sent, and the map before it is published, every `keep_every`
     scans. A robot that is killed and restarted with the same store and log reads the few scans since then
-    again, publishes nothing before it is as far as it was, and continues: its final map equals that of a
-    robot that was never killed. If the progress is lost, it begins again; the records that it sent before
-    stay in the team's map together with the new ones until the log is over.
-
-    A scan that cannot be read is left out and counted; the first one is logged.
+    again, publishes nothing before it is as far as it was, and ends with the map of a robot that was never
+    killed. If the progress is lost, it begins again; the records that it sent before stay in the team's map
+    until the log is over. A scan that cannot be read is left out and counted; the first one is logged.
 
     Args:
-        replica: of this robot; nothing else may add components to it.
+        replica, transport, announce_every, budget, joiner: as for `SharedMap`.
         scans: the log. An iterator is read from its beginning again when the robot is restarted.
-        transport: the network.
         make_map: makes an empty map, always with the same options; what it learns is published.
         rate: scans per second.
         store: has restored the replica. Raises `DataError` if its progress is of other options or scans.
-        announce_every: seconds between announcements while there is news.
-        budget: bytes per second for records; None: no limit.
-        joiner: of a replica with a frame of its own; it is given the scans, and joins a teammate's frame.
 
     Attributes:
         map: the robot's own map. shared: what it exchanges with its team.

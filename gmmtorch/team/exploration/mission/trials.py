@@ -1,4 +1,4 @@
-"""Trials: missions that run to their end, one after another or several in parallel, and keep their rows."""
+"""Trials: missions that are built and run to their end, one by one or in parallel; their rows are kept."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import concurrent.futures.process
 import functools
 import hashlib
 import json
+import math
 import tempfile
 import time
 import zlib
@@ -15,24 +16,161 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from gmmtorch import __version__
-from gmmtorch.errors import DataError, GmmTorchError, check_whole
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
 from gmmtorch.events import Event, ignore
-from gmmtorch.files import check_writable, write_json, write_npz
+from gmmtorch.files import check_writable, write_json
+from gmmtorch.occupancy import RollingWindow
 from gmmtorch.processes import end_with_parent
-from gmmtorch.team.exploration.mission.driver import SimulatedClock, drive
-from gmmtorch.team.exploration.mission.mission import Mission
+from gmmtorch.team.exploration.mission.driver import SimulatedClock, Stopwatch, drive
+from gmmtorch.team.exploration.mission.mission import Mission, MissionScore
 from gmmtorch.team.exploration.mission.options import TeamOptions, WorldOptions
 from gmmtorch.team.exploration.mission.results import mission_row
-from gmmtorch.team.exploration.mission.team_setup import assemble
+from gmmtorch.team.exploration.planning.journeys import Roadmap
+from gmmtorch.team.exploration.planning.planners import make_planner
+from gmmtorch.team.exploration.planning.primitives import Primitives
+from gmmtorch.team.exploration.planning.view_evaluator import ViewEvaluator
+from gmmtorch.team.exploration.robot.agent import Agent, Robot
+from gmmtorch.team.exploration.robot.gmm_mapper import GmmMapper
+from gmmtorch.team.exploration.robot.mapper import GridMapper, Mapper, Memo
+from gmmtorch.team.exploration.world import starts
+from gmmtorch.team.exploration.world.scoring import BeliefMap
 from gmmtorch.team.exploration.world.world import World
+from gmmtorch.team.sharing import Broadcast, Network, Replica, Transport, ViewLibrary
+
+_SLACK = 24
+"""Cells by which the sliding map moves, once the robot is so far from its centre. Rays are long: a map that
+is filled in wide slabs casts each ray far less often. Planners read a smaller window around the robot."""
+_ROUNDING = 4  # cells by which the planner's window may be off the robot
+_CACHED_MESSAGES = 4096
+"""Decoded datagrams in the cache of a simulated team: more than are in flight together."""
+_CACHED_MESSAGES_ALONE = 64
+"""The same for a robot in its own process, where a stranger's messages may be large."""
+_CACHED_EVIDENCE = 16
+"""Batches of evidence in the cache, per robot. They are large; this covers the last dozen seconds."""
+
+
+def assemble(world: World, options: TeamOptions, watch: Stopwatch | None = None) -> Mission:
+    """A mission of a simulated team with its network and its score. Raises `InvalidArgumentError` for options
+    that contradict each other or the world.
+
+    watch: times the stages of all robots together; None: wall time.
+    """
+    poses = start_poses(world, options)
+    network = Network(options.size, options, seed=options.seed)
+    memo, evidence = Memo(_CACHED_MESSAGES), Memo(_CACHED_EVIDENCE * options.size)
+    watch = Stopwatch() if watch is None else watch
+    agents = [
+        make_agent(number, poses[number], world, options, network, memo, evidence, watch)
+        for number in range(options.size)
+    ]
+    score = MissionScore(world, agents, network, options)
+    return Mission(world, agents, options, watch, network, score)
+
+
+def start_poses(world: World, options: TeamOptions) -> Tensor:
+    """The start poses (size, 4): x, y, z, yaw. Raises `InvalidArgumentError` where robots cannot start."""
+    primitives = Primitives(options.dynamics)
+    if options.start is None:
+        return starts.start_poses(world, options.size, primitives)
+    poses = torch.tensor(options.start, dtype=torch.float64)
+    if poses.shape != (options.size, 4):
+        raise InvalidArgumentError(
+            f"‹start› has shape {tuple(poses.shape)}; expected a pose x, y, z, yaw for each of "
+            f"{options.size} robots."
+        )
+    return starts.check_start(world, poses, primitives)
+
+
+def make_agent(
+    number: int,
+    pose: Tensor,
+    world: World,
+    options: TeamOptions,
+    transport: Transport,
+    memo: Memo | None = None,
+    evidence: Memo | None = None,
+    watch: Stopwatch | None = None,
+    incarnation: int = 0,
+) -> Agent:
+    """A robot at its start pose (4,).
+
+    memo, evidence: caches of decoded datagrams and of evidence, and watch: the robots of a simulation share
+    them; None: its own. incarnation: of its replica and view library. A robot that may be restarted needs
+    another one in each session (`record_keys.drawn_incarnation`).
+
+    Raises `InvalidArgumentError` for options that contradict each other or the world.
+    """
+    _check_window(options, world.resolution)
+    memo = Memo(_CACHED_MESSAGES_ALONE) if memo is None else memo
+    evidence = Memo(_CACHED_EVIDENCE) if evidence is None else evidence
+    camera = options.camera
+    evaluator = ViewEvaluator(
+        camera.horizontal_fov,
+        camera.vertical_fov,
+        camera.max_range,
+        world.resolution,
+        information=options.information,
+        n_beams=options.n_beams,
+        device=options.device,
+    )
+    primitives = Primitives(options.dynamics)
+    start = starts.initial_free_space(world, pose[:3].double(), primitives)
+    if start is None:
+        raise InvalidArgumentError(
+            f"pose={pose.tolist()} is a place from which a robot cannot take off; choose another."
+        )
+    robot = Robot(
+        number,
+        pose,
+        _mapper(number, world, options, memo, evidence, incarnation),
+        make_planner(options.planner, primitives, evaluator),
+        ViewLibrary(number, incarnation=incarnation),
+        Roadmap(),
+        start,
+        options.rest,
+    )
+    watch = Stopwatch() if watch is None else watch
+    return Agent(robot, transport, evaluator, primitives, options, memo, watch)
+
+
+def _check_window(options: TeamOptions, resolution: float) -> None:
+    """Raises `InvalidArgumentError` unless the window contains the camera's whole field of view."""
+    camera = options.camera
+    far = (camera.max_range, camera.max_range, camera.max_range * math.sin(camera.vertical_fov / 2))
+    for axis, n, needed in zip("xyz", options.window, far, strict=True):
+        sight = (n / 2 - _ROUNDING) * resolution
+        if sight < needed:
+            raise InvalidArgumentError(
+                f"‹window›={list(options.window)} cells of {resolution} m reaches {max(sight, 0):.3g} m "
+                f"around the robot along {axis}, less than the {needed:.3g} m that a camera of "
+                f"‹max_range›={camera.max_range} m sees; take a larger window."
+            )
+
+
+def _mapper(
+    number: int, world: World, options: TeamOptions, memo: Memo, evidence: Memo, incarnation: int
+) -> Mapper:
+    x, y, z = (n + 2 * (_SLACK + _ROUNDING) for n in options.window)
+    local = RollingWindow(world.resolution, (x, y, z), _SLACK, options.device)
+    belief = BeliefMap(world.resolution, world.box, world.observable, options.belief, options.device)
+    width = options.camera.width
+    if not options.has_mixtures:
+        team = options.shares, options.size
+        return GridMapper(number, local, belief, width, options.novelty, evidence, *team, memo.decoded)
+    shared: Replica | Broadcast
+    if options.codec == "quantized":
+        shared = Replica(number, dim=3, incarnation=incarnation)
+    else:
+        shared = Broadcast(number, options.codec)
+    return GmmMapper(local, belief, width, options.novelty, options.frame, evidence, shared)
+
 
 ROW = "row.json"
 STAGE = "simulated seconds"
-TRAJECTORIES = "trajectories.npz"
-_CONVERGENCE = 120.0
-"""Simulated seconds after a mission in which the maps may become equal."""
+_CONVERGENCE = 120.0  # simulated seconds after a mission in which the maps may become equal
 
 OnMission = Callable[[Mission], object]
 
@@ -67,6 +205,24 @@ class Trial:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()[:16]
 
+    def kept_row(self, **more: Any) -> dict[str, Any] | None:
+        """The row that `keep_row` kept for an equal trial with the same `more` facts; None: there is none."""
+        if self.folder is None or not (self.folder / ROW).is_file():
+            return None
+        path = self.folder / ROW
+        try:
+            kept = json.loads(path.read_text("utf-8"))
+            row: dict[str, Any] = kept["row"]
+            is_same = kept["facts"] == {**self.facts(), **more}
+        except (ValueError, KeyError, TypeError) as error:
+            raise DataError(f"{path} is damaged ({error!r}); delete it to run the trial again.") from error
+        return row if is_same else None
+
+    def keep_row(self, row: dict[str, Any], **more: Any) -> None:
+        """Keeps the row of the finished trial in its folder, if it has one."""
+        if self.folder is not None:
+            write_json(self.folder / ROW, {"facts": {**self.facts(), **more}, "row": row})
+
 
 def run_mission(
     trial: Trial, world: World | None = None, on_tick: OnMission = lambda mission: None
@@ -75,8 +231,7 @@ def run_mission(
 
     Raises `OutputError`, before anything is computed, if the trial's folder cannot be written to.
 
-    Args:
-        on_tick: called at the start and after every tick.
+    on_tick: called at the start and after every tick.
     """
     if trial.folder is not None:
         check_writable(trial.folder)
@@ -104,13 +259,12 @@ def run_trials(
     Each trial uses one thread, so results do not depend on `workers`. If one trial fails, no other starts;
     those that are running end, keep their rows, and then the error is raised.
 
-    Args:
-        on_row: called with each row when it is there.
-        on_event: called with the simulated seconds of all trials together (`STAGE`).
-        on_sample: with one worker, then called with the running mission whenever its curves grow.
+    on_row: called with each row when it is there. on_event: called with the simulated seconds of all trials
+    together (`STAGE`). on_sample: with one worker, then called with the running mission whenever its curves
+    grow.
     """
     check_whole("workers", workers, 1)
-    rows = [kept_row(trial) for trial in trials]
+    rows = [trial.kept_row() for trial in trials]
     missing = [i for i, row in enumerate(rows) if row is None]
     durations = [trial.team.duration for trial in trials]
     seconds = [0.0 if row is None else whole for whole, row in zip(durations, rows, strict=True)]
@@ -141,38 +295,12 @@ def run_trials(
     return [row for row in rows if row is not None]
 
 
-def kept_row(trial: Trial, **more: Any) -> dict[str, Any] | None:
-    """The row that `keep_row` kept for an equal trial with the same `more` facts; None: there is none."""
-    if trial.folder is None or not (trial.folder / ROW).is_file():
-        return None
-    path = trial.folder / ROW
-    try:
-        kept = json.loads(path.read_text("utf-8"))
-        row: dict[str, Any] = kept["row"]
-        is_same = kept["facts"] == {**trial.facts(), **more}
-    except (ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{path} is damaged ({error!r}); delete it to run the trial again.") from error
-    return row if is_same else None
-
-
-def keep_row(trial: Trial, row: dict[str, Any], **more: Any) -> None:
-    """Keeps the row of a finished trial in its folder, if it has one."""
-    if trial.folder is not None:
-        write_json(trial.folder / ROW, {"facts": {**trial.facts(), **more}, "row": row})
-
-
-def save_trajectories(mission: Mission, path: Path) -> None:
-    """Writes poses (T, 4) of each robot, one per tick, as arrays robot_0, robot_1, … of an npz file."""
-    poses = {f"robot_{n}": torch.stack(path).numpy() for n, path in enumerate(mission.trajectories)}
-    write_npz(path, **poses)
-
-
 def _run_and_keep(trial: Trial, on_tick: OnMission = lambda mission: None) -> dict[str, Any]:
     torch.set_num_threads(1)
     mission, row = run_mission(trial, on_tick=on_tick)
     if trial.folder is not None:
-        save_trajectories(mission, trial.folder / TRAJECTORIES)
-    keep_row(trial, row)
+        mission.save_trajectories(trial.folder)
+    trial.keep_row(row)
     return row
 
 

@@ -19,10 +19,9 @@ from gmmtorch.team.exploration.planning.coordination import PeerTrajectories, cl
 from gmmtorch.team.exploration.robot.mapper import LocalMap
 from gmmtorch.team.exploration.world.navigable import widened
 
-_SPACING = 1.0
-"""Cells between the checked points of a path; half of it is the margin around the body."""
-_FINE_SPACING = 0.25
-"""The same for a robot that leaves a place where it does not fit, and has little room."""
+_SPACING, _FINE_SPACING = 1.0, 0.25
+"""Cells between the checked points of a path, half of which is the margin around the body; and the same for a
+robot that leaves a place where it does not fit."""
 _STRUCK_RAYS, _STRUCK_SHARE = 1.0, 0.05
 """A cell with at least this many hits and this share of hits among its rays is an obstacle. A rail of a
 twentieth of a cell's width is hit by no larger share."""
@@ -31,11 +30,11 @@ _CHUNK_PAIRS = 1 << 22
 
 
 def inflated(blocked: Tensor, radius: float, resolution: float) -> Tensor:
-    """Return cells (nx, ny, nz), bool, in which the centre of a sphere of `radius` metres may not be.
+    """Return cells (nx, ny, nz), bool, in which the centre of a sphere of `radius` metres may not be, as it
+    could reach into a blocked cell. Cells outside the array are blocked.
 
-    A sphere centred somewhere in such a cell reaches into a blocked cell. Cells outside the array are
-    blocked. A cell at offset (i, j, k) from a blocked cell is included if Σ max(|i| − 1, 0)² < (radius /
-    resolution)². That set is a union of boxes; each box is computed one axis after the other.
+    A cell at offset (i, j, k) from a blocked cell is included if Σ max(|i| − 1, 0)² < (radius / resolution)².
+    That set is a union of boxes; each box is computed one axis after the other.
     """
     boxes = _covering_boxes((radius / resolution) ** 2 * (1 - _ROUNDING))
     reach = max(max(box) for box in boxes)
@@ -127,13 +126,12 @@ def feasible(
     Every point of a safe path is in a passable cell and clear of the peers (see `clear_of`). A path that
     does not move, such as a turn in place or a wait, is always safe.
 
-    The map may change so that the robot's own cell is no longer passable. The robot may leave that cell
-    if `radius` is given. Its body, at its exact position, may then touch only free cells and
-    the cells that it touches at the start, and it must move away from every point q of those: (x − x₀)·(q
-    − x₀) ≤ 0. So no known obstacle comes closer than it is at the start, or than the radius.
+    The map may change so that the robot's own cell is no longer passable. The robot may leave that cell if
+    `radius` is given. Its body may then touch only free cells and those that it touches at the start, and it
+    must move away from every point q of those: (x − x₀)·(q − x₀) ≤ 0. So no known obstacle comes closer than
+    it is at the start, or than the radius.
 
-    Args:
-        start: (..., 7) or broadcastable: the states before the first step. radius: of the robot (m).
+    start: (..., 7) or broadcastable: the states before the first step. radius: of the robot (m).
     """
     begin = start.to(rollout).expand(*rollout.shape[:-2], 7)
     origin = begin[..., :3]
@@ -157,9 +155,8 @@ def feasible_motions(
 ) -> Tensor:
     """`feasible` of motions, (N, P), by the fused kernel.
 
-    Args:
-        longest: (2,), longest step (m) and largest turn (rad) in a step. after: steps of the peers before
-            the motions begin.
+    longest: (2,), longest step (m) and largest turn (rad) in a step. after: steps of the peers before the
+    motions begin.
     """
     return motions_are_clear(
         motions,
@@ -191,11 +188,9 @@ def _covering_boxes(square: float) -> list[tuple[int, int, int]]:
 
 
 def _points_along(states: Tensor, spacing: float) -> Tensor:
-    """Sample points (..., n, 3) of paths (..., L, 7), at most `spacing` apart along each path.
-
-    The first state is left out. Steps are treated as straight; an arc of chord c that turns by φ deviates
-    from its chord by c φ/8.
-    """
+    """Sample points (..., n, 3) of paths (..., L, 7), at most `spacing` apart along each path. The first
+    state is left out. Steps are treated as straight; an arc of chord c that turns by φ deviates from its
+    chord by c φ/8."""
     place, yaw = states[..., :3], states[..., 3]
     step = place[..., 1:, :] - place[..., :-1, :]
     chord = step.square().sum(-1)

@@ -36,10 +36,8 @@ class Coordination:
         self.n_rounds = check_whole("n_rounds", n_rounds, 1)
 
     def rounds(self, n_robots: int, generator: torch.Generator) -> list[list[int]]:
-        """Return the robots, of 0 … n_robots − 1, that plan in each round, without empty rounds.
-
-        In "distributed_greedy" the later rounds depend on the plans, so only the first round is returned.
-        """
+        """Return the robots, of 0 … n_robots − 1, that plan in each round, without empty rounds. In
+        "distributed_greedy" the later rounds depend on the plans, so only the first round is returned."""
         everyone = list(range(n_robots))
         if self.name == "greedy":
             rounds = [[robot] for robot in everyone]
@@ -58,8 +56,7 @@ class Coordination:
     ) -> dict[int, Plan]:
         """Return the plan of each robot, in the order in which the plans were fixed.
 
-        Args:
-            plan: called with a robot and the plans of other robots that it must consider; returns its plan.
+        plan: called with a robot and the plans of other robots that it must consider; returns its plan.
         """
         team = list(robots)
         if self.name == "distributed_greedy":
@@ -82,8 +79,7 @@ class Coordination:
         return settled
 
 
-_MOST_STEPS = 1000
-"""Largest number of steps of a received plan that are used."""
+_MOST_STEPS = 1000  # largest number of steps of a received plan that are used
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,10 +152,8 @@ def clear_of(path: Tensor, peers: PeerTrajectories, start: Tensor | None = None)
 
 def predicted_path(plan: PlanMessage, age: float, step: float) -> Tensor:
     """Positions (S, 3), metres, of a teammate after 1, 2, …, S steps of `step` seconds from now, by a plan
-    that was heard `age` seconds ago.
-
-    Each is the plan's pose nearest in time, at most half a step of the plan off, which `clear_of` allows for.
-    """
+    that was heard `age` seconds ago. Each is the plan's pose nearest in time, at most half a step of the plan
+    off, which `clear_of` allows for."""
     n = len(plan.path)
     left = n * plan.step - age
     ahead = step * torch.arange(1, min(max(math.ceil(left / step - 1e-9), 1), _MOST_STEPS) + 1)

@@ -76,8 +76,7 @@ class Primitives:
 
     def continued(self, states: Tensor) -> tuple[Motions, Tensor] | None:
         """Return the motions from states (N, 7) after primitives, and the longest step (m) and the largest
-        turn (rad) in a step, (2,); None if a state has velocities with which no primitive ends.
-        """
+        turn (rad) in a step, (2,); None if a state has velocities with which no primitive ends."""
         follows = self._follows(states)
         if follows is None:
             return None

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from gmmtorch.team.exploration.information.view_cache import ViewCache
-from gmmtorch.team.exploration.planning.global_planner import Goal
+from gmmtorch.team.exploration.planning.journeys import Goal
 from gmmtorch.team.exploration.planning.planner_interface import PlanningTask, continuations, options
 from gmmtorch.team.exploration.planning.primitives import Primitives
+from gmmtorch.team.exploration.planning.view_evaluator import ViewCache
 
 _FAR = 1e4  # metres, where there is no way to the goal
 _WIDENING = 1.5  # a node tries about `_WIDENING` √visits primitives; the root tries all
@@ -92,10 +92,8 @@ def search_tree(
     counts as taken. UCT chooses the primitives (see `_Tree._promising`). A leaf counts as visited with zero
     return until its round ends.
 
-    Args:
-        memory: values of views; None: only the goal counts.
-        goal: the goal; None: only views count.
-        first: primitives of a branch that is tried first, such as the rest of the last plan.
+    memory: values of views; None: only the goal counts. goal: the goal; None: only views count. first:
+    primitives of a branch that is tried first, such as the rest of the last plan.
     """
     tree = _Tree(primitives, rule, task, memory, goal)
     tree.grow(first)
@@ -131,8 +129,8 @@ class _Tree:
         self._nodes = [root]
         if goal is not None:
             self._metres[0] = goal.cost(start).clamp_max(_FAR)
-        self._options = options(primitives, start[None], task, may_escape=True)
-        self._open([root], self._options.paths[:, :, -1], self._options.feasible)
+        self._paths, self._braking, feasible = options(primitives, start[None], task, may_escape=True)
+        self._open([root], self._paths[:, :, -1], feasible)
 
     def grow(self, first: Sequence[int]) -> None:
         """Try the branch `first`, then the most promising leaves, round by round."""
@@ -159,8 +157,8 @@ class _Tree:
         branch = last.path()[1:]
         return Found(
             actions=[node.action for node in branch],
-            path=self._options.paths[0, branch[0].action],
-            braking=self._options.braking[0, branch[0].action],
+            path=self._paths[0, branch[0].action],
+            braking=self._braking[0, branch[0].action],
             views=self._states[[node.number for node in branch], :4],
             value=last.value,
             information=last.information,

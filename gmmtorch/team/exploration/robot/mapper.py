@@ -1,4 +1,4 @@
-"""Mapper: the interface between a robot and its map; and LocalMap, the cells that its planner reads."""
+"""Mapper: the interface between a robot and its map; LocalMap, which its planner reads; and voxel maps."""
 
 from __future__ import annotations
 
@@ -7,20 +7,25 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
 from gmmtorch.errors import check_whole
 from gmmtorch.mapping import Components, NoveltyRule, beam_novelty
-from gmmtorch.occupancy import Box, CellEvidence, RollingWindow
+from gmmtorch.occupancy import Box, CellEvidence, RollingWindow, cast_evidence
 from gmmtorch.simulation import DepthFrame
 from gmmtorch.team.exploration.world.scoring import BeliefMap
-from gmmtorch.team.sharing import Broadcast, Message, ReceivedMessage, Replica, decode
-
-if TYPE_CHECKING:
-    from gmmtorch.team.exploration.robot.grid_mapper import SharedPoints
+from gmmtorch.team.sharing import (
+    Broadcast,
+    Message,
+    PointsMessage,
+    ReceivedMessage,
+    Replica,
+    SharedPoints,
+    decode,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,11 +96,9 @@ class FrameUpdate(NamedTuple):
 
 
 class Memo:
-    """A cache of a pure function's values, which the robots of a simulation share.
-
-    Robots that receive the same datagram get the same evidence from it, so one computation serves all. The
-    cache keeps the `size` values used last.
-    """
+    """A cache of a pure function's values, which the robots of a simulation share. Robots that receive the
+    same datagram get the same evidence from it, so one computation serves all. The cache keeps the `size`
+    values used last."""
 
     def __init__(self, size: int) -> None:
         self._size = check_whole("size", size, 1)
@@ -174,8 +177,7 @@ def novel_beams(
     The first beam of each block of `side` × `side` pixels decides for the block: neighbouring pixels are much
     closer to one another than the cells are wide.
 
-    Args:
-        width: of the image, pixels. within, short: see `beam_novelty`.
+    width: of the image, pixels. within, short: see `beam_novelty`.
     """
     n, across = len(frame.pixel), -(-width // side)
     block = frame.pixel // (side * width) * across + frame.pixel % width // side
@@ -188,3 +190,77 @@ def novel_beams(
         local, frame.origin, frame.ends[first], frame.is_hit[first], rule, short=short, within=within
     )
     return (unobserved | (bits >= rule.threshold))[number[block]]
+
+
+class GridMapper(Mapper):
+    """The voxel map of one robot.
+
+    All beams of its own frames count. Teammates are sent, and count, the beams that were novel to the sender.
+    The grid behind the window is `belief.grid`.
+
+    Args:
+        robot: its id. shares: whether the robot sends its novel points. size: robots of the team.
+        decode: turns a datagram into a message; a memo's, where robots share one.
+    """
+
+    shared: SharedPoints
+
+    def __init__(
+        self,
+        robot: int,
+        local: RollingWindow,
+        belief: BeliefMap,
+        width: int,
+        novelty: NoveltyRule,
+        memo: Memo,
+        shares: bool,
+        size: int,
+        decode: Callable[[bytes], Message] = decode,
+    ) -> None:
+        super().__init__(local, belief, width, novelty, memo)
+        self.shared = SharedPoints(robot, size)
+        self._shares, self._decode = shares, decode
+
+    def center_on(self, position: Tensor) -> None:
+        for box in self.local.center_on(position):
+            self.local.add_from(self.belief.grid, box)
+
+    def sense(self, frame: DepthFrame) -> FrameUpdate:
+        novel = novel_beams(self.local, frame, self._width, self._novelty, self.belief.grid.box)
+        parts, rest = [], torch.ones_like(novel)
+        if self._shares and (datagrams := self.shared.add(frame, novel)):
+            parts.append(self._evidence_of(datagrams))  # of the points as teammates receive them
+            rest = ~novel
+        grid = self.belief.grid
+        parts.append(
+            cast_evidence(frame.origin, frame.ends[rest], frame.is_hit[rest], grid.resolution, grid.box)
+        )
+        for part in parts:
+            self._add(part)
+        return FrameUpdate(parts, novel)
+
+    def receive(self, received: Sequence[ReceivedMessage]) -> list[bytes]:
+        frames: dict[tuple[int, int], list[bytes]] = {}
+        for item in received:
+            if isinstance(item.message, PointsMessage) and self.shared.accept(item.message):
+                frames.setdefault((item.message.sender, item.message.frame), []).append(item.datagram)
+        for datagrams in frames.values():
+            self._add(self._evidence_of(datagrams))
+        return [datagram for datagrams in frames.values() for datagram in datagrams]
+
+    def components(self) -> None:
+        """None: a grid has no components."""
+
+    def _evidence_of(self, datagrams: list[bytes]) -> CellEvidence:
+        """The evidence of the points of one frame."""
+
+        def make() -> CellEvidence:
+            messages = [self._decode(datagram) for datagram in datagrams]
+            points = [message for message in messages if isinstance(message, PointsMessage)]
+            grid = self.belief.grid
+            ends = torch.cat([message.ends for message in points]).double().to(grid.device)
+            is_hit = torch.cat([message.is_hit for message in points]).to(grid.device)
+            origin = points[0].origin.double().to(grid.device)
+            return cast_evidence(origin, ends, is_hit, grid.resolution, grid.box)
+
+        return self._memo(tuple(datagrams), make)

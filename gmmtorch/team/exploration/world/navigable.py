@@ -85,10 +85,8 @@ def connected(
     radius: float,
     name: str,
 ) -> Tensor:
-    """Return the connected part (nx, ny, nz), bool, of the clear cells that robots use.
-
-    It is the part that contains the start. Without a start it is the part with the most standing room.
-    """
+    """Return the connected part (nx, ny, nz), bool, of the clear cells that robots use. It is the part that
+    contains the start. Without a start it is the part with the most standing room."""
     from scipy.ndimage import label
 
     parts, n_parts = label(clear.numpy())
@@ -120,11 +118,9 @@ def connected(
 
 
 def collides(world: MeshWorld, positions: Tensor, radius: float) -> Tensor:
-    """Flag (S,) the positions (S, 3), metres, that are closer than `radius` to a surface.
-
-    The test does not detect positions deep inside a solid. Positions along a path must therefore be no
-    farther apart than the robot's width, so that no step passes through a surface undetected.
-    """
+    """Flag (S,) the positions (S, 3), metres, that are closer than `radius` to a surface. The test does not
+    detect positions deep inside a solid. Positions along a path must therefore be no farther apart than the
+    robot's width, so that no step passes through a surface undetected."""
     if len(positions) == 0:
         return torch.zeros(0, dtype=torch.bool)
     return world.clearance(positions, threads=torch.get_num_threads()) < radius
@@ -145,8 +141,7 @@ def meets_others(positions: Tensor, radius: float) -> Tensor:
 
 
 _GOLDEN = (math.sqrt(5) - 1) / 2
-_AT_SURFACE = 1e-3
-"""Tolerance (m) for float32 rays. A ray can only end in a cell that the mesh meets."""
+_AT_SURFACE = 1e-3  # tolerance (m) for float32 rays. A ray can only end in a cell that the mesh meets.
 
 _RAYS_AT_ONCE = 1 << 18
 
@@ -190,11 +185,8 @@ def observable_cells(
 ) -> Tensor:
     """Return cells (nx, ny, nz), bool, that some ray crosses or ends in. Rays end at the mesh, range or box.
 
-    Args:
-        occupied: (nx, ny, nz) bool, the cells of the box that the mesh meets.
-        points_of_view: (V, 3) int64, cells relative to the low corner of the box.
-        directions: (N, 3) unit vectors.
-        max_range: metres.
+    occupied: (nx, ny, nz) bool, the cells of the box that the mesh meets. points_of_view: (V, 3) int64, cells
+    relative to the low corner of the box. directions: (N, 3) unit vectors. max_range: metres.
     """
     shape = box.shape
     strides = torch.tensor(row_major_strides(shape))
@@ -231,10 +223,7 @@ def observable_cells(
 
 def _crossed(direction: Tensor, reach: float, strides: Tensor) -> tuple[Tensor, Tensor]:
     """Return the distances (K,), in cells, at which a ray from a cell's centre enters cells, and the offsets
-    (K,) of their flat indices.
-
-    The first cell is the start, entered at distance 0.
-    """
+    (K,) of their flat indices. The first cell is the start, entered at distance 0."""
     plane = torch.arange(math.ceil(reach) + 1, dtype=torch.float64) + 0.5
     distance = (plane / direction.abs()[:, None]).flatten()  # infinite along planes
     step = (direction.sign().long() * strides)[:, None].expand(3, len(plane)).flatten()

@@ -16,31 +16,22 @@ from gmmtorch.team.exploration.robot.mapper import LocalMap
 from gmmtorch.team.exploration.world.navigable import viewpoints
 from gmmtorch.team.exploration.world.world import World
 
-_SPACING = 1.5
-"""Metres between two starts."""
-_ROOMY = 1.0
-"""Preferred distance (m) of a start from the nearest surface."""
+_SPACING = 1.5  # metres between two starts
+_ROOMY = 1.0  # preferred distance (m) of a start from the nearest surface
 _DOWN = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)
-_TRIES = 40
-"""Number of places, or sets of places, that are tried before the search fails."""
-_NEAR = 2.0
-"""Metres from the start to the nearest place where the robot can take off, at most."""
-_STEP = 0.05
-"""Metres between the positions of the way there."""
-_YAWS = 16
-"""Headings tried at each place."""
-_BATCH = 16
-"""Places tried together."""
+_TRIES = 40  # places, or sets of places, that are tried before the search fails
+_NEAR = 2.0  # metres from the start to the nearest place where the robot can take off, at most
+_STEP = 0.05  # metres between the positions of the way there
+_YAWS, _BATCH = 16, 16  # headings tried at each place; places tried together
 
 
 def start_poses(world: World, n: int, primitives: Primitives) -> Tensor:
     """Choose start poses (n, 4), x, y, z (m) and yaw (rad), in the navigable space.
 
-    The poses are near the world's start. Without one, they are at the end that is farthest from the middle.
-    They are 1.5 m apart, and the robots never touch. If there is room, every pose is visible from the first,
-    a metre from every surface, and at the same height. Yaw angles are spread evenly; the first robot looks
-    towards the middle of the world. Raises `InvalidArgumentError` if there is no room for n robots that can
-    fly off.
+    The poses are near the world's start, else at the end that is farthest from the middle, and 1.5 m apart.
+    If there is room, every pose is visible from the first, a metre from every surface, and at one height.
+    Yaw angles are spread evenly; the first robot looks towards the middle of the world. Raises
+    `InvalidArgumentError` if there is no room for n robots that can fly off.
     """
     apart = max(_SPACING, 2 * world.robot_radius + world.resolution)
     anchor = _far_end(world) if world.start is None else world.start
@@ -71,10 +62,8 @@ def start_poses(world: World, n: int, primitives: Primitives) -> Tensor:
 
 
 def check_start(world: World, poses: Tensor, primitives: Primitives) -> Tensor:
-    """Check that robots can start at poses (n, 4), x, y, z (m) and yaw (rad), float64; return them.
-
-    Raises `InvalidArgumentError` that names the first bad pose and a better place for it.
-    """
+    """Check that robots can start at poses (n, 4), x, y, z (m) and yaw (rad), float64; return them. Raises
+    `InvalidArgumentError` that names the first bad pose and a better place for it."""
     for i, pose in enumerate(poses):
         others = poses[:i, :3]
         if not bool(torch.isfinite(pose).all()):
@@ -197,15 +186,13 @@ class InitialFreeSpace:
 
 
 def initial_free_space(world: World, place: Tensor, primitives: Primitives) -> InitialFreeSpace | None:
-    """The free space that a robot knows at its start (3,), metres; None if it cannot take off from there.
+    """The free space that a robot knows at its start (3,), metres; None if it cannot take off from there,
+    because none of its primitives is safe even with a perfect map.
 
     The start must touch nothing. In open space the robot knows that the sphere up to the nearest surface is
     free. Near a surface that sphere is too small, and the camera sees nothing above, below or behind the
     robot: there it is given the free cells nearby. If its start is too narrow for its primitives, it is also
-    given a straight, collision-free way from the nearest place that is not; it flies back along that way
-    first.
-
-    A robot cannot take off if none of its primitives is safe there even with a perfect map.
+    given a straight way from the nearest place that is not, and flies back along that way first.
     """
     radius, resolution = world.robot_radius, world.resolution
     # The radius that a robot must know to be free in order to take off.

@@ -2,18 +2,32 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+import logging
 import math
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from gmmtorch.datasets import read_triangles
-from gmmtorch.errors import InvalidArgumentError, MemoryLimitError, MissingDataError, check_choice
+from gmmtorch.errors import (
+    DataError,
+    InvalidArgumentError,
+    MemoryLimitError,
+    MissingDataError,
+    OutputError,
+    check_choice,
+    check_number,
+)
 from gmmtorch.events import Event, ignore
+from gmmtorch.files import pack_tensors, read_tensors, require, write_bytes
 from gmmtorch.occupancy import Box, check_resolution
 from gmmtorch.simulation import MeshWorld, checked_triangles, tunnels, warehouse, warehouse_start
 from gmmtorch.team.exploration.world.navigable import (
@@ -25,18 +39,55 @@ from gmmtorch.team.exploration.world.navigable import (
     view_directions,
     viewpoints,
 )
-from gmmtorch.team.exploration.world.world_cache import cached_cells
+
+_log = logging.getLogger(__name__)
+
+_CELLS = ("occupied", "observable", "navigable")
+_Cells = dict[str, Tensor]  # bool tensors (nx, ny, nz) by these names
+_KIND = "gmmtorch-world"
+VERSION = 1
+"""Increase it when the same mesh would give other cells."""
+
+
+def cached_cells(
+    triangles: Tensor, options: Mapping[str, Any], shape: tuple[int, ...], compute: Callable[[], _Cells]
+) -> _Cells:
+    """Return the cells of a world of this shape, from the cache, or computed and stored there.
+
+    The folder is $GMMTORCH_CACHE, else gmmtorch in $XDG_CACHE_HOME, else in ~/.cache. The name of a file is a
+    hash of the triangles (T, 3, 3), float64, the options (JSON), and the version; cells are packed as bits.
+    """
+    digest = hashlib.sha256(triangles.contiguous().numpy().tobytes())
+    digest.update(json.dumps({"version": VERSION, **options}, sort_keys=True).encode())
+    key, n_cells = digest.hexdigest(), math.prod(shape)
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "gmmtorch"
+    path = Path(os.environ.get("GMMTORCH_CACHE") or home) / "worlds" / f"{key[:32]}.safetensors"
+    try:
+        tensors, facts = read_tensors(path, _KIND, VERSION)
+        packed = [require(tensors, name, (math.ceil(n_cells / 8),), torch.uint8, path) for name in _CELLS]
+        if facts.get("key") != key or facts.get("shape") != list(shape):
+            raise DataError(f"{path} belongs to another world.")
+        bits = (np.unpackbits(part.numpy(), count=n_cells).view(np.bool_) for part in packed)
+        return {name: torch.from_numpy(bit).view(shape) for name, bit in zip(_CELLS, bits, strict=True)}
+    except MissingDataError:
+        pass
+    except (DataError, OSError) as error:
+        _log.warning("The cached world cannot be used and is computed again: %s", error)
+    cells = compute()
+    try:
+        packed_bits = {name: torch.from_numpy(np.packbits(cell.numpy())) for name, cell in cells.items()}
+        write_bytes(path, pack_tensors(packed_bits, _KIND, VERSION, key=key, shape=list(shape)))
+    except OutputError as error:
+        _log.warning("The world is not cached: %s", error)
+    return cells
+
 
 MAX_CELLS = 1 << 28
 """Largest number of cells of a world; computing it takes about 2 GB."""
 
-_SHARP = 0.4
-"""Share of the camera's range at which the rays that find observable cells are one cell apart."""
+_SHARP = 0.4  # share of the camera's range at which the rays that find observable cells are one cell apart
 
-_FINEST = 0.01
-"""Smallest angle (rad) between those rays."""
-
-_CELLS = ("occupied", "observable", "navigable")
+_FINEST = 0.01  # smallest angle (rad) between those rays
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,17 +95,14 @@ class World:
     """A mesh within bounds, on a lattice of cells.
 
     Attributes:
-        name: used in messages and results.
-        mesh: the mesh; it casts rays.
-        resolution: side of a cell (m).
+        name: in messages and results. mesh: casts rays. resolution: side of a cell (m).
         box: the lattice cells of the bounds.
         occupied: (nx, ny, nz) bool, cells that the mesh meets.
         navigable: bool, connected cells above a floor at whose centre a robot does not touch the mesh. Cells
             without a surface below them are outside, such as the rock around a mine without a roof.
         observable: bool, cells that a camera in the navigable space can see: occupied cells, and free cells
             above a floor.
-        robot_radius: metres.
-        start: (3,), metres, the default start of the robots.
+        robot_radius: metres. start: (3,), metres, the default start of the robots.
     """
 
     name: str
@@ -106,19 +154,19 @@ class World:
         mesh = MeshWorld(triangles)
         box = _lattice_box(mesh, bounds, resolution, name)
         place = None if start is None else _point(start)
-        options = _CellOptions(
-            resolution,
-            box.low.tolist(),
-            box.high.tolist(),
-            vertical_fov,
-            max_range,
-            robot_radius,
-            None if place is None else place.tolist(),
-            spacing,
-        )
+        options: dict[str, Any] = {  # what the cells depend on besides the triangles; the key of the cache
+            "resolution": resolution,
+            "low": box.low.tolist(),
+            "high": box.high.tolist(),
+            "vertical_fov": vertical_fov,
+            "max_range": max_range,
+            "robot_radius": robot_radius,
+            "start": None if place is None else place.tolist(),
+            "spacing": spacing,
+        }
 
-        def compute() -> dict[str, Tensor]:
-            cells = _compute_cells(mesh, triangles, box, options, name, on_event)
+        def compute() -> _Cells:
+            cells = _compute_cells(mesh, triangles, box, place, options, name, on_event)
             if cells is None:
                 raise InvalidArgumentError(
                     f"bounds={_listed(bounds)} contain no surface of {name}, which extends from "
@@ -126,7 +174,7 @@ class World:
                 )
             return cells
 
-        cells = cached_cells(triangles, options._asdict(), _CELLS, box.shape, compute) if cache else compute()
+        cells = cached_cells(triangles, options, box.shape, compute) if cache else compute()
         return cls(name, mesh, resolution, box, **cells, robot_radius=robot_radius, start=place)
 
     def centers(self, cells: Tensor) -> Tensor:
@@ -134,34 +182,26 @@ class World:
         return (cells + self.box.low + 0.5).double() * self.resolution
 
 
-class _CellOptions(NamedTuple):
-    """What the cells of a world depend on besides its triangles; the key of the cache."""
-
-    resolution: float
-    low: list[int]
-    high: list[int]
-    vertical_fov: float
-    max_range: float
-    robot_radius: float
-    start: list[float] | None
-    spacing: float
-
-
 def _compute_cells(
-    mesh: MeshWorld, triangles: Tensor, box: Box, options: _CellOptions, name: str, on_event: Event
-) -> dict[str, Tensor] | None:
+    mesh: MeshWorld,
+    triangles: Tensor,
+    box: Box,
+    start: Tensor | None,
+    options: Mapping[str, Any],
+    name: str,
+    on_event: Event,
+) -> _Cells | None:
     """Return the occupied, observable and navigable cells; None if no cell is occupied."""
-    resolution, radius = options.resolution, options.robot_radius
+    resolution, radius, max_range = (options[key] for key in ("resolution", "robot_radius", "max_range"))
     grounded = above_floor(mesh, resolution, box)
     occupied, clear = occupied_and_clear(mesh, triangles, resolution, box, grounded, radius, on_event)
     if not bool(occupied.any()):
         return None
-    start = None if options.start is None else _point(options.start)
     navigable = connected(clear, mesh, resolution, box, start, radius, name)
-    places = viewpoints(navigable, max(1, round(options.spacing / resolution)))
-    angle = max(resolution / (_SHARP * options.max_range), _FINEST)
-    directions = view_directions(options.vertical_fov, angle)
-    seen = observable_cells(mesh, occupied, box, resolution, places, directions, options.max_range, on_event)
+    places = viewpoints(navigable, max(1, round(options["spacing"] / resolution)))
+    angle = max(resolution / (_SHARP * max_range), _FINEST)
+    directions = view_directions(options["vertical_fov"], angle)
+    seen = observable_cells(mesh, occupied, box, resolution, places, directions, max_range, on_event)
     seen = (seen | navigable) & (grounded | occupied)
     return {"occupied": occupied, "observable": seen, "navigable": navigable}
 
@@ -173,8 +213,7 @@ def _check_sizes(
     if not 0 < vertical_fov <= math.pi:
         raise InvalidArgumentError(f"vertical_fov={vertical_fov} must be above 0 and at most π rad.")
     for key, value in {"max_range": max_range, "robot_radius": robot_radius, "spacing": spacing}.items():
-        if not (math.isfinite(value) and value > 0):
-            raise InvalidArgumentError(f"{key}={value} must be above zero metres.")
+        check_number(key, value, above=True)
     if max_range <= robot_radius + 2 * resolution:
         raise InvalidArgumentError(
             f"max_range={max_range} m ends within two cells of the robot (robot_radius={robot_radius} m, "
@@ -236,11 +275,8 @@ def open_world(
     **options: Any,
 ) -> World:
     """Open the world `name`: "warehouse" or "tunnels" with a seed and a size (m), or the "mesh" in a file.
-
-    `options` are those of `World.from_mesh`, which also raises its errors. Raises `InvalidArgumentError`
-    for an unknown name or an option that the world does not have, and `MissingDataError` for a missing
-    file.
-    """
+    `options` are those of `World.from_mesh`, which also raises its errors. Raises `InvalidArgumentError` for
+    an unknown name or an option that the world does not have, and `MissingDataError` for a missing file."""
     check_choice("world", name, ("warehouse", "tunnels", "mesh"))
     if name == "mesh":
         if size is not None:

@@ -1,9 +1,9 @@
-"""Components as datagrams. See docs/messages.md."""
+"""Components, and points that components gained, as datagrams. See docs/messages.md."""
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,27 +14,42 @@ from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.linalg import pack_symmetric, unpack_symmetric
 from gmmtorch.mapping import FARTHEST as THESIS_FARTHEST
 from gmmtorch.mapping import (
+    LARGEST_COUNT,
     LARGEST_VARIANCE,
     MOST_POINTS,
+    NO_COUNT,
     ORIGIN_STEP,
+    BitReader,
+    BitWriter,
     Components,
+    Ints,
     Quantized,
+    count_steps,
     decode,
     decode_thesis,
+    decode_thesis_updates,
     encode_quantized,
     encode_thesis,
+    encode_thesis_updates,
+    points_of,
     quantize,
     scaled,
 )
-from gmmtorch.team.sharing.messages.envelope import (
+from gmmtorch.team.sharing.messages.datagrams import (
     FARTHEST,
     LARGEST_NUMBER,
     MAX_BYTES,
     Kind,
     check_codec,
+    check_ids,
     check_places,
+    id_order,
     make_datagram,
+    read_ids,
+    read_number,
     split,
+    write_ids,
+    write_number,
 )
 
 MOST_COMPONENTS_SENT = 1024
@@ -42,10 +57,8 @@ MOST_COMPONENTS_SENT = 1024
 map's datagrams have about 170."""
 
 _SIZES = struct.Struct("<BIII")  # dimensions, components, origins, viewpoints
-_FIRST_GUESS = 128
-"""Components that are likely to fit into a datagram."""
-_FILL = 0.95
-"""Share of a datagram to fill, as components differ in size."""
+_FIRST_GUESS = 128  # components that are likely to fit into a datagram
+_FILL = 0.95  # share of a datagram to fill, as components differ in size
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,12 +71,11 @@ class ComponentsMessage:
 def encode_components(components: Components, codec: str = "quantized") -> list[bytes]:
     """Datagrams of components in order, each with the sensor origins that it needs; empty without components.
 
-    Args:
-        codec: "quantized": 8 to 10 bytes per component, rounded as `mapping.codec.quantized` does.
-            "float": float64, unchanged. "thesis": 57 bytes for each component and sensor origin.
+    codec: "quantized": 8 to 10 bytes per component, rounded as `mapping.codec.quantized` does. "float":
+    float64, unchanged. "thesis": 57 bytes for each component and sensor origin.
 
-    Raises `InvalidArgumentError` for values that the codec cannot store, for positions beyond
-    `envelope.FARTHEST`, and for a component with so many sensor origins that it does not fit into a datagram.
+    Raises `InvalidArgumentError` for values that the codec cannot store, positions beyond
+    `datagrams.FARTHEST`, and a component with so many sensor origins that it does not fit into a datagram.
     """
     viewpoints = torch.bincount(components.seen_by, minlength=len(components)).cpu()
     _check_viewpoints(viewpoints)
@@ -81,11 +93,8 @@ def encode_components(components: Components, codec: str = "quantized") -> list[
 
 
 def fitted(values: Quantized, max_bytes: int = MAX_BYTES) -> Iterator[tuple[bytes, Quantized]]:
-    """Datagrams of quantised components in order, each with as many as fit; and the components of each.
-
-    The number of components is estimated from the size of the datagram before, which takes fewer attempts
-    than halving all of them.
-    """
+    """Datagrams of quantised components in order, each with as many as fit; and the components of each. Their
+    number is estimated from the datagram before, which takes fewer attempts than halving."""
     _check_viewpoints(values.n_viewpoints)
     _check_quantized(values)
     so_far = values.n_viewpoints.cumsum(0)
@@ -130,32 +139,9 @@ def read_batch(data: bytes) -> Components:
     return components
 
 
-def _float(components: Components) -> bytes:
-    c = _checked(components)
-    fields = [
-        _doubles(c.means),
-        _doubles(pack_symmetric(c.covariances)),
-        _doubles(c.support),
-        c.max_range.cpu().numpy().astype("u1"),
-        c.ids.cpu().numpy().astype("<i8"),
-        _doubles(c.origins),
-        c.seen_by.cpu().numpy().astype("<u2"),
-        c.seen_from.cpu().numpy().astype("<u2"),
-        _doubles(c.seen_count),
-    ]
-    sizes = (c.dim, len(c), len(c.origins), len(c.seen_by))  # indices beyond 16 bits do not fit anyway
-    return make_datagram(Kind.FLOAT_COMPONENTS, _SIZES.pack(*sizes) + b"".join(f.tobytes() for f in fields))
-
-
-def read_float(body: bytes) -> ComponentsMessage:
-    if len(body) < _SIZES.size:
-        raise DataError(f"{len(body)} bytes are too few for components.")
-    dim, k, s, e = _SIZES.unpack_from(body)
-    if dim not in (2, 3):
-        raise DataError(f"The components are {dim}-dimensional; a map has 2 or 3 dimensions.")
-    if max(k, s, e) > len(body) or not k:
-        raise DataError(f"{k} components, {s} origins and {e} viewpoints do not fit: it is damaged.")
-    layout = np.dtype(
+def _float_layout(dim: int, k: int, s: int, e: int) -> np.dtype:
+    """The fields of k components with s origins and e viewpoints, in order."""
+    return np.dtype(
         [
             ("means", "<f8", (k, dim)),
             ("covariances", "<f8", (k, dim * (dim + 1) // 2)),
@@ -168,13 +154,34 @@ def read_float(body: bytes) -> ComponentsMessage:
             ("seen_count", "<f8", (e,)),
         ]
     )
+
+
+def _float(components: Components) -> bytes:
+    c = _checked(components)
+    sizes = (c.dim, len(c), len(c.origins), len(c.seen_by))  # indices beyond 16 bits do not fit anyway
+    row = np.zeros((), _float_layout(*sizes))
+    for name, value in {**vars(c), "covariances": pack_symmetric(c.covariances)}.items():
+        row[name] = value.detach().cpu().numpy()
+    return make_datagram(Kind.FLOAT_COMPONENTS, _SIZES.pack(*sizes) + row.tobytes())
+
+
+def read_float(body: bytes) -> ComponentsMessage:
+    if len(body) < _SIZES.size:
+        raise DataError(f"{len(body)} bytes are too few for components.")
+    dim, k, s, e = _SIZES.unpack_from(body)
+    if dim not in (2, 3):
+        raise DataError(f"The components are {dim}-dimensional; a map has 2 or 3 dimensions.")
+    if max(k, s, e) > len(body) or not k:
+        raise DataError(f"{k} components, {s} origins and {e} viewpoints do not fit: it is damaged.")
+    layout = _float_layout(dim, k, s, e)
     if len(body) != _SIZES.size + layout.itemsize:
         raise DataError(f"{len(body)} bytes do not match {k} components, {s} origins, {e} viewpoints.")
     row = np.frombuffer(body, layout, offset=_SIZES.size)[0]
     if (row["max_range"] > 1).any() or (row["ids"] < 0).any():
         raise DataError("A max_range flag or an id is out of range: it is damaged.")
     values = {
-        name: torch.from_numpy(row[name].astype(_wide(layout[name].base))) for name in layout.names or ()
+        name: torch.from_numpy(row[name].astype(np.float64 if layout[name].base.kind == "f" else np.int64))
+        for name in layout.names or ()
     }
     values["covariances"] = unpack_symmetric(values["covariances"], dim)
     values["max_range"] = values["max_range"] != 0
@@ -244,8 +251,7 @@ def _check_range(means: Tensor, origins: Tensor, ids: Tensor, farthest: float = 
 
 
 def _checked(components: Components, farthest: float = FARTHEST) -> Components:
-    """The components, if they are in range and their covariances positive definite, as codec=quantized
-    demands."""
+    """The components, if they are in range and their covariances positive definite, as for "quantized"."""
     c = components.checked()
     _check_range(c.means, c.origins, c.ids, farthest)
     for name, value, limit in (
@@ -257,23 +263,107 @@ def _checked(components: Components, farthest: float = FARTHEST) -> Components:
             raise InvalidArgumentError(
                 f"{name} go up to {float(value.max()):g}; {limit:g} is the most. Are they in metres?"
             )
-    _check_definite(unpack_symmetric(pack_symmetric(c.covariances), c.dim))  # only the upper half is sent
-    return c
-
-
-def _check_definite(covariances: Tensor) -> None:
-    info = torch.linalg.cholesky_ex(covariances).info
+    sent = unpack_symmetric(pack_symmetric(c.covariances), c.dim)  # only the upper half is
+    info = torch.linalg.cholesky_ex(sent).info
     if bool((info != 0).any()):
         first = int((info != 0).nonzero()[0])
         raise InvalidArgumentError(
             f"covariances[{first}] is not positive definite after rounding by this codec; use "
             "codec=quantized, which keeps it positive definite, or a larger least variance."
         )
+    return c
 
 
-def _doubles(values: Tensor) -> np.ndarray:
-    return values.detach().cpu().numpy().astype("<f8")
+_COUNT = np.dtype([("robot", "<i8"), ("number", "<i8"), ("count", "<f8")])
 
 
-def _wide(kind: np.dtype) -> type:
-    return np.float64 if kind.kind == "f" else np.int64
+@dataclass(frozen=True, eq=False)
+class CountsMessage:
+    """Points that `sender` assigned to components since its last message, by (robot, sequence)."""
+
+    sender: int
+    counts: dict[tuple[int, int], float]
+
+
+def encode_counts(
+    sender: int, counts: Mapping[tuple[int, int], float], codec: str = "quantized"
+) -> list[bytes]:
+    """Datagrams of counts ≥ 0 that components (robot, sequence) gained; empty without counts.
+
+    codec: "quantized": 1 to 3 bytes a count, rounded by up to 9 %, as `mapping.codec.quantization` does.
+    "float": 24 bytes. "thesis": 8 bytes, id and float32.
+    """
+    ids = torch.tensor(list(counts), dtype=torch.int64).reshape(-1, 2)
+    values = torch.tensor(list(counts.values()), dtype=torch.float64)
+    bad = ~((values >= 0) & (values <= MOST_POINTS))
+    if bool(bad.any()):
+        first = int(bad.nonzero()[0])
+        raise InvalidArgumentError(
+            f"counts[{tuple(ids[first].tolist())}]={float(values[first])} must be from 0 to {MOST_POINTS:g}."
+        )
+    check_codec(codec)
+    order = torch.from_numpy(id_order(check_ids("counts", ids)))
+    ids, values = ids[order], values[order]
+
+    def part(begin: int, end: int) -> bytes:
+        some, gained = ids[begin:end], values[begin:end]
+        writer = BitWriter()
+        write_number(writer, "sender", sender)
+        if codec == "quantized":
+            write_ids(writer, some.numpy())
+            writer.column(count_steps(gained).numpy())
+            return make_datagram(Kind.COUNTS, writer.to_bytes())
+        if codec == "thesis":
+            return make_datagram(Kind.THESIS_COUNTS, writer.to_bytes() + encode_thesis_updates(some, gained))
+        rows = np.empty(len(some), _COUNT)
+        rows["robot"], rows["number"], rows["count"] = some[:, 0], some[:, 1], gained
+        return make_datagram(Kind.FLOAT_COUNTS, writer.to_bytes() + rows.tobytes())
+
+    return split(len(ids), part, "count")
+
+
+def read_quantized_counts(body: bytes) -> CountsMessage:
+    reader = BitReader(body)
+    sender, ids = read_number(reader), read_ids(reader)
+    steps = reader.column(len(ids))
+    reader.finish()
+    return _counts(sender, ids, counts_of(steps))
+
+
+def counts_of(steps: Ints) -> np.ndarray:
+    """The numbers of points of `count_steps`. Raises `DataError` for steps out of range."""
+    if len(steps) and not NO_COUNT <= int(steps.min()) <= int(steps.max()) <= LARGEST_COUNT:
+        raise DataError(f"Counts reach from {steps.min()} to {steps.max()} steps: it is damaged.")
+    return points_of(torch.from_numpy(steps)).numpy()
+
+
+def read_float_counts(body: bytes) -> CountsMessage:
+    sender, rest = _sender_of(body)
+    if len(rest) % _COUNT.itemsize:
+        raise DataError(f"{len(rest)} bytes are not whole counts of {_COUNT.itemsize} bytes: truncated?")
+    rows = np.frombuffer(rest, _COUNT)
+    return _counts(sender, np.stack([rows["robot"], rows["number"]], 1).astype(np.int64), rows["count"])
+
+
+def read_thesis_counts(body: bytes) -> CountsMessage:
+    sender, rest = _sender_of(body)
+    ids, counts = decode_thesis_updates(rest)
+    return _counts(sender, ids.numpy(), counts.numpy())
+
+
+def _sender_of(body: bytes) -> tuple[int, bytes]:
+    """The sender at the begin of a body, and the remaining bytes."""
+    reader = BitReader(body)
+    sender = read_number(reader)
+    return sender, body[len(body) - reader.left // 8 :]
+
+
+def _counts(sender: int, ids: Ints, values: np.ndarray) -> CountsMessage:
+    counts = {
+        (robot, number): count for (robot, number), count in zip(ids.tolist(), values.tolist(), strict=True)
+    }
+    if len(counts) != len(ids) or not all(0 <= count <= MOST_POINTS for count in counts.values()):
+        raise DataError(f"An id comes twice, or a count is not from 0 to {MOST_POINTS:g}: it is damaged.")
+    if not len(ids) or not 0 <= int(ids.min()) <= int(ids.max()) <= LARGEST_NUMBER:
+        raise DataError(f"No ids, or ids outside 0 to {LARGEST_NUMBER}: it is damaged.")
+    return CountsMessage(sender, counts)

@@ -1,4 +1,4 @@
-"""All messages of a mission: an encoder for each kind, and one `decode`.
+"""All messages of a mission, and one `decode`.
 
 A datagram can be read without any other, has at most 1200 bytes, and is checked completely.
 docs/messages.md has the format byte by byte.
@@ -7,59 +7,14 @@ docs/messages.md has the format byte by byte.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 from gmmtorch.errors import DataError, GmmTorchError
-from gmmtorch.team.sharing.messages import (
-    component_messages,
-    count_messages,
-    point_messages,
-    record_messages,
-    view_messages,
-)
-from gmmtorch.team.sharing.messages.component_messages import ComponentsMessage, encode_components
-from gmmtorch.team.sharing.messages.count_messages import CountsMessage, encode_counts
-from gmmtorch.team.sharing.messages.envelope import CODECS, MAX_BYTES, Kind, parse_datagram
-from gmmtorch.team.sharing.messages.point_messages import PointsMessage, encode_points
-from gmmtorch.team.sharing.messages.record_messages import (
-    AnnouncementMessage,
-    CalibrationMessage,
-    CorrectionMessage,
-    CountersMessage,
-    FrameMessage,
-    SupersessionMessage,
-)
-from gmmtorch.team.sharing.messages.view_messages import (
-    PlanMessage,
-    ViewsMessage,
-    encode_plan,
-    encode_views,
-    quantized_poses,
-)
-
-__all__ = [
-    "CODECS",
-    "MAX_BYTES",
-    "AnnouncementMessage",
-    "CalibrationMessage",
-    "ComponentsMessage",
-    "CorrectionMessage",
-    "CountersMessage",
-    "CountsMessage",
-    "FrameMessage",
-    "Message",
-    "PlanMessage",
-    "PointsMessage",
-    "SupersessionMessage",
-    "ViewsMessage",
-    "decode",
-    "encode_components",
-    "encode_counts",
-    "encode_plan",
-    "encode_points",
-    "encode_views",
-    "kind_of",
-    "quantized_poses",
-]
+from gmmtorch.team.sharing.messages import component_messages, mission_messages, record_messages
+from gmmtorch.team.sharing.messages.component_messages import ComponentsMessage, CountsMessage
+from gmmtorch.team.sharing.messages.datagrams import Kind, parse_datagram
+from gmmtorch.team.sharing.messages.mission_messages import PlanMessage, PointsMessage, ViewsMessage
+from gmmtorch.team.sharing.messages.record_messages import AnnouncementMessage, RecordMessage, read_record
 
 Message = (
     ComponentsMessage
@@ -68,29 +23,25 @@ Message = (
     | ViewsMessage
     | PlanMessage
     | AnnouncementMessage
-    | SupersessionMessage
-    | CountersMessage
-    | CorrectionMessage
-    | FrameMessage
-    | CalibrationMessage
+    | RecordMessage
 )
 
 _KINDS: dict[Kind, tuple[str, Callable[[bytes], Message]]] = {
     Kind.COMPONENTS: ("components", component_messages.read_quantized),
     Kind.FLOAT_COMPONENTS: ("components", component_messages.read_float),
     Kind.THESIS_COMPONENTS: ("components", component_messages.read_thesis),
-    Kind.COUNTS: ("counts", count_messages.read_quantized_counts),
-    Kind.FLOAT_COUNTS: ("counts", count_messages.read_float_counts),
-    Kind.THESIS_COUNTS: ("counts", count_messages.read_thesis_counts),
-    Kind.POINTS: ("points", point_messages.read_points),
-    Kind.VIEWS: ("views", view_messages.read_views),
-    Kind.PLAN: ("plans", view_messages.read_plan),
+    Kind.COUNTS: ("counts", component_messages.read_quantized_counts),
+    Kind.FLOAT_COUNTS: ("counts", component_messages.read_float_counts),
+    Kind.THESIS_COUNTS: ("counts", component_messages.read_thesis_counts),
+    Kind.POINTS: ("points", mission_messages.read_points),
+    Kind.VIEWS: ("views", mission_messages.read_views),
+    Kind.PLAN: ("plans", mission_messages.read_plan),
     Kind.ANNOUNCEMENT: ("announcements", record_messages.read_announcement),
-    Kind.SUPERSESSION: ("supersessions", record_messages.read_supersession),
-    Kind.COUNTERS: ("counts", record_messages.read_counters),
-    Kind.CORRECTION: ("corrections", record_messages.read_correction),
-    Kind.FRAME: ("frames", record_messages.read_frame),
-    Kind.CALIBRATION: ("calibrations", record_messages.read_calibration),
+    Kind.SUPERSESSION: ("supersessions", partial(read_record, Kind.SUPERSESSION)),
+    Kind.COUNTERS: ("counts", partial(read_record, Kind.COUNTERS)),
+    Kind.CORRECTION: ("corrections", partial(read_record, Kind.CORRECTION)),
+    Kind.FRAME: ("frames", partial(read_record, Kind.FRAME)),
+    Kind.CALIBRATION: ("calibrations", partial(read_record, Kind.CALIBRATION)),
 }
 """Name of the contents for statistics, and reader of the body."""
 
@@ -101,11 +52,8 @@ def kind_of(datagram: bytes) -> str:
 
 
 def decode(datagram: bytes) -> Message:
-    """The message of a datagram, with tensors on the CPU.
-
-    Raises `DataError`, and nothing else, for any bytes that no encoder of this version writes. `MAX_BYTES`
-    bounds the memory.
-    """
+    """The message of a datagram, with tensors on the CPU. Raises `DataError`, and nothing else, for any bytes
+    that no encoder of this version writes. `MAX_BYTES` bounds the memory."""
     kind, body = parse_datagram(datagram)
     try:
         return _KINDS[kind][1](body)

@@ -1,31 +1,31 @@
-"""Datagrams of records other than components: supersessions, counters, corrections, frames, calibrations; and
-announcements.
-
-docs/messages.md describes the formats.
-"""
+"""Datagrams of records other than components, and announcements. See docs/messages.md."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
-from gmmtorch.mapping import LARGEST_COUNT, NO_COUNT, BitReader, BitWriter, count_steps
+from gmmtorch.mapping import AXIS_ORDERS, LARGEST_COUNT, NO_COUNT, BitReader, BitWriter, count_steps
 from gmmtorch.occupancy import N_BYTES, Calibration
-from gmmtorch.team.sharing.messages.count_messages import counts_of
-from gmmtorch.team.sharing.messages.envelope import FARTHEST, MAX_BYTES, Kind, make_datagram, split
-from gmmtorch.team.sharing.messages.fields import (
+from gmmtorch.team.sharing.messages.component_messages import counts_of
+from gmmtorch.team.sharing.messages.datagrams import (
+    FARTHEST,
+    MAX_BYTES,
+    Kind,
     is_motion,
+    make_datagram,
     matrix_of,
     motion_dim,
+    parse_datagram,
     read_intervals,
     read_keys,
     read_motion,
     read_number,
+    split,
     write_intervals,
     write_keys,
     write_motion,
@@ -41,10 +41,14 @@ from gmmtorch.team.sharing.replica.record_keys import (
     Ints,
     author_of,
     first_key,
+    keys_of,
     keys_of_robot,
     robot_of,
 )
 
+_OTHER_RECORDS = {Kind.SUPERSESSION, Kind.COUNTERS, Kind.CORRECTION, Kind.FRAME, Kind.CALIBRATION}
+RECORD_KINDS = frozenset({Kind.COMPONENTS} | _OTHER_RECORDS)
+"""Kinds of datagrams that contain records."""
 RECORD_BYTES = 1000
 """Longest record. A datagram of 1200 bytes has room for it and for encryption."""
 
@@ -57,8 +61,7 @@ def check_size(max_bytes: int) -> None:
 
 @dataclass(frozen=True, eq=False)
 class SupersessionMessage:
-    """Record `key`: in a replica that holds all of `new`, `old` no longer counts. All are keys of one
-    robot."""
+    """Record `key`: where all of `new` is held, `old` no longer counts. All are keys of one robot."""
 
     key: int
     old: Intervals
@@ -138,15 +141,12 @@ class CalibrationMessage:
 
 
 RecordMessage = SupersessionMessage | CountersMessage | CorrectionMessage | FrameMessage | CalibrationMessage
-_Record = TypeVar("_Record", bound=RecordMessage)
 
 
 def encode_record(record: RecordMessage) -> bytes:
-    """The datagram of a record. The caller must check that it has at most `RECORD_BYTES`.
-
-    Raises `InvalidArgumentError` for a record that `decode` would refuse.
-    """
-    _checked(record)
+    """The datagram of a record. The caller must check that it has at most `RECORD_BYTES`. Raises
+    `InvalidArgumentError` for a record that `decode` would refuse."""
+    _check(record)
     writer = BitWriter()
     writer.number(record.key)
     base = first_key(robot_of(record.key))
@@ -175,63 +175,38 @@ def encode_record(record: RecordMessage) -> bytes:
     return make_datagram(Kind.CORRECTION, writer.to_bytes())
 
 
-def read_supersession(body: bytes) -> SupersessionMessage:
+def read_record(kind: Kind, body: bytes) -> RecordMessage:
+    """The record in the body of a datagram of its kind."""
     reader = BitReader(body)
-    key, keys = _read_key(reader)
-    old, new = (read_intervals(reader, *keys.pairs()[0]) for _ in range(2))
-    reader.finish()
-    return _checked(SupersessionMessage(key, old, new))
-
-
-def read_counters(body: bytes) -> CountersMessage:
-    reader = BitReader(body)
-    key, _ = _read_key(reader)
-    components = read_keys(reader)
-    steps = reader.column(len(components))
-    reader.finish()
-    return _checked(CountersMessage(key, components, steps))
-
-
-def read_correction(body: bytes) -> CorrectionMessage:
-    reader = BitReader(body)
-    key, keys = _read_key(reader)
-    scan, version = read_number(reader), read_number(reader)
-    pose = read_motion(reader)
-    moved = read_intervals(reader, *keys.pairs()[0])
-    reader.finish()
-    return _checked(CorrectionMessage(key, scan, version, moved, pose))
-
-
-def read_frame(body: bytes) -> FrameMessage:
-    reader = BitReader(body)
-    key, _ = _read_key(reader)
-    incarnation, version, anchor = (read_number(reader) for _ in range(3))
-    if incarnation > LARGEST_INCARNATION:
-        raise DataError(f"Record {key} is of incarnation {incarnation}: it is damaged.")
-    frame = author_of(first_key(robot_of(key), incarnation))
-    pose = None if anchor - 1 == frame else read_motion(reader)
-    reader.finish()
-    return _checked(FrameMessage(key, frame, version, anchor - 1, pose))
-
-
-def read_calibration(body: bytes) -> CalibrationMessage:
-    reader = BitReader(body)
-    key, _ = _read_key(reader)
-    data = bytes(reader.fixed(N_BYTES, 8).tolist())
-    reader.finish()
-    return _checked(CalibrationMessage(key, Calibration.of_bytes(data)))
-
-
-def _read_key(reader: BitReader) -> tuple[int, Intervals]:
-    """A record's key, and all keys of its robot."""
     key = reader.number()
     if not 0 <= key < END:
         raise DataError(f"Record {key} is out of range: it is damaged.")
-    return key, keys_of_robot(robot_of(key))
+    (own,) = keys_of_robot(robot_of(key)).pairs()
+    record: RecordMessage
+    if kind is Kind.SUPERSESSION:
+        record = SupersessionMessage(key, read_intervals(reader, *own), read_intervals(reader, *own))
+    elif kind is Kind.COUNTERS:
+        components = read_keys(reader)
+        record = CountersMessage(key, components, reader.column(len(components)))
+    elif kind is Kind.CORRECTION:
+        scan, version, pose = read_number(reader), read_number(reader), read_motion(reader)
+        record = CorrectionMessage(key, scan, version, read_intervals(reader, *own), pose)
+    elif kind is Kind.FRAME:
+        incarnation, version, anchor = (read_number(reader) for _ in range(3))
+        if incarnation > LARGEST_INCARNATION:
+            raise DataError(f"Record {key} is of incarnation {incarnation}: it is damaged.")
+        frame = author_of(first_key(robot_of(key), incarnation))
+        at = None if anchor - 1 == frame else read_motion(reader)
+        record = FrameMessage(key, frame, version, anchor - 1, at)
+    else:
+        record = CalibrationMessage(key, Calibration.of_bytes(bytes(reader.fixed(N_BYTES, 8).tolist())))
+    reader.finish()
+    _check(record)
+    return record
 
 
-def _checked(record: _Record) -> _Record:
-    """The record; raises `InvalidArgumentError` if it is invalid."""
+def _check(record: RecordMessage) -> None:
+    """Raise `InvalidArgumentError` if a record is invalid."""
     key = record.key
     if not 0 <= key < END:
         raise InvalidArgumentError(f"key={key} is out of range: keys go from 0 to {END - 1}.")
@@ -264,7 +239,6 @@ def _checked(record: _Record) -> _Record:
             f"Record {key} corrects {record.moved!r} by {record.pose.tolist()}: it must move components "
             f"of its robot, by up to {FARTHEST:g} m on each axis and a rotation of unit length."
         )
-    return record
 
 
 def _check_frame(record: FrameMessage) -> None:
@@ -306,8 +280,7 @@ def counters_message(key: int, points: dict[int, float]) -> CountersMessage:
 
 @dataclass(frozen=True, eq=False)
 class AnnouncementMessage:
-    """Of the keys from `begin` to `end` − 1, incarnation `incarnation` of robot `sender` holds exactly
-    `held`."""
+    """Of the keys from `begin` to `end` − 1, this incarnation of robot `sender` holds exactly `held`."""
 
     sender: int
     incarnation: int
@@ -323,11 +296,8 @@ class AnnouncementMessage:
 def encode_announcements(
     sender: int, incarnation: int, held: Intervals, max_bytes: int = MAX_BYTES
 ) -> list[bytes]:
-    """Datagrams of all keys that are held, at least one.
-
-    Each covers another range of keys, so any of them may be lost. Raises `InvalidArgumentError` for
-    values out of range.
-    """
+    """Datagrams of all keys that are held, at least one; each covers another range, so any may be lost.
+    Raises `InvalidArgumentError` for values out of range."""
     _check_sender(sender, incarnation)
     if not Intervals.span(0, END).covers(held):
         raise InvalidArgumentError(f"held={held!r} goes beyond the largest key, {END - 1}.")
@@ -366,3 +336,27 @@ def _check_sender(sender: int, incarnation: int) -> None:
             f"sender={sender}, incarnation={incarnation}: robots go up to {LARGEST_ROBOT}, incarnations "
             f"up to {LARGEST_INCARNATION}."
         )
+
+
+def keys_in(datagram: bytes) -> Intervals:
+    """The keys of the records in a datagram that a replica has sent or merged, without decoding the rest.
+    Raises `DataError` if it is no datagram of `RECORD_KINDS`."""
+    kind, body = parse_datagram(datagram)
+    if kind is Kind.COMPONENTS:
+        return Intervals.of(_component_keys(BitReader(body[1:])))
+    if kind not in RECORD_KINDS:
+        raise DataError(f"A datagram of kind {int(kind)} has no records.")
+    key = BitReader(body).number()
+    return Intervals.span(key, key + 1)
+
+
+def _component_keys(batch: BitReader) -> Ints:
+    """The keys of a codec batch (docs/formats.md): three numbers and the axis orders precede its ids."""
+    dim, k, _ = batch.number(), batch.number(), batch.number()
+    if dim not in AXIS_ORDERS or k < 0:
+        raise DataError(f"{k} components in {dim}D: it is damaged.")
+    n_bits = (len(AXIS_ORDERS[dim]) - 1).bit_length()
+    batch.require(k * n_bits)
+    batch.fixed(k, n_bits)
+    robots, numbers = batch.column(k), batch.column(k) + np.arange(k)
+    return keys_of(torch.from_numpy(np.stack([robots, numbers], 1)))

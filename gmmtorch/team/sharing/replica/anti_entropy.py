@@ -16,20 +16,18 @@ from gmmtorch.team.sharing.replica.record_keys import Intervals, Ints, authors, 
 from gmmtorch.team.sharing.replica.records import Records
 
 _CALLS_IN_FLIGHT = 3
-"""Calls of `sent` after which a datagram has arrived. A robot that sends, then receives, each tick, over a
-network with less delay than a tick, announces before it has received the datagrams of the last tick, and
-its announcement arrives a tick later."""
+"""Calls of `sent` after which a datagram has arrived. A robot that sends, then receives, each tick announces
+before it has received the datagrams of the last tick, and its announcement arrives a tick later."""
 MOST_PEERS = 64
 """Largest number of robots whose gaps are stored: those that announced last."""
 MOST_REMEMBERED = 1 << 16
-"""Intervals of what these robots lack, all together, and of what they hold: 1 MiB each. Two honest robots
-at their limits, or hundreds usually, need as many. The robot with most of them is forgotten until it
-announces again."""
+"""Intervals of what these robots lack, all together, and of what they hold: 1 MiB each, for hundreds of
+robots usually. The robot with most of them is forgotten until it announces again."""
 MOST_IN_FLIGHT = 1 << 14
 """Intervals of keys in flight. If there are more, they are forgotten, and some records are sent twice."""
 PATIENCE = 1 << 7
 """Announcements made here after which a silent robot counts as gone, with the records that only it announced:
-two minutes if urgent, longer than most partitions of a team."""
+two minutes if urgent."""
 
 Packet = tuple[bytes, Intervals]
 """A datagram, and the keys of its records."""
@@ -61,10 +59,6 @@ class Backlog:
         """Another robot sent these records, or an echo of this robot's arrived."""
         self.due -= keys
         self._in_flight[0] = (self._in_flight[0] | keys).up_to(MOST_IN_FLIGHT)
-
-    def superseded(self, dead: Intervals) -> None:
-        """These records no longer count, and need not be sent."""
-        self.due -= dead
 
     def sent(self, keys: Intervals) -> None:
         """All records that this robot has sent since the last call."""
@@ -102,19 +96,16 @@ class Backlog:
         return Intervals.union(self._theirs.values()) - held
 
 
-_RUN = 96
-"""Components with consecutive keys that are sent together: about one datagram."""
+_RUN = 96  # components with consecutive keys that are sent together: about one datagram
 
 
 def packets(
     records: Records, due: Intervals, ready: Sequence[Packet], max_bytes: int, by_information: bool
 ) -> Iterator[Packet]:
-    """Datagrams with the keys of their records: supersessions and corrections, then components, then
-    counters.
+    """Datagrams with the keys of their records: supersessions and corrections, components, then counters.
 
     Args:
-        due: keys of records to send, none of them superseded.
-        ready: datagrams of components that were encoded before; they are sent unchanged.
+        due: keys of records to send, none superseded. ready: encoded components; they are sent unchanged.
         max_bytes: largest size of a datagram.
         by_information: False: components in the order of their keys, which takes the fewest bytes. True: in
             runs of consecutive keys, the runs with most `_information` first, which takes few more.
@@ -158,9 +149,7 @@ def _in_order(
 
 def _information(components: Components) -> Tensor:
     """The approximate space (K,), m³ or m², that each component shows: its face times its sensor distance.
-
-    Large components seen from afar leave the largest hole in a map that lacks them.
-    """
+    Large components seen from afar leave the largest hole in a map that lacks them."""
     deviation = torch.linalg.eigvalsh(components.covariances).clamp_min(0).sqrt()
     face = deviation[:, 1:].prod(1)
     apart = components.means[components.seen_by] - components.origins[components.seen_from]

@@ -1,8 +1,8 @@
-"""Author: writes the records of one incarnation of a robot."""
+"""Author: writes the records of one incarnation of a robot; MovedMap: how corrected poses moved a map."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -14,8 +14,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping import NO_COUNT, Components, order_of, quantize, quantized
 from gmmtorch.occupancy import Calibration
 from gmmtorch.team.sharing.messages.component_messages import fitted
-from gmmtorch.team.sharing.messages.envelope import split
-from gmmtorch.team.sharing.messages.fields import pose_of
+from gmmtorch.team.sharing.messages.datagrams import pose_of, split
 from gmmtorch.team.sharing.messages.message_registry import decode
 from gmmtorch.team.sharing.messages.record_messages import (
     RECORD_BYTES,
@@ -29,14 +28,13 @@ from gmmtorch.team.sharing.messages.record_messages import (
     encode_record,
 )
 from gmmtorch.team.sharing.replica.anti_entropy import Packet
-from gmmtorch.team.sharing.replica.component_table import fingerprints, most_viewpoints
-from gmmtorch.team.sharing.replica.materialized_view import latest
-from gmmtorch.team.sharing.replica.moved_map import MovedMap
+from gmmtorch.team.sharing.replica.materialized_view import fingerprints, latest, most_viewpoints
 from gmmtorch.team.sharing.replica.record_keys import (
     MOST_RECORDS,
     Intervals,
     Ints,
     author_of,
+    authors,
     first_key,
     ids_of,
     keys_of_author,
@@ -44,24 +42,55 @@ from gmmtorch.team.sharing.replica.record_keys import (
 )
 from gmmtorch.team.sharing.replica.records import MOST_VIEWPOINTS, Records
 
-_MOST_SUPERSESSIONS = 32
-"""Effective supersessions of this author before they are merged."""
+_MOST_RUNS = 128  # intervals of keys in a correction, which then fits into a datagram
+
+
+class MovedMap(NamedTuple):
+    """How corrected poses have moved a map of K components.
+
+    before: the components where they would be without corrections. scans (K,): the number of the scan, or of
+    the window of scans, of each; −1: of none. motions: of each scan, from number 0 on, (D+1, D+1), from
+    `before` to the map; the identity to the bit for those that were not corrected.
+    """
+
+    before: Components
+    scans: Tensor
+    motions: Sequence[Tensor]
+
+    def corrected(self, keys: Ints, live: Ints, known: Collection[int]) -> dict[int, Intervals]:
+        """The keys that the correction of each corrected scan moves, and some of dead records, so that
+        intervals are few. Keys beyond `_MOST_RUNS` intervals of a scan are set to −1: publish them again.
+
+        keys: (K,) of the components that were published where they were before; −1 for others. live: (L,)
+        rising keys of all components of the robot. known: scans that have a correction already.
+        """
+        scans = np.full(len(live), -1)
+        scans[np.searchsorted(live, keys[keys >= 0])] = self.scans.cpu().numpy()[keys >= 0]
+        is_first = np.ones(len(live), np.bool_)  # key of an interval of one scan and one author
+        is_first[1:] = (scans[1:] != scans[:-1]) | (authors(live[1:]) != authors(live[:-1]))
+        is_last = np.append(is_first[1:], True)[: len(live)]
+        edges, scans = np.stack([live[is_first], live[is_last] + 1], 1), scans[is_first]
+        found = {}
+        for scan, motion in enumerate(self.motions):
+            runs = edges[scans == scan]
+            is_identity = torch.equal(motion, torch.eye(len(motion), dtype=motion.dtype))
+            if scan in known or (len(runs) and not is_identity):
+                found[scan] = Intervals(runs[:_MOST_RUNS].reshape(-1))
+                for begin, end in runs[_MOST_RUNS:].tolist():
+                    keys[(begin <= keys) & (keys < end)] = -1
+        return found
+
+
+_MOST_SUPERSESSIONS = 32  # effective supersessions of this author before they are merged
 _MOST_OUTDATED = 64
 """Outdated entries in records of counters, beyond as many as are current, before all are rewritten."""
-_MOST_SHORT = 16
-"""Records of counters shorter than half of `RECORD_BYTES` before they are merged."""
+_MOST_SHORT = 16  # records of counters shorter than half of `RECORD_BYTES` before they are merged
 _MOST_POINTS = 2.0**40
-_MORE_PREDICTIONS = 1.5
-"""Growth of the number of predictions after which a calibration is written again."""
+_MORE_PREDICTIONS = 1.5  # growth of the number of predictions after which a calibration is written again
 
 
-class Published(NamedTuple):
-    """keys (K,): of the given components; written: keys of all new records; packets: datagrams of the
-    components."""
-
-    keys: Ints
-    written: Intervals
-    packets: list[Packet]
+Published = tuple[Ints, Intervals, list[Packet]]
+"""Keys (K,) of the given components; keys of all new records; datagrams of the components."""
 
 
 class Author:
@@ -99,7 +128,7 @@ class Author:
         if not self._keys_of_robot.covers(old):
             raise InvalidArgumentError(f"A robot supersedes its own records only; robot={self._robot}.")
         if not len(components) and not old:
-            return Published(np.zeros(0, np.int64), Intervals.empty(), [])
+            return np.zeros(0, np.int64), Intervals.empty(), []
         values = quantize(components)
         order = order_of(values.places)
         first = self._numbers(len(order))
@@ -114,17 +143,15 @@ class Author:
         keys = np.empty_like(numbered)
         keys[order.numpy()] = numbered
         superseded = self._supersede((old & self._records.held) - self._records.dead, written)
-        return Published(keys, written | superseded, packets)
+        return keys, written | superseded, packets
 
     def publish_map(
         self, components: Components, whole: bool, max_bytes: int, moved: MovedMap | None = None
     ) -> Published:
-        """Write what is new in a map, and supersede what it no longer has. Components are compared by
-        content.
+        """Write what is new in a map, by content, and supersede what it no longer has. Keys are rising.
 
-        whole: whether the map continues those of earlier incarnations, whose records are superseded, too,
-        if the map lacks them.
-        moved: components that were published where they were before are corrected.
+        whole: whether the map continues those of earlier incarnations, whose records are superseded, too, if
+        the map lacks them. moved: components that were published where they were before are corrected.
         """
         table, own = self._records.table, self._own_components()
         published = self._published & set(own)
@@ -141,10 +168,10 @@ class Author:
         gone = set(candidates if whole else published) - set(keys.tolist())
         rows = np.flatnonzero(keys < 0)
         new = components.selected(torch.from_numpy(rows))
-        made = self.publish(new, Intervals.of(np.array(sorted(gone), np.int64)), max_bytes)
-        self._published = {*keys[keys >= 0].tolist(), *made.keys.tolist()}
+        made, written, packets = self.publish(new, Intervals.of(np.array(sorted(gone), np.int64)), max_bytes)
+        self._published = {*keys[keys >= 0].tolist(), *made.tolist()}
         corrected = [] if moved is None else self._correct_map(runs, moved.motions)
-        return made._replace(written=Intervals.union([made.written, *corrected]))
+        return np.sort(made), Intervals.union([written, *corrected]), packets
 
     def _correct_map(self, runs: Mapping[int, Intervals], motions: Sequence[Tensor]) -> list[Intervals]:
         """Write the corrections of scans that have changed; returns the new records."""
@@ -200,18 +227,14 @@ class Author:
         for key in keys[is_dead].tolist():
             self._written_steps.pop(key, None)
         rewritten = self._write_counters({key: self._points[key] for key in keys[~is_dead].tolist()})
-        old = Intervals.of(np.array([record.key for record in own], np.int64))
-        return rewritten | self._supersede(old, rewritten)
+        return self._replace(own, rewritten)
 
     def correct(self, scan: int, transform: Tensor, moved: Intervals) -> Intervals:
         """Write a correction of a scan with the components `moved`; returns the new records."""
         if not self._keys_of_robot.covers(moved):
             raise InvalidArgumentError(f"A robot corrects its own components only; robot={self._robot}.")
-        before = [
-            record
-            for record in self._records.of(CorrectionMessage)
-            if record.scan == scan and record.key in self._keys_of_robot
-        ]
+        records = self._records.of(CorrectionMessage)
+        before = [r for r in records if r.scan == scan and r.key in self._keys_of_robot]
         version = 1 + max((record.version for record in before), default=0)
         record = CorrectionMessage(self._first + self._n, scan, version, moved, pose_of(transform))
         if len(encode_record(record)) > RECORD_BYTES:
@@ -220,9 +243,7 @@ class Author:
                 "Number a scan's components consecutively."
             )
         self._numbers(1)
-        written = self._records.add_record(record, bounded=False)
-        old = Intervals.of(np.array([r.key for r in before], np.int64))
-        return written | self._supersede(old, written)
+        return self._replace(before, self._records.add_record(record, bounded=False))
 
     def place_frame(self, frame: int, anchor: int, transform: Tensor | None) -> Intervals:
         """Write where a frame of this robot is; returns the new records.
@@ -232,9 +253,9 @@ class Author:
         before = [record for record in self._records.of(FrameMessage) if record.frame == frame]
         version = 1 + max((record.version for record in before), default=0)
         pose = None if transform is None else pose_of(transform)
-        written = self._write(FrameMessage(self._first + self._n, frame, version, anchor, pose))
-        old = Intervals.of(np.array([r.key for r in before], np.int64))
-        return written | self._supersede(old, written)
+        return self._replace(
+            before, self._write(FrameMessage(self._first + self._n, frame, version, anchor, pose))
+        )
 
     def calibrate(self, calibration: Calibration) -> Intervals:
         """Write the calibration of this robot's map, if it rests on many more predictions than the one that
@@ -243,8 +264,7 @@ class Author:
         known = max((r.calibration.n_predicted for r in before), default=0)
         if calibration.n_predicted <= _MORE_PREDICTIONS * known:
             return Intervals.empty()
-        written = self._write(CalibrationMessage(self._first + self._n, calibration))
-        return written | self._supersede(Intervals.of(np.array([r.key for r in before], np.int64)), written)
+        return self._replace(before, self._write(CalibrationMessage(self._first + self._n, calibration)))
 
     def _write_counters(self, points: Mapping[int, float]) -> Intervals:
         keys = sorted(points)
@@ -262,12 +282,15 @@ class Author:
 
     # -- superseding ------------------------------------------------------------------------------
 
-    def _supersede(self, old: Intervals, new: Intervals) -> Intervals:
-        """Write supersessions of `old` by `new`; returns their keys.
+    def _replace(self, before: Sequence[RecordMessage], written: Intervals) -> Intervals:
+        """Supersede records by those that were written for them; returns all new records."""
+        old = Intervals.of(np.array([record.key for record in before], np.int64))
+        return written | self._supersede(old, written)
 
-        A supersession whose successors are all superseded is superseded with them, and its old records become
-        old records of the new supersession. So no robot needs the first one any more. See docs/replica.md.
-        """
+    def _supersede(self, old: Intervals, new: Intervals) -> Intervals:
+        """Write supersessions of `old` by `new`; returns their keys. A supersession whose successors are all
+        superseded is superseded with them: its old records become those of the new one, so that no robot
+        needs it any more. See docs/replica.md."""
         if not old:
             return Intervals.empty()
         closed, dead = old, self._records.dead | old
@@ -276,7 +299,7 @@ class Author:
                 closed |= record.old | Intervals.span(record.key, record.key + 1)
                 dead |= closed
         written = Intervals.empty()
-        whole = self._supersession(closed, new)
+        whole = SupersessionMessage(self._first + self._n, closed, new)
         if len(encode_record(whole)) <= RECORD_BYTES:
             written = self._write(whole)
         else:
@@ -290,9 +313,6 @@ class Author:
                 assert isinstance(message, SupersessionMessage)
                 written |= self._write(replace(message, key=self._first + self._n))
         return written | self._merge_supersessions()
-
-    def _supersession(self, old: Intervals, new: Intervals) -> SupersessionMessage:
-        return SupersessionMessage(self._first + self._n, old, new)
 
     def _merge_supersessions(self) -> Intervals:
         """If this author has many effective supersessions, merge them, so that their memory stays bounded."""
@@ -312,7 +332,7 @@ class Author:
             old |= record.old | Intervals.span(record.key, record.key + 1)
             new |= record.new
         # Dead successors are covered by other supersessions. So none waits for what it supersedes itself.
-        union = self._supersession(old, new - old - self._records.dead)
+        union = SupersessionMessage(self._first + self._n, old, new - old - self._records.dead)
         if len(encode_record(union)) <= RECORD_BYTES:
             return self._write(union)
         half = len(records) // 2

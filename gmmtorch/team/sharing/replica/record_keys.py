@@ -1,9 +1,8 @@
 """Keys of records (the robot, its incarnation, and a number), and sets of keys stored as intervals.
 
 A record's id is (robot, sequence), as a component's in a map; sequence = incarnation · 2²⁸ + number. A
-robot draws a new incarnation whenever it starts, and numbers its records from 0. So a robot that lost its
-disk, or whose disk is older than its last datagrams, gives no id twice, without knowing its earlier
-records. Two of n incarnations are equal with probability n²/2²⁵: 3·10⁻⁶ for ten.
+robot draws a new incarnation whenever it starts, and numbers its records from 0. So it gives no id twice,
+even if it lost its disk. Two of n incarnations are equal with probability n²/2²⁵: 3·10⁻⁶ for ten.
 
 Here an id is one whole number, the key: robot · 2⁵² + sequence. An author is one incarnation of a robot, as
 the number robot · 2²⁴ + incarnation.
@@ -21,8 +20,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.mapping import AXIS_ORDERS, BitReader
-from gmmtorch.team.sharing.messages.envelope import Kind, parse_datagram
 
 Ints = NDArray[np.int64]
 
@@ -197,9 +194,6 @@ END = 1 << (ROBOT_BITS + SEQUENCE_BITS)
 WORLD = -1
 """The frame of records of authors that have no frame of their own; other frames have the number of their
 author."""
-_OTHER_RECORDS = {Kind.SUPERSESSION, Kind.COUNTERS, Kind.CORRECTION, Kind.FRAME, Kind.CALIBRATION}
-RECORD_KINDS = frozenset({Kind.COMPONENTS} | _OTHER_RECORDS)
-"""Kinds of datagrams that contain records."""
 
 
 def drawn_incarnation() -> int:
@@ -256,29 +250,3 @@ def keys_of(ids: Tensor) -> Ints:
     if not is_rising and len(np.unique(keys)) != len(keys):
         raise DataError("Two records have the same id.")
     return keys
-
-
-def keys_in(datagram: bytes) -> Intervals:
-    """The keys of the records in a datagram that a replica has sent or merged, without decoding the rest.
-
-    Raises `DataError` if it is no datagram of `RECORD_KINDS`.
-    """
-    kind, body = parse_datagram(datagram)
-    if kind is Kind.COMPONENTS:
-        return Intervals.of(_component_keys(BitReader(body[1:])))
-    if kind not in RECORD_KINDS:
-        raise DataError(f"A datagram of kind {int(kind)} has no records.")
-    key = BitReader(body).number()
-    return Intervals.span(key, key + 1)
-
-
-def _component_keys(batch: BitReader) -> Ints:
-    """The keys of a codec batch (docs/formats.md): three numbers and the axis orders precede its ids."""
-    dim, k, _ = batch.number(), batch.number(), batch.number()
-    if dim not in AXIS_ORDERS or k < 0:
-        raise DataError(f"{k} components in {dim}D: it is damaged.")
-    n_bits = (len(AXIS_ORDERS[dim]) - 1).bit_length()
-    batch.require(k * n_bits)
-    batch.fixed(k, n_bits)
-    robots, numbers = batch.column(k), batch.column(k) + np.arange(k)
-    return keys_of(torch.from_numpy(np.stack([robots, numbers], 1)))

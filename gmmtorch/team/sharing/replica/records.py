@@ -20,13 +20,17 @@ from gmmtorch.team.sharing.messages.record_messages import (
     SupersessionMessage,
     encode_record,
 )
-from gmmtorch.team.sharing.replica.component_table import (
+from gmmtorch.team.sharing.replica.materialized_view import (
+    ChangeLog,
+    Changes,
     ComponentTable,
     Counters,
+    Frames,
+    corrected,
     fingerprints,
     most_viewpoints,
+    with_gains,
 )
-from gmmtorch.team.sharing.replica.materialized_view import ChangeLog, Changes, Frames, corrected, with_gains
 from gmmtorch.team.sharing.replica.record_keys import WORLD, Intervals, Ints, authors, keys_of, robot_of
 
 MOST_VIEWPOINTS = 48
@@ -40,8 +44,7 @@ of each of 64 robots."""
 MOST_INTERVALS = 1 << 14
 """Intervals of held keys, with those that waiting supersessions may add. A team that loses datagrams has
 fewer."""
-_BATCH = 2048
-"""Components of a stored batch."""
+_BATCH = 2048  # components of a stored batch
 _PIECE = 128
 """Components of a batch in the table after loading: to drop one takes time in proportion to its batch."""
 
@@ -61,9 +64,8 @@ class Records:
 
     A supersession takes effect when all of its successors are held. Its old records are then dropped,
     because a robot that lacks them needs only the supersession and the successors. So the records that
-    count depend on the set of held keys, and not on the order of arrival.
-
-    Limits on memory apply to other robots' records. The robot's own records are never refused.
+    count depend on the set of held keys, and not on the order of arrival. Limits on memory apply to other
+    robots' records only.
 
     Args:
         dim: 2 or 3; None: that of the first components.
@@ -102,22 +104,18 @@ class Records:
     def add_components(self, components: Components, bounded: bool = True) -> Intervals:
         """Add all of the components, which the codec has rounded, or none; returns their keys.
 
-        bounded: whether the limits on memory apply.
-
-        Raises `RefusedError` with the reason "duplicate_id" (a key is held with another content), "full", or
-        "unfit" (another dimension, or more than `MOST_VIEWPOINTS` viewpoints).
+        bounded: whether the limits on memory apply. Raises `RefusedError`: "duplicate_id" (a key is held with
+        another content), "full", or "unfit" (another dimension, or more than `MOST_VIEWPOINTS` viewpoints).
         """
         keys = keys_of(components.ids)
         if not len(keys):
             return Intervals.empty()
         if components.dim != (self.dim or components.dim) or most_viewpoints(components) > MOST_VIEWPOINTS:
-            raise RefusedError(
-                "unfit",
-                robot_of(int(keys[0])),
-                f"Components in {components.dim}D with up to {most_viewpoints(components)} viewpoints; "
-                f"this map is in {self.dim or components.dim}D, and {MOST_VIEWPOINTS} viewpoints are the "
-                "most.",
+            message = (
+                f"Components in {components.dim}D with up to {most_viewpoints(components)} viewpoints; this "
+                f"map is in {self.dim or components.dim}D, and {MOST_VIEWPOINTS} viewpoints are the most."
             )
+            raise RefusedError("unfit", robot_of(int(keys[0])), message)
         fresh = ~self.held.contains(keys)
         if not fresh.all():
             self._check_same(keys[~fresh], components.selected(torch.from_numpy(np.flatnonzero(~fresh))))
@@ -142,9 +140,8 @@ class Records:
         dim = record.dim if isinstance(record, CorrectionMessage | FrameMessage) else None
         unfit = None not in (dim, self.dim) and dim != self.dim
         if unfit or len(datagram) > RECORD_BYTES:
-            raise RefusedError(
-                "unfit", robot, f"Record {key} is too long, or has another dimension than this map."
-            )
+            message = f"Record {key} is too long, or has another dimension than this map."
+            raise RefusedError("unfit", robot, message)
         if bounded and not self._has_room(record):
             raise _full(key)
         held = self._with(span, bounded)
@@ -255,8 +252,7 @@ class Records:
 
     def components(self, root: int | None = None) -> Components:
         """The components that count and are in frames of a root, by key, with the points of all counters,
-        moved by the corrections, in the root frame. None: that of the author.
-        """
+        moved by the corrections, in the root frame. None: that of the author."""
         if root is not None and root != self.root:
             return self._seen_in(root)
         if self._view is None or self._view[0] != self.version:
@@ -307,10 +303,7 @@ class Records:
 
     def load_batch(self, data: bytes, own: int) -> None:
         """Add the components of a batch of `stored`. The limits on memory do not apply to those of robot
-        `own`.
-
-        Raises as `add_components` does, and `DataError` for a damaged batch.
-        """
+        `own`. Raises as `add_components` does, and `DataError` for a damaged batch."""
         components = read_batch(data)
         is_own = components.ids[:, 0] == own
         for rows in (is_own.nonzero().squeeze(1), (~is_own).nonzero().squeeze(1)):
@@ -330,12 +323,8 @@ def _n_entries(record: RecordMessage) -> int:
 
 def _duplicate_id(key: int) -> RefusedError:
     robot = robot_of(key)
-    return RefusedError(
-        "duplicate_id",
-        robot,
-        f"Record {key} of robot {robot} has two contents: two robots use the id {robot}. Give each robot an "
-        "id of its own.",
-    )
+    message = f"Record {key} of robot {robot} has two contents: two robots use the id {robot}."
+    return RefusedError("duplicate_id", robot, f"{message} Give each robot an id of its own.")
 
 
 def _full(key: int) -> RefusedError:

@@ -15,8 +15,9 @@ from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, chec
 from gmmtorch.mapping import Components, GaussianMap
 from gmmtorch.occupancy import Calibration
 from gmmtorch.scan import ArrayLike
-from gmmtorch.team.sharing.messages.envelope import MAX_BYTES
-from gmmtorch.team.sharing.messages.message_registry import ComponentsMessage, Message, decode
+from gmmtorch.team.sharing.messages.component_messages import ComponentsMessage
+from gmmtorch.team.sharing.messages.datagrams import MAX_BYTES
+from gmmtorch.team.sharing.messages.message_registry import Message, decode
 from gmmtorch.team.sharing.messages.record_messages import (
     AnnouncementMessage,
     CalibrationMessage,
@@ -28,9 +29,8 @@ from gmmtorch.team.sharing.messages.record_messages import (
     encode_announcements,
 )
 from gmmtorch.team.sharing.replica.anti_entropy import Backlog, packets
-from gmmtorch.team.sharing.replica.authorship import Author, Published
+from gmmtorch.team.sharing.replica.authorship import Author, MovedMap, Published
 from gmmtorch.team.sharing.replica.materialized_view import Changes, Placement, robot_of_frame
-from gmmtorch.team.sharing.replica.moved_map import MovedMap
 from gmmtorch.team.sharing.replica.record_keys import (
     LARGEST_INCARNATION,
     LARGEST_ROBOT,
@@ -105,11 +105,10 @@ class Replica:
     def add(self, new: GaussianMap | Components, supersedes: ArrayLike | None = None) -> Tensor:
         """Write new records of this robot; returns their ids (K, 2).
 
-        Of a map: the components that are new or have changed since the last call; components that it no
-        longer has are superseded. See `publish`. Of components: all of them, with new ids; they supersede
-        this robot's components `supersedes` (J, 2) at all robots that hold all of the new ones.
-
-        Raises `InvalidArgumentError` for components that cannot be stored, and for other robots' records.
+        Of a map: what is new or has changed since the last call; what it no longer has is superseded, as by
+        `publish`. Of components: all, with new ids; they supersede this robot's components `supersedes`
+        (J, 2) where all of the new ones are held. Raises `InvalidArgumentError` for components that cannot be
+        stored, and for other robots' records.
         """
         if isinstance(new, GaussianMap):
             if supersedes is not None:
@@ -128,23 +127,20 @@ class Replica:
         return self._due(self._author.publish(self._checked(new), old, self._max_bytes))
 
     def publish(self, components: Components, *, whole: bool, moved: MovedMap | None = None) -> Tensor:
-        """Make this robot's records equal to the components of its own map; returns the ids (K, 2) of new
-        ones.
+        """Make this robot's records those of its own map; returns the ids (K, 2) of new ones.
 
-        Components are compared by content: those that are published already, also before a restart, are not
-        written again; those published by this replica and no longer in the map are superseded. whole: also
-        supersede what was published before a restart and is not in the map. Components given to `add`
-        directly are not affected.
+        Components are compared by content: those published already, also before a restart, are not written
+        again; those published by this replica and no longer in the map are superseded. Components given to
+        `add` directly are not affected.
 
-        moved: how corrected poses have moved the map. A component that was published where it was before is
-        corrected, as by `correct`, and not written again.
+        whole: also supersede what was published before a restart and is not in the map. moved: how corrected
+        poses have moved the map. A component published where it was before is corrected, as by `correct`.
         """
         if not len(components) and not self.n_components:
             return ids_of(np.zeros(0, np.int64))
         if moved is not None:
             moved = moved._replace(before=self._checked(moved.before))
-        made = self._author.publish_map(self._checked(components), whole, self._max_bytes, moved)
-        return self._due(made._replace(keys=np.sort(made.keys)))
+        return self._due(self._author.publish_map(self._checked(components), whole, self._max_bytes, moved))
 
     def count(self, gains: Mapping[tuple[int, int], float]) -> None:
         """Add points that components (robot, sequence), of any robot, have gained since the last call."""
@@ -152,11 +148,8 @@ class Replica:
         self._backlog.add(self._author.count(dict(zip(keys.tolist(), gains.values(), strict=True))))
 
     def correct(self, scan: int, transform: ArrayLike, ids: ArrayLike) -> None:
-        """Correct the pose of a scan of this robot, which moves the scan's components `ids` (J, 2).
-
-        transform: (D+1, D+1), rigid, from the positions that were added to the corrected ones. Of several
-        corrections of a scan the last one counts, not their product.
-        """
+        """Correct the pose of a scan of this robot, which moves the scan's components `ids` (J, 2) from where
+        they were added by `transform` (D+1, D+1), rigid. The last correction of a scan counts, no product."""
         check_whole("scan", scan, 0)
         matrix = torch.as_tensor(transform, dtype=torch.float64)
         if self._records.dim not in (None, len(matrix) - 1):
@@ -174,13 +167,10 @@ class Replica:
         """Place the frame of this robot in another frame; its components, also later ones, move with it.
 
         Of several calls the last one counts. A robot joins frames of robots with a lower id, `WORLD`, or its
-        own of an earlier start, so that chains of frames end without an agreement between robots.
+        own of an earlier start, so that chains of frames end. Raises `InvalidArgumentError` for others.
 
-        Args:
-            frame: one of `other_frames`, or the one that was joined before.
-            transform: (D+1, D+1), rigid, frame ← the frame in which this robot adds components.
-
-        Raises `InvalidArgumentError` for another robot's frame, or a transform that is not rigid.
+        frame: one of `other_frames`, or the one joined before. transform: (D+1, D+1), rigid, frame ← the
+        frame in which this robot adds components.
         """
         frames, base = self._records.frames, self._own
         while (anchor := frames.anchor(base)) is not None and robot_of_frame(anchor) == self.robot:
@@ -204,34 +194,27 @@ class Replica:
         return whole if rest is None else torch.linalg.inv(rest) @ whole
 
     def _due(self, made: Published) -> Tensor:
-        self._backlog.add(made.written, made.packets)
-        return ids_of(made.keys)
+        keys, written, packets = made
+        self._backlog.add(written, packets)
+        return ids_of(keys)
 
     # -- sending and receiving --------------------------------------------------------------------
 
     def datagrams(self, max_bytes: int = MAX_BYTES, budget: int | None = None) -> list[bytes]:
         """Datagrams of the records that are due: new ones, and those that other robots lack.
 
-        Args:
-            max_bytes: largest size of a datagram, from 1000 to 1200.
-            budget: largest size of all datagrams together; the other records stay due. Supersessions and
-                corrections are sent first, then components by their information, then counters. None: no
-                limit.
+        max_bytes: largest size of a datagram, from 1000 to 1200. budget: largest size of all together; None:
+        no limit. Other records stay due: supersessions and corrections are sent first, then components by
+        their information, then counters.
         """
         check_size(max_bytes)
         self._max_bytes = max_bytes
         left = np.inf if budget is None else check_whole("budget", budget, 0)
         sent: list[bytes] = []
         sent_keys = Intervals.empty()
-        self._backlog.superseded(self._records.dead)
-        queue = packets(
-            self._records,
-            self._backlog.due,
-            self._backlog.ready,
-            max_bytes,
-            by_information=budget is not None,
-        )
-        for datagram, keys in queue:
+        self._backlog.due -= self._records.dead
+        due, ready = self._backlog.due, self._backlog.ready
+        for datagram, keys in packets(self._records, due, ready, max_bytes, budget is not None):
             left -= len(datagram)
             if left < 0:
                 break
@@ -280,35 +263,26 @@ class Replica:
         elif isinstance(message, RecordMessage):
             self._check_keys(np.array([message.key]))
             if isinstance(message, SupersessionMessage) and message.key not in self._author.written:
-                self._check_supersession(message)
+                # An earlier incarnation cannot know the records of this one.
+                self._check_id((message.old | message.new) & self._author.keys)
             self._backlog.received(self._records.add_record(message))
         else:
             raise RefusedError("other", -1, f"{type(message).__name__} is no record.")
 
     def _check_sender(self, message: AnnouncementMessage) -> None:
-        """Refuse an announcement with this robot's id.
-
-        It is an echo, or from an earlier incarnation; or from a second robot with this id, if another
-        incarnation holds records of this one.
-        """
-        if message.sender != self.robot:
-            return
-        if message.incarnation != self.incarnation and message.held & self._author.written:
-            raise self._duplicate_id()
-        raise RefusedError("own", self.robot, "An announcement of this robot.")
+        """Refuse an announcement with this robot's id. It is an echo, or from an earlier incarnation; or from
+        a second robot with this id, if another incarnation holds records of this one."""
+        if message.sender == self.robot:
+            self._check_id(message.incarnation != self.incarnation and message.held & self._author.written)
+            raise RefusedError("own", self.robot, "An announcement of this robot.")
 
     def _check_keys(self, keys: Ints) -> None:
         """Only this robot gives keys of its incarnation."""
-        if bool((self._author.keys - self._author.written).contains(keys).any()):
-            raise self._duplicate_id()
+        self._check_id((self._author.keys - self._author.written).contains(keys).any())
 
-    def _check_supersession(self, message: SupersessionMessage) -> None:
-        """An earlier incarnation cannot know the records of this one."""
-        if (message.old | message.new) & self._author.keys:
-            raise self._duplicate_id()
-
-    def _duplicate_id(self) -> RefusedError:
-        return RefusedError("duplicate_id", self.robot, f"Another robot uses the id {self.robot}.")
+    def _check_id(self, is_duplicate: object) -> None:
+        if is_duplicate:
+            raise RefusedError("duplicate_id", self.robot, f"Another robot uses the id {self.robot}.")
 
     # -- reading ----------------------------------------------------------------------------------
 
@@ -317,11 +291,8 @@ class Replica:
         return self._records.digest()
 
     def components(self, frame: int | None = None) -> Components:
-        """The components that count, by id, with the points of all counters, moved by the corrections.
-
-        frame: of `other_frames`: the components that are placed in it. None: those that are placed relative
-        to this robot's own, in the frame `placement.root`.
-        """
+        """The components that count, by id, with the points of all counters, moved by the corrections: those
+        placed in `frame`, one of `other_frames`; None: relative to this robot's, in `placement.root`."""
         return self._records.components(frame)
 
     @property
@@ -342,10 +313,8 @@ class Replica:
 
     @property
     def other_frames(self) -> list[int]:
-        """Frames with components that this robot may join; first the one that all robots prefer.
-
-        Authors whose first record is missing are left out: it says whether they have a frame of their own.
-        """
+        """Frames with components that this robot may join; first the one that all robots prefer. Authors
+        whose first record is missing are left out: it says whether they have a frame of their own."""
         records = self._records
         keys = records.table.keys()
         keys = keys[records.held.contains(authors(keys) << NUMBER_BITS)]
@@ -355,11 +324,8 @@ class Replica:
         return sorted(root for root in roots if robot_of_frame(root) < limit)
 
     def changes(self) -> Changes:
-        """What was added since the last call, by this robot or others.
-
-        All `added` and `gained` together are `components()`, unless `rebuilt` is True: then read these again.
-        The first call returns everything. The time is proportional to the changes.
-        """
+        """What was added since the last call, by this robot or others, in time proportional to it. All
+        `added` and `gained` together are `components()`; where `rebuilt` is True, read these again."""
         return self._records.changes()
 
     @property
@@ -388,10 +354,8 @@ class Replica:
 
     @property
     def missing(self) -> Intervals:
-        """Keys of records that other robots have announced and that this robot lacks.
-
-        Robots without a recent announcement are left out: see `anti_entropy.PATIENCE`.
-        """
+        """Keys of records that other robots have announced and that this robot lacks. Robots without a recent
+        announcement are left out: see `anti_entropy.PATIENCE`."""
         return self._backlog.missing(self._records.held)
 
     @property
@@ -411,11 +375,9 @@ class Replica:
         return self._records.stored()
 
     def load(self, batches: Iterable[bytes], datagrams: Iterable[bytes]) -> int:
-        """Add records that `stored` returned before a restart, and datagrams that were sent or merged since.
-
-        Returns the number of batches and datagrams that were refused: damaged ones, and those without room.
-        Loaded records are not due, but are sent to robots that lack them. Superseded keys are held again.
-        """
+        """Add records that `stored` returned before a restart, and datagrams that were sent or merged since;
+        returns how many were refused, as damaged or without room. Loaded records are not due, but are sent to
+        robots that lack them."""
         refused, duplicates = self.refused.copy(), self.duplicates.copy()
         merges = [partial(self._records.load_batch, data, self.robot) for data in batches]
         merges += [partial(self._load_datagram, data) for data in datagrams]
@@ -441,8 +403,7 @@ class Replica:
         return components.on_cpu()
 
 
-_QUANTIZED = b"\x11"
-"""First byte of a datagram of components that every robot encodes equally."""
+_QUANTIZED = b"\x11"  # first byte of a datagram of components that every robot encodes equally
 
 
 def _keys(name: str, ids: ArrayLike) -> Ints:

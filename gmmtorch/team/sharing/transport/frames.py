@@ -26,13 +26,12 @@ class FramedTransport(ABC):
 
     A subclass sends frames (`_carry`), passes received ones to `_take` from one thread, and ends that thread
     (`_shut`). A network that is down is no error: `_count_failure` counts it. The times `now` are not used:
-    `deliver` returns what has arrived; it does not depend on the clocks of the team.
+    `deliver` returns what has arrived.
 
     Attributes:
         sent, received: frames that were given to the network and that came from it, refused ones included.
-        failures: number of network errors, by the name of the error.
-        n_dropped: datagrams that were dropped because the queue was full.
-        n_lost: datagrams that were dropped as `lose` demands.
+        failures: number of network errors, by the name of the error. n_dropped, n_lost: datagrams that were
+            dropped because the queue was full, and as `lose` demands.
     """
 
     def __init__(self, robot: int, key: TeamKey | None, max_waiting: int) -> None:
@@ -60,10 +59,8 @@ class FramedTransport(ABC):
     # -- the transport -------------------------------------------------------------------------------------
 
     def send(self, sender: int, datagrams: Sequence[bytes], now: float, kind: str) -> None:
-        """Broadcast datagrams of at most 1200 bytes; `sender` must be this robot. See `Transport`.
-
-        Does not wait: datagrams that the network does not take at once are lost.
-        """
+        """Broadcast datagrams of at most 1200 bytes; `sender` must be this robot. See `Transport`. Does not
+        wait: datagrams that the network does not take at once are lost."""
         self._check("sender", sender)
         frames = [self._sealer.seal(datagram) for datagram in datagrams]
         carried = _sum(*(self._carry(frame, kind) for frame in frames))
@@ -94,9 +91,7 @@ class FramedTransport(ABC):
 
     def disown(self, former: Iterable[bytes]) -> None:
         """Set the sessions of this robot's former starts. Their frames are no sign of a duplicate robot id.
-
-        Without them, `sessions.OwnIdWatch` decides by the frames' numbers and times.
-        """
+        Without them, `sessions.OwnIdWatch` decides by the frames' numbers and times."""
         self._opener.former = frozenset(former)
 
     @property
@@ -120,10 +115,8 @@ class FramedTransport(ABC):
         return said.wire_bytes + self.overhead * said.datagrams
 
     def books(self, robot: int) -> dict[str, Any]:
-        """Traffic and errors, as fields of a results row. `robot` must be this one.
-
-        A robot's own frames that multicast brings back are not counted as refused.
-        """
+        """Traffic and errors, as fields of a results row. `robot` must be this one. A robot's own frames that
+        multicast brings back are not counted as refused."""
         self._check_robot("robot", robot)
         said = self.traffic()
         with self._lock:

@@ -6,19 +6,275 @@ byte by byte, and what it protects from.
 
 from __future__ import annotations
 
+import hmac
 import logging
 import os
 import secrets
+import stat
 import threading
 import time
+from collections import OrderedDict
 from collections.abc import Callable
-from typing import NoReturn
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NoReturn
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.errors import (
+    DataError,
+    GmmTorchError,
+    InvalidArgumentError,
+    MissingDataError,
+    OutputError,
+    check_whole,
+)
 from gmmtorch.optional_packages import needs_extra
-from gmmtorch.team.sharing.messages.envelope import MAX_BYTES, check_datagram
-from gmmtorch.team.sharing.transport.sessions import OwnIdWatch, Sessions
-from gmmtorch.team.sharing.transport.team_key import TeamKey
+from gmmtorch.team.sharing.messages.datagrams import MAX_BYTES, check_datagram
+
+KEY_BYTES = 32
+KEY_VARIABLE = "GMMTORCH_TEAM_KEY"
+"""Environment variable that may contain the key."""
+_HELP = f"A key is {KEY_BYTES} bytes as {2 * KEY_BYTES} hexadecimal digits: `openssl rand -hex 32`."
+
+
+class TeamKey:
+    """The secret that all robots of a team share. Neither `repr` nor any error shows it."""
+
+    __slots__ = ("_data",)
+
+    def __init__(self, data: bytes) -> None:
+        """`data`: 32 random bytes."""
+        if not isinstance(data, bytes) or len(data) != KEY_BYTES:
+            what = f"{len(data)} bytes" if isinstance(data, bytes) else f"of type {type(data).__name__}"
+            raise InvalidArgumentError(f"The team key is {what}; it must be {KEY_BYTES} bytes.")
+        self._data = data
+
+    @classmethod
+    def generate(cls) -> TeamKey:
+        """A new key, from the operating system's random numbers."""
+        return cls(secrets.token_bytes(KEY_BYTES))
+
+    @classmethod
+    def from_file(cls, path: str | Path) -> TeamKey:
+        """The key in a file of 64 hexadecimal digits that only its owner may read. Raises `MissingDataError`
+        if there is no file, and `DataError` if it contains something else, or if other users may read or
+        write it."""
+        path = Path(path)
+        try:
+            if not path.is_file():
+                raise MissingDataError(
+                    f"The team key {path} {'is no file' if path.exists() else 'does not exist'}. Copy the "
+                    f"team's key there, or make one: `(umask 077; openssl rand -hex 32 > {path})`."
+                )
+            with path.open("rb") as file:
+                mode = stat.S_IMODE(os.fstat(file.fileno()).st_mode)
+                data = file.read(1024)
+        except MissingDataError:
+            raise
+        except OSError as error:
+            raise DataError(f"The team key {path} cannot be read: {error.strerror}.") from None
+        if os.name == "posix" and mode & 0o077:
+            raise DataError(
+                f"The team key {path} has mode {mode:o}: other users than its owner may read or write it. "
+                f"`chmod 600 {path}`; if others have used this machine, make a new key."
+            )
+        return cls._from_hex(data, f"The team key {path}")
+
+    @classmethod
+    def from_environment(cls) -> TeamKey:
+        """The key in `KEY_VARIABLE`, as 64 hexadecimal digits. Raises as `from_file` does."""
+        text = os.environ.get(KEY_VARIABLE)
+        if text is None:
+            raise MissingDataError(f"${KEY_VARIABLE} is not set. {_HELP}")
+        return cls._from_hex(text.encode(errors="replace"), f"The team key in ${KEY_VARIABLE}")
+
+    @classmethod
+    def _from_hex(cls, data: bytes, what: str) -> TeamKey:
+        """The key of hexadecimal digits. Errors show the length of the data, but no data."""
+        digits = data.strip()
+        if len(digits) != 2 * KEY_BYTES:
+            raise DataError(f"{what} has {len(digits)} characters. {_HELP}")
+        try:
+            return cls(bytes.fromhex(digits.decode("ascii")))
+        except ValueError:
+            raise DataError(f"{what} has characters that are no hexadecimal digits. {_HELP}") from None
+
+    def save(self, path: str | Path) -> Path:
+        """Write a file that `from_file` reads. Raises `OutputError` if the file exists already."""
+        path = Path(path)
+        try:
+            handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        except OSError as error:
+            raise OutputError(f"The team key {path} cannot be written: {error.strerror}.") from None
+        try:
+            with os.fdopen(handle, "w") as file:
+                file.write(self._data.hex() + "\n")
+        except OSError as error:
+            path.unlink(missing_ok=True)
+            raise OutputError(f"The team key {path} cannot be written: {error.strerror}.") from None
+        return path
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, TeamKey) and hmac.compare_digest(self._data, other._data)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        return "TeamKey(…)"
+
+    def __reduce__(self) -> NoReturn:
+        raise InvalidArgumentError("A TeamKey cannot be pickled or copied: give other processes its file.")
+
+
+WINDOW = 1024
+"""Numbers below the highest one of a session for which replays are detected; lower numbers are refused."""
+MAX_SESSIONS = 1024
+"""Largest number of stored sessions. Beyond it, the sessions that were silent longest are removed."""
+RETURNS = 4
+"""How often a session must continue after another one of the same robot id, until they are two robots."""
+SILENCE = 60.0
+"""Seconds for which only one session must send until its robot id counts as unique again."""
+FRESH_FRAMES, FRESH_SECONDS = 5, 5.0
+"""New frames of one session, and the time from first to last, that show a second robot with this id."""
+
+
+class ReplayWindow:
+    """The numbers of a session that were received: the anti-replay window of IPsec (RFC 4303, appendix
+    A2)."""
+
+    __slots__ = ("_seen", "highest")
+
+    def __init__(self) -> None:
+        self.highest = -1
+        self._seen = 0  # bit i: number highest − i was received
+
+    def accept(self, number: int) -> bool:
+        """Whether a number ≥ 0 is new; marks it as received."""
+        ahead = number - self.highest
+        if ahead > 0:
+            kept = self._seen << ahead if ahead < WINDOW else 0
+            self._seen = (kept | 1) & ((1 << WINDOW) - 1)
+            self.highest = number
+            return True
+        if -ahead >= WINDOW or self._seen >> -ahead & 1:
+            return False
+        self._seen |= 1 << -ahead
+        return True
+
+
+@dataclass
+class _Speaker:
+    """The session of a robot id that sent last, from which address, and since when."""
+
+    session: bytes
+    source: str
+    since: float
+    returns: int = 0
+
+
+class Sessions:
+    """The sessions of other robots. Each start of a robot begins one.
+
+    A robot that restarts begins a new session, and its former session ends. If two sessions of one id send
+    alternately, two robots use that id. Both are then refused until only one has sent for `SILENCE` seconds.
+
+    Memory: a few hundred bytes for each of at most `MAX_SESSIONS` sessions.
+
+    Attributes:
+        duplicates: robot ids that two robots use now, with the addresses of both.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        """`clock`: seconds that never go back."""
+        self._clock = clock
+        self._windows: OrderedDict[tuple[int, bytes], ReplayWindow] = OrderedDict()
+        self._speakers: dict[int, _Speaker] = {}
+        self.duplicates: dict[int, str] = {}
+
+    def __len__(self) -> int:
+        return len(self._windows)
+
+    def refusal(self, sender: int, session: bytes, number: int, source: str = "") -> str | None:
+        """Why an authentic datagram is refused: 'replayed', 'duplicate_id', or None if it is accepted.
+
+        source: the sender's address, for messages.
+        """
+        known = self._windows.get((sender, session))
+        window = known or ReplayWindow()
+        continues = number > window.highest  # a late datagram of a former session does not
+        if not window.accept(number):
+            return "replayed"
+        self._windows[sender, session] = window
+        self._windows.move_to_end((sender, session))
+        if len(self._windows) > MAX_SESSIONS:
+            self._forget(*self._windows.popitem(last=False)[0])
+        if continues:
+            self._note_speaker(sender, session, source, returns=known is not None)
+        return "duplicate_id" if sender in self.duplicates else None
+
+    def _note_speaker(self, sender: int, session: bytes, source: str, returns: bool) -> None:
+        """Update which session of a robot id sends, and whether the id is duplicate."""
+        now, speaker = self._clock(), self._speakers.get(sender)
+        if speaker is None:
+            self._speakers[sender] = _Speaker(session, source, now)
+            return
+        if session != speaker.session:
+            speaker.returns += returns
+            if speaker.returns >= RETURNS:
+                self.duplicates[sender] = f"{speaker.source} and {source}"
+            speaker.session, speaker.source, speaker.since = session, source, now
+        elif sender in self.duplicates and now - speaker.since >= SILENCE:
+            speaker.returns = 0
+            self.duplicates.pop(sender, None)
+
+    def _forget(self, sender: int, session: bytes) -> None:
+        speaker = self._speakers.get(sender)
+        if speaker is not None and speaker.session == session:
+            del self._speakers[sender]
+            self.duplicates.pop(sender, None)
+
+
+@dataclass
+class _Continuing:
+    """A session that continues: its highest number, and the new frames since its last long silence."""
+
+    since: float
+    last: float
+    highest: int = -1
+    n_fresh: int = 0
+
+
+class OwnIdWatch:
+    """Detects whether another robot uses this robot's id.
+
+    A frame with this robot's id and another session may come from a former start of this robot: late, or
+    recorded and replayed. Another robot is reported only after `FRESH_FRAMES` frames of one session, each
+    with a higher number than all before, over at least `FRESH_SECONDS`, without a silence of `SILENCE`
+    seconds.
+
+    Memory: a few hundred bytes for each of at most `MAX_SESSIONS` sessions.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._sessions: OrderedDict[bytes, _Continuing] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._sessions)
+
+    def detects(self, session: bytes, number: int) -> bool:
+        """Whether another robot uses the id, after an authentic datagram of another session arrived."""
+        now = self._clock()
+        heard = self._sessions.setdefault(session, _Continuing(now, now))
+        self._sessions.move_to_end(session)
+        if len(self._sessions) > MAX_SESSIONS:
+            self._sessions.popitem(last=False)
+        if number <= heard.highest:
+            return False
+        if now - heard.last > SILENCE:
+            heard.since, heard.n_fresh = now, 0
+        heard.highest, heard.last, heard.n_fresh = number, now, heard.n_fresh + 1
+        return heard.n_fresh >= FRESH_FRAMES and now - heard.since >= FRESH_SECONDS
+
 
 __all__ = ["REFUSALS", "Opener", "Sealer", "TeamKey"]
 
@@ -52,29 +308,17 @@ _WARNINGS = {
 _log = logging.getLogger(__name__)
 
 
-class _Cipher:
-    """ChaCha20-Poly1305 with a team's key."""
-
-    def __init__(self, key: TeamKey) -> None:
-        with needs_extra("A team key needs", "cryptography", "network"):
-            from cryptography.exceptions import InvalidTag
-            from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
-        self._aead, self._invalid = ChaCha20Poly1305(key._data), InvalidTag
-
-    def encrypt(self, header: bytes, datagram: bytes) -> bytes:
-        return self._aead.encrypt(_nonce(header), datagram, header)
-
-    def decrypt(self, header: bytes, data: bytes) -> bytes | None:
-        """The datagram; None if key, header or data differ from those that it was sealed with."""
-        try:
-            return self._aead.decrypt(_nonce(header), data, header)
-        except self._invalid:
-            return None
+_NONCE = slice(3, None)  # of a header: session and number, 12 bytes; unique for each datagram under one key
 
 
-def _nonce(header: bytes) -> bytes:
-    """Session and number, 12 bytes: unique for each datagram under one key."""
-    return header[3:]
+def _cipher(key: TeamKey | None) -> tuple[Any, type[Exception]]:
+    """ChaCha20-Poly1305 with a team's key, None without one; and the error of data that were altered."""
+    if key is None:
+        return None, GmmTorchError
+    with needs_extra("A team key needs", "cryptography", "network"):
+        from cryptography.exceptions import InvalidTag
+        from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
+    return ChaCha20Poly1305(key._data), InvalidTag
 
 
 class Sealer:
@@ -88,7 +332,7 @@ class Sealer:
     def __init__(self, sender: int, key: TeamKey | None = None) -> None:
         self.sender = check_whole("sender", sender, 0, MAX_SENDER)
         self.overhead = PLAIN_OVERHEAD if key is None else SEALED_OVERHEAD
-        self._cipher = None if key is None else _Cipher(key)
+        self._cipher, _ = _cipher(key)
         self._first = bytes([(_PLAIN if key is None else _SEALED) << 4 | FRAME_VERSION])
         self._lock = threading.Lock()
         self._begin()
@@ -106,7 +350,9 @@ class Sealer:
             header = self._first + self.sender.to_bytes(2, "little") + self.session
             header += self._number.to_bytes(4, "little")
             self._number += 1
-        return header + (datagram if self._cipher is None else self._cipher.encrypt(header, datagram))
+        if self._cipher is not None:
+            datagram = self._cipher.encrypt(header[_NONCE], datagram, header)
+        return header + datagram
 
     def __reduce__(self) -> NoReturn:
         raise InvalidArgumentError("A Sealer cannot be copied: two with one session would share nonces.")
@@ -133,7 +379,7 @@ class Opener:
         own: this robot's sealer, to recognize its own frames, and other robots with its id.
         clock: seconds that never go back.
         """
-        self._cipher = None if key is None else _Cipher(key)
+        self._cipher, self._altered = _cipher(key)
         self._own = own
         self._form = _PLAIN if key is None else _SEALED
         self._sessions = Sessions(clock)
@@ -172,8 +418,9 @@ class Opener:
         own = self._own
         if own is not None and (sender, session) == (own.sender, own.session):
             return sender, b"", "echo"
-        datagram = data if self._cipher is None else self._cipher.decrypt(header, data)
-        if datagram is None:
+        try:
+            datagram = data if self._cipher is None else self._cipher.decrypt(header[_NONCE], data, header)
+        except self._altered:
             return sender, b"", "wrong_key"
         number = int.from_bytes(header[11:], "little")
         address = f"{source} (session {session.hex()})"  # the log of that robot shows its session, too

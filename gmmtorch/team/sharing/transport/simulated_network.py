@@ -1,4 +1,4 @@
-"""Transport, which carries datagrams between robots; and Network, a simulated one."""
+"""Transport, which carries datagrams between robots; and Network, a simulated one, with its conditions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol
 import torch
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
-from gmmtorch.team.sharing.messages.envelope import check_datagram
+from gmmtorch.team.sharing.messages.datagrams import check_datagram
 from gmmtorch.team.sharing.transport.link_conditions import LinkConditions
 
 HEADER_BYTES = 28
@@ -64,13 +64,8 @@ class Reception(NamedTuple):
     out_of_reach: int = 0
 
 
-class _Arrival(NamedTuple):
-    """A datagram in flight to one robot; sorted by time, then by the order of sending."""
-
-    time: float
-    order: int
-    sender: int
-    datagram: bytes
+_Arrival = tuple[float, int, int, bytes]
+"""A datagram in flight to one robot: time, order of sending, sender, datagram; sorted by the first two."""
 
 
 class Network:
@@ -85,9 +80,8 @@ class Network:
        second alone may be cut off; a datagram whose first copy is cut off has no second;
     3. the robot loses it, with probability `loss`.
 
-    Without jitter, a sender's datagrams arrive in order. With jitter, they overtake one another if their
-    delays differ by more than the time between them. Losses have a random generator of their own: the same
-    `seed` loses the same datagrams under all other conditions. Delivered datagrams are not stored.
+    Losses have a random generator of their own: the same `seed` loses the same datagrams under all other
+    conditions.
     """
 
     def __init__(self, n_robots: int, conditions: LinkConditions | None = None, seed: int = 0) -> None:
@@ -126,7 +120,7 @@ class Network:
             lost = self.conditions.draw_losses(len(others), self._losses)
             delays = self.conditions.draw_delays(len(others), self._delays)
             for robot, is_near, is_lost, times in zip(others, near, lost, delays, strict=True):
-                copies = [_Arrival(end + time, self._n_sent, sender, data) for time in times]
+                copies = [(end + time, self._n_sent, sender, data) for time in times]
                 self._carry(copies, robot, begin, is_near, is_lost)
             self._n_sent += 1
         before = self._traffic.get((sender, kind), Traffic())
@@ -137,9 +131,9 @@ class Network:
         """(sender, datagram) in the order of arrival, at equal times in that of sending; see `Transport`."""
         self._check("robot", robot, now)
         queue, delivered = self._queues[robot], []
-        while queue and queue[0].time <= now:
-            arrival = heapq.heappop(queue)
-            delivered.append((arrival.sender, arrival.datagram))
+        while queue and queue[0][0] <= now:
+            _, _, sender, datagram = heapq.heappop(queue)
+            delivered.append((sender, datagram))
         self._received[robot]["datagrams"] += len(delivered)
         self._received[robot]["bytes"] += sum(len(data) for _, data in delivered)
         return delivered
@@ -161,11 +155,6 @@ class Network:
         return Reception(*(sum(counts[field] for counts in chosen) for field in Reception._fields))
 
     @property
-    def n_bytes(self) -> int:
-        """Bytes of all datagrams, without headers."""
-        return self.traffic().bytes
-
-    @property
     def bytes_by_kind(self) -> dict[str, int]:
         """Bytes without headers, by the kinds that the senders gave, sorted."""
         return {kind: self.traffic(kind=kind).bytes for kind in sorted({k for _, k in self._traffic})}
@@ -185,11 +174,6 @@ class Network:
             "dropped": 0,
             "namesakes": {},
         }
-
-    @property
-    def n_in_flight(self) -> int:
-        """Datagrams in flight, one for each robot that will receive it."""
-        return sum(map(len, self._queues))
 
     def _near(self, sender: int, others: Sequence[int]) -> list[bool]:
         """Whether each of the others is in reach."""
@@ -215,7 +199,7 @@ class Network:
         counts, (first, *second) = self._received[receiver], copies
 
         def is_cut(copy: _Arrival) -> bool:
-            return self.conditions.cut(copy.sender, receiver, begin, copy.time)
+            return self.conditions.cut(copy[2], receiver, begin, copy[0])
 
         if not is_near:
             counts["out_of_reach"] += 1

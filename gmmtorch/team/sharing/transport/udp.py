@@ -30,12 +30,11 @@ _BINDS_GROUPS = sys.platform != "win32"  # there a socket must be bound to an ad
 
 
 class UdpTransport(FramedTransport):
-    """One robot's end of a network; see `Transport`. Close it, or use it as a context manager.
+    """One robot's end of a network; see `FramedTransport`.
 
-    Lost datagrams stay lost. A network that is down is no error: `failures` counts datagrams that cannot be
-    sent, by the name of the error: ENETUNREACH, ENOBUFS, …. A thread reads the socket, opens the frames and
-    queues the datagrams, so that any time may pass between two calls of `deliver`. `sent` counts a copy for
-    each peer.
+    `failures` counts datagrams that cannot be sent by ENETUNREACH, ENOBUFS, …. A thread reads the socket,
+    opens the frames and queues the datagrams, so that any time may pass between two calls of `deliver`.
+    `sent` counts a copy for each peer.
 
     Attributes:
         address: where the socket is bound, with the port that was chosen if 0 was given.
@@ -49,11 +48,8 @@ class UdpTransport(FramedTransport):
         key: TeamKey | None = None,
         max_waiting: int = MAX_WAITING,
     ) -> None:
-        """For sockets made otherwise; use `unicast` or `multicast`.
-
-        make_socket: makes the bound socket. Datagrams are sent to its own address until `peers` are set. The
-        transport closes it.
-        """
+        """For sockets made otherwise; use `unicast` or `multicast`. make_socket: makes the bound socket,
+        which the transport closes. Datagrams are sent to its own address until `peers` are set."""
         super().__init__(robot, key, max_waiting)
         self.n_overflowed = 0
         self._socket = make_socket()
@@ -109,10 +105,9 @@ class UdpTransport(FramedTransport):
     ) -> UdpTransport:
         """Sends each datagram once, to all that have joined the group, also on this machine.
 
-        Args:
-            group: an address 224.0.0.0 … 239.255.255.255 (239.… are for private use), and a port.
-            interface: the address of this machine's interface to the team's network.
-            ttl: how many networks a datagram may cross, 0 … 255; 1: it does not pass a router.
+        group: an address 224.0.0.0 … 239.255.255.255 (239.… are for private use), and a port. interface: the
+        address of this machine's interface to the team's network. ttl: how many networks a datagram may
+        cross, 0 … 255; 1: it does not pass a router.
 
         The other arguments and errors are those of `unicast`; here the interface needs a key.
         """

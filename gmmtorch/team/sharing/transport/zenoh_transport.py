@@ -50,12 +50,8 @@ def open_session(
 ) -> zenoh.Session:
     """A session of Zenoh. While it is open, it keeps trying to connect to endpoints that are not reached.
 
-    Args:
-        listen: endpoints, such as 'tcp/10.0.0.3:7447'; empty: those of `config`.
-        connect: endpoints of other robots, or of routers; empty: those of `config`.
-        scouting: whether to look for others by multicast; None: as `config` says, else not.
-        config: a file of Zenoh's own settings (JSON5), or None.
-        is_local: use only the given endpoints, which must be on loopback.
+    listen, connect: endpoints; empty: those of `config`. is_local: use only the given ones, which must be on
+    loopback. The others are those of `ZenohTransport`.
 
     Raises `InvalidArgumentError` for endpoints that are invalid or cannot be listened on, `MissingDataError`
     if `config` does not exist, and `DataError` if it is no configuration.
@@ -171,14 +167,12 @@ _LONGEST_SOURCE = 100
 
 
 class ZenohTransport(FramedTransport):
-    """One robot's end of a Zenoh network; see `Transport`. Close it, or use it as a context manager.
+    """One robot's end of a Zenoh network; see `FramedTransport`.
 
     Robot i publishes at the key 'gmmtorch/<team>/<i>' and subscribes to 'gmmtorch/<team>/*'. Kinds in
     `SOON_REPEATED` are sent best-effort, all others reliably from hop to hop. On a congested link Zenoh drops
-    both. All have one priority: a datagram that a thousand others overtake is refused as replayed.
-
-    A network that is down is no error; Zenoh connects again. A thread reads frames, as in `UdpTransport`.
-    `sent` counts a frame once, however many robots receive it.
+    both. All have one priority: a datagram that a thousand others overtake is refused as replayed. If the
+    network is down, Zenoh connects again. `sent` counts a frame once, however many robots receive it.
     """
 
     def __init__(

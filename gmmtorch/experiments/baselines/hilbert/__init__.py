@@ -1,1 +1,0 @@
-"""Hilbert maps: features, logistic regression, and its Bayesian form."""

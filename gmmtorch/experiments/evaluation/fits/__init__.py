@@ -1,1 +1,0 @@
-"""Comparisons of ways to fit a mixture: estimators, pruning, and clouds larger than memory."""

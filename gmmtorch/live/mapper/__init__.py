@@ -1,1 +1,0 @@
-"""A map from live ROS 2 topics, and recordings played to topics."""

@@ -1,1 +1,0 @@
-"""Hierarchical mixtures: a tree of components, grown level by level (thesis 2.1.2)."""

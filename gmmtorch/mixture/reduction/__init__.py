@@ -1,1 +1,0 @@
-"""Reduction of mixtures: merging and pruning of components."""

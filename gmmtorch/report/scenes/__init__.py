@@ -1,1 +1,0 @@
-"""Ellipsoids, points and paths in space: one renderer for all commands."""

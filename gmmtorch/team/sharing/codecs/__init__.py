@@ -1,1 +1,0 @@
-"""Codecs of raw points, which the bytes of mixtures are compared with."""

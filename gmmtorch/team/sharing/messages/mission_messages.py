@@ -1,0 +1,356 @@
+"""Points of a frame, views worth visiting, and the plan of a robot, as datagrams. See docs/messages.md."""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
+from gmmtorch.mapping import BitReader, BitWriter, Ints
+from gmmtorch.team.sharing.messages.datagrams import (
+    FARTHEST,
+    MAX_BYTES,
+    Kind,
+    check_ids,
+    check_places,
+    make_datagram,
+    read_intervals,
+    read_keys,
+    read_number,
+    split,
+    write_intervals,
+    write_keys,
+    write_number,
+)
+from gmmtorch.team.sharing.replica.record_keys import END, Intervals, ids_of, keys_of
+
+_HEADER = struct.Struct("<HI3dHHH")  # sender, frame, origin, part, parts, points
+_POINT_BYTES = 12
+_OVERHEAD = len(make_datagram(Kind.POINTS, b""))
+POINTS_PER_DATAGRAM = (MAX_BYTES - _OVERHEAD - _HEADER.size) * 8 // (8 * _POINT_BYTES + 1)
+LARGEST_ROBOT, LARGEST_FRAME, MOST_PARTS = (1 << 16) - 1, (1 << 32) - 1, (1 << 16) - 1
+
+
+@dataclass(frozen=True, eq=False)
+class PointsMessage:
+    """Part `part` of `n_parts` of the novel beams of a robot's frame. origin (3,) of all beams, ends (N, 3),
+    float64, metres, world frame; is_hit (N,) bool: the others are no-return beams, which end at the range
+    where they are cut off."""
+
+    sender: int
+    frame: int
+    part: int
+    n_parts: int
+    origin: Tensor
+    ends: Tensor
+    is_hit: Tensor
+
+
+def encode_points(sender: int, frame: int, origin: Tensor, ends: Tensor, is_hit: Tensor) -> list[bytes]:
+    """Datagrams of beams in order, 12 1/8 bytes each; empty without beams.
+
+    Ends are stored as float32 offsets from the origin, so that they are equally exact anywhere in the world.
+
+    sender: id of the robot, up to 65535. frame: its number, up to 2³² − 1. origin: (3,), metres. ends: (N,
+    3), metres. is_hit: (N,) bool.
+
+    Raises `InvalidArgumentError` for values out of range, and for positions beyond `datagrams.FARTHEST`.
+    """
+    check_whole("sender", sender, 0, LARGEST_ROBOT)
+    check_whole("frame", frame, 0, LARGEST_FRAME)
+    if ends.shape[1:] != (3,) or origin.shape != (3,) or is_hit.shape != ends.shape[:1]:
+        raise InvalidArgumentError(
+            f"origin {tuple(origin.shape)}, ends {tuple(ends.shape)} and is_hit {tuple(is_hit.shape)} must "
+            "be (3,), (N, 3) and (N,)."
+        )
+    place = origin.detach().double().cpu()
+    check_places("origin", place[None])
+    rounded = (ends.detach().double().cpu() - place).float()
+    check_places("ends", place + rounded.double())
+    offsets = rounded.numpy()
+    hits = is_hit.cpu().numpy().astype(bool)
+    starts = range(0, len(offsets), POINTS_PER_DATAGRAM)
+    if len(starts) > MOST_PARTS:
+        raise InvalidArgumentError(
+            f"{len(offsets)} points of one frame; at most {MOST_PARTS * POINTS_PER_DATAGRAM} can be sent."
+        )
+    datagrams = []
+    for part, begin in enumerate(starts):
+        chosen = slice(begin, begin + POINTS_PER_DATAGRAM)
+        rows, bits = offsets[chosen], np.packbits(hits[chosen])
+        header = _HEADER.pack(sender, frame, *place.tolist(), part, len(starts), len(rows))
+        datagrams.append(make_datagram(Kind.POINTS, header + rows.astype("<f4").tobytes() + bits.tobytes()))
+    return datagrams
+
+
+def read_points(body: bytes) -> PointsMessage:
+    if len(body) < _HEADER.size:
+        raise DataError(f"{len(body)} bytes are too few for points.")
+    sender, frame, x, y, z, part, n_parts, n = _HEADER.unpack_from(body)
+    if len(body) != _HEADER.size + _POINT_BYTES * n + (n + 7) // 8 or not part < n_parts or n == 0:
+        raise DataError(f"{len(body)} bytes with {n} points, part {part} of {n_parts}: it is damaged.")
+    offsets = np.frombuffer(body, "<f4", 3 * n, _HEADER.size).reshape(n, 3)
+    bits = np.unpackbits(np.frombuffer(body, np.uint8, offset=_HEADER.size + _POINT_BYTES * n))
+    if bits[n:].any() or not np.isfinite(offsets).all():
+        raise DataError("Points are NaN or infinite, or padding bits are set: it is damaged.")
+    offsets = offsets.astype(np.float64)  # after the check, as casting some NaNs raises a warning
+    origin = torch.tensor([x, y, z], dtype=torch.float64)
+    check_places("origin", origin[None])
+    ends = check_places("ends", origin + torch.from_numpy(offsets))
+    return PointsMessage(sender, frame, part, n_parts, origin, ends, torch.from_numpy(bits[:n] != 0))
+
+
+MOST_POSES = 1000
+"""Poses of a path, and of the views of a plan: those of a robot at rest take no bits that bound them."""
+STEPS_PER_METRE = 100
+"""Positions are whole centimetres."""
+YAW_STEPS = 256
+"""Steps of a full turn."""
+TICKS = 1000
+"""Times are whole milliseconds."""
+LATEST = 1e9
+"""Latest time (s)."""
+_FARTHEST_STEP = FARTHEST * STEPS_PER_METRE
+_HALF_BITS = 16
+
+
+@dataclass(frozen=True, eq=False)
+class ViewsMessage:
+    """Views that are new or changed, and the keys of views that are removed.
+
+    ids (V, 2): (robot, sequence), as of records; poses (V, 4); values (V,); stamps (V,) s, when the value was
+    found. removed: keys, as in `record_keys`.
+    """
+
+    ids: Tensor
+    poses: Tensor
+    values: Tensor
+    stamps: Tensor
+    removed: Intervals
+
+
+@dataclass(frozen=True, eq=False)
+class PlanMessage:
+    """Plan number `number` of robot `sender`.
+
+    path (S, 4): poses at time, time + step, time + 2 step, … (s); the robot is at rest at the last one.
+    views (V, 4): camera poses that the robot will observe from.
+    """
+
+    sender: int
+    number: int
+    time: float
+    step: float
+    path: Tensor
+    views: Tensor
+
+
+def encode_views(message: ViewsMessage) -> list[bytes]:
+    """Datagrams of views, 9 to 11 bytes each, and of removed keys; empty without either. Ids in any order.
+
+    Poses are rounded to 1 cm and 1/256 of a turn (`quantized_poses`), values to float16 (65504 at most),
+    stamps to 1 ms. Raises `InvalidArgumentError` for values that are not finite, for duplicate ids, and for
+    rows of different lengths.
+    """
+    m = message
+    sizes = (len(m.poses), len(m.values), len(m.stamps))
+    if sizes != (len(m.ids),) * 3:
+        raise InvalidArgumentError(
+            f"{len(m.ids)} ids with {sizes[0]} poses, {sizes[1]} values and {sizes[2]} stamps: each id "
+            "needs one of each."
+        )
+    if not Intervals.span(0, END).covers(m.removed):
+        raise InvalidArgumentError(f"removed={m.removed!r} goes beyond the largest key, {END - 1}.")
+    try:
+        keys = keys_of(check_ids("ids", m.ids))
+    except DataError as error:
+        raise InvalidArgumentError(f"ids: {error}") from error
+    order, removed = np.argsort(keys), m.removed
+    keys = keys[order]
+    steps, halves = _pose_steps("poses", m.poses)[order], _halves(m.values)[order]
+    times = _ticks("stamps", m.stamps)[order]
+
+    def part(begin: int, end: int) -> bytes:
+        """Items begin … end − 1 of all views, followed by all intervals of removed keys."""
+        views = slice(min(begin, len(keys)), min(end, len(keys)))
+        edges = slice(2 * max(begin - len(keys), 0), 2 * max(end - len(keys), 0))
+        writer = BitWriter()
+        write_keys(writer, keys[views])
+        _write_poses(writer, steps[views])
+        writer.fixed(halves[views], _HALF_BITS)
+        writer.column(times[views])
+        write_intervals(writer, Intervals(removed.edges[edges]), 0)
+        return make_datagram(Kind.VIEWS, writer.to_bytes())
+
+    return split(len(keys) + len(removed), part, "view")
+
+
+def read_views(body: bytes) -> ViewsMessage:
+    reader = BitReader(body)
+    keys = read_keys(reader)
+    poses = _read_poses(reader, len(keys))
+    values = reader.fixed(len(keys), _HALF_BITS).astype(np.uint16).view(np.float16).astype(np.float64)
+    if not np.isfinite(values).all():
+        raise DataError("Values are NaN or infinite: it is damaged.")
+    stamps = _seconds_of(reader.column(len(keys)))
+    removed = read_intervals(reader, 0, END)
+    reader.finish()
+    return ViewsMessage(ids_of(keys), poses, torch.from_numpy(values), stamps, removed)
+
+
+def encode_plan(
+    sender: int, number: int, time: float, step: float, path: Tensor, views: Tensor | None = None
+) -> list[bytes]:
+    """The datagram of a plan, 1 to 3 bytes per pose of the path, 5 a view.
+
+    Poses are rounded to 1 cm and 1/256 of a turn, times to 1 ms.
+
+    sender: id of the robot. number: rises with each of its plans. time: (s) of the first pose of the path.
+    step: (s) from each pose to the next, above zero. path: (S, 4). views: (V, 4).
+
+    Raises `InvalidArgumentError` if the plan does not fit into a datagram.
+    """
+    writer = BitWriter()
+    write_number(writer, "sender", sender)
+    write_number(writer, "number", number)
+    writer.number(int(_ticks("time", torch.tensor([time], dtype=torch.float64))[0]))
+    pace = int(_ticks("step", torch.tensor([step], dtype=torch.float64))[0])
+    if pace < 1:
+        raise InvalidArgumentError(f"step={step} must be at least a millisecond.")
+    writer.number(pace)
+    for name, poses, write in (
+        ("path", path, _write_path),
+        ("views", path[:0] if views is None else views, _write_poses),
+    ):
+        if len(poses) > MOST_POSES:
+            raise InvalidArgumentError(f"{name} has {len(poses)} poses; {MOST_POSES} are the most.")
+        writer.number(len(poses))
+        write(writer, _pose_steps(name, poses))
+    datagram = make_datagram(Kind.PLAN, writer.to_bytes())
+    if len(datagram) > MAX_BYTES:
+        raise InvalidArgumentError(
+            f"The plan of {len(path)} poses takes {len(datagram)} bytes; a datagram has room for "
+            f"{MAX_BYTES}. Send every second pose, or fewer."
+        )
+    return [datagram]
+
+
+def read_plan(body: bytes) -> PlanMessage:
+    reader = BitReader(body)
+    sender, number = read_number(reader), read_number(reader)
+    time, step = _seconds_of(np.array([reader.number(), reader.number()])).tolist()
+    if not step > 0:
+        raise DataError(f"The poses of a path are {step} s apart: it is damaged.")
+    path = _read_path(reader, _read_size(reader))
+    views = _read_poses(reader, _read_size(reader))
+    reader.finish()
+    return PlanMessage(sender, number, time, step, path, views)
+
+
+def _read_size(reader: BitReader) -> int:
+    n = reader.number()
+    if not 0 <= n <= MOST_POSES:
+        raise DataError(f"{n} poses; {MOST_POSES} are the most: it is damaged.")
+    return n
+
+
+def _halves(values: Tensor) -> Ints:
+    """The bits (V,) of values rounded to float16."""
+    rows = values.detach().double().cpu().numpy()
+    if rows.ndim != 1 or not (np.abs(rows) <= np.finfo(np.float16).max).all():
+        raise InvalidArgumentError("values must be a row of numbers up to 65504, the most of float16.")
+    return rows.astype(np.float16).view(np.uint16).astype(np.int64)
+
+
+# -- poses and times ------------------------------------------------------------------------------------
+
+
+def quantized_poses(poses: Tensor) -> Tensor:
+    """Poses (N, 4) as messages round them: to 1 cm and 1/256 of a turn, yaw in [−π, π)."""
+    return _poses(_pose_steps("poses", poses))
+
+
+def _pose_steps(name: str, poses: Tensor) -> Ints:
+    """Poses (N, 4) in steps, yaw from 0 to 255."""
+    if poses.ndim != 2 or poses.shape[1] != 4:
+        raise InvalidArgumentError(f"{name} has shape {tuple(poses.shape)}; expected (N, 4): x, y, z, yaw.")
+    rows = poses.detach().double().cpu()
+    bad = ~((rows[:, :3].abs() <= FARTHEST).all(1) & rows[:, 3].isfinite())
+    if bool(bad.any()):
+        first = int(bad.nonzero()[0])
+        raise InvalidArgumentError(
+            f"{name}[{first}] is {rows[first].tolist()}; positions reach {FARTHEST:g} m, and yaw is finite."
+        )
+    scaled = rows * rows.new_tensor([STEPS_PER_METRE] * 3 + [YAW_STEPS / (2 * math.pi)])
+    scaled[:, 3] = scaled[:, 3].remainder(YAW_STEPS)
+    steps = scaled.round().long().numpy()
+    steps[:, 3] %= YAW_STEPS
+    return steps
+
+
+def _write_poses(writer: BitWriter, steps: Ints) -> None:
+    """Write unrelated poses (N, 4) as four columns."""
+    for axis in range(4 if len(steps) else 0):
+        writer.column(steps[:, axis])
+
+
+def _read_poses(reader: BitReader, n: int) -> Tensor:
+    """Poses (n, 4). Columns may take no bits at all, so the caller must bound n."""
+    steps = np.zeros((n, 4), np.int64)
+    for axis in range(4 if n else 0):
+        steps[:, axis] = reader.column(n)
+    return _checked_poses(steps)
+
+
+def _write_path(writer: BitWriter, steps: Ints) -> None:
+    """Write poses (S, 4) of a path: the first, then columns of the steps, which are nearly equal."""
+    for axis in range(4 if len(steps) else 0):
+        ways = np.diff(steps[:, axis])
+        if axis == 3:  # the shorter direction
+            ways = (ways + YAW_STEPS // 2) % YAW_STEPS - YAW_STEPS // 2
+        writer.number(int(steps[0, axis]))
+        writer.column(ways)
+
+
+def _read_path(reader: BitReader, n: int) -> Tensor:
+    """Poses (n, 4) of a path. The caller must bound n, as in `_read_poses`."""
+    steps = np.zeros((n, 4), np.int64)
+    for axis in range(4 if n else 0):
+        ways = np.concatenate([np.array([reader.number()], np.int64), reader.column(n - 1)])
+        if float(np.abs(ways.astype(np.float64)).sum()) > _FARTHEST_STEP * 2 * n:
+            raise DataError("A path leaves the world: it is damaged.")
+        steps[:, axis] = np.cumsum(ways)
+    return _checked_poses(steps)
+
+
+def _ticks(name: str, seconds: Tensor) -> Ints:
+    """Times (N,) in milliseconds, of times in seconds."""
+    times = seconds.detach().double().cpu()
+    if times.ndim != 1 or not bool((times.abs() <= LATEST).all()):
+        raise InvalidArgumentError(f"{name} must be a row of times (s) of at most {LATEST:g}, and finite.")
+    return (times * TICKS).round().long().numpy()
+
+
+def _seconds_of(steps: Ints) -> Tensor:
+    """Times (N,) in seconds, of times in milliseconds."""
+    if len(steps) and int(np.abs(steps).max()) > LATEST * TICKS:
+        raise DataError(f"Times are later than {LATEST:g} s: it is damaged.")
+    return torch.from_numpy(steps.astype(np.float64) / TICKS)
+
+
+def _checked_poses(steps: Ints) -> Tensor:
+    if len(steps) and int(np.abs(steps[:, :3]).max()) > _FARTHEST_STEP:
+        raise DataError(f"Positions lie farther out than {FARTHEST:g} m: it is damaged.")
+    return _poses(steps)
+
+
+def _poses(steps: Ints) -> Tensor:
+    positions = steps[:, :3].astype(np.float64) / STEPS_PER_METRE
+    half = YAW_STEPS // 2
+    yaw = ((steps[:, 3] + half) % YAW_STEPS - half) * (2 * math.pi / YAW_STEPS)
+    return torch.from_numpy(np.concatenate([positions, yaw[:, None]], 1))
