@@ -34,7 +34,7 @@ from gmmtorch.team.exploration.world.world import World
 from gmmtorch.team.sharing.messages.mission_messages import PlanMessage, encode_plan
 from gmmtorch.team.sharing.replica.replica import Replica
 from gmmtorch.team.sharing.store import Store
-from gmmtorch.team.sharing.transport.simulated_network import Partition
+from gmmtorch.team.sharing.transport.link_conditions import Partition
 from gmmtorch.team.sharing.transport.udp import UdpTransport
 
 CONTRACT = """

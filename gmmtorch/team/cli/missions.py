@@ -67,7 +67,7 @@ def _short(value: Any) -> str:
 
 def world_options(config: DictConfig) -> WorldOptions:
     """The world that the options describe."""
-    if OmegaConf.is_missing(config.world, "path"):
+    if config.world.name == "mesh" and not config.world.path:
         raise InvalidArgumentError(
             "world=mesh needs world.path=FILE: a triangle mesh (PLY, OBJ, STL) in metres, z up."
         )
@@ -76,7 +76,8 @@ def world_options(config: DictConfig) -> WorldOptions:
 
 def open_world(world: WorldOptions, team: TeamOptions, on_event: Event = ignore) -> World:
     """The world for this team; errors name options."""
-    with naming(argument_names(WorldOptions)):
+    of_team = {"robot_radius": "robot.radius", "max_range": "sensor.max_range"}
+    with naming({**argument_names(WorldOptions), **of_team}):
         return world.open(team, on_event)
 
 

@@ -288,6 +288,8 @@ class TeamOptions(LinkConditions):
         for name in ("duration", "rate", "sample_every"):
             check_number(name, getattr(self, name), above=True)
         check_number("margin", self.margin)
+        if self.start is not None:
+            object.__setattr__(self, "start", _checked_poses(self.start))
         # These check their own arguments.
         Coordination(self.coordination, self.n_rounds)
         Radio.check(self.announce_every, self.budget)
@@ -372,6 +374,19 @@ class TeamOptions(LinkConditions):
     def shares(self) -> bool:
         """Whether robots send anything."""
         return self.framework != "grid_isolated"
+
+
+def _checked_poses(start: Any) -> tuple[tuple[float, ...], ...]:
+    """Start poses as tuples. Raises `InvalidArgumentError` unless each has four numbers."""
+    try:
+        poses = tuple(tuple(float(x) for x in pose) for pose in start)
+    except (TypeError, ValueError):
+        poses = ()
+    if not poses or any(len(pose) != 4 for pose in poses):
+        raise InvalidArgumentError(
+            f"start={start} must be poses of four numbers each: [[x, y, z, yaw], …], m and rad."
+        )
+    return poses
 
 
 @dataclass(frozen=True)
