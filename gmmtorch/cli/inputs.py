@@ -177,11 +177,14 @@ def open_map(
     return tiled.open(list(bounds[: tiled.dim]), list(bounds[tiled.dim :]), resolution)
 
 
-def chosen_map(options: dict[str, Any], group: str) -> dict[str, Any]:
+def chosen_map(given: Any, group: str) -> dict[str, Any]:
     """All options of a map, from those that differ from map=incremental, or from the map that `name` says.
 
     group: name of the options, for errors.
     """
+    options = {} if given is None else OmegaConf.to_container(given) if OmegaConf.is_config(given) else given
+    if not isinstance(options, dict):
+        raise InvalidArgumentError(f"{group}={options} must be options of a map, such as {{name: windowed}}.")
     name = str(options.get("name", "incremental"))
     check_choice(f"{group}.name", name, ("incremental", "per_scan", "windowed"))
     window = {"window": 1} if name == "per_scan" else {}

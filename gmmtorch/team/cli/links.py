@@ -14,17 +14,20 @@ from gmmtorch.errors import InvalidArgumentError, check_choice
 from gmmtorch.team.sharing import KEY_VARIABLE, FramedTransport, TeamKey, UdpTransport, ZenohTransport
 
 TRANSPORTS = ("udp", "zenoh")
+_NAMES = {"key": "link.key_file", "insecure": "link.insecure"}
 _ZENOH_NAMES = {
-    "key": "link.key_file",
+    **_NAMES,
     "listen": "link.listen_endpoints",
     "connect": "link.connect_endpoints",
     "config": "link.zenoh_config",
     "team": "link.team",
 }
-_UDP_NAMES = {"key": "link.key_file", "address": "link.listen"}
-"""Options by the arguments that they become, where the names differ."""
-_TTL = 1
-"""Networks that datagrams to a multicast group pass: robots of a team share one."""
+_UDP_NAMES = {
+    **_NAMES,
+    "address": "link.listen",
+    **{name: f"link.{name}" for name in ("peers", "group", "interface")},
+}
+"""Options by the arguments that they become, for error messages."""
 
 
 def open_link(config: DictConfig, robot: int, is_alone: bool = False) -> FramedTransport:
@@ -71,7 +74,7 @@ def _udp(robot: int, link: dict[str, Any], key: TeamKey | None) -> FramedTranspo
     insecure = link["insecure"]
     if link["group"] is not None:
         group = address("link.group", link["group"], least_port=1)
-        return UdpTransport.multicast(robot, group, link["interface"], _TTL, key=key, insecure=insecure)
+        return UdpTransport.multicast(robot, group, link["interface"], key=key, insecure=insecure)
     listen = address("link.listen", link["listen"])
     peers = [address("link.peers", peer, least_port=1) for peer in link["peers"]]
     return UdpTransport.unicast(robot, listen, peers, key=key, insecure=insecure)

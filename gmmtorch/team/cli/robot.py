@@ -56,8 +56,9 @@ class LogOptions:
     """The replay of recorded scans."""
 
     dataset: Any = option(None, "reader of the log, as in dataset@log.dataset=carmen")
-    map: dict[str, Any] = option(
-        {}, "options of the map that differ from those of map=incremental, as in {name: windowed, window: 20}"
+    map: Any = option(
+        None,
+        "options of the map that differ from those of map=incremental, as in {name: windowed, window: 20}",
     )
     rate: float = option(1.0, "scans per second")
     part: str = option("consecutive", "consecutive or interleaved part of the log for each robot")

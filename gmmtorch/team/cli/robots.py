@@ -74,7 +74,7 @@ def log_map(config: DictConfig) -> Callable[[], GaussianMap]:
         return map_factory(
             OmegaConf.create(
                 {
-                    "map": chosen_map(as_options(config.log.map), "log.map"),
+                    "map": chosen_map(config.log.map, "log.map"),
                     "runtime": runtime,
                     "seed": config.seed,
                 }

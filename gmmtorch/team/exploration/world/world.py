@@ -217,7 +217,7 @@ def _check_sizes(
     if max_range <= robot_radius + 2 * resolution:
         raise InvalidArgumentError(
             f"max_range={max_range} m ends within two cells of the robot (‹robot_radius›={robot_radius} m, "
-            f"resolution={resolution} m); use a longer range or finer cells."
+            f"‹resolution›={resolution} m); use a longer range or finer cells."
         )
 
 
