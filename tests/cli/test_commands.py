@@ -26,7 +26,7 @@ from command_runs import (
 )
 
 import gmmtorch
-from gmmtorch.experiments.studies import ComponentCountStudy, SensorModelStudy
+from gmmtorch.experiments.studies import ComponentCountStudy, InitializationStudy, SensorModelStudy
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 from gmmtorch.occupancy.occupancy_grid import OccupancyGrid
@@ -234,7 +234,7 @@ def test_initialization_study(run):
     ]
     done = succeeded(run("fit", "experiment=fig2_1_initialization", *options))
     results = done.results()
-    starts = results["config"]["study"]["init_params"]
+    starts = InitializationStudy().init_params
     assert len(results["rows"]) == 2 * 2 * len(starts)
     for row in results["rows"]:
         assert FIT_FIELDS | {"init_params", "seed", "init_seconds", "em_seconds"} <= row.keys()
@@ -347,7 +347,7 @@ def test_an_invalid_map_option_gives_a_one_line_error(options, words, run):
         ("scans=[99]", "scans=[99] 0 39"),
         ("max_points=0", "max_points=0"),
         ("mixture.n_components=9999", "n_components=9999"),
-        ("mixture.n_components=null method=[scikit_learn]", "mixture.n_components=null scikit_learn"),
+        ("mixture.n_components=null method=[scikit_learn]", "mixture.n_components=None scikit_learn"),
         ("experiment=fig2_1_initialization study.n_seeds=0", "study.n_seeds=0"),
         ("experiment=fig2_1_initialization study.n_components=[999]", "n_components=999 200"),
         ("+method_options.em.branching=2", "method_options.em.branching warm_start"),

@@ -58,7 +58,7 @@ class LogOptions:
     dataset: Any = option(None, "reader of the log, as in dataset@log.dataset=carmen")
     map: Any = option(
         None,
-        "options of the map that differ from those of map=incremental, as in {name: windowed, window: 20}",
+        "options of the map that differ from those of map=incremental, as in {name: windowed}",
     )
     rate: float = option(1.0, "scans per second")
     part: str = option("consecutive", "consecutive or interleaved part of the log for each robot")

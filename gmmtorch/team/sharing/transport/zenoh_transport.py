@@ -63,7 +63,8 @@ def open_session(
         )
     if not (listen or connect or scouting or config is not None):
         raise InvalidArgumentError(
-            "No robot is reached with ‹listen›=[], ‹connect›=[], scouting=None, ‹config›=None: give one of them."
+            "No robot is reached with ‹listen›=[], ‹connect›=[], scouting=None, ‹config›=None: give one of "
+            "them."
         )
     settings = _settings(
         _checked("listen", listen, 0, is_local), _checked("connect", connect, 1, is_local), scouting, config
@@ -80,8 +81,8 @@ def open_session(
         cause = _cause(error)
         remedies = (remedy for sign, remedy in _REMEDIES.items() if sign in cause)
         raise InvalidArgumentError(
-            f"listen={list(listen)}, ‹connect›={list(connect)}, ‹config›={str(config)!r} cannot be used by Zenoh "
-            f"({cause}): {next(remedies, 'see the documentation of Zenoh.')}"
+            f"listen={list(listen)}, ‹connect›={list(connect)}, ‹config›={str(config)!r} cannot be used by "
+            f"Zenoh ({cause}): {next(remedies, 'see the documentation of Zenoh.')}"
         ) from error
 
 
