@@ -40,8 +40,7 @@ from gmmtorch.experiments.evaluation.mapping_methods import choose, methods
 from gmmtorch.kernels.rays.ray_traversal import traverse
 from gmmtorch.report.style import PALETTE, label_axes, legend_below, new_figure, save_figure
 from gmmtorch.simulation import World3D, building_3d, poses_3d, spinning_lidar
-from gmmtorch.simulation.worlds.floor_plan import Footprint, circle
-from gmmtorch.simulation.worlds.furniture import prism
+from gmmtorch.simulation.furniture import Footprint, circle, prism
 
 CELL = 0.1  # metres
 SECONDS = 0.4  # between two scans

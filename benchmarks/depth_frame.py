@@ -20,7 +20,7 @@ from tables import hardware, markdown, publish
 from torch import Tensor
 
 from gmmtorch import GaussianMap, GaussianMixture, datasets
-from gmmtorch.datasets.depth_frames import DepthFrames
+from gmmtorch.datasets.depth_images import DepthFrames
 from gmmtorch.experiments.evaluation.metrics import roc
 from gmmtorch.experiments.evaluation.queries import hit_and_free, test_beams
 from gmmtorch.mixture.estimators.depth_image import fit_depth_image

@@ -28,7 +28,7 @@ from gmmtorch.kernels import kernels
 from gmmtorch.mapping.learning.rules import IncrementalRule, LearningRule, WindowedRule
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.evidence import Evidence
-from gmmtorch.occupancy.forms.flux.box_flux import flux_evidence
+from gmmtorch.occupancy.forms.flux import flux_evidence
 from gmmtorch.occupancy.forms.monte_carlo import sample_rays
 from gmmtorch.occupancy.forms.point import PointForm
 from gmmtorch.occupancy.grid import VoxelGrid

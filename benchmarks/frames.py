@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 
 from gmmtorch import datasets
-from gmmtorch.datasets.depth_frames import DepthFrames
+from gmmtorch.datasets.depth_images import DepthFrames
 from gmmtorch.experiments.evaluation.queries import Queries, hit_and_free, split_indices, test_beams
 from gmmtorch.pinhole import back_project
 from gmmtorch.scan import Scan
-from gmmtorch.simulation.sensors.depth_camera import DepthCamera
-from gmmtorch.simulation.worlds.mesh_world import MeshWorld
-from gmmtorch.simulation.worlds.warehouse import warehouse
+from gmmtorch.simulation.mesh_world import MeshWorld
+from gmmtorch.simulation.robot_camera import DepthCamera
+from gmmtorch.simulation.warehouses import warehouse
 
 RESOLUTIONS = {"kinect": 0.05, "hall": 0.2, "warehouse": 0.2}  # metres, of the cells asked about
 TEST_EVERY, MAX_BEAMS, SEED = 5, 5_000, 0

@@ -27,13 +27,13 @@ from torch import Tensor
 from gmmtorch import GaussianMap, datasets
 from gmmtorch.experiments.evaluation.queries import hit_and_free, test_beams
 from gmmtorch.kernels import kernels
-from gmmtorch.kernels.mixtures.e_step import expectation
+from gmmtorch.kernels.mixtures.em_steps import expectation
 from gmmtorch.kernels.rays.ray_traversal import traverse
 from gmmtorch.mapping.learning.rules import IncrementalRule
 from gmmtorch.mixture.em.exact import quadratic_features
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.evidence import Evidence
-from gmmtorch.occupancy.forms.flux.box_flux import flux_evidence
+from gmmtorch.occupancy.forms.flux import flux_evidence
 from gmmtorch.occupancy.forms.point import PointForm
 from gmmtorch.occupancy.grid import VoxelGrid
 from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence

@@ -22,8 +22,8 @@ from tables import hardware, markdown, publish
 
 import gmmtorch as gt
 from gmmtorch.localization import Odometry
-from gmmtorch.localization.trajectories import absolute_trajectory_error
-from gmmtorch.mapping.window_motions import WindowMotions
+from gmmtorch.localization.trajectory_errors import absolute_trajectory_error
+from gmmtorch.mapping.map_builder import WindowMotions
 from gmmtorch.team.sharing import Replica
 from gmmtorch.team.sharing.messages.datagrams import Kind, parse_datagram
 from gmmtorch.team.sharing.shared_map import SharedMap

@@ -23,7 +23,7 @@ from torch import Tensor
 import gmmtorch as gt
 from gmmtorch.datasets import Dataset
 from gmmtorch.localization import Tracker
-from gmmtorch.localization.rigid_motions import generators
+from gmmtorch.pose import generators
 
 _IN_ORDER = 300  # first scans of a log
 

@@ -18,7 +18,7 @@ import torch
 from tables import hardware, markdown, publish
 
 from gmmtorch import GaussianMap, IncrementalRule, datasets
-from gmmtorch.datasets.depth_frames import DepthFrames
+from gmmtorch.datasets.depth_images import DepthFrames
 from gmmtorch.experiments.evaluation.metrics import roc
 from gmmtorch.experiments.evaluation.queries import FREE, OCCUPIED, hit_and_free, split_indices, test_beams
 

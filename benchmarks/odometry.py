@@ -25,8 +25,8 @@ import gmmtorch as gt
 from gmmtorch.datasets import Dataset
 from gmmtorch.experiments.evaluation.held_out import Protocol, evaluate
 from gmmtorch.experiments.evaluation.mapping_methods import choose, methods
-from gmmtorch.localization.odometry.recorded_poses import METHODS, with_odometry
-from gmmtorch.localization.trajectories import absolute_trajectory_error, relative_pose_error
+from gmmtorch.localization.odometry import METHODS, with_odometry
+from gmmtorch.localization.trajectory_errors import absolute_trajectory_error, relative_pose_error
 
 NOISE = 1e-3  # metres of standard deviation that move every point of a run
 WRONG = 0.2  # metres of a step

@@ -190,10 +190,6 @@ def frame(device: str) -> Work:
 
 
 def registration(data: Path, device: str) -> Work:
-    try:
-        from gmmtorch import register
-    except ImportError:
-        from gmmtorch.mapping.registration import register
     scans = list(gt.datasets.load("scan_folder", data / "hall"))
     made = []
     for place in (10, 14):
@@ -203,7 +199,7 @@ def registration(data: Path, device: str) -> Work:
         made.append(part if device == "cpu" else part.to(device))
     start = torch.eye(4, dtype=torch.float64)
     start[:3, 3] = torch.tensor([0.4, -0.3, 0.1], dtype=torch.float64)
-    return lambda: register(made[1], made[0], start)
+    return lambda: gt.register(made[1], made[0], start)
 
 
 def works(data: Path, device: str = "cpu") -> dict[str, Callable[[], Work]]:

@@ -40,8 +40,7 @@ from gmmtorch.files import write_bytes
 from gmmtorch.mapping.codec.quantization import spatial_order
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.fitting import SurfaceFit, fit_points
-from gmmtorch.mapping.learning.merging import compact
-from gmmtorch.mapping.learning.viewpoints import all_origins
+from gmmtorch.mapping.learning.merging import all_origins, compact
 from gmmtorch.mapping.learning.windows import surface_fit
 from gmmtorch.occupancy.occupancy_grid import OccupancyGrid
 from gmmtorch.occupancy.protocol import OccupancyMap

@@ -36,9 +36,9 @@ from torch import Tensor
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.mapping.components import Components
 from gmmtorch.report.text import format_table
-from gmmtorch.simulation.sensors.depth_camera import DepthFrame
-from gmmtorch.simulation.worlds.mesh_world import MeshWorld
-from gmmtorch.simulation.worlds.warehouse import warehouse
+from gmmtorch.simulation.mesh_world import MeshWorld
+from gmmtorch.simulation.robot_camera import DepthFrame
+from gmmtorch.simulation.warehouses import warehouse
 from gmmtorch.team.exploration.mission.driver import SimulatedClock, drive
 from gmmtorch.team.exploration.mission.mission import Mission
 from gmmtorch.team.exploration.mission.options import TeamOptions

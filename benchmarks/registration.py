@@ -27,10 +27,10 @@ from tables import hardware, markdown, publish
 from torch import Tensor
 
 from gmmtorch import WindowedRule, datasets
-from gmmtorch.localization.registration.registration import register, yaw_starts
-from gmmtorch.localization.rigid_motions import generators
+from gmmtorch.localization.registration import register, yaw_starts
 from gmmtorch.mapping.codec import component_batch as codec
 from gmmtorch.mapping.learning.windows import learn_window
+from gmmtorch.pose import generators
 from gmmtorch.scan import Scan
 
 STARTS = ((0.1, 2.0), (0.5, 10.0), (1.0, 20.0), (2.0, 45.0))  # metres, degrees

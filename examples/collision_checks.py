@@ -6,7 +6,7 @@ python examples/collision_checks.py
 import torch
 
 import gmmtorch as gt
-from gmmtorch.mapping.clearance import clearance, collision_probability
+from gmmtorch.mapping.surfaces import clearance, collision_probability
 
 RADIUS = 0.3  # metres, of the robot's body
 

@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import dijkstra
 
 import gmmtorch as gt
 from gmmtorch.mapping import Body
-from gmmtorch.mapping.clearance import clearance
+from gmmtorch.mapping.surfaces import clearance
 
 STEP = 0.25  # metres between the places that the search visits
 # Two balls: 0.7 m long, 0.4 m wide.

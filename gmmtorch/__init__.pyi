@@ -3,7 +3,7 @@ from . import datasets as datasets
 from . import mixture as mixture
 from . import sharing as sharing
 from .errors import GmmTorchError as GmmTorchError
-from .localization.registration.registration import register as register
+from .localization.registration import register as register
 from .mapping.components import Components as Components
 from .mapping.gaussian_map import GaussianMap as GaussianMap
 from .mapping.learning.rules import IncrementalRule as IncrementalRule

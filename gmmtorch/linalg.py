@@ -1,4 +1,4 @@
-"""Batches of small matrices (symmetric ones packed and factorised, rotations), checks, and fast sorting."""
+"""Batches of small symmetric matrices, packed and factorised, copies between devices, and fast sorting."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from gmmtorch.errors import InvalidArgumentError, NumericalError
 from gmmtorch.kernels import distinct_keys, is_fused
 
 _MANY_KEYS = 1 << 12  # from here on a hash table is faster than sorting
-_ORTHONORMAL = 1e-5  # largest error of an entry of R Rᵀ
-_LAST_ROW = 1e-12  # largest error of an entry of the last row: that of an inverse
 _JITTERS = (1e-12, 1e-10, 1e-8, 1e-6)  # relative to the mean of the diagonal
 
 
@@ -91,46 +89,6 @@ def check_symmetric(matrices: Tensor, name: str) -> Tensor:
     return matrices
 
 
-def plane_rotations(angles: Tensor) -> Tensor:
-    """Rotations (…, 2, 2) of the plane by angles (…), rad, counter-clockwise."""
-    cos, sin = angles.cos(), angles.sin()
-    return torch.stack([torch.stack([cos, -sin], -1), torch.stack([sin, cos], -1)], -2)
-
-
-def nearest_rotations(matrices: Tensor) -> Tensor:
-    """The rotations nearest to matrices (…, D, D) that are rotations up to rounding: U Vᵀ of U Σ Vᵀ."""
-    left, _, right = torch.linalg.svd(matrices)
-    return left @ right
-
-
-def check_rigid(transform: Tensor, dim: int, name: str = "transform") -> tuple[Tensor, Tensor]:
-    """Rotation (D, D) and translation (D,), float64, of a rigid motion given as a matrix (D+1, D+1).
-
-    Raises `InvalidArgumentError` unless the matrix is finite, its rotation is orthonormal with
-    determinant +1, and its last row is 0 … 0 1, up to the rounding of an inverse.
-    """
-    shape = (dim + 1, dim + 1)
-    if tuple(transform.shape) != shape:
-        raise InvalidArgumentError(
-            f"{name} has shape {tuple(transform.shape)}; a rigid motion in {dim}D is {shape}."
-        )
-    matrix = transform.double()
-    values = matrix.detach().cpu().numpy()
-    turn, last = values[:dim, :dim], values[dim]
-    rigid = (
-        np.isfinite(values).all()
-        and float(np.abs(turn @ turn.T - np.eye(dim)).max()) <= _ORTHONORMAL
-        and np.linalg.det(turn) > 0
-        and float(np.abs(last - np.eye(dim + 1)[dim]).max()) <= _LAST_ROW
-    )
-    if not rigid:
-        raise InvalidArgumentError(
-            f"{name}={matrix.tolist()} is not rigid; its rotation must be orthonormal with determinant 1, "
-            "its translation in metres, and its last row 0 … 0 1."
-        )
-    return matrix[:dim, :dim], matrix[:dim, dim]
-
-
 # -- devices ---------------------------------------------------------------------------------------
 
 
@@ -163,8 +121,13 @@ def argsort(keys: Tensor) -> Tensor:
     if keys.device.type != "cpu":
         return keys.argsort(stable=True)
     array = keys.numpy()
-    if array.dtype == np.int64 and array.size and array.min() >= 0 and array.max() < 1 << 16:
-        array = array.astype(np.uint16)  # radix sort
+    if array.dtype == np.int64 and array.size and array.min() >= 0:
+        if array.max() < 1 << 16:
+            array = array.astype(np.uint16)  # radix sort
+        elif array.max() < 1 << 32 and (array[1:] < array[:-1]).any():  # two of them
+            order = np.argsort(array.astype(np.uint16), kind="stable")
+            high = (array >> 16).astype(np.uint16)
+            return torch.from_numpy(order[np.argsort(high[order], kind="stable")])
     return torch.from_numpy(np.argsort(array, kind="stable"))
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike as ArrayLike
 from gmmtorch.arrays import as_tensor, naming_device
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.linalg import check_rigid
+from gmmtorch.pose import Pose
 
 FARTHEST = 2.0**27
 """Largest absolute coordinate in metres, 134 217 km. Map files store no larger ones."""
@@ -147,13 +147,10 @@ class Scan:
 
     def transformed(self, transform: ArrayLike) -> Scan:
         """The scan moved by a rigid motion (D+1, D+1): x → R x + t."""
-        matrix = as_tensor(transform, "transform", torch.float64, self.points.device)
-        rotation, translation = check_rigid(matrix, self.dim)
-
-        def move(x: Tensor) -> Tensor:
-            return (x.double() @ rotation.T + translation).to(x.dtype)
-
-        return Scan(move(self.points), move(self.origin[None])[0], move(self.no_return), self.time)
+        pose = Pose.checked(transform, self.dim, device=self.points.device)
+        return Scan(
+            pose.apply(self.points), pose.apply(self.origin[None])[0], pose.apply(self.no_return), self.time
+        )
 
     def copied(self, device: torch.device | str | None = None) -> Scan:
         """A deep copy, on `device` if given. A reader that reuses its arrays for the next scan needs it."""

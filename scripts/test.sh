@@ -8,6 +8,7 @@ cd "$(dirname "$0")/.."
 
 ./scripts/setup.sh
 .venv/bin/ruff format --check .
+find gmmtorch -name '*.h' -exec .venv/bin/clang-format --dry-run --Werror {} +
 .venv/bin/ruff check .
 .venv/bin/mypy
 .venv/bin/mypy --config-file benchmarks/mypy.ini

@@ -24,6 +24,7 @@ GROUND = [
     "options",
     "arrays",
     "linalg",
+    "pose",
     "files",
     "events",
     "scan",

@@ -9,7 +9,6 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.linalg import polar
 from torch import Tensor
 
 from gmmtorch.errors import GmmTorchError, NumericalError
@@ -18,9 +17,7 @@ from gmmtorch.linalg import (
     dense_ranks,
     inverse_factor,
     largest_indices,
-    nearest_rotations,
     pack_symmetric,
-    plane_rotations,
     ragged_index,
     safe_cholesky,
     unpack_symmetric,
@@ -121,16 +118,6 @@ def test_inverse_factor_gives_the_mahalanobis_distance(generator):
     squared = (x[:, None, :] @ whiten).square().sum((1, 2))
     expected = [float(v @ np.linalg.inv(m) @ v) for v, m in zip(x.numpy(), matrices.numpy(), strict=True)]
     np.testing.assert_allclose(squared.numpy(), expected, rtol=1e-10)
-
-
-def test_rotations_equal_the_matrix_exponential_and_the_polar_decomposition(generator):
-    angles = torch.randn(4, 2, dtype=torch.float64, generator=generator) * 3
-    turns = plane_rotations(angles)
-    skew = torch.tensor([[0.0, -1.0], [1.0, 0.0]], dtype=torch.float64)
-    torch.testing.assert_close(turns, torch.linalg.matrix_exp(angles[..., None, None] * skew))
-    rounded = turns + 1e-3 * torch.randn(turns.shape, dtype=torch.float64, generator=generator)
-    expected = np.stack([polar(matrix)[0] for matrix in rounded.reshape(-1, 2, 2).numpy()])
-    np.testing.assert_allclose(nearest_rotations(rounded).reshape(-1, 2, 2), expected, atol=1e-12)
 
 
 # -- sorting ----------------------------------------------------------------------------------------

@@ -46,7 +46,7 @@ def bag(folder: Path) -> object:
 
 
 def las(folder: Path) -> object:
-    from gmmtorch.datasets.point_files.point_rows import LasRows
+    from gmmtorch.datasets.point_files.las_files import LasRows
 
     return LasRows(folder / "a.las")
 
@@ -95,7 +95,7 @@ def node(middleware: str) -> Callable[[Path], object]:
 
 
 def odometry(folder: Path) -> object:
-    from gmmtorch.localization.odometry.recorded_poses import with_odometry
+    from gmmtorch.localization.odometry import with_odometry
 
     return with_odometry(gt.datasets.load("synthetic_building_2d", n_scans=2), "kiss_icp")
 

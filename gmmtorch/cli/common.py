@@ -72,8 +72,7 @@ class Runtime(Memory):
     )
     compile: bool = option(
         False,
-        "torch.compile for ray casting where no fused kernel runs; the same result, faster in very large "
-        "runs; without effect in gmmtorch-fit",
+        "without effect: fused kernels are compiled anyway",
     )
 
 

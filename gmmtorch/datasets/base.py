@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gzip
 import math
 import re
@@ -12,16 +13,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import overload
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError, check_whole
+from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 
 _ROUNDING = 1e-6
 """Upper bound of the relative rounding error of a range recomputed from rotated float32 coordinates."""
 
+_ROUNDED_ROTATION = 1e-2  # largest error of an entry of R Rᵀ
 _MAX_TEXT_BYTES = 1 << 28
 _GZIP_BLOCK_BYTES = 1 << 20
 
@@ -80,7 +84,7 @@ class Ranges:
 
     def posed(self, points: Tensor, pose: Tensor) -> Scan:
         """A scan from points (N, 3) in the sensor frame and the pose (4, 4), world ← sensor; see `scan`."""
-        return self.scan(points @ pose[:3, :3].T + pose[:3, 3], pose[:3, 3])
+        return self.scan(Pose.from_matrix(pose).apply(points), pose[:3, 3])
 
 
 class Dataset(Sequence[Scan]):
@@ -216,18 +220,23 @@ def natural_key(path: Path) -> list[tuple[int, int | str]]:
     return [(0, int(w)) if w.isdecimal() else (1, w) for w in re.split(r"(\d+)", path.name)]
 
 
-def check_pose(matrix: Tensor, where: str) -> Tensor:
-    """The pose (4, 4), world ← sensor. Raises `DataError`, which begins with `where`, unless it is rigid."""
-    rotation = matrix[:3, :3]
-    error = (rotation @ rotation.T - torch.eye(3, dtype=matrix.dtype)).abs().max()
-    if not (
-        bool(torch.isfinite(matrix).all()) and float(error) < 1e-2 and float(torch.linalg.det(rotation)) > 0
-    ):
+def check_poses(matrices: Tensor, where: str) -> Tensor:
+    """The poses (N, 4, 4) or (4, 4), world ← sensor, as files state them, whose rotations are rounded.
+
+    Raises `DataError`, which begins with `where` and the number of the row from 1, unless they are rigid.
+    """
+    rotation = matrices[..., :3, :3]
+    error = (rotation @ rotation.mT - torch.eye(3, dtype=matrices.dtype)).abs().amax((-2, -1))
+    finite = torch.isfinite(matrices).flatten(-2).all(-1)
+    bad = ~(finite & (error < _ROUNDED_ROTATION) & (torch.linalg.det(rotation) > 0))
+    if bool(bad.any()):
+        row = int(bad.reshape(-1).nonzero()[0])
         raise DataError(
-            f"{where} is not a rigid pose (rotation off by {float(error):.2g}); expected world ← sensor, "
-            "a rotation matrix and a translation in metres."
+            f"{where}{f' {row + 1}' if bad.ndim else ''} is not a rigid pose (rotation off by "
+            f"{float(error.reshape(-1)[row]):.2g}); expected world ← sensor, a rotation matrix and a "
+            "translation in metres."
         )
-    return matrix
+    return matrices
 
 
 def gunzip(path: Path) -> bytes | None:
@@ -305,9 +314,58 @@ def start_frame(scans: Dataset, index: int) -> Tensor:
     and x points ahead. In 3D it is upright. Without poses it has the axes of the world.
     """
     pose, origin = scans.pose(index), scans[index].origin.double()
-    frame = torch.eye(len(origin) + 1, dtype=torch.float64)
-    frame[:-1, -1] = origin
-    if pose is not None and float(pose[:2, 0].norm()) > 0:
-        (cos, sin) = (pose[:2, 0] / pose[:2, 0].norm()).tolist()
-        frame[:2, :2] = torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64)
-    return frame
+    yaw = 0.0 if pose is None else math.atan2(float(pose[1, 0]), float(pose[0, 0]))
+    return Pose.from_yaw(yaw, origin).matrix
+
+
+# -- rows of numbers in text files -------------------------------------------------------------------
+
+
+_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|[+-]?(?:nan|inf|infinity)", re.I | re.A)
+# C runtimes print these, Microsoft's older ones rounded to the precision: 1.#QNAN, 1.#INF00, 1.#J, 1.$
+_NOT_FINITE = re.compile(
+    r"(?<!\S)[+-]?(?:nan(?:[qs]|\(\w*\))|1\.(?:#[a-z]+|\$)0*(?:e[+-]?\d+)?)(?!\S)", re.I | re.A
+)
+_SHOWN = 40  # characters of a word in an error
+
+
+def number_rows(lines: Sequence[str], width: int | None, where: str, first: int = 1) -> np.ndarray:
+    """Numbers (N, width), float64, of lines that are not blank. White space separates the numbers.
+
+    Numbers are decimal, with a point. NaN and infinity are read in every spelling of C runtimes.
+
+    Args:
+        width: numbers in each line; None: as many as in the first line.
+        where: beginning of errors, up to the number of the line, as in "a.pcd, row".
+        first: number of the first line.
+
+    Raises `DataError`, which names the line and the word, if a word is not a number or a line has another
+    width.
+    """
+    if not lines:
+        return np.empty((0, width or 0))
+    width = width or len(lines[0].split())
+    spellings = (None, _NOT_FINITE) if lines[0].strip() else ()
+    for spelling in spellings:  # the second is rare, and takes longer than to read the numbers
+        text = lines if spelling is None else [spelling.sub("nan", line) for line in lines]
+        with contextlib.suppress(ValueError):
+            table = np.loadtxt(text, np.float64, comments=None, ndmin=2)
+            if table.shape == (len(lines), width):
+                return table
+    raise _bad_line(lines, width, where, first)
+
+
+def _bad_line(lines: Sequence[str], width: int, where: str, first: int) -> DataError:
+    """The error for the first line that is not `width` numbers."""
+    for number, line in enumerate(lines, first):
+        words = _NOT_FINITE.sub("nan", line).split()
+        for word in words:
+            if not _NUMBER.fullmatch(word):
+                remedy = "write decimals with a point, not a comma" if "," in word else "write the file again"
+                return DataError(f"{where} {number}: {word[:_SHOWN]!r} is not a number; {remedy}.")
+        if len(words) != width:
+            return DataError(
+                f"{where} {number} has {len(words)} numbers instead of {width}; the file is truncated or "
+                "damaged. Write it again."
+            )
+    return DataError(f"{where} {first} or a later one cannot be read as numbers; write the file again.")

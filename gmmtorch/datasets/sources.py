@@ -21,14 +21,14 @@ class _Source(NamedTuple):
 
 
 _SOURCES = {
-    "carmen": _Source("carmen", "CarmenLog"),
-    "scan_folder": _Source("scan_folder", "ScanFolder"),
-    "pcd_viewpoint": _Source("scan_folder", "PcdViewpoint"),
-    "depth_frames": _Source("depth_frames", "DepthFrames"),
-    "octomap_log": _Source("octomap_log", "OctomapLog"),
-    "rosbag": _Source("recordings.ros.rosbag", "open_rosbag"),
-    "kitti": _Source("recordings.kitti", "Kitti"),
-    "tum": _Source("recordings.tum", "TumRgbd"),
+    "carmen": _Source("scan_logs", "CarmenLog"),
+    "scan_folder": _Source("scan_folders", "ScanFolder"),
+    "pcd_viewpoint": _Source("scan_folders", "PcdViewpoint"),
+    "depth_frames": _Source("depth_images", "DepthFrames"),
+    "octomap_log": _Source("scan_logs", "OctomapLog"),
+    "rosbag": _Source("ros.rosbag", "open_rosbag"),
+    "kitti": _Source("scan_folders", "Kitti"),
+    "tum": _Source("depth_images", "TumRgbd"),
     "mesh": _Source("synthetic", "MeshSamples"),
     "mesh_scans": _Source("synthetic", "MeshScans"),
     "synthetic_building": _Source("synthetic", "SyntheticBuilding", needs_path=False),
@@ -86,7 +86,7 @@ def load(
                 f"{option}={value!r} is not an option of dataset={name}, which {takes}."
             )
     if source.needs_path and poses is not None and "poses" not in known:
-        from gmmtorch.datasets.recordings.reposed import with_trajectory
+        from gmmtorch.datasets.trajectory import with_trajectory
 
         return with_trajectory(reader(path, ranges, 1, **options), poses, stride)
     for option, value in (("path", path), ("poses", poses)):

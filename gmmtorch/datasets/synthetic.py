@@ -14,7 +14,7 @@ from torch import Tensor
 from gmmtorch.datasets.base import Dataset, Ranges, require_path
 from gmmtorch.datasets.point_files.mesh_files import read_triangles
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_number, check_whole
-from gmmtorch.linalg import plane_rotations
+from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 from gmmtorch.simulation import (
     MeshWorld,
@@ -202,12 +202,11 @@ def _forward(places: Tensor) -> Tensor:
     """Poses (S, 4, 4), world ← sensor, at places (S, 3) of a path, x towards the next place."""
     steps = places.diff(dim=0) if len(places) > 1 else torch.zeros_like(places)
     ahead = torch.cat([steps, steps[-1:]])[: len(places)]
-    poses = torch.eye(4, dtype=torch.float64).repeat(len(places), 1, 1)
-    poses[:, :2, :2] = plane_rotations(torch.atan2(ahead[:, 1], ahead[:, 0]))
-    poses[:, :3, 3] = places
-    return poses
+    return Pose.from_yaw(torch.atan2(ahead[:, 1], ahead[:, 0]), places).matrix
 
 
 def _sensor_3d(name: str, max_range: float) -> RangeSensor:
     check_choice("sensor", name, ("lidar", "depth_camera"))
-    return (spinning_lidar if name == "lidar" else depth_camera)(max_range=max_range)
+    if name == "lidar":
+        return spinning_lidar(max_range=max_range)
+    return depth_camera(max_range=max_range)

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from gmmtorch.datasets import NANOSECONDS, in_space, to_nanoseconds
+from gmmtorch.datasets import ARRAY, BASE, NAME, NANOSECONDS, to_nanoseconds
 from gmmtorch.errors import InvalidArgumentError, OutputError
 from gmmtorch.optional_packages import needs_extra
+from gmmtorch.pose import Pose
 from gmmtorch.scan import ArrayLike, Scan
 
-_BASE, _NAME, _ARRAY = 1, 2, 3
 _POINT_TYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 
 
@@ -28,19 +28,19 @@ def built_message(store: Any, name: str, fields: Mapping[str, Any], stamp: int) 
     values: dict[str, Any] = {}
     for field, (kind, content) in store.fielddefs[name][1]:
         given = fields.get(field)
-        if kind == _NAME:
+        if kind == NAME:
             if content == "builtin_interfaces/msg/Time" and given is None and name.endswith("/Header"):
                 given = time_fields(stamp)
             values[field] = built_message(store, content, given or {}, stamp)
-        elif kind == _BASE:
+        elif kind == BASE:
             values[field] = given if given is not None else "" if content[0] == "string" else 0
-        elif content[0][0] == _NAME:
+        elif content[0][0] == NAME:
             values[field] = [built_message(store, content[0][1], item, stamp) for item in given or []]
         elif content[0][1][0] == "string":
             values[field] = list(given or [])
         else:
             code = {"bool": "u1", "byte": "u1", "char": "u1", "octet": "u1"}.get(content[0][1][0])
-            size = content[1] if kind == _ARRAY else 0
+            size = content[1] if kind == ARRAY else 0
             array = np.zeros(size) if given is None else given
             values[field] = np.asarray(array, dtype=np.dtype(code or content[0][1][0]))
     return store.types[name](**values)
@@ -53,11 +53,9 @@ def time_fields(stamp: int) -> dict[str, int]:
 
 def pose_fields(matrix: ArrayLike) -> tuple[dict[str, float], dict[str, float]]:
     """Translation and rotation of a pose (4, 4) as fields of messages."""
-    from scipy.spatial.transform import Rotation
-
-    pose = np.asarray(matrix, dtype=np.float64)
-    turn = Rotation.from_matrix(pose[:3, :3]).as_quat()
-    return dict(zip("xyz", pose[:3, 3].tolist(), strict=True)), dict(zip("xyzw", turn.tolist(), strict=True))
+    pose = Pose.from_matrix(matrix)
+    shift, turn = pose.translation.tolist(), pose.quaternion().tolist()
+    return dict(zip("xyz", shift, strict=True)), dict(zip("xyzw", turn, strict=True))
 
 
 def transform_fields(edges: Mapping[tuple[str, str], ArrayLike]) -> dict[str, Any]:
@@ -147,7 +145,7 @@ def write_bag(
                 )
             points = scan.points.detach().cpu().double().numpy()
             local = (points - given[:dim, dim]) @ given[:dim, :dim]
-            bag.transforms(time, {("map", "lidar"): in_space(given[None])[0]})
+            bag.transforms(time, {("map", "lidar"): Pose.from_matrix(given).in_space().matrix})
             bag.cloud(topic, time, "lidar", np.pad(local, ((0, 0), (0, 3 - dim))))
     return Path(path)
 

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gmmtorch.datasets import in_space
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.files import write_bytes
+from gmmtorch.pose import Pose
 from gmmtorch.scan import ArrayLike
 
 _POSE = ("time", "x", "y", "z", "qx", "qy", "qz", "qw")
@@ -46,7 +46,7 @@ def write_kitti(path: str | Path, poses: ArrayLike) -> Path:
 
     Raises `InvalidArgumentError` for other shapes, and for values that are not finite.
     """
-    lines = [_numbers(matrix[:3].ravel(), 17) + "\n" for matrix in _checked(poses)]
+    lines = [_numbers(rows, 17) + "\n" for rows in _checked(poses).matrix[:, :3].flatten(1).tolist()]
     return write_bytes(path, "".join(lines).encode())
 
 
@@ -69,14 +69,13 @@ def write_pose_table(
 
     Raises `InvalidArgumentError` for other shapes, and for values that are not finite.
     """
-    matrices = _checked(poses)
-    pose_rows = _pose_rows(times, matrices)
+    pose_rows = _pose_rows(times, _checked(poses))
     spread = torch.as_tensor(covariances).detach().cpu().double().numpy()
     free = _FREE.get(spread.shape[-1] if spread.ndim == 3 else 0, ())
-    if spread.shape != (len(matrices), len(free), len(free)) or not np.isfinite(spread).all():
+    if spread.shape != (len(pose_rows), len(free), len(free)) or not np.isfinite(spread).all():
         raise InvalidArgumentError(
             f"covariances has shape {spread.shape} or holds NaN; expected (S, 3, 3) or (S, 6, 6) of "
-            f"{len(matrices)} poses."
+            f"{len(pose_rows)} poses."
         )
     more = dict(columns or {})
     rows, cols = np.triu_indices(len(free))
@@ -96,28 +95,25 @@ def write_pose_table(
     return write_bytes(path, text.getvalue().encode())
 
 
-def _pose_rows(times: ArrayLike, matrices: np.ndarray) -> np.ndarray:
-    """time, x, y, z, qx, qy, qz, qw (S, 8) of poses (S, 4, 4)."""
-    from scipy.spatial.transform import Rotation
-
+def _pose_rows(times: ArrayLike, poses: Pose) -> np.ndarray:
+    """time, x, y, z, qx, qy, qz, qw (S, 8) of S poses of space."""
     stamp = torch.as_tensor(times).detach().cpu().double().numpy()
-    if stamp.shape != (len(matrices),) or not np.isfinite(stamp).all():
+    if stamp.shape != (len(poses),) or not np.isfinite(stamp).all():
         raise InvalidArgumentError(
             f"times has shape {stamp.shape} or holds NaN or infinite values; give one time (s) for each of "
-            f"{len(matrices)} poses."
+            f"{len(poses)} poses."
         )
-    turns = Rotation.from_matrix(matrices[:, :3, :3]).as_quat() if len(matrices) else np.zeros((0, 4))
-    return np.column_stack([stamp, matrices[:, :3, 3], turns])
+    return np.column_stack([stamp, poses.translation, poses.quaternion()])
 
 
-def _checked(poses: ArrayLike) -> np.ndarray:
-    """Poses (S, 4, 4), float64, of poses in 2D or 3D."""
-    given = torch.as_tensor(poses).detach().cpu().double().numpy()
+def _checked(poses: ArrayLike) -> Pose:
+    """Poses of space, of S poses in 2D or 3D."""
+    given = torch.as_tensor(poses).detach().cpu().double()
     if given.ndim != 3 or given.shape[1:] not in ((3, 3), (4, 4)):
-        raise InvalidArgumentError(f"poses has shape {given.shape}; expected (S, 3, 3) or (S, 4, 4).")
-    if not np.isfinite(given).all():
+        raise InvalidArgumentError(f"poses has shape {tuple(given.shape)}; expected (S, 3, 3) or (S, 4, 4).")
+    if not bool(given.isfinite().all()):
         raise InvalidArgumentError("poses holds NaN or infinite values; drop these poses.")
-    return in_space(given)
+    return Pose.from_matrix(given).in_space()
 
 
 def _numbers(row: Sequence[float] | np.ndarray, digits: int) -> str:

@@ -1,7 +1,8 @@
 """Fused kernels of the hot loops, for CPU and CUDA from one source.
 
-Each file holds one loop: the fused kernel, its twin in batched tensor operations, and the function that
-chooses. The twin defines the result, carries gradients, and runs where the kernel compiler is missing.
+A fused kernel is a C++ function in a `.h` file. The Python file beside it has the function that launches the
+kernel, and its twin in batched tensor operations, or says where the twin is. The twin defines the result,
+carries gradients, and runs where the kernel compiler is missing.
 """
 
 import lazy_loader

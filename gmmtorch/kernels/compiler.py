@@ -31,59 +31,49 @@ from gmmtorch.errors import GmmTorchError
 
 logger = logging.getLogger(__name__)
 
-_TYPES = {"int64": "int64", "double": "float64", "float": "float32", "bool": "bool"}
-_PACKED = {"int64": "q", "double": "d", "float": "f4x", "bool": "?7x"}
-"""Formats of `struct` that place each argument of a CPU in eight bytes."""
-_POINTERS = {"int64": "int64_t", "int32": "int32_t", "uint8": "uint8_t"}
+_TYPES = {
+    "int64_t": ("int64", "q"),
+    "double": ("float64", "d"),
+    "float": ("float32", "f4x"),
+    "bool": ("bool", "?7x"),
+}
+"""The type in Warp of a number in C++, and the format of `struct` that places it in eight bytes."""
 _LEAST_ITEMS = 1 << 10  # of a thread of a CPU
 _BLOCK = 64
 """Items of a block on CUDA. Few, because many kernels have some thousand items, each with much work: they
 spread over all multiprocessors."""
 _lock = threading.RLock()
 
-_PRELUDE = """
-#if defined(__CUDA_ARCH__)
-#define GMM_ADD(place, value) atomicAdd(place, value)
-#define GMM_FETCH(place, n)
-#else
-#define GMM_ADD(place, value) (*(place) += (value))
-#define GMM_FETCH(place, n) \\
-    for (int byte = 0; byte < (n) * 8; byte += 64) __builtin_prefetch((const char*)(place) + byte)
-#endif
-#define GMM_MIN(a, b) ((a) < (b) ? (a) : (b))
-#define GMM_MAX(a, b) ((a) > (b) ? (a) : (b))
-"""
+CPU_LANES = 8
+"""Lanes of a vector on a CPU, as in `lanes.h`; CUDA has one lane in each thread."""
 
 
 class FusedKernel:
-    """A C++ loop body, which runs once for each `item` (int64) from 0 up to the size of a launch.
+    """A C++ function, which runs once for each `item` (int64_t) from 0 up to the size of a launch.
+
+    Its other parameters are int64_t, double, float, bool, pointers, or structures of these, whose fields are
+    passed one by one. A pointer is a tensor, or None for a null pointer.
 
     Args:
-        name: a C++ identifier, unique among the kernels.
-        parameters: C++ parameters of the types int64, double, float, bool, and pointers to these and to
-            int32 and uint8, separated by commas. A pointer is a tensor, or None for a null pointer.
-        body: C++ statements. GMM_ADD(pointer, value) adds so that items can meet in one place on CUDA.
+        source: the file with the function, relative to this one.
+        call: its name, with the arguments of its template; unique among the kernels.
         shares: whether items write to the same places. Such a launch uses one thread of a CPU.
-        strided: parameters whose tensors need not be contiguous, because the body is given their strides.
+        strided: parameters whose tensors need not be contiguous, because the function is given their strides.
         rounds_each: whether the compiler must round every product, as tensor operations do, and not contract
             a * b + c. Results of such a kernel can equal those of tensor operations to the bit.
     """
 
     def __init__(
         self,
-        name: str,
-        parameters: str,
-        body: str,
+        source: str,
+        call: str,
         shares: bool = False,
         strided: tuple[str, ...] = (),
         rounds_each: bool = False,
     ) -> None:
-        self.name, self.shares, self._strided, self._rounds_each = name, shares, strided, rounds_each
-        self._parameters = [_parsed(parameter, name) for parameter in parameters.split(",")]
-        self._packed = struct.Struct(
-            "=" + "".join("Q" if p.pointer else _PACKED[p.type] for p in self._parameters)
-        )
-        self._body = body
+        self.name = re.sub(r"\W+", "_", call).strip("_")
+        self.shares, self._strided, self._rounds_each = shares, strided, rounds_each
+        self._source, self._call = (Path(__file__).parent / source).resolve(), call
         self._kernels: dict[str, Any] = {}  # of Warp, by type of device
         self._loaded: set[torch.device] = set()
         self._threads = threading.local()
@@ -118,6 +108,37 @@ class FusedKernel:
         ]
         for job in jobs:
             job.result()  # Warp releases the interpreter's lock during a launch
+
+    @functools.cached_property
+    def _text(self) -> str:
+        return _with_includes(self._source, set())
+
+    @functools.cached_property
+    def _signature(self) -> tuple[list[_Parameter], str]:
+        """The parameters, with the fields of structures, and the C++ of a call with these."""
+        text = re.sub(r"//.*", "", self._text)
+        name, *given = re.findall(r"\w+", self._call)
+        match = re.search(rf"(template <[^>]*>\s*)?GMM_KERNEL {name}\(\s*int64_t(?: item)?, ([^)]*)\)", text)
+        if match is None:
+            raise ValueError(f"{self._source} has no kernel {name}.")
+        values = dict(zip(re.findall(r"\w+ (\w+)", match[1] or ""), given, strict=True))
+        found, passed = [], ["item"]
+        for declared in match[2].split(","):
+            *_, kind, label = re.findall(r"\w+", declared)
+            fields = re.search(rf"struct {kind} {{(.*?)}};", text, re.S)
+            own = _declared(fields[1].split(";")[:-1] if fields else [declared], values)
+            found += own
+            joined = ", ".join(parameter.label for parameter in own)
+            passed.append(f"gmm::{kind}{{{joined}}}" if fields else label)
+        return found, f"gmm::{self._call}({', '.join(passed)});"
+
+    @property
+    def _parameters(self) -> list[_Parameter]:
+        return self._signature[0]
+
+    @functools.cached_property
+    def _packed(self) -> struct.Struct:
+        return struct.Struct("=" + "".join("Q" if p.pointer else _TYPES[p.cpp][1] for p in self._parameters))
 
     def _values(self, arguments: tuple[Tensor | float | None, ...]) -> list[float]:
         """What is passed for the arguments: the address of a tensor, 0 for None."""
@@ -186,9 +207,11 @@ class FusedKernel:
                 linecache.cache[path] = (len(code), None, code.splitlines(True), path)
                 exec(compile(code, path, "exec"), scope)
                 if part == "stub":
-                    scope["body"] = wp.func_native(_PRELUDE + native)(scope["body"])
+                    scope["body"] = wp.func_native(native)(scope["body"])
             module = wp.get_module(scope["__name__"])
-            wp.set_module_options({"fuse_fp": not self._rounds_each, "block_dim": _BLOCK}, module)
+            build = wp.ModuleBuildOptions(extra_cpu_preamble=self._text, extra_cuda_preamble=self._text)
+            options = {"fuse_fp": not self._rounds_each, "block_dim": _BLOCK, "extra_build_options": build}
+            wp.set_module_options(options, module)
             self._kernels[kind] = wp.kernel(
                 scope[self.name], enable_backward=False, module=module, grid_stride=False
             )
@@ -203,10 +226,7 @@ class FusedKernel:
         native = [
             "const char* gmm_block = (const char*)gmm_block_;",
             *read,
-            "auto gmm_run = [=](const int64_t item) {",
-            self._body,
-            "};",
-            "for (int64_t item = gmm_begin; item < gmm_stop; ++item) gmm_run(item);",
+            f"for (int64_t item = gmm_begin; item < gmm_stop; ++item) {self._signature[1]}",
         ]
         names = ("gmm_begin", "gmm_stop", "gmm_block_")
         signature = ", ".join(
@@ -218,30 +238,43 @@ class FusedKernel:
     def _for_cuda(self) -> tuple[str, str, str]:
         """C++ of one item, and the stub and the entry in Python."""
         names = [p.label + "_" * p.pointer for p in self._parameters]
-        types = ["uint64" if p.pointer else _TYPES[p.type] for p in self._parameters]
+        types = ["uint64" if p.pointer else _TYPES[p.cpp][0] for p in self._parameters]
         casts = [f"{p.cpp} {p.label} = ({p.cpp}){p.label}_;" for p in self._parameters if p.pointer]
         signature = ", ".join(f"{n}: wp.{t}" for n, t in zip(names, types, strict=True))
         stub = f"def body(item: wp.int64, {signature}): ...\n"
         entry = f"def {self.name}({signature}):\n    body(wp.int64(wp.tid()), {', '.join(names)})\n"
-        return "\n".join(casts) + self._body, stub, entry
+        return "\n".join([*casts, self._signature[1]]), stub, entry
+
+
+def _with_includes(source: Path, seen: set[Path]) -> str:
+    """The text of a source after that of the files that it includes, each once. Its hash identifies the
+    compiled module in the cache."""
+    if source in seen:
+        return ""
+    seen.add(source)
+    text = source.read_text(encoding="utf-8")
+    included = re.findall(r'^#include "(.+)"', text, re.M)
+    before = [_with_includes((source.parent / name).resolve(), seen) for name in included]
+    return "".join([*before, re.sub(r'^#(pragma once|include ").*\n', "", text, flags=re.M)])
 
 
 class _Parameter(NamedTuple):
-    """A parameter of a kernel: its name, the type of its values, its type in C++, whether it is a pointer."""
+    """A parameter of a kernel: its name, its type in C++, whether it is a pointer."""
 
     label: str
-    type: str
     cpp: str
     pointer: bool
 
 
-def _parsed(parameter: str, kernel: str) -> _Parameter:
-    match = re.fullmatch(r"\s*(const\s+)?(\w+)\s*(\*?)\s*(\w+)\s*", parameter)
-    if match is None:
-        raise ValueError(f"parameter {parameter!r} of kernel {kernel} is not `type name`.")
-    const, kind, star, label = match.groups()
-    cpp = f"{const or ''}{_POINTERS.get(kind, kind)}{star}"
-    return _Parameter(label, kind, cpp, bool(star))
+def _declared(declarations: list[str], values: dict[str, str]) -> list[_Parameter]:
+    """Declarations of one variable each, or of an array; values: the arguments of a template."""
+    found = []
+    for declaration in declarations:
+        const, kind, star, label, size = re.findall(r"(const )?(\w+)(\*?) (\w+)(?:\[(\d)\])?", declaration)[0]
+        cpp = f"{const}{values.get(kind, kind)}{star}"
+        labels = [f"{label}{i}" for i in range(int(size))] if size else [label]
+        found += [_Parameter(each, cpp, bool(star)) for each in labels]
+    return found
 
 
 class _CpuLaunch:
@@ -304,7 +337,7 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_threads.cache_clear)  # a child process has no threads
 
 
-_PROBE = FusedKernel("probe", "int64* value", "value[item] = item + 1;")
+_PROBE = FusedKernel("probe.h", "probe")
 
 
 @functools.cache

@@ -5,11 +5,10 @@ from __future__ import annotations
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets import NANOSECONDS, in_space
+from gmmtorch.datasets import NANOSECONDS
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.live.live_scans import LiveScan, LiveScans
 from gmmtorch.live.live_view import TeamMap
@@ -17,6 +16,7 @@ from gmmtorch.live.publishers import Diagnostics, MapPublisher, PosePublisher
 from gmmtorch.live.ros import Node
 from gmmtorch.localization import Tracker
 from gmmtorch.mapping import GaussianMap, MapBuilder
+from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 
 _MESSAGES = 500  # of a flood, before a scan is mapped
@@ -240,7 +240,7 @@ class LiveLocalizer:
         self._node, self._scans, self._has_motion, self._device = node, scans, has_motion, device
         self._tracker = Tracker(known.to(device))
         self._n_components, self._nbytes = known.n_components, known.nbytes
-        self._last: Tensor | None = None
+        self._last: Pose | None = None
         self._poses = PosePublisher(node, MAP)
 
     def step(self, timeout: float = 0.1) -> bool:
@@ -263,9 +263,10 @@ class LiveLocalizer:
                 f"localize has a map in {self._tracker.dim}D, but topic {self._scans.name} has scans in "
                 f"{dim}D; give a map of this kind of sensor."
             )
-        points = (newest.scan.points - placed[:dim, dim]) @ placed[:dim, :dim]
-        motion = None if self._last is None or not self._has_motion else torch.linalg.inv(self._last) @ placed
-        self._last = placed
+        pose = Pose.from_matrix(placed)
+        points = pose.inverse().apply(newest.scan.points)
+        motion = None if self._last is None or not self._has_motion else (self._last.inverse() @ pose).matrix
+        self._last = pose
         location = self._tracker.locate(points.to(self._device), motion)
         self.n_scans += 1
         if not location.found:
@@ -276,6 +277,6 @@ class LiveLocalizer:
         self.poses.append(location.pose.cpu())
         self.times.append(newest.stamp / NANOSECONDS)
         child = self._scans.world_frame if self._has_motion else newest.frame
-        below = in_space(placed.cpu().numpy()[None])[0] if self._has_motion else np.eye(4)
+        below = pose.to("cpu").in_space() if self._has_motion else Pose.identity(3)
         self._poses.publish(location, newest, child, below)
         self.diagnostics.note_latency((self._node.now() - newest.stamp) / NANOSECONDS)

@@ -36,8 +36,6 @@ from gmmtorch.datasets import (
     Topic,
     TransformTree,
     frame_name,
-    in_plane,
-    in_space,
     nearest_names,
     stamp_of,
 )
@@ -47,6 +45,7 @@ from gmmtorch.live.ros import Node
 from gmmtorch.live.ros.node import reading
 from gmmtorch.localization import METHODS, Location, Odometry, Tracker, composed, odometry_of
 from gmmtorch.mapping import GaussianMap
+from gmmtorch.pose import Pose
 from gmmtorch.scan import FARTHEST, Scan
 
 DROPPED = "dropped, because mapping is slower than the sensor"
@@ -69,12 +68,12 @@ class _Waiting:
 
 
 class LiveScan(NamedTuple):
-    """The newest scan. matrix: (4, 4) fixed frame ← sensor. stamp: ns. frame: of the sensor. location: of
+    """The newest scan. pose: fixed frame ← sensor, in 3D. stamp: ns. frame: of the sensor. location: of
     odometry.
     """
 
     scan: Scan
-    matrix: np.ndarray
+    pose: Pose
     stamp: int
     frame: str
     location: Location | None = None
@@ -261,7 +260,7 @@ class LiveScans(Dataset):
         self._last_stamp = item.stamp
         try:
             poses = conversion.source.at(np.array([item.stamp]), item.frame)
-            if not poses.known[0] or (np.abs(poses.matrices[0, :3, 3]) > FARTHEST).any():
+            if not poses.known[0] or bool((poses.poses.translation[0].abs() > FARTHEST).any()):
                 self._note("no pose at the time of the scan")
                 return False
             found = conversion.points(item.message)
@@ -270,20 +269,20 @@ class LiveScans(Dataset):
             self._note("message that cannot be decoded")
             return False
         self._n_posed += 1
-        return (self._n_posed - 1) % self._options.stride == 0 and self._keep(item, found, poses.matrices[0])
+        return (self._n_posed - 1) % self._options.stride == 0 and self._keep(item, found, poses.poses[0])
 
-    def _keep(self, item: _Waiting, found: Reading, matrix: np.ndarray) -> bool:
+    def _keep(self, item: _Waiting, found: Reading, pose: Pose) -> bool:
         conversion = self._conversion
         assert conversion is not None
         if self._is_flat is None:
             if not len(found.points):
                 self._note("message without a valid point")
                 return False
-            self._is_flat = conversion.is_flat(matrix[None], [found, *self._readings_ahead()])
-        if self._is_flat and not conversion.is_level(matrix[None]):
+            self._is_flat = conversion.is_flat(pose, [found, *self._readings_ahead()])
+        if self._is_flat and not conversion.is_level(pose):
             self._note("tilted sensor among planar scans")
             return False
-        scan = conversion.scan(found, item.stamp, item.frame, matrix, self._is_flat, self._note)
+        scan = conversion.scan(found, item.stamp, item.frame, pose, self._is_flat, self._note)
         if scan.n_beams == 0:
             return False
         location = None
@@ -293,8 +292,8 @@ class LiveScans(Dataset):
                 self.trouble = "; ".join(location.doubts)
                 self._note("no pose was found by odometry")
                 return False
-            scan, matrix = scan.transformed(location.pose), in_space(location.pose.numpy()[None])[0]
-        self.newest = LiveScan(scan, matrix, item.stamp, item.frame, location)
+            scan, pose = scan.transformed(location.pose), Pose.from_matrix(location.pose).in_space()
+        self.newest = LiveScan(scan, pose, item.stamp, item.frame, location)
         self._stamps.append(item.stamp / NANOSECONDS)
         self._posed.append(self._n_added - 1)
         return True
@@ -364,8 +363,7 @@ class LiveScans(Dataset):
 
     def _known_pose(self, index: int) -> Tensor | None:
         newest = self._newest(index)
-        matrix = newest.matrix
-        return torch.from_numpy(in_plane(matrix[None])[0] if newest.scan.dim == 2 else matrix)
+        return (newest.pose.in_plane() if newest.scan.dim == 2 else newest.pose).matrix
 
     def _known_time(self, index: int) -> float:
         return self._newest(index).stamp / NANOSECONDS

@@ -17,6 +17,7 @@ from gmmtorch.live import viewer_scene
 from gmmtorch.live.map_viewer import MapViewer, Rgb
 from gmmtorch.live.viewer_scene import RobotNodes
 from gmmtorch.mapping import Components, GaussianMap, MapBuilder, MotionAt, WindowMotions
+from gmmtorch.pose import Pose
 from gmmtorch.report import colour
 from gmmtorch.scan import Scan
 
@@ -171,17 +172,14 @@ class LiveView:
             self._plot(title, moment.times, series)
 
     def _place(self, robot: ViewedRobot) -> None:
-        from scipy.spatial.transform import Rotation
-
         if robot.number not in self._robots:
             scene, hue = self.viewer.server.scene, robot_colour(robot.number)
             self._robots[robot.number] = RobotNodes(scene, robot.number, hue, robot.camera)
         shift = self.viewer.shift
         (path,) = viewer_scene.in_space([robot.path[-1:]])
         (ahead,) = viewer_scene.in_space([robot.ahead])
-        turned = np.eye(3)
-        turned[: len(robot.rotation), : len(robot.rotation)] = robot.rotation.double().cpu().numpy()
-        wxyz = Rotation.from_matrix(turned).as_quat()[[3, 0, 1, 2]]
+        turned = Pose(robot.rotation.double().cpu(), torch.zeros(len(robot.rotation)).double())
+        wxyz = turned.quaternion()[[3, 0, 1, 2]].numpy()
         self._robots[robot.number].place(wxyz, (path[0] - shift).numpy(), (ahead - shift).numpy())
 
     def _plot(self, title: str, times: Sequence[float], series: Mapping[str, Sequence[float]]) -> None:

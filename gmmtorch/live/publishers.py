@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets import in_space
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, check_choice
 from gmmtorch.export import (
     CellCloud,
@@ -27,6 +26,7 @@ from gmmtorch.live.ros.topics import LATCHED
 from gmmtorch.localization import Location
 from gmmtorch.mapping import GaussianMap, Query, resident_bytes
 from gmmtorch.occupancy import CellClass, KeptEvidence, Thresholds, VoxelGrid, probability
+from gmmtorch.pose import Pose
 
 CLOUDS = ("cells", "means", "none")
 _EXTENT = 3.0  # standard deviations around each component that the grid covers
@@ -216,17 +216,17 @@ class PosePublisher:
         self._send_pose = node.publisher("pose", "nav_msgs/msg/Odometry")
         self._send_transform = node.publisher("/tf", "tf2_msgs/msg/TFMessage")
 
-    def publish(self, location: Location, newest: LiveScan, child: str, below: np.ndarray) -> None:
+    def publish(self, location: Location, newest: LiveScan, child: str, below: Pose) -> None:
         """Publishes the pose of a scan's sensor, and the transform from the frame to `child`.
 
-        below: (4, 4) child ← sensor.
+        below: child ← sensor, in 3D.
         """
-        pose = in_space(location.pose.cpu().numpy()[None])[0]
-        fields = odometry_fields(self._frame, newest.frame, pose)
+        pose = Pose.from_matrix(location.pose.cpu()).in_space()
+        fields = odometry_fields(self._frame, newest.frame, pose.matrix)
         fields["pose"]["covariance"] = _covariance(location.covariance.cpu())
         self._send_pose(fields, newest.stamp)
         if child != self._frame:  # TF of somebody else has a frame of this name
-            above = pose @ np.linalg.inv(below)
+            above = (pose @ below.inverse()).matrix
             self._send_transform(transform_fields({(self._frame, child): above}), newest.stamp)
 
     def publish_odometry(self, location: Location, newest: LiveScan) -> None:
@@ -235,7 +235,7 @@ class PosePublisher:
         The transform is published once the root has not changed for half a second, and only if no other node
         moves it.
         """
-        tree, child, below = self._node.transforms, self._frame, np.eye(4)
+        tree, child, below = self._node.transforms, self._frame, Pose.identity(3)
         try:
             chain = tree.chain(newest.frame)
             fixed = tree.static_part(chain)
@@ -245,7 +245,7 @@ class PosePublisher:
                 self._candidate = fixed, time.monotonic()
             if self._robot is not None or time.monotonic() - self._candidate[1] >= SETTLING:
                 self._robot = child = fixed[-1]
-                below = tree.lookup(fixed, np.array([newest.stamp]), 0.0).matrices[0]
+                below = tree.lookup(fixed, np.array([newest.stamp]), 0.0).poses[0]
         except DataError as error:
             self._node.warn("odometry", f"{error!s}; only the topic pose is published.")
         self.publish(location, newest, child, below)

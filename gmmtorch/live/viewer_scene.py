@@ -14,6 +14,7 @@ from gmmtorch.errors import check_choice
 from gmmtorch.export import TriangleMesh
 from gmmtorch.mapping import Components, GaussianMap
 from gmmtorch.occupancy import VoxelGrid
+from gmmtorch.pose import Pose
 from gmmtorch.report import (
     N_SIGMA,
     SOUTH_WEST,
@@ -89,11 +90,9 @@ def sphere(n_components: int) -> tuple[Tensor, Tensor]:
 
 def instances(solid: Solid) -> Instances:
     """The 2σ ellipsoids."""
-    from scipy.spatial.transform import Rotation
-
     deviations, axes = principal_axes(solid.covariances)
-    turned = Rotation.from_matrix(axes.numpy()).as_quat()[:, [3, 0, 1, 2]] if len(axes) else np.zeros((0, 4))
-    return Instances(turned, solid.means.numpy(), N_SIGMA * deviations.numpy())
+    turned = Pose(axes, solid.means).quaternion()[:, [3, 0, 1, 2]]
+    return Instances(turned.numpy(), solid.means.numpy(), N_SIGMA * deviations.numpy())
 
 
 class Colours(NamedTuple):
@@ -221,12 +220,17 @@ def first_hit(solid: Solid, origin: Tensor, direction: Tensor) -> float:
     return float(torch.where(met, enter, torch.inf).min())
 
 
-def place_text(shown: GaussianMap, position: Tensor, resolution: float) -> str:
-    """A table of what the map knows about the cube of a side (m) around a position (D,), in Markdown."""
+def place_at(shown: GaussianMap, position: Tensor, resolution: float) -> tuple[float, float, float]:
+    """What the map knows about the cube of a side (m) around a position (D,): θ, hits and misses."""
     corner = (position - resolution / 2).tolist()
     evidence = shown.evidence(VoxelGrid(tuple(corner), resolution, (1,) * len(corner)))
-    theta = float(torch.as_tensor(shown.occupancy(position[None], resolution))[0])
-    hits, misses = float(evidence.hits.sum()), float(evidence.misses.sum())
+    theta = torch.as_tensor(shown.occupancy(position[None], resolution))
+    return float(theta[0]), float(evidence.hits.sum()), float(evidence.misses.sum())
+
+
+def place_text(shown: GaussianMap, position: Tensor, resolution: float) -> str:
+    """A table of what the map knows about the cube of a side (m) around a position (D,), in Markdown."""
+    theta, hits, misses = place_at(shown, position, resolution)
     where = ", ".join(f"{value:.2f}" for value in position.tolist())
     kind = "unknown" if hits + misses < 0.01 else "free" if theta < 0.5 else "occupied"
     return (

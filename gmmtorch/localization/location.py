@@ -1,4 +1,4 @@
-"""Location: the pose of a scan, how sure it is, and reasons against it."""
+"""Location: the pose of a scan, how sure it is, and reasons against it; and predictions of the next one."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gmmtorch.localization.rigid_motions import generators
+from gmmtorch.arrays import ArrayLike, as_tensor
+from gmmtorch.pose import Pose, skew
 
 UNSEEN = 10.0
 """Metres of standard deviation of a direction that no surface fixes."""
@@ -54,13 +55,47 @@ def composed(first: Location, then: Location) -> Location:
 
     The errors of both are independent.
     """
-    dim = len(first.pose) - 1
-    rotation = first.pose[:dim, :dim]
-    turned = torch.eye(len(then.covariance), dtype=torch.float64)
-    turned[:dim, :dim] = rotation
-    if dim == 3:
-        turned[3:, 3:] = rotation
-    lever = torch.eye(len(turned), dtype=torch.float64)  # an error of the first turn shifts later poses
-    lever[:dim, dim:] = (generators(dim) @ (rotation @ then.pose[:dim, dim])).mT
+    before, after = Pose.from_matrix(first.pose), Pose.from_matrix(then.pose)
+    turned = Pose(before.rotation, torch.zeros_like(before.translation)).adjoint()
+    still = torch.eye(before.dim, dtype=torch.float64)
+    lever = Pose(still, -(before.rotation @ after.translation)).adjoint()  # an error of the first turn shifts
     covariance = turned @ then.covariance @ turned.mT + lever @ first.covariance @ lever.mT
-    return replace(then, pose=first.pose @ then.pose, covariance=covariance)
+    return replace(then, pose=(before @ after).matrix, covariance=covariance)
+
+
+# -- predictions ----------------------------------------------------------------------------------
+
+
+def measured_motion(motion: ArrayLike, dim: int, device: torch.device) -> Pose | Tensor:
+    """A motion (D+1, D+1), or its rotation (D, D) alone, as a tensor. Raises `InvalidArgumentError`."""
+    matrix = as_tensor(motion, "motion", torch.float64, device).detach().clone()
+    if tuple(matrix.shape) == (dim, dim):
+        return Pose.checked(_turned(matrix).matrix, dim, "motion").rotation
+    return Pose.checked(matrix, dim, "motion")
+
+
+def continued(rotation: Tensor, last: Pose | None, ratio: float = 1.0) -> Pose:
+    """The motion with a measured rotation (D, D) at the velocity of the last one, if it is known.
+
+    The velocity v in the frame of the sensor stays, and takes effect while the sensor turns by ω: the
+    translation is t = J(ω) v with J(ω) = ∫₀¹ exp(s [ω]) ds. `ratio`: how many times longer than the last
+    motion this one takes.
+    """
+    if last is None:
+        return _turned(rotation)
+    velocity = torch.linalg.solve(_mean_rotation(last.rotation), last.translation)
+    return Pose(rotation, ratio * _mean_rotation(rotation) @ velocity)
+
+
+def _turned(rotation: Tensor) -> Pose:
+    """The motion with this rotation (D, D) and no translation."""
+    return Pose(rotation, rotation.new_zeros(len(rotation)))
+
+
+def _mean_rotation(rotation: Tensor) -> Tensor:
+    """J(ω) (D, D) of a rotation (D, D) by ω: a block of exp [[ω] I; 0 0]."""
+    dim = len(rotation)
+    block = torch.zeros(2 * dim, 2 * dim).double()
+    block[:dim, :dim] = skew(_turned(rotation).turn().cpu())
+    block[:dim, dim:] = torch.eye(dim)
+    return torch.linalg.matrix_exp(block)[:dim, dim:].to(rotation)

@@ -1,37 +1,36 @@
-"""Tracker: the pose of each scan of a moving sensor in a map that is known."""
+"""Tracker: the pose of each scan of a moving sensor, or of a data set, in a map that is known."""
 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
-from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
-from gmmtorch.linalg import check_rigid
-from gmmtorch.localization.location import UNSEEN, Location, pose_covariance
-from gmmtorch.localization.registration.alignment import (
+from gmmtorch.datasets import Dataset
+from gmmtorch.errors import DataError, InvalidArgumentError, check_number, check_whole
+from gmmtorch.localization.alignment import (
     Alignment,
     AlignmentTarget,
     align,
+    around,
+    best_distinct,
+    differences,
+    everywhere,
     merged_below,
     seen_normals,
 )
-from gmmtorch.localization.rigid_motions import (
-    Motions,
-    around,
-    best_distinct,
-    continued,
-    differences,
-    everywhere,
-    measured_motion,
-)
+from gmmtorch.localization.location import UNSEEN, Location, continued, measured_motion, pose_covariance
 from gmmtorch.mapping import Components, GaussianMap, Surfaces, surface_mixture
+from gmmtorch.pose import Pose
 from gmmtorch.scan import check_positions
 
+_GAP = 10.0  # times the median step of a clock: it jumps, or scans are missing
 _BLURS = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # metres, one level after the other
 _FINE = 2  # the level at which a search around a good prediction begins
 _STEPS = 15  # of the first and the last level of a search
@@ -126,11 +125,11 @@ class Tracker:
             )
         self.n_lost = 0
         self._explained = 0.0
-        self._motion: Tensor | None = None
-        self._last: Tensor | None = None  # pose (D+1, D+1), about the centre
+        self._motion: Pose | None = None
+        self._last: Pose | None = None  # about the centre
         if pose is not None:
-            self._last = _rigid(pose, "pose", self._center)
-            self._last[: self.dim, self.dim] -= self._center
+            start = Pose.checked(pose, self.dim, "pose", device=self._center.device)
+            self._last = start.shifted(-self._center)
 
     def locate(self, points: ArrayLike, motion: ArrayLike | None = None) -> Location:
         """The pose of the next scan; if it is not `found`, the best guess.
@@ -149,8 +148,7 @@ class Tracker:
             raise InvalidArgumentError(f"points has shape {shape}; expected (N, {self.dim}), metres.")
         check_positions("points", rows)
         measured = None if motion is None else measured_motion(motion, self.dim, self._center.device)
-        if measured is not None and len(measured) == self.dim:
-            measured = continued(measured, self._motion)
+        measured = continued(measured, self._motion) if isinstance(measured, Tensor) else measured
         predicted = self._predicted(measured)
         rows = self._thinned(rows[rows.norm(dim=1) > _NEAREST])
         best: Location | None = None
@@ -163,14 +161,12 @@ class Tracker:
         self._remember(best, predicted, measured is not None)
         return best
 
-    def _questioned(self, location: Location, predicted: Tensor | None) -> Location:
+    def _questioned(self, location: Location, predicted: Pose | None) -> Location:
         """The location; not found if it is away from the prediction and fits worse than the last scan did."""
         if predicted is None or not location.found or location.explained >= _SURE * self._explained:
             return location
-        expected, pose = predicted[None], location.pose.clone()[None]
-        pose[:, : self.dim, self.dim] -= self._center
-        away = differences(_motions(pose, self.dim), _motions(expected, self.dim), self.distance, self.angle)
-        if float(away) <= 1:
+        pose = Pose.from_matrix(location.pose).shifted(-self._center)
+        if float(differences(pose[None], predicted[None], self.distance, self.angle)) <= 1:
             return location
         doubt = (
             f"{location.explained:.0%} of the points lie on surfaces, fewer than in the last scan, and the "
@@ -178,14 +174,14 @@ class Tracker:
         )
         return replace(location, doubts=(doubt,))
 
-    def _predicted(self, measured: Tensor | None) -> Tensor | None:
+    def _predicted(self, measured: Pose | None) -> Pose | None:
         step = self._motion if measured is None else measured
         return self._last if self._last is None or step is None else self._last @ step
 
-    def _searches(self, predicted: Tensor | None, is_measured: bool) -> Iterator[tuple[int, Motions, float]]:
+    def _searches(self, predicted: Pose | None, is_measured: bool) -> Iterator[tuple[int, Pose, float]]:
         """First level, starts, and the explained share that ends the search; the cheapest search first."""
         if predicted is not None:
-            start = _motions(predicted[None], self.dim)
+            start = predicted[None]
             if self.n_lost == 0 and (is_measured or self._motion is not None):
                 yield _FINE, start, _USUAL * self._explained
             yield _FINE, around(start, self.distance, self.angle, _BLURS[_FINE]), _USUAL * self._explained
@@ -198,12 +194,12 @@ class Tracker:
         draw = torch.Generator().manual_seed(0)
         return rows[torch.randperm(len(rows), generator=draw)[: self.n_points].to(rows.device)]
 
-    def _climbed(self, rows: Tensor, starts: Motions, first: int) -> Location:
+    def _climbed(self, rows: Tensor, starts: Pose, first: int) -> Location:
         """The location that the levels from `first` on reach from the best of the starts."""
         motions = self._ranked(rows, starts, self._targets[first])
         for number, target in enumerate(self._targets[first:]):
             if number == _SECOND_CHANCE:
-                motions = motions.joined(self._ranked(rows, starts, target))
+                motions = Pose.cat([motions, self._ranked(rows, starts, target)])
             is_last = target is self._targets[-1]
             used = rows if is_last else rows[: max(_RANKING_POINTS, int(_COARSE_SHARE * len(rows)))]
             found = align(used, target, motions, _STEPS if is_last or number == 0 else _BETWEEN_STEPS)
@@ -211,26 +207,26 @@ class Tracker:
                 best_distinct(found.motions, found.score, target.blur * _SAME)[: max(2, _CLIMBED >> number)]
             )
             motions = found.motions
-        return self._location(rows, found, is_tracked=len(starts.translations) == 1)
+        return self._location(rows, found, is_tracked=len(starts) == 1)
 
-    def _ranked(self, rows: Tensor, starts: Motions, target: AlignmentTarget) -> Motions:
+    def _ranked(self, rows: Tensor, starts: Pose, target: AlignmentTarget) -> Pose:
         """The best starts that differ from each other, at most `_CLIMBED`."""
-        if len(starts.translations) > 10 * _RANKED:
+        if len(starts) > 10 * _RANKED:
             score = self._scores(rows[:_GLIMPSE_POINTS], starts, target)
-            starts = starts.at(score.topk(len(score) // 5).indices)
-        n = len(starts.translations)
+            starts = starts[score.topk(len(score) // 5).indices]
+        n = len(starts)
         if n <= _CLIMBED:
             return starts
         score = self._scores(rows[:_RANKING_POINTS], starts, target)
         order = score.argsort(descending=True, stable=True)
         if n > _RANKED:
             best = order[:_RANKED]
-            order = best[best_distinct(starts.at(best), score[best], 1.01 * target.blur)]
-        return starts.at(order[:_CLIMBED])
+            order = best[best_distinct(starts[best], score[best], 1.01 * target.blur)]
+        return starts[order[:_CLIMBED]]
 
-    def _scores(self, rows: Tensor, starts: Motions, target: AlignmentTarget) -> Tensor:
-        parts = torch.arange(len(starts.translations), device=rows.device).split(_RANKED_AT_ONCE)
-        return torch.cat([target.sums(rows, starts.at(part)).score for part in parts])
+    def _scores(self, rows: Tensor, starts: Pose, target: AlignmentTarget) -> Tensor:
+        parts = torch.arange(len(starts), device=rows.device).split(_RANKED_AT_ONCE)
+        return torch.cat([target.sums(rows, starts[part]).score for part in parts])
 
     def _location(self, rows: Tensor, found: Alignment, is_tracked: bool) -> Location:
         covariance, loosest = pose_covariance(found.information[0], rows)
@@ -247,59 +243,39 @@ class Tracker:
             doubts.append("another pose explains the scan as well")
         if len(rows) < _FEWEST:
             doubts.append(f"the scan has only {len(rows)} points beyond {_NEAREST} m: is the sensor covered?")
-        pose = torch.eye(self.dim + 1).to(rows)
-        pose[: self.dim, : self.dim] = found.motions.rotations[0]
-        pose[: self.dim, self.dim] = found.motions.translations[0] + self._center
+        pose = found.motions[0].shifted(self._center)
         in_free_space = 0.0 if doubts or is_tracked else self._in_free_space(rows, pose)
         if in_free_space > _MOST_FREE * (1 - self.least_explained):
             doubts.append(f"{in_free_space:.0%} of the points lie where the map saw free space")
-        return Location(pose, covariance, share, tuple(doubts))
+        return Location(pose.matrix, covariance, share, tuple(doubts))
 
-    def _in_free_space(self, rows: Tensor, pose: Tensor) -> float:
+    def _in_free_space(self, rows: Tensor, pose: Pose) -> float:
         """Share of the points that lie in free space of the map; 0 if the surfaces are no map."""
         if self._map is None:
             return 0.0
-        few = rows[:_RANKING_POINTS]
-        ends = few @ pose[: self.dim, : self.dim].T + pose[: self.dim, self.dim]
-        return float((torch.as_tensor(self._map.occupancy(ends, _CELL)) < _FREE).double().mean())
+        occupancy = self._map.occupancy(pose.apply(rows[:_RANKING_POINTS]), _CELL)
+        return float((torch.as_tensor(occupancy) < _FREE).double().mean())
 
-    def _nothing(self, predicted: Tensor | None) -> Location:
+    def _nothing(self, predicted: Pose | None) -> Location:
         """The prediction, for a scan without points."""
-        pose = torch.eye(self.dim + 1).to(self._center) if predicted is None else predicted.clone()
-        pose[: self.dim, self.dim] += self._center
-        n_free = self.dim + self.dim * (self.dim - 1) // 2
-        return Location(
-            pose,
-            UNSEEN**2 * torch.eye(n_free).to(pose),
-            0.0,
-            (f"the scan has no points beyond {_NEAREST} m",),
-        )
+        pose = Pose.identity(self.dim, device=self._center.device) if predicted is None else predicted
+        covariance = UNSEEN**2 * torch.eye(self.dim * (self.dim + 1) // 2).to(self._center)
+        doubt = f"the scan has no points beyond {_NEAREST} m"
+        return Location(pose.shifted(self._center).matrix, covariance, 0.0, (doubt,))
 
-    def _remember(self, location: Location, predicted: Tensor | None, is_measured: bool) -> None:
+    def _remember(self, location: Location, predicted: Pose | None, is_measured: bool) -> None:
         if not location.found:
             self.n_lost += 1
             self._last, self._motion = predicted if is_measured else self._last, None
             return
-        now = location.pose.clone()
-        now[: self.dim, self.dim] -= self._center
-        is_next = self._last is not None and self.n_lost == 0 and self._explained > 0
-        self._motion = torch.linalg.solve(self._last, now) if is_next else None
+        now, last = Pose.from_matrix(location.pose).shifted(-self._center), self._last
+        is_next = last is not None and self.n_lost == 0 and self._explained > 0
+        self._motion = last.inverse() @ now if last is not None and is_next else None
         self._last, self.n_lost, self._explained = now, 0, location.explained
 
 
 def _better(some: Location, other: Location) -> Location:
     return max(some, other, key=lambda location: (location.found, location.explained))
-
-
-def _rigid(matrix: ArrayLike, name: str, like: Tensor) -> Tensor:
-    pose = as_tensor(matrix, name, torch.float64, like.device).detach().clone()
-    check_rigid(pose, len(like), name)
-    return pose
-
-
-def _motions(poses: Tensor, dim: int) -> Motions:
-    """Poses (B, D+1, D+1) as motions."""
-    return Motions(poses[:, :dim, :dim], poses[:, :dim, dim])
 
 
 def _places(surfaces: Components, center: Tensor) -> Tensor:
@@ -308,3 +284,83 @@ def _places(surfaces: Components, center: Tensor) -> Tensor:
     cells, member = torch.unique((origins / _PLACES).round(), dim=0, return_inverse=True)
     first = torch.full((len(cells),), len(origins), device=center.device)
     return origins[first.scatter_reduce(0, member, torch.arange(len(origins)).to(member), "amin")]
+
+
+# -- the scans of a data set -----------------------------------------------------------------------
+
+
+class ScanLocation(NamedTuple):
+    """number: of the scan. time: seconds, or the number if the data set has no times. location: in the map.
+    seconds: computing time of the tracker.
+    """
+
+    number: int
+    time: float
+    location: Location
+    seconds: float
+
+
+def locate_scans(
+    dataset: Dataset, tracker: Tracker, use_motion: bool = False, turns: Tensor | None = None
+) -> Iterator[ScanLocation]:
+    """Localises every scan in order. A scan that cannot be read is not found, and its doubt is the reason.
+
+    Args:
+        dataset: its poses serve only to move its scans to the frame of the sensor.
+        tracker: with the first pose, if it is known.
+        use_motion: predict each pose with the motion between the poses of the data set, such as an
+            odometry's. False: the sensor moves as between the last two scans.
+        turns: rotations (N, D, D) of the sensor since the scan before, as `Dataset.turns` returns them, which
+            predict the headings instead; NaN where they are unknown.
+
+    Raises `InvalidArgumentError` if scans and map have different dimensions.
+    """
+    times = scan_times(dataset)
+    before: Tensor | None = None
+    for index in range(len(dataset)):
+        points, failure = torch.zeros(0, tracker.dim), ""
+        pose = dataset.pose(index)
+        try:
+            scan = dataset[index]
+            turn = torch.eye(scan.dim).double() if pose is None else pose.double()[:-1, :-1]
+            points = scan.transformed(Pose(turn, scan.origin.double()).inverse().matrix).points
+        except DataError as error:
+            failure = str(error)
+        motion = None
+        if use_motion and pose is not None and before is not None:
+            motion = (Pose.from_matrix(before).inverse() @ Pose.from_matrix(pose)).matrix
+        if turns is not None and index and bool(turns[index].isfinite().all()):
+            motion = turns[index]
+        begin = time.process_time()
+        location = tracker.locate(points, motion)
+        seconds = time.process_time() - begin
+        if failure:
+            location = replace(location, doubts=(failure,))
+        yield ScanLocation(index, float(times[index]), location, seconds)
+        before = pose
+
+
+def scan_times(dataset: Dataset) -> Tensor:
+    """Times (N,) of the scans, seconds; their indices if the data set has none."""
+    return torch.arange(len(dataset)).double() if dataset.times is None else dataset.times.double()
+
+
+def clock_faults(times: Tensor) -> list[tuple[int, str]]:
+    """Scans before which the clock goes back or jumps, with a sentence for each. times: (N,), seconds."""
+    steps = times.diff()
+    if len(steps) < 2:
+        return []
+    usual = float(steps[steps > 0].median()) if bool((steps > 0).any()) else 0.0
+    faults = ((steps < 0) | (steps > _GAP * usual)).nonzero()[:, 0] + 1
+    return [(scan, _fault(float(steps[scan - 1]), usual)) for scan in faults.tolist()]
+
+
+def _fault(step: float, usual: float) -> str:
+    if step < 0:
+        return (
+            f"the clock goes back by {-step:.3g} s; readers of the trajectory drop the poses of one side: "
+            "correct the times of the recording (a bag: clock=received)"
+        )
+    return (
+        f"{step:.3g} s after the scan before it, usually {usual:.2g} s: scans are missing, or the clock jumps"
+    )

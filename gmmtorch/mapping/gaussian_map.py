@@ -12,16 +12,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.arrays import ArrayLike, as_tensor
+from gmmtorch.arrays import ArrayLike
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_whole
 from gmmtorch.files import write_bytes
-from gmmtorch.linalg import check_rigid
-from gmmtorch.mapping.codec import map_file
+from gmmtorch.mapping.codec.component_batch import CODECS, MapSettings, map_bytes, read_map
 from gmmtorch.mapping.codec.quantization import quantized_after
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.depth_frame import DepthFrame, depth_and_pose
-from gmmtorch.mapping.learning.forgetting import Doubts
+from gmmtorch.mapping.learning.fitting import DepthFrame, depth_and_pose
 from gmmtorch.mapping.learning.rules import IncrementalRule, LearningRule, WindowedRule, read_rule
+from gmmtorch.mapping.learning.windows import Doubts
 from gmmtorch.mapping.map_state import MapState
 from gmmtorch.mapping.query import Query
 from gmmtorch.mapping.query_options import (
@@ -31,6 +30,7 @@ from gmmtorch.mapping.query_options import (
     check_method,
 )
 from gmmtorch.occupancy import Calibration, Evidence, VoxelGrid, check_queries, check_resolution, check_scan
+from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan, as_time, extent
 
 
@@ -61,7 +61,7 @@ class GaussianMap(MapState):
         n_samples: number of rays of method "monte_carlo", drawn from the whole map.
         sampling: sequence of these rays, "sobol", "stratified" or "plain".
         memory_limit: largest number of bytes of the evidence of a grid, and of Monte Carlo evidence.
-        compiled: use torch.compile where a compiled form exists.
+        compiled: has no effect; fused kernels answer queries.
         calibration: from which the map's own goes on, such as that of another map. None: that of the sensor
             model, for the ranges of the map's beams.
 
@@ -94,7 +94,7 @@ class GaussianMap(MapState):
         calibration: Calibration | None = None,
     ) -> None:
         check_method(method)
-        check_choice("codec", codec, map_file.CODECS)
+        check_choice("codec", codec, CODECS)
         rule = IncrementalRule() if learning is None else learning
         if not isinstance(rule, WindowedRule | IncrementalRule):
             raise InvalidArgumentError(
@@ -112,7 +112,7 @@ class GaussianMap(MapState):
             calibration=calibration,
         )
         number = check_whole("robot", robot, 0)
-        settings = map_file.MapSettings(check_resolution(resolution), method, codec, number, query)
+        settings = MapSettings(check_resolution(resolution), method, codec, number, query)
         super().__init__(rule, settings, random_state)
 
     def __repr__(self) -> str:
@@ -251,9 +251,8 @@ class GaussianMap(MapState):
         """
 
         def moved(components: Components) -> Components:
-            matrix = as_tensor(transform, "transform", torch.float64, components.means.device)
-            check_rigid(matrix, components.dim)
-            return components.transformed(matrix, components.has_id(ids))
+            pose = Pose.checked(transform, components.dim, device=components.means.device)
+            return components.transformed(pose.matrix, components.has_id(ids))
 
         self.revise(moved)
 
@@ -317,7 +316,7 @@ class GaussianMap(MapState):
 
     def _file(self) -> bytes:
         rule = self.learning.fitted(self._pending)
-        return map_file.to_bytes(self.components(), rule, self.settings, self._next_number)
+        return map_bytes(self.components(), rule, self.settings, self._next_number)
 
     @property
     def nbytes(self) -> int:
@@ -331,7 +330,7 @@ class GaussianMap(MapState):
     @classmethod
     def load(cls, path: str | Path) -> GaussianMap:
         """Reads a map that `save` wrote; it gives the same answers. Raises `DataError` for other files."""
-        components, facts = map_file.from_file(path)
+        components, facts = read_map(path)
         try:
             next_number = check_whole("n_numbered", facts.pop("n_numbered"), 0)
             time = as_time(facts.pop("time", None))

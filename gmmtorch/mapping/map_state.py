@@ -12,14 +12,20 @@ from torch import Tensor
 
 from gmmtorch.arrays import DeviceModule
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
-from gmmtorch.mapping.codec.map_file import MapSettings, file_size
+from gmmtorch.mapping.codec.component_batch import MapSettings, file_size
 from gmmtorch.mapping.codec.quantization import number_after, numbered
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.depth_frame import DepthFrame, as_scans
-from gmmtorch.mapping.learning.forgetting import Doubts, joined
-from gmmtorch.mapping.learning.prediction import SIDES, predicted
+from gmmtorch.mapping.learning.fitting import DepthFrame, as_scans
 from gmmtorch.mapping.learning.rules import LearningRule, WindowedRule, read_rule, rule_facts
-from gmmtorch.mapping.learning.windows import BeforeWindow, absorb, learn_window, no_prediction
+from gmmtorch.mapping.learning.windows import (
+    SIDES,
+    BeforeWindow,
+    Doubts,
+    absorb,
+    joined,
+    learn_window,
+    predicted,
+)
 from gmmtorch.mapping.query import Query
 from gmmtorch.mapping.query_options import QueryOptions
 from gmmtorch.occupancy import Calibrator
@@ -159,7 +165,7 @@ class MapState(DeviceModule):
         scans: Iterable[Scan | DepthFrame],
         rule: LearningRule,
         weight: float = 1.0,
-        before: BeforeWindow = no_prediction,
+        before: BeforeWindow | None = None,
     ) -> tuple[Components, int]:
         """`_upcoming`, with the components of scans, or of frames whose points each stand for `weight`.
 

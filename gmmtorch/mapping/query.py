@@ -189,8 +189,7 @@ class Query:
         found = None
         for part in self._parts:
             if resolution not in part.forms:
-                compiled = self.options.compiled
-                part.forms[resolution] = PointForm(part.cones, resolution, self.cutoff, compiled=compiled)
+                part.forms[resolution] = PointForm(part.cones, resolution, self.cutoff)
             found = part.forms[resolution](points, found)
         assert found is not None
         return found
@@ -214,9 +213,7 @@ class Query:
         """Monte Carlo evidence of the whole map on the world's lattice of this resolution."""
         if resolution not in self._lattices:
             options, device = self.options, self.cones.means.device
-            lattice = SparseEvidence(
-                resolution, self.cones.dim, device, options.memory_limit, options.compiled
-            )
+            lattice = SparseEvidence(resolution, self.cones.dim, device, options.memory_limit)
             self._cast(lattice)
             self._lattices[resolution] = lattice
         return self._lattices[resolution]
@@ -228,10 +225,7 @@ class Query:
         rays = sample_rays(self.cones, options.n_samples, generator, options.sampling)
         parts = zip(*(field.split(_RAYS_AT_ONCE) for field in rays), strict=True)
         for origins, ends, weights, is_hit in parts:
-            if isinstance(evidence, Evidence):
-                evidence.add_rays(origins, ends, weights, is_hit, compiled=options.compiled)
-            else:
-                evidence.add_rays(origins, ends, weights, is_hit)
+            evidence.add_rays(origins, ends, weights, is_hit)
 
 
 def _sum(parts: Iterable[PointEvidence]) -> PointEvidence:

@@ -30,7 +30,7 @@ class QueryOptions:
     sampling: "sobol", "stratified" or "plain".
     random_state: seed of the rays.
     memory_limit: largest number of bytes of evidence.
-    compiled: use torch.compile where a compiled form exists.
+    compiled: has no effect; fused kernels answer queries.
     calibration: of the probabilities. None: that of the sensor model, for the ranges of the map's beams.
     """
 

@@ -105,11 +105,12 @@ class MixtureDensity(DensityMixin, BaseEstimator, DeviceModule):
         else:
             full = parameters._replace(covariances=self.covariances)
             rows = max(64, chunk_elements(points.device) // k)
-            if not em.is_ill_conditioned(full) and not bool(((points - center).abs() > _FAR).any()):
-                natural = em.natural_parameters(full)
-                yield from (natural @ em.quadratic_features(p - center).T for p in points.split(rows))
+            if em.is_ill_conditioned(full) or bool(((points - center).abs() > _FAR).any()):
+                yield from (em.log_joint(part - center, full).T for part in points.split(rows))
                 return
-            joint = by_type.Factors(full, "full").direct()
+            natural = em.natural_parameters(full)
+            yield from (natural @ em.quadratic_features(part - center).T for part in points.split(rows))
+            return
         yield from (joint(part - center) for part in points.split(rows))
 
     def n_parameters(self) -> int:

@@ -21,7 +21,7 @@ from torch import Tensor
 from gmmtorch.arrays import as_tensor
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, NumericalError
 from gmmtorch.files import pack_tensors, read_tensors, require, write_bytes
-from gmmtorch.linalg import check_rigid, check_symmetric, safe_cholesky
+from gmmtorch.linalg import check_symmetric, safe_cholesky
 from gmmtorch.mixture.density import InvalidParameterError, MixtureDensity
 from gmmtorch.mixture.em.exact import SOFTMAX_DTYPES, Parameters, check_type, compact, type_shape
 from gmmtorch.mixture.em.initialization import INITIALIZATIONS
@@ -33,6 +33,7 @@ from gmmtorch.mixture.validation import (
     checked_weight,
     warn_if_coarse,
 )
+from gmmtorch.pose import Pose
 
 
 class Report:
@@ -378,8 +379,7 @@ class MixtureEstimator(MixtureDensity):
         `covariance_type="full"`.
         """
         means = self._fitted()
-        matrix = as_tensor(transform, "transform", torch.float64, means.device)
-        rotation, translation = check_rigid(matrix, means.shape[1])
+        rotation, translation = Pose.checked(transform, means.shape[1], device=means.device).parts
         moved = type(self)(**BaseEstimator.get_params(self, deep=False))
         if self._fitted_type == "diag":
             moved.covariance_type = "full"

@@ -76,14 +76,12 @@ class Hulls:
         )
         return made
 
-    def near(
-        self, given: Lists, lists: Tensor, centers: Tensor, radii: Tensor, compiled: bool = False
-    ) -> Lists:
+    def near(self, given: Lists, lists: Tensor, centers: Tensor, radii: Tensor) -> Lists:
         """For each ball (T,), those cones of its list that can give evidence to a cube centred in the ball;
         arguments as for `near_lists`."""
         chunks = chunks_of(given.lengths()[lists], _TESTS_AT_ONCE)
         parts = [
-            near_lists(self.table, given, lists[t], centers[t], radii[t], self.reach, self.spread, compiled)
+            near_lists(self.table, given, lists[t], centers[t], radii[t], self.reach, self.spread)
             for t in chunks
         ]
         if len(parts) == 1:
@@ -110,7 +108,10 @@ _FEW_PAIRS = 1 << 17  # of a point and a cone: for at most so many smaller bucke
 _BUCKETS_AT_ONCE = 1 << 12
 _PAIRS_AT_ONCE = 1 << 20
 _TESTS_AT_ONCE = 1 << 22
-_SUBCELLS = 4  # points are sorted into this many parts of a bucket along each axis
+_SUBCELL_BITS = 2
+_SUBCELLS = 1 << _SUBCELL_BITS  # points are sorted into this many parts of a bucket along each axis
+_TABLE, _CELLS_PER_POINT = 1 << 21, 4  # smallest buckets of which a table is made, at most, for many points
+_MISSING, _OUTSIDE = -1, -2  # instead of a list's number: it is not made; no cone reaches the bucket
 
 
 class ConeIndex:
@@ -166,6 +167,7 @@ class ConeIndex:
         finest = max(self.extent, span / (self._limit - 1))
         self.side = _chosen_side(hulls, finest, span, per_cone or _ENTRIES_PER_CONE[self.dim])
         self._n_levels = 1 + math.ceil(math.log2(max(span / self.side, 1.0)) / _SHIFT)
+        self._set_box()
         self._drop_all()
 
     def replaced(self, cones: Cones, former: Tensor, spectrum: Spectrum | None = None) -> ConeIndex:
@@ -187,6 +189,7 @@ class ConeIndex:
         if is_far or len(former) > 2 * self._n_chosen:
             made._set_lattice()
             return made
+        made._set_box()
         if bool(is_new.all()):
             made._drop_all()
             return made
@@ -207,6 +210,15 @@ class ConeIndex:
             made.lists.entries.copy_(number[made.lists.entries])
         return made
 
+    def _set_box(self) -> None:
+        """Sets the smallest buckets that cones reach, and one more at each end: along each axis the first of
+        them, and how many they are."""
+        if not len(self.hulls.low):
+            return
+        ends = torch.stack([self.hulls.low.amin(0), self.hulls.high.amax(0)])
+        first, last = ((ends - self.origin) / self.side).floor().long().tolist()
+        self._box = [a - 1 for a in first], [b - a + 3 for a, b in zip(first, last, strict=True)]
+
     # -- lists that are kept --------------------------------------------------------------------------
 
     def _drop_all(self) -> None:
@@ -215,6 +227,7 @@ class ConeIndex:
         self._used, self._now = none, 0  # when each list was used last
         self._levels = none  # of the bucket of each list
         self._buffer = none.int()  # begins with the entries of the lists
+        self._table: Tensor | None = None  # of the smallest buckets of the box: the list of each
         self.lists = Lists.of(none, self._buffer)
 
     def _keep(self, kept: Tensor) -> None:
@@ -227,7 +240,7 @@ class ConeIndex:
         for keys, numbers in self._buckets:
             stays = kept[numbers]
             buckets.append((keys[stays], rank[numbers[stays]]))
-        self._buckets = buckets
+        self._buckets, self._table = buckets, None
 
     def _make_room(self) -> None:
         """Drops lists that were not used for the longest time, if there are more than the bound."""
@@ -254,7 +267,7 @@ class ConeIndex:
         keys, numbers = self._buckets[level]
         keys, numbers = torch.cat([keys, self._pack(cells)]), torch.cat([numbers, added])
         order = argsort(keys)
-        self._buckets[level] = keys[order], numbers[order]
+        self._buckets[level], self._table = (keys[order], numbers[order]), None
         return added
 
     def _numbered(self, level: int, cells: Tensor) -> Tensor:
@@ -308,14 +321,14 @@ class ConeIndex:
         """The list (B,) of each bucket with these keys (B,), −1 if there is none yet."""
         keys, numbers = self._buckets[level]
         if not len(keys):
-            return torch.full_like(key, -1)
+            return torch.full_like(key, _MISSING)
         place = torch.searchsorted(keys, key).clamp_max_(len(keys) - 1)
-        return torch.where(keys[place] == key, numbers[place], -1)
+        return torch.where(keys[place] == key, numbers[place], _MISSING)
 
     def parts(self, points: Tensor, bounded: bool = True) -> Iterator[tuple[Tensor, Tensor]]:
-        """Parts of points (M, D): their rows (R,), ascending, and the list (R,) in `lists` of all cones that
-        can give evidence to each. Later parts change `lists`: use it part by part. Points that are in no part
-        have no evidence.
+        """Parts of points (M, D): their rows (R,), in an order in which neighbours follow each other; and, at
+        these rows of (M,), the list in `lists` of all cones that can give evidence to each. Later parts
+        change both: use them part by part. Points that are in no part have no evidence.
 
         bounded: False keeps the lists of all these points, beyond the bound.
         """
@@ -324,33 +337,67 @@ class ConeIndex:
         self._now += 1
         if bounded:
             self._make_room()
-        cell = ((points.detach().double() - self.origin) / self.side).floor()
-        rows = torch.arange(len(points), device=points.device)
-        inside = (cell.abs() <= self._limit).all(1)
-        if not bool(inside.all()):
-            rows, cell = rows[inside], cell[inside]
-        cell = cell.long()
-        key = self._pack(cell)
-        number = self._find(0, key)
-        missing = (number < 0).nonzero().squeeze(1)
-        rank, n_missing = dense_ranks(key[missing])
-        cells = cell.new_zeros(n_missing, self.dim)
-        cells[rank] = cell[missing]
+        cells, part = self._places(points)
+        number = self._lists_at(cells)
+        if len(self._used):
+            self._used.index_fill_(0, number.clamp_min(0), self._now)
+        missing = (number == _MISSING).nonzero().squeeze(1)
+        cell = torch.stack([axis[missing] for axis in cells], 1)
+        rank, n_missing = dense_ranks(self._pack(cell))
+        cell = cell.new_zeros(n_missing, self.dim).index_copy_(0, rank, cell)
         if n_missing <= _BUCKETS_AT_ONCE:
-            self._used[number[number >= 0] if n_missing else number] = self._now
             if n_missing:
-                number[missing] = self._serving(cells, rank)
-            yield rows, number
+                number[missing] = self._serving(cell, rank)
+            yield self._in_order(number, part), number
             return
-        found = number >= 0
-        self._used[number[found]] = self._now
-        yield rows[found], number[found]
-        for first in range(0, n_missing, _BUCKETS_AT_ONCE):
-            chosen = (rank // _BUCKETS_AT_ONCE == first // _BUCKETS_AT_ONCE).nonzero().squeeze(1)
+        yield self._in_order(number, part), number
+        chunk = rank // _BUCKETS_AT_ONCE
+        chunks = argsort(chunk).split(torch.bincount(chunk).tolist())
+        for chosen, some in zip(chunks, cell.split(_BUCKETS_AT_ONCE), strict=True):
             if bounded:
                 self._make_room()
-            number = self._serving(cells[first : first + _BUCKETS_AT_ONCE], rank[chosen] - first)
-            yield rows[missing[chosen]], number
+            rows = missing[chosen]
+            number[rows] = served = self._serving(some, rank[chosen] % _BUCKETS_AT_ONCE)
+            yield rows[self._in_order(served, part[rows])], number
+
+    def _places(self, points: Tensor) -> tuple[list[Tensor], Tensor]:
+        """Coordinates (M,) of the smallest bucket of points (M, D) along each axis, and the part (M,) of the
+        bucket. Points outside the box of the cones are in the buckets around it."""
+        cells, part = [], torch.zeros_like(points[:, 0], dtype=torch.int64)
+        for axis, (first, n_cells) in enumerate(zip(*self._box, strict=True)):
+            place = (points[:, axis].detach().double() - self.origin[axis]).div_(self.side / _SUBCELLS)
+            place = place.floor_().clamp_(first * _SUBCELLS, (first + n_cells) * _SUBCELLS - 1).long()
+            cells.append(place >> _SUBCELL_BITS)
+            part = part << _SUBCELL_BITS | place & _SUBCELLS - 1
+        return cells, part
+
+    def _lists_at(self, cells: list[Tensor]) -> Tensor:
+        """The list (M,) of the smallest buckets with these coordinates (M,) along each axis, or `_MISSING`,
+        or `_OUTSIDE` the box of the cones."""
+        firsts, sizes = self._box
+        n_cells = math.prod(sizes)
+        if self._table is None and n_cells <= min(_TABLE, _CELLS_PER_POINT * len(cells[0])):
+            self._table = torch.full(sizes, _OUTSIDE, device=self.origin.device)
+            self._table[(slice(1, -1),) * self.dim] = _MISSING
+            keys, numbers = self._buckets[0]
+            known = self._unpack(keys) - keys.new_tensor(firsts)
+            inside = ((known >= 1) & (known < keys.new_tensor(sizes) - 1)).all(1)
+            self._table[known[inside].unbind(1)] = numbers[inside]
+        place, edge = torch.zeros_like(cells[0]), torch.zeros_like(cells[0], dtype=torch.bool)
+        if self._table is not None:
+            for cell, first, size in zip(cells, firsts, sizes, strict=True):
+                place = place.mul_(size).add_(cell).sub_(first)
+            return self._table.view(-1).index_select(0, place)
+        for cell, first, size in zip(cells, firsts, sizes, strict=True):
+            edge |= (cell == first) | (cell == first + size - 1)
+        return torch.where(edge, _OUTSIDE, self._find(0, self._pack(torch.stack(cells, 1))))
+
+    def _in_order(self, number: Tensor, part: Tensor) -> Tensor:
+        """Rows (R,) of the points that have a list `number` (M,) with entries, by list, then by `part`."""
+        none = torch.zeros(-min(_MISSING, _OUTSIDE), dtype=torch.bool, device=number.device)
+        listed = torch.cat([self.lists.lengths() > 0, none])[number]  # negative numbers count from the end
+        key = (number + 1 << _SUBCELL_BITS * self.dim | part) * listed
+        return argsort(key)[len(key) - int(listed.count_nonzero()) :]
 
     def _serving(self, cells: Tensor, rank: Tensor) -> Tensor:
         """The list (R,) that serves each point, in the bucket with number `rank` (R,) among `cells` (B, D).
@@ -393,19 +440,8 @@ class ConeIndex:
         is none. Valid until the next query."""
         found = torch.full(points.shape[:1], -1, dtype=torch.int64, device=points.device)
         for rows, number in self.parts(points, bounded=False):
-            found[rows] = torch.where(self.lists.lengths()[number] > 0, number, -1)
+            found[rows] = number[rows]
         return found
-
-    def in_space_order(self, points: Tensor, bucket: Tensor) -> Tensor:
-        """An order (M,) of points (M, D) with lists `bucket` (M,) in which neighbours follow each other.
-
-        Points are sorted by list, and by the parts of their bucket.
-        """
-        part = ((points.detach() - self.origin) / self.side % 1 * _SUBCELLS).long()
-        fine = bucket
-        for axis in range(self.dim):
-            fine = fine * _SUBCELLS + part[:, axis]
-        return argsort(fine)
 
     def candidates(self, low: Tensor, high: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
         """Chunks of pairs, box (P,) and cone (P,): all cones whose hull meets a box [low, high], (M, D) each.
@@ -421,9 +457,8 @@ class ConeIndex:
                 f"extent={self.extent:.4g} m; make the index with the extent of the largest box."
             )
         center = 0.5 * (low + high)
-        for rows, bucket in self.parts(center):
-            order = self.in_space_order(center[rows], bucket)
-            rows, bucket = rows[order], bucket[order]
+        for rows, number in self.parts(center):
+            bucket = number[rows]
             for part in chunks_of(self.lists.lengths()[bucket], _PAIRS_AT_ONCE):
                 boxes = rows[part]
                 found = self.hulls.near(

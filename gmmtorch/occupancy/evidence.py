@@ -20,7 +20,7 @@ from gmmtorch.kernels import bernoulli_entropy as bernoulli_entropy
 from gmmtorch.kernels import occupancy_probability as occupancy_probability
 from gmmtorch.occupancy.calibrator import Calibration
 from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.voxels.boxes import flat_index
+from gmmtorch.occupancy.voxels.cells import flat_index
 
 Rule = Calibration | float
 """How a probability follows from evidence: calibrated, or with a count N_p by the thesis's (3.9)."""
@@ -157,7 +157,6 @@ class Evidence:
         weights: ArrayLike | None = None,
         is_hit: ArrayLike | None = None,
         chunk_visits: int = CHUNK_VISITS,
-        compiled: bool = False,
     ) -> None:
         """Count rays: one hit in the cell of each end, one miss in every other cell that the ray passes.
 
@@ -167,7 +166,6 @@ class Evidence:
             weights: (R,) number of rays that each row counts for; 1 if not given.
             is_hit: (R,) bool, False for no-return beams, which add only misses. All True if not given.
             chunk_visits: voxel visits in one pass. It bounds the memory and does not change the result.
-            compiled: see `traverse`.
 
         Raises `InvalidArgumentError` for shapes that do not match.
         """
@@ -180,7 +178,7 @@ class Evidence:
             starts, stops = self.grid.to_units(origins[part]), self.grid.to_units(ends[part])
             counts = None if weights is None else weights[part]
             misses, shape = self.misses.view(-1), self.grid.shape
-            count_in_grid(misses, starts, stops, shape, counts, chunk_visits=chunk_visits, compiled=compiled)
+            count_in_grid(misses, starts, stops, shape, counts, chunk_visits=chunk_visits)
             cell, counted = flat_index(stops.floor(), shape)
             if is_hit is not None:
                 counted = counted & is_hit[part]

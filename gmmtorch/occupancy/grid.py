@@ -12,7 +12,7 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
 from gmmtorch.errors import check_resolution as check_resolution
-from gmmtorch.occupancy.voxels.boxes import flat_index
+from gmmtorch.occupancy.voxels.cells import flat_index
 
 BYTES_PER_CELL = 16
 """Bytes of the hits and misses of one cell, float64 each."""

@@ -48,7 +48,7 @@ class OccupancyGrid(TensorFileMap):
         log_odds: the updates of the log-odds variant; None for counts.
         prior: N_p of (3.9); for counts only.
         memory_limit: largest size of the cells, bytes.
-        compiled: casts rays with torch.compile, see `traverse`.
+        compiled: has no effect; fused kernels cast rays.
     """
 
     file_kind = "gmmtorch.occupancy_grid"
@@ -75,7 +75,7 @@ class OccupancyGrid(TensorFileMap):
         return torch.device("cpu") if self._cells is None else self._cells.keys.device
 
     def _start(self, dim: int, device: torch.device) -> None:
-        self._cells = SparseEvidence(self.resolution, dim, device, self.memory_limit, self.compiled)
+        self._cells = SparseEvidence(self.resolution, dim, device, self.memory_limit)
 
     def _learn(self, scan: Scan) -> None:
         self._pending.append(scan.copied(self.device))

@@ -31,8 +31,8 @@ from gmmtorch.experiments.evaluation import methods
 from gmmtorch.experiments.evaluation.fits import ESTIMATORS
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
-from gmmtorch.simulation.worlds.tunnels import tunnels
-from gmmtorch.simulation.worlds.warehouse import warehouse
+from gmmtorch.simulation.mine import tunnels
+from gmmtorch.simulation.warehouses import warehouse
 from gmmtorch.team.cli import missions
 from gmmtorch.team.exploration.mission.options import FRAMEWORKS, THESIS, TeamOptions
 from gmmtorch.team.exploration.mission.trials import WorldOptions

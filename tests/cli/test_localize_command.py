@@ -12,7 +12,7 @@ from command_runs import QUIET, Finished, refused, run_here, succeeded
 from sensor_bags import BagWriter
 
 from gmmtorch.datasets import Dataset, load
-from gmmtorch.datasets.recordings.trajectory import read_trajectory
+from gmmtorch.datasets.trajectory import read_trajectory
 from gmmtorch.export.trajectory_files import write_tum
 from gmmtorch.mapping.gaussian_map import GaussianMap
 
@@ -54,11 +54,11 @@ def test_scans_are_found_and_scored_and_every_file_is_written(run, scans):
     assert row["lost"] == row["messages"] == []
     assert {"trajectory.tum", "trajectory.csv", "path.png"} <= done.files()
     assert any(name.startswith("tensorboard/") for name in done.files())
-    written = read_trajectory(done.folder / "trajectory.tum").matrices
+    written = read_trajectory(done.folder / "trajectory.tum").poses
     table = list(csv.DictReader((done.folder / "trajectory.csv").open()))
     assert len(written) == len(table) == N
     positions = np.array([[float(line["x"]), float(line["y"])] for line in table])
-    np.testing.assert_allclose(positions, written[:, :2, 3], atol=1e-6)
+    np.testing.assert_allclose(positions, written.translation[:, :2], atol=1e-6)
     assert all(0 < float(line["cov_x_x"]) < 0.01 and line["doubts"] == "" for line in table)
 
 

@@ -27,10 +27,9 @@ from sensor_bags import BagWriter
 
 from gmmtorch.cli import common
 from gmmtorch.datasets.base import Ranges
-from gmmtorch.datasets.recordings.ros.bag_reader import Topic
-from gmmtorch.datasets.recordings.ros.bag_topics import LASER as LASERS
-from gmmtorch.datasets.recordings.ros.bag_topics import Sensor
-from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree
+from gmmtorch.datasets.ros.bag_reader import LASER as LASERS
+from gmmtorch.datasets.ros.bag_reader import Sensor, Topic
+from gmmtorch.datasets.ros.transform_tree import TransformTree
 from gmmtorch.live.live_scans import LiveOptions, LiveScans
 from gmmtorch.live.ros import Node
 from gmmtorch.mapping.gaussian_map import GaussianMap

@@ -122,11 +122,11 @@ def test_transforms_whose_definition_is_damaged_are_left_out(tmp_path):
 
 @pytest.mark.parametrize("suffix", ["mcap", "bag"])
 def test_a_chunk_that_unpacks_without_end_is_refused(tmp_path, suffix, monkeypatch):
-    from gmmtorch.datasets.recordings.ros import rosbags_access
+    from gmmtorch.datasets.ros import bag_reader
 
     path = compressed_bag(tmp_path / f"a.{suffix}", "LZ4", np.ones((100_000, 3)))
     assert path.stat().st_size < 20_000
-    monkeypatch.setattr(rosbags_access, "MAX_CHUNK_BYTES", 1 << 20)
+    monkeypatch.setattr(bag_reader, "MAX_CHUNK_BYTES", 1 << 20)
     with pytest.raises(DataError, match="unpacks to more than"):
         load("rosbag", path)
 
@@ -136,7 +136,7 @@ def test_a_bag_compressed_as_a_whole_is_unpacked_to_a_limit(tmp_path, monkeypatc
     """`ros2 bag record --compression-mode file`."""
     from rosbags import rosbag2
 
-    from gmmtorch.datasets.recordings.ros import rosbags_access
+    from gmmtorch.datasets.ros import bag_reader
 
     bag, folder = BagWriter(tmp_path / "a.db3"), tmp_path / "bag"
     bag.writer = rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin.SQLITE3)
@@ -151,7 +151,7 @@ def test_a_bag_compressed_as_a_whole_is_unpacked_to_a_limit(tmp_path, monkeypatc
         file.write_bytes(zstd.compress(zstd.decompress(file.read_bytes())))
     assert file.stat().st_size < 20_000
     assert load("rosbag", folder)[0].points.shape == (100_000, 2)
-    monkeypatch.setattr(rosbags_access, "MAX_BAG_BYTES", 1 << 20)
+    monkeypatch.setattr(bag_reader, "MAX_BAG_BYTES", 1 << 20)
     with pytest.raises(DataError, match=r"bag unpacks to more than 1,048,576 bytes.*zstd -d"):
         load("rosbag", folder)
     file.write_bytes(b"no zstd")
@@ -396,7 +396,7 @@ def test_an_unusable_layout_is_refused_at_once(tmp_path):
 
 @pytest.mark.parametrize("packed", [False, True])
 def test_announced_lengths_are_checked_before_anything_is_allocated(packed):
-    from gmmtorch.datasets.recordings.ros.message_decoder import BASE, NAME, SEQUENCE, MessageDecoder
+    from gmmtorch.datasets.ros.message_decoder import BASE, NAME, SEQUENCE, MessageDecoder
 
     numbers, items = (BASE, ("float64", 0)), (NAME, "Item")
     definitions = {

@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 from scan_files import kitti, scan_folder
 
 from gmmtorch.datasets import load
-from gmmtorch.datasets.number_rows import number_rows
-from gmmtorch.datasets.point_files.cloud_files import read_cloud
-from gmmtorch.datasets.point_files.point_chunks import open_points
+from gmmtorch.datasets.base import number_rows
+from gmmtorch.datasets.point_files.point_chunks import open_points, read_cloud
 from gmmtorch.errors import DataError
 
 NOT_FINITE = [

@@ -1,52 +1,46 @@
-"""Ranges: beam ends as hits, no-return beams and invalid ones. Data sets as sequences, and their shards."""
+"""Data sets: ranges, sequences and shards, and `load` by name."""
 
 from __future__ import annotations
 
 import itertools
 import math
+import subprocess
+import sys
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmmtorch.datasets import Dataset, Ranges
+from gmmtorch.datasets import Dataset, Ranges, load
 from gmmtorch.datasets.base import SPLITS, DatasetShard, shard_indices
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import InvalidArgumentError, MissingDataError
 from gmmtorch.scan import Scan
 
 ORIGIN = torch.zeros(2, dtype=torch.float64)
 ENDS = torch.tensor([[1.0, 0.0], [0.0, 5.0], [-20.0, 0.0]], dtype=torch.float64)
 
 
-def test_without_max_range_every_end_is_a_hit():
-    scan = Ranges().scan(ENDS, ORIGIN)
-    assert scan.points.tolist() == ENDS.tolist()
-    assert scan.no_return.shape == (0, 2)
-
-
-def test_ends_at_or_beyond_max_range_become_no_return_beams():
-    scan = Ranges(5.0, 3.0).scan(ENDS, ORIGIN)
-    assert scan.points.tolist() == [[1.0, 0.0]]
-    assert scan.no_return.tolist() == [[0.0, 3.0], [-3.0, 0.0]]
-
-
-def test_no_return_range_zero_drops_no_return_beams():
-    scan = Ranges(5.0, 0.0).scan(ENDS, ORIGIN)
-    assert scan.points.tolist() == [[1.0, 0.0]]
-    assert scan.no_return.shape == (0, 2)
-
-
-def test_free_part_is_limited_by_max_range_and_the_beam():
-    scan = Ranges(6.0, 50.0).scan(ENDS, ORIGIN, no_return=torch.tensor([False, True, False]))
-    assert scan.no_return.tolist() == [[0.0, 5.0], [-6.0, 0.0]]
-
-
-def test_ends_that_are_not_finite_or_at_the_origin_are_dropped():
-    ends = torch.tensor([[math.nan, 0.0], [0.0, math.inf], [0.0, 0.0], [1.0, 1.0]], dtype=torch.float64)
-    scan = Ranges(5.0, 3.0).scan(ends, ORIGIN)
-    assert scan.points.tolist() == [[1.0, 1.0]]
-    assert scan.no_return.shape == (0, 2)
+@pytest.mark.parametrize(
+    ("ranges", "mask", "points", "no_return"),
+    [
+        (Ranges(), None, ENDS.tolist(), []),
+        (Ranges(5.0, 3.0), None, [[1, 0]], [[0, 3], [-3, 0]]),  # at the range or beyond: no return
+        (Ranges(5.0, 0.0), None, [[1, 0]], []),
+        (Ranges(6.0, 50.0), [False, True, False], [[1, 0]], [[0, 5], [-6, 0]]),  # as long as beam and range
+    ],
+)
+def test_ends_become_hits_and_beams_without_return(ranges, mask, points, no_return):
+    given = None if mask is None else torch.tensor(mask)
+    invalid = torch.tensor([[math.nan, 0.0], [0.0, math.inf], [0.0, 0.0]], dtype=torch.float64)
+    for ends in (ENDS, torch.cat([ENDS, invalid])):  # not finite, or at the origin
+        marked = None if given is None else torch.nn.functional.pad(given, (0, len(ends) - 3))
+        before = None if marked is None else marked.clone()
+        scan = ranges.scan(ends, ORIGIN, no_return=marked)
+        assert scan.points.tolist() == points
+        assert scan.no_return.tolist() == no_return
+        assert scan.no_return.shape[1] == 2
+        assert marked is before or torch.equal(marked, before)
 
 
 def test_ends_at_max_range_within_rounding_are_no_hits():
@@ -55,22 +49,14 @@ def test_ends_at_max_range_within_rounding_are_no_hits():
     assert Ranges(50.0, 8.0).scan(ends, torch.zeros(2)).points.shape == (0, 2)
 
 
-def test_the_no_return_mask_is_not_modified():
-    mask = torch.zeros(3, dtype=torch.bool)
-    Ranges(5.0, 3.0).scan(ENDS, ORIGIN, no_return=mask)
-    assert not bool(mask.any())
-
-
-@pytest.mark.parametrize("value", [0.0, -1.0, math.nan])
-def test_max_range_must_be_a_distance(value):
-    with pytest.raises(InvalidArgumentError, match="max_range"):
-        Ranges(value)
-
-
-@pytest.mark.parametrize("value", [-1.0, math.nan, math.inf])
-def test_no_return_range_must_be_a_distance(value):
-    with pytest.raises(InvalidArgumentError, match="no_return_range"):
-        Ranges(None, value)
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("max_range", x) for x in (0.0, -1.0, math.nan)]
+    + [("no_return_range", x) for x in (-1.0, math.nan, math.inf)],
+)
+def test_ranges_must_be_distances(option, value):
+    with pytest.raises(InvalidArgumentError, match=option):
+        Ranges(**{option: value})
 
 
 class _TenScans(Dataset):
@@ -151,3 +137,70 @@ def test_dataset_shard_reads_only_the_accessed_scans():
     assert read == [4, 7, 4, 7, 1, 4, 7]
     with pytest.raises(IndexError):
         shard[3]
+
+
+# -- load --------------------------------------------------------------------------------------------
+
+
+WITH_PATH = ["carmen", "scan_folder", "pcd_viewpoint", "depth_frames", "octomap_log", "mesh", "mesh_scans"]
+WITH_PATH += ["rosbag", "kitti", "tum"]
+
+
+def test_load_lists_the_names_when_the_name_is_unknown():
+    with pytest.raises(InvalidArgumentError, match="intel") as caught:
+        load("intel")
+    for name in (*WITH_PATH, "synthetic_building_2d"):
+        assert name in str(caught.value)
+
+
+@pytest.mark.parametrize("name", WITH_PATH)
+def test_load_states_the_expected_content_of_a_missing_path(name, tmp_path):
+    with pytest.raises(MissingDataError, match="nowhere") as caught:
+        load(name, tmp_path / "nowhere")
+    assert "looked for" in str(caught.value)
+    assert isinstance(caught.value, FileNotFoundError)
+
+
+@pytest.mark.parametrize(
+    ("name", "path", "options", "error", "message"),
+    [
+        ("carmen", None, {}, InvalidArgumentError, r"dataset\.path is not set"),
+        ("carmen", "", {}, InvalidArgumentError, r"dataset\.path is not set"),
+        ("carmen", "/", {}, MissingDataError, "not a file"),
+        ("carmen", "/", {"seed": 1}, InvalidArgumentError, "takes no further options"),
+        ("synthetic_building", "/", {}, InvalidArgumentError, "is simulated"),
+        (
+            "synthetic_building",
+            None,
+            {"sensr": "lidar"},
+            InvalidArgumentError,
+            "sensr=.*n_scans, seed, sensor",
+        ),
+    ],
+)
+def test_load_names_a_wrong_path_or_option(name, path, options, error, message):
+    with pytest.raises(error, match=message):
+        load(name, path, **options)
+
+
+def test_load_applies_the_default_ranges_of_each_data_set(tmp_path):
+    log = tmp_path / "a.log"
+    log.write_text("FLASER 1 1.0 0 0 0 0 0 0 0 host 0\n")
+    carmen = load("carmen", log)
+    assert (carmen.ranges.max_range, carmen.ranges.no_return_range) == (50.0, 8.0)
+    changed = load("carmen", log, max_range=20.0, no_return_range=0).ranges
+    assert (changed.max_range, changed.no_return_range) == (20.0, 0.0)
+    synthetic = load("synthetic_building_2d", n_scans=1)
+    assert (synthetic.ranges.max_range, synthetic.ranges.no_return_range) == (None, 8.0)
+
+
+@pytest.mark.slow
+def test_importing_datasets_loads_no_reader():
+    code = (
+        "import sys, gmmtorch.datasets\n"
+        "late = [m for m in ('open3d', 'PIL', 'gmmtorch.simulation', 'gmmtorch.datasets.scan_logs')"
+        " if m in sys.modules]\n"
+        "sys.exit(', '.join(late) or 0)"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr

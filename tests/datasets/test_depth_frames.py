@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -89,44 +89,33 @@ def test_depth_frames_read_an_image_without_valid_pixels(tmp_path):
     assert load("depth_frames", folder)[0].n_beams == 0
 
 
-def _truncated_png(folder: Path) -> None:
-    path = folder / "frame-000000.depth.png"
-    path.write_bytes(path.read_bytes()[:-40])
+def saved(write: Callable[..., object], content: object) -> bytes:
+    file = io.BytesIO()
+    write(file, content)
+    return file.getvalue()
 
 
-def _text_png(folder: Path) -> None:
-    (folder / "frame-000000.depth.png").write_text("not an image")
-
-
-def _color_png(folder: Path) -> None:
-    Image.fromarray(np.zeros((4, 6, 3), dtype=np.uint8)).save(folder / "frame-000000.depth.png")
-
-
-def _pose(value: np.ndarray | str) -> Callable[[Path], None]:
-    def write(folder: Path) -> None:
-        path = folder / "frame-000000.pose.txt"
-        path.write_text(value) if isinstance(value, str) else np.savetxt(path, value)
-
-    return write
+NOISE = np.random.default_rng(0).integers(1, 9999, (40, 60)).astype(np.uint16)
+PNG = saved(lambda file, image: Image.fromarray(image).save(file, "PNG"), NOISE)
+COLOURED = saved(lambda file, image: Image.fromarray(image).save(file, "PNG"), np.zeros((4, 6, 3), np.uint8))
 
 
 @pytest.mark.parametrize(
-    ("damage", "message"),
+    ("name", "content", "message"),
     [
-        (_truncated_png, r"000000\.depth\.png is not a complete PNG"),
-        (_text_png, r"000000\.depth\.png is not a complete PNG"),
-        (_color_png, r"000000\.depth\.png is uint8.*expected one 16-bit channel"),
-        (_pose(np.full((4, 4), math.nan)), r"000000\.pose\.txt.*finite 4×4"),
-        (_pose(np.eye(3)), r"000000\.pose\.txt.*finite 4×4"),
-        (_pose(3 * np.eye(4)), r"000000\.pose\.txt is not a rigid pose"),
-        (_pose("lost"), r"000000\.pose\.txt is not a matrix of numbers"),
+        ("depth.png", PNG[:-40], "is not a complete PNG"),
+        ("depth.png", b"not an image", "is not a complete PNG"),
+        ("depth.png", COLOURED, "is uint8.*expected one 16-bit channel"),
+        ("pose.txt", saved(np.savetxt, np.full((4, 4), math.nan)), ".*finite 4×4"),
+        ("pose.txt", saved(np.savetxt, np.eye(3)), ".*finite 4×4"),
+        ("pose.txt", saved(np.savetxt, 3 * np.eye(4)), "is not a rigid pose"),
+        ("pose.txt", b"lost", "is not a matrix of numbers"),
     ],
 )
-def test_depth_frames_reject_damaged_files(tmp_path, damage, message):
-    noise = np.random.default_rng(0).integers(1, 9999, (40, 60)).astype(np.uint16)
-    dataset = load("depth_frames", depth_folder(tmp_path, [(noise, np.eye(4))]))
-    damage(tmp_path)
-    with pytest.raises(DataError, match=message):
+def test_depth_frames_reject_damaged_files(tmp_path, name, content, message):
+    dataset = load("depth_frames", depth_folder(tmp_path, [(NOISE, np.eye(4))]))
+    (tmp_path / f"frame-000000.{name}").write_bytes(content)
+    with pytest.raises(DataError, match=rf"000000\.{name}.*{message}"):
         dataset[0]
 
 

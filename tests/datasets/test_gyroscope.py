@@ -14,10 +14,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from gmmtorch.datasets import load
-from gmmtorch.datasets.recordings.ros.gyroscope import Gyroscope
+from gmmtorch.datasets.ros.rosbag import Gyroscope
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.localization import with_odometry
-from gmmtorch.localization.odometry.odometry import Odometry
+from gmmtorch.localization.odometry import Odometry
 
 pytest.importorskip("rosbags")
 

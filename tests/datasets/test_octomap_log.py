@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.datasets import Dataset, load
-from gmmtorch.datasets.octomap_log import rotation
+from gmmtorch.datasets.scan_logs import rotation
 from gmmtorch.errors import DataError
 
 OCTOMAP = """NODE 1 2 3 0 0 0

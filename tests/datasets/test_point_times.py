@@ -22,7 +22,7 @@ pytest.importorskip("rosbags")
 
 from sensor_bags import BagWriter
 
-from gmmtorch.datasets.recordings.ros.point_times import PointTimes, Rate
+from gmmtorch.datasets.ros.point_times import PointTimes, Rate
 
 WALLS = np.array([6.0, 4.0, 1.25])  # half of the room
 SWEEP = 0.1  # s

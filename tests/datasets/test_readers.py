@@ -11,8 +11,8 @@ import torch
 from scan_files import TURN_LEFT, flaser, kitti, pcd, ply, scan_folder
 
 from gmmtorch.datasets import load
-from gmmtorch.datasets.carmen import beam_angles
-from gmmtorch.datasets.point_files.cloud_files import read_cloud
+from gmmtorch.datasets.point_files.point_chunks import read_cloud
+from gmmtorch.datasets.scan_logs import beam_angles
 from gmmtorch.errors import DataError
 
 NAN_POINT = (math.nan,) * 3

@@ -33,9 +33,8 @@ from gmmtorch.experiments.evaluation.metrics import (
     unknown_scores,
 )
 from gmmtorch.experiments.evaluation.queries import hit_and_free
-from gmmtorch.occupancy.calibrator import N_BINS, Calibrator
+from gmmtorch.occupancy.calibrator import N_BINS, Calibrator, reliability_of, scores_of
 from gmmtorch.occupancy.evidence import occupancy_probability
-from gmmtorch.occupancy.reliability import reliability_of, scores_of
 from gmmtorch.scan import Scan
 
 eighths = st.lists(st.integers(0, 8).map(lambda n: n / 8), min_size=1, max_size=12)

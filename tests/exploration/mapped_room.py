@@ -11,9 +11,9 @@ import torch
 
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import NoveltyRule
-from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.cells import Box
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
-from gmmtorch.simulation.sensors.depth_camera import DepthCamera, DepthFrame
+from gmmtorch.simulation.robot_camera import DepthCamera, DepthFrame
 from gmmtorch.team.exploration.mission.options import THESIS
 from gmmtorch.team.exploration.robot.gmm_mapper import FrameRule, GmmMapper
 from gmmtorch.team.exploration.robot.mapper import Memo

@@ -16,7 +16,7 @@ from mapping.random_components import random_components
 from sharing.message_examples import examples, frame_of_components, views
 
 from gmmtorch.errors import DataError
-from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
+from gmmtorch.occupancy.voxels.cells import CellEvidence
 from gmmtorch.team.exploration.mission.driver import Stopwatch
 from gmmtorch.team.exploration.mission.options import TeamOptions
 from gmmtorch.team.exploration.planning.collision_checking import cells_in_sphere

@@ -30,11 +30,10 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.association import count_explained
-from gmmtorch.mapping.learning.novelty import beam_novelty
-from gmmtorch.occupancy.voxels.boxes import Box, intersection
+from gmmtorch.mapping.learning.novelty import beam_novelty, count_explained
+from gmmtorch.occupancy.voxels.cells import Box, intersection
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
-from gmmtorch.simulation.sensors.depth_camera import DepthFrame
+from gmmtorch.simulation.robot_camera import DepthFrame
 from gmmtorch.team.exploration.robot.gmm_mapper import FrameRule, GmmMapper
 from gmmtorch.team.exploration.robot.mapper import FrameUpdate, Memo
 from gmmtorch.team.sharing.messages.component_messages import (

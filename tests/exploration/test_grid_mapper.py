@@ -10,11 +10,10 @@ from torch import Tensor
 
 from gmmtorch.mapping.learning.novelty import beam_novelty
 from gmmtorch.mapping.learning.rules import NoveltyRule
-from gmmtorch.occupancy.voxels.boxes import Box
-from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
+from gmmtorch.occupancy.voxels.cells import Box, CellEvidence
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
-from gmmtorch.simulation.sensors.depth_camera import DepthFrame
+from gmmtorch.simulation.robot_camera import DepthFrame
 from gmmtorch.team.exploration.robot.mapper import GridMapper, Memo, novel_beams
 from gmmtorch.team.exploration.world.scoring import BeliefMap, BeliefRule
 from gmmtorch.team.sharing.broadcast import MOST_INTERVALS

@@ -19,8 +19,8 @@ from pretended_gpu import GPUTensor, pretended_gpu
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.kernels import kernels
 from gmmtorch.mapping.components import Components
-from gmmtorch.simulation.sensors.depth_camera import DepthCamera
-from gmmtorch.simulation.worlds.furniture import box
+from gmmtorch.simulation.furniture import box
+from gmmtorch.simulation.robot_camera import DepthCamera
 from gmmtorch.team.cli.explore_pictures import _coverage, _team_view
 from gmmtorch.team.exploration.mission.driver import SimulatedClock, Stopwatch, WallClock, drive, settle
 from gmmtorch.team.exploration.mission.mission import Mission

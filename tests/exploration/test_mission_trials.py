@@ -15,7 +15,7 @@ from exploration.rooms import SMALL, without_seconds
 from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError, OutputError
-from gmmtorch.simulation.worlds.furniture import box
+from gmmtorch.simulation.furniture import box
 from gmmtorch.team.exploration.mission import trials as trials_module
 from gmmtorch.team.exploration.mission.trials import (
     ROW,

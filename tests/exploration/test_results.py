@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.occupancy.voxels.boxes import Box
-from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
+from gmmtorch.occupancy.voxels.cells import Box, CellEvidence
 from gmmtorch.team.exploration.mission.options import TeamOptions
 from gmmtorch.team.exploration.mission.results import (
     VARIANT,

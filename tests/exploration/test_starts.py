@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.simulation.worlds.furniture import box
+from gmmtorch.simulation.furniture import box
 from gmmtorch.team.exploration.mission.driver import SimulatedClock, drive
 from gmmtorch.team.exploration.mission.mission import Mission
 from gmmtorch.team.exploration.mission.trials import assemble, start_poses

@@ -11,12 +11,11 @@ from exploration.rooms import HALL
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, MissingDataError
-from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.cells import Box, occupied_cells
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
-from gmmtorch.occupancy.voxels.voxelize import occupied_cells
-from gmmtorch.simulation.sensors.mesh_raycasting import ray_triangles
-from gmmtorch.simulation.worlds.furniture import box
-from gmmtorch.simulation.worlds.mesh_world import MeshWorld
+from gmmtorch.simulation.furniture import box
+from gmmtorch.simulation.mesh_raycasting import ray_triangles
+from gmmtorch.simulation.mesh_world import MeshWorld
 from gmmtorch.team.exploration.planning.primitives import Dynamics, Primitives
 from gmmtorch.team.exploration.world.navigable import (
     collides,

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.cells import Box
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.team.exploration.planning.collision_checking import cells_in_sphere, local_map_of
 from gmmtorch.team.exploration.planning.coordination import PeerTrajectories

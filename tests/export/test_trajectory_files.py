@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from gmmtorch.datasets.recordings.trajectory import read_trajectory
+from gmmtorch.datasets.trajectory import read_trajectory
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.export.trajectory_files import write_kitti, write_pose_table, write_tum
 
@@ -48,7 +48,7 @@ def test_kitti_rows_are_read_back_to_the_bit(tmp_path):
     poses[:, :3, 3] = np.random.default_rng(0).normal(size=(5, 3)) * 1e5
     path = write_kitti(tmp_path / "a.txt", poses)
     np.testing.assert_array_equal(np.loadtxt(path).reshape(5, 3, 4), poses[:, :3])
-    np.testing.assert_array_equal(read_trajectory(path).matrices, poses)
+    np.testing.assert_array_equal(read_trajectory(path).poses.matrix, poses)
 
 
 def test_kitti_rows_of_poses_in_the_plane_and_refused_input(tmp_path):

@@ -7,7 +7,7 @@ import torch
 
 from gmmtorch.errors import MemoryLimitError
 from gmmtorch.kernels import chunks, kernels
-from gmmtorch.kernels.mixtures import e_step
+from gmmtorch.kernels.mixtures import em_steps
 from gmmtorch.mixture.em.exact import quadratic_features
 
 pytestmark = pytest.mark.cpu_only
@@ -50,8 +50,8 @@ def test_an_e_step_without_memory_gives_the_same_statistics(monkeypatch):
     features = quadratic_features(torch.rand(300, 2, dtype=torch.float64))
     weight, natural = torch.rand(300).double(), torch.randn(7, 6).double()
     with kernels("torch"):
-        expected = e_step.expectation(features, weight, natural, torch.float64)
-        softmax, largest = e_step.softmax, []
+        expected = em_steps.expectation(features, weight, natural, torch.float64)
+        softmax, largest = em_steps.softmax, []
 
         def full(logits, *options):
             if logits.shape[1] > 50:
@@ -59,7 +59,7 @@ def test_an_e_step_without_memory_gives_the_same_statistics(monkeypatch):
             largest.append(logits.shape[1])
             return softmax(logits, *options)
 
-        monkeypatch.setattr(e_step, "softmax", full)
-        found = e_step.expectation(features, weight, natural, torch.float64)
+        monkeypatch.setattr(em_steps, "softmax", full)
+        found = em_steps.expectation(features, weight, natural, torch.float64)
     assert max(largest) == 37
     torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)

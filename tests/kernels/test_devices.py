@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
-
 import pytest
 import torch
 from kernels.cones_for_kernels import cones_of
 from pretended_gpu import GPUTensor, pretended_gpu
 
 import gmmtorch as gt
-import gmmtorch.kernels
 from gmmtorch.kernels import kernels
-from gmmtorch.kernels.compiler import FusedKernel, compiler_failure
 from gmmtorch.kernels.rays.ray_traversal import traverse
 from gmmtorch.linalg import on_cpu
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.truncated import Rows, group_rows, truncated_expectation
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.evidence import Evidence
-from gmmtorch.occupancy.forms.flux.box_flux import flux_evidence
+from gmmtorch.occupancy.forms.flux import flux_evidence
 from gmmtorch.occupancy.forms.point import point_evidence
 from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.cells import Box
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 
@@ -206,21 +201,3 @@ def test_work_goes_on_in_smaller_chunks_where_the_memory_of_the_gpu_ends(work, m
     assert "chunks of" in caplog.text
     for one, other in zip(found, expected, strict=True):
         torch.testing.assert_close(one.held, other, rtol=1e-9, atol=1e-12)
-
-
-def all_kernels() -> list[FusedKernel]:
-    modules = pkgutil.walk_packages(gmmtorch.kernels.__path__, "gmmtorch.kernels.")
-    named = [value for found in modules for value in vars(importlib.import_module(found.name)).values()]
-    listed = [item for value in named for item in (value.values() if isinstance(value, dict) else [value])]
-    return [item for item in listed if isinstance(item, FusedKernel)]
-
-
-@pytest.mark.slow
-def test_the_cuda_source_of_every_kernel_compiles_without_a_gpu(tmp_path):
-    warp = pytest.importorskip("warp")
-    assert compiler_failure() is None  # this sets warp up
-    assert len(all_kernels()) > 50
-    for kernel in all_kernels():
-        folder = tmp_path / kernel.name
-        warp.compile_aot_module(kernel.defined("cuda").module, arch=80, module_dir=str(folder), use_ptx=True)
-        assert list(folder.glob("*.ptx")), kernel.name

@@ -115,7 +115,7 @@ def test_two_processes_compile_at_once_after_a_third_was_killed_while_it_compile
 @pytest.mark.slow
 def test_only_kernels_that_run_are_compiled_and_one_line_says_so(tmp_path):
     code = """import logging, torch
-from gmmtorch.kernels.mixtures.distinct_keys import distinct_keys
+from gmmtorch.kernels.mixtures.cell_sums import distinct_keys
 logging.basicConfig(level=logging.INFO)
 from gmmtorch.kernels import use_kernels
 use_kernels("fused")
@@ -129,29 +129,13 @@ distinct_keys(torch.arange(5))"""
     assert compiled == ["wp_gmmtorch_distinct_keys", "wp_gmmtorch_probe"]
 
 
-@pytest.mark.slow
-def test_kernels_with_code_of_their_own_for_cuda_compile_without_a_gpu(tmp_path):
-    from gmmtorch.kernels.mixtures import depth_cells, lattice_rounding, m_step, truncated_e_step
-
-    warp = compiler._warp()
-    chosen = [
-        depth_cells._KERNELS[torch.float32],
-        lattice_rounding._ROUNDINGS[3],
-        m_step._STEPS[3],
-        truncated_e_step._CHOICES[3, torch.float32],
-    ]
-    for kernel in chosen:
-        folder = tmp_path / kernel.name
-        warp.compile_aot_module(kernel.defined("cuda").module, device=None, arch=80, module_dir=str(folder))
-        assert any(path.stat().st_size for path in folder.iterdir())
-
-
 def test_a_tensor_that_is_not_contiguous_is_refused():
     turned = torch.ones(2, 3).T
-    kernel = compiler.FusedKernel("not_compiled", "float* x, float* y", "", strided=("y",))
-    with pytest.raises(GmmTorchError, match=r"x of kernel not_compiled has shape \(3, 2\).*contiguous"):
-        kernel(2, turned, turned, device=torch.device("cpu"))
-    assert kernel._values((None, turned)) == [0, turned.data_ptr()]
+    with pytest.raises(GmmTorchError, match=r"value of kernel probe has shape \(3, 2\).*contiguous"):
+        compiler.FusedKernel("probe.h", "probe")(2, turned, device=torch.device("cpu"))
+    strided = compiler.FusedKernel("probe.h", "probe", strided=("value",))
+    assert strided._values((turned,)) == [turned.data_ptr()]
+    assert strided._values((None,)) == [0]
 
 
 def test_a_forked_process_makes_its_own_threads():

@@ -18,9 +18,8 @@ from test_live_scans import laser, recorded
 
 from gmmtorch.datasets import load
 from gmmtorch.datasets.base import Ranges
-from gmmtorch.datasets.recordings.ros.bag_reader import Topic
-from gmmtorch.datasets.recordings.ros.bag_topics import CLOUD, LASER, Sensor
-from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree
+from gmmtorch.datasets.ros.bag_reader import CLOUD, LASER, Sensor, Topic
+from gmmtorch.datasets.ros.transform_tree import TransformTree
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.live.bag_player import BagPlayer
 from gmmtorch.live.live_mapper import LiveMapper

@@ -15,9 +15,8 @@ from sensor_bags import BagWriter
 
 from gmmtorch.datasets import load
 from gmmtorch.datasets.base import Ranges
-from gmmtorch.datasets.recordings.ros.bag_reader import BagReader, Topic
-from gmmtorch.datasets.recordings.ros.bag_topics import CLOUD, DEPTH, LASER, Sensor
-from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree
+from gmmtorch.datasets.ros.bag_reader import CLOUD, DEPTH, LASER, BagReader, Sensor, Topic
+from gmmtorch.datasets.ros.transform_tree import TransformTree
 from gmmtorch.errors import told
 from gmmtorch.live import live_scans
 from gmmtorch.live.live_scans import DROPPED, LiveOptions, LiveScans

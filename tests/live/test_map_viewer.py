@@ -127,14 +127,11 @@ def test_first_hit_is_where_a_dense_walk_along_the_ray_enters_an_ellipsoid(maps)
 def test_a_place_has_the_evidence_from_which_its_occupancy_follows(dim, maps):
     built, _ = maps[dim]
     position = built.components().means[3]
-    text = viewer_scene.place_text(built, position, 0.1)
-    theta, hits, misses = (
-        float(re.search(rf"{name} \| (\S+) \|", text)[1]) for name in ("occupancy θ", "hits", "misses")
-    )
+    theta, hits, misses = viewer_scene.place_at(built, position, 0.1)
     given = (torch.tensor(value).double() for value in (hits, misses))
     expected = Query(built.components().cones(), built.query_options).rule.probability(*given, 0.1, dim)
     assert hits > 0
-    assert theta == pytest.approx(float(expected), abs=0.01)
+    assert theta == pytest.approx(float(expected))
 
 
 # -- the page -------------------------------------------------------------------------------------

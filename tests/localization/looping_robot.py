@@ -10,9 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gmmtorch.localization.local_map import Keyframe
 from gmmtorch.localization.location import Location
-from gmmtorch.localization.odometry.local_map import Keyframe
-from gmmtorch.localization.odometry.odometry import Odometry
+from gmmtorch.localization.odometry import Odometry
+from gmmtorch.pose import Pose
 
 N_BEAMS = 180
 ANGLES = np.linspace(-np.pi, np.pi, N_BEAMS, endpoint=False)
@@ -94,9 +95,7 @@ class DriftingOdometry(Odometry):
 
     def _located(self, scan: Keyframe, *_: Any) -> Location:
         number = len(self._poses)
-        turn = torch.tensor(
-            [[math.cos(DRIFT), -math.sin(DRIFT), 0], [math.sin(DRIFT), math.cos(DRIFT), 0], [0, 0, 1]]
-        ).double()
-        step = torch.linalg.inv(self._true[number - 1]) @ self._true[number] @ turn
+        before, now = (Pose.from_matrix(self._true[row]) for row in (number - 1, number))
+        step = before.inverse() @ now @ Pose.from_yaw(DRIFT, [0.0, 0.0])
         covariance = torch.diag(torch.tensor([0.02, 0.02, 0.01]).double().square())
-        return Location(self._poses[-1] @ step, covariance, 1.0, ())
+        return Location((self._poses[-1] @ step).matrix, covariance, 1.0, ())

@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from gmmtorch.localization.odometry.free_space import FreeSpace
+from gmmtorch.localization.local_map import FreeSpace
+from gmmtorch.pose import Pose
 
 HALF = 4.0  # metres from the centre of the room to a wall
 
@@ -23,20 +24,16 @@ def room(dim: int, origin: Tensor) -> Tensor:
     return beams * ranges.amin(1)[:, None]
 
 
-def at(*place: float, turn: float = 0.0) -> Tensor:
-    pose = torch.eye(len(place) + 1).double()
-    pose[:-1, -1] = torch.tensor(place).double()
-    pose[0, 0] = pose[1, 1] = math.cos(turn)
-    pose[1, 0], pose[0, 1] = math.sin(turn), -math.sin(turn)
-    return pose
+def at(*place: float, turn: float = 0.0) -> Pose:
+    return Pose.from_yaw([turn], place)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_true_pose_contradicts_nothing_and_a_shifted_one_does(dim):
     first, now = torch.zeros(dim).double(), torch.tensor([1.0, 0.5, 0.0][:dim]).double()
-    space = FreeSpace([room(dim, first)], at(*first.tolist())[None])
+    space = FreeSpace([room(dim, first)], at(*first.tolist()))
     shifted = now + torch.tensor([1.0, 0.0, 0.0][:dim])
-    poses = torch.stack([at(*now.tolist()), at(*shifted.tolist())])
+    poses = Pose.cat([at(*now.tolist()), at(*shifted.tolist())])
     view = space.view(room(dim, now), poses)
     assert float(view.in_free_space[0]) < 0.01
     assert float(view.looked_through[0]) < 0.01
@@ -52,9 +49,9 @@ def test_a_true_pose_contradicts_nothing_and_a_shifted_one_does(dim):
 def test_points_behind_a_surface_or_outside_the_field_of_view_are_unknown():
     ahead = room(2, torch.zeros(2).double())
     ahead = ahead[ahead[:, 0] > 0]
-    space = FreeSpace([ahead], at(0.0, 0.0)[None])
+    space = FreeSpace([ahead], at(0.0, 0.0))
     points = torch.tensor([[3.0, 0.0], [4.0, 0.5], [6.0, 0.0], [-2.0, 0.0]]).double()
-    view = space.view(points, at(0.0, 0.0)[None])  # in front of the wall, on it, behind it, behind the sensor
+    view = space.view(points, at(0.0, 0.0))  # in front of the wall, on it, behind it, behind the sensor
     assert float(view.in_free_space[0]) == pytest.approx(1 / 4)
     assert float(view.unknown[0]) == pytest.approx(2 / 4)
 
@@ -62,9 +59,9 @@ def test_points_behind_a_surface_or_outside_the_field_of_view_are_unknown():
 def test_shares_do_not_depend_on_the_frame_of_the_world():
     draw = torch.Generator().manual_seed(0)
     scan = room(2, torch.tensor([0.5, -0.3]).double())
-    poses = torch.stack([at(*(torch.rand(2, generator=draw) - 0.5).tolist(), turn=0.3 * i) for i in range(5)])
+    poses = Pose.cat([at(*(torch.rand(2, generator=draw) - 0.5).tolist(), turn=0.3 * i) for i in range(5)])
     there = at(20.0, -7.0, turn=1.1)
-    one = FreeSpace([room(2, torch.zeros(2).double())], at(0.0, 0.0)[None]).view(scan, poses)
-    other = FreeSpace([room(2, torch.zeros(2).double())], there[None]).view(scan, there @ poses)
+    one = FreeSpace([room(2, torch.zeros(2).double())], at(0.0, 0.0)).view(scan, poses)
+    other = FreeSpace([room(2, torch.zeros(2).double())], there).view(scan, there @ poses)
     for a, b in zip(one, other, strict=True):
         assert torch.allclose(a, b, atol=0.01)

@@ -17,11 +17,12 @@ from torch import Tensor
 from gmmtorch.datasets import Dataset, Ranges, load
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.localization import Odometry, Tracker, with_odometry
-from gmmtorch.localization.odometry.odometry import Trajectory
-from gmmtorch.localization.rigid_motions import continued, turns
-from gmmtorch.localization.scan_locations import locate_scans
-from gmmtorch.localization.trajectories import absolute_trajectory_error
+from gmmtorch.localization.location import continued
+from gmmtorch.localization.odometry import Trajectory
+from gmmtorch.localization.tracker import locate_scans
+from gmmtorch.localization.trajectory_errors import absolute_trajectory_error
 from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 
 TURN, STEP, SECONDS, RATE = math.radians(60), 0.3, 0.5, 100
@@ -36,22 +37,21 @@ def test_the_velocity_in_the_frame_of_the_sensor_continues(dim, ratio):
     velocity = torch.tensor([0.8, -0.3, 0.2]).double()[:dim]
     spins = [torch.tensor(spin).double()[:free] for spin in ([0.5, 0.2, -0.4], [-1.7, 0.3, 0.6], [0.0] * 3)]
 
-    def driven(spin: Tensor, seconds: float) -> Tensor:
+    def driven(spin: Tensor, seconds: float) -> Pose:
         """Small steps with a constant velocity and spin."""
         n = 20_000
-        step = torch.eye(dim + 1).double()
-        step[:dim, :dim] = turns(spin[None] * seconds / n)[0]
-        step[:dim, dim] = turns(spin[None] * seconds / n / 2)[0] @ velocity * seconds / n
-        return torch.linalg.matrix_power(step, n)
+        shift = Pose.from_turn(spin * seconds / n / 2).rotation @ velocity * seconds / n
+        step = Pose.from_turn(spin * seconds / n, shift)
+        return Pose.from_matrix(torch.linalg.matrix_power(step.matrix, n))
 
     for before in spins:
         for now in spins:
             expected = driven(now / ratio, ratio)
-            found = continued(expected[:dim, :dim].clone(), driven(before, 1.0), ratio)
-            torch.testing.assert_close(found, expected, rtol=0, atol=1e-8)
-    still = continued(expected[:dim, :dim].clone(), None)
-    assert torch.equal(still[:dim, :dim], expected[:dim, :dim])
-    assert still[:dim, dim].tolist() == [0.0] * dim
+            found = continued(expected.rotation, driven(before, 1.0), ratio)
+            torch.testing.assert_close(found.matrix, expected.matrix, rtol=0, atol=1e-8)
+    still = continued(expected.rotation, None)
+    assert torch.equal(still.rotation, expected.rotation)
+    assert still.translation.tolist() == [0.0] * dim
 
 
 def test_a_rotation_of_another_shape_or_with_nan_is_named():
@@ -190,7 +190,8 @@ def test_a_tracker_turns_with_the_rotation_and_keeps_its_velocity():
     for number in (0, 1):
         points = source.scans[number].transformed(torch.linalg.inv(source.pose(number))).points
         poses.append(tracker.locate(points).pose)
-    turn = turns(torch.tensor([[0.7]]).double())[0]
+    turn = Pose.from_turn(torch.tensor([0.7]).double()).rotation
     found = tracker.locate(torch.zeros(0, 2), turn)
-    expected = poses[1] @ continued(turn, torch.linalg.solve(poses[0], poses[1]))
+    last = Pose.from_matrix(torch.linalg.solve(poses[0], poses[1]))
+    expected = poses[1] @ continued(turn, last).matrix
     torch.testing.assert_close(found.pose, expected, rtol=0, atol=1e-9)

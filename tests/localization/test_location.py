@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gmmtorch.localization.location import Location, composed
-from gmmtorch.localization.rigid_motions import turns
+from gmmtorch.pose import Pose
 
 
 def drawn(location: Location, n: int, generator: torch.Generator) -> torch.Tensor:
@@ -15,7 +15,7 @@ def drawn(location: Location, n: int, generator: torch.Generator) -> torch.Tenso
     root = torch.linalg.cholesky(location.covariance)
     errors = torch.randn(n, len(root), dtype=torch.float64, generator=generator) @ root.T
     poses = location.pose.repeat(n, 1, 1)
-    poses[:, :dim, :dim] = turns(errors[:, dim:]) @ location.pose[:dim, :dim]
+    poses[:, :dim, :dim] = Pose.from_turn(errors[:, dim:]).rotation @ location.pose[:dim, :dim]
     poses[:, :dim, dim] += errors[:, :dim]
     return poses
 
@@ -28,7 +28,7 @@ def test_errors_of_a_composed_location_have_its_covariance(dim):
     for _ in range(2):
         pose = torch.eye(dim + 1, dtype=torch.float64)
         angles = torch.randn(1, free - dim, dtype=torch.float64, generator=generator)
-        pose[:dim, :dim] = turns(angles)[0]
+        pose[:dim, :dim] = Pose.from_turn(angles[0]).rotation
         pose[:dim, dim] = 5 * torch.randn(dim, dtype=torch.float64, generator=generator)
         root = 0.01 * torch.randn(free, free, dtype=torch.float64, generator=generator)
         locations.append(Location(pose, root @ root.T, 0.9, ()))

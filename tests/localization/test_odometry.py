@@ -9,10 +9,11 @@ from torch import Tensor
 from gmmtorch.datasets import load
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.localization import Odometry, with_odometry
-from gmmtorch.localization.odometry.local_map import Expectation, LocalMap
-from gmmtorch.localization.odometry.odometry import _RULE, _scaled
-from gmmtorch.localization.registration.alignment import align
-from gmmtorch.localization.trajectories import absolute_trajectory_error
+from gmmtorch.localization.alignment import align
+from gmmtorch.localization.local_map import Expectation, LocalMap
+from gmmtorch.localization.odometry import _RULE
+from gmmtorch.localization.trajectory_errors import absolute_trajectory_error
+from gmmtorch.pose import Pose
 
 N_2D, N_3D = 14, 6
 
@@ -94,10 +95,8 @@ def test_a_room_with_equal_sides_leaves_the_heading_in_doubt():
     room = torch.cat([torch.stack(w, 1) for w in ((side, wall), (side, -wall), (wall, side), (-wall, side))])
     frame = Odometry()._scan(room)
     local = LocalMap([frame], 0.5, _RULE)
-    between = torch.tensor(
-        [[math.cos(0.8), -math.sin(0.8), 0], [math.sin(0.8), math.cos(0.8), 0], [0, 0, 1]]
-    ).double()
-    location = local.locate(frame, Expectation(between[None], 0.3, 0.2, 0.95))
+    between = Pose.from_yaw([0.8], [0.0, 0.0])
+    location = local.locate(frame, Expectation(between, 0.3, 0.2, 0.95))
     assert "another pose explains the scan as well" in location.doubts
     heading = math.atan2(location.pose[1, 0], location.pose[0, 0])
     assert heading == pytest.approx(math.pi / 2, abs=0.02)  # 45° lies between; 0.8 rad is nearer to this one
@@ -118,9 +117,8 @@ def test_the_first_search_in_3d_reaches_past_the_nearest_maximum(seed):
     before, after = wall(draw, 4000, 8, 1), wall(draw, 1000, 3, 1)
     before, after = (points[(points[:, 0].abs() > 0.2) | (points[:, 1] > 2.9)] for points in (before, after))
     local = LocalMap([Odometry()._scan(before)], 0.5, _RULE)
-    predicted = torch.eye(4).double()
-    predicted[0, 3] = 0.75
-    location = local.locate(Odometry()._scan(after), Expectation(predicted[None], 0.3, 0.2, 0.95))
+    predicted = Pose.from_yaw([0.0], [0.75, 0.0, 0.0])
+    location = local.locate(Odometry()._scan(after), Expectation(predicted, 0.3, 0.2, 0.95))
     assert location.found
     assert float(location.pose[:3, 3].norm()) < 0.05
 
@@ -140,11 +138,10 @@ def test_a_pose_that_slid_along_a_wall_returns_to_where_its_post_is(dim, shift):
     draw = torch.Generator().manual_seed(0)
     local = LocalMap([Odometry()._scan(wall_and_post(draw, 2000, 6, dim))], 0.5, _RULE)
     scan = Odometry()._scan(wall_and_post(draw, 600, 3, dim))
-    start = torch.eye(dim + 1).double()[None]
-    start[0, 0, dim] = shift
-    expected = Expectation(torch.eye(dim + 1).double()[None], 0.3, 0.2, 0.95)
-    climbed = align(scan.points, local._targets[-1], local._motions(start), 15).motions
-    assert float((local._poses(climbed)[0, :dim, dim]).norm()) > 0.3
+    start = Pose.from_yaw([0.0], [shift, 0.0, 0.0][:dim])
+    expected = Expectation(Pose.identity(dim, 1), 0.3, 0.2, 0.95)
+    climbed = align(scan.points, local._targets[-1], start.shifted(-local._center), 15).motions
+    assert float(climbed.orthonormal().shifted(local._center).translation.norm()) > 0.3
     location = local._climbed(scan, expected, start, local._targets[-1:]).location
     assert location.found
     assert float(location.pose[:dim, dim].norm()) < 0.05
@@ -155,10 +152,10 @@ def test_a_small_gain_of_evidence_does_not_move_a_pose_from_the_largest_score():
     draw = torch.Generator().manual_seed(0)
     local = LocalMap([Odometry()._scan(wall_and_post(draw, 2000, 6, 3))], 0.5, _RULE)
     scan = Odometry()._scan(wall_and_post(draw, 600, 3, 3))
-    start = torch.eye(4).double()[None]
-    climbed = align(scan.points, local._targets[-1], local._motions(start), 15).motions
+    start = Pose.identity(3, 1)
+    climbed = align(scan.points, local._targets[-1], start.shifted(-local._center), 15).motions
     location = local._climbed(scan, Expectation(start, 0.3, 0.2, 0.95), start, local._targets[-1:]).location
-    assert torch.equal(location.pose, local._poses(climbed)[0])
+    assert torch.equal(location.pose, climbed.orthonormal().shifted(local._center)[0].matrix)
 
 
 @pytest.mark.parametrize("seed", [0, 2])
@@ -171,7 +168,7 @@ def test_a_box_that_moved_does_not_outweigh_the_expected_motion(seed):
         points[(points[:, 0] - place).abs() < 0.1, 1] -= 0.3
     after[:300, 1] = 3 - 0.3 * torch.rand(300, generator=draw)
     local = LocalMap([Odometry()._scan(before)], 0.5, _RULE)
-    expected = Expectation(torch.eye(3).double()[None], 0.3, 0.2, 0.95)
+    expected = Expectation(Pose.identity(2, 1), 0.3, 0.2, 0.95)
     location = local.locate(Odometry()._scan(after), expected)
     assert location.found
     assert float(location.pose[:2, 2].norm()) < 0.05
@@ -251,17 +248,6 @@ def test_a_clock_that_jumps_does_not_scale_the_motion():
     odometry = Odometry()
     ratios = [odometry._clock(stamp) for stamp in (0.0, 1.0, 3.0, 2.0, 3.0, math.nan, 5.0, 1e9, None)]
     assert ratios == [1.0, 1.0, 2.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0]
-
-
-@pytest.mark.parametrize("dim", [2, 3])
-def test_a_scaled_motion_taken_twice_is_the_motion(dim):
-    turn = torch.zeros(dim, dim).double()
-    turn[1, 0], turn[0, 1] = 0.6, -0.6
-    motion = torch.eye(dim + 1).double()
-    motion[:dim, :dim] = torch.linalg.matrix_exp(turn)
-    half = _scaled(motion, 0.5)
-    assert torch.allclose(half @ half, motion)
-    assert _scaled(motion, 1.0) is motion
 
 
 def test_bad_arguments_are_named():

@@ -11,8 +11,7 @@ from torch import Tensor
 from gmmtorch.experiments.evaluation import queries
 from gmmtorch.experiments.evaluation.metrics import scores
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.tile_merging import merge, tile_files
-from gmmtorch.mapping.tiles import TiledMap
+from gmmtorch.mapping.tiles import TiledMap, merge, tile_files
 from gmmtorch.scan import Scan
 
 SIDE = 10.0

@@ -14,9 +14,9 @@ from scipy import optimize, stats
 from scipy.spatial.transform import Rotation
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mapping.clearance import Body, clearance, collision_probability, expected_returns
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping.surfaces import Body, clearance, collision_probability, expected_returns
 
 dims = pytest.mark.parametrize("dim", [2, 3])
 

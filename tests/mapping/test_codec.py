@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import zlib
 from dataclasses import replace
 
 import numpy as np
@@ -15,9 +16,10 @@ from mapping.map_cases import assert_same_components
 from mapping.random_components import random_components, rotations
 
 from gmmtorch.datasets import load
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.experiments.evaluation import metrics, queries
 from gmmtorch.mapping.codec import component_batch, lattice
+from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Code, best_code, zigzag
 from gmmtorch.mapping.codec.component_batch import decode, encode
 from gmmtorch.mapping.codec.quantization import COUNT_ERROR, ORIGIN_STEP, quantized, spatial_order
 from gmmtorch.mapping.components import Components
@@ -303,13 +305,6 @@ def test_a_component_with_one_origin_takes_few_bytes(dim, most):
     assert len(encode(components)) - len(encode(ordered)) > 0.7 * 300  # log2(300!)/300 is 6.8 bits
 
 
-@dims
-def test_a_small_batch_is_short(dim):
-    assert len(encode(random_components(dim, k=1, n_origins=1, max_sightings=1))) <= 80
-    fits = random_components(dim, k=200, extent=5.0, max_sightings=1).selected(torch.arange(90))
-    assert len(encode(fits)) <= 1200
-
-
 # -- a real map ------------------------------------------------------------------------------------------
 
 
@@ -341,3 +336,150 @@ def test_quantization_of_a_real_map_keeps_its_occupancy(real_data):
     assert abs(float(np.mean(losses))) < 1e-3
     assert len(encode(learned)) <= 11 * len(learned)
     assert_same_components(decode(encode(learned)), quantized(learned))
+
+
+# -- damaged batches -----------------------------------------------------------------------------------
+
+
+def sealed(body: bytes) -> bytes:
+    """The body with a valid checksum."""
+    return body + zlib.crc32(body).to_bytes(4, "little")
+
+
+@pytest.fixture(scope="module")
+def sound() -> bytes:
+    return encode(random_components(3, k=12))
+
+
+def test_every_cut_and_every_flipped_bit_is_refused(sound):
+    for length in range(len(sound)):
+        with pytest.raises(DataError):
+            decode(sound[:length])
+    for bit in range(8 * len(sound)):
+        damaged = bytearray(sound)
+        damaged[bit // 8] ^= 1 << bit % 8
+        with pytest.raises(DataError):
+            decode(bytes(damaged))
+
+
+def test_bytes_after_a_batch_are_refused(sound):
+    for longer in (sound + b"\0", sealed(sound[:-4] + b"\0"), sealed(sound[:-4] + b"\1\2\3")):
+        with pytest.raises(DataError):
+            decode(longer)
+
+
+def test_another_version_is_refused_by_name(sound):
+    with pytest.raises(DataError, match="version 9"):
+        decode(sealed(b"\x09" + sound[1:-4]))
+
+
+@settings(max_examples=120)
+@given(
+    changes=st.lists(
+        st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), min_size=1, max_size=4
+    ),
+    cut=st.sampled_from([0, 0, 1, 8]),
+)
+def test_forged_batches_are_refused_or_decode_to_valid_components(sound, changes, cut):
+    body = bytearray(sound[:-4])
+    for place, value in changes:
+        body[1 + int(place * (len(body) - 1))] = value
+    try:
+        found = decode(sealed(bytes(body[: len(body) - cut])))
+    except DataError:
+        return
+    found.checked()
+    assert bool((found.seen_count >= 0).all())
+    assert_same_components(decode(encode(found)), quantized(found))
+
+
+@pytest.mark.parametrize("k", [2**20, 2**40, 2**61])
+@pytest.mark.parametrize("what", ["components", "origins"])
+def test_forged_array_lengths_allocate_no_memory(k, what):
+    writer = BitWriter()
+    for number in (3, k, 1) if what == "components" else (3, 1, k):
+        writer.number(number)
+    with pytest.raises(DataError, match="announced"):
+        decode(sealed(b"\x01" + writer.to_bytes() + bytes(2000)))
+
+
+# -- bit streams ---------------------------------------------------------------------------------------
+
+
+whole_numbers = st.lists(st.integers(-(2**59), 2**59) | st.integers(-9, 9), max_size=40)
+
+
+@settings(max_examples=100)
+@given(values=whole_numbers)
+def test_integer_columns_are_decoded_exactly(values):
+    column = np.array(values, np.int64)
+    writer = BitWriter()
+    writer.column(column)
+    reader = BitReader(writer.to_bytes())
+    assert reader.column(len(column)).tolist() == values
+    reader.finish()
+
+
+@given(values=st.lists(st.integers(-(2**40), 2**40)), scales=st.data())
+def test_scaled_and_single_numbers_are_decoded(values, scales):
+    scale = np.array(
+        [max(abs(v).bit_length() + scales.draw(st.integers(-3, 3)), 0) for v in values], np.int64
+    )
+    writer = BitWriter()
+    writer.scaled(np.array(values, np.int64), scale)
+    small = zigzag(np.array(values, np.int64)) % 1000
+    writer.rice_column(small)
+    for value in values:
+        writer.number(value)
+    reader = BitReader(writer.to_bytes())
+    assert reader.scaled(scale).tolist() == values
+    assert reader.rice_column(len(values)).tolist() == [
+        int(v) for v in zigzag(np.array(values, np.int64)) % 1000
+    ]
+    assert [reader.number() for _ in values] == values
+    reader.finish()
+
+
+def test_rice_codes_equal_those_by_hand():
+    """With 2 low bits, 5 = 1·4 + 01 is 0 1 01 and 2 = 0·4 + 10 is 1 10."""
+    writer = BitWriter()
+    writer.rice(np.array([5, 2]), 2)
+    assert writer.to_bytes() == bytes([0b011_01_10_0])
+
+
+@pytest.mark.parametrize(
+    ("values", "code"),
+    [
+        ([7] * 50, Code.FIXED),
+        (list(range(1000, 1050)), Code.DIFFERENCES),
+        ([0] * 40 + [1, 2, 0, 30], Code.RICE),
+        ([3, 0, 2, 1] * 12, Code.FIXED),
+    ],
+)
+def test_the_shortest_column_code_is_chosen(values, code):
+    column = np.array(values, np.int64)
+    coding = best_code(column)
+    assert coding.code is code
+    writer = BitWriter()
+    writer.column(column)
+    assert len(writer.to_bytes()) <= math.ceil((8 + 70 + coding.n_bits) / 8)
+
+
+@given(
+    ends=st.tuples(*[st.sampled_from([0, 1 << 53, 1 << 60, (1 << 61) - 1, -(1 << 61), -(1 << 62) + 1])] * 2),
+    n=st.integers(1, 40),
+    rises=st.booleans(),
+)
+def test_every_encodable_column_is_decoded(ends, n, rises):
+    """Alternating extreme values overflow the sum of differences, however few bits they take."""
+    column = np.array([ends[number % 2] for number in range(n)], np.int64)
+    column = np.sort(column) if rises else column
+    writer = BitWriter()
+    try:
+        writer.column(column)
+    except InvalidArgumentError:
+        assert max(map(abs, ends)) >= 1 << 60
+        return
+    reader = BitReader(writer.to_bytes())
+    assert reader.column(n).tolist() == column.tolist()
+    reader.finish()

@@ -19,7 +19,7 @@ from gmmtorch.errors import GmmTorchError
 from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.association import summed
+from gmmtorch.mapping.learning.novelty import summed
 from gmmtorch.mapping.query_options import METHODS
 from gmmtorch.occupancy.grid import VoxelGrid
 

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError
 from gmmtorch.files import pack_tensors, read_tensors
-from gmmtorch.mapping.codec import map_file as storage
+from gmmtorch.mapping.codec import component_batch as storage
 from gmmtorch.mapping.codec.quantization import numbered
 from gmmtorch.mapping.components import UNNUMBERED
 from gmmtorch.mapping.gaussian_map import GaussianMap
@@ -124,7 +124,7 @@ def test_file_size_equals_the_length_of_the_written_file(dim, k, n_known, seed, 
     options = QueryOptions(calibration=Calibration.prior(5.0))
     rule, map_settings = IncrementalRule(), storage.MapSettings(0.1, "point", codec, 3, options)
     size = storage.file_size(components, rule, map_settings, next_number=40)
-    written = storage.to_bytes(numbered(components, 3, 40)[0], rule, map_settings, 40)
+    written = storage.map_bytes(numbered(components, 3, 40)[0], rule, map_settings, 40)
     assert size == len(written) + 48  # room for settings that change
 
 

@@ -13,14 +13,12 @@ from mapping.random_components import random_components
 
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, MissingDataError
 from gmmtorch.files import pack_tensors, read_tensors
-from gmmtorch.mapping.codec.map_file import MapSettings
+from gmmtorch.mapping.codec.component_batch import MapSettings
 from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.query_options import QueryOptions
-from gmmtorch.mapping.tile_index import INDEX
-from gmmtorch.mapping.tile_merging import canonical, merge, tile_files
-from gmmtorch.mapping.tiles import TiledMap
+from gmmtorch.mapping.tiles import INDEX, TiledMap, canonical, merge, tile_files
 from gmmtorch.occupancy.calibrator import Calibration
 
 SIDE = 10.0

@@ -17,7 +17,7 @@ from gmmtorch.mixture.em.partition import FlatnessRule, partition
 from gmmtorch.mixture.estimators.sensor_model import DepthCameraModel, LaserModel, LidarModel, SensorModel
 from gmmtorch.mixture.pruning import expected_density, support_density
 from gmmtorch.simulation import RangeSensor, laser_2d, simulate_scan, spinning_lidar
-from gmmtorch.simulation.sensors.range_sensors import depth_camera
+from gmmtorch.simulation.sensors import depth_camera
 
 
 def tensor(*rows: object) -> Tensor:

@@ -94,7 +94,7 @@ def test_result_is_at_least_as_good_as_the_last_bound(seed, dim, k, n_candidates
     found, owner, candidates = run_truncated(
         rows_of(points, weight), nearest(points, parameters.means), parameters, setup
     )
-    joint = by_type.Factors(found.parameters, "full").direct()(points).T
+    joint = em.log_joint(points, found.parameters)
     allowed = torch.full_like(joint, -torch.inf).scatter(1, candidates[owner], 0.0)
     bound, score = (torch.logsumexp(j, 1) @ weight / weight.sum() for j in (joint + allowed, joint))
     assert found.lower_bounds[-1] - 1e-7 <= float(bound) <= float(score) + 1e-12
@@ -211,7 +211,7 @@ def test_components_that_become_thin_switch_to_float64(monkeypatch):
     found, *_ = run_truncated(rows, owner, parameters, Settings(1e-6, 0.0, 2))
     assert spy.dtypes == [torch.float32, torch.float64]
     for at, bound in zip(spy.given, found.lower_bounds, strict=True):
-        score = torch.logsumexp(by_type.Factors(at, "full").direct()(points), 0).mean()
+        score = torch.logsumexp(em.log_joint(points, at), 1).mean()
         assert bound == pytest.approx(float(score), abs=1e-4)
     thinnest = torch.linalg.eigvalsh(found.parameters.covariances)[:, 0]
     torch.testing.assert_close(thinnest, torch.full_like(thinnest, 1.01e-6), rtol=0.01, atol=0)

@@ -10,8 +10,8 @@ from occupancy.cone_cases import random_cones
 
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.evidence import Evidence
-from gmmtorch.occupancy.forms.cone.cone_evidence import cone_evidence
-from gmmtorch.occupancy.forms.flux.box_flux import box_flux, flux_evidence
+from gmmtorch.occupancy.forms.cone import cone_evidence
+from gmmtorch.occupancy.forms.flux import box_flux, flux_evidence
 from gmmtorch.occupancy.forms.monte_carlo import sample_rays
 from gmmtorch.occupancy.forms.point import PointForm
 from gmmtorch.occupancy.grid import VoxelGrid

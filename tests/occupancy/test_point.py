@@ -1,5 +1,8 @@
 """Point form: formulas by quadrature, rays by simulation, invariances and gradients."""
 
+from __future__ import annotations
+
+import itertools
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,13 +17,23 @@ from scipy.integrate import quad
 from scipy.stats import multivariate_normal
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, NumericalError
+from gmmtorch.errors import InvalidArgumentError, MemoryLimitError, NumericalError
+from gmmtorch.kernels.choice import kernels
 from gmmtorch.kernels.evidence.point_evidence import pair_evidence
 from gmmtorch.occupancy import cone_index
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.evidence import occupancy_probability
 from gmmtorch.occupancy.forms import point
-from gmmtorch.occupancy.forms.point import PointEvidence, PointForm, point_evidence
+from gmmtorch.occupancy.forms.point import (
+    KeptEvidence,
+    PointEvidence,
+    PointForm,
+    expected_range,
+    first_hit,
+    hit_probability,
+    point_evidence,
+)
+from gmmtorch.occupancy.grid import VoxelGrid
 
 
 def near_rays(cones: Cones, n: int, seed: int, spread: float = 1.0) -> Tensor:
@@ -185,13 +198,6 @@ def test_point_evidence_does_not_depend_on_order_and_chunks(monkeypatch):
     same(point_evidence(cones, points.float().double(), 0.05), form(points.float()))
 
 
-@pytest.mark.slow
-def test_compiled_evidence_equals_eager_evidence():
-    cones = random_cones(3, 60, 0, room=True)
-    points = near_rays(cones, 500, 0)
-    same(PointForm(cones, 0.05, compiled=True)(points), PointForm(cones, 0.05)(points))
-
-
 def test_evidence_is_invariant_under_right_angle_rotations():
     cones = random_cones(3, 20, 0)
     points = near_rays(cones, 200, 0)
@@ -311,3 +317,207 @@ def test_gradients_are_finite(dim, resolution):
     evidence = PointForm(Cones(*fields, cones.max_range), resolution)(points)
     gradients = torch.autograd.grad(occupancy_probability(*evidence).sum(), [points, *fields])
     assert all(bool(torch.isfinite(gradient).all()) for gradient in gradients)
+
+
+# -- evidence that is kept -----------------------------------------------------------------------------
+
+
+H = 0.3
+
+
+def taken(cones: Cones, rows: torch.Tensor) -> Cones:
+    return Cones(*(part[rows] for part in cones))
+
+
+def joined(*parts: Cones) -> Cones:
+    return Cones(*(torch.cat(fields) for fields in zip(*parts, strict=True)))
+
+
+def moved(cones: Cones, x: float) -> Cones:
+    shift = torch.zeros(cones.dim, dtype=torch.float64)
+    shift[0] = x
+    return cones._replace(means=cones.means + shift, origins=cones.origins + shift)
+
+
+def states(dim: int) -> list[Cones]:
+    """A map that grows, also below its lowest corner, loses and changes cones, and is emptied."""
+    base, far = random_cones(dim, 40, 0, room=True), moved(random_cones(dim, 10, 1, room=True), -9.0)
+    grown = joined(base, far)
+    without = taken(grown, torch.arange(5, 50))
+    counted = without._replace(counts=without.counts * (1 + (torch.arange(45) == 7)))
+    swapped = taken(counted, torch.cat([torch.tensor([9]), torch.arange(9), torch.arange(10, 45)]))
+    doubled = joined(swapped, taken(swapped, torch.arange(3)))
+    none = taken(base, torch.arange(0))
+    remote = moved(taken(base, torch.arange(4)), 1e8)
+    return [base, grown, without, counted, counted, swapped, doubled, none, joined(base, remote), base]
+
+
+def box(dim: int, low: float, high: float) -> VoxelGrid:
+    return VoxelGrid.covering([low] * dim, [high] * dim, H)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("choice", ["fused", "torch"])
+def test_kept_evidence_is_that_of_all_cones(dim, choice):
+    if choice == "fused":
+        pytest.importorskip("warp", reason="needs the extra [fast]: warp-lang")
+    tolerance = 0.0 if choice == "fused" else 1e-12
+    kept = KeptEvidence(H)
+    with kernels(choice):
+        for number, cones in enumerate(states(dim)):
+            grid = box(dim, *((-0.5, 6.5), (-2.0, 5.0), (0.0, 7.0))[number // 2 % 3])
+            found = kept.update(cones, grid)
+            expected = PointForm(cones, H)(kept.centers(grid))
+            for values, wanted in zip(found, expected, strict=True):
+                torch.testing.assert_close(values.flatten(), wanted, rtol=tolerance, atol=tolerance)
+
+
+def test_only_cells_near_changed_cones_are_evaluated():
+    near, far = random_cones(2, 40, 0, room=True), moved(random_cones(2, 40, 1, room=True), 30.0)
+    grid, kept = VoxelGrid.covering([-1.0, -1.0], [37.0, 7.0], H), KeptEvidence(H)
+    kept.update(joined(near, far), grid)
+    everything = kept.n_evaluated
+    kept.update(joined(near, far), grid)
+    assert kept.n_evaluated == 0
+    kept.update(joined(near, taken(far, torch.arange(39))), grid)
+    assert 0 < kept.n_evaluated < everything / 2
+
+
+def test_cells_off_the_lattice_are_refused():
+    with pytest.raises(InvalidArgumentError, match="multiples of resolution"):
+        KeptEvidence(H).update(random_cones(2, 3, 0), VoxelGrid((0.1, 0.0), H, (4, 4)))
+
+
+# -- queries along rays --------------------------------------------------------------------------------
+
+
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=8))
+def test_first_hit_equals_enumeration_of_all_maps(occupancy):
+    """Every map of the cells, weighted by its probability, says where the beam ends."""
+    ends, none = [0.0] * len(occupancy), 0.0
+    for cells in itertools.product([False, True], repeat=len(occupancy)):
+        weight = 1.0
+        for full, o in zip(cells, occupancy, strict=True):
+            weight *= o if full else 1 - o
+        if any(cells):
+            ends[cells.index(True)] += weight
+        else:
+            none += weight
+    probability, no_hit = first_hit(torch.tensor(occupancy, dtype=torch.float64))
+    assert probability.tolist() == pytest.approx(ends, abs=1e-12)
+    assert float(no_hit) == pytest.approx(none, abs=1e-12)
+
+
+def wall(dim: int, distance: float, noise: float, counts: float = 5e5) -> Cones:
+    """A wall across the first axis seen from two metres around the origin, tiled by components."""
+    axis = torch.arange(-8, 9, dtype=torch.float64) * 0.5
+    aside = torch.cartesian_prod(*[axis] * (dim - 1)).view(-1, dim - 1)
+    n = aside.shape[0]
+    deviations = torch.tensor([noise] + [0.5] * (dim - 1), dtype=torch.float64)
+    return Cones(
+        torch.cat([torch.full((n, 1), distance, dtype=torch.float64), aside], 1),
+        torch.diag(deviations**2).repeat(n, 1, 1),
+        torch.zeros(n, dim, dtype=torch.float64),
+        torch.full((n,), counts, dtype=torch.float64),
+        torch.zeros(n, dtype=torch.bool),
+    )
+
+
+def fan(dim: int, n: int = 9) -> torch.Tensor:
+    angle = torch.linspace(-0.4, 0.4, n, dtype=torch.float64)
+    rest = [torch.full_like(angle, 0.1)] * (dim - 2)
+    return torch.stack([angle.cos(), angle.sin(), *rest], 1)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("distance", [2.0, 3.3])
+def test_beams_end_where_a_simulated_scan_does(dim, distance):
+    """Against a thousand noisy scans of the wall: where they end, on average and cell by cell."""
+    noise, h = 0.02, 0.1
+    directions = fan(dim)
+    true = distance * directions.norm(dim=1) / directions[:, 0]
+    generator = torch.Generator().manual_seed(0)
+    scans = true + noise * torch.randn(1000, len(true), generator=generator, dtype=torch.float64)
+    origins = torch.zeros_like(directions)
+    hits = hit_probability(wall(dim, distance, noise), origins, directions, 5.0, h)
+    found = expected_range(wall(dim, distance, noise), origins, directions, 5.0, h)
+    assert float((found.mean - scans.mean(0)).abs().max()) < h
+    assert float(hits.no_hit.max()) < 0.02
+    near = (hits.depth - true[:, None]).abs() < 1.5 * h + 2 * noise
+    measured = ((hits.depth[:, None, None] - scans).abs() < h / 2).double().mean(1)  # (S, R)
+    assert float(measured.sum(0).min()) > 0.99
+    assert float((hits.probability * near).sum(1).min()) > 0.9
+    assert float((measured.T * near).sum(1).min()) > 0.99
+
+
+def test_a_beam_does_not_end_before_the_wall():
+    found = expected_range(wall(3, 3.0, 0.02), torch.zeros(9, 3), fan(3), 2.5, 0.1)
+    assert float(found.no_hit.min()) > 0.98
+    assert float((found.mean - 2.5).abs().max()) < 0.03
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_hit_probability_and_expected_range_agree(dim):
+    cones = random_cones(dim, 30, 0)
+    generator = torch.Generator().manual_seed(0)
+    origins = 6 * torch.rand(40, dim, generator=generator, dtype=torch.float64)
+    directions = torch.randn(40, dim, generator=generator, dtype=torch.float64)
+    hits = hit_probability(cones, origins, directions, 3.05, 0.1)
+    assert hits.probability.shape == (40, 31)
+    total = hits.probability.sum(1) + hits.no_hit
+    torch.testing.assert_close(total, torch.ones_like(total))
+    found = expected_range(PointForm(cones, 0.1), origins, 7 * directions, 3.05, 0.1)
+    mean = (hits.probability * hits.depth.clamp_max(3.05)).sum(1) + 3.05 * hits.no_hit
+    torch.testing.assert_close(found.mean, mean)
+    torch.testing.assert_close(found.no_hit, hits.no_hit)
+
+
+def test_occupancy_along_a_beam_is_that_of_the_point_form():
+    cones = random_cones(3, 20, 1)
+    origin, direction = torch.tensor([[1.0, 2.0, 3.0]]), torch.tensor([[0.0, 3.0, 4.0]])
+    hits = hit_probability(cones, origin, direction, 1.0, 0.25, prior=0.5)
+    assert hits.depth.tolist() == [0.125, 0.375, 0.625, 0.875]
+    points = origin.double() + hits.depth[:, None] * direction.double() / 5
+    o = occupancy_probability(*PointForm(cones, 0.25)(points), 0.5)
+    expected, none = first_hit(o)
+    torch.testing.assert_close(hits.probability[0], expected)
+    torch.testing.assert_close(hits.no_hit[0], none)
+
+
+def test_unobserved_space_stops_a_beam_with_probability_half_per_cell():
+    hits = hit_probability(random_cones(2, 1, 0), torch.full((1, 2), 1e6), torch.ones(1, 2), 0.4, 0.1)
+    assert hits.probability[0].tolist() == pytest.approx([1 / 2, 1 / 4, 1 / 8, 1 / 16])
+    assert float(hits.no_hit) == pytest.approx(1 / 16)
+
+
+def test_expected_range_has_gradients():
+    cones = wall(2, 2.0, 0.05, counts=100.0)
+    form = PointForm(cones, 0.2)
+    origins = torch.tensor([[0.1, 0.2], [0.3, -0.1]], dtype=torch.float64, requires_grad=True)
+    directions = torch.tensor([[1.0, 0.1], [1.0, -0.3]], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(
+        lambda o, d: expected_range(form, o, d, 3.0, 0.2).mean, (origins, directions), atol=1e-4, rtol=1e-3
+    )
+
+
+def test_no_rays_give_empty_results():
+    none = torch.zeros(0, 3)
+    hits = hit_probability(random_cones(3, 2, 0), none, none, 1.0, 0.1)
+    assert hits.probability.shape == (0, 10)
+    assert expected_range(random_cones(3, 2, 0), none, none, 1.0, 0.1).mean.shape == (0,)
+
+
+def test_invalid_rays_are_refused():
+    cones, one = random_cones(3, 2, 0), torch.ones(1, 3)
+    for origins, directions in ((one, 0 * one), (one / 0, one), (one, one * float("nan")), (one, one[:, :2])):
+        with pytest.raises(InvalidArgumentError, match=r"direction|origin"):
+            expected_range(cones, origins, directions, 1.0, 0.1)
+    for max_range in (0, -1, float("inf"), float("nan")):
+        with pytest.raises(InvalidArgumentError, match="max_range"):
+            hit_probability(cones, one, one, max_range, 0.1)
+    with pytest.raises(InvalidArgumentError, match="resolution"):
+        hit_probability(PointForm(cones, 0.2), one, one, 1.0, 0.1)
+    with pytest.raises(MemoryLimitError, match="resolution"):
+        expected_range(cones, one, one, 1e7, 0.001)
+    with pytest.raises(MemoryLimitError, match="fewer rays"):
+        hit_probability(cones, one.expand(100_000, 3), one.expand(100_000, 3), 1e3, 0.05)

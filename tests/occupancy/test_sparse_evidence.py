@@ -15,8 +15,7 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import BYTES_PER_CELL, VoxelGrid
-from gmmtorch.occupancy.voxels.boxes import Box
-from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
+from gmmtorch.occupancy.voxels.cells import Box, CellEvidence
 from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 
 RESOLUTION = 0.125

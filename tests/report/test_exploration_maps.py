@@ -14,9 +14,8 @@ from matplotlib.colors import to_rgb
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.report.ellipsoids import cut_away
 from gmmtorch.report.map_images import MapImage, highest_occupancy
-from gmmtorch.report.paths import smooth_path
 from gmmtorch.report.scene_renderer import Camera, Canvas, render
-from gmmtorch.report.scenes import mixture_scene_figure
+from gmmtorch.report.scenes import mixture_scene_figure, smooth_path
 from gmmtorch.report.style import UNKNOWN
 from gmmtorch.team.exploration.planning.primitives import Dynamics, Primitives
 from gmmtorch.team.exploration.world.scoring import BeliefRule

@@ -45,7 +45,7 @@ def write_poses(path: Path, output: Path) -> str:
     """Write the poses of a trajectory file as KITTI rows; returns a message."""
     if not path.is_file():
         raise MissingDataError(f"path={path} does not exist; format=kitti needs a trajectory file.")
-    matrices = read_trajectory(path).matrices
+    matrices = read_trajectory(path).poses.matrix
     write_kitti(output, matrices)
     return f"{_size(output)}: {len(matrices):,} poses"
 

@@ -8,14 +8,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from omegaconf import DictConfig, ListConfig
 from torch import Tensor
 
 from gmmtorch.cli import common, schema
 from gmmtorch.cli.outputs import map_outputs
-from gmmtorch.datasets import Dataset, in_plane, pose_matrix, read_trajectory, to_nanoseconds
+from gmmtorch.datasets import Dataset, read_trajectory, to_nanoseconds
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.events import Row
 from gmmtorch.export import write_pose_table, write_tum
@@ -28,6 +27,7 @@ from gmmtorch.localization import (
     scan_times,
 )
 from gmmtorch.mapping import GaussianMap
+from gmmtorch.pose import Pose
 from gmmtorch.report import Board, map_figure
 
 _FORMS = {2: "[x,y,yaw]", 3: "[x,y,z,yaw] or [x,y,z,qx,qy,qz,qw]"}
@@ -54,19 +54,15 @@ def first_pose(config: DictConfig, dataset: Dataset, dim: int) -> Tensor | None:
         return known
     numbers = list(given) if isinstance(given, ListConfig) else []
     try:
-        values = np.array([float(value) for value in numbers])
-        if len(values) not in {2: (3,), 3: (4, 7)}[dim]:
+        values = [float(value) for value in numbers]
+        if len(values) not in {2: (3,), 3: (4, 7)}[dim] or not all(map(math.isfinite, values)):
             raise ValueError
-        position = np.zeros(3)
-        position[:dim] = values[:dim]
-        yaw = values[dim]
-        spin = values[3:] if len(values) == 7 else np.array([0, 0, math.sin(yaw / 2), math.cos(yaw / 2)])
-        matrix = pose_matrix(position, spin)
+        turned = Pose.from_quaternion if len(values) == 7 else lambda at, yaw: Pose.from_yaw(yaw[0], at)
+        return turned(values[:dim], values[dim:]).matrix
     except (TypeError, ValueError) as error:
         raise InvalidArgumentError(
             f"pose={given} is not a pose in a {dim}D map; give {_FORMS[dim]} (m, rad), dataset or null."
         ) from error
-    return torch.from_numpy(matrix if dim == 3 else in_plane(matrix[None])[0])
 
 
 def true_poses(config: DictConfig, dataset: Dataset, dim: int) -> Truth | None:
@@ -85,8 +81,8 @@ def true_poses(config: DictConfig, dataset: Dataset, dim: int) -> Truth | None:
         is_timed = bool((trajectory.times >= len(trajectory)).any()) or len(trajectory) != len(dataset)
         times = to_nanoseconds(scan_times(dataset).numpy()) if is_timed else trajectory.times
         found = trajectory.at(times)
-        matrices = torch.from_numpy(found.matrices if dim == 3 else in_plane(found.matrices))
-        truth, known = Truth(matrices, torch.from_numpy(found.known)), list(found.known.nonzero()[0])
+        true = found.poses if dim == 3 else found.poses.in_plane()
+        truth, known = Truth(true.matrix, torch.from_numpy(found.known)), list(found.known.nonzero()[0])
     if not known:
         raise InvalidArgumentError(
             f"truth={config.truth} has no pose at the time of a scan of {dataset.name}; give a file of the "

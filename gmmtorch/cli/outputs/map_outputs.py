@@ -23,6 +23,7 @@ from gmmtorch.localization import Trajectory, scan_times
 from gmmtorch.mapping import Components, GaussianMap, MapBuilder
 from gmmtorch.occupancy import reliability_of, scores_of
 from gmmtorch.optional_packages import load_pyoctomap
+from gmmtorch.pose import Pose
 from gmmtorch.report import (
     Board,
     MapPanel,
@@ -130,10 +131,7 @@ def write_estimated_poses(dataset: Dataset, estimated: Trajectory, folder: Path)
         return
     dim = estimated.poses.shape[1] - 1
     turn = estimated.poses[:, :dim, :dim]
-    axes = torch.eye(estimated.covariances.shape[1]).to(turn).repeat(len(turn), 1, 1)
-    axes[:, :dim, :dim] = turn
-    if dim == 3:
-        axes[:, dim:, dim:] = turn
+    axes = Pose(turn, turn.new_zeros(len(turn), dim)).adjoint()
     columns = {
         "scan": range(len(turn)),
         "found": estimated.found.int().tolist(),
@@ -160,7 +158,7 @@ def trajectories(run: Path, given: str | None, dim: int) -> list[Tensor]:
 
 def positions(trajectory: Path, dim: int) -> Tensor:
     """The sensor positions (S, D) of a trajectory file. Raises `DataError` if it is damaged."""
-    return torch.from_numpy(read_trajectory(trajectory).matrices[:, :dim, 3])
+    return read_trajectory(trajectory).poses.translation[:, :dim]
 
 
 def print_skipped(skipped: Mapping[str, int]) -> None:

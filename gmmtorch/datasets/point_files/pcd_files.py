@@ -6,8 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from gmmtorch.datasets.point_files.headers import (
+from gmmtorch.datasets.point_files.point_rows import (
     AXES,
+    ArrayRows,
+    RecordRows,
+    Rows,
+    TextRows,
     check_fields,
     check_size,
     check_text,
@@ -15,7 +19,6 @@ from gmmtorch.datasets.point_files.headers import (
     header_lines,
     whole_number,
 )
-from gmmtorch.datasets.point_files.point_rows import ArrayRows, RecordRows, Rows, TextRows
 from gmmtorch.errors import DataError
 
 _MAX_POINT_BYTES = 1 << 24

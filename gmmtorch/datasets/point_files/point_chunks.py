@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -19,8 +19,10 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike
 from gmmtorch.datasets.base import is_beyond
-from gmmtorch.datasets.point_files.cloud_files import open_rows
-from gmmtorch.datasets.point_files.point_rows import ArrayRows, Rows
+from gmmtorch.datasets.point_files.las_files import LasRows
+from gmmtorch.datasets.point_files.mesh_files import ply_rows
+from gmmtorch.datasets.point_files.pcd_files import pcd_rows
+from gmmtorch.datasets.point_files.point_rows import SUFFIXES, ArrayRows, NpyRows, Rows, point_path
 from gmmtorch.errors import InvalidArgumentError, check_whole
 
 CHUNK_POINTS = 1 << 17
@@ -235,3 +237,29 @@ def _checksum(points: Tensor, rows: Tensor) -> int:
     for axis in range(bits.shape[1]):
         state = _mix_bits(state * _ODD + bits[:, axis])
     return int((state >> np.uint64(64 - _CHECKSUM_BITS)).sum(dtype=np.uint64)) % (1 << _CHECKSUM_BITS)
+
+
+# -- files of every format ---------------------------------------------------------------------------
+
+
+_READERS: dict[str, Callable[[Path], Rows]] = dict(
+    zip(SUFFIXES, (NpyRows, LasRows, LasRows, pcd_rows, ply_rows), strict=True)
+)
+
+
+def open_rows(path: str | Path) -> Rows:
+    """A reader of the points of a .npy, .las, .laz, .pcd or .ply file.
+
+    Raises `MissingDataError` if the file does not exist, `InvalidArgumentError` for another suffix, and
+    `DataError` for a damaged file.
+    """
+    path = point_path(path)
+    return _READERS[path.suffix.lower()](path)
+
+
+def read_cloud(path: Path) -> Tensor:
+    """Points (N, D), float64, of a point file, with those that are not finite. Errors: `open_rows`."""
+    rows = open_rows(path)
+    blocks = list(rows.blocks(0, rows.n_rows, max(1, rows.n_rows)))
+    points = blocks[0] if len(blocks) == 1 else np.concatenate([np.empty((0, rows.dim)), *blocks])
+    return torch.from_numpy(np.require(points, np.float64, ["C", "W"]))

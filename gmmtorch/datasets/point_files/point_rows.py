@@ -1,29 +1,26 @@
-"""Readers of point files, block by block: .npy, .las, .laz, .pcd, .ply.
+"""Readers of point files, block by block: rows of numbers in arrays, records and lines of text.
 
 A reader checks the header when it is opened, and keeps at most one block of points in memory. If the file
 contains less than its header announces, a `DataError` names the file.
+
+Names, sizes and headers are checked before a file is read.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+import struct
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor, check_unmasked
-from gmmtorch.datasets.number_rows import number_rows
-from gmmtorch.datasets.point_files.headers import AXES, check_size
-from gmmtorch.datasets.point_files.las_header import read_las_header
-from gmmtorch.errors import DataError, GmmTorchError
-from gmmtorch.optional_packages import needs_extra
-
-_LAS_BLOCK_BYTES = 1 << 25
-"""Limit of one read: a point may announce 64 kB of extra bytes."""
+from gmmtorch.datasets.base import number_rows
+from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
 
 
 class Rows(Protocol):
@@ -81,65 +78,6 @@ class NpyRows:
             yield self._map()[first : min(first + size, end)]
 
 
-class LasRows:
-    """The points of a LAS or LAZ file, in the file's frame, float64, with scale and offset applied."""
-
-    dim = 3
-
-    def __init__(self, path: Path) -> None:
-        with needs_extra(f"{path}: LAS and LAZ files need", "laspy", "formats"):
-            import laspy
-            import lazrs  # noqa: F401  used by laspy
-        self._laspy: Any = laspy
-        self._path = path
-        self.name = path.stem
-        with _las_errors(path):
-            self.n_rows, self._point_bytes = read_las_header(path)
-        with _las_errors(path), self._open() as reader:
-            if int(reader.header.point_count) != self.n_rows:
-                raise DataError(f"{path} announces two numbers of points; it is damaged. Write it again.")
-            scales, offsets = (
-                np.asarray(of, np.float64) for of in (reader.header.scales, reader.header.offsets)
-            )
-            if not (np.isfinite(offsets).all() and np.isfinite(scales).all() and (scales > 0).all()):
-                raise DataError(
-                    f"{path} has scales {scales} and offsets {offsets}; it is damaged. Write it again."
-                )
-
-    def _open(self) -> Any:
-        return self._laspy.open(self._path, read_evlrs=False)
-
-    def blocks(self, begin: int, end: int, size: int) -> Iterator[np.ndarray]:
-        if begin >= end:  # laspy cannot seek to the end of a file
-            return
-        size = min(size, max(1, _LAS_BLOCK_BYTES // self._point_bytes))
-        with _las_errors(self._path), self._open() as reader:
-            reader.seek(begin)
-            for first in range(begin, end, size):
-                wanted = min(size, end - first)
-                points = reader.read_points(wanted)
-                block = np.stack([points.x, points.y, points.z], 1)
-                _check_count(self._path, first, block.shape[0], wanted, self.n_rows)
-                yield block
-
-
-@contextmanager
-def _las_errors(path: Path) -> Iterator[None]:
-    """Turns every error of laspy and lazrs into a `DataError`; their errors share no base class."""
-    try:
-        yield
-    except GmmTorchError:
-        raise
-    except BaseException as error:
-        # lazrs is written in Rust, whose panics are no `Exception`.
-        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
-            raise
-        raise DataError(
-            f"{path} cannot be read as LAS or LAZ ({error}); it is truncated or damaged. "
-            "Write or fetch it again."
-        ) from error
-
-
 class RecordRows:
     """The points of a binary file, mapped into memory: records with the fields x, y and z from a byte on."""
 
@@ -192,7 +130,7 @@ class TextRows:
             for first in range(begin, end, size):
                 wanted = min(size, end - first)
                 taken = list(itertools.islice(lines, wanted))
-                _check_count(self._path, first, len(taken), wanted, self.n_rows)
+                check_count(self._path, first, len(taken), wanted, self.n_rows)
                 # All columns are read, so that a truncated line is detected whichever column it lacks.
                 table = number_rows(taken, self._width, f"{self._path}, row", first + 1)
                 yield table[:, self._columns]
@@ -212,9 +150,113 @@ def _table_shape(array: np.ndarray, name: str) -> tuple[int, int]:
     return array.shape[0], array.shape[1]
 
 
-def _check_count(path: Path, first: int, found: int, wanted: int, announced: int) -> None:
+def check_count(path: Path, first: int, found: int, wanted: int, announced: int) -> None:
     if found < wanted:
         raise DataError(
             f"{path} announces {announced} points, but ends after {first + found}; it is truncated. "
             "Write or fetch it again."
+        )
+
+
+# -- what is checked before a point file is read -----------------------------------------------------
+
+
+AXES = ("x", "y", "z")
+SUFFIXES = (".npy", ".las", ".laz", ".pcd", ".ply")
+_HEADER_BYTES = 1 << 16
+_MAX_PADDING = 1 << 16
+
+
+def point_path(path: str | Path) -> Path:
+    """The path of a point file, with ~ expanded.
+
+    Raises `InvalidArgumentError` for an unknown suffix, and `MissingDataError` if the file does not exist.
+    """
+    path = Path(path).expanduser()
+    known = ", ".join(SUFFIXES)
+    if path.suffix.lower() not in SUFFIXES:
+        raise InvalidArgumentError(f"points={path} has an unknown suffix {path.suffix!r}; known are {known}.")
+    if not path.is_file():
+        what = "is not a file" if path.exists() else "does not exist"
+        raise MissingDataError(f"points={path} {what}; give a file of points ({known}).")
+    return path
+
+
+@contextmanager
+def damaged(path: Path, what: str) -> Iterator[None]:
+    """Turns errors of missing and wrong content into a `DataError`: path, what is wrong, and the remedy."""
+    try:
+        yield
+    except DataError:
+        raise
+    except (ValueError, KeyError, IndexError, TypeError, OverflowError, struct.error) as error:
+        raise DataError(
+            f"{path} {what} ({error!r}); it is truncated, damaged or another kind of file. Write or fetch it "
+            "again."
+        ) from error
+
+
+def header_lines(path: Path, last: str) -> tuple[list[list[str]], int]:
+    """The words of each line of a header, up to the line that begins with `last`, and the header's bytes."""
+    with path.open("rb") as file:
+        *whole, _ = file.read(_HEADER_BYTES).split(b"\n")
+    lines, n_bytes = [], 0
+    for line in whole:
+        lines.append(line.decode("ascii", errors="replace").split())
+        n_bytes += len(line) + 1
+        if lines[-1][:1] == [last]:
+            return lines, n_bytes
+    raise DataError(f"{path} has no header that ends with a line {last}; it is another kind of file.")
+
+
+def whole_number(word: str) -> int:
+    """The number that digits alone spell: int() also accepts 1_0. Raises `ValueError`."""
+    if not word.isdecimal():
+        raise ValueError(f"{word!r} is not a whole number")
+    return int(word)
+
+
+def check_fields(path: Path, fields: Sequence[str]) -> None:
+    """Raises `DataError` unless x, y and z are one field each."""
+    for axis in AXES:
+        if axis not in fields:
+            raise DataError(f"{path} has no field {axis}, only {', '.join(fields)}; it holds no points.")
+        if fields.count(axis) > 1:
+            raise DataError(f"{path} has several fields {axis}; its header is damaged. Write it again.")
+
+
+def check_size(path: Path, expected: int, what: str) -> None:
+    """Raises `DataError` unless `what` fill the file, whose `expected` bytes may be followed by some zeros.
+
+    PCL has allocated binary files by whole pages.
+    """
+    found = path.stat().st_size
+    with path.open("rb") as file:
+        file.seek(min(expected, found))
+        rest = file.read(_MAX_PADDING + 1)
+    if found < expected or len(rest) > _MAX_PADDING or rest.strip(b"\0"):
+        state = "truncated" if found < expected else "damaged"
+        raise DataError(
+            f"{path} announces {what} in {expected:,} bytes, but has {found:,}; it is {state}. Write or "
+            "fetch it again."
+        )
+
+
+def check_text(path: Path, n_rows: int) -> None:
+    """Raises `DataError` unless a text file has space for its rows, and a line end after the last one.
+
+    Without a line end, digits of the last number may be missing.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        file.seek(max(0, size - 1))
+        last = file.read()
+    if 2 * n_rows > size:
+        raise DataError(
+            f"{path} announces {n_rows:,} rows, but has {size:,} bytes; it is truncated or damaged."
+        )
+    if last not in (b"\n", b"\r"):
+        raise DataError(
+            f"{path} has no line end after its last row, so it may be truncated. Write or fetch it again; if "
+            "it is complete, add a line end."
         )

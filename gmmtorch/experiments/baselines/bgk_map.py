@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, MemoryLimitError, check_number, check_whole
+from gmmtorch.experiments.baselines.cell_table import CellTable
 from gmmtorch.experiments.baselines.samples import thinned_samples
 from gmmtorch.files import require
 from gmmtorch.linalg import ragged_index
 from gmmtorch.occupancy import (
     MEMORY_LIMIT,
-    CellTable,
     TensorFileMap,
     check_length,
     check_resolution,

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.baselines.bgk_map import kernel_offsets, sparse_kernel
+from gmmtorch.experiments.baselines.cell_table import CellTable
 from gmmtorch.experiments.baselines.samples import centroids
-from gmmtorch.occupancy import CellTable
 
 CHUNK_VALUES = 1 << 22
 """Values of features that are computed at a time."""

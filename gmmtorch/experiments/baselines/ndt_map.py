@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, check_whole
+from gmmtorch.experiments.baselines.cell_table import CellTable
 from gmmtorch.experiments.baselines.samples import cut_beams
 from gmmtorch.files import require
 from gmmtorch.kernels import traverse
 from gmmtorch.linalg import pack_symmetric, unpack_symmetric
 from gmmtorch.occupancy import (
     MEMORY_LIMIT,
-    CellTable,
     TensorFileMap,
     check_length,
     check_resolution,

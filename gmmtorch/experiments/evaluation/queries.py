@@ -16,6 +16,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.evaluation.protocol_options import FreePoints, Removal
 from gmmtorch.files import write_bytes
 from gmmtorch.occupancy import SparseEvidence
+from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 
 
@@ -57,11 +58,8 @@ def pose_perturbations(scans: Sequence[Scan], noise: Sequence[float], seed: int)
         dim = scan.dim
         translation = torch.randn(dim, generator=generator, dtype=torch.float64) * shift
         turn = torch.randn(1 if dim == 2 else 3, generator=generator, dtype=torch.float64) * angle
-        transform = torch.eye(dim + 1, dtype=torch.float64)
-        transform[:dim, :dim] = _rotation(turn)
-        origin = scan.origin.double().cpu()
-        transform[:dim, dim] = origin + translation - transform[:dim, :dim] @ origin
-        motions.append(transform)
+        rotation, origin = Pose.from_turn(turn).rotation, scan.origin.double().cpu()
+        motions.append(Pose(rotation, origin + translation - rotation @ origin).matrix)
     return motions
 
 
@@ -71,17 +69,6 @@ def perturb_poses(scans: Sequence[Scan], noise: Sequence[float], seed: int) -> l
         return list(scans)
     motions = pose_perturbations(scans, noise, seed)
     return [scan.transformed(motion) for scan, motion in zip(scans, motions, strict=True)]
-
-
-def _rotation(turn: torch.Tensor) -> torch.Tensor:
-    """Rotation matrix of an angle (1,) or of a rotation vector (3,): exponential of the skew matrix."""
-    skew = torch.zeros(2 if turn.shape[0] == 1 else 3, 2 if turn.shape[0] == 1 else 3, dtype=torch.float64)
-    if turn.shape[0] == 1:
-        skew[0, 1], skew[1, 0] = -turn[0], turn[0]
-    else:
-        skew[0, 1], skew[0, 2], skew[1, 2] = -turn[2], turn[1], -turn[0]
-        skew = skew - skew.T
-    return torch.matrix_exp(skew)
 
 
 FREE, OCCUPIED, UNKNOWN = 0, 1, 2

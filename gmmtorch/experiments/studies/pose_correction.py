@@ -24,6 +24,7 @@ from gmmtorch.experiments.evaluation import (
     test_beams,
 )
 from gmmtorch.mapping import GaussianMap
+from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 
 
@@ -56,15 +57,7 @@ def correct_poses(built: GaussianMap, ids: Sequence[Tensor], motions: Sequence[T
         )
     for ids_of_scan, motion in zip(ids, motions, strict=True):
         if len(ids_of_scan):
-            built.transform(_inverse(motion), ids_of_scan)
-
-
-def _inverse(motion: Tensor) -> Tensor:
-    """Inverse of a rigid motion by its transpose, which keeps it exactly rigid."""
-    inverse = torch.eye(len(motion), dtype=torch.float64, device=motion.device)
-    inverse[:-1, :-1] = motion[:-1, :-1].T
-    inverse[:-1, -1] = -motion[:-1, :-1].T @ motion[:-1, -1]
-    return inverse
+            built.transform(Pose.from_matrix(motion).inverse().matrix, ids_of_scan)
 
 
 def evaluate_correction(

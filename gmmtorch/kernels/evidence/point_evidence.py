@@ -1,4 +1,5 @@
-"""Point evidence: hits and misses of the cube around a point from the cones near it; see `PointForm`.
+"""Point evidence: hits and misses of the cube around a point from the cones near it; see `PointForm`. And the
+lists of the cones whose hulls can give evidence near a place, see `occupancy.cone_index`.
 
 The fused kernel walks the list of cones of each point, tests whether the point is within the cutoff, and
 evaluates those that are. Its twin evaluates blocks of points. Their evidence differs by at most 10⁻¹² of the
@@ -9,14 +10,15 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels.compiler import FusedKernel
-from gmmtorch.kernels.simd import CPU_LANES, SIMD
+from gmmtorch.kernels.choice import is_fused
+from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel
+from gmmtorch.linalg import ragged_index
 
 _SQRT_HALF_PI = math.sqrt(math.pi / 2)
 
@@ -34,145 +36,7 @@ class PointTable(NamedTuple):
     tilts: Tensor
 
 
-_BODY = """
-    const double h = resolution, limit = cutoff * cutoff;
-    const int64_t begin = item * LANES, stop = GMM_MIN(begin + LANES, n_points);
-    vec x[DIM], hits, misses, number = (vec)(-1.0);
-    for (int l = 0; l < LANES; ++l) {
-        const int64_t point = order[GMM_MIN(begin + l, stop - 1)];
-        for (int a = 0; a < DIM; ++a) set(x[a], l, points[point * DIM + a]);
-        set(hits, l, hits_out[point]);
-        set(misses, l, misses_out[point]);
-        if (begin + l < stop) set(number, l, (double)bucket[point]);
-    }
-    for (int first = 0; first < LANES; ++first) {  // each bucket of these points once
-        const double mine = get(number, first);
-        if (mine < 0.0 || (first > 0 && get(number, first - 1) == mine)) continue;
-        const mask active = number == mine;
-        const int64_t list = (int64_t)mine;
-        for (int64_t entry = starts[list]; entry < starts[list + 1]; ++entry) {
-            const double* cone = table + entries[entry] * WIDTH;
-            GMM_FETCH(table + entries[GMM_MIN(entry + 6, starts[list + 1] - 1)] * WIDTH, WIDTH);
-            const double *mean = cone + DIM * DIM, *origin = mean + DIM, *seen = origin + DIM;
-            const double *variance = seen + DIM, *fixed = variance + DIM, *rest = fixed + DIM;
-            vec y[DIM], z[DIM], ray[DIM];
-            vec squared_distance = (vec)(0.0), squared = (vec)(0.0), turn = (vec)(0.0);
-            double seen_squared = 0.0;
-            for (int j = 0; j < DIM; ++j) {
-                const double toward = mean[j] - origin[j];
-                ray[j] = x[j] - origin[j];
-                squared_distance += ray[j] * ray[j];
-                turn += toward * ray[j];
-                seen_squared += toward * toward;
-            }
-            // The mean is farther from the ray than the cutoff for the largest variance: a quick test.
-            const double widest = seen_squared * (1.0 - 1e-14) - limit * (variance[DIM - 1] + h * h / 12.0);
-            const mask near = widest * squared_distance - turn * turn <= GMM_MAX(limit, 9.0) * rest[0];
-            if (!any(active & near)) continue;
-            for (int j = 0; j < DIM; ++j) {
-                y[j] = (vec)(0.0);
-                for (int i = 0; i < DIM; ++i) y[j] += cone[i * DIM + j] * (x[i] - mean[i]);
-                z[j] = y[j] + seen[j];
-                squared += fixed[j] * y[j] * y[j];
-            }
-            const vec kappa = rest[0] / squared_distance;
-            vec wide[DIM], sharp[DIM];
-            for (int j = 0; j < DIM; ++j) wide[j] = variance[j] + kappa;
-            vec determinant;
-            SHARPEN
-            vec aa = (vec)(0.0), bb = (vec)(0.0), cc = (vec)(0.0);
-            for (int j = 0; j < DIM; ++j) {
-                aa += sharp[j] * z[j] * z[j];
-                bb += sharp[j] * y[j] * z[j];
-                cc += sharp[j] * y[j] * y[j];
-            }
-            vec breadth = (vec)(0.0), extent = (vec)(0.0);
-            for (int j = 0; j < DIM; ++j) {
-                const vec size = ray[j] < 0.0 ? -ray[j] : ray[j];
-                breadth += size;
-                extent = size > extent ? size : extent;
-            }
-            const mask at_sensor = extent <= 0.5 * h;
-            // Conservative: squares of differences lose digits, which the second term allows for.
-            const vec room = (limit * (1.0 + 1e-9) + 1e-9 * cc) * aa;
-            const mask passes = (cc * aa - bb * bb < room) & !((bb > 0.0) & (bb * bb > room));
-            const mask strikes = squared < limit;
-            if (!any(active & (at_sensor | passes | strikes))) continue;
-            vec hit = (vec)(0.0);
-            if (any(active & strikes)) {
-                vec fade = limit - squared;
-                fade = fade < 0.0 ? (vec)(0.0) : fade > 1.0 ? (vec)(1.0) : fade;
-                hit = expo(rest[1] - 0.5 * squared) * fade;
-                hit = hit > 1.0 ? (vec)(1.0) : hit;
-            }
-            vec miss = (vec)(0.0);
-            if (any(active & passes)) {
-                const vec length = root(aa), share = bb / aa;
-                vec across = (vec)(0.0);
-                for (int j = 0; j < DIM; ++j) {
-                    const vec part = y[j] - share * z[j];
-                    across += sharp[j] * part * part;
-                }
-                const vec along = share * length, leaving = along + 0.5 * h * length / breadth;
-                const vec beyond = leaving > 0.0 ? leaving : (vec)(0.0);
-                vec fade = limit - across - beyond * beyond;
-                fade = fade < 0.0 ? (vec)(0.0) : fade > 1.0 ? (vec)(1.0) : fade;
-                const vec edge = expo(-0.5 * leaving * leaving);
-                const vec ratio = edge * mills(leaving < 0.0 ? -leaving : leaving);
-                const vec tail = leaving < 0.0 ? 2.5066282746310002 - ratio : ratio;
-                const vec depth = length - along;
-                MOMENT
-                const vec peak = expo(-0.5 * across) * root(determinant) / NORM;
-                miss = peak * moment * breadth * AREA * fade;
-            }
-            miss = at_sensor ? (vec)(1.0) : miss;
-            miss = miss < 1.0 - hit ? miss : 1.0 - hit;
-            hits += active ? hit * rest[3] : (vec)(0.0);
-            misses += active ? miss * rest[2] : (vec)(0.0);
-        }
-    }
-    for (int l = 0; l < LANES; ++l)
-        if (begin + l < stop) {
-            const int64_t point = order[begin + l];
-            hits_out[point] = get(hits, l);
-            misses_out[point] = get(misses, l);
-        }
-"""
-_BY_DIM = {
-    2: {
-        "SHARPEN": "determinant = 1.0 / (wide[0] * wide[1]); sharp[0] = wide[1] * determinant;"
-        " sharp[1] = wide[0] * determinant;",
-        "MOMENT": "const vec moment = depth * tail + edge;",
-        "NORM": "(6.283185307179586 * aa)",
-        "AREA": "h",
-    },
-    3: {
-        "SHARPEN": "const vec pair = wide[0] * wide[1]; determinant = 1.0 / (pair * wide[2]);"
-        " sharp[2] = pair * determinant; const vec third = wide[2] * determinant;"
-        " sharp[0] = wide[1] * third; sharp[1] = wide[0] * third;",
-        "MOMENT": "const vec moment = (depth * depth + 1.0) * tail + (2.0 * depth + along_end) * edge;",
-        "NORM": "(15.749609945722419 * aa * length)",
-        "AREA": "h * h",
-    },
-}
-
-
-def _kernel(dim: int) -> FusedKernel:
-    body = _BODY
-    for name, text in _BY_DIM[dim].items():
-        body = body.replace(name, text)
-    body = body.replace("along_end", "leaving")
-    body = body.replace("WIDTH", str(dim * dim + 5 * dim + 4)).replace("DIM", str(dim))
-    return FusedKernel(
-        f"point_evidence_{dim}d",
-        "const double* points, const int64* order, const int64* bucket, int64 n_points, const int64* starts,"
-        " const int32* entries, const double* table, double resolution, double cutoff, double* hits_out,"
-        " double* misses_out",
-        SIMD + body,
-    )
-
-
-_KERNELS = {dim: _kernel(dim) for dim in (2, 3)}
+_EVIDENCE = {dim: FusedKernel("evidence/point_evidence.h", f"point_evidence<{dim}>") for dim in (2, 3)}
 
 
 def listed_evidence(
@@ -197,7 +61,7 @@ def listed_evidence(
         rows: see `PointTable.rows`.
     """
     lanes = CPU_LANES if points.device.type == "cpu" else 1
-    _KERNELS[points.shape[1]](
+    _EVIDENCE[points.shape[1]](
         (order.shape[0] + lanes - 1) // lanes,
         points.contiguous(),
         order,
@@ -271,12 +135,6 @@ def _product(v: list[Tensor], w: list[Tensor], sharp: list[Tensor], tilts: Seque
     return product
 
 
-@functools.cache
-def compiled_pair_evidence() -> Callable[..., tuple[Tensor, Tensor]]:
-    compiled: Callable[..., tuple[Tensor, Tensor]] = torch.compile(pair_evidence, dynamic=True)
-    return compiled
-
-
 def tail_moment(along: Tensor, depth: Tensor, dim: int) -> Tensor:
     """∫_a^∞ (w + b)^{D−1} e^{−w²/2} dw, the radial integral of the rays that end beyond a point; any shape.
 
@@ -294,3 +152,106 @@ def tail_moment(along: Tensor, depth: Tensor, dim: int) -> Tensor:
 def sum_of(terms: Iterable[Tensor]) -> Tensor:
     """Sum of tensors, in order; unlike `sum` it does not start with an integer 0."""
     return functools.reduce(torch.add, terms)
+
+
+_NEAR = {dim: FusedKernel("evidence/near_lists.h", f"near_lists<{dim}>") for dim in (2, 3)}
+_PARTS_OF_LISTS = 32  # of a list, on a device with many threads
+
+
+class Lists(NamedTuple):
+    """Lists of cones: list i holds `entries[starts[i] : starts[i + 1]]`. starts int64, entries int32."""
+
+    starts: Tensor
+    entries: Tensor
+
+    @classmethod
+    def of(cls, lengths: Tensor, entries: Tensor) -> Lists:
+        """Lists of these lengths, one after the other."""
+        return cls(torch.cat([lengths.new_zeros(1), lengths.cumsum(0)]), entries)
+
+    def lengths(self) -> Tensor:
+        """Number of cones in each list."""
+        return self.starts[1:] - self.starts[:-1]
+
+    def taken(self, lists: Tensor) -> tuple[Tensor, Tensor]:
+        """All entries of some lists (T,), in order: position in `lists` (P,) and cone (P,), int64."""
+        place, within = ragged_index(self.lengths()[lists])
+        return place, self.entries[self.starts[lists][place] + within].long()
+
+
+def near_lists(
+    table: Tensor,
+    given: Lists,
+    lists: Tensor,
+    centers: Tensor,
+    radii: Tensor,
+    cube_reach: float,
+    spread: float,
+) -> Lists:
+    """For each ball (T,), those cones of its list that can give evidence to a cube centred in the ball.
+
+    Args:
+        table: (C, n) float64, a row for each cone: its axes (D²), mean, sensor origin and squared half axes
+            at the cutoff (D each), the distance between mean and origin, and that to the farthest point.
+        lists: (T,) a list of `given` for each ball. Balls of one list that follow each other share its cost.
+        centers, radii: (T, D), (T,) of the balls, float64.
+        cube_reach: from the centre of a cube to its corners; spread: see `Hulls`; metres.
+    """
+    lengths = given.lengths()[lists]
+    if is_fused(table, given.entries, lists, centers):
+        ends = lengths.cumsum(0)
+        firsts, counts = ends - lengths, torch.zeros_like(lengths, dtype=torch.float64)
+        near = torch.empty(int(ends[-1]) if len(ends) else 0, dtype=torch.bool, device=table.device)
+        lanes, parts = (CPU_LANES, 1) if table.device.type == "cpu" else (1, _PARTS_OF_LISTS)
+        arguments = (table, *given, lists, firsts, centers.contiguous(), radii.contiguous(), len(lists))
+        sizes = (cube_reach, spread, parts)
+        n_items = (len(lists) + lanes - 1) // lanes * parts
+        _NEAR[centers.shape[1]](n_items, *arguments, *sizes, near, counts, device=table.device)
+        counts = counts.long()
+        shift = torch.repeat_interleave(given.starts[lists] - firsts, counts)
+        return Lists.of(counts, given.entries[near.nonzero().squeeze(1) + shift])
+    ball, cone = given.taken(lists)
+    near = _near_cone(table.T, cone, centers[ball], radii[ball], cube_reach, spread)
+    return Lists.of(torch.bincount(ball[near], minlength=len(lists)), cone[near].int())
+
+
+def _near_cone(
+    table: Tensor, cone: Tensor, centers: Tensor, radius: Tensor, cube_reach: float, spread: float
+) -> Tensor:
+    """Whether each cone (P,) meets its ball; the twin. The cones are columns of the table.
+
+    Let y, within R of the centre x, lie on the segment from the sensor origin s to a point p of the
+    ellipsoid E. Then the ray from s through x passes, beyond x, within R |p − s|/|y − s| ≤ β of p, with β =
+    R·far/(|x − s| − R). So from x on this ray meets the sum of E and a ball of radius β. The ellipsoid (1 +
+    ε)E + (1 + 1/ε)β²I contains that sum for every ε > 0. The test uses two values of ε, which are tight
+    along the two longest axes. In the smoothed case E is widened first.
+    """
+    dim = centers.shape[1]
+    columns = [column[cone] for column in table]
+    mean, origin, squares = (columns[dim * dim + i * dim :][:dim] for i in range(3))
+    whole, far = columns[-2:]
+    axes = [columns[i * dim : (i + 1) * dim] for i in range(dim)]  # axes[i][j]: entry i of axis j
+    x = centers.unbind(1)
+    ray = [a - s for a, s in zip(x, origin, strict=True)]
+    offset = [a - m for a, m in zip(x, mean, strict=True)]
+    y = [sum_of(axes[i][j] * offset[i] for i in range(dim)) for j in range(dim)]
+    z = [sum_of(axes[i][j] * ray[i] for i in range(dim)) for j in range(dim)]
+    distance = sum_of(r * r for r in ray).sqrt()
+    reach = radius if spread > 0 else radius + cube_reach
+    clear = (distance - reach).clamp_min(1e-12)
+    widened = (spread * (whole / clear).clamp_min(1)) ** 2  # added variance, of the rays and of the component
+    far = far + widened.sqrt()
+    beta = far * reach / clear
+    near = distance <= far + reach
+    for axis in (-1, -2):
+        ratio = (beta / (squares[axis] + widened).sqrt().clamp_min(1e-12)).clamp(1e-6, 1e6)
+        added = (1 + ratio) * widened + (1 + 1 / ratio) * beta**2
+        weight = [1 / ((1 + ratio) * square + added) for square in squares]
+        cc = sum_of(w * a * a for w, a in zip(weight, y, strict=True))
+        bb = sum_of(w * a * b for w, a, b in zip(weight, y, z, strict=True))
+        aa = sum_of(w * b * b for w, b in zip(weight, z, strict=True))
+        # Squared Mahalanobis distance to the inflated ellipsoid, at x or at the nearest point of the ray
+        # beyond x.
+        near = near & (cc - bb.clamp_max(0) ** 2 / aa.clamp_min(1e-300) < 1 + 1e-6)
+    # The bound does not hold where the cube contains the sensor origin: these cones count as near.
+    return near | (distance <= (reach + cube_reach) * (1 + 1e-9))

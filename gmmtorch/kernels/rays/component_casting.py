@@ -1,8 +1,8 @@
 """Evidence of components in the cells of a box, from rays that are drawn from them and cast.
 
 The fused kernel handles one viewpoint in one item, from its component to the cells, and keeps no list of
-rays. `mapping.rays.component_rays` has its twin, which draws with `truncated_normals` here and casts with
-`count_in_grid`.
+rays. Its twin, `component_rays` of the exploration's robots, draws with `truncated_normals` here and casts
+with `count_in_grid`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels.compiler import FusedKernel
-from gmmtorch.kernels.rays.ray_walk import walk
+from gmmtorch.kernels.rays.ray_traversal import TIE
 
 THINNING = 4
 """Of the first halves of rays, one in this many is followed, with as much more weight."""
@@ -33,214 +33,7 @@ class Seen(NamedTuple):
     rays: Tensor
 
 
-_QUANTILE = """
-    // Normal quantile: algorithm AS 241, PPND16 (Wichura 1988); relative error about 1e-16.
-    auto quantile = [](double p) {
-        const double q = p - 0.5;
-        if (fabs(q) <= 0.425) {
-            const double r = 0.180625 - q * q;
-            return q * (((((((2.5090809287301226727e+3 * r + 3.3430575583588128105e+4) * r
-                + 6.7265770927008700853e+4) * r + 4.5921953931549871457e+4) * r
-                + 1.3731693765509461125e+4) * r + 1.9715909503065514427e+3) * r
-                + 1.3314166789178437745e+2) * r + 3.3871328727963666080)
-                / (((((((5.2264952788528545610e+3 * r + 2.8729085735721942674e+4) * r
-                + 3.9307895800092710610e+4) * r + 2.1213794301586595867e+4) * r
-                + 5.3941960214247511077e+3) * r + 6.8718700749205790830e+2) * r
-                + 4.2313330701600911252e+1) * r + 1.0);
-        }
-        double r = sqrt(-log(q < 0.0 ? p : 1.0 - p)), x;
-        if (r <= 5.0) {
-            r -= 1.6;
-            x = (((((((7.74545014278341407640e-4 * r + 2.27238449892691845833e-2) * r
-                + 2.41780725177450611770e-1) * r + 1.27045825245236838258) * r
-                + 3.64784832476320460504) * r + 5.76949722146069140550) * r
-                + 4.63033784615654529590) * r + 1.42343711074968357734)
-                / (((((((1.05075007164441684324e-9 * r + 5.47593808499534494600e-4) * r
-                + 1.51986665636164571966e-2) * r + 1.48103976427480074590e-1) * r
-                + 6.89767334985100004550e-1) * r + 1.67638483018380384940) * r
-                + 2.05319162663775882187) * r + 1.0);
-        } else {
-            r -= 5.0;
-            x = (((((((2.01033439929228813265e-7 * r + 2.71155556874348757815e-5) * r
-                + 1.24266094738807843860e-3) * r + 2.65321895265761230930e-2) * r
-                + 2.96560571828504891230e-1) * r + 1.78482653991729133580) * r
-                + 5.46378491116411436990) * r + 6.65790464350110377720)
-                / (((((((2.04426310338993978564e-15 * r + 1.42151175831644588870e-7) * r
-                + 1.84631831751005468180e-5) * r + 7.86869131145613259100e-4) * r
-                + 1.48753612908506148525e-2) * r + 1.36929880922735805310e-1) * r
-                + 5.99832206555887937690e-1) * r + 1.0);
-        }
-        return q < 0.0 ? -x : x;
-    };
-    auto scrambled = [](uint64_t word) {  // as `_scrambled`
-        word += 0x9E3779B97F4A7C15ull;
-        word = (word ^ (word >> 30)) * 0xBF58476D1CE4E5B9ull;
-        word = (word ^ (word >> 27)) * 0x94D049BB133111EBull;
-        return word ^ (word >> 31);
-    };
-"""
-
-_COMPONENT = """
-    const int64_t row = item / parts, part = item % parts, by = seen_by[row];
-    const bool returns = !max_range[by];
-    const double cutoff = cutoffs[returns ? 0 : 1], rays_per_cell = densities[returns ? 0 : 1];
-    const double* mean = means + 3 * by;
-    const double* sigma = covariances + 9 * by;
-    const double* origin = origins + 3 * seen_from[row];
-    const double* box = bounds;  // low and high of the box, then of the window, in cells
-    double near_from = 0.0, near_to = 1.0;  // the part of the rays that is near the box
-    for (int a = 0; a < 3; ++a) {
-        const double spread = cutoff * sqrt(sigma[4 * a]), apex = origin[a] / resolution;
-        const double edge[2] = {(mean[a] - spread) / resolution, (mean[a] + spread) / resolution};
-        for (int side = 0; side < 2; ++side) {
-            const double sign = side ? -1.0 : 1.0;
-            const double room = sign * (box[side ? a : 3 + a] - apex) + 0.5;
-            const double slope = sign * (edge[side] - apex);
-            if (slope > 0.0) near_to = GMM_MIN(near_to, room / slope);
-            if (slope < 0.0) near_from = GMM_MAX(near_from, room / slope);
-            if (slope == 0.0 && room < 0.0) near_to = -1.0;
-        }
-    }
-    if (near_from > near_to) return;
-    const int64_t times = returns && near_to >= 1.0 ? hits_per_ray : 1;
-    double l[3][3];  // Cholesky factor
-    for (int i = 0; i < 3; ++i) {
-        for (int j = 0; j <= i; ++j) {
-            double sum = sigma[3 * i + j];
-            for (int k = 0; k < j; ++k) sum -= l[i][k] * l[j][k];
-            l[i][j] = i == j ? sqrt(sum) : sum / l[j][j];
-        }
-        if (!(l[i][i] > 0.0) || !(l[i][i] < 1e300)) {
-            failed[0] = true;
-            return;
-        }
-    }
-    int64_t n_rays;
-    {  // as `hidden_area`
-        const double scale = GMM_MAX(GMM_MAX(sigma[0], sigma[4]), sigma[8]);
-        const double xx = sigma[0] / scale, xy = sigma[1] / scale, xz = sigma[2] / scale;
-        const double yy = sigma[4] / scale, yz = sigma[5] / scale, zz = sigma[8] / scale;
-        double to[3], largest = 2.2250738585072014e-308;
-        for (int a = 0; a < 3; ++a) {
-            to[a] = mean[a] - origin[a];
-            largest = GMM_MAX(largest, fabs(to[a]));
-        }
-        const double x = to[0] / largest, y = to[1] / largest, z = to[2] / largest;
-        const double a = yy * zz - yz * yz, b = xx * zz - xz * xz, c = xx * yy - xy * xy;
-        const double mixed =
-            x * y * (xz * yz - xy * zz) + x * z * (xy * yz - xz * yy) + y * z * (xy * xz - xx * yz);
-        const double length = x * x + y * y + z * z;
-        const double along = (a * x * x + b * y * y + c * z * z + 2.0 * mixed) / length;
-        const double determinant = GMM_MAX(length > 0.0 ? along : a + b + c, 0.0);
-        const double hidden = area * scale * sqrt(determinant) / (resolution * resolution);
-        const double wanted = ceil(rays_per_cell * hidden);
-        n_rays = (int64_t)GMM_MIN(GMM_MAX(wanted, (double)least), (double)most);
-    }
-    double thinnest[3] = {0.0, 0.0, 0.0};
-    if (shell > 0.0) {  // the eigenvector of the smallest eigenvalue, by Jacobi rotations
-        double m[3][3], e[3][3] = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}};
-        for (int i = 0; i < 9; ++i) m[i / 3][i % 3] = sigma[i];
-        for (int sweep = 0; sweep < 12; ++sweep) {
-            const double off = fabs(m[0][1]) + fabs(m[0][2]) + fabs(m[1][2]);
-            if (off == 0.0) break;
-            for (int i = 0; i < 2; ++i)
-                for (int j = i + 1; j < 3; ++j) {
-                    if (m[i][j] == 0.0) continue;
-                    const double theta = (m[j][j] - m[i][i]) / (2.0 * m[i][j]);
-                    const double t = (theta < 0.0 ? -1.0 : 1.0) / (fabs(theta) + sqrt(theta * theta + 1.0));
-                    const double c = 1.0 / sqrt(t * t + 1.0), s = t * c;
-                    for (int k = 0; k < 3; ++k) {
-                        const double p = m[k][i], q = m[k][j];
-                        m[k][i] = c * p - s * q;
-                        m[k][j] = s * p + c * q;
-                    }
-                    for (int k = 0; k < 3; ++k) {
-                        const double p = m[i][k], q = m[j][k], u = e[k][i], w = e[k][j];
-                        m[i][k] = c * p - s * q;
-                        m[j][k] = s * p + c * q;
-                        e[k][i] = c * u - s * w;
-                        e[k][j] = s * u + c * w;
-                    }
-                    m[i][j] = m[j][i] = 0.0;
-                }
-        }
-        const int least_of_two = m[1][1] < m[0][0] ? 1 : 0;
-        const int column = m[2][2] < m[least_of_two][least_of_two] ? 2 : least_of_two;
-        for (int k = 0; k < 3; ++k) thinnest[k] = e[k][column];
-    }
-    double shift[3];
-    const uint64_t key = scrambled(scrambled((uint64_t)ids[2 * by]) ^ (uint64_t)ids[2 * by + 1]);
-    for (int a = 0; a < 3; ++a) shift[a] = (double)(scrambled(key + a + 1) >> 11) * 0x1p-53;
-"""
-
-_DRAWS = f"""
-    const double* lows = bounds + 6;
-    const double* shrinkages = shrinkage + (returns ? 0 : n_radii);
-    const int dim = 3;
-    const double unit = 1.0, CLOSEST = 0x1p-33, STEP = {_RADII / _FARTHEST_DRAW!r};
-    const int64_t size0 = (int64_t)(bounds[9] - lows[0]), size1 = (int64_t)(bounds[10] - lows[1]);
-    const int64_t size2 = (int64_t)(bounds[11] - lows[2]);
-    const int64_t stride0 = size1 * size2, stride1 = size2, stride2 = 1;
-    const int64_t n_draws = n_rays * times, n_some = thinned ? (n_rays + {THINNING - 1}) / {THINNING} : 0;
-    const double per_draw = seen_count[row] / (double)n_draws, per_ray = per_draw * (double)times;
-    const double per_first_half = n_some ? per_ray * ((double)n_rays / (double)n_some) : 0.0;
-    for (int64_t draw = part; draw < n_draws; draw += parts) {{
-        double normal[3], square = 0.0;
-        for (int a = 0; a < 3; ++a) {{
-            double cube = sobol[a * n_sobol + draw] + shift[a];
-            if (cube >= 1.0) cube -= 1.0;
-            normal[a] = quantile(GMM_MIN(GMM_MAX(cube, CLOSEST), 1.0 - CLOSEST));
-            square += normal[a] * normal[a];
-        }}
-        const double position = sqrt(square) * STEP;
-        const int64_t step_of = (int64_t)position;
-        const double below = shrinkages[step_of];
-        const double shrunk = below + (position - (double)step_of) * (shrinkages[step_of + 1] - below);
-        double end[3];
-        for (int i = 0; i < 3; ++i) {{
-            end[i] = mean[i];
-            for (int j = 0; j <= i; ++j) end[i] += l[i][j] * (normal[j] * shrunk);
-        }}
-        if (returns) {{
-            const double x = floor(end[0] / resolution) - lows[0], y = floor(end[1] / resolution) - lows[1];
-            const double z = floor(end[2] / resolution) - lows[2];
-            if (x >= 0 && y >= 0 && z >= 0 && x < size0 && y < size1 && z < size2)
-                GMM_ADD(hits + (int64_t)x * stride0 + (int64_t)y * stride1 + (int64_t)z, per_draw);
-        }}
-        if (draw >= n_rays) continue;
-        double closing = 0.0, share = 0.0;
-        if (shell > 0.0 && returns) {{
-            for (int a = 0; a < 3; ++a) closing += thinnest[a] * (end[a] - origin[a]);
-            share = GMM_MIN(shell / GMM_MAX(fabs(closing), 2.2250738585072014e-308), 1.0);
-        }}
-        double cells[9];  // origin, middle, stop
-        for (int a = 0; a < 3; ++a) {{
-            const double stop = end[a] - share * (end[a] - origin[a]);
-            cells[a] = origin[a] / resolution;
-            cells[3 + a] = (origin[a] + 0.5 * (stop - origin[a])) / resolution;
-            cells[6 + a] = stop / resolution;
-        }}
-        for (int half = 0; half < (draw < n_some ? 2 : 1); ++half) {{
-            const double* starts = cells + (thinned ? 3 - 3 * half : 0);
-            const double* ends = cells + 6 - 3 * half;
-            const double weight = half ? per_first_half : per_ray;
-            const int64_t item = 0;  // of the walk
-            {walk("GMM_ADD(misses + voxel, weight);")}
-        }}
-    }}
-"""
-
-_CAST = FusedKernel(
-    "cast_components",
-    "const double* means, const double* covariances, const double* origins, const bool* max_range,"
-    " const int64* ids, const int64* seen_by, const int64* seen_from, const double* seen_count,"
-    " const double* sobol, int64 n_sobol, const double* shrinkage, int64 n_radii, const double* bounds,"
-    " int64 parts, double resolution, const double* densities, int64 least, int64 most,"
-    " const double* cutoffs, double area,"
-    " double shell, int64 hits_per_ray, bool thinned, double* hits, double* misses, bool* failed",
-    _QUANTILE + _COMPONENT + _DRAWS,
-    shares=True,
-)
+_CAST = FusedKernel("rays/component_casting.h", "cast_components", shares=True)
 
 
 def cast_components(
@@ -286,9 +79,11 @@ def cast_components(
         points.shape[1],
         _shrinkages(cutoff, str(device)),
         _RADII + 2,
+        _RADII / _FARTHEST_DRAW,
         bounds.contiguous(),
         parts,
         resolution,
+        TIE,
         torch.tensor(rays_per_cell, dtype=torch.float64, device=device),
         least,
         most,
@@ -296,7 +91,7 @@ def cast_components(
         EFFECTIVE_AREA,
         shell,
         hits_per_ray,
-        thinned,
+        THINNING if thinned else 0,
         hits,
         misses,
         failed,

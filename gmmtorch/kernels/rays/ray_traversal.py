@@ -1,5 +1,9 @@
-"""Traversal of a voxel grid by rays. The fused kernel steps from voxel to voxel (`ray_walk`).
-Its twin enumerates plane crossings, without a stepping loop and without a sort.
+"""Traversal of a voxel grid by rays: voxels that are listed, counted, in a grid or in blocks, and marked.
+
+The fused kernels step from voxel to voxel (`ray_walk.h`). Those that count keep no list of visits. On a CPU
+they walk eight rays side by side, fetch the memory of a voxel when a walk meets it, and add to it up to 256
+visits later, so that the walks do not wait. The twin enumerates plane crossings, without a stepping loop and
+without a sort.
 
 A straight segment leaves one voxel at each grid plane that it crosses. The planes crossed along one axis
 are an arithmetic progression, so all crossings of all rays along that axis fit one flat tensor. The voxel
@@ -23,9 +27,12 @@ from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.chunks import chunked
-from gmmtorch.kernels.compiler import FusedKernel
-from gmmtorch.kernels.rays.ray_walk import PARAMETERS, TIE, walk
+from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel
 
+_SOURCE = "rays/ray_counting.h"
+TIE = 1e-13
+"""Distance of crossings that count as one point, relative to the terms: a few hundred times their rounding
+error."""
 CHUNK_VISITS = 1 << 18
 """Voxel visits in one pass: they fit a core's cache."""
 
@@ -81,7 +88,7 @@ def _planes_inside(rays: _Rays, size: Tensor, axis: int) -> tuple[Tensor, Tensor
         ratio = rays.delta[:, axis] / step
         enter = rays.start[:, axis] - rays.start[:, other] * ratio
         leave = rays.start[:, axis] + (size[other] - rays.start[:, other]) * ratio
-        slack = 2 + 1e-9 * (enter.abs() + leave.abs())  # a loose bound; `_voxels_left` masks exactly
+        slack = 2 + 1e-9 * (enter.abs() + leave.abs())  # a loose bound; `_crossings` masks exactly
         moving = (step > 0) & torch.isfinite(enter) & torch.isfinite(leave)
         begin = torch.where(moving, torch.maximum(begin, (enter - slack).floor()), begin)
         stop = torch.where(moving, torch.minimum(stop, (leave + slack).ceil()), stop)
@@ -91,97 +98,49 @@ def _planes_inside(rays: _Rays, size: Tensor, axis: int) -> tuple[Tensor, Tensor
     return begin - first, (stop - begin).clamp_min(0).long()
 
 
-class _Progression(NamedTuple):
-    """Constants (R,) of the crossings of rays along an axis: crossing k leaves voxel base + k·stride."""
+def _crossings(rays: _Rays, shape: tuple[int, ...], strides: list[int], axis: int, masked: bool) -> Visits:
+    """All voxels left through planes of `axis`, in the grid if `masked`.
 
-    begin: Tensor  # position of the ray's crossing 0 in the flat tensor
-    base: Tensor
-    stride: Tensor
-    step: Tensor  # |direction| along the axis
-
-
-class _Other(NamedTuple):
-    """Constants of each ray along another axis, (R,) each: its position at crossing k is (a + k·b)/step.
-
-    `a` includes the slack of the tie rule. A plane of a lower axis, which is crossed first in a tie, counts
-    as crossed slightly before the ray reaches it; a plane of a higher axis slightly after.
+    Crossing k of a ray is at plane first + k + 1 and leaves voxel first + k. On another axis it is at
+    (a + k·b)/step. `a` includes the slack of the tie rule: a plane of a lower axis, which is crossed first in
+    a tie, counts as crossed slightly before the ray reaches it; a plane of a higher axis slightly after.
     """
-
-    a: Tensor
-    b: Tensor
-    first: Tensor
-    last: Tensor
-    stride: Tensor
-    size: int
-    is_lower_axis: bool
-
-
-def _voxels_left(
-    ray: Tensor, along: _Progression, others: list[_Other], masked: bool
-) -> tuple[Tensor, Tensor | None]:
-    """Voxel (V,) that each crossing leaves and, if `masked`, whether it is in the grid (V,)."""
-    k = torch.arange(ray.shape[0], device=ray.device).sub(along.begin.index_select(0, ray)).double()
-    voxel = torch.addcmul(along.base.index_select(0, ray), k, along.stride.index_select(0, ray))
-    step = along.step.index_select(0, ray)
-    inside: Tensor | None = None
-    for other in others:
-        position = torch.addcmul(other.a.index_select(0, ray), k, other.b.index_select(0, ray)).div_(step)
-        index = position.floor_() if other.is_lower_axis else position.ceil_().sub_(1)
-        index = torch.clamp(index, other.first.index_select(0, ray), other.last.index_select(0, ray))
-        if masked:
-            within = (index >= 0) & (index < other.size)
-            inside = within if inside is None else inside & within
-        voxel = torch.addcmul(voxel, index, other.stride.index_select(0, ray))
-    return voxel.long(), inside
-
-
-@functools.cache
-def _compiled_voxels_left() -> Callable[..., tuple[Tensor, Tensor | None]]:
-    compiled: Callable[..., tuple[Tensor, Tensor | None]] = torch.compile(_voxels_left, dynamic=True)
-    return compiled
-
-
-def _crossings(
-    rays: _Rays, shape: tuple[int, ...], strides: list[int], axis: int, masked: bool, compiled: bool
-) -> Visits:
-    """All voxels left through planes of `axis`."""
-    device = rays.start.device
-    size = torch.tensor(shape, dtype=torch.float64, device=device)
+    size, stride = (
+        torch.tensor(values, dtype=torch.float64, device=rays.start.device) for values in (shape, strides)
+    )
+    signed = torch.where(rays.flipped, -stride, stride)  # mirrored voxel i is size − 1 − i
+    start, delta, first, last = (part.unbind(1) for part in rays[:4])
     if masked:
         skipped, count = _planes_inside(rays, size, axis)
     else:
-        skipped = torch.zeros_like(rays.start[:, axis])
-        count = (rays.last[:, axis] - rays.first[:, axis]).long()
+        skipped, count = torch.zeros_like(start[axis]), (last[axis] - first[axis]).long()
     ray = torch.repeat_interleave(count)
-    stride_t = torch.tensor(strides, dtype=torch.float64, device=device)
-    signed = torch.where(rays.flipped, -stride_t, stride_t)  # mirrored voxel i is size − 1 − i
-    shift = (rays.flipped * stride_t * (size - 1)).sum(1)
-    step = rays.delta[:, axis]
-    # Along this axis crossing k is at plane first + k + 1 and leaves voxel first + k.
-    along = _Progression(
-        begin=torch.cumsum(count, 0) - count - skipped.long(),
-        base=signed[:, axis] * rays.first[:, axis] + shift,
-        stride=signed[:, axis].contiguous(),
-        step=step.contiguous(),
+
+    def each(values: Tensor) -> Tensor:
+        return values.contiguous().index_select(0, ray)
+
+    k = (
+        torch.arange(len(ray), device=ray.device)
+        .sub(each(torch.cumsum(count, 0) - count - skipped.long()))
+        .double()
     )
-    to_first = rays.first[:, axis] + 1 - rays.start[:, axis]  # from the start to the first plane
-    others = [
-        _Other(
-            a=rays.start[:, other] * step
-            + to_first * rays.delta[:, other]
-            + _slack(rays, axis, other) * (1 if other < axis else -1),
-            b=rays.delta[:, other].contiguous(),
-            first=rays.first[:, other].contiguous(),
-            last=rays.last[:, other].contiguous(),
-            stride=signed[:, other].contiguous(),
-            size=shape[other],
-            is_lower_axis=other < axis,
-        )
-        for other in range(len(shape))
-        if other != axis
-    ]
-    voxel, inside = (_compiled_voxels_left() if compiled else _voxels_left)(ray, along, others, masked)
-    return Visits(voxel, ray) if inside is None else Visits(voxel[inside], ray[inside])
+    base = signed[:, axis] * first[axis] + (rays.flipped * stride * (size - 1)).sum(1)
+    voxel = torch.addcmul(each(base), k, each(signed[:, axis]))
+    step, to_first = each(delta[axis]), first[axis] + 1 - start[axis]  # from the start to the first plane
+    inside = torch.ones_like(ray, dtype=torch.bool)
+    for other in range(len(shape)):
+        if other == axis:
+            continue
+        slack = _slack(rays, axis, other) * (1 if other < axis else -1)
+        a = start[other] * delta[axis] + to_first * delta[other] + slack
+        position = torch.addcmul(each(a), k, each(delta[other])).div_(step)
+        index = position.floor_() if other < axis else position.ceil_().sub_(1)
+        index = torch.clamp(index, each(first[other]), each(last[other]))
+        if masked:
+            inside &= (index >= 0) & (index < shape[other])
+        voxel = torch.addcmul(voxel, index, each(signed[:, other]))
+    voxel = voxel.long()
+    return Visits(voxel[inside], ray[inside]) if masked else Visits(voxel, ray)
 
 
 def _slack(rays: _Rays, axis: int, other: int) -> Tensor:
@@ -209,7 +168,6 @@ def traverse(
     shape: tuple[int, ...],
     chunk_visits: int = CHUNK_VISITS,
     strides: list[int] | None = None,
-    compiled: bool = False,
     low: Tensor | None = None,
 ) -> Iterator[Visits]:
     """Voxels that each segment passes through and leaves; the voxel that it ends in is not included.
@@ -220,8 +178,6 @@ def traverse(
         shape: voxels along each axis; voxels outside are left out.
         chunk_visits: approximate number of visits in each chunk.
         strides: strides of the flat voxel index, one for each axis; row-major if not given.
-        compiled: use torch.compile: the same voxels about twice as fast, after about ten seconds for the
-            first call in a process. It needs a C++ compiler.
         low: (D,) index of the grid's lowest voxel, which has the flat index 0; zeros if not given.
 
     Yields:
@@ -234,31 +190,26 @@ def traverse(
     if is_fused(starts, ends, low):
         yield from _fused(starts, ends, shape, chunk_visits, strides, low)
     else:
-        yield from _batched(starts, ends, shape, chunk_visits, strides, compiled, low)
+        yield from _batched(starts, ends, shape, chunk_visits, strides, low)
 
 
-def grid_arguments(
-    starts: Tensor, ends: Tensor, shape: tuple[int, ...], strides: list[int], low: Tensor | None
+def rays_argument(
+    starts: Tensor,
+    ends: Tensor,
+    shape: tuple[int, ...],
+    strides: list[int],
+    low: Tensor | None,
+    unit: float = 1.0,
 ) -> list[Tensor | float]:
-    """The arguments `ray_walk.PARAMETERS` of a fused kernel, for voxels that are not divided."""
+    """The fields of `Rays` of `ray_walk.h`. unit: 1/n if n finer voxels make a voxel and ties are theirs."""
     dim = len(shape)
     low = starts.new_zeros(dim) if low is None else low.double().contiguous()
-    pad = 3 - dim
-    return [starts.contiguous(), ends.contiguous(), low, dim, *shape, *[1] * pad, *strides, *[0] * pad, 1.0]
+    sizes, pad = [*shape, *[1] * (3 - dim)], [0] * (3 - dim)
+    return [starts.contiguous(), ends.contiguous(), low, dim, *sizes, *strides, *pad, TIE, unit]
 
 
-_COUNT_VISITS = FusedKernel(
-    "count_visits", PARAMETERS + ", int64* n_visits", "int64_t n = 0;" + walk("++n;") + "n_visits[item] = n;"
-)
-_LIST_VISITS = FusedKernel(
-    "list_visits",
-    "int64 first_ray, const int64* stops, int64* voxels, int64* rays, " + PARAMETERS,
-    """
-    const int64_t ray = item + first_ray, before = first_ray ? stops[first_ray - 1] : 0;
-    int64_t place = (ray ? stops[ray - 1] : 0) - before;
-    """
-    + walk("voxels[place] = voxel; rays[place] = ray; ++place;", "ray"),
-)
+_COUNT_VISITS = FusedKernel(_SOURCE, "count_visits")
+_LIST_VISITS = FusedKernel(_SOURCE, "list_visits")
 
 
 def _fused(
@@ -270,27 +221,27 @@ def _fused(
     low: Tensor | None,
 ) -> Iterator[Visits]:
     device = starts.device
-    grid = grid_arguments(starts, ends, shape, strides, low)
+    rays = rays_argument(starts, ends, shape, strides, low)
     counts = torch.empty(starts.shape[0], dtype=torch.int64, device=device)
-    _COUNT_VISITS(starts.shape[0], *grid, counts, device=device)
+    _COUNT_VISITS(starts.shape[0], *rays, counts, device=device)
     stops = torch.cumsum(counts, 0)
     cuts = _chunk_bounds(counts, chunk_visits)
     sizes = stops[torch.tensor(cuts[1:], device=device) - 1].tolist()
     for begin, stop, before, after in zip(cuts, cuts[1:], [0, *sizes], sizes, strict=False):
         if after > before:
-            listed = functools.partial(_listed, grid, stops, {begin: before, stop: after}, begin)
+            listed = functools.partial(_listed, rays, stops, {begin: before, stop: after}, begin)
             yield from chunked(stop - begin, stop - begin, listed)
 
 
 def _listed(
-    grid: list[Tensor | float], stops: Tensor, known: dict[int, int], begin: int, part: slice
+    rays: list[Tensor | float], stops: Tensor, known: dict[int, int], begin: int, part: slice
 ) -> Visits:
     """Visits of a run of rays; `known`: how many visits come before a ray, where Python has this number."""
     first, last = begin + part.start, begin + part.stop
     before, after = (known[ray] if ray in known else int(stops[ray - 1]) for ray in (first, last))
-    voxels, rays = torch.empty(2, after - before, dtype=torch.int64, device=stops.device)
-    _LIST_VISITS(last - first, first, stops, voxels, rays, *grid, device=stops.device)
-    return Visits(voxels, rays)
+    visits = Visits(*torch.empty(2, after - before, dtype=torch.int64, device=stops.device))
+    _LIST_VISITS(last - first, first, stops, *visits, *rays, device=stops.device)
+    return visits
 
 
 def _batched(
@@ -299,7 +250,6 @@ def _batched(
     shape: tuple[int, ...],
     chunk_visits: int,
     strides: list[int],
-    compiled: bool,
     low: Tensor | None,
 ) -> Iterator[Visits]:
     """The twin: enumerates plane crossings in batches."""
@@ -312,7 +262,7 @@ def _batched(
     for begin, stop in itertools.pairwise(_chunk_bounds(visits, chunk_visits)):
         masked = not bool(fits[begin:stop].all())
         for axis in range(len(shape)):
-            crossings = functools.partial(_crossings_of, rays, begin, shape, strides, axis, masked, compiled)
+            crossings = functools.partial(_crossings_of, rays, begin, shape, strides, axis, masked)
             yield from (found for found in chunked(stop - begin, stop - begin, crossings) if len(found.voxel))
 
 
@@ -323,13 +273,12 @@ def _crossings_of(
     strides: list[int],
     axis: int,
     masked: bool,
-    compiled: bool,
     part: slice,
 ) -> Visits:
     """`_crossings` of a run of rays that starts at `begin`."""
     first, last = begin + part.start, begin + part.stop
     some = _Rays(*(field[first:last] for field in rays))
-    found = _crossings(some, shape, strides, axis, masked, compiled)
+    found = _crossings(some, shape, strides, axis, masked)
     return Visits(found.voxel, found.ray + first if first else found.ray)
 
 
@@ -338,3 +287,183 @@ def _chunk_bounds(visits: Tensor, chunk_visits: int) -> list[int]:
     chunk = (torch.cumsum(visits, 0) / chunk_visits).floor()
     cuts = (chunk[1:] != chunk[:-1]).nonzero().squeeze(1) + 1
     return [0, *cuts.tolist(), visits.shape[0]]
+
+
+_IN_GRID = FusedKernel(_SOURCE, "count_rays_in_grid", shares=True)
+_IN_BLOCKS = {
+    dtype: FusedKernel(_SOURCE, f"count_rays_in_blocks<{kind}>", shares=True)
+    for dtype, kind in ((torch.float64, "double"), (torch.float32, "float"))
+}
+_MARK = FusedKernel(_SOURCE, "mark_rays")
+_MARK_BITS = FusedKernel(_SOURCE, "mark_cells_of_rays")
+
+
+def count_in_grid(
+    counts: Tensor,
+    starts: Tensor,
+    ends: Tensor,
+    shape: tuple[int, ...],
+    weights: Tensor | None = None,
+    *,
+    low: Tensor | None = None,
+    chunk_visits: int = CHUNK_VISITS,
+) -> None:
+    """Add the weight of each ray to `counts`, a dense grid, at every voxel that it leaves.
+
+    Args:
+        counts: (voxels,) float64, row-major.
+        starts, ends, shape, low: see `traverse`.
+        weights: (R,); ones if not given.
+        chunk_visits: of the twin, see `traverse`.
+    """
+    weights = None if weights is None else weights.double().contiguous()
+    starts, ends = starts.double(), ends.double()
+    if is_fused(counts, starts, ends, weights, low):
+        rays = rays_argument(starts, ends, shape, row_major_strides(shape), low)
+        n_items = _n_items(len(starts), counts.device)
+        _IN_GRID(n_items, len(starts), *rays, weights, counts, device=counts.device)
+        return
+    one = torch.ones((), dtype=torch.float64, device=counts.device)
+    for visit in traverse(starts, ends, shape, chunk_visits, low=low):
+        source = one.expand(visit.voxel.shape) if weights is None else weights[visit.ray]
+        counts.scatter_add_(0, visit.voxel, source)
+
+
+class BlockTable(NamedTuple):
+    """A box of blocks of voxels, each side padded to a power of two, and where each block is stored.
+
+    first: index in the counts of the first voxel of each block, −1 if it is not stored; row-major. low: (D,)
+    lowest block, float64. bits: of the block's coordinate along each axis. local_bits: of the voxel's
+    coordinate in its block. open: stores the blocks with these indices (M,) and enters them in `first`.
+    """
+
+    first: Tensor
+    low: Tensor
+    bits: tuple[int, ...]
+    local_bits: int
+    open: Callable[[Tensor], None]
+
+
+def count_in_blocks(
+    counts: Callable[[], Tensor],
+    table: BlockTable,
+    starts: Tensor,
+    ends: Tensor,
+    weights: Tensor | None,
+    *,
+    chunk_visits: int = CHUNK_VISITS,
+) -> None:
+    """Add the weight of each ray at every voxel that it leaves; stores the blocks of these voxels.
+
+    Args:
+        counts: gives the counts (cells,), float32 or float64. `table.open` can replace them.
+        table: contains the starts and the ends.
+        starts, ends: (R, D) in voxels.
+        weights: (R,); ones if not given.
+        chunk_visits: of the twin, see `traverse`.
+    """
+    starts, ends = starts.double(), ends.double()
+    weights = None if weights is None else weights.to(counts().dtype).contiguous()
+    low = table.low * (1 << table.local_bits)
+    if is_fused(counts(), starts, ends, weights):
+        _count_in_blocks_fused(counts, table, starts, ends, weights, low)
+        return
+    bits = tuple(b + table.local_bits for b in table.bits)
+    one = torch.ones((), dtype=counts().dtype, device=starts.device)
+    shape, strides = tuple(1 << b for b in bits), packed_strides(bits)
+    for visit in traverse(starts, ends, shape, chunk_visits, strides, low):
+        block, place = _split(visit.voxel, table.bits, table.local_bits)
+        first = table.first.index_select(0, block)
+        if int(first.min()) < 0:
+            table.open(block[first < 0].long().unique())
+            first = table.first.index_select(0, block)
+        source = one.expand(first.shape) if weights is None else weights[visit.ray]
+        counts().scatter_add_(0, first.add_(place), source)
+
+
+def _count_in_blocks_fused(
+    counts: Callable[[], Tensor],
+    table: BlockTable,
+    starts: Tensor,
+    ends: Tensor,
+    weights: Tensor | None,
+    low: Tensor,
+) -> None:
+    device, side, dim = starts.device, 1 << table.local_bits, len(table.bits)
+    n_rays = starts.shape[0]
+    # A walk over blocks finds those to store. Division by a power of two is exact, and `unit` keeps the tie
+    # rule of the voxels, so that the walk over voxels meets the same blocks.
+    marked = torch.zeros_like(table.first, dtype=torch.bool)
+    shape = tuple(1 << b for b in table.bits)
+    strides = packed_strides(table.bits)
+    rays = rays_argument(starts / side, ends / side, shape, strides, table.low, unit=1 / side)
+    _MARK(n_rays, *rays, marked, device=device)
+    new = (marked & (table.first < 0)).nonzero().squeeze(1)
+    if new.numel():
+        table.open(new)
+    bits = tuple(b + table.local_bits for b in table.bits)
+    rays = rays_argument(starts, ends, tuple(1 << b for b in bits), packed_strides(bits), low)
+    shifts = [shift for shift, _ in _fields(bits)]
+    above = [shift for shift, _ in _fields(table.bits)]
+    mask2 = (1 << bits[2]) - 1 if dim == 3 else 0
+    fields = [table.local_bits, shifts[0], shifts[1], (1 << bits[1]) - 1, mask2, above[0], above[1]]
+    kernel = _IN_BLOCKS[counts().dtype]
+    n_items = _n_items(n_rays, device)
+    kernel(n_items, n_rays, *rays, table.first, *fields, weights, counts(), device=device)
+
+
+def mark_cells_of_rays(
+    marks: Tensor, starts: Tensor, stops: Tensor, is_hit: Tensor, low: Tensor, bit: int
+) -> None:
+    """Sets a bit of the cells that rays leave or hit, in place; cells outside the grid do not count.
+
+    Args:
+        marks: (nx, ny, nz) int32, contiguous. low: (3,) int64, its lowest cell.
+        starts, stops: (R, 3) float64, in cells. is_hit: (R,) bool, whether a ray hits the cell it ends in.
+        bit: a power of two.
+    """
+    shape = tuple(marks.shape)
+    strides = row_major_strides(shape)
+    if is_fused(marks, starts, stops, is_hit, low):
+        rays = rays_argument(starts, stops, shape, strides, low)
+        _MARK_BITS(len(stops), *rays, is_hit.contiguous(), bit, marks, device=marks.device)
+        return
+    flat = marks.view(-1)
+    for visit in traverse(starts, stops, shape, low=low):
+        flat[visit.voxel] |= bit
+    ends = stops[is_hit].floor().long() - low
+    inside = ((ends >= 0) & (ends < torch.tensor(shape, device=ends.device))).all(1)
+    flat[(ends[inside] * torch.tensor(strides, device=ends.device)).sum(1)] |= bit
+
+
+def _n_items(n_rays: int, device: torch.device) -> int:
+    """On a CPU an item is a group of rays that are walked side by side; on CUDA it is a ray."""
+    return -(-n_rays // CPU_LANES) if device.type == "cpu" else n_rays
+
+
+def _split(voxel: Tensor, block_bits: tuple[int, ...], local_bits: int) -> tuple[Tensor, Tensor]:
+    """Block in the table, and place in the block, (V,) each, of packed cell indices (V,).
+
+    The field of each axis is cut into block bits and local bits; each kind is packed again.
+    """
+    bits = tuple(b + local_bits for b in block_bits)
+    packed = voxel.int() if sum(bits) < 31 else voxel
+    side_mask = (1 << local_bits) - 1
+    block, place = packed >> local_bits & ((1 << block_bits[-1]) - 1), packed & side_mask
+    for axis in range(len(bits) - 2, -1, -1):
+        shift, width = _fields(bits)[axis][0], block_bits[axis]
+        above = sum(block_bits[axis + 1 :])
+        block = block | ((packed >> (shift + local_bits - above)) & (((1 << width) - 1) << above))
+        low = local_bits * (len(bits) - 1 - axis)
+        place = place | ((packed >> (shift - low)) & (side_mask << low))
+    return block, place
+
+
+def packed_strides(bits: tuple[int, ...]) -> list[int]:
+    """Strides of a packed index whose axes have these bits; the last axis is lowest."""
+    return [1 << shift for shift, _ in _fields(bits)]
+
+
+def _fields(bits: tuple[int, ...]) -> list[tuple[int, int]]:
+    """(shift, width) of each axis in a packed index; the last axis is lowest."""
+    return [(sum(bits[axis + 1 :]), bits[axis]) for axis in range(len(bits))]

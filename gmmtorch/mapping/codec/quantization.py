@@ -345,14 +345,5 @@ def raster(cells: Ints, least: Ints, extent: Ints) -> Ints:
     return number
 
 
-def world_exponents(places: Lattice) -> Tensor:
-    return places.by_world_axis(places.mean_exponents())
-
-
-def by_world_axis(places: Lattice, values: Tensor) -> Tensor:
-    """Values (K, D), ordered by falling deviation, in the order of the world axes."""
-    return torch.empty_like(values).scatter_(1, places.axes(), values)
-
-
 def ints(values: Tensor) -> Ints:
     return values.long().numpy()

@@ -19,7 +19,7 @@ from gmmtorch.mixture import PruneOptions
 from gmmtorch.options import option
 
 if TYPE_CHECKING:
-    from gmmtorch.mapping.learning.depth_frame import DepthFrame
+    from gmmtorch.mapping.learning.fitting import DepthFrame
     from gmmtorch.scan import Scan
 
 FORGET_OFF, CONTRADICTION = "off", "contradiction"

@@ -1,33 +1,73 @@
-"""Learning from windows of scans: their components are added to those of a map, and merged under a budget."""
+"""Learning from windows of scans: their components are added to those of a map, and merged under a budget.
+
+Forgetting: components that later beams contradict, or that are old, leave the map.
+
+Contradiction. A surface that is still there stops at least a share q of the beams that meet it; one that is
+gone stops at most a share ε. A component that is thicker than flat pieces joins several surfaces, with gaps
+between them, so that its q and ε are lower. A scan of which `passed` beams went through a component and
+`returned` ones ended on it changes the log-odds that the surface is gone by
+
+    w (passed · log((1 − ε)/(1 − q)) + returned · log(ε/q)),
+
+where w lets the beams of a scan count as at most a few independent ones, because they share the error of its
+pose. The log-odds start at 0 and stay between 0 and log(_CERTAIN). A component that ends a window at the
+upper limit is dropped (Page's cumulative sum test, Biometrika 41, 1954). Because of the lower limit, many
+early returns do not delay the removal of a surface that is gone later.
+
+Half-life. Counts of all components are halved for every half-life between the times of two windows.
+
+Prediction: what a map says about a window's beams before it learns from them. The predictions calibrate the
+map, see `occupancy.calibrator`.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import islice
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.kernels import PassLimits, beam_passes
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.association import count_explained
-from gmmtorch.mapping.learning.depth_frame import DepthFrame, as_scans
-from gmmtorch.mapping.learning.fitting import SurfaceFit, fit_frames, fit_window
-from gmmtorch.mapping.learning.forgetting import Doubts, joined
-from gmmtorch.mapping.learning.merging import Size, compact, compact_to_bytes, estimated_bytes
-from gmmtorch.mapping.learning.novelty import novel_beams
-from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
-from gmmtorch.mapping.learning.viewpoints import all_origins, limit_origins, sampled_origins
+from gmmtorch.mapping.learning.fitting import DepthFrame, SurfaceFit, as_scans, fit_frames, fit_window
+from gmmtorch.mapping.learning.merging import (
+    Size,
+    all_origins,
+    compact,
+    compact_to_bytes,
+    estimated_bytes,
+    limit_origins,
+    sampled_origins,
+)
+from gmmtorch.mapping.learning.novelty import count_explained, explained_within, novel_beams
+from gmmtorch.mapping.learning.rules import (
+    CONTRADICTION,
+    FORGET_OFF,
+    IncrementalRule,
+    LearningRule,
+    NoveltyRule,
+    WindowedRule,
+)
+from gmmtorch.mapping.query import MANY_POINTS, cutoff_of
 from gmmtorch.mixture import SOFTMAX_DTYPES, FlatnessRule, surface_rule
+from gmmtorch.occupancy import (
+    Calibrator,
+    Cones,
+    PointEvidence,
+    Prediction,
+    listed_points,
+    spectrum_of,
+    whitening,
+)
 from gmmtorch.scan import Scan
 
 BeforeWindow = Callable[[Components, Sequence[Scan | DepthFrame]], None]
 """Is called with the components of a map before a window, and the window."""
-
-
-def no_prediction(known: Components, window: Sequence[Scan | DepthFrame]) -> None:
-    """Ignores the window."""
 
 
 # -- an IncrementalRule ---------------------------------------------------------------------------------
@@ -40,7 +80,7 @@ def absorb(
     size: Size = estimated_bytes,
     weight: float = 1.0,
     doubts: Doubts | None = None,
-    before: BeforeWindow = no_prediction,
+    before: BeforeWindow | None = None,
 ) -> tuple[Components, Doubts]:
     """The components of a map with scans added, merged until they meet the budget; and the doubts after them.
 
@@ -54,7 +94,7 @@ def absorb(
         rule: if it is not complete, it is fitted to all scans, which are then read at once.
         size: number of bytes of given components, for `rule.max_bytes`.
         weight: number of measured points for which each point of the scans stands.
-        doubts: of `forgetting`, before these scans; None: none.
+        doubts: before these scans; None: none.
         before: is called before each window is learned.
     """
     if None in (rule.noise, rule.length, rule.cell, rule.window):
@@ -62,7 +102,8 @@ def absorb(
         rule = rule.fitted(scans)
     doubts, left = doubts or Doubts.none(), iter(scans)
     while window := list(islice(left, rule.window)):
-        before(components, window)
+        if before is not None:
+            before(components, window)
         components, doubts = _absorb_window(components, window, rule, size, weight, doubts)
     return components, doubts
 
@@ -105,25 +146,18 @@ def _explain(
     remaining = []
     for scan in scans:
         novel = scan.select(novel_beams(components, scan, rule))
-        frees = _contribute_free_space(components, novel, rule)
+        frees = None  # all returns are novel by the cells before their ends
+        if rule.distance_for != "all":
+            before_ends = Scan(novel.points[:0], novel.origin, novel.points)
+            frees = novel_beams(components, before_ends, rule)
         keep = []
-        for points, max_range, free in (
-            (novel.points, False, frees),
-            (novel.no_return, True, None),
-        ):
+        for points, max_range, free in ((novel.points, False, frees), (novel.no_return, True, None)):
             components, explained = count_explained(
                 components, points, scan.origin, rule.distance, rule.explained, max_range, weight, free
             )
             keep.append(~explained)
         remaining.append(novel.select(torch.cat(keep)))
     return components, remaining
-
-
-def _contribute_free_space(components: Components, scan: Scan, rule: NoveltyRule) -> Tensor | None:
-    """Which returns (N,) of a scan are novel by the cells before their ends alone; None: all."""
-    if rule.distance_for == "all":
-        return None
-    return novel_beams(components, Scan(scan.points[:0], scan.origin, scan.points), rule)
 
 
 def _within_budget(components: Components, rule: IncrementalRule, size: Size) -> Components:
@@ -192,3 +226,258 @@ def flatness_rule(rule: WindowedRule, dim: int) -> FlatnessRule:
         max_components=rule.n_components,
         outlier_gap=10 * rule.length,
     )
+
+
+_FLAT = 3.0  # times the noise: the smallest deviation of a flat component, at most
+_FLAT_STOPS, _THICK_STOPS = (0.5, 0.05), (0.3, 0.02)  # q and ε
+_CERTAIN = 1000.0  # odds that the surface is gone
+_INDEPENDENT = 4.0  # beams of a scan
+_MOST_BEAMS = 4096  # of a scan that are counted
+_LEAST_SUPPORT = 0.5  # points: a component with fewer is dropped
+_MARGIN = 20.0  # times the noise
+_LIMITS = {"through": 1.0, "reach": 3.0, "grazing": 4.0}  # see `PassLimits`; 4: about 14°
+
+
+@dataclass(frozen=True)
+class Doubts:
+    """The state of forgetting, besides the components.
+
+    ids: (J, 2) of the components in doubt. log_odds: (J,) that their surfaces are gone, above 0.
+    time: of the last scan (s); None: not known.
+    """
+
+    ids: Tensor
+    log_odds: Tensor
+    time: float | None = None
+
+    @classmethod
+    def none(cls, time: float | None = None) -> Doubts:
+        """No component is in doubt."""
+        return cls(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0, dtype=torch.float64), time)
+
+    @classmethod
+    def read(cls, state: dict[str, Any]) -> Doubts:
+        """The doubts of a state, `vars` of others. Raises `ValueError` if it is damaged."""
+        made = cls(**state)
+        if made.ids.shape != (len(made.log_odds), 2) or made.ids.dtype != torch.int64:
+            raise ValueError("the components in doubt are damaged")
+        return made
+
+    def of(self, ids: Tensor) -> Tensor:
+        """The log-odds (K,) of components with these ids (K, 2); 0 for those that are not in doubt."""
+        found = torch.zeros(len(ids), dtype=torch.float64, device=ids.device)
+        if len(self.ids) == 0:
+            return found
+        both = torch.cat([self.ids.to(ids.device), ids])
+        _, number = torch.unique(both, dim=0, return_inverse=True)
+        table = found.new_zeros(int(number.max()) + 1)
+        table[number[: len(self.ids)]] = self.log_odds.to(ids.device)
+        return table[number[len(self.ids) :]]
+
+
+def joined(
+    known: Components,
+    learned: Components,
+    window: Sequence[Scan | DepthFrame],
+    rule: LearningRule,
+    doubts: Doubts,
+) -> tuple[Components, Doubts]:
+    """The components of a map and those learned from a window of S scans, without those that are gone; and
+    the doubts after the window.
+
+    Components without a number are not in doubt: their test begins with the next window.
+
+    Args:
+        rule: its noise must be set if a scan has a return.
+        doubts: before the window.
+
+    Raises `InvalidArgumentError` for a half-life if a scan has no time.
+    """
+    if rule.forget == FORGET_OFF:
+        return Components.concatenate([known, learned]), doubts
+    if rule.forget == CONTRADICTION:
+        both = Components.concatenate([known, learned])
+        return _confirmed(both, as_scans(window), rule.noise or 0.0, doubts)
+    aged, doubts = _aged(known, getattr(window[-1], "time", None), float(rule.forget), doubts)
+    return Components.concatenate([aged, learned]), doubts
+
+
+def _confirmed(
+    components: Components, scans: Sequence[Scan], noise: float, doubts: Doubts
+) -> tuple[Components, Doubts]:
+    """The components that these scans do not contradict."""
+    log_odds = doubts.of(components.ids)
+    surfaces = (~components.max_range).nonzero().squeeze(1)
+    found = gone_log_odds(components.selected(surfaces), scans, noise, log_odds[surfaces])
+    log_odds = log_odds.index_copy(0, surfaces, found)
+    kept = (log_odds < math.log(_CERTAIN)).nonzero().squeeze(1)
+    doubted = kept[(log_odds[kept] > 0) & (components.ids[kept, 1] >= 0)]
+    doubts = Doubts(components.ids[doubted].cpu(), log_odds[doubted].cpu())
+    return components if len(kept) == len(components) else components.selected(kept), doubts
+
+
+def _aged(
+    components: Components, time: float | None, half_life: float, doubts: Doubts
+) -> tuple[Components, Doubts]:
+    """The components with their counts at the time (s) of the last scan of the window."""
+    if time is None:
+        raise InvalidArgumentError(
+            f"forget={half_life:g} is a half-life in seconds, but a scan has no time: give "
+            "Scan(points, origin, time=seconds), or forget='contradiction'."
+        )
+    before = doubts.time
+    doubts = replace(doubts, time=time if before is None else max(time, before))
+    if before is None or time <= before:  # a clock that goes back does not add evidence
+        return components, doubts
+    left = 2.0 ** ((before - time) / half_life)
+    kept = (components.support * left >= _LEAST_SUPPORT).nonzero().squeeze(1)
+    aged = components.selected(kept)
+    return replace(aged, support=aged.support * left, seen_count=aged.seen_count * left), doubts
+
+
+def gone_log_odds(components: Components, scans: Sequence[Scan], noise: float, log_odds: Tensor) -> Tensor:
+    """Log-odds (K,) after the scans that the surfaces of K components are gone; `log_odds` (K,): before them.
+
+    Components of no-return beams must not be among the components. noise: of the sensor, metres.
+    """
+    if len(components) == 0:
+        return log_odds
+    white, _ = whitening(components.covariances)
+    deviations = torch.linalg.eigvalsh(components.covariances.double())[:, [0, -1]].clamp_min(0).sqrt()
+    limits = PassLimits(**_LIMITS, margin=_MARGIN * noise, explained=explained_within(components.dim, None))
+    is_flat = deviations[:, :1] <= _FLAT * noise
+    flat, thick = deviations.new_tensor([_FLAT_STOPS, _THICK_STOPS])
+    there, gone = torch.where(is_flat, flat, thick).unbind(1)
+    passes, returns = ((1 - gone) / (1 - there)).log(), (gone / there).log()
+    for scan in scans:
+        ends, is_hit = scan.ends()
+        stride = -(-len(ends) // _MOST_BEAMS) or 1
+        origin = scan.origin.double()
+        beams = ends[::stride].double() - origin
+        passed, returned = beam_passes(
+            white, components.means - origin, deviations, beams, is_hit[::stride], limits
+        )
+        share = _INDEPENDENT / (passed + returned).clamp_min(_INDEPENDENT)
+        change = share * (passes * passed + returns * returned)
+        log_odds = (log_odds + change).clamp(0, math.log(_CERTAIN))
+    return log_odds
+
+
+SIDES = (0.02, 0.1, 0.4)
+"""Sides (m) of the cubes for which a map predicts."""
+
+_BEAMS = 12  # of a window, from one scan, whose neighbourhood few components reach
+_PREDICTING = 3.5, 8e-4  # ms of a prediction, and of each pair of a point and a cone, on one core
+_LEARNING, _MOST = (20.0, 5e-4), 200_000  # ms of a window, and of each of its points, at most so many
+_SHARE = 0.04  # of the time of learning that predictions take
+
+
+def predicted(
+    known: Components, window: Sequence[Scan | DepthFrame], calibrator: Calibrator | None, number: int
+) -> Calibrator | None:
+    """What is known about the calibration after a map has predicted the beams of a window.
+
+    Of each chosen beam, its end is occupied and a point drawn uniformly from the rest is free. Points without
+    evidence are left out, and those with less than half of the others: they lie where the map has only begun,
+    and later it is asked mostly about places that it knows well.
+
+    Args:
+        known: the components before the window.
+        calibrator: before the window; None: the ranges of the window give one.
+        number: of the window; chooses the beams, and the side of the cubes.
+    """
+    if calibrator is not None and number < calibrator.next_window:
+        return calibrator
+    generator = torch.Generator().manual_seed(number)
+    origins, ends = _beams(window, generator)
+    if not len(ends):
+        return calibrator
+    if calibrator is None:
+        calibrator = Calibrator.of(_mean_range(window), len(SIDES))
+    if not len(known):
+        return calibrator
+    share = torch.rand(len(ends), 1, generator=generator, dtype=torch.float64).to(ends.device)
+    points = torch.cat([ends, origins + share * (ends - origins)])
+    occupied = torch.arange(len(points), device=points.device) < len(ends)
+    predictions = []
+    evidence, n_pairs = few_points(known, points, SIDES)
+    for side, (hits, misses) in zip(SIDES, evidence, strict=True):
+        seen = hits * (calibrator.length / side) + misses
+        kept = (seen >= seen.median()) & (seen > 0)
+        predictions.append(Prediction(hits[kept], misses[kept], occupied[kept], side))
+    due = number + _windows_between(n_pairs, sum(map(_size, window)))
+    return replace(calibrator.updated(predictions, known.dim), next_window=due)
+
+
+def _windows_between(n_pairs: int, n_points: int) -> int:
+    """Windows from one prediction to the next, so that predictions take a small share of the time."""
+    predicting = _PREDICTING[0] + _PREDICTING[1] * n_pairs
+    learning = _LEARNING[0] + _LEARNING[1] * min(n_points, _MOST)
+    return max(1, round(predicting / (_SHARE * learning)))
+
+
+def _size(scan: Scan | DepthFrame) -> int:
+    """Number of points, or of pixels."""
+    return scan.depth.numel() if isinstance(scan, DepthFrame) else len(scan.points)
+
+
+def _mean_range(window: Sequence[Scan | DepthFrame]) -> float:
+    """Mean range (m) of the returns of a window that has some."""
+    ranges = torch.cat([(scan.points - scan.origin).norm(dim=1).double() for scan in window])
+    return float(ranges.mean())
+
+
+def _beams(window: Sequence[Scan | DepthFrame], generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Origins and ends (B, D) of some returns of a scan of a window, float64."""
+    scan = window[int(torch.randint(len(window), (1,), generator=generator))]
+    points = scan.points
+    if len(points):
+        points = points[torch.randint(len(points), (_BEAMS,), generator=generator).to(points.device)]
+    return scan.origin.double().expand_as(points), points.double()
+
+
+def few_points(known: Components, points: Tensor, sides: Sequence[float]) -> tuple[list[PointEvidence], int]:
+    """Evidence (M,) of cubes of several sides (m) at a few points (M, D), without an index; and the number of
+    pairs of a point and a cone that it takes."""
+    cutoff = cutoff_of(len(known.seen_count), int((known.seen_count >= MANY_POINTS).sum()))
+    point, view = _near(known, points, max(sides), cutoff)
+    used, cone = torch.unique(view, return_inverse=True)
+    by = known.seen_by[used]
+    component, number = torch.unique(by, return_inverse=True)
+    origins = known.origins[known.seen_from[used]]
+    cones = Cones(
+        known.means[by], known.covariances[by], origins, known.seen_count[used], known.max_range[by]
+    )
+    axes = spectrum_of(known.covariances[component])[1][number]
+    return listed_points(cones, axes, points, (point, cone), sides, cutoff), len(point)
+
+
+def _near(known: Components, points: Tensor, side: float, cutoff: float) -> tuple[Tensor, Tensor]:
+    """Pairs of a point (P,) and a viewpoint (P,) whose cone may give evidence to the cube at the point.
+
+    First by boxes around the cones, then by balls around the components. Both keep every pair with evidence.
+    """
+    widest = side * max(0.5 * known.dim**0.5, cutoff / 12**0.5)
+    extent = cutoff * known.covariances.diagonal(dim1=1, dim2=2).sqrt()
+    by, origins = known.seen_by, known.origins[known.seen_from]
+    low = torch.minimum((known.means - extent)[by], origins) - widest
+    high = torch.maximum((known.means + extent)[by], origins) + widest
+    view = ((low <= points.amax(0)) & (high >= points.amin(0))).all(1).nonzero().squeeze(1)
+    low, high = low[view], high[view]
+    met = (points[:, :1] >= low[:, 0]) & (points[:, :1] <= high[:, 0])
+    for axis in range(1, known.dim):
+        met &= points[:, axis, None] >= low[:, axis]
+        met &= points[:, axis, None] <= high[:, axis]
+    point, row = met.nonzero(as_tuple=True)
+    view = view[row]
+    ray, offset = points[point] - origins[view], points[point] - known.means[by[view]]
+    square = (ray * ray).sum(1).clamp_min(1e-12)
+    along = (ray * offset).sum(1)
+    distance = (offset - ray).square().sum(1)
+    # The cube seen from a sensor at range r is as wide as widest · distance / r at the component.
+    ball = extent.norm(dim=1)[by[view]] + widest * (distance / square).clamp_min(1).sqrt()
+    close = (offset * offset).sum(1) * square - along * along <= 1.001 * ball * ball * square
+    close = (close & ((along <= 0) | (along * along <= 1.001 * ball * ball * square))) | (
+        square <= widest * widest
+    )
+    return point[close], view[close]

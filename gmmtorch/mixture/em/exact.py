@@ -141,7 +141,7 @@ def feature_dimension(n_features: int) -> int:
     return int(((8 * n_features + 1) ** 0.5 - 3) / 2 + 0.5)
 
 
-# -- lost digits ----------------------------------------------------------------------------------
+# -- the direct form: slower, without cancellation ------------------------------------------------
 
 
 def is_ill_conditioned(parameters: Parameters) -> bool:
@@ -165,6 +165,18 @@ def has_cancelled(statistics: Tensor, parameters: Parameters) -> bool:
     second = statistics[:, 1:].abs().amax(1) / statistics[:, 0].clamp_min(1e-300)
     lost = torch.finfo(variance.dtype).eps * second > 1e-6 * variance
     return bool((lost & alive).any())
+
+
+def log_joint(points: Tensor, parameters: Parameters) -> Tensor:
+    """log π_k + log N(x_n | μ_k, Σ_k), (N, K), from ‖L⁻¹(x − μ)‖², without cancellation at any distance."""
+    weights, means, covariances = parameters
+    factors = safe_cholesky(covariances)
+    whiten = inverse_factor(factors)
+    offset = points[:, None, :] - means
+    squared = torch.einsum("nkd,kde->nke", offset, whiten).square().sum(-1)
+    half_log_det = torch.log(factors.diagonal(dim1=-2, dim2=-1)).sum(-1)
+    constant = torch.log(weights).clamp_min(MIN_LOG_WEIGHT) - half_log_det - 0.5 * means.shape[1] * LOG_2PI
+    return constant - 0.5 * squared
 
 
 # -- covariance types -----------------------------------------------------------------------------

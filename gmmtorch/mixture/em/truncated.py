@@ -113,7 +113,7 @@ def _steps(
     last: tuple[Tensor, Tensor] | None,
     share: float,
 ) -> tuple[Parameters, Parameters | None]:
-    """EM's own step and the extrapolated one; the twin of `kernels.mixtures.m_step.fused_steps`."""
+    """EM's own step and the extrapolated one; the twin of `kernels.fused_steps`."""
     centered = parameters._replace(means=torch.zeros_like(parameters.means))
 
     def maximized(sums: Tensor) -> Parameters:

@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -44,9 +44,23 @@ class Deviations(NamedTuple):
     footprint: Tensor
 
 
+class SensorModel(Protocol):
+    """The sensor properties that fitting and pruning use."""
+
+    def noise_covariances(
+        self, points: ArrayLike, origin: ArrayLike, normals: ArrayLike | None = None
+    ) -> Tensor:
+        """Covariances (N, D, D), m², of the errors of the points, world frame."""
+        ...
+
+    def point_density(self, distance: ArrayLike, cos_incidence: ArrayLike | float = 1.0) -> Tensor:
+        """Expected points of one scan on a surface, per square metre in 3D and per metre in 2D."""
+        ...
+
+
 @dataclass(frozen=True)
-class SensorModel(ABC):
-    """Base of the sensor models: the properties that fitting and pruning use.
+class _BeamModel(ABC):
+    """Base of the sensor models.
 
     max_incidence: radians. A surface at a larger incidence is treated as at this angle. It limits f tan θ
         from above and the density from below: an observed surface is not exactly edge-on.
@@ -103,7 +117,7 @@ class SensorModel(ABC):
 
 
 @dataclass(frozen=True)
-class DepthCameraModel(SensorModel):
+class DepthCameraModel(_BeamModel):
     """A structured-light or stereo camera: σ(z) = a + b z + c z², because it measures disparity.
 
     The defaults are those of a Kinect: axial noise 1.2 mm + 1.9 mm (z − 0.4)², lateral noise 0.8 pixels
@@ -136,7 +150,7 @@ class DepthCameraModel(SensorModel):
 
 
 @dataclass(frozen=True)
-class LidarModel(SensorModel):
+class LidarModel(_BeamModel):
     """A spinning or solid-state lidar: constant and proportional range noise, and a beam that widens.
 
     The defaults are those of a 16-ring spinning lidar's data sheet, except for the noise, which in
@@ -165,7 +179,7 @@ class LidarModel(SensorModel):
 
 
 @dataclass(frozen=True)
-class LaserModel(SensorModel):
+class LaserModel(_BeamModel):
     """A laser that sweeps a plane: `LidarModel` in 2D.
 
     The defaults are those of common indoor scanners of the 2000s: 1 cm, beams of 0.25°, 1° apart.

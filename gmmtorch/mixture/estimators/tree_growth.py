@@ -19,8 +19,13 @@ from torch import Tensor
 from gmmtorch.kernels import chunk_elements
 from gmmtorch.linalg import unpack_symmetric
 from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em.by_type import Factors
-from gmmtorch.mixture.em.exact import SOFTMAX_DTYPES, Parameters, feature_dimension, natural_parameters
+from gmmtorch.mixture.em.exact import (
+    SOFTMAX_DTYPES,
+    Parameters,
+    feature_dimension,
+    log_joint,
+    natural_parameters,
+)
 from gmmtorch.mixture.em.truncated import Rows, group_rows
 
 if TYPE_CHECKING:
@@ -167,7 +172,7 @@ def _root(points: Tensor, weight: Tensor, reg_covar: float) -> tuple[Nodes, Memb
     covariance = (weight[:, None] * offset).T @ offset / total
     covariance.diagonal().add_(reg_covar)
     root = Parameters(torch.ones_like(total)[None], mean[None], covariance[None])
-    own = (weight * Factors(root, "full").direct()(points)[0]).sum()[None]
+    own = (weight * log_joint(points, root)[:, 0]).sum()[None]
     index = torch.arange(points.shape[0], device=points.device)
     return Nodes(index.new_tensor([-1]), root, own, own), Members(index, torch.zeros_like(index), weight)
 

@@ -1,31 +1,35 @@
-"""Point form: evidence of the cube around a point in closed form, without a grid and without samples."""
+"""Point form: evidence of the cube around a point in closed form, without a grid and without samples.
+
+KeptEvidence keeps the evidence of the cells of a grid from one state of a map to the next. Queries along rays
+tell where a beam ends, given the occupancy of the cells on its way.
+"""
 
 from __future__ import annotations
 
 import copy
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from gmmtorch.arrays import ArrayLike
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.arrays import ArrayLike, as_tensor
+from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
 from gmmtorch.kernels import (
     Lists,
     PointTable,
     chunked,
-    compiled_pair_evidence,
     is_fused,
     listed_evidence,
     pair_evidence,
 )
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.occupancy.cone_index import ConeIndex, chunks_of, replaced_rows, spectrum_of
-from gmmtorch.occupancy.cones import CUTOFF, Cones
-from gmmtorch.occupancy.grid import check_resolution
+from gmmtorch.occupancy.cones import CUTOFF, Cones, former_rows
+from gmmtorch.occupancy.evidence import occupancy_probability
+from gmmtorch.occupancy.grid import MEMORY_LIMIT, VoxelGrid, check_resolution
 from gmmtorch.occupancy.protocol import check_queries
 
 
@@ -33,37 +37,35 @@ class PointBlocks(NamedTuple):
     """Points sorted by position, in b blocks of B points; all points of a block lie in one bucket.
 
     points (D, B, b); bucket (b,); centers (b, D) and radius (b,): a ball around the points of each block.
-    point (n,) and slot (n,): indices of the given points, and their places among the b·B slots. Free slots
-    of a block repeat its last point.
+    slot (n,): the places of the given points among the b·B slots. Free slots of a block repeat its last
+    point.
     """
 
     points: Tensor
     bucket: Tensor
     centers: Tensor
     radius: Tensor
-    point: Tensor
     slot: Tensor
 
     @classmethod
-    def of(cls, points: Tensor, bucket: Tensor, index: ConeIndex) -> PointBlocks:
-        """Blocks of points (M, D), at least one, in buckets (M,)."""
-        point = index.in_space_order(points, bucket)
-        touched, count = torch.unique_consecutive(bucket[point], return_counts=True)
-        n_points, n_touched = point.shape[0], touched.shape[0]
+    def of(cls, points: Tensor, bucket: Tensor) -> PointBlocks:
+        """Blocks of points (n, D), at least one, in rising buckets (n,)."""
+        touched, count = torch.unique_consecutive(bucket, return_counts=True)
+        (n_points, dim), n_touched = points.shape, touched.shape[0]
         size = 16 if n_points > 24 * n_touched else 4 if n_points > 4 * n_touched else 1
         n_blocks = (count + size - 1) // size
         first, begin = torch.cumsum(count, 0) - count, (torch.cumsum(n_blocks, 0) - n_blocks) * size
-        number = torch.arange(n_points, device=point.device)
+        number = torch.arange(n_points, device=points.device)
         slot = number + torch.repeat_interleave(begin - first, count)
-        filled = torch.zeros(int(n_blocks.sum()) * size, dtype=torch.int64, device=point.device)
+        filled = torch.zeros(int(n_blocks.sum()) * size, dtype=torch.int64, device=points.device)
         filled[slot] = number
         filled = filled.cummax(0).values
-        gathered = points[point][filled].view(-1, size, index.dim)
+        gathered = points[filled].view(-1, size, dim)
         fixed = gathered.detach()
         centers = 0.5 * (fixed.amin(1) + fixed.amax(1))
         radius = (fixed - centers[:, None]).norm(dim=2).amax(1)
         owner = torch.repeat_interleave(touched, n_blocks)
-        return cls(gathered.permute(2, 1, 0).contiguous(), owner, centers, radius, point, slot)
+        return cls(gathered.permute(2, 1, 0).contiguous(), owner, centers, radius, slot)
 
 
 CHUNK_PAIRS = 1 << 16
@@ -86,14 +88,12 @@ def point_evidence(
     points: ArrayLike,
     resolution: float,
     cutoff: float = CUTOFF,
-    *,
-    compiled: bool = False,
 ) -> PointEvidence:
     """Evidence of the cube of side `resolution` (m) centred at each point (M, D), world metres.
 
     For several calls with the same cones use a `PointForm`.
     """
-    return PointForm(cones, resolution, cutoff, compiled=compiled)(points)
+    return PointForm(cones, resolution, cutoff)(points)
 
 
 def listed_points(
@@ -149,7 +149,6 @@ class PointForm:
         cones: must not change afterwards.
         resolution: h (m).
         cutoff: Mahalanobis distance beyond which a component gives no evidence.
-        compiled: use torch.compile. It needs a C++ compiler, and tens of seconds for the first call.
     """
 
     def __init__(
@@ -157,14 +156,12 @@ class PointForm:
         cones: Cones,
         resolution: float,
         cutoff: float = CUTOFF,
-        *,
-        compiled: bool = False,
     ) -> None:
         self.resolution = check_resolution(resolution)
         cones = cones.checked()
         if not 0 < cutoff < math.inf:
             raise InvalidArgumentError(f"cutoff={cutoff} must be finite and above zero.")
-        self.dim, self.cutoff, self.compiled = cones.dim, float(cutoff), compiled
+        self.dim, self.cutoff = cones.dim, float(cutoff)
         safe_cholesky(cones.covariances.double().detach())  # raises if one is not positive definite
         spectrum = spectrum_of(cones.covariances)
         self._table = _table_of(cones, spectrum[1], self.resolution)
@@ -224,38 +221,31 @@ class PointForm:
         for rows, number in self.index.parts(points):
             if not len(rows):
                 continue
-            blocks = PointBlocks.of(points[rows], number, self.index)
+            blocks = PointBlocks.of(points[rows], number[rows])
             chunks = chunks_of(self.index.lists.lengths()[blocks.bucket], CHUNK_PAIRS)
             evidence = torch.cat([self._of_blocks(blocks, part) for part in chunks], 1)
-            place, (hit, miss) = rows[blocks.point], evidence.flatten(1)[:, blocks.slot]
-            hits, misses = hits.index_add(0, place, hit), misses.index_add(0, place, miss)
+            hit, miss = evidence.flatten(1)[:, blocks.slot]
+            hits, misses = hits.index_add(0, rows, hit), misses.index_add(0, rows, miss)
         return PointEvidence(hits, misses)
 
     def _fused(self, points: Tensor, found: Tensor) -> Tensor:
         """Adds hits and misses to `found` (2, M) by the fused kernel."""
         settings = self.rows, self.resolution, self.cutoff, found
-        bucket = torch.zeros_like(points[:, 0], dtype=torch.int64)
         if len(points) * len(self.rows) <= _FEW_PAIRS:
+            bucket = torch.zeros_like(points[:, 0], dtype=torch.int64)
             every = torch.arange(len(self.rows), dtype=torch.int32, device=points.device)
             order = torch.arange(len(points), device=points.device)
             bucket[(points.abs() > _FARTHEST).any(1)] = -1
             listed_evidence(points, order, bucket, Lists.of(order.new_tensor([len(every)]), every), *settings)
             return found
         for rows, number in self.index.parts(points):
-            if len(rows) == len(points):
-                bucket, order = number, self.index.in_space_order(points, number)
-            else:
-                bucket[rows] = number
-                order = rows[self.index.in_space_order(points[rows], number)]
-            listed_evidence(points, order, bucket, self.index.lists, *settings)
+            listed_evidence(points, rows, number, self.index.lists, *settings)
         return found
 
     def _near_cones(self, blocks: PointBlocks, part: slice) -> tuple[Tensor, Tensor]:
         """Pairs of a block (R,), counted from the start of `part`, and a cone (R,) near it."""
         bucket, index = blocks.bucket[part], self.index
-        found = index.hulls.near(
-            index.lists, bucket, blocks.centers[part], blocks.radius[part], self.compiled
-        )
+        found = index.hulls.near(index.lists, bucket, blocks.centers[part], blocks.radius[part])
         return found.taken(torch.arange(len(bucket), device=bucket.device))
 
     def _of_blocks(self, blocks: PointBlocks, part: slice) -> Tensor:
@@ -264,10 +254,9 @@ class PointForm:
         points = blocks.points[..., part]
         hits = points.new_zeros(points.shape[2], points.shape[1])
         misses = hits.clone()
-        evaluate = compiled_pair_evidence() if self.compiled else pair_evidence
         n_rows = max(1, CHUNK_PAIRS // points.shape[1])
         for rows, cones in zip(block.split(n_rows), cone.split(n_rows), strict=True):
-            hit, miss = evaluate(points, rows, *self._table, cones, self.resolution, self.cutoff)
+            hit, miss = pair_evidence(points, rows, *self._table, cones, self.resolution, self.cutoff)
             hits, misses = hits.index_add(0, rows, hit.T), misses.index_add(0, rows, miss.T)
         return torch.stack([hits, misses])
 
@@ -277,7 +266,7 @@ class PointForm:
         n_rows = 0
         for rows, number in self.index.parts(query):
             if len(rows):
-                blocks = PointBlocks.of(query[rows], number, self.index)
+                blocks = PointBlocks.of(query[rows], number[rows])
                 for part in chunks_of(self.index.lists.lengths()[blocks.bucket], CHUNK_PAIRS):
                     n_rows += len(self._near_cones(blocks, part)[0]) * blocks.points.shape[1]
         return n_rows / query.shape[0]
@@ -307,3 +296,230 @@ def _table_of(cones: Cones, axes: Tensor, resolution: float) -> PointTable:
     above = torch.triu_indices(dim, dim, 1, device=covariances.device)
     tilts = turned[:, above[0], above[1]] if covariances.requires_grad else turned.new_zeros(len(means), 0)
     return PointTable(torch.cat(rows, 1), tilts)
+
+
+class KeptEvidence:
+    """Evidence of the cells of a grid in the point form, for a map whose cones change.
+
+    `update` evaluates the cells near cones that are new or gone since the last call, and the cells that the
+    last grid did not have. With fused kernels its numbers are, to the bit, those of a `PointForm` of all
+    cones at `centers`; the twins of the kernels differ by rounding.
+
+    Args:
+        resolution: side (m) of the cells, which lie at its multiples.
+    """
+
+    def __init__(self, resolution: float) -> None:
+        self.resolution = check_resolution(resolution)
+        self._form: PointForm | None = None
+        self._cones: Cones
+        self._first: Tensor
+        self._hits: Tensor
+        self._misses: Tensor
+        self.n_evaluated = 0
+        """Cells that the last call evaluated."""
+
+    def update(self, cones: Cones, grid: VoxelGrid, cutoff: float = CUTOFF) -> PointEvidence:
+        """Hits and misses, in the shape of the grid.
+
+        Args:
+            cones: all cones of the map now; must not change afterwards.
+            grid: cells at multiples of the resolution.
+            cutoff: Mahalanobis distance beyond which a component gives no evidence.
+        """
+        cones = cones.checked()
+        form, changed = self._next_form(cones, cutoff)
+        first = self._first_cell(grid, cones.means.device)
+        points = self.centers(grid, cones.means.device)
+        hits, misses = torch.zeros(2, *grid.shape, dtype=torch.float64, device=points.device)
+        is_asked = torch.ones(grid.shape, dtype=torch.bool, device=points.device)
+        if self._form is not None:
+            new, old = _overlap(first, grid.shape, self._first, self._hits.shape)
+            hits[new], misses[new], is_asked[new] = self._hits[old], self._misses[old], False
+            index = ConeIndex(changed, self.resolution, cutoff, smoothed=True, smallest=True)
+            is_asked |= (index.buckets(points) >= 0).view(grid.shape)
+        asked = is_asked.flatten().nonzero().squeeze(1)
+        found = form(points[asked])
+        for values, new_values in zip((hits, misses), found, strict=True):
+            values.view(-1)[asked] = new_values
+        self.n_evaluated = len(asked)
+        self._form, self._cones = form, cones
+        self._first, self._hits, self._misses = first, hits, misses
+        return PointEvidence(hits, misses)
+
+    def centers(self, grid: VoxelGrid, device: torch.device | None = None) -> Tensor:
+        """Centres (M, D) of the cells of a grid: the same for a cell of any grid, to the bit."""
+        flat = torch.arange(grid.n_cells, device=device)
+        cell = torch.stack(torch.unravel_index(flat, grid.shape), 1) + self._first_cell(grid, device)
+        return (cell.double() + 0.5) * self.resolution
+
+    def _first_cell(self, grid: VoxelGrid, device: torch.device | None) -> Tensor:
+        """The lowest cell (D,) of a grid, counted from the origin of the world."""
+        units = torch.tensor(grid.origin, dtype=torch.float64, device=device) / self.resolution
+        first = units.round()
+        if grid.resolution != self.resolution or bool(((units - first).abs() > 1e-6).any()):
+            raise InvalidArgumentError(
+                f"grid={grid} must have cells at multiples of resolution={self.resolution} m; make it with "
+                "VoxelGrid.covering."
+            )
+        return first.long()
+
+    def _next_form(self, cones: Cones, cutoff: float) -> tuple[PointForm, Cones]:
+        """The form of the cones, and those that are new or gone."""
+        if self._form is None or self._form.cutoff != cutoff or self._cones.dim != cones.dim:
+            self._form = None
+            return PointForm(cones, self.resolution, cutoff), cones
+        former = former_rows(self._cones, cones)
+        gone = torch.ones_like(self._cones.max_range)
+        gone[former[former >= 0]] = False
+        parts = zip(self._cones.taken(gone), cones.taken(former < 0), strict=True)
+        return self._form.replaced(cones, former), Cones(*map(torch.cat, parts))
+
+
+def _overlap(
+    first: Tensor, shape: tuple[int, ...], other_first: Tensor, other_shape: tuple[int, ...]
+) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+    """The cells that two grids share, as slices of each, from the lowest cells and shapes of both."""
+    shift = (other_first - first).tolist()
+    mine, others = [], []
+    for offset, size, other_size in zip(shift, shape, other_shape, strict=True):
+        low, high = max(offset, 0), max(min(offset + other_size, size), max(offset, 0))
+        mine.append(slice(low, high))
+        others.append(slice(low - offset, high - offset))
+    return tuple(mine), tuple(others)
+
+
+_CHUNK_CELLS = 1 << 18
+
+
+class RayHits(NamedTuple):
+    """Where R beams end: probability (R, S) of ending in each cell, and no_hit (R,) of ending in none.
+
+    depth (S,): distance (m) of the cell centres from the sensor origin. A row and its no_hit sum to 1.
+    """
+
+    depth: Tensor
+    probability: Tensor
+    no_hit: Tensor
+
+
+class ExpectedRange(NamedTuple):
+    """Expected range `mean` (R,) in metres, counting no hit as `max_range`; no_hit (R,): its probability."""
+
+    mean: Tensor
+    no_hit: Tensor
+
+
+def first_hit(occupancy: Tensor) -> tuple[Tensor, Tensor]:
+    """o_i Π_{j<i} (1 − o_j), (…, S), for cells in the order along a beam, and Π_j (1 − o_j), (…)."""
+    passed = torch.cumprod(1 - occupancy, -1)
+    reached = torch.cat([torch.ones_like(passed[..., :1]), passed[..., :-1]], -1)
+    return occupancy * reached, passed[..., -1]
+
+
+def hit_probability(
+    cones: Cones | PointForm,
+    origins: ArrayLike,
+    directions: ArrayLike,
+    max_range: float,
+    resolution: float,
+    prior: float = 1.0,
+) -> RayHits:
+    """Probability that a beam ends in each cell on its way.
+
+    Cells are cubes of side h = `resolution` with centres on the beam at (i + ½)h, up to `max_range`. Their
+    occupancy comes from the point form.
+
+    Args:
+        cones: the cones, or for several calls a `PointForm` of them at this resolution.
+        origins: (R, D) sensor origins, world metres.
+        directions: (R, D), of any length above zero.
+        max_range: range of the sensor (m).
+        resolution: h (m).
+        prior: N_p of thesis (3.9).
+
+    Raises:
+        InvalidArgumentError: shapes that do not match, values that are not finite, a direction of length
+            zero, a range that is not above zero, or a form made for another resolution.
+        MemoryLimitError: R·S cells exceed the memory limit.
+    """
+    depth, occupancies = _along(cones, origins, directions, max_range, resolution, prior)
+    if len(origins) * depth.shape[0] * 8 > MEMORY_LIMIT:
+        raise MemoryLimitError(
+            f"{len(origins):,} rays of {depth.shape[0]:,} cells take more than {MEMORY_LIMIT:,} bytes; "
+            "pass fewer rays per call, or use expected_range, which does not store the cells."
+        )
+    probability, no_hit = zip(*map(first_hit, occupancies), strict=True)
+    return RayHits(depth, torch.cat(probability), torch.cat(no_hit))
+
+
+def expected_range(
+    cones: Cones | PointForm,
+    origins: ArrayLike,
+    directions: ArrayLike,
+    max_range: float,
+    resolution: float,
+    prior: float = 1.0,
+) -> ExpectedRange:
+    """Expected range of a beam, Σ p_i d_i + p_none · max_range; arguments as for `hit_probability`."""
+    depth, occupancies = _along(cones, origins, directions, max_range, resolution, prior)
+    reported = depth.clamp_max(max_range)  # the last cell can extend beyond the range
+    means, none = [], []
+    for occupancy in occupancies:
+        probability, no_hit = first_hit(occupancy)
+        means.append(probability @ reported + no_hit * max_range)
+        none.append(no_hit)
+    return ExpectedRange(torch.cat(means), torch.cat(none))
+
+
+def _along(
+    cones: Cones | PointForm,
+    origins: ArrayLike,
+    directions: ArrayLike,
+    max_range: float,
+    resolution: float,
+    prior: float,
+) -> tuple[Tensor, Iterator[Tensor]]:
+    """Distance (S,) of the cell centres along a beam (m), and the occupancy (r, S) of chunks of r rays.
+
+    Raises the errors of `hit_probability`.
+    """
+    form = cones if isinstance(cones, PointForm) else PointForm(cones, resolution)
+    if form.resolution != resolution:
+        raise InvalidArgumentError(
+            f"resolution={resolution} m differs from that of the PointForm, {form.resolution} m; "
+            "make a form for this resolution."
+        )
+    if not 0 < max_range < math.inf:
+        raise InvalidArgumentError(f"max_range={max_range} must be metres above zero.")
+    n_cells = math.ceil(max_range / form.resolution * (1 - 1e-12))
+    if n_cells * 8 > MEMORY_LIMIT // 16:
+        raise MemoryLimitError(
+            f"max_range={max_range} m at resolution={form.resolution} m is {n_cells:,} cells a ray; "
+            "take a larger resolution."
+        )
+    start = as_tensor(origins, "origins", torch.float64)
+    direction = as_tensor(directions, "directions", torch.float64)
+    if start.shape != direction.shape or start.ndim != 2 or start.shape[1] != form.dim:
+        raise InvalidArgumentError(
+            f"origins {tuple(start.shape)} and directions {tuple(direction.shape)} must both be "
+            f"(R, {form.dim})."
+        )
+    for name, value in (("origins", start), ("directions", direction)):
+        if not bool(torch.isfinite(value).all()):
+            raise InvalidArgumentError(
+                f"{name} contains NaN or infinite values; remove such rays before the query."
+            )
+    length = direction.norm(dim=1, keepdim=True)
+    if bool((length == 0).any()):
+        raise InvalidArgumentError("directions contains a vector of length zero; give each ray a direction.")
+    steps = torch.arange(n_cells, dtype=torch.float64, device=start.device)
+    depth = (steps + 0.5) * form.resolution
+
+    def occupancies() -> Iterator[Tensor]:
+        n_rays = max(1, _CHUNK_CELLS // n_cells)
+        for begin, toward in zip(start.split(n_rays), (direction / length).split(n_rays), strict=True):
+            points = begin[:, None] + toward[:, None] * depth[:, None]
+            yield occupancy_probability(*form(points.flatten(0, 1)), prior).view(points.shape[:2])
+
+    return depth, occupancies()

@@ -12,8 +12,7 @@ from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import MemoryLimitError
 from gmmtorch.kernels import count_in_grid
 from gmmtorch.occupancy.grid import BYTES_PER_CELL, MEMORY_LIMIT
-from gmmtorch.occupancy.voxels.boxes import Box, flat_index, intersection, to_lattice
-from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
+from gmmtorch.occupancy.voxels.cells import Box, CellEvidence, flat_index, intersection, to_lattice
 
 _CHUNK_VISITS = 1 << 16  # fastest when cores share a cache
 
@@ -25,7 +24,6 @@ def cast_evidence(
     resolution: float,
     box: Box,
     weights: ArrayLike | None = None,
-    free_until: ArrayLike | None = None,
     hit_places: tuple[ArrayLike, ArrayLike] | None = None,
 ) -> CellEvidence:
     """Evidence of rays in the cells of a box; rays are trimmed to the box (thesis Fig 4.2).
@@ -39,8 +37,6 @@ def cast_evidence(
         is_hit: (R,) bool, False for no-return beams.
         resolution: side (m) of the cells.
         weights: (R,); ones if not given.
-        free_until: (R, 3), points on the rays, world metres. Misses are counted only up to the cell of this
-            point, which gets none; up to the ends if not given.
         hit_places: points (H, 3), world metres, and weights (H,) of the hits, if hits are sampled more
             densely than rays. By default the ends of the rays with `is_hit`.
 
@@ -50,9 +46,8 @@ def cast_evidence(
     """
     starts, stops = to_lattice(origins, resolution, "origins"), to_lattice(ends, resolution, "ends")
     starts = starts.expand_as(stops)
-    until = None if free_until is None else to_lattice(free_until, resolution, "free_until")
     places = None if hit_places is None else to_lattice(hit_places[0], resolution, "hit_places")
-    rays = rays_in_box(starts, stops, box, until, places)
+    rays = rays_in_box(starts, stops, box, others=places)
     if rays is None:
         return CellEvidence.empty(stops.device)
     window, block = rays.window, rays.block

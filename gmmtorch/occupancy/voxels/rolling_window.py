@@ -7,7 +7,7 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike
 from gmmtorch.errors import InvalidArgumentError, check_whole
-from gmmtorch.occupancy.voxels.boxes import Box, difference, to_lattice
+from gmmtorch.occupancy.voxels.cells import Box, difference, to_lattice
 from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 
 

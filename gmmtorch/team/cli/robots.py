@@ -24,6 +24,7 @@ from gmmtorch.cli import (
 from gmmtorch.datasets import DatasetShard, shard_indices, start_frame
 from gmmtorch.errors import check_choice, check_number, check_whole
 from gmmtorch.mapping import GaussianMap
+from gmmtorch.pose import Pose
 from gmmtorch.team.cli import links, missions
 from gmmtorch.team.exploration import (
     Drivable,
@@ -98,7 +99,7 @@ def replaying(config: DictConfig, transport: FramedTransport, stack: ExitStack) 
             replica.join(replica.earlier_frames[0], torch.eye(len(frame)))
     mission = ReplayMission(
         replica,
-        DatasetShard(scans, chosen, None if frame is None else torch.linalg.inv(frame)),
+        DatasetShard(scans, chosen, None if frame is None else Pose.from_matrix(frame).inverse().matrix),
         transport,
         log_map(config),
         rate=config.log.rate,

@@ -25,6 +25,7 @@ from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.files import write_atomically
 from gmmtorch.occupancy import CellClass, check_resolution
 from gmmtorch.optional_packages import needs_extra
+from gmmtorch.pose import Pose
 from gmmtorch.report import (
     EDGE,
     N_SIGMA,
@@ -309,8 +310,6 @@ def _log_robot(rerun: Any, stream: Any, robot: int, poses: np.ndarray, period: f
 
 
 def _log_map(rerun: Any, stream: Any, recorded: RecordedMap, resolution: float) -> None:
-    from scipy.spatial.transform import Rotation
-
     cells = as_array(recorded.cells).reshape(-1, 3)
     centres = (cells + 0.5) * resolution
     half = np.full((len(cells), 3), resolution / 2)
@@ -324,7 +323,7 @@ def _log_map(rerun: Any, stream: Any, recorded: RecordedMap, resolution: float) 
     ellipsoids = rerun.Ellipsoids3D(
         centers=means.cpu().numpy(),
         half_sizes=(N_SIGMA * deviations).numpy(),
-        quaternions=Rotation.from_matrix(directions.numpy()).as_quat() if len(means) else np.empty((0, 4)),
+        quaternions=Pose(directions, means.cpu()).quaternion().numpy(),
         colors=_shades(means.cpu().numpy()),
         fill_mode="solid",
     )

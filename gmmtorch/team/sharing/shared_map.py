@@ -14,6 +14,7 @@ from torch import Tensor
 from gmmtorch.errors import check_number, check_whole
 from gmmtorch.localization import Tracker, register
 from gmmtorch.mapping import Components, GaussianMap, MotionAt, WindowMotions
+from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 from gmmtorch.team.sharing.radio import Radio
 from gmmtorch.team.sharing.replica.authorship import MovedMap
@@ -159,7 +160,7 @@ class FrameJoiner:
         is_own = placed.ids[:, 0] == self._replica.robot
         own, theirs = (placed.selected(which.nonzero().squeeze(1)) for which in (is_own, ~is_own))
         if to_root is not None:
-            own = own.transformed(torch.linalg.inv(to_root), torch.ones(len(own)) > 0)
+            own = own.transformed(Pose.from_matrix(to_root).inverse().matrix, torch.ones(len(own)) > 0)
         return own, theirs
 
 
@@ -281,7 +282,8 @@ class SharedMap:
         found, transform = self.replica.components(), self.replica.placement.transform
         if transform is None:
             return found
-        return found.transformed(torch.linalg.inv(transform).to(found.means), torch.ones(len(found)).bool())
+        back = Pose.from_matrix(transform).inverse().matrix.to(found.means)
+        return found.transformed(back, torch.ones(len(found)).bool())
 
     def row(self) -> dict[str, Any]:
         """What the robot shared with its team, as a part of a row of results.json."""

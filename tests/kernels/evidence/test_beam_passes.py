@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from kernels.twins import by_both
 from torch import Tensor
 
 from gmmtorch.kernels import kernels
@@ -36,10 +37,7 @@ def counts(means: Tensor, covariances: Tensor, beams: Tensor, is_hit: Tensor) ->
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_the_fused_count_equals_the_twin(dim):
-    found = []
-    for choice in ("torch", "fused"):
-        with kernels(choice):
-            found.append(counts(*case(dim)))
+    found = by_both(lambda: counts(*case(dim)))
     assert all(bool((part > 0).sum() > 5) for part in found[0])
     torch.testing.assert_close(found[1], found[0], rtol=0, atol=0)
 

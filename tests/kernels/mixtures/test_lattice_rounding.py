@@ -9,6 +9,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kernels.twins import by_both
 from mapping.random_components import random_components
 from torch import Tensor
 
@@ -22,10 +23,7 @@ pytestmark = pytest.mark.cpu_only
 
 def rounded_by_both(means: Tensor, covariances: Tensor) -> Lattice:
     """The lattice points of the fused kernel, after a comparison with those of the twin."""
-    with kernels("fused"):
-        fused = lattice.nearest(means, covariances)
-    with kernels("torch"):
-        twin = lattice.nearest(means, covariances)
+    twin, fused = by_both(lambda: lattice.nearest(means, covariances))
     for field in fields(Lattice):
         assert torch.equal(getattr(fused, field.name), getattr(twin, field.name)), field.name
     with kernels("torch"):

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import pytest
 import torch
+from kernels.twins import by_both
 from mapping.random_components import random_components
 
 from gmmtorch.errors import NumericalError
 from gmmtorch.kernels import kernels
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.rays.component_evidence import component_evidence
-from gmmtorch.occupancy.voxels.boxes import Box
-from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
+from gmmtorch.occupancy.voxels.cells import Box, CellEvidence
+from gmmtorch.team.exploration.robot.component_rays import component_evidence
 
 OPTIONS = {
     "plain": {},
@@ -49,12 +49,8 @@ def cases() -> dict[str, Components]:
     }
 
 
-def both(components: Components, box: Box, **options) -> list:
-    found = []
-    for choice in ("torch", "fused"):
-        with kernels(choice):
-            found.append(in_order(component_evidence(components, 0.2, box, **options)))
-    return found
+def both(components: Components, box: Box, **options) -> tuple[CellEvidence, CellEvidence]:
+    return by_both(lambda: in_order(component_evidence(components, 0.2, box, **options)))
 
 
 def in_order(evidence: CellEvidence) -> CellEvidence:

@@ -1,4 +1,4 @@
-"""Fused ray counting against its twin, which test_sparse_evidence compares with exact walks."""
+"""Fused counts and marks of rays against twins; test_sparse_evidence compares counts with exact walks."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import math
 
 import pytest
 import torch
+from kernels.twins import by_both
 from torch import Tensor
 
 from gmmtorch.kernels import kernels
-from gmmtorch.kernels.rays.ray_counting import count_in_grid
+from gmmtorch.kernels.rays.ray_traversal import count_in_grid, mark_cells_of_rays
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.cells import Box
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 
@@ -39,11 +40,13 @@ def rays(dim: int, kind: str, n: int = 3000) -> tuple[Tensor, Tensor]:
 def test_fused_counts_in_a_grid_equal_the_twin(dim, kind, weighted):
     origins, ends = rays(dim, kind)
     weights = (torch.arange(len(ends)) % 7).double() if weighted else None  # whole, so that sums are exact
-    grid, found = VoxelGrid((0.0,) * dim, 0.25, (40,) * dim), []
-    for choice in ("torch", "fused"):
-        with kernels(choice):
-            found.append(Evidence.empty(grid))
-            found[-1].add_rays(origins, ends, weights)
+
+    def counted() -> Evidence:
+        made = Evidence.empty(VoxelGrid((0.0,) * dim, 0.25, (40,) * dim))
+        made.add_rays(origins, ends, weights)
+        return made
+
+    found = by_both(counted)
     assert found[0].misses.sum() > 1000
     torch.testing.assert_close(found[1].misses, found[0].misses, rtol=0, atol=0)
     torch.testing.assert_close(found[1].hits, found[0].hits, rtol=0, atol=0)
@@ -95,9 +98,26 @@ def test_fused_counts_in_blocks_equal_the_twin(dim, kind, dtype):
 def test_fused_evidence_of_rays_cut_at_a_box_equals_the_twin():
     origins, ends = rays(3, "planes")
     box = Box(torch.tensor([8, 4, 0]), torch.tensor([30, 36, 22]))
-    found = []
-    for choice in ("torch", "fused"):
-        with kernels(choice):
-            found.append(cast_evidence(origins, ends, torch.arange(3000) % 2 == 0, 0.25, box))
+    found = by_both(lambda: cast_evidence(origins, ends, torch.arange(3000) % 2 == 0, 0.25, box))
     for one, other in zip(*found, strict=True):
         assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize("choice", ["torch", "auto"])
+@pytest.mark.parametrize("n", [0, 1, 200])
+def test_the_cells_with_evidence_are_marked(choice, n):
+    generator = torch.Generator().manual_seed(n)
+    low = torch.tensor([-7, 3, -20])
+    shape = (15, 20, 30)
+    origin = torch.tensor([0.3, 11.7, -4.2], dtype=torch.float64)
+    stops = origin + 12 * torch.randn(n, 3, generator=generator, dtype=torch.float64)
+    stops[: n // 5] = stops[: n // 5].round()  # on grid planes
+    is_hit = torch.rand(n, generator=generator) < 0.5
+    marks = torch.randint(2, shape, generator=generator, dtype=torch.int32)
+    before = marks.clone()
+    with kernels(choice):
+        mark_cells_of_rays(marks, origin.expand_as(stops), stops, is_hit, low, 4)
+    expected = torch.zeros(shape, dtype=torch.int32)
+    seen = cast_evidence(origin, stops, is_hit, 1.0, Box(low, low + torch.tensor(shape)))
+    expected[(seen.cells - low).unbind(1)] = 4
+    assert torch.equal(marks, before | expected)

@@ -18,21 +18,19 @@ from torch import Tensor
 
 from gmmtorch.mapping import (
     Components,
-    MixtureTiles,
     NoveltyRule,
     all_origins,
     box_around,
-    component_evidence,
     count_explained,
     explained_within,
     fit_window,
-    regenerate,
     summed,
 )
 from gmmtorch.occupancy import Box, CellEvidence, RollingWindow, intersection
 from gmmtorch.scan import Scan
 from gmmtorch.simulation import DepthFrame
 from gmmtorch.team.exploration.mission.options import FrameRule
+from gmmtorch.team.exploration.robot.component_rays import MixtureTiles, component_evidence, regenerate
 from gmmtorch.team.exploration.robot.mapper import FrameUpdate, Mapper, Memo, novel_beams
 from gmmtorch.team.exploration.world.scoring import BeliefMap
 from gmmtorch.team.sharing import Broadcast, ReceivedMessage, Replica

@@ -231,7 +231,7 @@ def _check_viewpoints(viewpoints: Tensor) -> None:
     if most > MOST_COMPONENTS_SENT:
         raise InvalidArgumentError(
             f"A single component has {most} viewpoints; a datagram may have {MOST_COMPONENTS_SENT}. Keep "
-            "fewer of its origins: mapping.learning.viewpoints.limit_origins."
+            "fewer of its origins: mapping.learning.merging.limit_origins."
         )
 
 

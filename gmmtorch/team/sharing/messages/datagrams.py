@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_whole
-from gmmtorch.linalg import check_rigid
 from gmmtorch.mapping import BitReader, BitWriter, Ints
+from gmmtorch.pose import Pose
 from gmmtorch.team.sharing.replica.record_keys import END, MOST_RECORDS, NUMBER_BITS, Intervals, authors
 
 VERSION = 1
@@ -267,32 +267,26 @@ def pose_of(transform: Tensor) -> Tensor:
     """The pose of a rigid motion (3, 3) or (4, 4); raises `InvalidArgumentError` if it is none."""
     if transform.shape not in ((3, 3), (4, 4)):
         raise InvalidArgumentError(f"transform has shape {tuple(transform.shape)}; give (3, 3) or (4, 4).")
-    rotation, translation = check_rigid(transform.detach().cpu().double(), len(transform) - 1)
-    if not bool((translation.abs() <= FARTHEST).all()):
-        raise InvalidArgumentError(f"transform moves by {translation.tolist()}; {FARTHEST:g} m is the most.")
-    if len(rotation) == 2:
-        turn = rotation[:, 0] / rotation[:, 0].norm()
+    motion = Pose.checked(transform.detach(), len(transform) - 1, device="cpu")
+    if not bool((motion.translation.abs() <= FARTHEST).all()):
+        raise InvalidArgumentError(
+            f"transform moves by {motion.translation.tolist()}; {FARTHEST:g} m is the most."
+        )
+    if motion.dim == 2:
+        turn = torch.nn.functional.normalize(motion.rotation[:, 0], dim=0)
     else:
-        from scipy.spatial.transform import Rotation
-
-        turn = torch.from_numpy(Rotation.from_matrix(rotation.numpy()).as_quat(canonical=True))
-    return torch.cat([translation, turn]) + 0.0  # no −0
+        turn = motion.quaternion()
+        turn = -turn if turn[3] < 0 else turn  # of both signs, the one with w above zero
+    return torch.cat([motion.translation, turn]) + 0.0  # no −0
 
 
 def matrix_of(pose: Tensor) -> Tensor:
     """The motion (D+1, D+1) of a pose."""
     dim = motion_dim(pose)
-    matrix = torch.eye(dim + 1, dtype=torch.float64)
-    matrix[:-1, -1] = pose[:dim]
-    if dim == 2:
-        cos, sin = pose[2:].tolist()
-        turn = torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64)
-    else:
-        from scipy.spatial.transform import Rotation
-
-        turn = torch.from_numpy(Rotation.from_quat(pose[3:].numpy()).as_matrix())
-    matrix[:-1, :-1] = turn
-    return matrix
+    if dim == 3:
+        return Pose.from_quaternion(pose[:3], pose[3:]).matrix
+    cos, sin = pose[2:].tolist()
+    return Pose(torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64), pose[:2]).matrix
 
 
 def write_motion(writer: BitWriter, pose: Tensor) -> None:

@@ -123,7 +123,7 @@ class Author:
         if most_viewpoints(components) > MOST_VIEWPOINTS:
             raise InvalidArgumentError(
                 f"A component has {most_viewpoints(components)} viewpoints; a datagram has room for "
-                f"{MOST_VIEWPOINTS}. Keep fewer: mapping.learning.viewpoints.limit_origins."
+                f"{MOST_VIEWPOINTS}. Keep fewer: mapping.learning.merging.limit_origins."
             )
         if not self._keys_of_robot.covers(old):
             raise InvalidArgumentError(f"A robot supersedes its own records only; robot={self._robot}.")

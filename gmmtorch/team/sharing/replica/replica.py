@@ -14,6 +14,7 @@ from torch import Tensor
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
 from gmmtorch.mapping import Components, GaussianMap
 from gmmtorch.occupancy import Calibration
+from gmmtorch.pose import Pose
 from gmmtorch.scan import ArrayLike
 from gmmtorch.team.sharing.messages.component_messages import ComponentsMessage
 from gmmtorch.team.sharing.messages.datagrams import MAX_BYTES
@@ -182,8 +183,8 @@ class Replica:
                 "robots with a lower id only, so that two robots never join each other."
             )
         matrix = torch.as_tensor(transform, dtype=torch.float64)
-        before = self._chain(base, len(matrix))
-        self._backlog.add(self._author.place_frame(base, frame, matrix @ torch.linalg.inv(before)))
+        back = Pose.from_matrix(self._chain(base, len(matrix))).inverse()
+        self._backlog.add(self._author.place_frame(base, frame, matrix @ back.matrix))
 
     def _chain(self, base: int, size: int) -> Tensor:
         """The motion (size, size), base ← this robot's frame."""
@@ -191,7 +192,7 @@ class Replica:
             return torch.eye(size, dtype=torch.float64)
         whole, rest = (self._records.frames.place(frame).transform for frame in (self._own, base))
         assert whole is not None  # its frame has an anchor
-        return whole if rest is None else torch.linalg.inv(rest) @ whole
+        return whole if rest is None else Pose.from_matrix(rest).inverse().matrix @ whole
 
     def _due(self, made: Published) -> Tensor:
         keys, written, packets = made

@@ -1,0 +1,277 @@
+"""Depth images with poses: folders in the layout of 7-Scenes, and sequences of the TUM RGB-D benchmark.
+
+`frame-*.depth.png`: 16 bit, millimetres along the optical axis, or another unit, see `depth_scale`.
+`frame-*.pose.txt`: 4×4 matrix camera-to-world, metres. `camera-intrinsics.txt`: 3×3 pinhole matrix in
+pixels.
+
+`depth.txt`: rows `time file`. `groundtruth.txt`: rows `time x y z qx qy qz qw`. Depth images are PNG with 16
+bits, in 1/5000 m; 0 is invalid.
+"""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path, PurePosixPath
+from typing import IO
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gmmtorch.datasets.base import Dataset, Ranges, check_poses, natural_key, require_path
+from gmmtorch.datasets.trajectory import (
+    NANOSECONDS,
+    order_of_rows,
+    read_trajectory,
+    to_nanoseconds,
+)
+from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_number, check_whole
+from gmmtorch.pinhole import back_project, check_intrinsics, is_centered, pinhole_matrix
+from gmmtorch.pose import Pose
+from gmmtorch.scan import Scan
+
+_INVALID = (0, 65535)
+MAX_PIXELS = 1 << 23
+"""An image of 4K has 8.3 million; a damaged header may announce billions."""
+
+_UPRIGHT = {
+    "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    "-z": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
+    "y": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
+    "-y": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+    "x": [[0, 0, -1], [0, 1, 0], [1, 0, 0]],
+    "-x": [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],
+}
+"""The rotation that turns an axis into z."""
+
+
+class DepthFrames(Dataset):
+    """Depth images as scans, in the natural order of their names (frame-2 before frame-10).
+
+    Pixels at a distance of `max_range` metres or beyond have no return. Depths 0 and 65535 are invalid
+    and dropped. `pixel_stride` keeps every n-th pixel of every n-th row. `depth_scale` is the number of
+    metres per unit of the images. `intrinsics` is the pinhole matrix (3, 3) in pixels. `image` returns the
+    full depth image of a scan. An image whose middle is far from the principal point is refused: it has
+    another size than the intrinsics. `up` is the axis of the world frame of the pose files that points up;
+    the frame is turned so that it becomes z.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        ranges: Ranges,
+        stride: int = 1,
+        pixel_stride: int = 1,
+        depth_scale: float = 0.001,
+        up: str = "z",
+    ) -> None:
+        path = require_path(
+            path,
+            "folder",
+            "frame-*.depth.png, frame-*.pose.txt and camera-intrinsics.txt",
+            "Microsoft's 7-Scenes data set is published in this layout.",
+        )
+        super().__init__(path.name, ranges, stride)
+        check_number("depth_scale", depth_scale, above=True)
+        self.pixel_stride = check_whole("pixel_stride", pixel_stride, 1)
+        check_choice("up", up, _UPRIGHT)
+        self._upright = torch.tensor(_UPRIGHT[up], dtype=torch.float64)
+        self.depth_scale = float(depth_scale)
+        self._files = sorted(path.glob("frame-*.depth.png"), key=natural_key)
+        if not self._files:
+            raise DataError(f"{path} holds no frame-*.depth.png.")
+        poses = list(path.glob("frame-*.pose.txt"))
+        if len(poses) != len(self._files):
+            raise DataError(
+                f"{path} holds {len(self._files)} depth images, but {len(poses)} poses; each image needs one."
+            )
+        file = path / "camera-intrinsics.txt"
+        try:
+            self.intrinsics = check_intrinsics(_matrix(file, 3))
+        except InvalidArgumentError as error:
+            raise DataError(f"{file}: {error}") from error
+
+    def _count(self) -> int:
+        return len(self._files)
+
+    def _read(self, index: int) -> Scan:
+        points = back_project(self._depth(index), self.intrinsics, self.pixel_stride)
+        return self.ranges.posed(points, self._known_pose(index))
+
+    def image(self, index: int) -> tuple[Tensor, Tensor]:
+        """Depth (H, W) in metres, 0 for invalid pixels, and pose (4, 4), world ← camera, of a scan.
+
+        The rotation, which is rounded in the file, is made orthonormal.
+        """
+        position = self._position(index)
+        pose = Pose.from_matrix(self._known_pose(position)).orthonormal()
+        return self._depth(position), pose.matrix
+
+    def _depth(self, index: int) -> Tensor:
+        """Depth (H, W) in metres, float64; 0 for invalid pixels."""
+        path = self._files[index]
+        depth = metric(read_png(path, str(path)), self.depth_scale)
+        height, width = depth.shape
+        if not is_centered(self.intrinsics, (height, width)):
+            (_, _, cx), (_, _, cy), _ = self.intrinsics.tolist()
+            raise DataError(
+                f"{path} has {width}×{height} pixels, but camera-intrinsics.txt is for images of about "
+                f"{2 * cx:.0f}×{2 * cy:.0f}: its principal point is not near the middle of the image. Scale "
+                "the intrinsics, or give the images in full size."
+            )
+        return depth
+
+    def _known_pose(self, index: int) -> Tensor:
+        path = self._files[index]
+        path = path.with_name(path.name.replace(".depth.png", ".pose.txt"))
+        pose = check_poses(_matrix(path, 4), str(path))
+        return torch.cat([self._upright @ pose[:3], pose[3:]])
+
+
+def read_png(source: Path | IO[bytes], where: str) -> np.ndarray:
+    """The pixels (H, W) of a PNG image with one channel of 16 bits. `where` begins the `DataError`s."""
+    from PIL import Image
+
+    try:
+        # From memory, because Pillow asks a file for as many bytes as a damaged chunk announces.
+        content = io.BytesIO(source.read_bytes()) if isinstance(source, Path) else source
+        with Image.open(content, formats=("PNG",)) as image:
+            if image.width * image.height > MAX_PIXELS:
+                raise DataError(
+                    f"{where} announces {image.width} × {image.height} pixels; at most "
+                    f"{MAX_PIXELS:,} are read."
+                )
+            raw = np.asarray(image)
+    except DataError:
+        raise
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise DataError(f"{where} is not a complete PNG image: {error}") from error
+    if raw.ndim != 2 or raw.dtype not in (np.uint16, np.int32):
+        raise DataError(f"{where} is {raw.dtype} of shape {raw.shape}; expected one 16-bit channel.")
+    return raw
+
+
+def metric(raw: np.ndarray, scale: float) -> Tensor:
+    """Depth (H, W) in metres, float64, of pixels in units of `scale` metres; 0 for invalid pixels."""
+    valid = np.where(np.isin(raw, _INVALID), 0, raw).astype(np.float64)
+    return torch.from_numpy(valid) / (1 / scale)  # exact for millimetres
+
+
+def _matrix(path: Path, size: int) -> Tensor:
+    if not path.is_file():
+        raise DataError(f"{path} is missing; expected a {size}×{size} matrix.")
+    try:
+        matrix = np.loadtxt(path, dtype=np.float64, ndmin=2)
+    except ValueError as error:
+        raise DataError(f"{path} is not a matrix of numbers: {error}") from error
+    if matrix.shape != (size, size) or not np.isfinite(matrix).all():
+        raise DataError(
+            f"{path} holds an array of shape {matrix.shape}; expected a finite {size}×{size} matrix."
+        )
+    return torch.from_numpy(matrix)
+
+
+# -- the TUM RGB-D benchmark -------------------------------------------------------------------------
+
+
+_INTRINSICS = (525.0, 525.0, 319.5, 239.5)
+"""The values that the benchmark recommends: its depth images are registered with these."""
+
+
+class TumRgbd(Dataset):
+    """Depth images as scans, in the order of their times, with poses interpolated at their times.
+
+    Images without a pose are left out and counted. `intrinsics` is the pinhole matrix (3, 3) in pixels;
+    `image` returns the full depth image of a scan.
+
+    Args:
+        path: the folder of the sequence.
+        ranges, stride: see `Dataset`.
+        poses: another trajectory file with times; None: groundtruth.txt.
+        intrinsics: fx, fy, cx, cy in pixels; None: 525, 525, 319.5, 239.5.
+        depth_scale: metres per unit of the images.
+        max_gap: longest time (s) between two poses that are interpolated.
+        pixel_stride: every n-th pixel of every n-th row is used.
+    """
+
+    _poses: Tensor
+
+    def __init__(
+        self,
+        path: str | Path,
+        ranges: Ranges,
+        stride: int = 1,
+        poses: str | None = None,
+        intrinsics: list[float] | None = None,
+        depth_scale: float = 0.0002,
+        max_gap: float = 0.5,
+        pixel_stride: int = 1,
+    ) -> None:
+        path = require_path(
+            path,
+            "folder",
+            "depth.txt, groundtruth.txt and depth/*.png",
+            "The TUM RGB-D benchmark publishes sequences in this layout.",
+        )
+        super().__init__(path.resolve().name, ranges, stride)
+        self.pixel_stride = check_whole("pixel_stride", pixel_stride, 1)
+        check_number("depth_scale", depth_scale, above=True)
+        self._scale = depth_scale
+        self.intrinsics = pinhole_matrix(_INTRINSICS if intrinsics is None else intrinsics)
+        times, files = _listed(path / "depth.txt")
+        trajectory = read_trajectory(poses or path / "groundtruth.txt")
+        if not trajectory.has_times:
+            raise DataError(
+                f"{poses or path / 'groundtruth.txt'} has poses without times; give a TUM trajectory."
+            )
+        found = trajectory.at(times, max_gap)
+        self._skip("no pose at the time of the scan", *np.flatnonzero(~found.known).tolist())
+        if not found.known.any():
+            raise DataError(
+                f"{path}: no depth image has a pose. Images are from {times[0] / NANOSECONDS:.3f} to "
+                f"{times[-1] / NANOSECONDS:.3f} s, poses from {trajectory.times[0] / NANOSECONDS:.3f} to "
+                f"{trajectory.times[-1] / NANOSECONDS:.3f} s."
+            )
+        self._files = [files[index] for index in np.flatnonzero(found.known)]
+        self._poses = found.poses[found.known].matrix
+        self._times = torch.from_numpy(times[found.known] / NANOSECONDS)
+
+    def _count(self) -> int:
+        return len(self._files)
+
+    def _read(self, index: int) -> Scan:
+        points = back_project(self._depth(index), self.intrinsics, self.pixel_stride)
+        return self.ranges.posed(points, self._poses[index])
+
+    def image(self, index: int) -> tuple[Tensor, Tensor]:
+        """Depth (H, W) in metres, 0 for invalid pixels, and pose (4, 4), world ← camera, of a scan."""
+        position = self._position(index)
+        return self._depth(position), self._poses[position]
+
+    def _depth(self, index: int) -> Tensor:
+        path = self._files[index]
+        return torch.from_numpy(read_png(path, str(path)) * self._scale)
+
+
+def _listed(path: Path) -> tuple[np.ndarray, list[Path]]:
+    """Times (ns), increasing, and files of a list of images. Files must be inside the folder of the list."""
+    if not path.is_file():
+        raise DataError(f"{path} is missing; it lists a time and a file for each depth image.")
+    times, files = [], []
+    for number, line in enumerate(path.read_text("utf-8", errors="replace").splitlines(), 1):
+        words = line.split("#")[0].split()
+        if not words:
+            continue
+        try:
+            seconds, name = float(words[0]), PurePosixPath(words[1])
+            if not abs(seconds) < 9e9 or name.is_absolute() or ".." in name.parts:
+                raise ValueError(f"{line!r} is not a time and a file of this folder")
+        except (ValueError, IndexError) as error:
+            raise DataError(f"{path}, line {number}: expected a time and a file ({error}).") from error
+        times.append(seconds)
+        files.append(path.parent / name)
+    if not files:
+        raise DataError(f"{path} lists no image.")
+    stamps = to_nanoseconds(np.array(times))
+    order = order_of_rows(path, stamps)
+    return stamps[order], [files[index] for index in order]

@@ -1,1 +1,0 @@
-"""Recordings of robots: ROS bags, KITTI and TUM sequences, and trajectory files."""

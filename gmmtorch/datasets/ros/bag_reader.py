@@ -1,0 +1,525 @@
+"""Reads ROS bags: ROS 1 (.bag), ROS 2 SQLite (.db3) and MCAP (.mcap), with the package rosbags.
+
+Bags are hostile input. Files are read within their length, compressed chunks are unpacked up to a limit, and
+messages are decoded by `MessageDecoder`; definitions in a bag are used only for types that ROS does not have.
+
+It also knows which topics of a bag are sensors or an IMU, and chooses between them.
+"""
+
+from __future__ import annotations
+
+import bz2
+import io
+import logging
+import re
+import shutil
+import tempfile
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, BinaryIO, NamedTuple
+
+from gmmtorch.datasets.ros.message_decoder import BASE, NAME, SEQUENCE, MessageDecoder
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
+from gmmtorch.optional_packages import needs_extra
+
+_log = logging.getLogger(__name__)
+_SUFFIXES = (".bag", ".mcap", ".db3")
+_ZSTD = b"\x28\xb5\x2f\xfd"
+"""Start of a compressed message: the file alone, without metadata.yaml, does not state the compression."""
+_REPAIRS = {
+    ".bag": "'rosbag reindex' repairs a recording that was interrupted",
+    ".mcap": "'mcap recover' repairs a recording that was interrupted",
+    ".db3": "'ros2 bag reindex' or sqlite3's '.recover' repairs a recording that was interrupted",
+}
+
+
+class Topic(NamedTuple):
+    """A topic of a bag: name, message type (pkg/msg/Name) and number of messages."""
+
+    name: str
+    type: str
+    n_messages: int
+
+
+class RawMessage(NamedTuple):
+    """A message as bytes. topic: its name. type: its type. time: of recording, in ns."""
+
+    topic: str
+    type: str
+    time: int
+    data: bytes
+
+
+class BagReader:
+    """The topics and messages of one bag.
+
+    Args:
+        path: a .bag, .mcap or .db3 file, or the folder of a ROS 2 bag.
+
+    Raises `DataError`, which states a repair, if the bag is damaged, and `GmmTorchError` without rosbags.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = _bag_file(path)
+        self._is_ros1 = self.path.suffix == ".bag"
+        with self._errors():
+            for file in sorted(self.path.glob("*.db3")) if self.path.is_dir() else [self.path]:
+                _check_length(file)
+            self._reader: Any = self._opened()
+            self._connections = [
+                c for c in self._reader.connections if isinstance(c.topic, str) and isinstance(c.msgtype, str)
+            ]  # columns of a damaged database can be empty
+            self._decoder = MessageDecoder(
+                {**self._own_definitions(), **standard_definitions(self._is_ros1)},
+                packed=self._is_ros1,
+            )
+
+    @property
+    def topics(self) -> list[Topic]:
+        """All topics by name. A topic with messages of two types is listed twice."""
+        counts: dict[tuple[str, str], int] = {}
+        for c in self._connections:
+            counts[c.topic, c.msgtype] = counts.get((c.topic, c.msgtype), 0) + c.msgcount
+        return [Topic(*key, count) for key, count in sorted(counts.items())]
+
+    @property
+    def is_ros1(self) -> bool:
+        """Whether messages have the packed form of ROS 1, not CDR."""
+        return self._is_ros1
+
+    def fields(self, message_type: str) -> list[tuple[str, Any]]:
+        """Names and kinds of the fields of a message type; empty if its definition is not known."""
+        return list(self._decoder.definitions.get(message_type, ((), ()))[1])
+
+    def messages(self, topics: Collection[str], start: int | None = None) -> Iterator[RawMessage]:
+        """The messages of some topics in the order of recording, from time `start` (ns) on."""
+        chosen = [c for c in self._connections if c.topic in topics]
+        if not chosen:
+            return
+        with self._errors():
+            for connection, time, data in self._reader.messages(connections=chosen, start=start):
+                content = bytes(data)
+                if not self._is_ros1 and content.startswith(_ZSTD):  # CDR starts with a zero
+                    content = unpack_zstd(content)
+                yield RawMessage(connection.topic, connection.msgtype, time, content)
+
+    def decode(self, message: RawMessage) -> dict[str, Any]:
+        """The fields of a message. Raises `DataError`, which names the topic and the time of recording."""
+        try:
+            return self._decoder.decode(message.data, message.type)
+        except DataError as error:
+            raise DataError(
+                f"{self.path}, topic {message.topic}, recorded at {message.time / 1e9:.3f} s: {error}."
+            ) from error
+
+    def _opened(self) -> Any:
+        """The opened reader of rosbags: of the folder, or of its only file if metadata.yaml is unusable."""
+        *tried, last = self.path, *_only_file(self.path)
+        for path in tried:
+            reader = reader_class(self._is_ros1)(_bounded(path))
+            with suppress(Exception):  # the parser of metadata.yaml raises many kinds
+                reader.open()
+                if reader.connections:
+                    return reader
+        reader = reader_class(self._is_ros1)(_bounded(last))
+        reader.open()
+        if tried:
+            _log.warning("%s/metadata.yaml is unusable; %s is read without it.", self.path, last.name)
+        return reader
+
+    def _own_definitions(self) -> dict[str, Any]:
+        """Definitions in the bag. One that cannot be parsed is left out."""
+        found: dict[str, Any] = {}
+        for c in self._connections:
+            if c.msgtype not in found and (parsed := parsed_definitions(c.msgdef, c.msgtype)):
+                found.update(parsed)
+        return found
+
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        """Turns every error of rosbags into a `DataError`; damaged bags raise many kinds of them."""
+        try:
+            yield
+        except GmmTorchError:
+            raise
+        except Exception as error:
+            reason = str(error) or type(error).__name__
+            if "index" in reason and self._is_ros1:
+                reason = f"{reason} (it was not closed)"
+            repair = _REPAIRS.get(self.path.suffix, "'ros2 bag reindex' writes metadata.yaml again")
+            raise DataError(
+                f"{self.path} cannot be read as a ROS bag: {reason}. It is truncated, damaged, or uses an "
+                f"unknown compression; {repair}."
+            ) from error
+
+
+def _bag_file(path: Path) -> Path:
+    """The file of the bag, or the folder with its metadata.yaml."""
+    if path.is_dir() and not (path / "metadata.yaml").is_file():
+        files = [file for file in sorted(path.iterdir()) if file.suffix in _SUFFIXES]
+        if len(files) == 1:
+            return files[0]
+        raise DataError(
+            f"{path} has no metadata.yaml and {len(files)} bag files; give one file: "
+            f"{', '.join(file.name for file in files) or '.bag, .mcap or .db3'}."
+        )
+    if path.is_file() and path.suffix not in _SUFFIXES:
+        raise DataError(f"{path} does not end in {', '.join(_SUFFIXES)}; it is not a ROS bag.")
+    if path.is_file() and path.stat().st_size == 0:
+        raise DataError(f"{path} is empty; record or copy it again.")
+    return path
+
+
+def _only_file(path: Path) -> list[Path]:
+    """The file of a bag's folder, if there is one and metadata.yaml names no other."""
+    metadata = path / "metadata.yaml"
+    if not metadata.is_file():
+        return []
+    files = [file for file in path.iterdir() if file.suffix in _SUFFIXES]
+    text = metadata.read_text("utf-8", errors="replace")
+    named = {name.split(": ")[-1].strip(" -") for name in re.findall(r"[^\n/,'\"[]+\.(?:mcap|db3)\b", text)}
+    return files if len(files) == 1 and named <= {files[0].name} else []
+
+
+def _check_length(path: Path) -> None:
+    """Raise `EOFError` if a SQLite file is shorter than its header states.
+
+    Some versions of SQLite notice that only when they read a page that is missing.
+    """
+    with path.open("rb") as file:
+        header = file.read(100)
+    if not header.startswith(b"SQLite format 3\0") or header[24:28] != header[92:96]:
+        return  # another format, or a header without a valid number of pages
+    page = int.from_bytes(header[16:18], "big")
+    expected = (65536 if page == 1 else page) * int.from_bytes(header[28:32], "big")
+    if path.stat().st_size < expected:
+        raise EOFError(f"it has {path.stat().st_size:,} of {expected:,} bytes")
+
+
+class _BoundedFile(io.BufferedReader):
+    """A file that allocates no more for reading than it has left."""
+
+    def __init__(self, path: str) -> None:
+        raw = io.FileIO(path)
+        super().__init__(raw)
+        self._length = raw.seek(0, io.SEEK_END)
+        raw.seek(0)
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        if size is not None and size >= 0:
+            size = min(size, max(0, self._length - self.tell()))
+        return super().read(size)
+
+
+def _bounded(path: Path) -> Path:
+    """The path, whose files are opened as `_BoundedFile`."""
+
+    class BoundedPath(type(path)):  # type: ignore[misc]
+        def open(self, mode: str = "r", *args: Any, **options: Any) -> Any:
+            return _BoundedFile(str(self)) if mode == "rb" else super().open(mode, *args, **options)
+
+    return BoundedPath(path)
+
+
+# -- topics of sensors -------------------------------------------------------------------------------
+
+
+TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+POSE_TYPES = (
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "geometry_msgs/msg/TransformStamped",
+)
+INFO_TYPE = "sensor_msgs/msg/CameraInfo"
+IMU_TYPE = "sensor_msgs/msg/Imu"
+_IMAGE, _COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+_DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")
+
+CLOUD, LIST, LASER, DEPTH, COMPRESSED = (
+    "cloud",
+    "list of points",
+    "laser",
+    "depth image",
+    "compressed depth image",
+)
+_PREFERENCE = (CLOUD, LIST, LASER, DEPTH, COMPRESSED)
+
+
+class Sensor(NamedTuple):
+    """A topic of a sensor. kind: one of the constants above. field: of the list, for `LIST`."""
+
+    topic: Topic
+    kind: str
+    field: str = ""
+
+    @property
+    def is_camera(self) -> bool:
+        """Whether its messages are depth images."""
+        return self.kind in (DEPTH, COMPRESSED)
+
+
+def choose_sensor(reader: BagReader, wanted: str | None) -> Sensor:
+    """The topic `wanted`, or else the only one of the most preferred kind that the bag has.
+
+    Kinds in order: clouds, lists of points, lasers, depth images. Raises `DataError` or
+    `InvalidArgumentError`, which list the topics, if there is none, or a choice.
+    """
+    named = [topic for topic in reader.topics if topic.name == wanted]
+    if wanted is not None and not named:
+        raise InvalidArgumentError(
+            f"‹topic›={wanted} is not in {reader.path}, whose topics are {listed(reader.topics)}. "
+            "Choose another ‹topic›."
+        )
+    if len(named) > 1:
+        raise DataError(
+            f"{reader.path}: topic {wanted} has messages of {len(named)} types: {listed(named)}. Choose "
+            "another ‹topic›, or write each type to a topic of its own."
+        )
+    found = [
+        sensor for topic in named or reader.topics if topic.n_messages and (sensor := _sensor(reader, topic))
+    ]
+    if not found:
+        what = f"‹topic›={wanted} is not" if wanted else "has no topic of"
+        remedy = "Choose another ‹topic›." if wanted else "Record such a topic."
+        raise DataError(
+            f"{reader.path} {what} a range sensor with messages (PointCloud2, LaserScan, depth Image, or a "
+            f"list of points). Its topics are {listed(reader.topics)}. {remedy}"
+        )
+    kind = min((sensor.kind for sensor in found), key=_PREFERENCE.index)
+    found = [sensor for sensor in found if sensor.kind == kind]
+    if len(found) > 1:
+        raise InvalidArgumentError(
+            f"{reader.path} has {len(found)} topics of a range sensor: "
+            f"{listed([sensor.topic for sensor in found])}. Choose one: ‹topic›={found[0].topic.name}."
+        )
+    return found[0]
+
+
+def listed(topics: list[Topic]) -> str:
+    """Topics with types and counts, for messages."""
+    return "; ".join(f"{t.name} ({t.type}, {t.n_messages} messages)" for t in topics) or "none"
+
+
+def _sensor(reader: BagReader, topic: Topic) -> Sensor | None:
+    if topic.type == "sensor_msgs/msg/PointCloud2":
+        return Sensor(topic, CLOUD)
+    if topic.type == "sensor_msgs/msg/LaserScan":
+        return Sensor(topic, LASER)
+    if topic.type in (_IMAGE, _COMPRESSED_IMAGE):
+        return _camera(reader, topic)
+    if not topic.type.startswith(("sensor_msgs/", "std_msgs/", "geometry_msgs/", "nav_msgs/")):
+        fields = reader.fields(topic.type)
+        if fields and fields[0][1] == (NAME, "std_msgs/msg/Header"):
+            for name, desc in fields:
+                if _is_list_of_points(reader, desc):
+                    return Sensor(topic, LIST, name)
+    return None
+
+
+def _is_list_of_points(reader: BagReader, desc: Any) -> bool:
+    if desc[0] != SEQUENCE or desc[1][0][0] != NAME:
+        return False
+    fields = dict(reader.fields(desc[1][0][1]))
+    numbers = all(inner[0] == BASE and inner[1][0] != "string" for inner in fields.values())
+    return numbers and {"x", "y", "z"} <= fields.keys()
+
+
+def _camera(reader: BagReader, topic: Topic) -> Sensor | None:
+    """A camera whose first image is a depth."""
+    first = next(reader.messages([topic.name]), None)
+    if first is None:
+        return None
+    try:
+        message = reader.decode(first)
+    except DataError:
+        return None
+    if topic.type == _IMAGE:
+        return Sensor(topic, DEPTH) if message["encoding"] in _DEPTH_ENCODINGS else None
+    return Sensor(topic, COMPRESSED) if "compressedDepth" in message["format"] else None
+
+
+def choose_camera_info(reader: BagReader, image: str, wanted: str | None) -> str:
+    """The topic of the camera parameters: `wanted`, or the one that shares most of the image topic's name."""
+    infos = [topic.name for topic in reader.topics if topic.type == INFO_TYPE and topic.n_messages]
+    if wanted in infos:
+        return wanted
+    best = nearest_names(infos, image)
+    if wanted is not None or len(best) != 1:
+        choice = f"Choose one: ‹camera_info›={best[0]}, or state" if best else "State"
+        raise InvalidArgumentError(
+            f"{reader.path}: ‹camera_info›={wanted} is not clear for the images of {image}; topics of "
+            f"type CameraInfo are {', '.join(infos) or 'none'}. {choice} ‹intrinsics›=[fx,fy,cx,cy] in "
+            "pixels, without distortion."
+        )
+    return best[0]
+
+
+def choose_imu(reader: BagReader, wanted: str | None) -> str:
+    """The topic `wanted`, or else the only one of an IMU. Raises `InvalidArgumentError`, which lists them."""
+    found = [topic for topic in reader.topics if topic.type == IMU_TYPE and topic.n_messages]
+    if wanted is None and len(found) > 1:
+        raise InvalidArgumentError(
+            f"{reader.path} has {len(found)} topics of an IMU: {listed(found)}. Choose one: "
+            f"‹imu_topic›={found[0].name}."
+        )
+    chosen = [topic.name for topic in found if wanted in (None, topic.name)]
+    if not chosen:
+        what = "has no topic" if wanted is None else f"has no topic ‹imu_topic›={wanted}"
+        raise InvalidArgumentError(
+            f"motion=imu cannot be used: {reader.path} {what} of type sensor_msgs/Imu with messages, only "
+            f"{listed(found)}. Record one, or predict with motion=constant or motion=dataset."
+        )
+    return chosen[0]
+
+
+def nearest_names(names: list[str], topic: str) -> list[str]:
+    """The names that share most of a topic's name: its first parts."""
+
+    def shared(name: str) -> int:
+        pairs = zip(name.split("/"), topic.split("/"), strict=False)
+        return next((i for i, (a, b) in enumerate(pairs) if a != b), 0)
+
+    return [name for name in names if shared(name) == max(map(shared, names))]
+
+
+# -- the package rosbags, with limits on what a hostile bag can make it allocate ---------------------
+
+
+MAX_CHUNK_BYTES = 1 << 28
+"""Limit of an unpacked chunk or message; recorders write chunks of about a megabyte."""
+
+MAX_BAG_BYTES = 1 << 35
+"""Limit of a ROS 2 bag file that is compressed as a whole, unpacked. It also takes at most half of the free
+space of the temporary folder."""
+
+_ZSTD_HEADER_BYTES = 18
+_MAGIC = {b"\x89MCAP0\r\n": ".mcap", b"SQLite f": ".db3"}
+
+
+def reader_class(is_ros1: bool) -> Any:
+    """The reader of ROS 1 or of ROS 2 bags, with limits. Raises `GmmTorchError` if rosbags does not load."""
+    with needs_extra("ROS bags need", "rosbags", "bags"):
+        import rosbags.rosbag1
+        import rosbags.rosbag2
+    ros1, ros2 = rosbags.rosbag1, rosbags.rosbag2
+    _limit_codecs(ros1.reader, ros2.reader, ros2.storage_mcap)
+    return _limited_ros1_reader(ros1) if is_ros1 else _reader_by_magic(ros2)
+
+
+def standard_definitions(is_ros1: bool) -> dict[str, Any]:
+    """The message types of ROS 1 Noetic or ROS 2 Jazzy."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return dict(get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY).fielddefs)
+
+
+def parsed_definitions(definition: Any, message_type: str) -> dict[str, Any]:
+    """The types of a definition in a bag; empty if it is missing or cannot be parsed."""
+    from rosbags.typesys import get_types_from_idl, get_types_from_msg
+
+    try:
+        if definition.format.name == "MSG":
+            return dict(get_types_from_msg(definition.data, message_type))
+        return dict(get_types_from_idl(definition.data)) if definition.format.name == "IDL" else {}
+    except Exception:  # the parser raises its own and many built-in errors
+        return {}
+
+
+def unpack_zstd(data: bytes, limit: int = MAX_CHUNK_BYTES) -> bytes:
+    """Unpack a compressed message or chunk. Raises `DataError` beyond `MAX_CHUNK_BYTES`."""
+    from rosbags.rosbag2 import storage_mcap
+
+    return _within(storage_mcap.zstd.ZstdDecompressor().decompress(data, _more(limit)))
+
+
+def _unpack_bz2(data: bytes, limit: int = MAX_CHUNK_BYTES) -> bytes:
+    return _within(bz2.BZ2Decompressor().decompress(data, _more(limit)))
+
+
+def _unpack_lz4(data: bytes, limit: int = MAX_CHUNK_BYTES) -> bytes:
+    import lz4.frame
+
+    return _within(lz4.frame.LZ4FrameDecompressor().decompress(data, _more(limit)))
+
+
+def _more(limit: int) -> int:
+    return min(limit, MAX_CHUNK_BYTES) + 1
+
+
+def _within(unpacked: bytes) -> bytes:
+    if len(unpacked) > MAX_CHUNK_BYTES:
+        raise DataError(f"A compressed chunk unpacks to more than {MAX_CHUNK_BYTES:,} bytes; it is damaged.")
+    return unpacked
+
+
+def _limit_codecs(ros1: Any, ros2: Any, mcap: Any) -> None:
+    """Put codecs with limits in the places where three modules of rosbags look for theirs."""
+    ros1.decompressors.update(bz2=_unpack_bz2, lz4=_unpack_lz4)
+    mcap.DECOMPRESSORS.update(lz4=_unpack_lz4, zstd=unpack_zstd)
+    ros2.zstd = SimpleNamespace(open=_limited_zstd_file(mcap.zstd), decompress=unpack_zstd)
+
+
+def _limited_zstd_file(zstd: Any) -> Any:
+    class LimitedZstdFile(zstd.ZstdFile):
+        """A compressed file that is not read further than `_most_bag_bytes`."""
+
+        def __init__(self, packed: BinaryIO, mode: str = "rb") -> None:
+            announced = zstd.get_frame_info(packed.read(_ZSTD_HEADER_BYTES)).decompressed_size
+            packed.seek(0)
+            self._left = _most_bag_bytes()
+            _check_bag(self._left - (announced or 0))
+            super().__init__(packed, mode)
+
+        def read(self, size: int | None = -1) -> bytes:
+            found: bytes = super().read(size)
+            self._left -= len(found)
+            _check_bag(self._left)
+            return found
+
+    return LimitedZstdFile
+
+
+def _most_bag_bytes() -> int:
+    return min(MAX_BAG_BYTES, shutil.disk_usage(tempfile.gettempdir()).free // 2)
+
+
+def _check_bag(bytes_left: int) -> None:
+    if bytes_left < 0:
+        raise DataError(
+            f"The compressed bag unpacks to more than {MAX_BAG_BYTES:,} bytes, or to more than half of the "
+            f"free space of {tempfile.gettempdir()}. If you trust it, unpack its files with 'zstd -d', "
+            "and write its metadata.yaml again with 'ros2 bag reindex'."
+        )
+
+
+def _reader_by_magic(rosbag2: Any) -> Any:
+    class ReaderByMagic(rosbag2.Reader):
+        """Knows the storage of a file by its first bytes, whatever its name."""
+
+        def __init__(self, path: Any) -> None:
+            super().__init__(path)
+            if not path.is_dir():
+                with path.open("rb") as file:
+                    suffix = _MAGIC.get(file.read(8), path.suffix)
+                self.storage = self.STORAGE_PLUGINS[suffix](path)
+
+    return ReaderByMagic
+
+
+def _limited_ros1_reader(rosbag1: Any) -> Any:
+    class LimitedRos1Reader(rosbag1.Reader):
+        """Reads each byte of the index once: chunks that share an index would multiply it."""
+
+        _index_bytes = 0
+
+        def read_index_data(self, pos: int, indexes: Any) -> None:
+            before = self.bio.tell()
+            super().read_index_data(pos, indexes)
+            self._index_bytes += self.bio.tell() - before
+            if self._index_bytes > self.path.stat().st_size:
+                raise rosbag1.ReaderError("Bag index looks damaged: its parts overlap.")
+
+    return LimitedRos1Reader

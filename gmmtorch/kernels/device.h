@@ -1,0 +1,47 @@
+// What all kernels use. A kernel is a function that starts with GMM_KERNEL: it runs once for each item of a
+// launch.
+#pragma once
+
+#if !defined(CUDA_CALLABLE)  // Warp's header is absent where an editor or another compiler reads a file alone
+#include <cmath>
+#include <cstdint>
+#define CUDA_CALLABLE
+using std::ceil, std::exp, std::fabs, std::floor, std::fma, std::log, std::rint, std::sqrt;
+#endif
+
+#define GMM_INLINE CUDA_CALLABLE inline __attribute__((always_inline))
+#define GMM_KERNEL GMM_INLINE void
+
+namespace gmm {
+
+template <typename Number>
+GMM_INLINE Number minimum(Number a, Number b) {
+    return a < b ? a : b;
+}
+
+template <typename Number>
+GMM_INLINE Number maximum(Number a, Number b) {
+    return a > b ? a : b;
+}
+
+// Adds so that items can meet in one place on CUDA. On a CPU, kernels that do so use one thread.
+template <typename Number>
+GMM_INLINE void add(Number* place, Number value) {
+#if defined(__CUDA_ARCH__)
+    atomicAdd(place, value);
+#else
+    *place += value;
+#endif
+}
+
+// Starts to load n numbers.
+GMM_INLINE void fetch(const double* place, int n) {
+#if !defined(__CUDA_ARCH__)
+    for (int byte = 0; byte < n * 8; byte += 64) __builtin_prefetch((const char*)place + byte);
+#endif
+}
+
+// Features 1, x_i and x_i x_j (i ≤ j) of a point.
+CUDA_CALLABLE constexpr int n_features(int dim) { return 1 + dim + dim * (dim + 1) / 2; }
+
+}  // namespace gmm

@@ -1,0 +1,324 @@
+"""Steps of EM: the E-step of exact and of truncated EM, the M-step, and natural parameters.
+
+The fused kernels compute in float64 and skip responsibilities below e⁻³⁷ of the row's largest term: a far
+component costs its log-density and nothing more. Statistics differ from the twin's with float64 exponentials
+by at most 10⁻¹² of their largest entry. On a CPU one kernel works on eight rows at a time. On a GPU the first
+kernel sums over the components of each row, and the second over the rows of each component; no block of
+N × K numbers is written to memory.
+
+The kernels of truncated EM run on the CPU and work on groups of rows. One makes the natural parameters of a
+group's candidates about its center, walks the group's rows once, and moves the sums to the components' means:
+nothing is stored for a pair of a row and a candidate. The other chooses the candidates. Their twins are in
+`mixture.em.truncated`, those of the M-step (2.4)-(2.6) and of natural parameters in `mixture.em`. The M-step
+differs from its twin by at most 10⁻¹² of the largest entry of a component, and natural parameters by this
+times the condition number of its covariance.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gmmtorch.kernels.choice import is_fused
+from gmmtorch.kernels.chunks import chunk_elements, chunked
+from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel
+
+_FEW_ROWS = 2048  # in fewer rows, their order matters little
+_PARTS = 64  # most parts of the rows; each has its own sums, so that threads write apart
+_GPU_THREADS = 1 << 18
+"""As many as a large GPU holds at a time; each sums one component over a part of the rows."""
+_GPU_ROWS = 32  # least rows of such a part
+
+_WIDTHS = {1: 3, 2: 6, 3: 10}
+_E_STEP = "mixtures/e_step.h"
+_EXPECTATION = {dim: FusedKernel(_E_STEP, f"e_step<{dim}>") for dim in _WIDTHS}
+_MOST_LIKELY = {dim: FusedKernel(_E_STEP, f"most_likely<{dim}>") for dim in _WIDTHS}
+_NORMS = {dim: FusedKernel(_E_STEP, f"row_norms<{dim}>") for dim in _WIDTHS}
+_SHARES = {dim: FusedKernel(_E_STEP, f"component_sums<{dim}>") for dim in _WIDTHS}
+_DIMENSIONS = {width: dim for dim, width in _WIDTHS.items()}
+
+
+def expectation(
+    features: Tensor, sample_weight: Tensor, natural: Tensor, softmax_dtype: torch.dtype = torch.float32
+) -> tuple[Tensor, Tensor]:
+    """One E-step (2.3): sufficient statistics S (K, F) and Σ_n p_n logsumexp_k L_nk (a scalar), L = φWᵀ.
+
+    Products are computed in the dtype of the features (float64, because the quadratic form cancels many
+    digits). The twin computes exponentials in `softmax_dtype`, after subtraction of the row's maximum.
+
+    Args:
+        features: φ (N, F). sample_weight: p (N,). natural: W (K, F).
+    """
+    if _is_e_step_fused(features, sample_weight, natural):
+        fused = _fused_expectation if features.device.type == "cpu" else _expectation_on_gpu
+        return fused(features, sample_weight, natural)
+    return _batched_expectation(features, sample_weight, natural, softmax_dtype)
+
+
+def most_likely(features: Tensor, natural: Tensor) -> Tensor:
+    """The component (N,) with the largest L_nk for each row of features (N, F); natural: W (K, F)."""
+    if _is_e_step_fused(features, natural):
+        n, dim, device = features.shape[0], _DIMENSIONS[features.shape[1]], features.device
+        likeliest = torch.empty(n, dtype=torch.int64, device=device)
+        if device.type != "cpu":
+            given = features.contiguous(), n, natural.contiguous(), natural.shape[0], 1
+            _NORMS[dim](n, *given, None, likeliest, device=device)
+            return likeliest
+        n_parts = _n_parts(features)
+        given = features.contiguous(), n, *_by_four(natural), n_parts
+        _MOST_LIKELY[dim](n_parts, *given, likeliest, device=device)
+        return likeliest
+    transposed = natural.T.contiguous()
+    rows = max(64, chunk_elements(features.device) // transposed.shape[1])
+    parts = chunked(features.shape[0], rows, lambda part: (features[part] @ transposed).argmax(1))
+    return torch.cat([features.new_empty(0, dtype=torch.int64), *parts])
+
+
+def in_spatial_order(features: Tensor, sample_weight: Tensor) -> tuple[Tensor, Tensor]:
+    """The rows (N, F), (N,) in an order in which neighbours follow each other, if the fused kernel runs.
+
+    The kernel skips what all of eight rows are far from. The order is that of a Morton curve through 32 cells
+    along each axis.
+    """
+    dim = _DIMENSIONS.get(features.shape[1], 0)
+    if not _is_e_step_fused(features, sample_weight) or features.shape[0] < _FEW_ROWS:
+        return features, sample_weight
+    places = features[:, 1 : 1 + dim].contiguous()
+    low, high = places.amin(0), places.amax(0)
+    cell = ((places - low) * (31.99 / (high - low).max().clamp_min(1e-300))).long().clamp_(0, 31)
+    spread = [sum((n >> b & 1) << (b * dim) for b in range(5)) for n in range(32)]
+    bits = torch.tensor(spread, device=places.device)
+    keys = sum((bits[cell[:, axis]] << axis for axis in range(dim)), torch.zeros_like(cell[:, 0]))
+    order = keys.short().argsort(stable=True)
+    return features.index_select(0, order), sample_weight.index_select(0, order)
+
+
+def _is_e_step_fused(*tensors: Tensor) -> bool:
+    features = tensors[0]
+    fits = features.shape[1] in _DIMENSIONS
+    return fits and all(t.dtype == torch.float64 for t in tensors) and is_fused(*tensors)
+
+
+def _n_parts(features: Tensor) -> int:
+    threads = torch.get_num_threads()
+    return max(1, min(threads, _PARTS, features.shape[0] // (4 * CPU_LANES)))
+
+
+def _by_four(natural: Tensor) -> tuple[Tensor, int]:
+    """W with rows of impossible components added, so that four make a step; and the number of rows."""
+    missing = -natural.shape[0] % 4
+    if missing:
+        none = natural.new_zeros(missing, natural.shape[1])
+        none[:, 0] = -1e300
+        natural = torch.cat([natural, none])
+    return natural.contiguous(), natural.shape[0]
+
+
+def _fused_expectation(features: Tensor, weight: Tensor, natural: Tensor) -> tuple[Tensor, Tensor]:
+    n, width = features.shape
+    padded, k = _by_four(natural)
+    n_parts = _n_parts(features)
+    n_scratch = n_parts * k * CPU_LANES
+    work = features.new_empty(n_scratch + 2 * n)
+    scratch, peaks, norms = work[:n_scratch], work[n_scratch : n_scratch + n], work[n_scratch + n :]
+    near = torch.empty(n_parts, k, dtype=torch.int64)
+    partial = features.new_zeros(n_parts, k, width, CPU_LANES)
+    arguments = (weight.contiguous(), scratch, near, partial, peaks, norms)
+    rows = features.contiguous(), n, padded, k, n_parts
+    _EXPECTATION[_DIMENSIONS[width]](n_parts, *rows, *arguments, device=features.device)
+    return partial.sum((0, 3))[: natural.shape[0]], torch.dot(weight, peaks + norms.log())
+
+
+def _expectation_on_gpu(features: Tensor, weight: Tensor, natural: Tensor) -> tuple[Tensor, Tensor]:
+    (n, width), k = features.shape, natural.shape[0]
+    dim, device = _DIMENSIONS[width], features.device
+    n_parts = max(1, min(_GPU_THREADS // k, n // _GPU_ROWS))
+    rows = features.contiguous(), n, natural.contiguous(), k, n_parts
+    norms = torch.empty_like(weight, memory_format=torch.contiguous_format)
+    partial = features.new_empty(n_parts, k, width)
+    _NORMS[dim](n, *rows, norms, None, device=device)
+    _SHARES[dim](n_parts * k, *rows, weight.contiguous(), norms, partial, device=device)
+    return partial.sum(0), torch.dot(weight, norms)
+
+
+def _batched_expectation(
+    features: Tensor, sample_weight: Tensor, natural: Tensor, softmax_dtype: torch.dtype
+) -> tuple[Tensor, Tensor]:
+    """The twin."""
+    rows = max(64, chunk_elements(features.device) // natural.shape[0])
+
+    def sums_of(part: slice) -> tuple[Tensor, Tensor]:
+        gamma, value = softmax(natural @ features[part].T, sample_weight[part], softmax_dtype)
+        return gamma @ features[part], value
+
+    statistics = torch.zeros_like(natural)
+    total = features.new_zeros(())
+    for sums, value in chunked(features.shape[0], rows, sums_of):
+        statistics += sums
+        total += value
+    return statistics, total
+
+
+def softmax(logits: Tensor, sample_weight: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Weighted responsibilities p_n γ_kn (K, n) of logits (K, n), which are overwritten; and
+    Σ_n p_n logsumexp_k. Exponentials are computed in `dtype`.
+    """
+    peak = logits.amax(0)
+    gamma = logits.sub_(peak).to(dtype).clamp_(min=exponent_floor(dtype)).exp_()
+    norm = gamma.sum(0)
+    value = torch.dot(sample_weight, peak + norm.to(peak.dtype).log())
+    return gamma.mul_((sample_weight / norm).to(dtype)).to(peak.dtype), value
+
+
+def exponent_floor(dtype: torch.dtype) -> float:
+    """Smallest exponent whose exp is not denormal: denormals are negligible, but slow to compute."""
+    return -80.0 if dtype == torch.float32 else -700.0
+
+
+DIMENSIONS = (1, 2, 3)
+
+_NATURALS = {dim: FusedKernel("mixtures/m_step.h", f"natural_parameters<{dim}>") for dim in DIMENSIONS}
+_STEPS = {dim: FusedKernel("mixtures/m_step.h", f"m_step<{dim}>") for dim in DIMENSIONS}
+
+Mixture = tuple[Tensor, Tensor, Tensor]
+"""Weights (K,), means (K, D) and covariances (K, D, D)."""
+
+
+def is_m_step_fused(dim: int, *tensors: Tensor) -> bool:
+    """Whether the fused kernels compute with these tensors in `dim` dimensions."""
+    return dim in DIMENSIONS and all(t.dtype == torch.float64 for t in tensors) and is_fused(*tensors)
+
+
+def fused_natural_parameters(
+    weights: Tensor, means: Tensor | None, covariances: Tensor
+) -> tuple[Tensor, Tensor]:
+    """W (K, F) such that φ(x)·W_k = log π_k + log N(x | μ_k, Σ_k); `means` None: zeros.
+
+    Also whether (a scalar) a weight or a covariance is not positive, NaN or infinite: W is not valid then.
+    """
+    k, dim = covariances.shape[:2]
+    natural = weights.new_empty(k, 1 + dim + dim * (dim + 1) // 2)
+    failed = torch.zeros(1, dtype=torch.bool, device=weights.device)
+    given = weights.contiguous(), None if means is None else means.contiguous(), covariances.contiguous()
+    _NATURALS[dim](k, *given, natural, failed, device=weights.device)
+    return natural, failed[0]
+
+
+def fused_maximization(statistics: Tensor, dim: int, reg_covar: float, previous: Mixture | None) -> Mixture:
+    """M-step from statistics (K, F), in their frame; components without points keep `previous` values."""
+    k = statistics.shape[0]
+    made = statistics.new_empty(k * (1 + dim + dim * dim))
+    masses, means = made[:k], made[k : k + k * dim].view(k, dim)
+    covariances = made[k + k * dim :].view(k, dim, dim)
+    _, *kept = (None, None, None) if previous is None else (part.contiguous() for part in previous)
+    given = statistics.contiguous(), *kept, False, reg_covar, None, None, 0.0
+    _STEPS[dim](k, *given, masses, means, covariances, *[None] * 4, device=statistics.device)
+    return masses / masses.sum(), means, covariances
+
+
+def fused_steps(
+    statistics: Tensor, before: Mixture, reg_covar: float, last: tuple[Tensor, Tensor] | None, share: float
+) -> tuple[Mixture, Mixture | None]:
+    """EM's own step, and the step from statistics that are extrapolated by a `share` of their last change.
+
+    Args:
+        statistics: (K, F) about the means `before`. last: the statistics (K, F) of the step before, and the
+            means (K, D) that they are about; with None, nothing is extrapolated.
+    """
+    _, means, covariances = (part.contiguous() for part in before)
+    k, dim = means.shape
+    em = means.new_empty(k), torch.empty_like(means), torch.empty_like(covariances)
+    given = statistics.contiguous(), means, covariances, True, reg_covar
+    if last is None:
+        _STEPS[dim](k, *given, None, None, share, *em, *[None] * 4, device=means.device)
+        return (em[0] / em[0].sum(), *em[1:]), None
+    new = torch.empty_like(em[0]), torch.empty_like(means), torch.empty_like(covariances)
+    trusted = torch.empty(k, dtype=torch.bool, device=means.device)
+    old = last[0].contiguous(), last[1].contiguous()
+    _STEPS[dim](k, *given, *old, share, *em, *new, trusted, device=means.device)
+    em_weights = em[0] / em[0].sum()
+    weights = torch.where(trusted, new[0] / new[0].sum(), em_weights)
+    return (em_weights, *em[1:]), (weights / weights.sum(), *new[1:])
+
+
+class GroupedRows(NamedTuple):
+    """features (S, F) about the group's center, weight (S,): of S slots, float32 or float64. begin (G + 1,):
+    first slot of each group, multiples of eight. centers: (G, D).
+    """
+
+    features: Tensor
+    weight: Tensor
+    begin: Tensor
+    centers: Tensor
+
+
+def _kernels(name: str) -> dict[tuple[int, torch.dtype], FusedKernel]:
+    kinds = {torch.float32: "float", torch.float64: "double"}
+    calls = {(dim, dtype): f"{name}<{dim}, {kind}>" for dim in DIMENSIONS for dtype, kind in kinds.items()}
+    return {key: FusedKernel("mixtures/truncated_e_step.h", call) for key, call in calls.items()}
+
+
+_TRUNCATED, _CHOICES = _kernels("truncated"), _kernels("candidates")
+
+
+def is_truncated_e_step_fused(rows: GroupedRows, *others: Tensor) -> bool:
+    """Whether the fused kernels compute with these groups."""
+    fits = rows.features.device.type == "cpu" and rows.centers.shape[1] in DIMENSIONS
+    return fits and is_fused(*rows, *others)
+
+
+def fused_expectation(
+    rows: GroupedRows, candidates: Tensor, own: Tensor, means: Tensor, want_likeliest: bool
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Statistics (K, F) about the components' means, Σ p log Σ exp (a scalar), and the most likely candidate
+    (S,) of each slot, if requested.
+
+    Args:
+        candidates: (G, m). own: (K, F), natural parameters of the components about their own means.
+        means: (K, D).
+    """
+    n_groups, m = candidates.shape
+    k, width = own.shape
+    n_parts, padded = _n_parts_of_groups(n_groups), m + -m % 4
+    scratch = own.new_empty(n_parts, padded * (width + 2), CPU_LANES)
+    natural = own.new_empty(n_parts, padded, width)
+    statistics, value = own.new_zeros(n_parts, k, width), own.new_empty(n_parts)
+    likeliest = torch.empty(len(rows.weight), dtype=torch.int64) if want_likeliest else None
+    sizes = n_groups, k, m, padded, n_parts
+    given = candidates.contiguous(), own.contiguous(), means.contiguous()
+    kernel = _TRUNCATED[rows.centers.shape[1], rows.features.dtype]
+    kernel(n_parts, *rows, *sizes, *given, scratch, natural, statistics, value, likeliest, device=own.device)
+    return statistics.sum(0), value.sum(), likeliest
+
+
+def fused_candidates(
+    rows: GroupedRows, slots: Tensor, natural: Tensor, bounds: Tensor, n_candidates: int
+) -> Tensor:
+    """The most likely `n_candidates` components (G, m) for the sampled slots (G, n) of each of the G groups.
+
+    Component g is a candidate of group g. The order is arbitrary.
+
+    Args:
+        natural: (G, F), of the components. bounds (D + 2, G): their means; the logarithm of weight times
+            density at the mean; and √(1/2v), v at least the largest variance.
+    """
+    k, width = natural.shape
+    n_parts, padded = _n_parts_of_groups(k), k + -k % CPU_LANES
+    table = natural.new_zeros(padded, width)
+    table[:k], table[k:, 0] = natural, -1e300
+    padded_bounds = natural.new_zeros(bounds.shape[0], padded)
+    padded_bounds[:, :k], padded_bounds[-2, k:] = bounds, -1e300
+    scratch = natural.new_empty(n_parts, 3, padded, CPU_LANES)
+    scores = natural.new_empty(n_parts, n_candidates)
+    candidates = torch.empty(k, n_candidates, dtype=torch.int64)
+    sizes = k, k, n_candidates, padded, n_parts
+    kernel = _CHOICES[rows.centers.shape[1], rows.features.dtype]
+    given = slots.contiguous(), slots.shape[1], table, padded_bounds
+    kernel(n_parts, *rows, *sizes, *given, scratch, scores, candidates, device=natural.device)
+    return candidates
+
+
+def _n_parts_of_groups(n_groups: int) -> int:
+    return max(1, min(torch.get_num_threads(), n_groups))

@@ -1,0 +1,132 @@
+// M-step of EM with its extrapolation, and natural parameters. An item is a component.
+#pragma once
+
+#include "../device.h"
+
+namespace gmm {
+
+template <int DIM>
+GMM_KERNEL natural_parameters(int64_t item, const double* weights, const double* means,
+                              const double* covariances, double* natural, bool* failed) {
+    constexpr int WIDTH = n_features(DIM);
+    const double *c = covariances + item * DIM * DIM, weight = weights[item];
+    double l[DIM][DIM], inverse[DIM][DIM], half_log_det = 0.0, across = 0.0;
+    bool good = weight >= 0.0;
+    for (int j = 0; j < DIM; ++j)
+        for (int i = j; i < DIM; ++i) {
+            double s = c[i * DIM + j];
+            for (int k = 0; k < j; ++k) s -= l[i][k] * l[j][k];
+            good = good && (i > j || (s > 0.0 && s < HUGE_VAL));
+            l[i][j] = i == j ? sqrt(s) : s / l[j][j];
+            if (i == j) half_log_det += log(l[j][j]);
+        }
+    if (!good) {
+        *failed = true;
+        natural[item * WIDTH] = -1e300;
+        for (int f = 1; f < WIDTH; ++f) natural[item * WIDTH + f] = 0.0;
+        return;
+    }
+    for (int j = 0; j < DIM; ++j)
+        for (int i = j; i < DIM; ++i) {
+            double s = i == j ? 1.0 : 0.0;
+            for (int k = j; k < i; ++k) s -= l[i][k] * inverse[k][j];
+            inverse[i][j] = s / l[i][i];
+        }
+    double* w = natural + item * WIDTH;
+    for (int a = 0; a < DIM; ++a) w[1 + a] = 0.0;
+    for (int a = 0, f = 1 + DIM; a < DIM; ++a)
+        for (int b = a; b < DIM; ++b, ++f) {
+            double p = 0.0;
+            for (int k = b; k < DIM; ++k) p += inverse[k][a] * inverse[k][b];
+            w[f] = a == b ? -0.5 * p : -p;
+            if (!means) continue;
+            w[1 + a] += p * means[item * DIM + b];
+            if (a != b) w[1 + b] += p * means[item * DIM + a];
+        }
+    if (means)
+        for (int a = 0; a < DIM; ++a) across += w[1 + a] * means[item * DIM + a];
+    const double log_weight = weight > 0.0 ? log(weight) : -1e30;
+    w[0] = log_weight - half_log_det - 0.5 * (DIM * 1.8378770664093453 + across);
+}
+
+// By Jacobi's rotations.
+template <int DIM>
+GMM_INLINE double least_eigenvalue(const double* matrix) {
+    double x[DIM][DIM];
+    for (int a = 0; a < DIM; ++a)
+        for (int b = 0; b < DIM; ++b) x[a][b] = matrix[a * DIM + b];
+    for (int sweep = 0; sweep < 30; ++sweep) {
+        double off = 0.0, on = 0.0;
+        for (int a = 0; a < DIM; ++a)
+            for (int b = 0; b < DIM; ++b) (a == b ? on : off) += x[a][b] * x[a][b];
+        if (!(off > 1e-32 * on)) break;
+        for (int a = 0; a < DIM; ++a)
+            for (int b = a + 1; b < DIM; ++b) {
+                if (x[a][b] == 0.0) continue;
+                const double w = (x[b][b] - x[a][a]) / (2.0 * x[a][b]);
+                const double t = (w < 0.0 ? -1.0 : 1.0) / (fabs(w) + sqrt(w * w + 1.0));
+                const double cosine = 1.0 / sqrt(t * t + 1.0), sine = t * cosine;
+                const double turn = t * x[a][b];
+                x[a][a] -= turn, x[b][b] += turn;
+                x[a][b] = x[b][a] = 0.0;
+                for (int k = 0; k < DIM; ++k) {
+                    if (k == a || k == b) continue;
+                    const double y = x[k][a], z = x[k][b];
+                    x[k][a] = x[a][k] = cosine * y - sine * z;
+                    x[k][b] = x[b][k] = sine * y + cosine * z;
+                }
+            }
+    }
+    double least = x[0][0];
+    for (int a = 1; a < DIM; ++a) least = minimum(least, x[a][a]);
+    return least;
+}
+
+template <int DIM>
+GMM_KERNEL m_step(int64_t item, const double* statistics, const double* means, const double* covariances,
+                  bool about_means, double reg_covar, const double* last, const double* last_means,
+                  double share, double* em_masses, double* em_means, double* em_covariances,
+                  double* new_masses, double* new_means, double* new_covariances, bool* trusted) {
+    constexpr int WIDTH = n_features(DIM);
+    const double* s = statistics + item * WIDTH;
+    // Mass, mean and covariance of sums; what was there and no mass, if there are no points.
+    auto maximized = [&](const double* sums, double* mass, double* mean, double* covariance) {
+        const double eps = 2.220446049250313e-15, count = sums[0] + eps;
+        const bool alive = !means || sums[0] > eps;
+        *mass = alive ? count : 0.0;
+        for (int a = 0; a < DIM; ++a) {
+            mean[a] = alive && !about_means ? 0.0 : means[item * DIM + a];
+            if (alive) mean[a] += sums[1 + a] / count;
+        }
+        const double* c = covariances + item * DIM * DIM;
+        for (int a = 0, f = 1 + DIM; a < DIM; ++a)
+            for (int b = a; b < DIM; ++b, ++f) {
+                double x = sums[f] / count - (sums[1 + a] / count) * (sums[1 + b] / count);
+                if (a == b) x = maximum(x, 0.0) + reg_covar;
+                covariance[a * DIM + b] = alive ? x : c[a * DIM + b];
+                covariance[b * DIM + a] = alive ? x : c[b * DIM + a];
+            }
+    };
+    double* em_covariance = em_covariances + item * DIM * DIM;
+    maximized(s, em_masses + item, em_means + item * DIM, em_covariance);
+    if (!last) return;
+    const double* old = last + item * WIDTH;
+    double ahead[WIDTH], shift[DIM], before[WIDTH];
+    for (int a = 0; a < DIM; ++a) shift[a] = last_means[item * DIM + a] - means[item * DIM + a];
+    before[0] = old[0];
+    for (int a = 0, f = 1 + DIM; a < DIM; ++a) {
+        before[1 + a] = old[1 + a] + old[0] * shift[a];
+        for (int b = a; b < DIM; ++b, ++f)
+            before[f] = old[f] + old[1 + a] * shift[b] + shift[a] * (old[1 + b] + old[0] * shift[b]);
+    }
+    const bool heavy = s[0] + share * (s[0] - before[0]) > 0.2 * s[0];
+    for (int f = 0; f < WIDTH; ++f) ahead[f] = heavy ? s[f] + share * (s[f] - before[f]) : s[f];
+    double *mean = new_means + item * DIM, *covariance = new_covariances + item * DIM * DIM;
+    maximized(ahead, new_masses + item, mean, covariance);
+    trusted[item] = heavy && least_eigenvalue<DIM>(covariance) > 0.3 * least_eigenvalue<DIM>(em_covariance);
+    if (trusted[item]) return;
+    for (int a = 0; a < DIM; ++a) mean[a] = em_means[item * DIM + a];
+    for (int f = 0; f < DIM * DIM; ++f) covariance[f] = em_covariance[f];
+}
+
+}  // namespace gmm

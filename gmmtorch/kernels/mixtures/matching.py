@@ -1,0 +1,248 @@
+"""Components matched with components or points: near pairs, overlaps, alignment of a scan, explained points.
+
+The twins of `near_pairs` and `overlap_sums` are in `localization.registration.overlap`, and that of
+`explained_points` in `mapping.learning.novelty`. The kernel of pairs tests all of them, which is faster
+than a k-d tree for the few hundred components of a scan; it finds those of the twin, in another order. Sums
+of overlaps and of alignment differ from the twin's by at most 10⁻¹¹ of their largest entry, shares of points
+by rounding.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gmmtorch.kernels.choice import is_fused
+from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel
+
+MOST_TESTED = 1 << 24
+"""Pairs above which a k-d tree is faster."""
+
+_PARTS_OF_PAIRS = 1024  # of the pairs; each part has its own sums
+_NEAR = {dim: FusedKernel("mixtures/pair_overlap.h", f"near_pairs<{dim}>") for dim in (2, 3)}
+_OVERLAPS = {dim: FusedKernel("mixtures/pair_overlap.h", f"pair_overlap<{dim}>") for dim in (2, 3)}
+
+
+def near_pairs(
+    moved: Tensor,
+    shapes: Tensor,
+    reaches: tuple[Tensor, Tensor],
+    means: Tensor,
+    covariances: Tensor,
+    scale: float,
+    wide: float,
+) -> Tensor:
+    """Motion, source and target (3, P) of the pairs that are near.
+
+    With the difference d of their means, |d| is at most the sum of their reaches, and dᵀM⁻¹d at most 1 for
+    M = `scale` (A + Σ) + `wide` I.
+
+    Args:
+        moved: (B, K, D) means of the source under each motion. shapes: A (B, K, D, D).
+        reaches: of the source (K,) and of the target (J,), metres. means, covariances: of the target.
+    """
+    n, k, dim = moved.shape
+    device = moved.device
+    targets = torch.cat([means, reaches[1][:, None]], 1)
+    given = [part.contiguous() for part in (moved, shapes, reaches[0])]
+    table = targets.contiguous(), covariances.contiguous(), len(means), scale, wide
+    near = torch.empty(n, k, len(means), dtype=torch.bool, device=device)
+    _NEAR[dim](n * k, *given, k, *table, near, device=device)
+    return near.nonzero().T.contiguous()
+
+
+def overlap_sums(
+    pairs: tuple[Tensor, Tensor, Tensor],
+    levers: Tensor,
+    moved: Tensor,
+    translations: Tensor,
+    target: tuple[Tensor, Tensor],
+    weights: tuple[Tensor, Tensor],
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Sums over the pairs of each of B motions.
+
+    With s = π_i π_j N of a pair: Σ s (B,), Σ s ∂log N (B, F), Σ s times the information (B, F, F), and
+    Σ s ∂log N ∂log Nᵀ (B, F, F), F = D + D(D−1)/2.
+
+    Args:
+        pairs: rows of the motion, the source and the target, (P,) each; fastest in the order of motions.
+        levers: R μ_i (B, K, D). moved: R Σ_i Rᵀ (B, K, D, D). translations: (B, D).
+        target: means (J, D) and covariances (J, D, D). weights: π of the source (K,) and of the target (J,).
+    """
+    n, dim = translations.shape
+    free = dim + dim * (dim - 1) // 2
+    on_cpu = levers.device.type == "cpu"
+    most = torch.get_num_threads() if on_cpu else _PARTS_OF_PAIRS
+    n_parts = max(1, min(most, len(pairs[0]) // (8 * CPU_LANES)))
+    n_triangle = free * (free + 1) // 2
+    sums = levers.new_zeros(n_parts, n, 1 + free + 2 * n_triangle)
+    counts = len(pairs[0]), n_parts, n, levers.shape[1]
+    tensors = (levers, moved, translations, *target, *weights, sums)
+    given = [part.contiguous() for part in (*pairs, *tensors)]
+    _OVERLAPS[dim](n_parts, *given[:3], *counts, *given[3:], device=levers.device)
+    total, slope, *triangles = sums.sum(0).split([1, free, n_triangle, n_triangle], 1)
+    rows, columns = torch.triu_indices(free, free, device=levers.device)
+    full = levers.new_zeros(2, n, free, free)
+    full[:, :, rows, columns] = full[:, :, columns, rows] = torch.stack(triangles)
+    return total[:, 0], slope, full[0], full[1]
+
+
+_PARTS_OF_POINTS = 64  # of the points of a motion; each part has its own sums
+_LEAST_POINTS = 256  # of a part on a CPU
+
+_ALIGNMENTS = {dim: FusedKernel("mixtures/point_alignment.h", f"point_alignment<{dim}>") for dim in (2, 3)}
+
+
+class AlignmentSums(NamedTuple):
+    """Of each of B motions, with q_n = Σ_k exp(−½ d_nk²) over the components listed for point n:
+
+    score: Σ log(1 + q_n/ε) (B,). n_explained: number of points with q above the given height (B,).
+    gradient: of the score in a shift and a turn, (B, F), F = D + D(D−1)/2.
+    complete: information (B, F, F) if the component of each point were known, as in a step of EM.
+    observed: the complete information less the missing one (Louis 1982), about −∇² of the score.
+    """
+
+    score: Tensor
+    n_explained: Tensor
+    gradient: Tensor
+    complete: Tensor
+    observed: Tensor
+
+
+def alignment_sums(
+    points: Tensor,
+    motions: tuple[Tensor, Tensor],
+    lists: tuple[Tensor, Tensor, Tensor],
+    target: tuple[Tensor, Tensor, Tensor],
+    limits: tuple[float, float, float, float],
+) -> AlignmentSums:
+    """The sums over N points under B motions.
+
+    Args:
+        points: (N, D), float64. motions: rotations (B, D, D) and translations (B, D).
+        lists: the bucket of each moved point (B N,), or −1; starts and entries of the buckets' lists.
+        target: means (K, D), precisions (K, D, D) and normals (K, D) of the components, zero for those that
+            are seen from all sides.
+        limits: metres behind a component's face from which on the sensor does not see it; d² beyond which a
+            component is left out; ε; q above which a point counts as explained.
+    """
+    n, dim = motions[1].shape
+    behind, farthest, outliers, height = limits
+    if not is_fused(points, *motions, *lists, *target):
+        return _batched_alignment(points, motions, lists, target, limits)
+    free = dim + dim * (dim - 1) // 2
+    on_cpu = points.device.type == "cpu"
+    n_parts = (
+        max(1, min(torch.get_num_threads(), len(points) // _LEAST_POINTS)) if on_cpu else _PARTS_OF_POINTS
+    )
+    n_triangle = free * (free + 1) // 2
+    sums = points.new_empty(n, n_parts, 2 + free + 2 * n_triangle)
+    given = [part.contiguous() for part in (*motions, *lists, *target)]
+    counts = len(points), n_parts
+    bounds = behind, farthest, outliers, outliers + height
+    _ALIGNMENTS[dim](n * n_parts, points.contiguous(), *counts, *given, *bounds, sums, device=points.device)
+    score, n_explained, gradient, *triangles = sums.sum(1).split([1, 1, free, n_triangle, n_triangle], 1)
+    rows, columns = torch.triu_indices(free, free, device=points.device)
+    full = points.new_zeros(2, n, free, free)
+    full[:, :, rows, columns] = full[:, :, columns, rows] = torch.stack(triangles)
+    return AlignmentSums(score[:, 0], n_explained[:, 0], gradient, full[0], full[1])
+
+
+def _batched_alignment(
+    points: Tensor,
+    motions: tuple[Tensor, Tensor],
+    lists: tuple[Tensor, Tensor, Tensor],
+    target: tuple[Tensor, Tensor, Tensor],
+    limits: tuple[float, float, float, float],
+) -> AlignmentSums:
+    """The twin."""
+    (rotations, translations), (means, precisions, normals) = motions, target
+    behind, farthest, outliers, height = limits
+    n, (count, dim) = len(translations), points.shape
+    lever = (points @ rotations.mT).flatten(0, 1)
+    moved = lever + translations.repeat_interleave(count, 0)
+    row, component = _listed(*lists)
+    offset = moved[row] - means[component]
+    precision = precisions[component]
+    pulls = (precision @ offset[:, :, None])[:, :, 0]
+    square = (offset * pulls).sum(1)
+    above = (normals[component] * (translations[row // count] - means[component])).sum(1)
+    hidden = (square > farthest) | (above < -behind)
+    heights = torch.where(hidden, 0.0, torch.exp(-0.5 * square))
+    total = lever.new_full((n * count,), outliers).index_add(0, row, heights)
+
+    def mean(terms: Tensor) -> Tensor:
+        """Means over the components of each point, weighted by their share in it."""
+        weighted = heights.view(-1, *[1] * (terms.ndim - 1)) * terms
+        summed = lever.new_zeros(n * count, *terms.shape[1:]).index_add(0, row, weighted)
+        return summed / total.view(-1, *[1] * (terms.ndim - 1))
+
+    pull, weight = mean(pulls), mean(precision)
+    spread = weight - mean(pulls[:, :, None] * pulls[:, None]) + pull[:, :, None] * pull[:, None]
+    jacobian = torch.cat([torch.eye(dim).to(lever).expand(n * count, dim, dim), _arms(lever)], 2)
+    gradient = -(jacobian.mT @ pull[:, :, None])[:, :, 0]
+    complete, observed = (jacobian.mT @ inner @ jacobian for inner in (weight, spread))
+    return AlignmentSums(
+        (total / outliers).log().view(n, count).sum(1),
+        (total > outliers + height).to(lever).view(n, count).sum(1),
+        *(terms.unflatten(0, (n, count)).sum(1) for terms in (gradient, complete, observed)),
+    )
+
+
+def _listed(bucket: Tensor, starts: Tensor, entries: Tensor) -> tuple[Tensor, Tensor]:
+    """Pairs of a point and a component (P,) of its bucket's list."""
+    known = (bucket >= 0).nonzero()[:, 0]
+    begin = starts[bucket[known]]
+    length = starts[bucket[known] + 1] - begin
+    row = torch.repeat_interleave(length)
+    within = torch.arange(len(row), device=row.device) - (length.cumsum(0) - length)[row]
+    return known[row], entries[begin[row] + within].long()
+
+
+def _arms(lever: Tensor) -> Tensor:
+    """G_k x (M, D, D(D−1)/2) of points x (M, D): their motion in a turn of one radian about each axis."""
+    if lever.shape[1] == 2:
+        return torch.stack([-lever[:, 1], lever[:, 0]], 1)[:, :, None]
+    x, y, z = lever.unbind(1)
+    zero = torch.zeros_like(x)
+    columns = [torch.stack(column, 1) for column in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
+    return torch.stack(columns, 2)
+
+
+_EXPLAINED = {
+    dim: FusedKernel("mixtures/explained_points.h", f"explained_points<{dim}>", shares=True) for dim in (2, 3)
+}
+
+
+def explained_points(
+    points: Tensor,
+    means: Tensor,
+    whitening: Tensor,
+    limit: float,
+    least: float,
+    near: Tensor,
+    frees: Tensor | None,
+) -> tuple[Tensor, Tensor]:
+    """Sums (K,) of the shares of K components in the points (N, D) that they explain, and whether any
+    component explains each point, (N,) bool.
+
+    A component explains a point if its squared Mahalanobis distance d is below `limit`. The components that
+    explain a point share it in proportion to 1/max(d, least).
+
+    Args:
+        means: (K, D), whitening: (K, D, D), lower triangular, float64; see `occupancy.cones.whitening`.
+        near: (K,) bool, frees: (N,) bool: components that are not near explain no point that frees space.
+            frees=None: no point does.
+
+    The fused kernel differs from its twin by rounding.
+    """
+    k, dim = means.shape
+    table = torch.cat([means.T, whitening.flatten(1).T]).contiguous()
+    gained = torch.zeros(k, dtype=torch.float64, device=points.device)
+    found = torch.empty(len(points), dtype=torch.bool, device=points.device)
+    frees = None if frees is None else frees.contiguous()
+    given = (table, k, near.contiguous(), limit, least, gained, found)
+    _EXPLAINED[dim](len(points), points.double().contiguous(), frees, *given, device=points.device)
+    return gained, found

@@ -1,0 +1,211 @@
+"""Alignment of a scan's points with the surfaces of a map, from a rough pose.
+
+The log-likelihood of N points p_n under the pose T = (R, t), with each component as a kernel of height one
+and a uniform density ε of outliers, is
+
+    ℓ(T) = Σ_n log(1 + q_n / ε),   q_n = Σ_k exp(−½ d_nkᵀ (Σ_k + s² I)⁻¹ d_nk),   d_nk = R p_n + t − μ_k
+
+(point-to-distribution NDT, Magnusson 2009, with an annealed blur s). Newton's steps climb it on SE(3) or
+SE(2); where −∇²ℓ is not positive definite, EM's steps do. Each point adds at most log(1 + q_n/ε), so people
+and other changes have little weight. A flat component that was seen from one side only is left out while the
+sensor is behind it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gmmtorch.kernels import AlignmentSums, alignment_sums
+from gmmtorch.mapping import Components
+from gmmtorch.mixture import Parameters, merge_components
+from gmmtorch.occupancy import ConeIndex, Cones
+from gmmtorch.pose import Pose
+
+CUTOFF = 3.5
+"""Deviations beyond which a component is left out of a point."""
+
+_OUTLIERS = 0.05  # ε, relative to the peak of a component
+_EXPLAINED = 0.1  # q above which components explain a point
+_SETTLED = 0.05  # of the blur: steps below this end a climb
+_SADDLE = 0.05  # of EM's information: with less curvature Newton's step is too long
+_ENTRIES = {2: 16, 3: 64}  # of the index, for each component
+_RIDGE = 1e-9
+_TURNED = math.radians(10)  # between the headings of neighbouring starts, for each metre between their places
+_FLAT = 0.25  # of the next deviation: thinner components have a face
+
+
+class Alignment(NamedTuple):
+    """Of B motions, world ← sensor: ℓ/N (B,), the share of explained points (B,), −∇²ℓ (B, F, F) in a shift
+    v (m) and a turn ω (rad) about the sensor, F = D + D(D−1)/2, and whether the last step was small (B,).
+    """
+
+    motions: Pose
+    score: Tensor
+    explained: Tensor
+    information: Tensor
+    converged: Tensor
+
+    def at(self, rows: Tensor) -> Alignment:
+        return Alignment(self.motions[rows], *(value[rows] for value in self[1:]))
+
+
+class AlignmentTarget:
+    """The surfaces of a map at one blur, listed by place.
+
+    Args:
+        surfaces: near the origin; their weights are not used.
+        blur: s (m), above zero.
+        normals: (K, D), towards the side from which a surface is seen; zero: from all sides. A sensor behind
+            a surface by more than the blur does not see it, so the two faces of a wall are not confused.
+    """
+
+    def __init__(self, surfaces: Parameters, blur: float, normals: Tensor | None = None) -> None:
+        means, dim = surfaces.means, surfaces.means.shape[1]
+        covariances = surfaces.covariances + blur**2 * torch.eye(dim).to(means)
+        normals = torch.zeros_like(means) if normals is None else normals
+        self.blur, self.means, self.normals = blur, means.contiguous(), normals.contiguous()
+        self.precisions = torch.linalg.inv(covariances).contiguous()  # else each sum would copy them
+        nothing = torch.zeros(len(means), dtype=torch.bool, device=means.device)
+        # A cone whose sensor is at the component's mean is the component's ellipsoid.
+        ellipsoids = Cones(means, covariances, means, surfaces.weights, nothing)
+        self.index = ConeIndex(ellipsoids, 1e-3 * blur, CUTOFF, entries_per_cone=_ENTRIES[dim], smallest=True)
+
+    def sums(self, points: Tensor, motions: Pose) -> AlignmentSums:
+        """ℓ of points (N, D) under each motion, and its derivatives."""
+        lists = self.index.buckets(motions.apply(points).flatten(0, 1)), *self.index.lists
+        target = self.means, self.precisions, self.normals
+        limits = self.blur, CUTOFF**2, _OUTLIERS, _EXPLAINED
+        return alignment_sums(points, motions.parts, lists, target, limits)
+
+
+def seen_normals(surfaces: Components) -> Tensor:
+    """Unit normals (K, D), towards the sensor, of the surfaces that are flat and seen from one side; zero for
+    the others. In the order of `surface_mixture`.
+    """
+    solid = ~surfaces.max_range & (surfaces.support > 0)
+    variances, axes = torch.linalg.eigh(surfaces.covariances.double())
+    normals = axes[:, :, 0]
+    views = surfaces.origins.double()[surfaces.seen_from] - surfaces.means.double()[surfaces.seen_by]
+    heights = (views * normals[surfaces.seen_by]).sum(1)
+    sides = [torch.zeros(len(normals)).to(normals).index_add(0, surfaces.seen_by, side.to(normals))
+             for side in (heights > 0, heights < 0)]  # fmt: skip
+    sign = (sides[0] > 0).to(normals) - (sides[1] > 0).to(normals)  # 0 if seen from both sides
+    is_flat = variances[:, 0] < _FLAT**2 * variances[:, 1]
+    return (normals * (sign * is_flat)[:, None])[solid]
+
+
+def deviations(mixture: Parameters) -> Tensor:
+    """Standard deviations (K, D) along the principal axes, in rising order."""
+    return torch.linalg.eigvalsh(mixture.covariances).clamp_min(0).sqrt()
+
+
+def merged_below(surfaces: Parameters, normals: Tensor, blur: float) -> tuple[Parameters, Tensor]:
+    """The surfaces with those merged that a blur hides: smaller ones of one side in a cell of that size."""
+    small = deviations(surfaces)[:, -1] < blur
+    alone = torch.where(small, -1, torch.arange(len(small)).to(small.device))
+    keys = torch.cat([(surfaces.means / blur).floor(), normals.round(), alone[:, None]], 1)
+    cells, labels = torch.unique(keys, dim=0, return_inverse=True)
+    summed = torch.zeros(len(cells), normals.shape[1]).to(normals).index_add(0, labels, normals)
+    return merge_components(*surfaces, labels, len(cells)), torch.nn.functional.normalize(summed)
+
+
+def align(points: Tensor, target: AlignmentTarget, motions: Pose, max_steps: int) -> Alignment:
+    """Climbs ℓ from B motions in parallel. A step that lowers ℓ is taken back, and the next one is shorter.
+
+    Args:
+        points: (N, D), N at least 1, sensor frame, metres, float64.
+        motions: world ← sensor. max_steps: evaluations of ℓ after the first one.
+    """
+    dim = points.shape[1]
+    scale = points.new_ones(dim + dim * (dim - 1) // 2)
+    scale[dim:] = 1 / points.norm(dim=1).amax().clamp_min(1e-9)  # a unit moves the farthest point by a metre
+    sums = target.sums(points, motions)
+    share = torch.ones_like(sums.score)
+    settled = torch.zeros_like(sums.score, dtype=torch.bool)
+    for _ in range(max_steps):
+        step = _steps(sums, scale, target.blur) * share[:, None]
+        trial = motions.moved(step)
+        tried = target.sums(points, trial)
+        better = tried.score >= sums.score
+        motions = Pose(*chosen_rows(better, trial.parts, motions.parts))
+        sums = AlignmentSums(*chosen_rows(better, tried, sums))
+        share = torch.where(better, (2 * share).clamp_max(1), share / 4)
+        settled = (step / scale).norm(dim=1) < _SETTLED * target.blur
+        if bool(settled.all()):
+            break
+    n = len(points)
+    return Alignment(motions, sums.score / n, sums.n_explained / n, sums.observed, settled)
+
+
+def chosen_rows(better: Tensor, new: tuple[Tensor, ...], old: tuple[Tensor, ...]) -> list[Tensor]:
+    """Rows of `new` where `better` (B,), else of `old`."""
+    return [torch.where(better.view(-1, *[1] * (n.ndim - 1)), n, o) for n, o in zip(new, old, strict=True)]
+
+
+def _steps(sums: AlignmentSums, scale: Tensor, longest: float) -> Tensor:
+    """Steps (B, F), Newton's or EM's, which move no point by more than about `longest` metres."""
+    outer = scale[:, None] * scale
+    complete = sums.complete * outer
+    ridge = _RIDGE * complete.diagonal(dim1=1, dim2=2).amax(1).clamp_min(1e-12)
+    complete = complete + ridge[:, None, None] * torch.eye(len(scale)).to(scale)
+    observed = sums.observed * outer
+    _, flawed = torch.linalg.cholesky_ex(observed - _SADDLE * complete)
+    curvature = torch.where((flawed == 0)[:, None, None], observed, complete)
+    step = torch.linalg.solve(curvature, sums.gradient * scale)
+    length = step.norm(dim=1, keepdim=True)
+    return step * (longest / length.clamp_min(longest)) * scale
+
+
+# -- starts of a search ---------------------------------------------------------------------------
+
+
+def differences(some: Pose, others: Pose, distance: float, angle: float) -> Tensor:
+    """How different motions are (A, B): the larger of the shift in `distance` and the turn in `angle`."""
+    shift = torch.cdist(some.translation, others.translation)
+    turn = torch.linalg.matrix_norm(some.rotation[:, None] - others.rotation) / math.sqrt(2)
+    return torch.maximum(shift / distance, turn / angle)
+
+
+def distinct(motions: Pose, distance: float, angle: float) -> Tensor:
+    """Rows of motions, best first, without those within both (m, rad) of a better one."""
+    is_near = differences(motions, motions, distance, angle) < 1
+    return (~is_near.tril(-1).any(1)).nonzero().squeeze(1)
+
+
+def best_distinct(motions: Pose, score: Tensor, distance: float) -> Tensor:
+    """Rows of motions by falling score, without those close to a better one: by less than `distance` (m) and
+    the turn that belongs to it.
+    """
+    order = score.argsort(descending=True, stable=True)
+    return order[distinct(motions[order], distance, _TURNED * distance)]
+
+
+def around(start: Pose, distance: float, angle: float, blur: float) -> Pose:
+    """Starts on a lattice of places, `blur` metres apart, up to `distance` metres from one along the ground,
+    and of headings up to `angle` radians; the start itself among them.
+    """
+    like = start.translation
+    n, m = math.ceil(distance / blur), math.ceil(angle / (_TURNED * blur))
+    side = torch.linspace(-distance, distance, 2 * n + 1).to(like)
+    places = torch.cartesian_prod(side, side)
+    places = places[places.norm(dim=1) <= distance * (1 + 1e-9)]
+    places = torch.nn.functional.pad(places, (0, start.dim - 2))
+    turned = Pose.from_yaw(torch.linspace(-angle, angle, 2 * m + 1).to(like), torch.zeros_like(like[0]))
+    return _crossed(turned.rotation @ start.rotation, like + places)
+
+
+def everywhere(places: Tensor, blur: float) -> Pose:
+    """Starts at places (S, D) with all headings; upright in 3D."""
+    n = math.ceil(math.pi / (_TURNED * blur))
+    angles = torch.arange(n).to(places) * (2 * math.pi / n)
+    return _crossed(Pose.from_yaw(angles, torch.zeros_like(places[0])).rotation, places)
+
+
+def _crossed(rotations: Tensor, translations: Tensor) -> Pose:
+    """Every pair of a rotation and a translation."""
+    n = len(rotations)
+    return Pose(rotations.repeat(len(translations), 1, 1), translations.repeat_interleave(n, 0))

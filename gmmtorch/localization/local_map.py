@@ -1,0 +1,368 @@
+"""LocalMap: the surfaces and the free space around a moving sensor, in which the next scan is found.
+
+Each keyframe is also kept as a range image: the nearest return in each direction. A point of another scan is,
+in such an image, in front of the surface (free space, which contradicts it), on the surface, or behind it or
+outside the field of view (unknown).
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gmmtorch.localization.alignment import (
+    Alignment,
+    AlignmentTarget,
+    align,
+    differences,
+    distinct,
+    seen_normals,
+)
+from gmmtorch.localization.location import CORRELATED, Location, pose_covariance
+from gmmtorch.localization.registration import register
+from gmmtorch.mapping import Components, WindowedRule, learn_window, surface_mixture
+from gmmtorch.pose import Pose
+from gmmtorch.scan import Scan
+
+_BLURS = {2: (0.2, 0.08, 0.03), 3: (0.25, 0.1, 0.04)}  # metres
+_STEPS = 15  # of a level
+_SLIDE = 1.0  # metres that the best pose is moved at most along its loosest direction, to
+_SLIDES = 16  # places, each of which climbs by
+_SLIDE_STEPS = 3
+_DECISIVE = 4.0  # nats by which such a place must be better: smaller gains do not make poses more exact
+_SPACING = {2: 0.25, 3: 0.5}  # metres between the starts of the first search
+_COARSE = {2: 0.5, 3: 1.0}  # metres of blur, and between the starts, of the last search
+_TURNED = {2: 0.5, 3: 0.2}  # radians between the headings of neighbours, for each metre between their places
+_NEAR = 0.5  # metres, and half as many radians, of the deviations of the first search
+_FARTHEST = 3.0  # metres of a search
+_NEVER = 1e4  # nats of a pose that is farther from the expected poses than the sensor moves
+_AT_ONCE = 256  # starts
+_SORTED = {2: 400, 3: 64}  # best starts, of which
+_CLIMBED = {2: 64, 3: 24}  # different ones are climbed
+_SPREAD = 0.75  # spacings between them
+_COARSE_POINTS = 400  # of the scan on all levels but the last one
+_RANKED = 200  # points of the scan that rank the starts
+_LOOSEST = 0.3  # metres of standard deviation
+LOST = 1.0, math.radians(20)  # deviations (m, rad) of a pose that no scan confirms
+_APART = 0.3  # metres, and radians: poses are different
+_INSIDE = 5.0  # nats of a point on a surface, however many components it touches
+_UNKNOWN = 4.0  # nats of a point that the local map could not see: neither for nor against a pose
+_CONTRADICTED = 8.0  # nats that a point costs in free space, or an earlier point that the scan looks through
+_MOST_CONTRADICTED = 0.3  # sum of both shares
+_LEAST_SEEN = 0.5  # share of the points of which at least so many must lie on surfaces
+_USUAL = 0.85  # of the share that is expected to be explained: less, and the search is wider
+_ALIKE = 2.0  # nats by which another pose must be worse
+_IMAGE_CELL = {2: math.radians(1), 3: math.radians(3)}  # of an image
+_MARGIN = 0.25, 0.02  # metres, and share of the range, that a point may be in front of or behind a surface
+_KEPT_POINTS = 200  # of each earlier scan, that a new scan must not look through
+
+
+class Keyframe(NamedTuple):
+    """A scan that stays: its points (N, D) and their mixture, in the frame of the sensor, and its pose,
+    world ← sensor.
+    """
+
+    points: Tensor
+    mixture: Components
+    pose: Pose
+
+
+class Expectation(NamedTuple):
+    """Where a scan is expected: poses (B), world ← sensor; the standard deviations of the first one
+    (m, rad); the share of its points that is usually explained; and the largest shift (m) and turn (rad) from
+    the nearest of the poses.
+    """
+
+    poses: Pose
+    distance: float
+    angle: float
+    explained: float
+    max_step: float = 4.0
+    max_turn: float = math.pi
+
+
+class _Found(NamedTuple):
+    """The result of one search, with its log-likelihood (nats) and the share of the points against it."""
+
+    location: Location
+    total: float
+    contradicted: float
+
+
+class LocalMap:
+    """The components of some keyframes in one frame.
+
+    Args:
+        keyframes: at least one, the last ones last.
+        least_explained: share of a scan's points that must lie on surfaces.
+    """
+
+    def __init__(
+        self, keyframes: Sequence[Keyframe], least_explained: float, rule: WindowedRule, n_points: int = 1000
+    ) -> None:
+        self.least_explained, self.n_points = least_explained, n_points
+        self.dim = keyframes[0].points.shape[1]
+        self._center = keyframes[-1].pose.translation
+        # One mixture of all points: where many scans overlap, a sum of their mixtures would outweigh the
+        # surfaces that only one of them saw, and pull the next scan back.
+        scans = [
+            Scan(frame.points, torch.zeros(self.dim)).transformed(frame.pose.matrix) for frame in keyframes
+        ]
+        self._components = learn_window(scans, rule, torch.Generator().manual_seed(0))
+        mixture = surface_mixture(self._components, "the local map")
+        centered = mixture._replace(means=mixture.means - self._center)
+        normals = seen_normals(self._components)
+        self._target = functools.partial(AlignmentTarget, centered, normals=normals)
+        self._targets = [self._target(blur) for blur in _BLURS[self.dim]]
+        poses = Pose.stack([frame.pose for frame in keyframes])
+        self._space = FreeSpace([frame.points for frame in keyframes], poses)
+
+    def locate(self, scan: Keyframe, expected: Expectation) -> Location:
+        """The pose of a scan, whose own pose is not used; `found` if it is sure."""
+        best: _Found | None = None
+        for starts, targets in self._searches(scan, expected):
+            tried = self._climbed(scan, expected, starts, targets)
+            if best is None or (tried.location.found, tried.total) > (best.location.found, best.total):
+                best = tried
+            supported = best.location.explained - best.contradicted
+            if best.location.found and supported >= _USUAL * expected.explained:
+                break
+        assert best is not None
+        return best.location
+
+    def _searches(
+        self, scan: Keyframe, expected: Expectation
+    ) -> Iterator[tuple[Pose, list[AlignmentTarget]]]:
+        """Starts, and the levels they climb; the cheapest search first."""
+        near = expected._replace(distance=min(expected.distance, _NEAR), angle=min(expected.angle, _NEAR / 2))
+        starts = self._lattice(scan, near, self._targets[0], _SPACING[self.dim])
+        if self.dim == 3:
+            registered = register(scan.mixture, self._components, expected.poses.matrix).transform
+            starts = Pose.cat([Pose.from_matrix(registered[None]), starts])
+        yield starts, self._targets
+        coarse = self._target(_COARSE[self.dim])
+        wide = expected._replace(distance=_FARTHEST / 2, angle=math.pi / 2)
+        starts = self._lattice(scan, wide, coarse, coarse.blur)
+        yield starts, [coarse, *self._targets]
+        if self.dim == 3:
+            found = register(scan.mixture, self._components, starts.matrix, coarsest=coarse.blur)
+            yield Pose.from_matrix(found.transform[None]), self._targets
+
+    def _lattice(
+        self, scan: Keyframe, expected: Expectation, target: AlignmentTarget, spacing: float
+    ) -> Pose:
+        """The expected poses, and the best of the starts around them, `spacing` metres apart."""
+        reach = math.ceil(min(2 * expected.distance, _FARTHEST) / spacing)
+        side = torch.arange(-reach, reach + 1).double() * spacing
+        shifts = torch.nn.functional.pad(torch.cartesian_prod(side, side), (0, self.dim - 2))
+        turn = _TURNED[self.dim] * spacing
+        n_turns = math.ceil(min(2 * expected.angle, math.pi) / turn)
+        angles = torch.arange(-n_turns, n_turns + 1).double() * turn
+        turns = Pose.from_yaw(angles, torch.zeros(self.dim).double()).rotation
+        rotations = (turns @ expected.poses.rotation[:, None, None]).expand(-1, len(shifts), -1, -1, -1)
+        places = (expected.poses.translation[:, None] + shifts)[:, :, None].expand(-1, -1, len(turns), -1)
+        starts = Pose.cat([expected.poses, Pose(rotations.flatten(0, 2), places.flatten(0, 2))])
+        points = scan.points[:_RANKED]
+        parts = torch.arange(len(starts)).split(_AT_ONCE)
+        score = torch.cat([target.sums(points, starts[part].shifted(-self._center)).score for part in parts])
+        total = score / CORRELATED - self._unlikely(starts, expected)
+        best = total.argsort(descending=True, stable=True)[: _SORTED[self.dim]]
+        view = self._space.view(points, starts[best])
+        against = _CONTRADICTED * (view.in_free_space + view.looked_through) - _UNKNOWN * view.unknown
+        total = total[best] - against * len(points) / CORRELATED
+        starts = starts[best[total.argsort(descending=True, stable=True)]]
+        starts = starts[distinct(starts.shifted(-self._center), _SPREAD * spacing, _SPREAD * turn)]
+        return Pose.cat([expected.poses, starts[: _CLIMBED[self.dim]]])
+
+    def _climbed(
+        self, scan: Keyframe, expected: Expectation, starts: Pose, targets: list[AlignmentTarget]
+    ) -> _Found:
+        motions, kept = starts.shifted(-self._center), len(starts)
+        for target in targets:
+            points = scan.points[: self.n_points if target is targets[-1] else _COARSE_POINTS]
+            found = align(points, target, motions, _STEPS)
+            kept = max(kept // 3, 3)
+            total, view = self._total(found, points, expected)
+            order = total.argsort(descending=True, stable=True)
+            order = order[distinct(found.motions[order], target.blur / 2, target.blur / 2)]
+            order = order[:kept]
+            found, total, view = found.at(order), total[order], view.at(order)
+            motions = found.motions
+        # A climb has the points' score alone, which can rise along a wall while the sum of evidence falls.
+        slid = align(points, targets[-1], _slid(found, points), _SLIDE_STEPS)
+        slid_total, slid_view = self._total(slid, points, expected)
+        # A place whose own direction stays open would lose to any pose of a wider search without a doubt.
+        is_open = [pose_covariance(one, points)[1] > _LOOSEST for one in slid.information]
+        slid_total = torch.where(torch.tensor(is_open), -torch.inf, slid_total)
+        order = slid_total.argsort(descending=True, stable=True)
+        if float(slid_total[order[0]] - total[0]) > _DECISIVE:
+            found, total, view = slid.at(order), slid_total[order], slid_view.at(order)
+        return self._judged(points, found, total, view, expected)
+
+    def _total(self, found: Alignment, points: Tensor, expected: Expectation) -> tuple[Tensor, View]:
+        """Log-likelihood of the points and of the motion (B,), nats; how the points agree with free space."""
+        poses = found.motions.orthonormal().shifted(self._center)
+        view = self._space.view(points, poses)
+        contradicted = view.in_free_space + view.looked_through
+        mean = (
+            found.score + _INSIDE * found.explained + _UNKNOWN * view.unknown - _CONTRADICTED * contradicted
+        )
+        return mean * len(points) / CORRELATED - self._unlikely(poses, expected), view
+
+    def _unlikely(self, poses: Pose, expected: Expectation) -> Tensor:
+        """Half the square deviation (B,) of poses from the nearest expected one."""
+        shift = torch.cdist(poses.translation, expected.poses.translation)
+        turned = (poses[:, None].inverse() @ expected.poses).angle()
+        is_near = (shift <= expected.max_step) & (turned <= expected.max_turn)
+        square = (shift / expected.distance).square() + (turned / expected.angle).square()
+        return square.amin(1) / 2 + torch.where(is_near.any(1), 0.0, _NEVER)
+
+    def _judged(
+        self, points: Tensor, found: Alignment, total: Tensor, view: View, expected: Expectation
+    ) -> _Found:
+        """The best pose; if others explain the scan nearly as well, the most expected one, with a doubt."""
+        poses = found.motions.orthonormal().shifted(self._center)
+        is_apart = differences(found.motions, found.motions[:1], _APART, _APART)[:, 0] > 1
+        rivals = is_apart & (total >= total[0] - _ALIKE)
+        chosen = rivals | (torch.arange(len(total)) == 0)
+        best = int(torch.where(chosen, self._unlikely(poses, expected), torch.inf).argmin())
+        covariance, loosest = pose_covariance(found.information[best], points)
+        contradicted = float(view.in_free_space[best] + view.looked_through[best])
+        seen = 1 - float(view.unknown[best])
+        share, doubts = min(float(found.explained[best]) / max(seen, _LEAST_SEEN), 1.0), []
+        if float(total[best]) < -_NEVER / 2:
+            doubts.append("the pose is farther from where it is expected than max_step and max_turn allow")
+        if contradicted > _MOST_CONTRADICTED:
+            doubts.append(f"{contradicted:.0%} of the points contradict the free space of the last scans")
+        if share < self.least_explained:
+            doubts.append(f"only {share:.0%} of the points lie on surfaces of the last scans")
+        if doubts:
+            covariance = covariance + nowhere(self.dim)
+        if loosest > _LOOSEST:
+            doubts.append(f"the surfaces leave a direction open: a standard deviation of {loosest:.2g} m")
+        if bool(rivals.any()):
+            doubts.append("another pose explains the scan as well")
+            covariance = covariance + _scatter(poses[best], poses[chosen])
+        location = Location(poses[best].matrix, covariance, share, tuple(doubts))
+        return _Found(location, float(total[best]), contradicted)
+
+
+def _slid(found: Alignment, points: Tensor) -> Pose:
+    """The first motion, moved along the direction that the points fix least, by up to two deviations."""
+    covariance, loosest = pose_covariance(found.information[0], points)
+    scale = torch.ones(len(covariance)).double()
+    scale[points.shape[1] :] = 1 / points.norm(dim=1).median().clamp_min(1e-3)
+    axis = torch.linalg.eigh(covariance / scale[:, None] / scale)[1][:, -1] * scale
+    steps = torch.linspace(-1, 1, _SLIDES).double() * min(2 * loosest, _SLIDE)
+    return found.motions[[0] * _SLIDES].moved(steps[:, None] * axis)
+
+
+def nowhere(dim: int) -> Tensor:
+    """The covariance (F, F) of a pose that no scan confirms."""
+    deviations = torch.full((dim * (dim + 1) // 2,), LOST[1]).double()
+    deviations[:dim] = LOST[0]
+    return torch.diag(deviations.square())
+
+
+def _scatter(pose: Pose, others: Pose) -> Tensor:
+    """The second moment (F, F) of other poses (B) about a pose, where each may be the true one."""
+    turned = others.rotation @ pose.rotation.T
+    steps = Pose(turned, others.translation - pose.translation).log()
+    return steps.T @ steps / len(steps)
+
+
+# -- free space -----------------------------------------------------------------------------------
+
+
+class View(NamedTuple):
+    """Of B poses: shares (B,) of the points that lie in free space, of the points that no earlier scan could
+    see, and of the earlier points that the scan looks through.
+    """
+
+    in_free_space: Tensor
+    unknown: Tensor
+    looked_through: Tensor
+
+    def at(self, rows: Tensor) -> View:
+        return View(*(value[rows] for value in self))
+
+
+class FreeSpace:
+    """What some scans saw, as range images.
+
+    Args:
+        points: (N, D) of each scan, in the frame of its sensor, metres.
+        poses: (K), world ← sensor, one for each scan.
+    """
+
+    def __init__(self, points: Sequence[Tensor], poses: Pose) -> None:
+        images = [range_image(one) for one in points]
+        self._nearest, self._farthest = (torch.stack(part) for part in zip(*images, strict=True))
+        self._inverse = poses.inverse()
+        some = [one[:: math.ceil(len(one) / _KEPT_POINTS) or 1] for one in points]
+        self._points = torch.cat([poses[row].apply(part) for row, part in enumerate(some)])
+
+    def view(self, points: Tensor, poses: Pose) -> View:
+        """How a scan's points (N, D) agree with the space that was seen, at poses (B)."""
+        there = self._inverse[:, None].apply(poses.apply(points))  # (K, B, N, D)
+        free, known = _compared(there, self._nearest, self._farthest)
+        free_anywhere = free.any(0)
+        is_unknown = ~(known.any(0) | free_anywhere)
+        seen = poses.inverse().apply(self._points)
+        nearest, farthest = range_image(points)
+        through, met = _compared(seen[None], nearest[None], farthest[None])
+        through, met = through[0], met[0]
+        share = through.sum(1) / (through | met).sum(1).clamp_min(_KEPT_POINTS // 4)
+        return View(free_anywhere.double().mean(1), is_unknown.double().mean(1), share.double())
+
+
+def range_image(points: Tensor) -> tuple[Tensor, Tensor]:
+    """The nearest return (C,) around each direction, and the farthest in it; infinity and zero without."""
+    dim = points.shape[1]
+    cells, distance = _cells(points)
+    across, high = _size(dim)
+    nearest = torch.full((across * high,), math.inf).to(points).scatter_reduce(0, cells, distance, "amin")
+    farthest = torch.zeros(across * high).to(points).scatter_reduce(0, cells, distance, "amax")
+    sides = nearest.view(high, across)
+    sides = torch.minimum(sides, torch.minimum(sides.roll(1, 1), sides.roll(-1, 1)))
+    if dim == 3:
+        up = torch.nn.functional.pad(sides[None, None], (0, 0, 1, 1), value=math.inf)[0, 0]
+        sides = torch.minimum(sides, torch.minimum(up[2:], up[:-2]))
+    around = torch.where(farthest > 0, sides.flatten(), math.inf)
+    return around, farthest
+
+
+def _compared(points: Tensor, nearest: Tensor, farthest: Tensor) -> tuple[Tensor, Tensor]:
+    """Whether points (K, B, N, D) are in front of the surfaces of K images, and whether they are on them."""
+    cells, distance = _cells(points)
+    flat = cells.flatten(1)
+    near = nearest.gather(1, flat).view_as(distance)
+    far = farthest.gather(1, flat).view_as(distance)
+    margin = _MARGIN[0] + _MARGIN[1] * distance
+    is_seen = torch.isfinite(near)
+    return is_seen & (distance < near - margin), is_seen & (distance >= near - margin) & (
+        distance <= far + margin
+    )
+
+
+def _cells(points: Tensor) -> tuple[Tensor, Tensor]:
+    """The cell of each point's direction, and its distance."""
+    dim = points.shape[-1]
+    across, high = _size(dim)
+    distance = points.norm(dim=-1)
+    column = (torch.atan2(points[..., 1], points[..., 0]) / _IMAGE_CELL[dim]).round().long() % across
+    if dim == 2:
+        return column, distance
+    sine = points[..., 2] / distance.clamp_min(1e-9)
+    row = ((sine.clamp(-1, 1).asin() + math.pi / 2) / _IMAGE_CELL[dim]).long().clamp_max(high - 1)
+    return row * across + column, distance
+
+
+def _size(dim: int) -> tuple[int, int]:
+    across = round(2 * math.pi / _IMAGE_CELL[dim])
+    return across, 1 if dim == 2 else across // 2

@@ -1,0 +1,194 @@
+"""Loop closures: pairs of keyframes that saw one place at different times, with the motion between them.
+
+`closed` finds those of a complete trajectory, `LoopCloser` those of a sensor that moves on.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gmmtorch.localization.local_map import Expectation, Keyframe, LocalMap
+from gmmtorch.localization.location import Location
+from gmmtorch.localization.pose_graph import Edges, optimised
+from gmmtorch.mapping import WindowedRule
+from gmmtorch.pose import Pose
+
+_ROUNDS = 3  # of closing and correcting: corrected poses bring more places together
+_APART = 15  # keyframes between two visits of a place
+_REACH = 3.0  # metres between the places of a closure, and
+_DRIFT = 0.02  # metres for each metre of path between both, up to
+_FARTHEST = 10.0  # metres
+_NEIGHBOURS = 3  # keyframes before and after an old one, in the map of its place
+_SPACING = 3  # every third keyframe looks for closures
+_MOST_EXPLAINED = 0.8  # share of the points that a closure explains at least
+_SYSTEMATIC = {  # deviations (m, rad) of errors that the points do not show, such as thick surfaces
+    2: torch.tensor([0.01, 0.01, 0.002]).double(),
+    3: torch.tensor([0.01, 0.01, 0.01, 0.001, 0.001, 0.001]).double(),
+}
+_ANGLE = math.radians(10)  # of the heading of a closure
+_AGREE = 0.3, math.radians(3)  # metres and radians: two closures agree
+_NOTICED = 0.03, math.radians(0.3)  # metres and radians: a closure changes the poses
+
+
+class _Closure(NamedTuple):
+    """Numbers of two poses, the motion source ← target between them, and its information."""
+
+    source: int
+    target: int
+    motion: Pose
+    information: Tensor
+
+
+def closed(
+    poses: Pose,
+    edges: Edges,
+    places: Sequence[tuple[int, Keyframe]],
+    least_explained: float,
+    rule: WindowedRule,
+) -> Edges:
+    """The edges of a pose graph, with those of the loop closures that can be found.
+
+    Args:
+        poses: (N), world ← sensor. edges: of odometry.
+        places: number of the pose, and keyframe, in order.
+    """
+    tried: set[tuple[int, int]] = set()
+    for _ in range(_ROUNDS):
+        pairs = [
+            pair for pair in _candidates(poses.translation[[at for at, _ in places]]) if pair not in tried
+        ]
+        found = [edge for pair in pairs if (edge := _closure(poses, places, *pair, least_explained, rule))]
+        tried.update(pairs)
+        if not found:
+            break
+        edges = edges.joined(_edges(found))
+        poses = optimised(poses, edges, with_covariances=False).poses
+    return edges
+
+
+class LoopCloser:
+    """Closes the loops of a sensor that moves on: every third keyframe is searched for in one old place.
+
+    A closure counts when the next one agrees with it, within 0.3 m and 3°, so that one wrong closure moves
+    nothing. The pose graph has the keyframes only.
+
+    Args:
+        least_explained, rule: as for `LocalMap`.
+
+    Attributes:
+        closures: of the graph, by rows of the keyframes.
+    """
+
+    def __init__(self, least_explained: float, rule: WindowedRule) -> None:
+        self._least_explained, self._rule = least_explained, rule
+        self.closures: list[_Closure] = []
+        self._last: _Closure | None = None  # the last one, which may wait for another one that agrees
+
+    @staticmethod
+    def is_due(n: int) -> bool:
+        """Whether the newest of n keyframes is searched for."""
+        return n > _APART and n % _SPACING == 1
+
+    def corrected(self, keyframes: Sequence[Keyframe], edges: Edges) -> Pose | None:
+        """Corrected poses (K) of K keyframes if the newest one closes a loop, otherwise None.
+
+        edges: of odometry, between successive keyframes.
+        """
+        poses = Pose.stack([frame.pose for frame in keyframes])
+        pairs = _candidates(poses.translation, [len(keyframes) - 1])
+        places = list(enumerate(keyframes))
+        found = _closure(poses, places, *pairs[0], self._least_explained, self._rule) if pairs else None
+        if found is None:
+            return None
+        last, self._last = self._last, found
+        if last is None or not _agree(poses, last, found):
+            return None
+        new_ones = [found] if self.closures and self.closures[-1] is last else [last, found]
+        self.closures += new_ones
+        if not any(_is_noticed(poses, closure) for closure in new_ones):
+            return None
+        return optimised(poses, edges.joined(_edges(self.closures)), with_covariances=False).poses
+
+
+def _agree(poses: Pose, last: _Closure, now: _Closure) -> bool:
+    """Whether the last closure, moved along the poses to the ends of the new one, gives its motion."""
+    before = poses[now.source].inverse() @ poses[last.source]
+    after = poses[last.target].inverse() @ poses[now.target]
+    return not _is_beyond(now.motion.inverse() @ before @ last.motion @ after, _AGREE)
+
+
+def _is_noticed(poses: Pose, closure: _Closure) -> bool:
+    """Whether the poses disagree with a closure."""
+    between = poses[closure.source].inverse() @ poses[closure.target]
+    return _is_beyond(closure.motion.inverse() @ between, _NOTICED)
+
+
+def _is_beyond(motion: Pose, limits: tuple[float, float]) -> bool:
+    """Whether a motion is longer than a shift (m) or turns by more than an angle (rad)."""
+    return bool(motion.translation.norm() > limits[0]) or bool(motion.angle() > limits[1])
+
+
+def _edges(closures: Sequence[_Closure]) -> Edges:
+    source, target, motions, information = zip(*closures, strict=True)
+    is_closure = torch.ones(len(closures), dtype=torch.bool)
+    return Edges(
+        torch.tensor(source), torch.tensor(target), Pose.stack(motions), torch.stack(information), is_closure
+    )
+
+
+def _candidates(at: Tensor, rows: Sequence[int] | None = None) -> list[tuple[int, int]]:
+    """Pairs (old, new) of rows of keyframes that may be at one place: for each new one, the nearest.
+
+    at: positions (K, D) of the keyframes. rows: new ones; None: every third.
+    """
+    if not len(at):
+        return []
+    path = torch.cat([torch.zeros(1), (at[1:] - at[:-1]).norm(dim=1)]).cumsum(0)
+    order = torch.arange(len(at))
+    new = order if rows is None else torch.tensor(rows)
+    gap = torch.cdist(at[new], at)
+    reach = (_REACH + _DRIFT * (path[new, None] - path)).clamp_max(_FARTHEST)
+    allowed = (new[:, None] - order >= _APART) & (gap <= reach)
+    nearest = torch.where(allowed, gap, torch.inf).argmin(1)
+    step = _SPACING if rows is None else 1
+    return [
+        (int(nearest[row]), int(new[row]))
+        for row in range(0, len(new), step)
+        if bool(allowed[row, nearest[row]])
+    ]
+
+
+def _closure(
+    poses: Pose,
+    places: Sequence[tuple[int, Keyframe]],
+    old: int,
+    new: int,
+    least_explained: float,
+    rule: WindowedRule,
+) -> _Closure | None:
+    """The closure between two rows of keyframes, if they see one place."""
+    around = range(max(old - _NEIGHBOURS, 0), min(old + _NEIGHBOURS + 1, len(places)))
+    order = [row for row in around if row != old] + [old]  # the last one is the centre of a local map
+    local = LocalMap(
+        [places[row][1]._replace(pose=poses[places[row][0]]) for row in order], least_explained, rule
+    )
+    source, target = places[old][0], places[new][0]
+    expected = Expectation(poses[[target]], _REACH / 2, _ANGLE, _MOST_EXPLAINED)
+    location = local.locate(places[new][1], expected)
+    if not location.found or location.explained < _MOST_EXPLAINED:
+        return None
+    motion = poses[source].inverse() @ Pose.from_matrix(location.pose)
+    return _Closure(source, target, motion, information_of(location))
+
+
+def information_of(location: Location) -> Tensor:
+    """The inverse covariance (F, F) of a location in the frame of the sensor."""
+    pose = Pose.from_matrix(location.pose)
+    turn = Pose(pose.rotation, torch.zeros_like(pose.translation)).adjoint()
+    covariance = location.covariance + torch.diag(_SYSTEMATIC[pose.dim].square())
+    return torch.linalg.inv(turn.T @ covariance @ turn)

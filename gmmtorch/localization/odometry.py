@@ -1,0 +1,420 @@
+"""Odometry: the poses of a moving sensor, or of a recording that states none, from its scans alone."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gmmtorch.arrays import ArrayLike, as_tensor
+from gmmtorch.datasets import Dataset, Reposed, with_poses
+from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_number, check_whole
+from gmmtorch.localization.local_map import LOST, Expectation, Keyframe, LocalMap, nowhere
+from gmmtorch.localization.location import Location, continued, measured_motion
+from gmmtorch.localization.loop_closure import LoopCloser, closed, information_of
+from gmmtorch.localization.pose_graph import Edges, optimised
+from gmmtorch.mapping import Components, WindowedRule, learn_window
+from gmmtorch.optional_packages import needs_extra
+from gmmtorch.pose import Pose
+from gmmtorch.scan import Scan
+
+METHODS = ("kiss_icp", "mixture")
+MOTIONS = ("constant", "dataset", "imu")
+_RULE = WindowedRule(window=1, noise=0.02, length=0.4, max_cells=5000)
+_STORED = 4000  # points of a keyframe
+_KEYFRAMES = 10  # in the local map,
+_MANY_KEYFRAMES = 80  # or of a sensor that looks in one direction
+_NARROW = 0.8  # length of the mean direction of its points; 0.64 for a half circle, 0.9 for a cone of 70°
+_GIVEN_UP = 3  # lost scans in a row, after which the next one begins a new local map
+_FEWEST = 10  # returns of a scan that can be located
+_FIRST_STEP = 1.0, math.radians(30)  # standard deviations (m, rad) of the first motions
+_SURPRISE = 0.3, math.radians(10)  # least standard deviations of a motion from the predicted one
+_MEMORY = 0.7  # share of the past in the mean surprise
+_LONG_MEMORY = 0.9  # share of the past in the mean explained share
+
+
+class Trajectory(NamedTuple):
+    """Poses (N, D+1, D+1) of N scans, world ← sensor (the world is the frame of the first one); covariances
+    (N, F, F) of a shift (m) and a turn (rad) in the frame of the sensor; whether each was found (N,); the
+    number of loop closures that were used; and the reasons against each pose, empty if it was found.
+    """
+
+    poses: Tensor
+    covariances: Tensor
+    found: Tensor
+    n_closures: int
+    doubts: tuple[str, ...]
+
+
+class Odometry:
+    """Estimates the motion of a sensor, scan by scan, and closes loops.
+
+    Usage::
+
+        odometry = Odometry()
+        for points in scans:  # (N, D) in the frame of the sensor
+            location = odometry.add(points)
+        poses = odometry.trajectory().poses
+
+    The pose of a scan is the one that best explains its points by one mixture of the last keyframes and is
+    not far from the prediction. The search climbs from the best of a lattice of starts and, in 3D,
+    from where the mixture of the scan is registered. The prediction continues the last motion. `trajectory`
+    finds the places that were seen twice and corrects all poses by a pose graph
+    (`localization.pose_graph`).
+
+    Args:
+        n_keyframes: in the local map. None: 10, or 80 for a sensor with a narrow field of view, such as a
+            depth camera, by the directions of the first points. Along a wall, the poses of such a sensor
+            drift if the local map has only what it saw last.
+        distance, angle: a scan becomes a keyframe after this motion (m, rad).
+        n_points: of a scan that are used at most, drawn with a fixed seed.
+        least_explained: share of the points that must lie on surfaces of the local map.
+        rule: how a scan becomes a mixture.
+        max_step, max_turn: largest motion (m, rad) of the sensor between two scans. A pose that is farther
+            from the last one and from the predicted one is not found.
+    """
+
+    def __init__(
+        self,
+        *,
+        n_keyframes: int | None = None,
+        distance: float = 0.3,
+        angle: float = math.radians(10),
+        n_points: int = 1000,
+        least_explained: float = 0.5,
+        rule: WindowedRule = _RULE,
+        max_step: float = 4.0,
+        max_turn: float = math.pi,
+    ) -> None:
+        self.n_keyframes = None if n_keyframes is None else check_whole("n_keyframes", n_keyframes, 1)
+        self.n_points = check_whole("n_points", n_points, _FEWEST)
+        check_number("distance", distance)
+        check_number("angle", angle, math.pi)
+        check_number("least_explained", least_explained, 1)
+        check_number("max_step", max_step)
+        check_number("max_turn", max_turn, math.pi)
+        self.max_step, self.max_turn = max_step, max_turn
+        self.distance, self.angle, self.least_explained, self.rule = distance, angle, least_explained, rule
+        self.keyframes: list[Keyframe] = []
+        self._local: LocalMap | None = None
+        self._poses: list[Pose] = []
+        self._locations: list[Location] = []
+        self._frames: list[int] = []  # scans that are keyframes
+        self._last_frame = 0
+        self._n_lost = 0
+        self._edges: list[tuple[int, Pose, Tensor]] = []  # from which scan, motion, information
+        self._motion: Pose | None = None
+        self._surprise = _FIRST_STEP
+        self._explained = 0.95  # share of the points: few places explain less
+        self._stamp: float | None = None
+        self._seconds: float | None = None
+        self._loops = LoopCloser(least_explained, rule)
+
+    def add(self, points: ArrayLike, stamp: float | None = None, motion: ArrayLike | None = None) -> Location:
+        """The pose of the next scan in the frame of the first one; if it is not `found`, the best guess.
+
+        Args:
+            points: (N, D) returns in the frame of the sensor, metres. Rows with NaN or infinite numbers are
+                left out.
+            stamp: time (s). The predicted motion is scaled by the time since the last scan, if both are
+                known and the clock runs forward.
+            motion: (D+1, D+1) of the sensor since the last scan, last ← now, such as that of wheels; or its
+                rotation (D, D) alone, such as that of an IMU: the velocity in the frame of the sensor
+                continues. None: the motion continues.
+
+        Raises `InvalidArgumentError` for another shape or dimension, or for a motion that is not rigid.
+        """
+        rows = self._checked(points)
+        dim = rows.shape[1]
+        measured = None if motion is None else measured_motion(motion, dim, rows.device)
+        scan = self._scan(rows)
+        ratio = self._clock(stamp)
+        if not self._poses:
+            location = Location(torch.eye(dim + 1).double(), nowhere(dim) * 0, 1.0, ())
+        else:
+            location = self._located(scan, measured, ratio)
+        self._remember(scan, location)
+        return location
+
+    @property
+    def poses(self) -> Tensor:
+        """Poses (N, D+1, D+1) of all scans so far, with the corrections of `close_loops`."""
+        return Pose.stack(self._poses).matrix
+
+    def close_loops(self) -> bool:
+        """Searches for the newest scan in an older place, if it is a keyframe and there is one near; returns
+        whether `poses` were corrected. For mapping while the sensor moves: call it after each `add`.
+
+        Every third keyframe is searched for, in the nearest older place, which takes about as long as
+        `add`. Two successive closures must agree. The first pose stays.
+        """
+        is_keyframe = bool(self._frames) and self._frames[-1] == len(self._poses) - 1
+        if not is_keyframe or not self._loops.is_due(len(self._frames)):
+            return False
+        rows = torch.tensor(self._frames)
+        chain = self._all_edges().at(rows[1:] - 1)
+        row = torch.arange(len(chain.source))
+        found = self._loops.corrected(self.keyframes, chain._replace(source=row, target=row + 1))
+        if found is None:
+            return False
+        # Other scans hang on the last keyframe before them.
+        before = Pose.stack(self._poses)
+        motions = found @ before[rows].inverse()
+        last = torch.searchsorted(rows, torch.arange(len(before)), right=True) - 1
+        after = motions[last.clamp_min(0)] @ before
+        self._poses = [after[number] for number in range(len(before))]
+        self.keyframes = [frame._replace(pose=found[row]) for row, frame in enumerate(self.keyframes)]
+        recent = self.keyframes[-(self.n_keyframes or 1) :]
+        self._local = LocalMap(recent, self.least_explained, self.rule, self.n_points)
+        return True
+
+    def trajectory(self, loops: bool = True) -> Trajectory:
+        """The poses of all scans so far; with `loops`, corrected by loop closures."""
+        if not self._poses:
+            raise InvalidArgumentError("no scan was added, so there is no trajectory.")
+        poses, edges = Pose.stack(self._poses), self._all_edges()
+        found = torch.tensor([location.found for location in self._locations])
+        if loops:
+            places = list(zip(self._frames, self.keyframes, strict=True))
+            edges = closed(poses, edges, places, self.least_explained, self.rule)
+        best = optimised(poses, edges)
+        used = edges.is_closure & (best.weights > 0.5)
+        doubts = tuple("; ".join(location.doubts) for location in self._locations)
+        return Trajectory(best.poses.matrix, best.covariances, found, int(used.sum()), doubts)
+
+    # -- one scan -------------------------------------------------------------------------------------
+
+    def _checked(self, points: ArrayLike) -> Tensor:
+        rows = as_tensor(points, "points", torch.float64).detach().cpu()
+        dims = (2, 3) if not self._poses else (self._poses[0].dim,)
+        if rows.ndim != 2 or rows.shape[1] not in dims:
+            wanted = " or ".join(f"(N, {dim})" for dim in dims)
+            raise InvalidArgumentError(f"points has shape {tuple(rows.shape)}; expected {wanted}, metres.")
+        return rows[torch.isfinite(rows).all(1)]
+
+    def _scan(self, rows: Tensor) -> Keyframe:
+        dim = rows.shape[1]
+        draw = torch.Generator().manual_seed(0)
+        chosen = rows[torch.randperm(len(rows), generator=draw)[:_STORED]]
+        mixture = Components.empty(dim)
+        if len(rows) >= _FEWEST:
+            seen = Scan(rows, rows.new_zeros(dim))
+            mixture = learn_window([seen], self.rule, torch.Generator().manual_seed(0))
+        return Keyframe(chosen, mixture, Pose.identity(dim))
+
+    def _clock(self, stamp: float | None) -> float:
+        """How many times longer than the last motion this one takes; 1 if the clocks do not say."""
+        if stamp is None or not math.isfinite(stamp) or self._stamp is None:
+            self._stamp = stamp if stamp is not None and math.isfinite(stamp) else None
+            return 1.0
+        now, before = stamp - self._stamp, self._seconds
+        self._stamp, self._seconds = stamp, now
+        if before is None or not before > 0 or not 0 < now <= 5 * before:
+            return 1.0
+        return now / before
+
+    def _located(self, scan: Keyframe, measured: Pose | Tensor | None, ratio: float) -> Location:
+        last = self._poses[-1]
+        step = rest = Pose.identity(last.dim)
+        if isinstance(measured, Tensor):
+            step, rest = continued(measured, self._motion, ratio), continued(measured, None)
+        elif measured is not None:
+            step = measured
+        elif self._motion is not None:
+            step = self._motion if ratio == 1.0 else rest.towards(self._motion, ratio)
+        poses, bounds = Pose.stack([last @ step, last @ rest]), (self.max_step, self.max_turn)
+        expected = Expectation(poses, *self._surprise, self._explained, *bounds)
+        if not len(scan.mixture) or self._local is None:
+            doubt = "the scan has too few points" if not len(scan.mixture) else "no scan before had points"
+            return Location(poses[0].matrix, nowhere(last.dim), 0.0, (doubt,))
+        location = self._local.locate(scan, expected)
+        self._note_surprise(location, expected)
+        return location
+
+    def _note_surprise(self, location: Location, expected: Expectation) -> None:
+        off = expected.poses[0].inverse() @ Pose.from_matrix(location.pose)
+        seen = float(off.translation.norm()), float(off.chord())
+        if location.found:
+            self._explained = _LONG_MEMORY * self._explained + (1 - _LONG_MEMORY) * location.explained
+        else:
+            seen = max(seen[0], LOST[0]), max(seen[1], LOST[1])
+        self._surprise = (
+            max(_SURPRISE[0], _mean(self._surprise[0], seen[0])),
+            max(_SURPRISE[1], _mean(self._surprise[1], seen[1])),
+        )
+
+    def _remember(self, scan: Keyframe, location: Location) -> None:
+        number, pose = len(self._poses), Pose.from_matrix(location.pose)
+        if number:
+            # The surfaces are those of the keyframes, so the edge begins at the last one.
+            since = self._poses[self._last_frame].inverse() @ pose
+            self._edges.append((self._last_frame, since, information_of(location)))
+            if location.found:
+                self._motion = self._poses[-1].inverse() @ pose
+            elif self._n_lost >= _GIVEN_UP:
+                self._motion = None  # a sensor that is covered for long may have stopped
+        self._poses.append(pose)
+        self._locations.append(location)
+        self._n_lost = 0 if location.found else self._n_lost + 1
+        is_sure = location.found or self._local is None or self._n_lost > _GIVEN_UP
+        if is_sure and len(scan.mixture) and self._is_new(pose):
+            self._last_frame = number
+            self._frames.append(number)
+            self.keyframes.append(scan._replace(pose=pose))
+            if self.n_keyframes is None:
+                directions = torch.nn.functional.normalize(scan.points, dim=1)
+                is_narrow = float(directions.mean(0).norm()) > _NARROW
+                self.n_keyframes = _MANY_KEYFRAMES if is_narrow else _KEYFRAMES
+            recent = self.keyframes[-self.n_keyframes :]
+            self._local = LocalMap(recent, self.least_explained, self.rule, self.n_points)
+
+    def _is_new(self, pose: Pose) -> bool:
+        """Whether the sensor has moved or turned enough since the last keyframe."""
+        if not self.keyframes:
+            return True
+        off = self.keyframes[-1].pose.inverse() @ pose
+        return bool(off.translation.norm() >= self.distance) or bool(off.chord() >= self.angle)
+
+    def _all_edges(self) -> Edges:
+        target = torch.arange(1, len(self._poses))
+        none = torch.zeros_like(target).bool()
+        if not self._edges:
+            dim = self._poses[0].dim
+            free = dim * (dim + 1) // 2
+            return Edges(target, target, Pose.identity(dim, 0), torch.zeros(0, free, free).double(), none)
+        source, motions, information = zip(*self._edges, strict=True)
+        return Edges(torch.tensor(source), target, Pose.stack(motions), torch.stack(information), none)
+
+
+def _mean(before: float, now: float) -> float:
+    """Of squares, weighted by `_MEMORY`."""
+    return math.sqrt(_MEMORY * before**2 + (1 - _MEMORY) * now**2)
+
+
+# -- recordings -----------------------------------------------------------------------------------
+
+
+class PosedRecording(NamedTuple):
+    """The scans with the estimated poses, and the trajectory of all scans."""
+
+    dataset: Reposed
+    trajectory: Trajectory
+
+
+def with_odometry(
+    source: Dataset,
+    method: str = "mixture",
+    on_scan: Callable[[int, int], None] = lambda done, total: None,
+    motion: str = "constant",
+) -> PosedRecording:
+    """A data set whose poses are estimated from its scans. The frame of the first usable scan is the world.
+
+    Args:
+        source: its own poses move the points into the frame of the sensor, and are not used otherwise.
+        method: mixture, `Odometry`; or kiss_icp, the package of Vizzo et al. (2023), without loop
+            closures and without covariances (NaN).
+        on_scan: called with the number of scans done and of all.
+        motion: prediction of each pose. constant: the motion continues; dataset: as between the poses of the
+            data set, such as those of wheel odometry; imu: with the rotation of a bag's IMU, while the
+            velocity continues. The last two are for mixture only.
+
+    Raises `InvalidArgumentError` for another method or motion or without a usable IMU, `DataError` if no scan
+    can be read.
+    """
+    check_choice("odometry", method, METHODS)
+    check_choice("motion", motion, MOTIONS)
+    if motion != "constant" and method != "mixture":
+        raise InvalidArgumentError(
+            f"motion={motion} does not go with odometry={method}; use odometry=mixture."
+        )
+    turns = source.turns() if motion == "imu" else None
+    odometry = odometry_of(method)
+    known = torch.zeros(len(source), dtype=torch.bool)
+    times = source.times
+    before: int | None = None
+    for index in range(len(source)):
+        points = _sensor_points(source, index)
+        if points is not None:
+            predicted = None
+            if before is not None and motion != "constant":
+                predicted = _motion(source, turns, before, index)
+            odometry.add(points, None if times is None else float(times[index]), predicted)
+            known[index], before = True, index
+        on_scan(index + 1, len(source))
+    if not known.any():
+        raise DataError(f"{source.name}: no scan of {len(source)} can be read, so none has a pose.")
+    trajectory: Trajectory = odometry.trajectory()
+    poses = torch.eye(trajectory.poses.shape[1]).double().repeat(len(source), 1, 1)
+    poses[known] = trajectory.poses
+    return PosedRecording(with_poses(source, poses, known), trajectory)
+
+
+def _motion(source: Dataset, turns: Tensor | None, before: int, now: int) -> Tensor | None:
+    """The motion of the sensor between two scans, by the poses of the data set, or its rotation by `turns`
+    (N, D, D) since the scan before; None if it is unknown.
+    """
+    if turns is not None:
+        turn = functools.reduce(torch.matmul, turns[before + 1 : now + 1])
+        return turn if bool(turn.isfinite().all()) else None
+    first, last = source.pose(before), source.pose(now)
+    if first is None or last is None:
+        return None
+    return (Pose.from_matrix(first).inverse() @ Pose.from_matrix(last)).matrix
+
+
+def _sensor_points(source: Dataset, index: int) -> Tensor | None:
+    """Returns (N, D) of a scan in the frame of the sensor; None if it cannot be read."""
+    try:
+        scan, pose = source[index], source.pose(index)
+    except DataError:
+        return None  # the reader counts it in `skipped`
+    if pose is None:
+        raise DataError(
+            f"{source.name} does not state the poses in which its points are, so they cannot be moved into "
+            "the frame of the sensor."
+        )
+    return Pose.from_matrix(pose).inverse().apply(scan.points.double())
+
+
+def odometry_of(method: str) -> Odometry | KissIcp:
+    """Odometry by a method, mixture or kiss_icp, without a scan yet."""
+    check_choice("odometry", method, METHODS)
+    return Odometry() if method == "mixture" else KissIcp()
+
+
+class KissIcp:
+    """KISS-ICP behind the methods of `Odometry`. Scans in 2D lie at z = 0."""
+
+    def __init__(self) -> None:
+        with needs_extra("Odometry by kiss_icp needs", "kiss-icp", "odometry"):
+            from kiss_icp.config import KISSConfig
+            from kiss_icp.kiss_icp import KissICP
+        config = KISSConfig()
+        config.data.deskew = False  # the readers have deskewed the points
+        config.mapping.voxel_size = config.data.max_range / 100  # its own default
+        self._icp = KissICP(config)
+        self._locations: list[Location] = []
+
+    def add(self, points: Tensor, stamp: float | None = None, motion: Tensor | None = None) -> Location:
+        """The pose of the next scan in the frame of the first one, without a covariance (NaN)."""
+        dim = points.shape[1]
+        rows = torch.nn.functional.pad(points, (0, 3 - dim))
+        if len(rows):
+            self._icp.register_frame(rows.numpy(), rows.new_zeros(0).numpy())
+        pose = Pose.from_matrix(self._icp.last_pose.copy())
+        pose = pose if dim == 3 else pose.in_plane()
+        free = dim * (dim + 1) // 2
+        unknown = torch.full((free, free), torch.nan, dtype=torch.float64)
+        self._locations.append(Location(pose.matrix, unknown, 1.0, ()))
+        return self._locations[-1]
+
+    def trajectory(self) -> Trajectory:
+        """The poses of all scans so far."""
+        poses = torch.stack([location.pose for location in self._locations])
+        covariances = torch.stack([location.covariance for location in self._locations])
+        found = torch.ones(len(poses), dtype=torch.bool)
+        return Trajectory(poses, covariances, found, 0, ("",) * len(poses))

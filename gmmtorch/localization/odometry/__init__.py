@@ -1,1 +1,0 @@
-"""The poses of a sensor from its scans alone."""

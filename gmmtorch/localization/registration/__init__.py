@@ -1,1 +1,0 @@
-"""Registration of two maps, and alignment of points with a map."""

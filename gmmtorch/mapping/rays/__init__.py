@@ -1,1 +1,0 @@
-"""Rays drawn from the components of a map, and a spatial index of its batches."""

@@ -1,1 +1,0 @@
-"""Cone form: the closed-form approximations of hits and misses in a cell (thesis 3.2.2)."""

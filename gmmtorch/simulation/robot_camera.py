@@ -1,0 +1,145 @@
+"""The forward-looking depth camera of a flying robot, and its frames.
+
+World frame: metres, z up. Camera frame: at the robot's centre, x forward along the heading, y left, z up.
+Only the robot's yaw rotates the camera.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from gmmtorch.arrays import ArrayLike, as_tensor
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.pose import Pose
+from gmmtorch.scan import Scan
+from gmmtorch.simulation.camera_options import CLOSEST_READING, CameraOptions
+from gmmtorch.simulation.mesh_world import MeshWorld
+from gmmtorch.simulation.sensors import pixel_rays
+
+_TEAMMATE_MARGIN = 0.05
+"""Beams that pass a teammate's body closer than this (m) are dropped, because its outline is not exact."""
+
+
+@dataclass(frozen=True, eq=False)
+class DepthFrame:
+    """The beams of one depth image, world frame, metres.
+
+    origin: (3,) the camera's centre. ends: (N, 3) float64, the beam ends. is_hit: (N,) bool, whether the beam
+    ended at a surface; otherwise it had no return and is free up to its end. pixel: (N,) int64, ascending
+    row-major index from the top left of the image. Beams without a valid reading are absent.
+    """
+
+    origin: Tensor
+    ends: Tensor
+    is_hit: Tensor
+    pixel: Tensor
+
+    def to(self, device: torch.device | str) -> DepthFrame:
+        """The frame on a device."""
+        if self.ends.device == torch.device(device):
+            return self
+        return DepthFrame(*(value.to(device) for value in vars(self).values()))
+
+    def scan(self) -> Scan:
+        """The frame as a scan: hits, and ends of beams without return."""
+        return Scan(self.ends[self.is_hit], self.origin, self.ends[~self.is_hit])
+
+
+@dataclass(frozen=True)
+class DepthCamera(CameraOptions):
+    """A pinhole depth camera whose noise grows with the square of the depth, as in triangulation."""
+
+    @cached_property
+    def directions(self) -> Tensor:
+        """Unit vectors (height · width, 3) of the beams in the camera frame, row by row from the top left."""
+        focal = (
+            self.width / 2 / math.tan(self.horizontal_fov / 2),
+            self.height / 2 / math.tan(self.vertical_fov / 2),
+        )
+        return pixel_rays(self.width, self.height, focal)
+
+    def sense(
+        self,
+        world: MeshWorld,
+        pose: ArrayLike,
+        others: ArrayLike,
+        radius: float,
+        generator: torch.Generator,
+        truth: Tensor | None = None,
+    ) -> DepthFrame:
+        """The frame at a pose.
+
+        A beam of range r and depth z has an error of standard deviation noise · z² · r/z. Readings of
+        `max_range` or more become beams without return that end there. Dropped beams are absent, and so are
+        beams that reach a teammate first. The number of random draws does not depend on the world.
+
+        Args:
+            pose: (4,) x, y, z in metres, yaw in radians.
+            others: (M, 3) centres of the teammates' bodies, metres.
+            radius: radius of a teammate's body (m).
+            truth: the `distances` from this pose, if they are known.
+        """
+        pose = _finite(pose, "pose", 4)
+        others = _finite(others, "others", -1, 3)
+        origin, directions = pose[:3], self._turned(float(pose[3]))
+        error = torch.randn(len(directions), generator=generator, dtype=torch.float64) * self.noise
+        kept = torch.rand(len(directions), generator=generator, dtype=torch.float64) >= self.dropout
+        truth = self.distances(world, pose) if truth is None else truth
+        reach = truth.clamp_max(self.max_range)
+        reading = reach + error * reach.square() * self.directions[:, 0]  # z = r · directions[:, 0]
+        is_hit = (truth < self.max_range) & (reading < self.max_range)
+        reading = torch.where(is_hit, reading.clamp_min(CLOSEST_READING), self.max_range)
+        body = radius + _TEAMMATE_MARGIN
+        others = others[(others - origin).norm(dim=1) < self.max_range + body + _TEAMMATE_MARGIN]
+        if len(others):
+            kept &= _distance_to_spheres(others - origin, body, directions) >= reach
+        pixel = kept.nonzero().squeeze(1)
+        ends = torch.addcmul(origin, directions[pixel], reading[pixel, None])
+        return DepthFrame(origin, ends, is_hit[pixel], pixel)
+
+    def distances(self, world: MeshWorld, pose: ArrayLike) -> Tensor:
+        """Distances (height · width,), metres, to the first surface along the beams from a pose (4,)."""
+        pose = _finite(pose, "pose", 4)
+        return world.distances(pose[:3], self._turned(float(pose[3])), threads=torch.get_num_threads())
+
+    def image(self, frame: DepthFrame) -> Tensor:
+        """Depth image (height, width) of a frame of this camera, metres along the optical axis.
+
+        Infinite for a beam without return, NaN for a pixel without a valid reading.
+        """
+        depth = torch.full((self.width * self.height,), math.nan, dtype=torch.float64)
+        reading = (frame.ends - frame.origin).norm(dim=1) * self.directions[frame.pixel, 0]
+        depth[frame.pixel] = torch.where(frame.is_hit, reading, math.inf)
+        return depth.view(self.height, self.width)
+
+    def _turned(self, yaw: float) -> Tensor:
+        """Directions of the beams (N, 3) in the world frame."""
+        return self.directions @ Pose.from_yaw(yaw, [0.0, 0.0, 0.0]).rotation.T
+
+
+def _distance_to_spheres(centers: Tensor, radius: float, directions: Tensor) -> Tensor:
+    """Range (N,) in metres from the origin along directions (N, 3) to the nearest sphere.
+
+    `centers` (M, 3) are the centres of the spheres. Infinite without a hit; zero inside a sphere.
+    """
+    along = directions @ centers.T
+    distance = centers.square().sum(1)
+    # |t u − c|² = ρ² has the roots t = u·c ± √((u·c)² − |c|² + ρ²).
+    root = along.square() - distance + radius**2
+    hits = (root >= 0) & (along > 0)
+    entry = torch.where(hits, along - root.clamp_min(0).sqrt(), math.inf)
+    return torch.where(distance <= radius**2, 0.0, entry).amin(1)
+
+
+def _finite(given: ArrayLike, name: str, *shape: int) -> Tensor:
+    """The array as float64. Raises `InvalidArgumentError` unless it is finite and of the shape; −1: any."""
+    value = as_tensor(given, name, torch.float64)
+    fits = value.ndim == len(shape) and all(n in (-1, m) for n, m in zip(shape, value.shape, strict=True))
+    if not fits or not bool(torch.isfinite(value).all()):
+        raise InvalidArgumentError(f"{name}={value.tolist()} must be finite, of shape {shape}, in metres.")
+    return value

@@ -1,1 +1,0 @@
-"""Simulated range sensors (laser, lidar, depth camera) and the paths they follow."""

@@ -1,1 +1,0 @@
-"""Simulated worlds whose surfaces are known exactly: an office, a hall, a warehouse, tunnels, any mesh."""

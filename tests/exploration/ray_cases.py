@@ -1,0 +1,33 @@
+"""A component with one origin, and dense evidence."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gmmtorch.mapping.components import Components
+from gmmtorch.occupancy.voxels.cells import Box, CellEvidence
+
+EVERYTHING = Box(torch.tensor([-4096] * 3), torch.tensor([4096] * 3))
+
+
+def one(covariance, mean=(4.0, 1.0, 0.5), origin=(0.1, 0.2, 0.3), count=100.0, sequence=0) -> Components:
+    """A component with one origin."""
+    return Components(
+        means=torch.tensor([mean], dtype=torch.float64),
+        covariances=torch.as_tensor(covariance, dtype=torch.float64)[None],
+        support=torch.tensor([count], dtype=torch.float64),
+        max_range=torch.tensor([False]),
+        ids=torch.tensor([[2, sequence]]),
+        origins=torch.tensor([origin], dtype=torch.float64),
+        seen_by=torch.tensor([0]),
+        seen_from=torch.tensor([0]),
+        seen_count=torch.tensor([count], dtype=torch.float64),
+    )
+
+
+def dense(evidence: CellEvidence, box: Box) -> Tensor:
+    both = torch.zeros(2, *box.shape, dtype=torch.float64)
+    x, y, z = (evidence.cells - box.low).unbind(1)
+    both[0, x, y, z], both[1, x, y, z] = evidence.hits.double(), evidence.misses.double()
+    return both

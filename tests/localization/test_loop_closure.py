@@ -1,0 +1,190 @@
+"""Pose graphs against a dense solution and a planted false closure; loops of a robot that comes back."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from localization.looping_robot import ANGLES, BACK, DriftingOdometry, lap
+from scipy.optimize import least_squares
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.localization import Odometry, loop_closure
+from gmmtorch.localization.pose_graph import Edges, _moved, optimised, residuals
+from gmmtorch.pose import Pose
+
+FREE = {2: 3, 3: 6}
+
+
+def motion(dim: int, *step: float) -> Pose:
+    return Pose.from_turn(torch.tensor(step[dim:]).double(), torch.tensor(step[:dim]).double())
+
+
+def chain(steps: list[Pose]) -> Pose:
+    poses = [Pose.identity(steps[0].dim)]
+    for step in steps:
+        poses.append(poses[-1] @ step)
+    return Pose.stack(poses)
+
+
+def edges_of(rows: list[tuple[int, int, Pose]], deviation: float = 0.1, n_closures: int = 0) -> Edges:
+    source, target, motions = zip(*rows, strict=True)
+    free = FREE[motions[0].dim]
+    is_closure = torch.arange(len(rows)) >= len(rows) - n_closures
+    information = torch.eye(free).double().repeat(len(rows), 1, 1) / deviation**2
+    return Edges(torch.tensor(source), torch.tensor(target), Pose.stack(motions), information, is_closure)
+
+
+def noisy_graph(dim: int, n: int = 8) -> tuple[Pose, Edges]:
+    draw = torch.Generator().manual_seed(dim)
+    free = FREE[dim]
+    turn = torch.zeros(n, free).double()
+    turn[:, 0], turn[:, -1] = 1.0, 2 * math.pi / n
+    true = chain([motion(dim, *row) for row in turn.tolist()])[:n]
+    pairs = [(i, i + 1) for i in range(n - 1)] + [(0, n - 1), (1, n - 2)]
+    noise = 0.03 * torch.randn(len(pairs), free, generator=draw).double()
+    measured = _moved(Pose.stack([true[i].inverse() @ true[j] for i, j in pairs]), noise)
+    rows = [(i, j, measured[row]) for row, (i, j) in enumerate(pairs)]
+    return chain([measured[row] for row in range(n - 1)]), edges_of(rows)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_optimum_is_that_of_a_dense_solver(dim):
+    start, edges = noisy_graph(dim)
+    found = optimised(start, edges)
+
+    def error(x: np.ndarray) -> np.ndarray:
+        steps = torch.from_numpy(x).view(len(start) - 1, -1)
+        poses = Pose.cat([start[:1], _moved(start[1:], steps)])
+        return (residuals(poses, edges) / 0.1).flatten().numpy()
+
+    dense = least_squares(error, np.zeros((len(start) - 1) * FREE[dim]), xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    cost = 0.5 * float((residuals(found.poses, edges) / 0.1).square().sum())
+    # The Jacobian of Gauss–Newton is exact only where the error is zero, so its end is not quite the optimum.
+    assert cost == pytest.approx(dense.cost, rel=1e-2)
+    steps = torch.from_numpy(dense.x).view(len(start) - 1, -1)
+    assert torch.allclose(found.poses[1:].matrix, _moved(start[1:], steps).matrix, atol=3e-3)
+
+
+def test_a_square_loop_spreads_its_error_evenly():
+    steps = [motion(2, 1.0, 0.0, 0.0) for _ in range(4)]  # a straight line, which a closure says is too long
+    rows = [(i, i + 1, step) for i, step in enumerate(steps)] + [(0, 4, motion(2, 3.5, 0.0, 0.0))]
+    found = optimised(chain(steps), edges_of(rows))
+    # Five equal springs in a ring: each takes a fifth of the misfit of 0.5 m.
+    assert found.poses.translation[:, 0].tolist() == pytest.approx([0, 0.9, 1.8, 2.7, 3.6], abs=1e-6)
+    assert float(found.covariances[1, 0, 0]) == pytest.approx(0.01 * 4 / 5, rel=1e-6)  # 1 edge parallel to 4
+
+
+def test_covariances_grow_along_a_chain():
+    steps = [motion(3, 1.0, 0, 0, 0, 0, 0.0)] * 5
+    found = optimised(chain(steps), edges_of([(i, i + 1, step) for i, step in enumerate(steps)]))
+    spread = found.covariances[:, 0, 0].tolist()
+    assert spread == pytest.approx([0, 0.01, 0.02, 0.03, 0.04, 0.05])
+    assert (torch.linalg.eigvalsh(found.covariances[1:]) > 0).all()
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_false_closure_does_not_tear_the_trajectory(dim):
+    start, edges = noisy_graph(dim, 12)
+    ends = zip(edges.source.tolist(), edges.target.tolist(), strict=True)
+    rows = [(i, j, edges.motions[row]) for row, (i, j) in enumerate(ends)]
+    honest = optimised(start, edges_of(rows, 0.03, 2))
+    false = (2, 8, motion(dim, *[5.0] * dim, *[0.5] * (FREE[dim] - dim)))
+    fooled = optimised(start, edges_of([*rows, false], 0.03, 3))
+    assert fooled.weights[-1] < 0.01
+    assert (fooled.weights[-3:-1] > 0.2).all()
+    assert torch.allclose(fooled.poses.matrix, honest.poses.matrix, atol=1e-2)
+
+
+def test_one_pose_is_its_own_optimum():
+    none = torch.zeros(0, dtype=torch.int64)
+    empty = Edges(none, none, Pose.identity(2, 0), torch.zeros(0, 3, 3).double(), none.bool())
+    found = optimised(Pose.identity(2, 1), empty)
+    assert found.converged
+    assert found.covariances.abs().max() == 0
+
+
+def test_edges_must_connect_all_poses():
+    start, edges = noisy_graph(2)
+    apart = edges.at(torch.arange(3))
+    with pytest.raises(InvalidArgumentError, match="do not connect pose 4"):
+        optimised(start, apart)
+    with pytest.raises(InvalidArgumentError, match="name pose"):
+        optimised(start[:3], edges)
+
+
+# -- loop closer -------------------------------------------------------------------------------------
+
+
+N_SCANS = 56
+
+
+def points(message: dict[str, Any]) -> torch.Tensor:
+    angles = torch.from_numpy(ANGLES)
+    return torch.from_numpy(message["ranges"]).double()[:, None] * torch.stack(
+        [angles.cos(), angles.sin()], 1
+    )
+
+
+@pytest.fixture(scope="module")
+def driven() -> tuple[DriftingOdometry, list[int], torch.Tensor]:
+    """Odometry after a lap, the scans that corrected it, and its poses before the first correction."""
+    messages, true = lap(N_SCANS)
+    odometry, corrected, before = DriftingOdometry(true), [], torch.empty(0)
+    for number, message in enumerate(messages):
+        odometry.add(points(message))
+        poses = odometry.poses
+        if odometry.close_loops():
+            before = before if corrected else poses
+            corrected.append(number)
+    return odometry, corrected, before
+
+
+def test_poses_are_near_the_truth_once_the_sensor_is_back(driven):
+    odometry, corrected, before = driven
+    true = odometry._true
+    assert BACK <= corrected[0] < N_SCANS - 3
+    assert float((before - true[: len(before)])[:, :2, 2].norm(dim=1).max()) > 0.7
+    off = (odometry.poses - true)[:, :2, 2].norm(dim=1)
+    assert float(off.max()) < 0.1
+    assert torch.equal(odometry.poses[0], torch.eye(3).double())
+    assert torch.equal(odometry.keyframes[-1].pose.matrix, odometry.poses[odometry._frames[-1]])
+    assert torch.allclose(odometry.trajectory().poses[:, :2, 2], odometry.poses[:, :2, 2], atol=0.05)
+    chain = odometry.trajectory(loops=False).poses
+    assert torch.allclose(chain[: len(before)], before, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("shifts", "counts"), [((2.0, -2.0, 0.0), [0, 0, 0]), ((2.0, 0.5, 0.5), [0, 0, 2])], ids=["none", "two"]
+)
+def test_a_closure_counts_only_if_the_next_one_agrees(driven, monkeypatch, shifts, counts):
+    odometry, _, _ = driven
+    left = list(shifts)  # of the new keyframe along x, by each closure
+
+    def closure(poses: Pose, places: Any, old: int, new: int, *_: Any) -> loop_closure._Closure:
+        moved = Pose.from_yaw(0.0, [left.pop(0), 0.0]) @ poses[new]
+        motion = poses[old].inverse() @ moved
+        return loop_closure._Closure(old, new, motion, torch.eye(3).double() * 1e4)
+
+    monkeypatch.setattr(loop_closure, "_closure", closure)
+    closer, chain, found = loop_closure.LoopCloser(0.5, odometry.rule), odometry._all_edges(), []
+    for row, count in zip((48, 51, 54), counts, strict=True):
+        poses = closer.corrected(odometry.keyframes[: row + 1], chain.at(torch.arange(row)))
+        assert len(closer.closures) == count
+        assert (poses is not None) == (count > 0)
+        found.append(poses)
+    if counts[-1]:
+        assert float((found[-1].translation[-1] - odometry.keyframes[54].pose.translation)[0]) > 0.2
+
+
+def test_scans_that_are_no_keyframes_are_not_searched_for():
+    odometry = Odometry()
+    assert not odometry.close_loops()
+    messages, _ = lap(2)
+    for message in (messages[0], messages[0]):
+        odometry.add(points(message))
+        assert not odometry.close_loops()
+    assert len(odometry.keyframes) == 1
