@@ -14,13 +14,8 @@ from invalid_values import each_value
 from scipy import stats
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.team.sharing.transport.simulated_network import (
-    LinkConditions,
-    Network,
-    Partition,
-    Reception,
-    Traffic,
-)
+from gmmtorch.team.sharing.transport.link_conditions import LinkConditions, Partition
+from gmmtorch.team.sharing.transport.simulated_network import Network, Reception, Traffic
 
 N = 3
 UNLIKELY = 1e-4  # seeds are fixed, so that results are reproducible
