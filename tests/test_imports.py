@@ -21,7 +21,7 @@ HOMES = ("team", "experiments")
 """Homes beside the map. A room is a package directly in gmmtorch/ or in a home."""
 GROUND = [
     "errors",
-    "options",
+    "declarations",
     "arrays",
     "linalg",
     "pose",

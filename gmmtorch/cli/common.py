@@ -15,9 +15,9 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from gmmtorch.cli.schema import naming
+from gmmtorch.declarations import option
 from gmmtorch.errors import InvalidArgumentError, MissingDataError, check_whole
 from gmmtorch.events import Row
-from gmmtorch.options import option
 from gmmtorch.report import format_table
 
 if TYPE_CHECKING:

@@ -9,9 +9,9 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from gmmtorch.cli import app, common, schema
+from gmmtorch.declarations import group, option
 from gmmtorch.errors import InvalidArgumentError, check_choice
 from gmmtorch.optional_packages import load_pyoctomap
-from gmmtorch.options import group, option
 from gmmtorch.report import ProgressBars
 
 _OF_SPACE = ("map_server", "octomap", "ply", "pcd", "mesh", "distance_field")

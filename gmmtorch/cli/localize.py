@@ -13,8 +13,8 @@ from omegaconf import MISSING, DictConfig
 
 from gmmtorch.cli import app, common, schema
 from gmmtorch.cli.view import BOUNDS
+from gmmtorch.declarations import group, option
 from gmmtorch.errors import InvalidArgumentError, check_choice
-from gmmtorch.options import group, option
 from gmmtorch.report import ProgressBars
 
 if TYPE_CHECKING:

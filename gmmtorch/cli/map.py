@@ -11,8 +11,8 @@ from omegaconf import MISSING, DictConfig
 
 from gmmtorch.cli import app, common, schema
 from gmmtorch.cli.view import ViewOptions, open_live_view, serve
+from gmmtorch.declarations import group, option
 from gmmtorch.errors import check_resolution
-from gmmtorch.options import group, option
 from gmmtorch.report import ProgressBars, byte_text
 
 if TYPE_CHECKING:

@@ -15,9 +15,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gmmtorch.datasets import OPTIONS
+from gmmtorch.declarations import About, declared, default_of, option
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.mapping import IncrementalRule, QueryOptions, WindowedRule
-from gmmtorch.options import About, declared, default_of, option
 
 T = TypeVar("T")
 Tree = dict[str, Any]

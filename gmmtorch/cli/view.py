@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 from omegaconf import DictConfig
 
 from gmmtorch.cli import app, common, schema
+from gmmtorch.declarations import group, option
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.options import group, option
 
 if TYPE_CHECKING:
     from gmmtorch.live import LiveView, MapViewer

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gmmtorch.datasets.base import Dataset, Ranges
-from gmmtorch.datasets.options import OPTIONS
+from gmmtorch.datasets.dataset_options import OPTIONS
 from gmmtorch.errors import InvalidArgumentError
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from gmmtorch.declarations import option
 from gmmtorch.errors import check_choice, check_number
-from gmmtorch.options import option
 
 
 @dataclass(frozen=True)

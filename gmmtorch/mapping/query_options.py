@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypedDict, get_args
 
+from gmmtorch.declarations import option
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_prior, check_whole
 from gmmtorch.mapping.learning.rules import LearningRule
-from gmmtorch.options import option
 
 if TYPE_CHECKING:
     from gmmtorch.occupancy import Calibration

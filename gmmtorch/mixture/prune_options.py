@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+from gmmtorch.declarations import option
 from gmmtorch.errors import check_choice, check_number
-from gmmtorch.options import option
 
 Prune = Literal["none", "support", "density"]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from gmmtorch.declarations import option
 from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
-from gmmtorch.options import option
 
 CLOSEST_READING = 1e-3
 """Metres."""

@@ -11,8 +11,8 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gmmtorch.cli.schema import about_of, argument_names, build, option_names, part_of, schema_of
+from gmmtorch.declarations import group, option, repeated
 from gmmtorch.errors import InvalidArgumentError, check_number
-from gmmtorch.options import group, option, repeated
 
 
 @dataclass(frozen=True)

@@ -21,11 +21,11 @@ from gmmtorch.cli import (
     store,
     write_results,
 )
+from gmmtorch.declarations import group, option
 from gmmtorch.errors import check_whole
 from gmmtorch.events import Event, Row
 from gmmtorch.experiments.cli import experiment_schema
 from gmmtorch.experiments.evaluation import Protocol
-from gmmtorch.options import group, option
 from gmmtorch.report import ProgressBars
 
 TABLE = (

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+from gmmtorch.declarations import option
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_resolution, check_whole
-from gmmtorch.options import option
 
 Removal = Literal["beams", "scans"]
 FreePoints = Literal["uniform", "near_surface", "clear"]

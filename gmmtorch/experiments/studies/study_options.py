@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from gmmtorch.declarations import option
 from gmmtorch.errors import (
     InvalidArgumentError,
     check_choice,
@@ -20,7 +21,6 @@ from gmmtorch.errors import (
 )
 from gmmtorch.experiments.evaluation import check_not_empty, check_test_every
 from gmmtorch.mapping import METHODS, QueryOptions, check_method
-from gmmtorch.options import option
 
 
 def _check_whole_numbers(options: object, *names: str) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args
 
+from gmmtorch.declarations import option
 from gmmtorch.errors import (
     InvalidArgumentError,
     check_choice,
@@ -16,7 +17,6 @@ from gmmtorch.errors import (
     check_whole,
 )
 from gmmtorch.mixture import PruneOptions
-from gmmtorch.options import option
 
 if TYPE_CHECKING:
     from gmmtorch.mapping.learning.fitting import DepthFrame

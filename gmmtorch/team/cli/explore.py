@@ -20,10 +20,10 @@ from gmmtorch.cli import (
     start,
     store,
 )
+from gmmtorch.declarations import group, option
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.options import group, option
 from gmmtorch.report import ProgressBars
-from gmmtorch.team.cli import schema
+from gmmtorch.team.cli import team_schema
 from gmmtorch.team.exploration import TeamOptions
 
 TABLE = (
@@ -47,7 +47,7 @@ class ExploreRuntime(Device):
 
 
 @dataclass
-class ExploreCommand(schema.MissionCommand):
+class ExploreCommand(team_schema.MissionCommand):
     """Options of gmmtorch-explore, beside those of `TeamOptions`."""
 
     transport: str = option("in_process", "in_process; gmmtorch-team has others")
@@ -69,7 +69,7 @@ class TrialsStudy:
 @functools.cache
 def register() -> None:
     """Stores the options of the command."""
-    schema.register()
+    team_schema.register()
     made = schema_of(TeamOptions, ExploreCommand)
     store({"explore": made}, {"study": {"trials": schema_of(TrialsStudy, name="trials")}})
 

@@ -27,10 +27,10 @@ from gmmtorch.cli import (
     store,
     write_results,
 )
+from gmmtorch.declarations import group, option
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, check_whole
-from gmmtorch.options import group, option
 from gmmtorch.processes import has_lost_parent
-from gmmtorch.team.cli import schema
+from gmmtorch.team.cli import team_schema
 from gmmtorch.team.cli.robot_report import Outputs, RobotReport, print_refusals, terse
 from gmmtorch.team.exploration import TeamOptions
 
@@ -70,7 +70,7 @@ class LogOptions:
 
 
 @dataclass
-class RobotCommand(schema.MissionCommand):
+class RobotCommand(team_schema.MissionCommand):
     """Options of gmmtorch-robot and gmmtorch-team, beside those of `TeamOptions`."""
 
     id: int = option(0, "this robot's id; unique in the team")
@@ -79,7 +79,7 @@ class RobotCommand(schema.MissionCommand):
     speed: float = option(1.0, "seconds of the robot's time per second")
     settle: float = option(10.0, "seconds without news after the last work, until the robot stops")
     transport: str = option("udp", "udp or zenoh")
-    link: schema.LinkOptions = group(schema.LinkOptions)
+    link: team_schema.LinkOptions = group(team_schema.LinkOptions)
     journal: JournalOptions = group(JournalOptions)
     log: LogOptions = group(LogOptions)
     report: Report = group(Report)
@@ -89,8 +89,8 @@ class RobotCommand(schema.MissionCommand):
 @functools.cache
 def register() -> None:
     """Stores the options of the command."""
-    schema.register()
-    store({"robot": schema_of(TeamOptions, RobotCommand, without=schema.SIMULATED)})
+    team_schema.register()
+    store({"robot": schema_of(TeamOptions, RobotCommand, without=team_schema.SIMULATED)})
 
 
 def main() -> None:

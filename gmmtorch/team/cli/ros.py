@@ -10,10 +10,10 @@ from typing import Any
 from omegaconf import MISSING, DictConfig
 
 from gmmtorch.cli import Progress, Runtime, ViewOptions, schema_of, set_up, start, store
+from gmmtorch.declarations import group, option
 from gmmtorch.errors import check_number
 from gmmtorch.live import LiveOptions
-from gmmtorch.options import group, option
-from gmmtorch.team.cli import schema
+from gmmtorch.team.cli import team_schema
 
 
 @dataclass
@@ -85,8 +85,8 @@ class RosCommand(ViewOptions):
     settle: float = option(
         2.0, "seconds without news of teammates after the last scan, until the command ends"
     )
-    link: schema.LinkOptions = group(schema.LinkOptions)
-    network: schema.SharingOptions = group(schema.SharingOptions)
+    link: team_schema.LinkOptions = group(team_schema.LinkOptions)
+    network: team_schema.SharingOptions = group(team_schema.SharingOptions)
     node: NodeOptions = group(NodeOptions)
     sensor: SensorOptions = group(SensorOptions)
     report: Progress = group(Progress)
@@ -96,7 +96,7 @@ class RosCommand(ViewOptions):
 @functools.cache
 def register() -> None:
     """Stores the options of the command."""
-    schema.register()
+    team_schema.register()
     store({"ros": schema_of(RosCommand)})
 
 

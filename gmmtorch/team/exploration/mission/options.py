@@ -9,10 +9,10 @@ import math
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
+from gmmtorch.declarations import group, option
 from gmmtorch.errors import InvalidArgumentError, arg, check_choice, check_number, check_whole
 from gmmtorch.events import Event, ignore
 from gmmtorch.mapping import NoveltyRule
-from gmmtorch.options import group, option
 from gmmtorch.simulation import CameraOptions
 from gmmtorch.team.sharing import LinkConditions
 

@@ -8,8 +8,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from gmmtorch.declarations import option
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.options import option
 
 if TYPE_CHECKING:
     import torch

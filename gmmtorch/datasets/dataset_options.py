@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gmmtorch.options import option, repeated
+from gmmtorch.declarations import option, repeated
 
 _REQUIRED = "???"
 """A value that must be given, as Hydra writes it."""

@@ -10,7 +10,7 @@ from omegaconf import MISSING
 
 from gmmtorch.cli import ViewOptions, part_of, store
 from gmmtorch.cli import register as register_inputs
-from gmmtorch.options import option, repeated
+from gmmtorch.declarations import option, repeated
 from gmmtorch.team.exploration import TeamOptions, WorldOptions
 
 SIMULATED = (
