@@ -72,11 +72,14 @@ class GmmTorchError(Exception):
         return told(found[name]) if found and found[name] else None
 
     def told(self, names: Mapping[str, str]) -> Self:
-        """The same error with other names for its argument and for the marked ones, such as options."""
+        """The same error with other names for its argument and for the marked ones, such as options.
+
+        Arguments that are not in `names` stay marked.
+        """
         text, argument = text_of(self), self.argument
-        if argument is not None and not text.startswith("‹"):
+        if argument is not None and argument in names and not text.startswith("‹"):
             text = arg(argument) + text.removeprefix(argument)
-        return type(self)(told(text, names))
+        return type(self)(_MARKED.sub(lambda found: names.get(found[1], found[0]), text))
 
     def __str__(self) -> str:  # also because OSError would print a bare tuple
         return told(format(self))

@@ -152,7 +152,7 @@ class Dataset(Sequence[Scan]):
         """
         raise InvalidArgumentError(
             f"motion=imu cannot be used: it needs the IMU of a ROS bag, and the scans of {self.name} are not "
-            "read from one, or have estimated poses. Predict with motion=constant or motion=dataset."
+            "read from one, or have estimated poses. Predict with ‹motion›=constant or ‹motion›=dataset."
         )
 
     @property

@@ -370,7 +370,7 @@ def choose_imu(reader: BagReader, wanted: str | None) -> str:
         what = "has no topic" if wanted is None else f"has no topic ‹imu_topic›={wanted}"
         raise InvalidArgumentError(
             f"motion=imu cannot be used: {reader.path} {what} of type sensor_msgs/Imu with messages, only "
-            f"{listed(found)}. Record one, or predict with motion=constant or motion=dataset."
+            f"{listed(found)}. Record one, or predict with ‹motion›=constant or ‹motion›=dataset."
         )
     return chosen[0]
 

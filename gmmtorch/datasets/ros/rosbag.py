@@ -439,5 +439,5 @@ def sensor_turns(
 
 def _unusable(reason: str, remedy: str) -> InvalidArgumentError:
     return InvalidArgumentError(
-        f"motion=imu cannot be used: {reason}. {remedy}, or predict with motion=constant."
+        f"motion=imu cannot be used: {reason}. {remedy}, or predict with ‹motion›=constant."
     )
