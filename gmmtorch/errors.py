@@ -4,20 +4,89 @@ from __future__ import annotations
 
 import math
 import numbers
-from collections.abc import Collection
+import re
+from collections.abc import Collection, Mapping
+from typing import Self
 
 _LARGEST_CELL = 1e9  # metres; powers of larger sides overflow
+_MARKED = re.compile(r"‹([\w.]+)›")
+_HEAD = re.compile(r"‹([\w.]+)›|([\w.]+)(?=(?:\[\d+\](?:\.\w+)?)?=)")
+_REST = re.compile(
+    r"(?:=(?P<value>.*?))?:? (?P<fault>(?:must|is|are|has|needs|does)\b.*?)(?:; (?P<remedy>.*))?"
+)
+"""The argument at the beginning of a text, and =value fault; remedy."""
+
+
+def arg(name: str) -> str:
+    """The name of an argument in the text of an error, marked so that a command can show its option."""
+    return f"‹{name}›"
+
+
+def told(text: str, names: Mapping[str, str] | None = None) -> str:
+    """A text with marked arguments (`arg`) as the user reads it. names: what an argument is called; its own
+    name if it is not there."""
+    return _MARKED.sub(lambda found: (names or {}).get(found[1], found[1]), text)
+
+
+def text_of(error: Exception) -> str:
+    """The text of an error with its marks, for `told`."""
+    return str(error.args[0]) if error.args else ""
 
 
 class GmmTorchError(Exception):
     """Base class of all errors that gmmtorch raises deliberately.
 
     Their text is one line that is safe to print: control characters, as in a file's name, are escaped.
+    The error of an argument says `argument=value fault; remedy`.
     """
 
+    @classmethod
+    def of(cls, argument: str, value: object, fault: str, remedy: str = "") -> Self:
+        """The error of an argument: its name, its value, what is wrong with it, and what to do."""
+        return cls(f"{arg(argument)}={value} {fault}{'; ' if remedy else ''}{remedy}.")
+
+    @property
+    def argument(self) -> str | None:
+        """The argument's name in Python; None if the error is of something else."""
+        found = _HEAD.match(text_of(self))
+        return (found[1] or found[2]) if found else None
+
+    @property
+    def value(self) -> str | None:
+        """The argument's value, as the text shows it."""
+        return self._part("value")
+
+    @property
+    def fault(self) -> str | None:
+        """What is wrong with the value."""
+        return self._part("fault")
+
+    @property
+    def remedy(self) -> str | None:
+        """What to do; None if the fault says it."""
+        return self._part("remedy")
+
+    def _part(self, name: str) -> str | None:
+        head = _HEAD.match(text_of(self))
+        found = _REST.fullmatch(text_of(self), head.end()) if head else None
+        return told(found[name]) if found and found[name] else None
+
+    def told(self, names: Mapping[str, str]) -> Self:
+        """The same error with other names for its argument and for the marked ones, such as options.
+
+        Arguments that are not in `names` stay marked.
+        """
+        text, argument = text_of(self), self.argument
+        if argument is not None and argument in names and not text.startswith("‹"):
+            text = arg(argument) + text.removeprefix(argument)
+        return type(self)(_MARKED.sub(lambda found: names.get(found[1], found[0]), text))
+
     def __str__(self) -> str:  # also because OSError would print a bare tuple
-        text = str(self.args[0]) if self.args else ""
-        return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+        return told(format(self))
+
+    def __format__(self, spec: str) -> str:
+        """The text for another error, with its marks."""
+        return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text_of(self))
 
 
 class InvalidArgumentError(GmmTorchError, ValueError):

@@ -49,9 +49,7 @@ def pinhole_matrix(values: Sequence[float]) -> Tensor:
         fx, fy, cx, cy = (float(value) for value in values)
         return check_intrinsics([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     except (TypeError, ValueError) as error:
-        raise InvalidArgumentError(
-            f"dataset.intrinsics={values} must be fx, fy, cx, cy in pixels."
-        ) from error
+        raise InvalidArgumentError(f"‹intrinsics›={values} must be fx, fy, cx, cy in pixels.") from error
 
 
 def is_centered(intrinsics: Tensor, shape: tuple[int, int]) -> bool:

@@ -25,3 +25,18 @@ def test_a_hostile_file_name_does_not_reach_the_terminal(tmp_path):
     with pytest.raises(errors.DataError) as error:
         open_points(path)
     assert r"a\x1b[2J\n.ply has no header" in str(error.value)
+
+
+def test_an_error_has_the_parts_of_its_text_and_can_name_options():
+    error = errors.InvalidArgumentError.of("poses", "x", "is neither tf nor a file", "choose ‹poses›=tf")
+    assert str(error) == "poses=x is neither tf nor a file; choose poses=tf."
+    assert (error.argument, error.value) == ("poses", "x")
+    assert (error.fault, error.remedy) == ("is neither tf nor a file", "choose poses=tf.")
+    told = error.told({"poses": "dataset.poses"})
+    assert str(told) == "dataset.poses=x is neither tf nor a file; choose dataset.poses=tf."
+    plain = errors.InvalidArgumentError("noise=-1 must be above 0, or ‹window›=3.")
+    assert str(plain.told({"noise": "map.noise"})) == "map.noise=-1 must be above 0, or window=3."
+    assert str(plain.told({"noise": "a.noise"}).told({"window": "a.window"})).endswith("or a.window=3.")
+    outer = errors.DataError(f"file: {plain}")
+    assert outer.argument is None
+    assert str(outer.told({"window": "map.window"})) == "file: noise=-1 must be above 0, or map.window=3."

@@ -21,6 +21,7 @@ HOMES = ("team", "experiments")
 """Homes beside the map. A room is a package directly in gmmtorch/ or in a home."""
 GROUND = [
     "errors",
+    "declarations",
     "arrays",
     "linalg",
     "pose",

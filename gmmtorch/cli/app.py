@@ -25,9 +25,8 @@ from hydra._internal.utils import get_args_parser
 from hydra.errors import HydraException
 from omegaconf import DictConfig
 
-from gmmtorch.cli import common
-from gmmtorch.cli.options import command_options
-from gmmtorch.cli.reporting.sweep_table import ERROR_FILE
+from gmmtorch.cli import common, options_help, schema
+from gmmtorch.cli.sweep_table import ERROR_FILE
 from gmmtorch.errors import GmmTorchError
 from gmmtorch.processes import end_with_parent
 
@@ -154,20 +153,20 @@ def _hydra_main(name: str, run: Callable[[DictConfig], Any]) -> None:
 
     try:
         if flags.help:
-            print(command_options.help_text(name, flags.overrides))
+            print(options_help.help_text(name, flags.overrides))
         elif flags.shell_completion and {"query=bash", "query=fish"} & {*flags.overrides}:
-            found = command_options.completions(name, os.environ["COMP_LINE"])
+            found = options_help.completions(name, os.environ["COMP_LINE"])
             print(*found, sep=" " if "query=bash" in flags.overrides else "\n")
         else:
-            command_options.check_choices(name, flags.overrides)
+            options_help.check_choices(name, flags.overrides)
             with _raising():
                 hydra.main(version_base="1.3", config_path=common.conf_dir(), config_name=name)(task)()
     except GmmTorchError as error:
-        sys.exit(f"gmmtorch: error: {error}")
+        sys.exit(f"gmmtorch: error: {error!s}")
     except (HydraException, OmegaConfBaseException) as error:
         if is_running:
             raise
-        sys.exit(f"gmmtorch: error: {command_options.explained(name, flags.overrides, error)}")
+        sys.exit(f"gmmtorch: error: {options_help.explained(name, flags.overrides, error)}")
     except OSError as error:
         if is_running:
             raise
@@ -218,13 +217,13 @@ def _guarded(run: Callable[[DictConfig], Any], config: DictConfig) -> Any:
         try:
             return _result_of(run, config)
         except GmmTorchError as error:
-            sys.exit(f"gmmtorch: error: {error}")
+            sys.exit(f"gmmtorch: error: {error.told(schema.option_names(config))}")
     note = common.run_dir() / ERROR_FILE
     note.unlink(missing_ok=True)  # of an earlier sweep in this folder
     try:
         return _result_of(run, config)
     except GmmTorchError as error:
-        text = str(error)
+        text = str(error.told(schema.option_names(config)))
     except Exception as error:
         text = f"{traceback.format_exc()}{type(error).__name__}: {error}"
     note.write_text(text, encoding="utf-8")

@@ -1,13 +1,12 @@
-"""Functions that several commands use: configuration folder, set-up of a run, errors, data sets, results."""
+"""What several commands share: their options, the configuration folder, the set-up of a run, its results."""
 
 from __future__ import annotations
 
 import logging
 import os
-import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +14,9 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from gmmtorch.errors import GmmTorchError, InvalidArgumentError, MissingDataError, check_whole
+from gmmtorch.cli.schema import naming
+from gmmtorch.declarations import option
+from gmmtorch.errors import InvalidArgumentError, MissingDataError, check_whole
 from gmmtorch.events import Row
 from gmmtorch.report import format_table
 
@@ -23,8 +24,56 @@ if TYPE_CHECKING:
     from gmmtorch.report import Board
 
 logger = logging.getLogger("gmmtorch")
-_NAMES_ARGUMENTS = (InvalidArgumentError, MissingDataError)
-_ARGUMENT = re.compile(r"(?<![\w.])[\w.]+(?=(?:\[\d+\][\w.]*)?=| is not set)")
+
+
+@dataclass
+class Progress:
+    """What a run shows."""
+
+    progress: bool = option(True, "progress bars, or a status line")
+
+
+@dataclass
+class Report(Progress):
+    """What a run shows and writes."""
+
+    figures: bool = option(True, "figures as PNG")
+    tensorboard: bool = option(True, "events for TensorBoard")
+
+
+@dataclass
+class Device:
+    """Where a run computes."""
+
+    device: str = option("cpu", "cpu, cuda, cuda:1, …")
+    threads: int | None = option(
+        1, "CPU threads; null: torch chooses. The same number gives the same results"
+    )
+    kernels: str = option(
+        "auto", "fused kernels: auto, if the extra [fast] is installed; fused: an error if not; torch: never"
+    )
+
+
+@dataclass
+class Memory(Device):
+    """Where a run computes, and how much memory cells may take."""
+
+    memory_limit: int = option(4 << 30, "bytes of a map's cells, at most")
+
+
+@dataclass
+class Runtime(Memory):
+    """Where and how a run learns."""
+
+    dtype: str = option(
+        "float32",
+        "type of the exponentials in EM (fused exact EM always computes in float64, map=incremental in "
+        "float32); float64: all computations",
+    )
+    compile: bool = option(
+        False,
+        "without effect: fused kernels are compiled anyway",
+    )
 
 
 def conf_dir() -> str:
@@ -37,21 +86,6 @@ def conf_dir() -> str:
     raise FileNotFoundError(
         f"conf/ is neither in {package} nor next to it; install gmmtorch again, or use a complete checkout."
     )
-
-
-@contextmanager
-def naming(options: Mapping[str, str]) -> Iterator[None]:
-    """Renames arguments in errors to the options that the user gave: `noise=-1` becomes `sensor.noise=-1`.
-
-    options: the option for each argument.
-    """
-    try:
-        yield
-    except GmmTorchError as error:
-        if type(error) is not GmmTorchError and not isinstance(error, _NAMES_ARGUMENTS):
-            raise
-        text = re.sub(_ARGUMENT, lambda name: options.get(name[0], name[0]), str(error))
-        raise type(error)(text) from error
 
 
 def as_options(node: DictConfig) -> dict[str, Any]:
@@ -93,16 +127,17 @@ def check_inputs(config: DictConfig) -> None:
         from gmmtorch.datasets import point_path
 
         point_path(points)
-    for option in ("path", "map.path", "world.path"):
-        path = OmegaConf.select(config, option)
+    for name in ("path", "map.path", "world.path"):
+        path = OmegaConf.select(config, name)
         if path and not Path(path).expanduser().exists():
-            raise MissingDataError(f"{option}={path} does not exist; give a file or folder that exists.")
+            raise MissingDataError(f"{name}={path} does not exist; give a file or folder that exists.")
     path = OmegaConf.select(config, "dataset.path")
     is_read = points is None and not OmegaConf.select(config, "inputs")
     if is_read and path and not Path(path).expanduser().exists():
         from gmmtorch import datasets
 
-        datasets.load(config.dataset.name, path)  # its error describes the files it needs
+        with naming({"path": "dataset.path"}):
+            datasets.load(config.dataset.name, path)  # its error describes the files it needs
 
 
 def set_up(config: DictConfig) -> str:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
+from dataclasses import dataclass
 from pathlib import Path
 
 from omegaconf import DictConfig
 
-from gmmtorch.cli import app, common
-from gmmtorch.cli.options import schema
+from gmmtorch.cli import app, common, schema
+from gmmtorch.declarations import group, option
 from gmmtorch.errors import InvalidArgumentError, check_choice
 from gmmtorch.optional_packages import load_pyoctomap
 from gmmtorch.report import ProgressBars
@@ -28,9 +30,48 @@ _OF_ENDINGS = {
 """Formats by the endings of the output, if none is given."""
 
 
+@dataclass
+class ExportOptions:
+    """Options of gmmtorch-export."""
+
+    path: str | None = option(
+        None,
+        "run directory of gmmtorch-map, or map, grid or mixture of gmmtorch (.safetensors), GIRA .csv, .npz; "
+        "for kitti a trajectory",
+    )
+    output: str | None = option(None, "file to write; for octomap its ending selects the format, .bt or .ot")
+    format: str | None = option(
+        None,
+        "map_server, octomap, ply, pcd, mesh, distance_field, csv, npz, mixture, kitti; null: by the ending "
+        "of the output",
+    )
+    method: str | None = option(None, "form of evidence: point, flux, cone, monte_carlo; null: the map's own")
+    resolution: float | None = option(None, "side (m) of the cells; null: the map's own")
+    bounds: list[float] | None = option(
+        None, "[x0,y0,x1,y1], in 3D [x0,y0,z0,x1,y1,z1] (m); null: around the components"
+    )
+    z_min: float | None = option(
+        None, "lowest height (m); both null: for map_server, between the floor and the ceiling of a 3D map"
+    )
+    z_max: float | None = option(None, "highest height (m)")
+    occupied_thresh: float = option(0.65, "cells above this probability are occupied")
+    free_thresh: float = option(0.196, "cells below this probability are free; others are unknown")
+    n_points: float | None = option(
+        None, "number of points from which a mixture without support (GIRA) was learned"
+    )
+    report: common.Progress = group(common.Progress)
+    runtime: common.Memory = group(common.Memory)
+
+
+@functools.cache
+def register() -> None:
+    """Stores the options of the command."""
+    schema.store({"export": schema.schema_of(ExportOptions)})
+
+
 def main() -> None:
     """Entry point of the command."""
-    app.start("export", run, schema.register)
+    app.start("export", run, register)
 
 
 def run(config: DictConfig) -> None:
@@ -39,7 +80,7 @@ def run(config: DictConfig) -> None:
         if not config[name]:
             raise InvalidArgumentError(f"{name} is not set; give {name}=FILE.")
     config.format = _format(config)
-    from gmmtorch.cli.reporting import exported_files  # takes seconds, so options are checked first
+    from gmmtorch.cli.outputs import exported_files  # takes seconds, so options are checked first
 
     if config.format == "octomap":
         load_pyoctomap()  # before the cells are computed

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from omegaconf import DictConfig
+from omegaconf import MISSING, DictConfig
 
-from gmmtorch.cli import app, common
-from gmmtorch.cli.options import schema
+from gmmtorch.cli import app, common, schema
+from gmmtorch.cli.view import BOUNDS
+from gmmtorch.declarations import group, option
 from gmmtorch.errors import InvalidArgumentError, check_choice
 from gmmtorch.report import ProgressBars
 
@@ -22,22 +25,68 @@ _STAGE = "localising"
 TABLE = "dataset n_scans n_found n_lost_runs ate rpe ate_degrees deviation scans_per_second"
 
 
+@dataclass
+class SavedMap:
+    """A saved map."""
+
+    path: str | None = option(
+        None, "map file, run directory of gmmtorch-map, or folder of tiles; map=FILE is short for it"
+    )
+
+
+@dataclass
+class LocalizeOptions:
+    """Options of gmmtorch-localize."""
+
+    dataset: Any = option(MISSING, "where the scans come from")
+    map: SavedMap = group(SavedMap)
+    bounds: list[float] | None = option(None, BOUNDS)
+    pose: Any = option(
+        None,
+        "first pose, [x,y,yaw], in 3D [x,y,z,yaw] or [x,y,z,qx,qy,qz,qw] (m, rad), within 0.5 m and 0.175 "
+        "rad; dataset: that of the data set; null: unknown, the whole map is searched",
+    )
+    motion: str = option(
+        "constant",
+        "constant: as between the last two scans; dataset: as between the poses of the data set, such as an "
+        "odometry's; imu: with the rotation of the IMU of a ROS bag",
+    )
+    n_points: int = option(1000, "points of a scan that are used at most")
+    least_explained: float = option(
+        0.9, "share of the points that must lie on surfaces of the map; less where much has changed"
+    )
+    truth: str | None = option("none", "true poses, for scores: dataset, none, or a TUM or KITTI file")
+    align: str = option(
+        "none",
+        "before scoring. none: the truth is in the frame of the map; first: the first poses coincide; rigid: "
+        "least squares",
+    )
+    report: common.Report = group(common.Report)
+    runtime: common.Memory = group(common.Memory)
+
+
+@functools.cache
+def register() -> None:
+    """Stores the options of the command."""
+    schema.register()
+    schema.store({"localize": schema.schema_of(LocalizeOptions)})
+
+
 def main() -> None:
     """Entry point of the command."""
     sys.argv[1:] = overrides(sys.argv[1:])
-    app.start("localize", run, schema.register)
+    app.start("localize", run, register)
 
 
 def overrides(words: Sequence[str]) -> list[str]:
-    """The arguments as Hydra's overrides: map=FILE becomes map.path=FILE."""
+    """The arguments as Hydra's overrides: map=FILE becomes map.path=FILE, because map is a group."""
     return [f"map.path={word.removeprefix('map=')}" if word.startswith("map=") else word for word in words]
 
 
 def run(config: DictConfig) -> None:
     """Run the command."""
-    from gmmtorch.cli.from_options import maps
-    from gmmtorch.cli.from_options.scans import open_dataset
-    from gmmtorch.cli.reporting import localization_outputs
+    from gmmtorch.cli import inputs
+    from gmmtorch.cli.outputs import localization_outputs
     from gmmtorch.localization import ALIGNMENTS, MOTIONS, Tracker
 
     if not config.map.path:
@@ -46,15 +95,13 @@ def run(config: DictConfig) -> None:
     check_choice("align", config.align, ALIGNMENTS)
     common.use_runtime(config.runtime)
     folder = common.run_dir()
-    built = maps.open_map(Path(config.map.path).expanduser(), config.runtime, config.map.bounds)
-    dataset = open_dataset(config.dataset)
+    built = inputs.open_map(Path(config.map.path).expanduser(), config.runtime, config.bounds)
+    dataset = inputs.open_dataset(config.dataset)
     truth = localization_outputs.true_poses(config, dataset, built.dim or 3)
-    with common.naming({"surfaces": "map", "points": "dataset"}):
+    with schema.naming({"surfaces": "map", "points": "dataset"}):
         tracker = Tracker(
             built,
             localization_outputs.first_pose(config, dataset, built.dim or 3),
-            distance=config.distance,
-            angle=config.angle,
             n_points=config.n_points,
             least_explained=config.least_explained,
         )

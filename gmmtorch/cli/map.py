@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import functools
 import sys
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
-from omegaconf import DictConfig
+from omegaconf import MISSING, DictConfig
 
-from gmmtorch.cli import app, common
-from gmmtorch.cli.options import schema
-from gmmtorch.cli.view import open_live_view, serve
+from gmmtorch.cli import app, common, schema
+from gmmtorch.cli.view import ViewOptions, open_live_view, serve
+from gmmtorch.declarations import group, option
 from gmmtorch.errors import check_resolution
 from gmmtorch.report import ProgressBars, byte_text
 
 if TYPE_CHECKING:
-    from gmmtorch.cli.reporting.map_outputs import Checkpoint
+    from gmmtorch.cli.outputs.map_outputs import Checkpoint
     from gmmtorch.live import LiveView
     from gmmtorch.mapping import MapBuilder
 
@@ -24,27 +26,63 @@ TABLE = (
 )
 
 
+@dataclass
+class MapOptions(ViewOptions):
+    """Options of gmmtorch-map."""
+
+    dataset: Any = option(MISSING, "where the scans come from")
+    map: Any = option(MISSING, "how the map is built")
+    seed: int = option(0, "seed of all random numbers")
+    resolution: float = option(0.1, "side (m) of the cells of queries, pictures and exports")
+    export: list[str] = option(
+        [],
+        "list of map_server (a 2D map for ROS), octomap, cloud (occupied cells), mesh (cells of half the "
+        "resolution), distance_field",
+    )
+    z_min: float | None = option(
+        None, "lowest height (m) of map_server in 3D; both null: between floor and ceiling"
+    )
+    z_max: float | None = option(None, "highest height (m) of map_server in 3D")
+    checkpoint_seconds: float = option(30.0, "computing time between two checkpoints")
+    inputs: list[str] = option(
+        [], "list of paths, globs and URLs of recordings, in place of dataset.path; maps are merged in tiles"
+    )
+    tile: float = option(100.0, "side (m) of the tiles into which the maps of inputs are merged")
+    tile_bytes: int | None = option(None, "bytes of a tile's file, at most; null: no limit")
+    workers: int = option(1, "processes of this machine that map inputs; more than one needs Ray")
+    cluster: str | None = option(
+        None, "address of a Ray cluster that maps inputs, such as ray://head:10001; null: this machine"
+    )
+    report: common.Report = group(common.Report)
+    runtime: common.Runtime = group(common.Runtime)
+
+
+@functools.cache
+def register() -> None:
+    """Stores the options of the command."""
+    schema.register()
+    schema.store({"map": schema.schema_of(MapOptions)})
+
+
 def main() -> None:
     """Entry point of the command."""
-    app.start("map", run, schema.register)
+    app.start("map", run, register)
 
 
 def run(config: DictConfig) -> None:
     """Run the command. A run directory that contains a checkpoint of the same run is continued."""
-    from gmmtorch.cli.from_options import maps
-    from gmmtorch.cli.from_options.scans import open_with_trajectory
-    from gmmtorch.cli.reporting import map_outputs
-    from gmmtorch.cli.runs import map_recordings
+    from gmmtorch.cli import inputs, recordings
+    from gmmtorch.cli.outputs import map_outputs
     from gmmtorch.mapping import MapBuilder
 
     device, folder = common.set_up(config), common.run_dir()
     check_resolution(config.resolution)
     map_outputs.check_exports(config)
     if config.inputs:
-        map_recordings.run(config)
+        recordings.run(config)
         return
-    dataset, poses, odometry = open_with_trajectory(config.dataset)
-    target = maps.map_factory(config, resolution=config.resolution)()
+    dataset, poses, odometry = inputs.open_with_trajectory(config.dataset)
+    target = inputs.map_factory(config, resolution=config.resolution)()
     builder = MapBuilder(dataset, target, device)
     with ProgressBars(enabled=config.report.progress) as bars:
         view = open_live_view(config)

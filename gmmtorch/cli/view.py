@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import atexit
+import functools
 import logging
 import sys
 import threading
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
-from gmmtorch.cli import app, common
-from gmmtorch.cli.options import schema
+from gmmtorch.cli import app, common, schema
+from gmmtorch.declarations import group, option
 from gmmtorch.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
@@ -24,10 +26,45 @@ _FLAGS_WITH_A_VALUE = {"--cfg", "-c", "--package", "-p", "--info", "-i", "--conf
 _FLAGS_WITH_A_VALUE |= {"--config-name", "-cn", "--config-dir", "-cd"}
 
 
+BOUNDS = "of a map in tiles: the box [x0,y0,z0,x1,y1,z1] (m), in 2D without z, that is opened; null: all"
+
+
+@dataclass
+class ViewOptions:
+    """The view of a command's work in the browser."""
+
+    view: bool = option(False, "show the work in the browser while it runs, and until Ctrl-C")
+    view_host: str = option("127.0.0.1", "address of the view; 0.0.0.0: other machines can open it, too")
+    view_port: int = option(8080, "port of the view; the next free one if it is in use")
+
+
+@dataclass
+class PageOptions:
+    """Options of gmmtorch-view."""
+
+    path: str | None = option(None, "map file, run directory of gmmtorch-map, or folder of tiles")
+    trajectory: str | None = option(
+        None, "TUM or KITTI file; null: trajectory.tum next to the map and of each recording"
+    )
+    bounds: list[float] | None = option(None, BOUNDS)
+    html: str | None = option(None, "file to write, .html, instead of serving a page")
+    shape: str = option("ellipsoids", "ellipsoids (2σ), splats, surfaces (the mesh, in 3D) or none")
+    colour: str = option("height", "height, support, or age: the order in which components were learned")
+    host: str = option("127.0.0.1", "address of the page; 0.0.0.0: other machines can open it, too")
+    port: int = option(8080, "port of the page; the next free one if it is in use")
+    runtime: common.Memory = group(common.Memory)
+
+
+@functools.cache
+def register() -> None:
+    """Stores the options of the command."""
+    schema.store({"view": schema.schema_of(PageOptions)})
+
+
 def main() -> None:
     """Entry point of the command."""
     sys.argv[1:] = overrides(sys.argv[1:])
-    app.start("view", run, schema.register)
+    app.start("view", run, register)
 
 
 def overrides(words: Sequence[str]) -> list[str]:
@@ -54,8 +91,8 @@ def _assigned(name: str, value: str) -> str:
 
 def run(config: DictConfig) -> None:
     """Run the command. Without `html` it serves the page until it is interrupted."""
-    from gmmtorch.cli.from_options import maps
-    from gmmtorch.cli.reporting import map_outputs
+    from gmmtorch.cli import inputs
+    from gmmtorch.cli.outputs import map_outputs
     from gmmtorch.live import MapViewer, write_page
 
     if not config.path:
@@ -63,7 +100,7 @@ def run(config: DictConfig) -> None:
     logging.getLogger("websockets").setLevel(logging.WARNING)  # it reports every connection
     common.use_runtime(config.runtime)
     path = Path(config.path).expanduser()
-    shown = maps.open_map(path, config.runtime, config.bounds)
+    shown = inputs.open_map(path, config.runtime, config.bounds)
     trajectories = map_outputs.trajectories(path, config.trajectory, shown.dim or 3)
     look = {"shape": config.shape, "colour": config.colour}
     if config.html:
@@ -80,7 +117,7 @@ def open_live_view(config: DictConfig) -> LiveView | None:
     from gmmtorch.live import LiveView
 
     logging.getLogger("websockets").setLevel(logging.WARNING)  # it reports every connection
-    with common.naming({"host": "view_host", "port": "view_port"}):
+    with schema.naming({"host": "view_host", "port": "view_port"}):
         view = LiveView(config.view_host, config.view_port)
     atexit.register(view.stop)  # a thread that computes while Python ends would abort the process
     print(f"The map is at {view.url}", flush=True)

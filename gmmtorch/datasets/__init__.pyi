@@ -3,6 +3,7 @@ from .base import DatasetShard as DatasetShard
 from .base import Ranges as Ranges
 from .base import shard_indices as shard_indices
 from .base import start_frame as start_frame
+from .dataset_options import OPTIONS as OPTIONS
 from .point_files.mesh_files import read_triangles as read_triangles
 from .point_files.point_chunks import PointChunks as PointChunks
 from .point_files.point_chunks import Survey as Survey

@@ -152,7 +152,7 @@ class Dataset(Sequence[Scan]):
         """
         raise InvalidArgumentError(
             f"motion=imu cannot be used: it needs the IMU of a ROS bag, and the scans of {self.name} are not "
-            "read from one, or have estimated poses. Predict with motion=constant or motion=dataset."
+            "read from one, or have estimated poses. Predict with ‹motion›=constant or ‹motion›=dataset."
         )
 
     @property
@@ -206,12 +206,12 @@ def require_path(path: str | Path, kind: str, content: str, source: str) -> Path
     states the expected `content` and a `source` of such data.
     """
     if path is None or str(path) == "":
-        raise InvalidArgumentError(f"dataset.path is not set; give a {kind} with {content}. {source}")
+        raise InvalidArgumentError(f"‹path› is not set; give a {kind} with {content}. {source}")
     path = Path(path).expanduser()
     exists = {"file": path.is_file, "folder": path.is_dir}.get(kind, path.exists)
     if not exists():
         what = "is not a " + kind if path.exists() else "does not exist"
-        raise MissingDataError(f"dataset.path={path} {what}; looked for {content}. {source}")
+        raise MissingDataError(f"‹path›={path} {what}; looked for {content}. {source}")
     return path
 
 

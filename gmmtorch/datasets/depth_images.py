@@ -73,8 +73,8 @@ class DepthFrames(Dataset):
         )
         super().__init__(path.name, ranges, stride)
         check_number("depth_scale", depth_scale, above=True)
-        self.pixel_stride = check_whole("dataset.pixel_stride", pixel_stride, 1)
-        check_choice("dataset.up", up, _UPRIGHT)
+        self.pixel_stride = check_whole("pixel_stride", pixel_stride, 1)
+        check_choice("up", up, _UPRIGHT)
         self._upright = torch.tensor(_UPRIGHT[up], dtype=torch.float64)
         self.depth_scale = float(depth_scale)
         self._files = sorted(path.glob("frame-*.depth.png"), key=natural_key)
@@ -214,8 +214,8 @@ class TumRgbd(Dataset):
             "The TUM RGB-D benchmark publishes sequences in this layout.",
         )
         super().__init__(path.resolve().name, ranges, stride)
-        self.pixel_stride = check_whole("dataset.pixel_stride", pixel_stride, 1)
-        check_number("dataset.depth_scale", depth_scale, above=True)
+        self.pixel_stride = check_whole("pixel_stride", pixel_stride, 1)
+        check_number("depth_scale", depth_scale, above=True)
         self._scale = depth_scale
         self.intrinsics = pinhole_matrix(_INTRINSICS if intrinsics is None else intrinsics)
         times, files = _listed(path / "depth.txt")

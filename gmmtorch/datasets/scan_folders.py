@@ -79,7 +79,7 @@ def _read_poses(path: Path) -> torch.Tensor:
     if not path.is_file():
         raise DataError(
             f"{path} is missing; write one row of 12 numbers (world ← sensor) for each scan, or "
-            "estimate the poses with dataset.odometry=auto."
+            "estimate the poses with ‹odometry›=auto."
         )
     rows = read_rows(path)
     if rows.shape[1] != 12:

@@ -8,21 +8,20 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gmmtorch.datasets.base import Dataset, Ranges
+from gmmtorch.datasets.dataset_options import OPTIONS
 from gmmtorch.errors import InvalidArgumentError
 
 
 class _Source(NamedTuple):
-    """The module and class of a data set, and the defaults of its `Ranges`."""
+    """The module and class of a data set."""
 
     module: str
     reader: str
-    max_range: float | None = None
-    no_return_range: float = 0.0
     needs_path: bool = True
 
 
 _SOURCES = {
-    "carmen": _Source("scan_logs", "CarmenLog", 50.0, 8.0),
+    "carmen": _Source("scan_logs", "CarmenLog"),
     "scan_folder": _Source("scan_folders", "ScanFolder"),
     "pcd_viewpoint": _Source("scan_folders", "PcdViewpoint"),
     "depth_frames": _Source("depth_images", "DepthFrames"),
@@ -31,9 +30,9 @@ _SOURCES = {
     "kitti": _Source("scan_folders", "Kitti"),
     "tum": _Source("depth_images", "TumRgbd"),
     "mesh": _Source("synthetic", "MeshSamples"),
-    "mesh_scans": _Source("synthetic", "MeshScans", None, 8.0),
-    "synthetic_building": _Source("synthetic", "SyntheticBuilding", None, 8.0, needs_path=False),
-    "synthetic_building_2d": _Source("synthetic", "SyntheticBuilding2D", None, 8.0, needs_path=False),
+    "mesh_scans": _Source("synthetic", "MeshScans"),
+    "synthetic_building": _Source("synthetic", "SyntheticBuilding", needs_path=False),
+    "synthetic_building_2d": _Source("synthetic", "SyntheticBuilding2D", needs_path=False),
 }
 
 
@@ -73,10 +72,8 @@ def load(
         raise InvalidArgumentError(f"dataset={name!r} is not known; choose one of {', '.join(_SOURCES)}.")
     source = _SOURCES[name]
     reader = getattr(importlib.import_module(f"gmmtorch.datasets.{source.module}"), source.reader)
-    ranges = Ranges(
-        source.max_range if max_range is None else max_range,
-        source.no_return_range if no_return_range is None else no_return_range,
-    )
+    given = {"max_range": max_range, "no_return_range": no_return_range}
+    ranges = Ranges(**{n: getattr(OPTIONS[name], n) if v is None else v for n, v in given.items()})
     known = set(inspect.signature(reader).parameters) - {"path", "ranges", "stride"}
     if poses is not None and "poses" in known:
         options["poses"] = str(poses)
@@ -95,7 +92,7 @@ def load(
     for option, value in (("path", path), ("poses", poses)):
         if value is not None and not source.needs_path:
             raise InvalidArgumentError(
-                f"dataset.{option}={value} is given, but dataset={name} is simulated; drop it, or choose one "
+                f"{option}={value} is given, but dataset={name} is simulated; drop it, or choose one "
                 f"of {', '.join(n for n, s in _SOURCES.items() if s.needs_path)}."
             )
     dataset: Dataset = reader(*[path] * source.needs_path, ranges, stride, **options)

@@ -106,7 +106,7 @@ def read_trajectory(path: str | Path, n_scans: int | None = None) -> Trajectory:
     """
     path = Path(path).expanduser()
     if not path.is_file():
-        raise MissingDataError(f"dataset.poses={path} does not exist; give a TUM or KITTI trajectory file.")
+        raise MissingDataError(f"‹poses›={path} does not exist; give a TUM or KITTI trajectory file.")
     rows = read_rows(path)
     if rows.shape[1] == 8:
         return _tum(path, rows)
@@ -188,7 +188,7 @@ def with_trajectory(source: Dataset, path: str | Path, stride: int) -> Dataset:
     path = Path(path).expanduser()
     if len(source) == 0 or source.pose(0) is None:
         raise InvalidArgumentError(
-            f"dataset.poses={path} cannot be used: the data set does not state its own poses, from which its "
+            f"‹poses›={path} cannot be used: the data set does not state its own poses, from which its "
             "points would be moved."
         )
     trajectory = read_trajectory(path, len(source))
@@ -197,7 +197,7 @@ def with_trajectory(source: Dataset, path: str | Path, stride: int) -> Dataset:
     else:
         if source.times is None:
             raise InvalidArgumentError(
-                f"dataset.poses={path} has poses at times, but the scans have no times; give a KITTI "
+                f"‹poses›={path} has poses at times, but the scans have no times; give a KITTI "
                 "trajectory, one row for each scan."
             )
         found, known = trajectory.at(to_nanoseconds(source.times.numpy()), _MAX_GAP)

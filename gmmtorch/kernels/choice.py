@@ -1,4 +1,4 @@
-"""The choice between fused kernels and their twins in tensor operations: `runtime.kernels`."""
+"""The choice between fused kernels and their twins in tensor operations: `use_kernels`."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def _require_compiler() -> None:
     if failure is not None:
         raise GmmTorchError(
             f"kernels=fused needs the kernel compiler, but {failure}; install it with "
-            "pip install 'gmmtorch[fast]', or choose kernels=auto or kernels=torch."
+            "pip install 'gmmtorch[fast]', or choose ‹kernels›=auto or ‹kernels›=torch."
         )
 
 

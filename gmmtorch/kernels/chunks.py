@@ -53,7 +53,7 @@ def memory_error(error: torch.OutOfMemoryError) -> MemoryLimitError:
     """The error of the package for a device without memory: the bytes asked for, and what needs fewer."""
     return MemoryLimitError(
         f"{_asked(error)} Reduce n_components, max_cells or the resolution of the grid, free memory that "
-        "other programs hold on the device, or choose runtime.device=cpu."
+        "other programs hold on the device, or choose ‹device›=cpu."
     )
 
 

@@ -3,7 +3,7 @@ from .live_mapper import MAP as MAP
 from .live_mapper import LiveLocalizer as LiveLocalizer
 from .live_mapper import LiveMapper as LiveMapper
 from .live_mapper import warm_up as warm_up
-from .live_scans import LiveOptions as LiveOptions
+from .live_options import LiveOptions as LiveOptions
 from .live_scans import LiveScans as LiveScans
 from .live_scans import find_sensor as find_sensor
 from .live_scans import open_scans as open_scans

@@ -39,7 +39,8 @@ from gmmtorch.datasets import (
     nearest_names,
     stamp_of,
 )
-from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_choice, check_number
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, arg, text_of
+from gmmtorch.live.live_options import LiveOptions
 from gmmtorch.live.ros import Node
 from gmmtorch.live.ros.node import reading
 from gmmtorch.localization import METHODS, Location, Odometry, Tracker, composed, odometry_of
@@ -53,46 +54,6 @@ _PATIENCE = 10.0  # s that a scan waits for its pose if there is no limit of the
 _WAITING_BYTES = 1 << 28
 _BACKWARDS = 30 * NANOSECONDS  # a clock that is set back further starts again
 _N_FIRST = 101  # messages whose stamps and receipt show how the sensor keeps time
-
-
-@dataclass(frozen=True)
-class LiveOptions:
-    """How live messages become scans.
-
-    poses: tf; standing for a sensor that does not move; mixture or kiss_icp for odometry from the scans.
-    frame: the fixed frame of TF, such as odom; None: the root of the sensor's tree. Of odometry: the name of
-        its frame; None: odom.
-    sensor_frame: the frame of the sensor; None: that of the messages.
-    loops: whether odometry by mixtures closes loops, which moves earlier poses and the present one.
-    max_gap: longest time (s) between two poses that are interpolated.
-    clock: header, stamps of the messages; or received, times of receipt.
-    deskew: each point with a time gets the pose of its own time.
-    stride: use every n-th scan.
-    pixel_stride: every n-th pixel of every n-th row of depth images.
-    depth_scale: metres per unit of depth images; None: 0.001 for whole numbers, 1 for floating ones.
-    intrinsics: [fx,fy,cx,cy] in pixels of depth images without distortion; None: of the CameraInfo.
-    max_latency: seconds after which a scan that waits is dropped; None: scans wait.
-    """
-
-    poses: str = "tf"
-    frame: str | None = None
-    sensor_frame: str | None = None
-    loops: bool = True
-    max_gap: float = 2.0
-    clock: str = "header"
-    deskew: bool = True
-    stride: int = 1
-    pixel_stride: int = 1
-    depth_scale: float | None = None
-    intrinsics: list[float] | None = None
-    max_latency: float | None = 2.0
-
-    def __post_init__(self) -> None:
-        check_choice("poses", self.poses, ("tf", "standing", *METHODS))
-        check_choice("clock", self.clock, ("header", "received"))
-        check_number("max_gap", self.max_gap)
-        if self.max_latency is not None:
-            check_number("max_latency", self.max_latency)
 
 
 @dataclass
@@ -242,7 +203,7 @@ class LiveScans(Dataset):
                 self.trouble = self._tree.unknown_step(chain, item.stamp, self._options.max_gap)
             return is_ready
         except DataError as error:
-            self.trouble = _of_live(error)
+            self.trouble = text_of(error)
             return False
 
     def _last_needed(self, item: _Waiting) -> int:
@@ -266,7 +227,7 @@ class LiveScans(Dataset):
             if not self._tree.is_moving(chain):
                 self.trouble = (
                     f"TF has only static transforms from frame {chain[0]} up to {chain[-1]}; choose "
-                    "sensor.poses=standing for a sensor that does not move"
+                    f"{arg('poses')}=standing for a sensor that does not move"
                 )
                 return None
             if chain != self._candidate[0]:
@@ -304,7 +265,7 @@ class LiveScans(Dataset):
                 return False
             found = conversion.points(item.message)
         except (DataError, ValueError, KeyError, OverflowError) as error:
-            self.trouble = _of_live(error)
+            self.trouble = text_of(error)
             self._note("message that cannot be decoded")
             return False
         self._n_posed += 1
@@ -411,11 +372,6 @@ class LiveScans(Dataset):
         return None if self._first else torch.tensor(self._stamps, dtype=torch.float64)
 
 
-def _of_live(error: Exception) -> str:
-    """The text of an error with the names of live options."""
-    return str(error).replace("dataset.", "sensor.")
-
-
 def _size(message: dict[str, Any]) -> int:
     """Bytes of a message's arrays."""
     return sum(value.nbytes for value in message.values() if isinstance(value, np.ndarray))
@@ -448,12 +404,12 @@ def find_sensor(node: Node, wanted: str | None, wait: float) -> Sensor:
         what = "no topic of a range sensor" if name is None else f"no topic {name}"
         if name in topics:
             raise InvalidArgumentError(
-                f"sensor.topic={name} has messages of type {', '.join(topics[name])}; give a topic of a "
+                f"{arg('topic')}={name} has messages of type {', '.join(topics[name])}; give a topic of a "
                 f"PointCloud2, a LaserScan or a depth Image. Published topics: {listed}."
             )
         raise GmmTorchError(
             f"there is {what} after {wait:g} s. Published topics: {listed}. If it is published, check "
-            "ROS_DOMAIN_ID, node.middleware, and that it is published on node.interface."
+            "ROS_DOMAIN_ID, the middleware, and that it is published on the interface of this node."
         )
     best = min(_RANKS.index(sensor.topic.type) for sensor in found)
     found = [sensor for sensor in found if _RANKS.index(sensor.topic.type) == best]
@@ -461,7 +417,7 @@ def find_sensor(node: Node, wanted: str | None, wait: float) -> Sensor:
         names = ", ".join(sensor.topic.name for sensor in found)
         raise InvalidArgumentError(
             f"there are {len(found)} topics of a range sensor: {names}. Choose one: "
-            f"sensor.topic={found[0].topic.name}."
+            f"{arg('topic')}={found[0].topic.name}."
         )
     return found[0]
 
@@ -500,8 +456,8 @@ def _camera_info(node: Node, image: str) -> str:
     best = nearest_names(infos, image) if infos else []
     if len(best) != 1:
         raise InvalidArgumentError(
-            f"sensor.camera_info is not clear for the images of {image}; topics of type CameraInfo are "
-            f"{', '.join(infos) or 'none'}. Choose one, or state sensor.intrinsics=[fx,fy,cx,cy] in pixels, "
-            "without distortion."
+            f"{arg('camera_info')} is not clear for the images of {image}; topics of type CameraInfo are "
+            f"{', '.join(infos) or 'none'}. Choose one, or state {arg('intrinsics')}=[fx,fy,cx,cy] in "
+            "pixels, without distortion."
         )
     return best[0]

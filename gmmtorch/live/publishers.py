@@ -107,7 +107,7 @@ class MapPublisher:
             theta = probability(*evidence, self._resolution, grid.dim, query.rule)
             return grid, theta.cpu()
         except (InvalidArgumentError, MemoryLimitError) as error:  # no floor yet, or too large
-            self._node.warn("grid", f"topic map is not published: {error}")
+            self._node.warn("grid", f"topic map is not published: {error!s}")
             return None, torch.empty(0)
 
     def _box(self, shown: GaussianMap) -> tuple[list[float], list[float]]:
@@ -247,7 +247,7 @@ class PosePublisher:
                 self._robot = child = fixed[-1]
                 below = tree.lookup(fixed, np.array([newest.stamp]), 0.0).poses[0]
         except DataError as error:
-            self._node.warn("odometry", f"{error}; only the topic pose is published.")
+            self._node.warn("odometry", f"{error!s}; only the topic pose is published.")
         self.publish(location, newest, child, below)
 
 
@@ -285,8 +285,8 @@ class Diagnostics:
             self._node.warn(
                 "clock",
                 f"stamps are {seconds:.0f} s away from the clock of this node. For a recording that is "
-                "played set node.use_sim_time=true; for a sensor with a clock of its own "
-                "sensor.clock=received.",
+                "played set use_sim_time=true; for a sensor with a clock of its own "
+                "clock=received.",
             )
             return
         self._latencies.append(seconds)

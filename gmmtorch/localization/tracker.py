@@ -359,7 +359,7 @@ def _fault(step: float, usual: float) -> str:
     if step < 0:
         return (
             f"the clock goes back by {-step:.3g} s; readers of the trajectory drop the poses of one side: "
-            "correct the times of the recording (a bag: dataset.clock=received)"
+            "correct the times of the recording (a bag: clock=received)"
         )
     return (
         f"{step:.3g} s after the scan before it, usually {usual:.2g} s: scans are missing, or the clock jumps"

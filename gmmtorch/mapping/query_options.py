@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypedDict, get_args
 
+from gmmtorch.declarations import option
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_prior, check_whole
 from gmmtorch.mapping.learning.rules import LearningRule
 
@@ -26,12 +27,6 @@ SAMPLINGS: tuple[str, ...] = get_args(Sampling)
 class QueryOptions:
     """How a map answers queries. No option changes what the map stores.
 
-    prior: None: probabilities are calibrated, see `occupancy.calibrator`. A number N_p: they follow from
-        counts, with N_p added to each outcome, as in the thesis (3.9).
-    cutoff: Mahalanobis distance at which a component ends. None: 3 if components have many points (the
-        median support is at least 50), so that tails do not claim unseen space; otherwise 5, because few
-        points do not show where a surface ends.
-    n_samples: number of Monte Carlo rays, drawn from the whole map.
     sampling: "sobol", "stratified" or "plain".
     random_state: seed of the rays.
     memory_limit: largest number of bytes of evidence.
@@ -39,9 +34,18 @@ class QueryOptions:
     calibration: of the probabilities. None: that of the sensor model, for the ranges of the map's beams.
     """
 
-    prior: float | None = None
-    cutoff: float | None = None
-    n_samples: int = 1_000_000
+    prior: float | None = option(
+        None,
+        "null: calibrated probabilities; a number N_p: those of counts, θ = (H + N_p)/(H + M + 2N_p), as in "
+        "the thesis (3.9)",
+    )
+    cutoff: float | None = option(
+        None,
+        "Mahalanobis distance at which a component ends. null: 3 if components have many points (the median "
+        "support is at least 50), so that tails do not claim unseen space; otherwise 5, because few points "
+        "do not show where a surface ends",
+    )
+    n_samples: int = option(1_000_000, "Monte Carlo rays, drawn from the whole map")
     sampling: Sampling = "sobol"
     random_state: int = 0
     memory_limit: int = 4 << 30

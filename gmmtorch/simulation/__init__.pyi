@@ -2,6 +2,7 @@ from .buildings import World2D as World2D
 from .buildings import World3D as World3D
 from .buildings import building_2d as building_2d
 from .buildings import building_3d as building_3d
+from .camera_options import CameraOptions as CameraOptions
 from .furniture import box as box
 from .mesh_raycasting import ray_segments as ray_segments
 from .mesh_raycasting import ray_triangles as ray_triangles

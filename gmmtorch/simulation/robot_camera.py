@@ -14,13 +14,13 @@ import torch
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
-from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
+from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
+from gmmtorch.simulation.camera_options import CLOSEST_READING, CameraOptions
 from gmmtorch.simulation.mesh_world import MeshWorld
-from gmmtorch.simulation.sensors import check_share, pixel_rays
+from gmmtorch.simulation.sensors import pixel_rays
 
-_CLOSEST_READING = 1e-3
 _TEAMMATE_MARGIN = 0.05
 """Beams that pass a teammate's body closer than this (m) are dropped, because its outline is not exact."""
 
@@ -51,39 +51,8 @@ class DepthFrame:
 
 
 @dataclass(frozen=True)
-class DepthCamera:
-    """A pinhole depth camera whose noise grows with the square of the depth, as in triangulation.
-
-    Attributes:
-        width, height: pixels, evenly spaced on the image plane.
-        horizontal_fov, vertical_fov: angles (rad) between opposite edges of the image, below π.
-        max_range: surfaces at this distance (m) along a beam, or beyond, give no return.
-        noise: a depth of z metres along the optical axis has standard deviation noise · z² metres.
-        dropout: share of the pixels without a reading.
-
-    Raises `InvalidArgumentError` for a value out of its range.
-    """
-
-    width: int = 160
-    height: int = 120
-    horizontal_fov: float = 1.5184
-    vertical_fov: float = 1.0123
-    max_range: float = 6.0
-    noise: float = 0.0015
-    dropout: float = 0.01
-
-    def __post_init__(self) -> None:
-        check_whole("width", self.width, 1)
-        check_whole("height", self.height, 1)
-        for name in ("horizontal_fov", "vertical_fov"):
-            if not 0 < getattr(self, name) < math.pi:
-                raise InvalidArgumentError(
-                    f"{name}={getattr(self, name)} must be an angle above 0 and below π radians: "
-                    "a camera needs a field of view."
-                )
-        check_number("max_range", self.max_range, above=True, least=_CLOSEST_READING)
-        check_number("noise", self.noise)
-        check_share(self.dropout)
+class DepthCamera(CameraOptions):
+    """A pinhole depth camera whose noise grows with the square of the depth, as in triangulation."""
 
     @cached_property
     def directions(self) -> Tensor:
@@ -124,7 +93,7 @@ class DepthCamera:
         reach = truth.clamp_max(self.max_range)
         reading = reach + error * reach.square() * self.directions[:, 0]  # z = r · directions[:, 0]
         is_hit = (truth < self.max_range) & (reading < self.max_range)
-        reading = torch.where(is_hit, reading.clamp_min(_CLOSEST_READING), self.max_range)
+        reading = torch.where(is_hit, reading.clamp_min(CLOSEST_READING), self.max_range)
         body = radius + _TEAMMATE_MARGIN
         others = others[(others - origin).norm(dim=1) < self.max_range + body + _TEAMMATE_MARGIN]
         if len(others):

@@ -12,7 +12,7 @@ import resource
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +22,8 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
 
 from gmmtorch.cli import common, export, localize, map, view
-from gmmtorch.experiments.cli import experiment_schema, fit, occupancy
+from gmmtorch.experiments.cli import fit, occupancy
 from gmmtorch.team.cli import explore, robot, ros, team
-from gmmtorch.team.cli.options import team_schema
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 CONF = Path(common.conf_dir())
@@ -32,8 +31,8 @@ CONF = Path(common.conf_dir())
 
 def register_schemas() -> None:
     """Stores the options of all commands in Hydra's config store."""
-    experiment_schema.register()
-    team_schema.register()
+    for command in COMMANDS.values():
+        command.register()
 
 
 COMMANDS = {
@@ -60,6 +59,15 @@ def composed(command: str, *overrides: str) -> DictConfig:
     register_schemas()
     with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
         return compose(command, overrides=list(overrides))
+
+
+def shrink(monkeypatch: pytest.MonkeyPatch, study: type, **values: Any) -> None:
+    """Gives fields of a study that are no options other defaults."""
+    made: Any = study.__init__
+    names = [item.name for item in fields(study)]
+    changed = {**dict(zip(names, made.__defaults__, strict=True)), **values}
+    assert len(changed) == len(names)
+    monkeypatch.setattr(made, "__defaults__", tuple(changed.values()))
 
 
 def room_mesh(path: Path) -> Path:

@@ -20,11 +20,13 @@ from command_runs import (
     refused,
     run_here,
     run_script,
+    shrink,
     succeeded,
     timeless,
 )
 
 import gmmtorch
+from gmmtorch.experiments.studies import ComponentCountStudy, InitializationStudy, SensorModelStudy
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 from gmmtorch.occupancy.occupancy_grid import OccupancyGrid
@@ -232,7 +234,7 @@ def test_initialization_study(run):
     ]
     done = succeeded(run("fit", "experiment=fig2_1_initialization", *options))
     results = done.results()
-    starts = results["config"]["study"]["init_params"]
+    starts = InitializationStudy().init_params
     assert len(results["rows"]) == 2 * 2 * len(starts)
     for row in results["rows"]:
         assert FIT_FIELDS | {"init_params", "seed", "init_seconds", "em_seconds"} <= row.keys()
@@ -247,20 +249,16 @@ def test_initialization_study(run):
     assert table == [["kmeans", "2", "2"], ["kmeans", "5", "2"]]
 
 
-def test_sensor_model_study(run):
+def test_sensor_model_study(run, monkeypatch):
+    small = {"n_points": 300, "max_beams": 200, "test_every": 3, "resolution": 0.5, "n_samples": 5000}
+    shrink(monkeypatch, SensorModelStudy, sensor="laser_2d", **small)
     done = succeeded(
         run(
             "fit",
             "experiment=sensor_model",
             "dataset=synthetic_building_2d",
             "dataset.n_scans=6",
-            "study.sensor=laser_2d",
             "study.n_components=[4]",
-            "study.n_points=300",
-            "study.max_beams=200",
-            "study.test_every=3",
-            "study.resolution=0.5",
-            "study.n_samples=5000",
             "report.figures=true",
         )
     )
@@ -273,7 +271,10 @@ def test_sensor_model_study(run):
     assert "sensor_model.png" in done.files()
 
 
-def test_component_count_study(run):
+def test_component_count_study(run, monkeypatch):
+    small = {"window": 3, "max_beams": 200, "test_every": 3, "resolution": 0.5, "n_samples": 5000}
+    rules = {"multiples": (1.0,), "bandwidths": (0.4,), "window_components": (4,)}
+    shrink(monkeypatch, ComponentCountStudy, **small, **rules)
     done = succeeded(
         run(
             "fit",
@@ -281,14 +282,6 @@ def test_component_count_study(run):
             "dataset=synthetic_building_2d",
             "dataset.n_scans=6",
             "study.n_components=[2,4]",
-            "study.multiples=[1]",
-            "study.bandwidths=[0.4]",
-            "study.window=3",
-            "study.window_components=[4]",
-            "study.max_beams=200",
-            "study.test_every=3",
-            "study.resolution=0.5",
-            "study.n_samples=5000",
             "report.figures=true",
             "report.tensorboard=true",
         )
@@ -354,12 +347,11 @@ def test_an_invalid_map_option_gives_a_one_line_error(options, words, run):
         ("scans=[99]", "scans=[99] 0 39"),
         ("max_points=0", "max_points=0"),
         ("mixture.n_components=9999", "n_components=9999"),
-        ("mixture.n_components=null method=[scikit_learn]", "mixture.n_components=null scikit_learn"),
+        ("mixture.n_components=null method=[scikit_learn]", "mixture.n_components=None scikit_learn"),
         ("experiment=fig2_1_initialization study.n_seeds=0", "study.n_seeds=0"),
         ("experiment=fig2_1_initialization study.n_components=[999]", "n_components=999 200"),
         ("+method_options.em.branching=2", "method_options.em.branching warm_start"),
         ("+method_options.hierarchical.branching=1 method=[hierarchical]", "branching=1"),
-        ("experiment=sensor_model study.sensor=sonar", "study.sensor='sonar' lidar"),
         ("experiment=sensor_model +study.sensor_options.axial=1", "study.sensor_options axial noise"),
         ("experiment=fig2_1_initialization study.name=history", "study.name='history' initialization"),
     ],

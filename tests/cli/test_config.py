@@ -19,10 +19,9 @@ from hydra.core.config_store import ConfigStore
 from hydra.errors import ConfigCompositionException
 from omegaconf import DictConfig, OmegaConf
 
-from gmmtorch.cli import common, export, localize
-from gmmtorch.cli.from_options import maps
-from gmmtorch.cli.from_options.scans import open_dataset
-from gmmtorch.datasets import sources
+from gmmtorch import datasets
+from gmmtorch.cli import common, export, inputs, localize
+from gmmtorch.cli.inputs import open_dataset
 from gmmtorch.errors import InvalidArgumentError, MissingDataError
 from gmmtorch.experiments.cli import methods_of_options
 from gmmtorch.experiments.cli import studies as study_cases
@@ -34,7 +33,7 @@ from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
 from gmmtorch.simulation.mine import tunnels
 from gmmtorch.simulation.warehouses import warehouse
-from gmmtorch.team.cli.from_options import missions
+from gmmtorch.team.cli import missions
 from gmmtorch.team.exploration.mission.options import FRAMEWORKS, THESIS, TeamOptions
 from gmmtorch.team.exploration.mission.trials import WorldOptions
 from gmmtorch.team.exploration.planning.planners import PLANNERS
@@ -81,7 +80,7 @@ def plain(node: DictConfig) -> dict[str, Any]:
 @pytest.mark.parametrize("dataset", choices("dataset"))
 def test_every_data_set_composes_and_its_reader_takes_its_options(dataset, tmp_path):
     config = composed("fit", f"dataset={dataset}").dataset
-    source = sources._SOURCES[dataset]
+    source = datasets.OPTIONS[dataset]
     assert (config.name, config.get("stride", 1)) == (dataset, 1)
     assert (config.no_return_range, config.max_range) == (source.no_return_range, source.max_range)
     if "path" not in list(config):  # `in` is False for a missing value
@@ -106,11 +105,6 @@ def test_every_experiment_composes_and_its_methods_and_study_exist(command, name
         return
     studies = study_cases.STUDIES[command]
     assert config.study.name in studies
-    expected = OmegaConf.structured(stored("study", config.study.name))
-    assert set(differences(config.study, expected)) <= {"others", "sensor_options"}
-    listing = (CONF / "experiment" / f"{name}.yaml").read_text(encoding="utf-8").split("\nstudy:")[1]
-    shown = set(re.findall(r"^  (\w+):", listing, re.MULTILINE))
-    assert shown == set(config.study) - {"name"}, "the file shows all options of the study"
     with pytest.raises(ConfigCompositionException, match="nonsense"):
         composed(command, f"experiment={name}", "study.nonsense=1")
 
@@ -158,14 +152,14 @@ def test_worlds_teams_and_planners_compose(world, team, planner, tmp_path):
 
 def test_the_file_of_the_thesis_team_has_its_options():
     config = composed("explore", "team=gmm_thesis")
-    assert {name: config.map.get(name, config.codec) for name in THESIS} == THESIS
+    assert config.codec == THESIS["codec"]
     plain = missions.team_options(composed("explore"), 0, {"team": "gmm_thesis"})
     assert missions.team_options(config, 0, {}) == plain
 
 
 def test_options_that_are_not_of_the_thesis_team_are_refused():
-    with pytest.raises(InvalidArgumentError, match=r"team=gmm_thesis with shell=0.5.* has 0.0"):
-        missions.team_options(composed("explore", "team=gmm_thesis", "map.shell=0.5"), 0, {})
+    with pytest.raises(InvalidArgumentError, match=r"team=gmm_thesis with codec=float.* has thesis"):
+        missions.team_options(composed("explore", "team=gmm_thesis", "codec=float"), 0, {})
     with pytest.raises(InvalidArgumentError, match="team=gmm_thesis sets options of all teams"):
         missions.variants_of(composed("explore", "team=gmm_thesis", "experiment=deviations"))
 
@@ -232,50 +226,20 @@ def stored(*path: str) -> Any:
     return ConfigStore.instance().load("/".join([*folder, *path]) + ".yaml").node
 
 
-def differences(config: Any, expected: Any, prefix: str = "") -> Iterator[str]:
-    """Dotted names of the options whose values differ; options that are missing in `expected` are skipped."""
-    for name in expected:
-        if OmegaConf.is_missing(expected, name):
-            continue
-        value, wanted = config[name], expected[name]
-        if isinstance(value, DictConfig) and isinstance(wanted, DictConfig):
-            yield from differences(value, wanted, f"{prefix}{name}.")
-        elif value != wanted:
-            yield f"{prefix}{name}"
-
-
-@pytest.mark.parametrize("command", CONFIGURED)
-def test_the_files_repeat_the_defaults_of_the_schema(command):
-    config = composed(command)
-    assert OmegaConf.missing_keys(config) == (set())
-    changed = {"method"} if command in SCORED else {"clock"} if command == "team" else set()
-    expected = OmegaConf.structured(stored(f"{'robot' if command == 'team' else command}_schema"))
-    assert set(differences(config, expected)) == changed | ({"scans"} if command == "fit" else set())
-    assert set(config) >= set(expected)
-
-
-@pytest.mark.parametrize(
-    ("choice", "kind"),
-    [
-        ("world=warehouse", "generated"),
-        *((f"team={name}", "team") for name in choices("team")),
-        ("planner=mcts", "tree"),
-        ("planner=frontier", "planner"),
-        ("planner=random", "planner"),
-    ],
-)
-def test_the_files_of_a_group_repeat_the_defaults_of_the_schema(choice, kind):
-    group, name = choice.split("=")
-    node = composed("explore", choice)[group]
-    assert node.name == name
-    assert not list(differences(node, OmegaConf.structured(stored(group, kind))))
+def test_files_in_conf_have_no_value_that_is_the_default():
+    """An option is told once: a file has what differs from the declarations, and choices."""
+    for command in CONFIGURED:
+        given = OmegaConf.load(CONF / f"{command}.yaml")
+        assert set(given) == {"defaults", "hydra"}, command
+    for name in choices("dataset"):
+        assert set(OmegaConf.load(CONF / "dataset" / f"{name}.yaml")) == {"defaults", "name"}
 
 
 @pytest.mark.parametrize("name", MAPS)
 def test_a_map_of_the_options_has_the_default_rule_and_answers(name):
     config = composed("occupancy", f"map={name}")
     assert config.map.name == name
-    made = maps.map_factory(config)()
+    made = inputs.map_factory(config)()
     assert made.learning == MAPS[name]
     assert made.codec == GaussianMap().codec
 
@@ -283,20 +247,20 @@ def test_a_map_of_the_options_has_the_default_rule_and_answers(name):
 @pytest.mark.parametrize(
     ("name", "more", "expected"),
     [
-        ("per_scan", "map.min_points=4", {"window": 1, "min_points": 4, "dtype": "float64"}),
-        ("windowed", "map.max_cells=500", {"window": 20, "max_origins": 8, "max_cells": 500}),
+        ("per_scan", "seed=7", {"window": 1, "max_origins": 1, "dtype": "float64"}),
+        ("windowed", "map.window=5", {"window": 5, "max_origins": 8}),
         ("incremental", "map.window=3 map.n_components=30", {"window": 3, "n_components": 30}),
         ("incremental", "map.novelty={threshold:2}", {"novelty": NoveltyRule(threshold=2)}),
     ],
 )
 def test_the_map_has_the_options_of_its_group(name, more, expected):
-    options = ["map.noise=0.02", "map.prior=0.5", "map.sampling=plain", "runtime.dtype=float64", "seed=7"]
+    options = ["map.noise=0.02", "map.prior=0.5", "runtime.dtype=float64", "seed=7"]
     options += ["map.cutoff=4", "map.codec=float", "map.n_samples=1000"]
-    made = maps.map_factory(composed("occupancy", f"map={name}", *more.split(), *options))()
+    made = inputs.map_factory(composed("occupancy", f"map={name}", *more.split(), *options))()
     assert made.learning.noise == 0.02
     assert {option: getattr(made.learning, option) for option in expected} == expected
     how = made.query_options
-    assert (how.n_samples, how.sampling, how.prior, how.random_state) == (1000, "plain", 0.5, 7)
+    assert (how.n_samples, how.prior, how.random_state) == (1000, 0.5, 7)
     assert (how.cutoff, made.codec) == (4, "float")
 
 
@@ -315,36 +279,12 @@ def test_a_fit_of_the_options_is_the_default_one():
 
 def test_robots_and_teams_have_the_options_of_an_exploration():
     explore, robot, team = (OmegaConf.to_container(composed(name)) for name in ("explore", "robot", "team"))
-    assert team == {**robot, "clock": None}
+    assert team == robot
     del robot["runtime"]["memory_limit"]  # of the map of a replayed log
     for name in ("report", "evaluation", "network", "runtime"):
         assert robot[name].items() <= explore[name].items()
     different = {"transport", "report", "evaluation", "network", "runtime"}
     assert all(robot[name] == explore[name] for name in (robot.keys() & explore.keys()) - different)
-
-
-@pytest.mark.parametrize("command", [name for name in CONFIGURED if name != "team"])
-def test_the_configuration_file_shows_every_option(command):
-    """`--help` prints the composed configuration; the file explains each option."""
-    bases = {"explore": ["exploration"], "robot": ["exploration", "link"], "ros": ["link"]}
-    files = [f"{command}.yaml", *(f"{name}_base.yaml" for name in bases.get(command, []))]
-    text = "".join((CONF / name).read_text(encoding="utf-8") for name in files)
-    groups = {"dataset", "world", "team", "planner", "study"} | (
-        {"map"} if command in ("occupancy", "map") else set()
-    )
-
-    def leaves(node: Any, prefix: str = "") -> Iterator[str]:
-        for name in node:
-            full = f"{prefix}{name}"
-            if full in groups or full in ("log.dataset", "log.map"):
-                continue
-            if not OmegaConf.is_missing(node, name) and isinstance(node[name], DictConfig) and node[name]:
-                yield from leaves(node[name], f"{full}.")
-            else:
-                yield str(name)
-
-    for name in leaves(OmegaConf.structured(stored(f"{command}_schema"))):
-        assert re.search(rf"^ *{name}:", text, re.MULTILINE), name
 
 
 # -- the folder conf/ -----------------------------------------------------------------------------

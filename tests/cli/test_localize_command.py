@@ -11,7 +11,6 @@ import torch
 from command_runs import QUIET, Finished, refused, run_here, succeeded
 from sensor_bags import BagWriter
 
-from gmmtorch.cli.localize import overrides
 from gmmtorch.datasets import Dataset, load
 from gmmtorch.datasets.trajectory import read_trajectory
 from gmmtorch.export.trajectory_files import write_tum
@@ -43,10 +42,6 @@ def run(monkeypatch, tmp_path, saved):
         return run_here(monkeypatch, "localize", tmp_path / "run", f"map={saved}", *RECORDING, *options)
 
     return localize
-
-
-def test_the_short_form_of_the_map_becomes_its_path():
-    assert overrides(["map=a.safetensors", "map.bounds=[0]", "--cfg", "job"])[0] == "map.path=a.safetensors"
 
 
 def test_scans_are_found_and_scored_and_every_file_is_written(run, scans):
@@ -148,6 +143,5 @@ def test_errors_are_one_line(run, monkeypatch, tmp_path, saved):
     assert "motion=imu cannot be used: it needs the IMU of a ROS bag" in refused(run("motion=imu"))
     assert "align='scale' is not one of" in refused(run("align=scale"))
     assert "truth=none.tum does not exist" in refused(run("truth=none.tum"))
-    assert "distance=-1" in refused(run("distance=-1"))
     (tmp_path / "late.tum").write_text("1000 0 0 0 0 0 0 1\n1001 0 0 0 0 0 0 1\n")
     assert "has no pose at the time of a scan" in refused(run(f"truth={tmp_path / 'late.tum'}"))

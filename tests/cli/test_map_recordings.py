@@ -14,10 +14,9 @@ import pytest
 import torch
 from command_runs import QUIET, Finished, refused, run_here, succeeded
 
-from gmmtorch.cli.reporting import map_outputs
-from gmmtorch.cli.runs import map_recordings
-from gmmtorch.cli.runs.inputs import find_recordings
-from gmmtorch.cli.runs.tasks import run_tasks
+from gmmtorch.cli import recordings as map_recordings
+from gmmtorch.cli.outputs import map_outputs
+from gmmtorch.cli.recordings import find_recordings, run_tasks
 from gmmtorch.datasets import load
 from gmmtorch.errors import MissingDataError
 from gmmtorch.mapping.components import Components

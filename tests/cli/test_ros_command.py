@@ -25,7 +25,6 @@ from exploration.replays import content
 from mapping.random_components import random_components
 from sensor_bags import BagWriter
 
-from gmmtorch.cli import common
 from gmmtorch.datasets.base import Ranges
 from gmmtorch.datasets.ros.bag_reader import LASER as LASERS
 from gmmtorch.datasets.ros.bag_reader import Sensor, Topic
@@ -34,8 +33,8 @@ from gmmtorch.live.live_scans import LiveOptions, LiveScans
 from gmmtorch.live.ros import Node
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.map_builder import MapBuilder
-from gmmtorch.team.cli.from_options import links
-from gmmtorch.team.cli.from_options.robots import shared_map
+from gmmtorch.team.cli import links, robots
+from gmmtorch.team.cli.robots import shared_map
 from gmmtorch.team.sharing import Replica
 from gmmtorch.team.sharing.shared_map import SharedMap
 from gmmtorch.team.sharing.transport.udp import UdpTransport
@@ -79,7 +78,7 @@ def test_wrong_options_are_errors_of_one_line(monkeypatch, tmp_path, ros_domain,
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_robot_that_starts_again_keeps_its_frame(monkeypatch, tmp_path, dim):
-    monkeypatch.setattr(common, "run_dir", lambda: tmp_path)
+    monkeypatch.setattr(robots, "run_dir", lambda: tmp_path)
     config = composed("ros", "transport=udp", "start=unknown", "link.listen=127.0.0.1:0")
     made = [random_components(dim, k=3, seed=seed) for seed in range(2)]
     for number, components in enumerate(made):

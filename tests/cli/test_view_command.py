@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from command_runs import composed, refused, run_here, succeeded
 
-from gmmtorch.cli.from_options import maps
+from gmmtorch.cli import inputs
 from gmmtorch.cli.view import overrides
 from gmmtorch.datasets import load
 from gmmtorch.mapping.gaussian_map import GaussianMap
@@ -50,5 +50,5 @@ def test_html_of_a_part_of_a_map_in_tiles(monkeypatch, tmp_path):
     html = f"html={tmp_path / 'map.html'}"
     succeeded(run_here(monkeypatch, "view", tmp_path, f"path={tmp_path}", html, "bounds=[2,10,3,11]"))
     assert (tmp_path / "map.html").stat().st_size > 10_000
-    part = maps.open_map(tmp_path, composed("view").runtime, [2, 10, 3, 11])
-    assert 0 < part.n_components <= maps.open_map(tmp_path, composed("view").runtime).n_components
+    part = inputs.open_map(tmp_path, composed("view").runtime, [2, 10, 3, 11])
+    assert 0 < part.n_components <= inputs.open_map(tmp_path, composed("view").runtime).n_components

@@ -164,8 +164,8 @@ def test_load_states_the_expected_content_of_a_missing_path(name, tmp_path):
 @pytest.mark.parametrize(
     ("name", "path", "options", "error", "message"),
     [
-        ("carmen", None, {}, InvalidArgumentError, r"dataset\.path is not set"),
-        ("carmen", "", {}, InvalidArgumentError, r"dataset\.path is not set"),
+        ("carmen", None, {}, InvalidArgumentError, r"path is not set"),
+        ("carmen", "", {}, InvalidArgumentError, r"path is not set"),
         ("carmen", "/", {}, MissingDataError, "not a file"),
         ("carmen", "/", {"seed": 1}, InvalidArgumentError, "takes no further options"),
         ("synthetic_building", "/", {}, InvalidArgumentError, "is simulated"),

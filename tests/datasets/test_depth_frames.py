@@ -52,7 +52,7 @@ def test_depth_frames_are_turned_so_that_up_is_z(tmp_path, up):
     motion = turned.image(0)[1] @ torch.linalg.inv(given.image(0)[1])
     assert float(torch.linalg.det(motion[:3, :3])) == pytest.approx(1)
     torch.testing.assert_close(given[0].transformed(motion).points, turned[0].points)
-    with pytest.raises(InvalidArgumentError, match=r"dataset\.up='w' is not one of z, -z"):
+    with pytest.raises(InvalidArgumentError, match=r"up='w' is not one of z, -z"):
         load("depth_frames", folder, up="w")
 
 

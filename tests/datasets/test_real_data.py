@@ -136,7 +136,7 @@ def test_a_ros_1_bag_of_merged_lasers_needs_no_option(real_data):
 
 def test_a_bag_without_tf_is_read_as_a_standing_sensor_by_one_option(real_data):
     path = real_data / "bags" / "truck_lidar"
-    with pytest.raises(DataError, match=r"has no TF.*dataset\.poses=standing.*/base_pose_ground_truth"):
+    with pytest.raises(DataError, match=r"has no TF.*poses=standing.*/base_pose_ground_truth"):
         load("rosbag", path)
     dataset = load("rosbag", path, poses="standing")
     assert [scan.points.shape[0] for scan in dataset] == [35707, 36055, 36267, 36457, 36336]

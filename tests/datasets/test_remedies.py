@@ -14,7 +14,7 @@ from test_depth_cameras import OWN, camera, recorded
 from test_rosbag import POINTS, drive, moved
 
 from gmmtorch.datasets import load
-from gmmtorch.errors import GmmTorchError
+from gmmtorch.errors import GmmTorchError, text_of
 
 pytest.importorskip("rosbags")
 
@@ -167,10 +167,10 @@ def remedies(message: str, case: Case, options: dict[str, Any], folder: Path) ->
         **case.values,
     }
     message = message.replace(
-        "dataset.poses=TOPIC, FILE or standing",
-        "dataset.poses=TOPIC dataset.poses=FILE dataset.poses=standing",
+        "‹poses›=TOPIC, FILE or standing",
+        "‹poses›=TOPIC ‹poses›=FILE ‹poses›=standing",
     )
-    found = re.findall(r"dataset\.(\w+)(?:=(\[[\w,]*\]|[\w/.-]*[\w/]))?", message)
+    found = re.findall(r"‹(\w+)›(?:=(\[[\w,]*\]|[\w/.-]*[\w/]))?", message)
     named = [(name, known.get(value or name, value)) for name, value in found]
     return [
         {name: value} for name, value in named if value is not None and str(options.get(name)) != str(value)
@@ -186,7 +186,7 @@ def check(case: Case, path: Path, options: dict[str, Any], folder: Path, depth: 
     if error is None:
         assert any(len(scan.points) for scan in scans)
         return True
-    found = remedies(str(error), case, options, folder)
+    found = remedies(text_of(error), case, options, folder)
     assert found, f"no remedy in: {error}"
     assert depth < 3, f"the remedies of {options} lead to: {error}"
     for remedy in found:

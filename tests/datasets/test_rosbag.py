@@ -279,7 +279,7 @@ def test_poses_come_from_a_topic_and_the_static_mount(tmp_path):
         for time in (0.0, 1.0):
             bag.odometry("/odom", time, "odom", "base", moved(4 * time))
         bag.cloud("/points", 0.5, "lidar", POINTS)
-    with pytest.raises(DataError, match=r"only static transforms.*dataset\.poses=standing.*/odom"):
+    with pytest.raises(DataError, match=r"only static transforms.*poses=standing.*/odom"):
         load("rosbag", tmp_path / "a.mcap")
     dataset = load("rosbag", tmp_path / "a.mcap", poses="/odom")
     np.testing.assert_allclose(dataset.pose(0).numpy(), moved(2, 0, 0.5), atol=1e-12)
@@ -291,13 +291,13 @@ def test_a_topic_of_poses_without_a_mount_asks_for_it(tmp_path):
     with BagWriter(tmp_path / "a.mcap") as bag:
         bag.odometry("/odom", 0.0, "odom", "base", moved(0))
         bag.cloud("/points", 0.0, "lidar", POINTS)
-    with pytest.raises(DataError, match=r"frame base.*frame lidar.*dataset\.extrinsic"):
+    with pytest.raises(DataError, match=r"frame base.*frame lidar.*extrinsic"):
         load("rosbag", tmp_path / "a.mcap", poses="/odom")
-    with pytest.raises(InvalidArgumentError, match=r"dataset\.extrinsic=\[1, 2\]"):
+    with pytest.raises(InvalidArgumentError, match=r"extrinsic=\[1, 2\]"):
         load("rosbag", tmp_path / "a.mcap", poses="/odom", extrinsic=[1, 2])
     with pytest.raises(InvalidArgumentError, match=r"poses=/points has messages.*which are not poses"):
         load("rosbag", tmp_path / "a.mcap", poses="/points")
-    with pytest.raises(InvalidArgumentError, match=r"dataset\.poses=/pose is neither.*/odom"):
+    with pytest.raises(InvalidArgumentError, match=r"poses=/pose is neither.*/odom"):
         load("rosbag", tmp_path / "a.mcap", poses="/pose")
 
 
@@ -331,15 +331,13 @@ def test_a_choice_of_sensors_is_listed_with_counts(tmp_path):
             for i in range(n):
                 bag.cloud(topic, i / 10, "lidar", POINTS)
         bag.laser("/scan", 0.0, "lidar", [1.0], 0.0, 0.1, 8.0)
-    with pytest.raises(
-        InvalidArgumentError, match=r"/front.*2 messages.*/rear.*1 messages.*dataset\.topic=/front"
-    ):
+    with pytest.raises(InvalidArgumentError, match=r"/front.*2 messages.*/rear.*1 messages.*topic=/front"):
         load("rosbag", tmp_path / "a.mcap")
     assert len(load("rosbag", tmp_path / "a.mcap", topic="/rear")) == 1
     assert load("rosbag", tmp_path / "a.mcap", topic="/scan")[0].dim == 2
-    with pytest.raises(InvalidArgumentError, match=r"dataset\.topic=/top is not in.*/front"):
+    with pytest.raises(InvalidArgumentError, match=r"topic=/top is not in.*/front"):
         load("rosbag", tmp_path / "a.mcap", topic="/top")
-    with pytest.raises(DataError, match=r"dataset\.topic=/tf is not a range sensor"):
+    with pytest.raises(DataError, match=r"topic=/tf is not a range sensor"):
         load("rosbag", tmp_path / "a.mcap", topic="/tf")
 
 

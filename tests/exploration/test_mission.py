@@ -21,7 +21,7 @@ from gmmtorch.kernels import kernels
 from gmmtorch.mapping.components import Components
 from gmmtorch.simulation.furniture import box
 from gmmtorch.simulation.robot_camera import DepthCamera
-from gmmtorch.team.cli.reporting.explore_pictures import _coverage, _team_view
+from gmmtorch.team.cli.explore_pictures import _coverage, _team_view
 from gmmtorch.team.exploration.mission.driver import SimulatedClock, Stopwatch, WallClock, drive, settle
 from gmmtorch.team.exploration.mission.mission import Mission
 from gmmtorch.team.exploration.mission.options import FRAMEWORKS, THESIS, TeamOptions
@@ -34,7 +34,7 @@ from gmmtorch.team.exploration.world.world import World
 from gmmtorch.team.sharing.messages.mission_messages import PlanMessage, encode_plan
 from gmmtorch.team.sharing.replica.replica import Replica
 from gmmtorch.team.sharing.store import Store
-from gmmtorch.team.sharing.transport.simulated_network import Partition
+from gmmtorch.team.sharing.transport.link_conditions import Partition
 from gmmtorch.team.sharing.transport.udp import UdpTransport
 
 CONTRACT = """

@@ -14,13 +14,8 @@ from invalid_values import each_value
 from scipy import stats
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.team.sharing.transport.simulated_network import (
-    LinkConditions,
-    Network,
-    Partition,
-    Reception,
-    Traffic,
-)
+from gmmtorch.team.sharing.transport.link_conditions import LinkConditions, Partition
+from gmmtorch.team.sharing.transport.simulated_network import Network, Reception, Traffic
 
 N = 3
 UNLIKELY = 1e-4  # seeds are fixed, so that results are reproducible
@@ -311,6 +306,7 @@ def test_invalid_partitions_are_named(bad):
     with pytest.raises(InvalidArgumentError) as caught:
         LinkConditions(partitions=[good, bad])
     assert str(caught.value).startswith(f"partitions[1]={bad!r} must have begin and end")
+    assert caught.value.argument == "partitions"
 
 
 @pytest.mark.parametrize(

@@ -78,7 +78,7 @@ class TfPoses:
                 raise DataError(
                     f"{self._where}: TF has no frame {frame or '(unnamed)'}, in which the sensor measures; "
                     f"its frames are {self._tree.describe()}. State which of them is the sensor's: "
-                    "dataset.sensor_frame=NAME, or choose other poses: dataset.poses=TOPIC, FILE or standing."
+                    "‹sensor_frame›=NAME, or choose other poses: ‹poses›=TOPIC, FILE or standing."
                 )
             try:
                 self._chains[frame] = self._tree.chain(frame, self._top)
@@ -177,8 +177,7 @@ def mount_of(extrinsic: list[float] | None) -> Pose | None:
         return Pose.from_quaternion(numbers[:3], numbers[3:])
     except (TypeError, ValueError) as error:
         raise InvalidArgumentError(
-            f"dataset.extrinsic={extrinsic} is not the sensor's pose on the body: give x, y, z (m), qx, qy, "
-            "qz, qw."
+            f"‹extrinsic›={extrinsic} is not the sensor's pose on the body: give x, y, z (m), qx, qy, qz, qw."
         ) from error
 
 
@@ -240,7 +239,7 @@ class BagSurvey:
             self._file = Path(str(poses)).expanduser()
             if not self._file.is_file():
                 raise InvalidArgumentError(
-                    f"dataset.poses={poses} is neither tf, standing, a topic of the bag, nor a file. "
+                    f"‹poses›={poses} is neither tf, standing, a topic of the bag, nor a file. "
                     f"{self._remedy()}"
                 )
         self.heads: list[tuple[int, bytes]] = []
@@ -278,7 +277,7 @@ class BagSurvey:
             what = "changes" if self._infos else "cannot be decoded"
             raise DataError(
                 f"{self._reader.path}: the camera info of {self._info_topic} {what}. State the images' own: "
-                "dataset.intrinsics=[fx,fy,cx,cy] in pixels, without distortion."
+                "‹intrinsics›=[fx,fy,cx,cy] in pixels, without distortion."
             )
         return next(iter(self._infos.values()), None)
 
@@ -286,15 +285,15 @@ class BagSurvey:
         types = [t.type for t in self._reader.topics if t.name == self._pose_topic]
         if not set(types) <= set(POSE_TYPES):
             raise InvalidArgumentError(
-                f"dataset.poses={self._pose_topic} has messages of type {', '.join(types)}, which are not "
+                f"‹poses›={self._pose_topic} has messages of type {', '.join(types)}, which are not "
                 f"poses. {self._remedy()}"
             )
 
     def _remedy(self) -> str:
         topics = [t for t in self._reader.topics if t.type in POSE_TYPES and t.n_messages]
         return (
-            "Choose dataset.poses=standing for a sensor that does not move, dataset.poses=FILE for a TUM or "
-            f"KITTI trajectory, or dataset.poses=TOPIC; topics of poses: {listed(topics)}."
+            "Choose ‹poses›=standing for a sensor that does not move, ‹poses›=FILE for a TUM or "
+            f"KITTI trajectory, or ‹poses›=TOPIC; topics of poses: {listed(topics)}."
         )
 
     def of_frame(self, records: list[Record], wanted: str, where: str) -> list[Record]:
@@ -313,8 +312,8 @@ class BagSurvey:
             return [record._replace(frame=wanted) for record in records if record.frame in unknown]
         best = frames.most_common(1)[0][0]
         raise InvalidArgumentError(
-            f"dataset.sensor_frame={wanted} is not a frame of {where}, whose frames are {_counted(frames)}; "
-            f"choose one: dataset.sensor_frame={best}."
+            f"‹sensor_frame›={wanted} is not a frame of {where}, whose frames are {_counted(frames)}; "
+            f"choose one: ‹sensor_frame›={best}."
         )
 
     def _seen_from(self, frame: str, wanted: str | None) -> str | None:
@@ -344,7 +343,7 @@ class BagSurvey:
         if seen_from is not None and sensor_frame is None and self._poses != "standing":
             _log.warning(
                 "%s: points are in the fixed frame %s already, and seen from %s. If %s is the frame of the "
-                "sensor instead, choose dataset.sensor_frame=%s.",
+                "sensor instead, choose sensor_frame=%s.",
                 *(where, first, seen_from or "the poses", first, first),
             )
         if self._poses in (None, "tf"):
@@ -361,14 +360,14 @@ class BagSurvey:
             best = next(frame for frame, _ in frames.most_common() if frame)
             raise InvalidArgumentError(
                 f"{where}: several sensors share the topic, with frames {_counted(frames)}; choose one: "
-                f"dataset.sensor_frame={best}."
+                f"‹sensor_frame›={best}."
             )
         if self._file is None:
             return Standing()
         if seen_from is not None:
             raise InvalidArgumentError(
-                f"dataset.poses={self._poses} would move the points of {where} again: they are in the fixed "
-                f"frame {first} already. Choose dataset.poses=tf, or dataset.sensor_frame={first} if that is "
+                f"‹poses›={self._poses} would move the points of {where} again: they are in the fixed "
+                f"frame {first} already. Choose ‹poses›=tf, or ‹sensor_frame›={first} if that is "
                 "the frame of the sensor."
             )
         mounts = dict.fromkeys(frames, Pose.identity(3) if mount is None else mount)
@@ -392,7 +391,7 @@ class BagSurvey:
             raise DataError(
                 f"{where}: TF has only static transforms from frame {chains[0][0]} up to {chains[0][-1]}, so "
                 f"the sensor's motion is unknown. {self._remedy()} If points are in {chains[0][0]} already, "
-                "as SLAM systems publish them, state the frame of the sensor: dataset.sensor_frame=NAME."
+                "as SLAM systems publish them, state the frame of the sensor: ‹sensor_frame›=NAME."
             )
         return source
 
@@ -407,9 +406,9 @@ class BagSurvey:
             chain = []
         if not chain or self.tree.is_moving(chain):
             raise DataError(
-                f"{where}: dataset.poses={self._pose_topic} states poses of frame {body}, but TF has no "
+                f"{where}: ‹poses›={self._pose_topic} states poses of frame {body}, but TF has no "
                 f"static transform from there to the sensor's frame {frame or '(unnamed)'}. State the "
-                "sensor's pose on the body: dataset.extrinsic=[x,y,z,qx,qy,qz,qw], which is [0,0,0,0,0,0,1] "
+                "sensor's pose on the body: ‹extrinsic›=[x,y,z,qx,qy,qz,qw], which is [0,0,0,0,0,0,1] "
                 "if they are the same."
             )
         return self.tree.lookup(chain, np.zeros(1, np.int64), np.inf).poses[0]

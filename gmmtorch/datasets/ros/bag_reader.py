@@ -270,20 +270,20 @@ def choose_sensor(reader: BagReader, wanted: str | None) -> Sensor:
     named = [topic for topic in reader.topics if topic.name == wanted]
     if wanted is not None and not named:
         raise InvalidArgumentError(
-            f"dataset.topic={wanted} is not in {reader.path}, whose topics are {listed(reader.topics)}. "
-            "Choose another dataset.topic."
+            f"‹topic›={wanted} is not in {reader.path}, whose topics are {listed(reader.topics)}. "
+            "Choose another ‹topic›."
         )
     if len(named) > 1:
         raise DataError(
             f"{reader.path}: topic {wanted} has messages of {len(named)} types: {listed(named)}. Choose "
-            "another dataset.topic, or write each type to a topic of its own."
+            "another ‹topic›, or write each type to a topic of its own."
         )
     found = [
         sensor for topic in named or reader.topics if topic.n_messages and (sensor := _sensor(reader, topic))
     ]
     if not found:
-        what = f"dataset.topic={wanted} is not" if wanted else "has no topic of"
-        remedy = "Choose another dataset.topic." if wanted else "Record such a topic."
+        what = f"‹topic›={wanted} is not" if wanted else "has no topic of"
+        remedy = "Choose another ‹topic›." if wanted else "Record such a topic."
         raise DataError(
             f"{reader.path} {what} a range sensor with messages (PointCloud2, LaserScan, depth Image, or a "
             f"list of points). Its topics are {listed(reader.topics)}. {remedy}"
@@ -293,7 +293,7 @@ def choose_sensor(reader: BagReader, wanted: str | None) -> Sensor:
     if len(found) > 1:
         raise InvalidArgumentError(
             f"{reader.path} has {len(found)} topics of a range sensor: "
-            f"{listed([sensor.topic for sensor in found])}. Choose one: dataset.topic={found[0].topic.name}."
+            f"{listed([sensor.topic for sensor in found])}. Choose one: ‹topic›={found[0].topic.name}."
         )
     return found[0]
 
@@ -348,10 +348,10 @@ def choose_camera_info(reader: BagReader, image: str, wanted: str | None) -> str
         return wanted
     best = nearest_names(infos, image)
     if wanted is not None or len(best) != 1:
-        choice = f"Choose one: dataset.camera_info={best[0]}, or state" if best else "State"
+        choice = f"Choose one: ‹camera_info›={best[0]}, or state" if best else "State"
         raise InvalidArgumentError(
-            f"{reader.path}: dataset.camera_info={wanted} is not clear for the images of {image}; topics of "
-            f"type CameraInfo are {', '.join(infos) or 'none'}. {choice} dataset.intrinsics=[fx,fy,cx,cy] in "
+            f"{reader.path}: ‹camera_info›={wanted} is not clear for the images of {image}; topics of "
+            f"type CameraInfo are {', '.join(infos) or 'none'}. {choice} ‹intrinsics›=[fx,fy,cx,cy] in "
             "pixels, without distortion."
         )
     return best[0]
@@ -363,14 +363,14 @@ def choose_imu(reader: BagReader, wanted: str | None) -> str:
     if wanted is None and len(found) > 1:
         raise InvalidArgumentError(
             f"{reader.path} has {len(found)} topics of an IMU: {listed(found)}. Choose one: "
-            f"dataset.imu_topic={found[0].name}."
+            f"‹imu_topic›={found[0].name}."
         )
     chosen = [topic.name for topic in found if wanted in (None, topic.name)]
     if not chosen:
-        what = "has no topic" if wanted is None else f"has no topic dataset.imu_topic={wanted}"
+        what = "has no topic" if wanted is None else f"has no topic ‹imu_topic›={wanted}"
         raise InvalidArgumentError(
             f"motion=imu cannot be used: {reader.path} {what} of type sensor_msgs/Imu with messages, only "
-            f"{listed(found)}. Record one, or predict with motion=constant or motion=dataset."
+            f"{listed(found)}. Record one, or predict with ‹motion›=constant or ‹motion›=dataset."
         )
     return chosen[0]
 

@@ -22,7 +22,7 @@ from gmmtorch.pinhole import back_project, check_intrinsics, is_centered, pinhol
 
 _RECTIFIED = re.compile(r"(^|[/_])(rect(ified)?(?![a-z])|aligned_depth)", re.IGNORECASE)
 """Names of rectified images, such as image_rect_raw. RealSense projects aligned depth images with P."""
-_REMEDY = "State the images' own: dataset.intrinsics=[fx,fy,cx,cy] in pixels, without distortion"
+_REMEDY = "State the images' own: ‹intrinsics›=[fx,fy,cx,cy] in pixels, without distortion"
 _PLAUSIBLE = (0.05, 200.0)
 """Medians of depth images in metres."""
 _N_COEFFICIENTS = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
@@ -69,10 +69,10 @@ class ImageCamera:
     ) -> None:
         self._sensor = sensor
         self._info: dict[str, Any] | None = None
-        self._stride = check_whole("dataset.pixel_stride", pixel_stride, 1)
+        self._stride = check_whole("pixel_stride", pixel_stride, 1)
         self._scale = depth_scale
         if depth_scale is not None:
-            check_number("dataset.depth_scale", depth_scale, above=True)
+            check_number("depth_scale", depth_scale, above=True)
         self._given = None if intrinsics is None else pinhole_matrix(intrinsics)
         self._model: _Model | None = None
         self._has_depth = False
@@ -129,7 +129,7 @@ class ImageCamera:
             if not _PLAUSIBLE[0] <= median <= _PLAUSIBLE[1]:
                 _log.warning(
                     "%s: the median depth is %.3g m. If that is wrong, state the metres per unit of the "
-                    "images: dataset.depth_scale=0.001 for millimetres, 1 for metres.",
+                    "images: depth_scale=0.001 for millimetres, 1 for metres.",
                     self._sensor.topic.name,
                     median,
                 )
@@ -168,7 +168,7 @@ def _matrix(info: dict[str, Any], is_rectified: bool) -> Tensor:
     if not is_rectified and not is_distorted and p.any() and np.abs(p - k)[:2].max() > 1:
         _log.warning(
             "K %s is used, not P %s, because the topic's name does not contain rect. If the images are "
-            "rectified, state P: dataset.intrinsics=[%g,%g,%g,%g].",
+            "rectified, state P: intrinsics=[%g,%g,%g,%g].",
             *(k.tolist(), p.tolist(), p[0, 0], p[1, 1], p[0, 2], p[1, 2]),
         )
     return matrix

@@ -78,9 +78,9 @@ def open_rosbag(
     """
     source = "A bag of ROS 1 is a file; one of ROS 2 is a file or its folder."
     file = require_path(path, "file or folder", "a ROS bag (.bag, .mcap, .db3)", source)
-    check_choice("dataset.clock", clock, ("header", "received"))
+    check_choice("clock", clock, ("header", "received"))
     if not max_gap > 0:
-        raise InvalidArgumentError(f"dataset.max_gap={max_gap} must be a time above zero seconds.")
+        raise InvalidArgumentError(f"‹max_gap›={max_gap} must be a time above zero seconds.")
     reader = BagReader(file)
     sensor = choose_sensor(reader, topic)
     info = None
@@ -181,8 +181,8 @@ class RosBag(Dataset):
                 f"{self._where}: no scan has a pose. Frame {first.frame or '(unnamed)'}, stamps from "
                 f"{first.stamp / NANOSECONDS:.3f} to {last.stamp / NANOSECONDS:.3f} s; "
                 f"{self._source.explain(first.stamp, first.frame)}. If the sensor has a clock of its own, "
-                "use the times of recording: dataset.clock=received; if poses are rare, raise "
-                "dataset.max_gap."
+                "use the times of recording: ‹clock›=received; if poses are rare, raise "
+                "‹max_gap›."
             )
         unknown = (records[i].number for i in np.flatnonzero(~known))
         self._skip("no pose at the time of the scan", *unknown)
@@ -245,7 +245,7 @@ class RosBag(Dataset):
         except (DataError, ValueError, KeyError, OverflowError) as error:
             raise DataError(
                 f"{self._where}, frame {record.frame}, stamp {record.stamp / NANOSECONDS:.3f} s: "
-                f"{str(error).removesuffix('.')}."
+                f"{f'{error}'.removesuffix('.')}."
             ) from error
 
     def _message(self, index: int) -> dict[str, Any]:
@@ -381,7 +381,7 @@ def read_gyroscope(reader: BagReader, topic: str | None, clock: str) -> Gyroscop
         raise _unusable(
             f"{where} has {len(kept)} usable angular velocities in {faults.total() + len(times)} messages "
             f"({reasons})",
-            "Choose another dataset.imu_topic",
+            "Choose another ‹imu_topic›",
         )
     if len(frames) > 1:
         counts = ", ".join(f"{frame or '(unnamed)'} ({n} messages)" for frame, n in frames.most_common(5))
@@ -425,7 +425,7 @@ def sensor_turns(
             f"{gyroscope.topic} has rotations from {first:.3f} to {last:.3f} s, with gaps of at most "
             f"{IMU_GAP} s, and none between two scans, which are from {stamps[0] / NANOSECONDS:.3f} to "
             f"{stamps[-1] / NANOSECONDS:.3f} s",
-            "If the sensors have clocks of their own, use the times of recording: dataset.clock=received",
+            "If the sensors have clocks of their own, use the times of recording: ‹clock›=received",
         )
     if n_unknown or gyroscope.n_bad:
         _log.warning(
@@ -439,5 +439,5 @@ def sensor_turns(
 
 def _unusable(reason: str, remedy: str) -> InvalidArgumentError:
     return InvalidArgumentError(
-        f"motion=imu cannot be used: {reason}. {remedy}, or predict with motion=constant."
+        f"motion=imu cannot be used: {reason}. {remedy}, or predict with ‹motion›=constant."
     )

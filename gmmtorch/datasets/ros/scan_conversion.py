@@ -142,7 +142,7 @@ class ScanConversion:
                 return found, None
             offsets, kept = self._times.offsets(found.times, stamp)
         except DataError as error:
-            skip(f"points not deskewed: {error}")
+            skip(f"points not deskewed: {error!s}")
             return found, None
         if kept is None:
             return found, offsets

@@ -90,20 +90,20 @@ class TransformTree:
                 counts = ", ".join(f"{parent} ({n} times)" for parent, n in parents.most_common())
                 raise DataError(
                     f"TF states several parents of frame {found[-1]}: {counts}; record only one of them, or "
-                    "choose other poses: dataset.poses=TOPIC, FILE or standing."
+                    "choose other poses: ‹poses›=TOPIC, FILE or standing."
                 )
             parent = next(iter(parents))
             if parent in found:
                 raise DataError(
                     f"TF loops: {' → '.join([*found, parent])}; record only one of these transforms, or "
-                    "choose other poses: dataset.poses=TOPIC, FILE or standing."
+                    "choose other poses: ‹poses›=TOPIC, FILE or standing."
                 )
             found.append(parent)
         if top is not None and found[-1] != top:
             raise DataError(
                 f"TF has no transform between frame {top} and frame {frame}, whose tree is "
-                f"{' → '.join(found)}; all frames: {self.describe()}. Choose dataset.frame={found[-1]}, or "
-                "other poses: dataset.poses=TOPIC, FILE or standing."
+                f"{' → '.join(found)}; all frames: {self.describe()}. Choose ‹frame›={found[-1]}, or "
+                "other poses: ‹poses›=TOPIC, FILE or standing."
             )
         return found
 

@@ -2,18 +2,36 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from omegaconf import DictConfig
+from omegaconf import MISSING, DictConfig
 
-from gmmtorch.cli import as_options, build, print_files, print_table, run_dir, set_up, start, write_results
+from gmmtorch.cli import (
+    Report,
+    Runtime,
+    as_options,
+    build,
+    print_files,
+    print_table,
+    run_dir,
+    schema_of,
+    set_up,
+    start,
+    store,
+    write_results,
+)
+from gmmtorch.declarations import group, option
 from gmmtorch.events import Event, Row
 from gmmtorch.experiments.cli import experiment_schema
+from gmmtorch.experiments.evaluation import FitOptions
 from gmmtorch.mixture import PruneOptions
 from gmmtorch.report import ProgressBars
 
@@ -23,10 +41,67 @@ TABLE = (
 )
 
 
+@dataclass
+class StreamOptions:
+    """Clouds that are read in chunks."""
+
+    chunk_points: int = option(1 << 17, "points of a chunk, which limits the memory")
+    sample_points: int = option(
+        100_000, "size of the random sample for the initialization of EM and for PSNR2"
+    )
+    max_range: float | None = option(
+        None, "points at this distance (m) from the frame's origin or beyond are dropped; null: none"
+    )
+    checkpoint_every: int = option(10, "iterations between two checkpoints")
+    timeout: float = option(600.0, "seconds that the processes of torchrun wait for each other")
+
+
+@dataclass
+class FitCommand:
+    """Options of gmmtorch-fit."""
+
+    dataset: Any = option(MISSING, "where the scans come from")
+    method: list[str] = option(
+        ["em"],
+        "list of em, hierarchical (a tree of mixtures with at most n_components leaves), variational "
+        "(weights of unneeded components vanish), riemannian (L-BFGS on the manifold of covariances), "
+        "sliced_wasserstein; for comparison scikit_learn, scikit_learn_bayesian",
+    )
+    seed: int = option(0, "seed of all random numbers")
+    scans: list[int] | None = option(
+        [0], "indices of the scans whose points are fitted together, as in [0,1,2]; null: all scans"
+    )
+    max_points: int | None = option(None, "size of a random subset of the points; null: all points")
+    test_share: float = option(0.1, "share of the points that is held out; 0: none")
+    method_options: dict[str, Any] = option(
+        {}, "options of one method, as in +method_options.hierarchical.branching=4"
+    )
+    study: Any = option(None, "a study with rows of its own, which an experiment sets")
+    points: str | None = option(
+        None, "file (.npy, .las, .laz, .pcd, .ply) that is read in chunks, instead of a data set"
+    )
+    checkpoint: str | None = option(None, "file for the state of the fit; null: none")
+    checkpoint_seconds: float | None = option(
+        None, "seconds between two checkpoints; null: only by stream.checkpoint_every"
+    )
+    resume: bool = option(False, "continue from the checkpoint if it exists; its folder must exist")
+    stream: StreamOptions = group(StreamOptions)
+    mixture: FitOptions = group(FitOptions)
+    report: Report = group(Report)
+    runtime: Runtime = group(Runtime)
+
+
+@functools.cache
+def register() -> None:
+    """Stores the options of the command."""
+    experiment_schema.register()
+    store({"fit": schema_of(FitCommand, ("mixture", PruneOptions))})
+
+
 def main() -> None:
     """Entry point of the command."""
     with _quiet_worker():
-        start("fit", run, experiment_schema.register)
+        start("fit", run, register)
 
 
 @contextmanager
@@ -79,7 +154,7 @@ def _compare(config: DictConfig, device: str, folder: Path, on_event: Event) -> 
         on_event,
         lambda rows: write_results("fit", config, rows, folder),
         as_options(config.method_options),
-        build(PruneOptions, as_options(config.mixture), "mixture"),
+        build(PruneOptions, config, "mixture"),
     )
     for method, mixture in outcome.mixtures.items():
         mixture.save(folder / f"{method}.safetensors")

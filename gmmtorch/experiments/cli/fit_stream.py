@@ -96,7 +96,7 @@ def _checkpoint(config: DictConfig) -> Checkpoint | None:
         return None
     stream = config.stream
     path = Path(config.checkpoint).expanduser()
-    return Checkpoint(path, stream.checkpoint_every, stream.checkpoint_seconds, config.resume)
+    return Checkpoint(path, stream.checkpoint_every, config.checkpoint_seconds, config.resume)
 
 
 def _split(config: DictConfig, device: str, on_event: Event) -> Split:

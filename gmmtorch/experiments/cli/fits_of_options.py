@@ -8,7 +8,7 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from gmmtorch.cli import as_options, build, open_dataset, read_scans
+from gmmtorch.cli import build, open_dataset, read_scans
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.events import Event
 from gmmtorch.experiments.evaluation import FitData, FitOptions, Views, split
@@ -17,8 +17,8 @@ from gmmtorch.scan import Scan
 
 def fit_options(config: DictConfig) -> FitOptions:
     """The options of a fit from `mixture.*` and `runtime.*`."""
-    runtime, mixture = config.runtime, as_options(config.mixture)
-    return build(FitOptions, mixture, "mixture", dtype=runtime.dtype, compiled=runtime.compile)
+    runtime = config.runtime
+    return build(FitOptions, config, "mixture", dtype=runtime.dtype, compiled=runtime.compile)
 
 
 def fit_data(config: DictConfig, device: str, on_event: Event) -> FitData:

@@ -19,7 +19,7 @@ def known_methods(config: DictConfig) -> dict[str, MapFactory]:
 
 def protocol_of(config: DictConfig) -> Protocol:
     """The held-out test from `evaluation.*`."""
-    return build(Protocol, as_options(config.evaluation), "evaluation")
+    return build(Protocol, config, "evaluation")
 
 
 def check_factories(factories: Mapping[str, MapFactory], resolution: float) -> None:

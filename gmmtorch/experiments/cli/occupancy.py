@@ -2,14 +2,30 @@
 
 from __future__ import annotations
 
+import functools
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from omegaconf import DictConfig
+from omegaconf import MISSING, DictConfig
 
-from gmmtorch.cli import print_files, print_table, run_dir, set_up, start, write_results
+from gmmtorch.cli import (
+    Report,
+    Runtime,
+    print_files,
+    print_table,
+    run_dir,
+    schema_of,
+    set_up,
+    start,
+    store,
+    write_results,
+)
+from gmmtorch.declarations import group, option
 from gmmtorch.errors import check_whole
 from gmmtorch.events import Event, Row
 from gmmtorch.experiments.cli import experiment_schema
+from gmmtorch.experiments.evaluation import Protocol
 from gmmtorch.report import ProgressBars
 
 TABLE = (
@@ -18,9 +34,48 @@ TABLE = (
 )
 
 
+@dataclass
+class OccupancyReport(Report):
+    """Figures of gmmtorch-occupancy."""
+
+    magnify: int = option(
+        0, "number of regions of a 2D map with a magnified figure; those with most surface are chosen"
+    )
+    scene: bool = option(False, "draw 3D maps in space, next to the points and the components")
+
+
+@dataclass
+class OccupancyCommand:
+    """Options of gmmtorch-occupancy."""
+
+    dataset: Any = option(MISSING, "where the scans come from")
+    map: Any = option(MISSING, "how a map is built")
+    method: list[str] = option(
+        ["occupancy_grid", "point"],
+        "list of point, flux, cone, monte_carlo: forms of evidence of one GaussianMap; and of baselines: "
+        "occupancy_grid (counts of the raw beams), occupancy_log_odds (each beam adds log-odds: 0.9 at its "
+        "end, −0.4 along it), hilbert, bayesian_hilbert, bgk, bgk_points, gp, ndt, octomap",
+    )
+    method_options: dict[str, Any] = option(
+        {}, "options of one baseline, as in +method_options.hilbert.features=nystroem"
+    )
+    seed: int = option(0, "seed of all random numbers")
+    study: Any = option(None, "a study with rows of its own, which an experiment sets")
+    evaluation: Protocol = group(Protocol)
+    report: OccupancyReport = group(OccupancyReport)
+    runtime: Runtime = group(Runtime)
+
+
+@functools.cache
+def register() -> None:
+    """Stores the options of the command."""
+    experiment_schema.register()
+    store({"occupancy": schema_of(OccupancyCommand)})
+
+
 def main() -> None:
     """Entry point of the command."""
-    start("occupancy", run, experiment_schema.register)
+    start("occupancy", run, register)
 
 
 def run(config: DictConfig) -> float | None:

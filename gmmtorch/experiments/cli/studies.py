@@ -8,7 +8,7 @@ file in conf/experiment.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,7 +17,6 @@ from omegaconf import DictConfig
 
 from gmmtorch.cli import (
     all_scans,
-    as_options,
     build,
     chosen_options,
     limits,
@@ -69,7 +68,7 @@ from gmmtorch.experiments.studies import (
     run_variance_threshold,
     sensor_model,
 )
-from gmmtorch.mapping import METHODS, GaussianMap
+from gmmtorch.mapping import METHODS, GaussianMap, MixtureRule
 from gmmtorch.report import Board
 from gmmtorch.scan import Scan
 
@@ -110,7 +109,7 @@ class Setting:
 
     def study(self, kind: type[T]) -> T:
         """The options of the study."""
-        return build(kind, as_options(self.config.study), "study")
+        return build(kind, self.config, "study")
 
     def scans(self) -> tuple[str, list[Scan]]:
         """The name of the data set, and all its scans."""
@@ -292,7 +291,7 @@ def _map_variants(setting: Setting) -> list[Row]:
     form = next((method for method in config.method if method in METHODS), "point")
     variants = {}
     for name, changes in study.variants.items():
-        if unknown := set(changes) - set(as_options(config.map)):
+        if unknown := set(changes) - {*config.map, *(item.name for item in fields(MixtureRule))}:
             raise InvalidArgumentError(
                 f"study.variants.{name}.{min(unknown)} is not an option of map={config.map.name}."
             )

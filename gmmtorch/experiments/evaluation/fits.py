@@ -136,11 +136,11 @@ def _fit_scikit_learn(
     """Fit from scikit-learn's own k-means start; returns the result as our mixture."""
     if options.init_params not in ("auto", "kmeans"):
         raise InvalidArgumentError(
-            f"mixture.init_params={options.init_params!r}: method {method} supports only kmeans."
+            f"init_params={options.init_params!r}: method {method} supports only kmeans."
         )
     arguments = _arguments(method, options, seed, own)
     if options.n_components is None:
-        raise InvalidArgumentError(f"mixture.n_components=null: method {method} needs a number.")
+        raise InvalidArgumentError(f"n_components=None: method {method} needs a number.")
     on_event(method, 0, 1)
     fitted = ESTIMATORS[method](**arguments)
     with warnings.catch_warnings():

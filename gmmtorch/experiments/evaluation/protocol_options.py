@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+from gmmtorch.declarations import option
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_resolution, check_whole
 
 Removal = Literal["beams", "scans"]
@@ -34,31 +35,26 @@ def check_not_empty(options: object, *names: str) -> None:
 
 @dataclass(frozen=True)
 class Protocol:
-    """The test on held-out scans; see docs/commands.md.
+    """The test on held-out scans; see docs/commands.md."""
 
-    Attributes:
-        test_every: scans 0, n, 2n, … are held out.
-        kept: shares of the training data that are used, each in (0, 1].
-        removal: "beams" or "scans": what is removed to keep a share.
-        resolution: sides (m) of the cells for which occupancy is queried.
-        free: where on a beam the free test points lie; see `queries.hit_and_free`.
-        unknown: also query points that no training beam observed.
-        pose_noise: standard deviations (m, rad) that perturb the training poses.
-        max_beams: number of held-out beams at most; a random subset is drawn from more.
-        save_queries: file for the test points; None saves none.
-        save_map: folder for the maps; None saves none.
-    """
-
-    test_every: int = 10
-    kept: Sequence[float] = (1.0,)
-    removal: Removal = "beams"
-    resolution: Sequence[float] = (0.1,)
-    free: FreePoints = "uniform"
-    unknown: bool = False
-    pose_noise: Sequence[float] = (0.0, 0.0)
-    max_beams: int = 1_000_000
-    save_queries: str | None = None
-    save_map: str | None = None
+    test_every: int = option(10, "scans 0, n, 2n, … are held out")
+    kept: Sequence[float] = option(
+        (1.0,), "shares of the training data that are used; a smaller share is a subset of a larger one"
+    )
+    removal: Removal = option("beams", "what is removed to keep a share: beams or scans")
+    resolution: Sequence[float] = option((0.1,), "sides (m) of the cells for which occupancy is asked")
+    free: FreePoints = option(
+        "uniform",
+        "where the free points of a beam lie. uniform: anywhere; near_surface: 0.5 to 2 cells before the "
+        "hit; clear: anywhere, but not within one cell of the hit",
+    )
+    unknown: bool = option(False, "also ask about points 2–12 cells behind hits, which no beam observed")
+    pose_noise: Sequence[float] = option(
+        (0.0, 0.0), "standard deviations (m, rad) that perturb the training poses"
+    )
+    max_beams: int = option(1_000_000, "held-out beams, at most; a random subset is drawn from more")
+    save_queries: str | None = option(None, "FILE.npz for the test points; null: none")
+    save_map: str | None = option(None, "DIR for every map, as METHOD_KEPT_RESOLUTION; null: none")
 
     def __post_init__(self) -> None:
         check_not_empty(self, "kept", "resolution")
@@ -84,28 +80,31 @@ class FitOptions:
     An estimator takes the options that its constructor has.
 
     Attributes:
-        n_components: number of components; None: as many as the surfaces need.
-        noise: standard deviation (m) of the range sensor, for n_components=None.
-        init_params: auto, kmeans, kmeans_restarts, random_points, bounding_box or flat_pieces.
-        algorithm: auto, exact, or truncated: each point uses only the components near it.
         max_cells: sum the points into at most this many cells; None: learn from the points.
-        tol: EM ends when the mean log-likelihood grows by less (nats per point).
         reg_covar: added to the variances (m²).
-        max_iter: EM iterations, at most.
-        n_init: initializations, of which the best is kept.
         dtype: type of the exponentials in EM, "float32" or "float64".
         compiled: without effect, because the kernels are compiled anyway.
     """
 
-    n_components: int | None = 100
-    noise: float = 0.01
-    init_params: str = "auto"
-    algorithm: str = "auto"
+    n_components: int | None = option(100, "number of components; null (em): chosen from the surfaces")
+    noise: float = option(
+        0.01, "standard deviation (m) of the range sensor, which defines flat pieces for n_components=null"
+    )
+    init_params: str = option(
+        "auto",
+        "kmeans; kmeans_restarts: the best of ten runs; random_points; bounding_box; flat_pieces: recursive "
+        "bisection of the cloud; auto: k-means if it is cheap, else flat pieces",
+    )
+    algorithm: str = option(
+        "auto",
+        "exact: every point with every component; truncated: every point with the components near it; auto: "
+        "truncated where it is faster",
+    )
     max_cells: int | None = None
-    tol: float = 1e-3
+    tol: float = option(1e-3, "EM ends when the mean log-likelihood grows by less (nats per point)")
     reg_covar: float = 1e-6
-    max_iter: int = 100
-    n_init: int = 1
+    max_iter: int = option(100, "EM iterations, at most")
+    n_init: int = option(1, "initializations, of which the best is kept")
     dtype: str = "float32"
     compiled: bool = False
 

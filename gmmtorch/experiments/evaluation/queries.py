@@ -102,8 +102,8 @@ def test_beams(scans: Sequence[Scan], max_beams: int, seed: int) -> tuple[Tensor
     origins, ends = origins[measured], ends[measured]
     if ends.shape[0] == 0:
         raise InvalidArgumentError(
-            "The held-out scans have no return beams, so there are no test points; check dataset.max_range, "
-            "or change evaluation.test_every."
+            "The held-out scans have no return beams, so there are no test points; check ‹max_range›, "
+            "or change ‹test_every›."
         )
     if ends.shape[0] > max_beams:
         generator = torch.Generator().manual_seed(seed)

@@ -215,7 +215,7 @@ def _cases(
     counts = [k for k in study.n_components if k <= len(points)]
     if not counts:
         raise InvalidArgumentError(
-            f"study.n_components={list(study.n_components)}: all exceed the number of points, {len(points)}."
+            f"n_components={list(study.n_components)}: all exceed the number of points, {len(points)}."
         )
     noise = study.noise
     return [

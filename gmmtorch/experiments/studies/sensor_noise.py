@@ -172,7 +172,7 @@ def _training_cloud(train: Sequence[Scan], sensor: SensorModel, study: SensorMod
     """A random sample of the points of all scans, with their noise."""
     sizes = torch.tensor([scan.points.shape[0] for scan in train])
     if int(sizes.sum()) == 0:
-        raise InvalidArgumentError("The training scans have no points; check dataset.max_range.")
+        raise InvalidArgumentError("The training scans have no points; check ‹max_range›.")
     generator = torch.Generator().manual_seed(seed)
     chosen = torch.randperm(int(sizes.sum()), generator=generator)[: study.n_points].sort().values
     index = torch.repeat_interleave(sizes)[chosen]

@@ -7,9 +7,10 @@ need torch are imported when an object is made.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
+from gmmtorch.declarations import option
 from gmmtorch.errors import (
     InvalidArgumentError,
     check_choice,
@@ -87,15 +88,14 @@ class AucMemoryStudy:
 
     Attributes:
         forms: forms of evidence that are computed from our map.
-        n_components: sizes of our map.
         bgk_points: sizes of the BGK map, in stored points.
         others: methods that have one size.
     """
 
     forms: Sequence[str] = ("monte_carlo", "point")
-    n_components: Sequence[int] = (100, 250, 500, 1000)
+    n_components: Sequence[int] = option((100, 250, 500, 1000), "sizes of our map")
     bgk_points: Sequence[int] = (1555, 3095, 5010, 9472, 17011)
-    others: Sequence[str] = ("occupancy_grid",)
+    others: Sequence[str] = ("occupancy_grid", "bgk", "ndt", "octomap")
 
     def __post_init__(self) -> None:
         for form in self.forms:
@@ -109,14 +109,9 @@ class AucMemoryStudy:
 
 @dataclass(frozen=True)
 class MapVariantsStudy:
-    """Options of `studies.map_studies`.
+    """Options of `studies.map_studies`. The first variant is compared with the others."""
 
-    Attributes:
-        variants: for each variant, its options of the map that differ, such as {prune: support}. The first
-            one is compared with the others.
-    """
-
-    variants: dict[str, Any] = field(default_factory=dict)
+    variants: dict[str, Any] = option({}, "for each variant, its options of the map that differ")
 
     def __post_init__(self) -> None:
         if not self.variants:
@@ -152,11 +147,8 @@ class VarianceThresholdStudy:
     """Options of `studies.variance_threshold`: one row for each combination of the lists.
 
     Attributes:
-        railing: width (m) of the bars of a simulated railing, which is scanned in place of the data set.
-            None: the data set.
         railing_scans: number of scans of the railing.
         method: forms of evidence, and "counts": the training rays counted in cells, without a map.
-        n_components: sizes; a map is built for each.
         resolution: sides (m) of the cells.
         prior: of the queries, as in `QueryOptions`: N_p of counts; None: calibrated.
         variance_threshold: values v of (3.10).
@@ -164,10 +156,12 @@ class VarianceThresholdStudy:
         thin_width: width (m) of thin structures in a data set, see `variance_threshold.seen_past`.
     """
 
-    railing: float | None = 0.04
+    railing: float | None = option(
+        0.04, "width (m) of the bars of a simulated railing, in place of the data set; null: the data set"
+    )
     railing_scans: int = 20
     method: Sequence[str] = (COUNTS, "point", "monte_carlo")
-    n_components: Sequence[int] = (200, 850)
+    n_components: Sequence[int] = option((200, 850), "sizes; a map is built for each")
     resolution: Sequence[float] = (0.1, 0.25)
     prior: Sequence[Any] = (1.0, 0.1, None)
     variance_threshold: Sequence[float] = (0.06, 0.24)
@@ -206,21 +200,19 @@ class VarianceThresholdStudy:
 
 @dataclass(frozen=True)
 class InitializationStudy:
-    """Options of `studies.fit_studies`.
+    """Options of `studies.fit_studies`. The first seed is the seed of the run.
 
-    Attributes:
-        n_components: numbers of components.
-        init_params: initializations; each is run with each number of components and each seed.
-        initial_covariance: covariances of the initializations that choose only means (random_points,
-            bounding_box). "tiles": the mean variance of the cloud, divided by K^(2/D). "box": the square of
-            the bounding box's longest side (thesis 2.1.3).
-        n_seeds: number of seeds; the first is the seed of the run.
+    init_params: initializations; each is run with each number of components and each seed.
     """
 
-    n_components: Sequence[int] = (4, 8, 32, 64, 128, 256, 512)
+    n_components: Sequence[int] = option((4, 8, 32, 64, 128, 256, 512), "numbers of components")
     init_params: Sequence[str] = ("random_points", "bounding_box", "kmeans", "kmeans_restarts", "flat_pieces")
-    initial_covariance: Sequence[str] = ("tiles",)
-    n_seeds: int = 3
+    initial_covariance: Sequence[str] = option(
+        ("tiles",),
+        "covariances of random_points and bounding_box. tiles: the mean variance of the cloud, divided by "
+        "K^(2/D); box: the square of the bounding box's longest side (thesis 2.1.3)",
+    )
+    n_seeds: int = option(3, "number of runs, with the seeds seed, seed + 1, …")
 
     def __post_init__(self) -> None:
         from gmmtorch.mixture import INITIALIZATIONS
@@ -249,7 +241,7 @@ class ComponentCountStudy:
         n_samples: Monte Carlo rays of a query.
     """
 
-    n_components: Sequence[int] = (16, 32, 64, 128, 256, 512, 1024)
+    n_components: Sequence[int] = option((16, 32, 64, 128, 256, 512, 1024), "numbers K of the curve")
     noise: float = 0.01
     multiples: Sequence[float] = (0.5, 1.0, 2.0, 4.0)
     bandwidths: Sequence[float] = (0.4, 0.2, 0.1)
@@ -280,8 +272,6 @@ class SensorModelStudy:
 
     Attributes:
         sensor: name of a sensor model in `sensor_noise.SENSORS`.
-        sensor_options: fields of the sensor model that are changed.
-        n_components: sizes K.
         n_points: training points, drawn at random from all training scans.
         resolution: side (m) of the cells of the test.
         test_every, max_beams: the test, as in `Protocol`.
@@ -293,8 +283,8 @@ class SensorModelStudy:
     """
 
     sensor: str = "lidar"
-    sensor_options: dict[str, Any] = field(default_factory=dict)
-    n_components: Sequence[int] = (50, 200)
+    sensor_options: dict[str, Any] = option({}, "changed options of the sensor model")
+    n_components: Sequence[int] = option((50, 200), "sizes K")
     n_points: int = 20_000
     resolution: float = 0.1
     test_every: int = 10

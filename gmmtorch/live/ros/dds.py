@@ -165,7 +165,7 @@ def _open_domain(number: int, settings: str) -> Any:
     if not 0 <= number <= MAX_DOMAIN:
         raise InvalidArgumentError(f"domain={number} must be in 0 … {MAX_DOMAIN} (ROS_DOMAIN_ID).")
     with _LOCK:
-        found = _DOMAINS.get(number)
+        found: Any = _DOMAINS.get(number)
         if found is None:
             found = Domain(number, settings)
             found.settings = settings

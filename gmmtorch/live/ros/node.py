@@ -288,7 +288,8 @@ class Node:
         subscription.n_malformed += 1
         self.warn(
             f"malformed {subscription.topic}",
-            f"{subscription.n_malformed} messages of {subscription.topic} cannot be used; the last: {error}",
+            f"{subscription.n_malformed} messages of {subscription.topic} cannot be used; the last: "
+            f"{error!s}",
         )
 
 

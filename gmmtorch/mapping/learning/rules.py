@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args
 
+from gmmtorch.declarations import option
 from gmmtorch.errors import (
     InvalidArgumentError,
     check_choice,
@@ -69,20 +70,26 @@ class NoveltyRule:
 class MixtureRule(PruneOptions):
     """How the mixture of a window is learned. Components of no-return beams are not pruned.
 
-    learner: "flat_pieces", EM that starts from flat pieces; "hierarchical", the leaves of a tree of mixtures
-        (thesis 2.1.2).
     planarity: the tree does not split a node whose smallest variance is a smaller share of the sum of its
         variances (2.9). None: it does not split a node that is at most as thick as a flat piece.
-    free_points: points at equal distances on each beam with a return, from which components of free space
-        are learned, as from the ends of no-return beams (thesis 3.5).
-    forget: what leaves the map. "off": nothing. "contradiction": surfaces that later beams pass through, see
-        `mapping.learning.windows`. A number: all evidence, with this half-life (s) of the scans' times.
     """
 
-    learner: LearnerName = "flat_pieces"
+    learner: LearnerName = option(
+        "flat_pieces",
+        "flat_pieces: EM that starts from flat pieces; hierarchical: the leaves of a tree of mixtures "
+        "(thesis 2.1.2)",
+    )
     planarity: float | None = None
-    free_points: int = 0
-    forget: int | float | str = FORGET_OFF
+    free_points: int = option(
+        0,
+        "points at equal distances on each beam with a return, from which components of free space are "
+        "learned, as from the ends of no-return beams (thesis 3.5)",
+    )
+    forget: int | float | str = option(
+        FORGET_OFF,
+        "what leaves the map. off: nothing; contradiction: surfaces that later beams pass through; a number: "
+        "all evidence, with this half-life (s) of the scans' times",
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -107,28 +114,30 @@ class MixtureRule(PruneOptions):
 class WindowedRule(MixtureRule):
     """Learns a mixture from every window of scans and adds it to the map; nothing is merged.
 
-    noise: standard deviation of the range sensor (m). Its square is the smallest variance of a component;
-        a piece counts as flat if it is at most twice as thick.
     length: largest standard deviation (m) along a component.
     min_points: fewest points of a component. None: 6 in 2D, 20 in 3D.
-    n_components: largest number of components of a window. None: as many as the surfaces need.
     max_origins: largest number of sensor origins of a component, sampled by their counts.
     iterations: EM iterations. EM starts from the flat pieces and needs few.
     max_cells: clouds with more points than this are first summed into cells.
-    window: number of neighbouring scans that are learned together.
     dtype: type of the exponentials in EM, "float32" or "float64".
     """
 
     kind: ClassVar[str] = "windowed"
 
-    noise: float = 0.01
+    noise: float = option(
+        0.01,
+        "standard deviation (m) of the range sensor. Its square is the smallest variance of a component; a "
+        "piece is flat if it is at most twice as thick",
+    )
     length: float = 0.3
     min_points: float | None = None
-    n_components: int | None = None
+    n_components: int | None = option(
+        None, "components of a window, at most; null: as many as its surfaces need"
+    )
     max_origins: int = 8
     iterations: int = 5
     max_cells: int = 20_000
-    window: int = 20
+    window: int = option(20, "number of neighbouring scans that are learned together")
     dtype: str = "float32"
 
     def __post_init__(self) -> None:
@@ -155,34 +164,39 @@ class IncrementalRule(MixtureRule):
 
     Options that are None are derived from the first scans, see `fitted`.
 
-    noise: standard deviation of the range sensor (m). Its square is the smallest variance of a component;
-        a piece counts as flat if it is at most twice as thick.
     length: largest standard deviation (m) along a component when it is learned; merging may exceed it.
     cell: side (m) of the cells into which points are summed before EM.
-    window: number of neighbouring scans that are learned together.
     window_components: largest number of components of a window.
     iterations: EM iterations on the cells of a window.
-    n_components, max_bytes: budget of the whole map: components, bytes of its file, both, or none.
     max_origins, mean_origins: largest and mean number of sensor origins of a component, see `limit_origins`.
-    max_cost: squared Hellinger distance up to which components are merged even if the budget is not used up.
-    novelty: learn from novel beams only, and count explained points to the components that explain them
-        (thesis 4.1). None: learn from all beams.
     """
 
     kind: ClassVar[str] = "incremental"
 
-    noise: float | None = None
+    noise: float | None = option(
+        None,
+        "standard deviation (m) of the range sensor, which defines flat pieces; null: derived from the "
+        "median range of the first scans",
+    )
     length: float | None = None
     cell: float | None = None
-    window: int | None = None
+    window: int | None = option(
+        None, "number of neighbouring scans that are learned together; null: derived, as noise"
+    )
     window_components: int = 500
     iterations: int = 6
-    n_components: int | None = None
-    max_bytes: int | None = None
+    n_components: int | None = option(None, "components of the whole map, at most; null: no limit")
+    max_bytes: int | None = option(None, "bytes of the map's file, at most; null: no limit")
     max_origins: int = 8
     mean_origins: float | None = 2.0
-    max_cost: float | None = None
-    novelty: NoveltyRule | None = None
+    max_cost: float | None = option(
+        None, "squared Hellinger distance up to which components are merged even below the budget"
+    )
+    novelty: NoveltyRule | None = option(
+        None,
+        "null: learn from all beams; {} or options of NoveltyRule: learn from novel beams only, and count "
+        "explained points to the components that explain them (thesis 4.1.2)",
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

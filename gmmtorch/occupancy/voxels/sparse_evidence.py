@@ -72,7 +72,7 @@ def _empty_table(store: SparseEvidence, origins: Tensor, ends: Tensor) -> BlockT
         raise MemoryLimitError(
             f"resolution={store.resolution} m over rays that span {[n * side for n in shape]} cells needs a "
             f"table of {n_bytes:,} bytes, above the limit of {store.memory_limit:,}; a resolution of "
-            f"{fits:.3g} m or more fits, or set dataset.max_range to drop stray far returns."
+            f"{fits:.3g} m or more fits, or set ‹max_range› to drop stray far returns."
         )
     store.check_reachable(torch.stack([low, high]) * side)
     first = torch.full((1 << sum(bits),), -1, device=low.device)

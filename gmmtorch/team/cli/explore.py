@@ -2,12 +2,29 @@
 
 from __future__ import annotations
 
+import functools
+from dataclasses import dataclass
+from typing import Any
+
 from omegaconf import DictConfig
 
-from gmmtorch.cli import open_live_view, print_files, run_dir, serve, set_up, start
+from gmmtorch.cli import (
+    Device,
+    Report,
+    open_live_view,
+    print_files,
+    run_dir,
+    schema_of,
+    serve,
+    set_up,
+    start,
+    store,
+)
+from gmmtorch.declarations import group, option
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.report import ProgressBars
-from gmmtorch.team.cli.options import team_schema
+from gmmtorch.team.cli import team_schema
+from gmmtorch.team.exploration import TeamOptions
 
 TABLE = (
     "framework seed planner t50 t90 entropy_reduction_bits bytes_sent bytes_raw_points auc "
@@ -15,14 +32,56 @@ TABLE = (
 )
 
 
+@dataclass
+class ExploreReport(Report):
+    """What a mission shows and writes."""
+
+    recording: bool = option(False, "a file for the rerun viewer")
+
+
+@dataclass
+class ExploreRuntime(Device):
+    """Where missions run."""
+
+    workers: int = option(2, "missions of an experiment that run in parallel")
+
+
+@dataclass
+class ExploreCommand(team_schema.MissionCommand):
+    """Options of gmmtorch-explore, beside those of `TeamOptions`."""
+
+    transport: str = option("in_process", "in_process; gmmtorch-team has others")
+    study: Any = option(None, "several missions, which an experiment sets")
+    report: ExploreReport = group(ExploreReport)
+    runtime: ExploreRuntime = group(ExploreRuntime)
+
+
+@dataclass
+class TrialsStudy:
+    """Missions that differ in some options, each with every seed."""
+
+    seeds: list[int] = option([0, 1, 2, 3, 4], "seeds of each variant")
+    variants: list[dict[str, Any]] = option(
+        [], "options of each variant, as in [{team: gmm_shared}, {team: grid_shared}]"
+    )
+
+
+@functools.cache
+def register() -> None:
+    """Stores the options of the command."""
+    team_schema.register()
+    made = schema_of(TeamOptions, ExploreCommand)
+    store({"explore": made}, {"study": {"trials": schema_of(TrialsStudy, name="trials")}})
+
+
 def main() -> None:
     """Entry point of the command."""
-    start("explore", run, team_schema.register)
+    start("explore", run, register)
 
 
 def run(config: DictConfig) -> float | None:
     """Runs a mission or a study; returns the entropy reduction (bits) of the last mission, for optimizers."""
-    from gmmtorch.team.cli.runs import explorations
+    from gmmtorch.team.cli import explorations
     from gmmtorch.team.report import load_rerun
 
     _check_options(config)
@@ -50,13 +109,6 @@ def _check_options(config: DictConfig) -> None:
         )
     if config.view and config.study is not None:
         raise InvalidArgumentError("view=true shows one mission, not those of a study; leave out experiment.")
-    for name, value in config.checkpoint.items():
-        if value is not None:
-            raise InvalidArgumentError(
-                f"checkpoint.{name}={value} was removed: missions have no checkpoints. A study that was "
-                "killed continues with the missions that are missing if you run the same command with "
-                "hydra.run.dir=RUN, the folder of the killed run."
-            )
 
 
 if __name__ == "__main__":

@@ -6,27 +6,33 @@ import functools
 import os
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
 
 from gmmtorch.cli import (
-    naming,
+    Memory,
+    Report,
     open_live_view,
     print_files,
     print_table,
     run_dir,
+    schema_of,
     serve,
     set_up,
     start,
     stop_requests,
+    store,
     write_results,
 )
+from gmmtorch.declarations import group, option
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, check_whole
 from gmmtorch.processes import has_lost_parent
-from gmmtorch.team.cli.options import team_schema
-from gmmtorch.team.cli.reporting.robot_report import Outputs, RobotReport, print_refusals, terse
+from gmmtorch.team.cli import team_schema
+from gmmtorch.team.cli.robot_report import Outputs, RobotReport, print_refusals, terse
+from gmmtorch.team.exploration import TeamOptions
 
 if TYPE_CHECKING:
     from gmmtorch.live import LiveView
@@ -37,60 +43,91 @@ TEAM_VARIABLE = "GMMTORCH_TEAM_PROCESS"
 TABLE = "robot n_components n_records bytes_sent wire_bytes datagrams digest"
 
 
+@dataclass
+class JournalOptions:
+    """The store of a robot's map."""
+
+    enabled: bool = option(True, "the map is stored on disk and restored at the next start")
+    folder: str | None = option(None, "folder of the store, to restore from; null: the run's folder")
+
+
+@dataclass
+class LogOptions:
+    """The replay of recorded scans."""
+
+    dataset: Any = option(None, "reader of the log, as in dataset@log.dataset=carmen")
+    map: Any = option(
+        None,
+        "options of the map that differ from those of map=incremental, as in {name: windowed}",
+    )
+    rate: float = option(1.0, "scans per second")
+    part: str = option("consecutive", "consecutive or interleaved part of the log for each robot")
+    start: str = option(
+        "known",
+        "known: the poses of the log; unknown: each robot maps in a frame of its own, and joins that of a "
+        "teammate when it recognises a place",
+    )
+
+
+@dataclass
+class RobotCommand(team_schema.MissionCommand):
+    """Options of gmmtorch-robot and gmmtorch-team, beside those of `TeamOptions`."""
+
+    id: int = option(0, "this robot's id; unique in the team")
+    source: str = option("world", "world: a simulated camera in a simulated world; log: recorded scans")
+    clock: str | None = option("wall", "wall: each robot runs by its own clock")
+    speed: float = option(1.0, "seconds of the robot's time per second")
+    settle: float = option(10.0, "seconds without news after the last work, until the robot stops")
+    transport: str = option("udp", "udp or zenoh")
+    link: team_schema.LinkOptions = group(team_schema.LinkOptions)
+    journal: JournalOptions = group(JournalOptions)
+    log: LogOptions = group(LogOptions)
+    report: Report = group(Report)
+    runtime: Memory = group(Memory)
+
+
+@functools.cache
+def register() -> None:
+    """Stores the options of the command."""
+    team_schema.register()
+    store({"robot": schema_of(TeamOptions, RobotCommand, without=team_schema.SIMULATED)})
+
+
 def main() -> None:
     """Entry point of the command."""
-    start("robot", terse()(run), team_schema.register)
+    start("robot", terse()(run), register)
 
 
 def run(config: DictConfig) -> None:
     """Runs a robot until its work is done and the team is quiet, or until it is stopped."""
-    from gmmtorch.team.cli.from_options import links, robots
+    from gmmtorch.team.cli import links, robots
 
-    with naming(_option_names(config)):
-        check_options(config)
-        folder = run_dir()
-        with ExitStack() as stack:
-            transport = links.open_link(config, config.id, is_alone=config.team.size == 1)
-            stack.callback(transport.close)
-            transport.lose(config.network.loss, config.seed + config.id)
-            make = robots.flying if config.source == "world" else robots.replaying
-            mission, view = make(config, transport, stack)
-            _drive(config, mission, view, folder)
-
-
-def _option_names(config: DictConfig) -> dict[str, str]:
-    """Options by the arguments that they become, for error messages."""
-    from gmmtorch.team.cli.from_options import missions
-
-    if config.source == "world":
-        return missions.NAMES
-    return {
-        **{argument: f"network.{option}" for option, argument in missions.OF_ROBOTS.items()},
-        **{f"map.{name}": f"log.map.{name}" for name in config.log.map},
-        "rate": "log.rate",
-        "split": "log.part",
-        "dataset": "dataset@log.dataset",
-        "dataset.path": "log.dataset.path",
-    }
+    check_options(config)
+    folder = run_dir()
+    with ExitStack() as stack:
+        transport = links.open_link(config, config.id, is_alone=config.team.size == 1)
+        stack.callback(transport.close)
+        transport.lose(config.network.loss, config.seed + config.id)
+        make = robots.flying if config.source == "world" else robots.replaying
+        mission, view = make(config, transport, stack)
+        _drive(config, mission, view, folder)
 
 
 def check_options(config: DictConfig) -> None:
     """Raises `InvalidArgumentError` for bad options of a robot or a team, before anything is opened."""
-    from gmmtorch.team.cli.from_options import links
+    from gmmtorch.team.cli import links
 
     if set_up(config) != "cpu" and config.source == "log":
         raise InvalidArgumentError(
             f"runtime.device={config.runtime.device} is not available for source=log; use cpu."
         )
-    if config.clock == "lockstep":
+    if config.clock not in ("wall", None):
         raise InvalidArgumentError(
-            "clock=lockstep was removed: each robot runs by its own clock. Use clock=wall, with "
+            f"clock={config.clock} is not available: each robot runs by its own clock. Use clock=wall, with "
             "speed=2 for twice real time."
         )
     check_choice("source", config.source, ("world", "log"))
-    check_choice("clock", config.clock, ("wall",))
     check_choice("transport", config.transport, links.TRANSPORTS)
-    check_choice("journal.sync", config.journal.sync, ("snapshot", "always"))
     check_choice("log.start", config.log.start, ("known", "unknown"))
     size = check_whole("team.size", config.team.size, 1)
     if check_whole("id", config.id, 0) >= size:
@@ -102,8 +139,7 @@ def check_options(config: DictConfig) -> None:
     if not config.evaluation.every > 0:
         raise InvalidArgumentError(f"evaluation.every={config.evaluation.every} must be above zero seconds.")
     rate = config.sensor.rate if config.source == "world" else config.log.rate
-    with naming({"rate": "sensor.rate" if config.source == "world" else "log.rate"}):
-        check_number("rate", rate, above=True)
+    check_number("sensor.rate" if config.source == "world" else "log.rate", rate, above=True)
     check_number("speed", config.speed, above=True)
     check_number("settle", config.settle)
     if config.source == "log" and config.log.dataset is None:

@@ -19,12 +19,21 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from gmmtorch.cli import open_live_view, print_files, print_table, run_dir, serve, start, write_results
+from gmmtorch.cli import (
+    argument_names,
+    naming,
+    open_live_view,
+    print_files,
+    print_table,
+    run_dir,
+    serve,
+    start,
+    write_results,
+)
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.report import ProgressBars
-from gmmtorch.team.cli.options import team_schema
-from gmmtorch.team.cli.reporting.robot_report import Outputs, print_refusals, terse
-from gmmtorch.team.cli.robot import TEAM_VARIABLE, check_options
+from gmmtorch.team.cli.robot import TEAM_VARIABLE, check_options, register
+from gmmtorch.team.cli.robot_report import Outputs, print_refusals, terse
 
 _COMMAND = (sys.executable, "-m", "gmmtorch.team.cli.robot")
 _PATIENCE = 30.0
@@ -127,14 +136,13 @@ _TURN = 2.0
 
 def main() -> None:
     """Entry point of the command."""
-    start("team", terse()(run), team_schema.register)
+    start("team", terse()(run), register)
 
 
 def run(config: DictConfig) -> None:
     """Runs a team until all its robots have ended."""
-    from gmmtorch.team.cli.reporting.team_listener import listener
+    from gmmtorch.team.cli.listener import listener
 
-    config.clock = config.clock or "wall"
     check_options(config)
     folder = run_dir()
     with ProgressBars(enabled=config.report.progress) as bars, ExitStack() as stack:
@@ -161,12 +169,14 @@ def run(config: DictConfig) -> None:
 
 def _prepare(config: DictConfig, bars: ProgressBars) -> None:
     """Computes the world's properties once for all robots, and raises errors of the options once."""
-    from gmmtorch.team.cli.from_options import missions
-    from gmmtorch.team.exploration import start_poses
+    from gmmtorch.team.cli import missions
+    from gmmtorch.team.exploration import TeamOptions, start_poses
 
     if config.source == "world":
         options = missions.team_options(config, config.seed, {})
-        start_poses(missions.open_world(missions.world_options(config), options, bars), options)
+        world = missions.open_world(missions.world_options(config), options, bars)
+        with naming(argument_names(TeamOptions)):
+            start_poses(world, options)
 
 
 # -- the processes --------------------------------------------------------------------------------
@@ -201,7 +211,7 @@ def _given_options() -> list[str]:
 
 def _addresses(config: DictConfig) -> list[list[str]]:
     """The options of each robot that say where it listens, and where it sends to; of a view, too."""
-    from gmmtorch.team.cli.from_options import links
+    from gmmtorch.team.cli import links
 
     n = config.team.size + (1 if config.view else 0)
     if config.transport == "zenoh":

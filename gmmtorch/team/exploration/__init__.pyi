@@ -5,7 +5,11 @@ from .mission.driver import drive as drive
 from .mission.driver import settle as settle
 from .mission.mission import Mission as Mission
 from .mission.options import THESIS as THESIS
+from .mission.options import Dynamics as Dynamics
+from .mission.options import FrameRule as FrameRule
+from .mission.options import StoppingRule as StoppingRule
 from .mission.options import TeamOptions as TeamOptions
+from .mission.options import WorldOptions as WorldOptions
 from .mission.replay import ReplayMission as ReplayMission
 from .mission.results import NETWORK as NETWORK
 from .mission.results import PLANNING as PLANNING
@@ -30,14 +34,10 @@ from .mission.robot_view import ReplayMoments as ReplayMoments
 from .mission.robot_view import RobotView as RobotView
 from .mission.trials import STAGE as STAGE
 from .mission.trials import Trial as Trial
-from .mission.trials import WorldOptions as WorldOptions
 from .mission.trials import make_agent as make_agent
 from .mission.trials import run_mission as run_mission
 from .mission.trials import run_trials as run_trials
 from .mission.trials import start_poses as start_poses
-from .planning.primitives import Dynamics as Dynamics
 from .robot.agent import Agent as Agent
-from .robot.agent import StoppingRule as StoppingRule
-from .robot.gmm_mapper import FrameRule as FrameRule
 from .world.scoring import BeliefRule as BeliefRule
 from .world.world import World as World

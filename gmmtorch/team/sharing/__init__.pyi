@@ -19,11 +19,11 @@ from .shared_map import FrameJoiner as FrameJoiner
 from .shared_map import SharedMap as SharedMap
 from .store import Store as Store
 from .transport.frames import FramedTransport as FramedTransport
+from .transport.link_conditions import LinkConditions as LinkConditions
+from .transport.link_conditions import Partition as Partition
 from .transport.security import KEY_VARIABLE as KEY_VARIABLE
 from .transport.security import TeamKey as TeamKey
-from .transport.simulated_network import LinkConditions as LinkConditions
 from .transport.simulated_network import Network as Network
-from .transport.simulated_network import Partition as Partition
 from .transport.simulated_network import Transport as Transport
 from .transport.udp import UdpTransport as UdpTransport
 from .transport.zenoh_transport import ZenohTransport as ZenohTransport

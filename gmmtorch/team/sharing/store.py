@@ -64,7 +64,7 @@ def open_file(path: Path, facts: Mapping[str, Any], max_bytes: int) -> tuple[sql
     except OutputError as error:
         _log.warning(
             "%s The robot uses what can be read there, and keeps nothing. "
-            "Choose another journal.folder, or journal.enabled=false.",
+            "Choose another folder, or run without a store.",
             error,
         )
     try:

@@ -14,7 +14,7 @@ from cli.command_runs import (
 )
 from cli.explore.explore_cases import SMALL
 
-from gmmtorch.team.cli.runs.explorations import warn_of_robots_at_their_start
+from gmmtorch.team.cli.explorations import warn_of_robots_at_their_start
 
 
 @pytest.mark.parametrize(
@@ -34,11 +34,10 @@ from gmmtorch.team.cli.runs.explorations import warn_of_robots_at_their_start
         ("world.bounds=[20,20,0,30,30,3]", "world.bounds=[20.0, do not meet room"),
         ("world.bounds=[0,0,0,3]", "world.bounds= six"),
         ("world.resolution=0", "world.resolution=0.0"),
-        ("sensor.horizontal_fov=0", "sensor.horizontal_fov=0.0"),
+        ("sensor.width=0", "sensor.width=0"),
         ("sensor.max_range=0.05", "sensor.max_range=0.05 robot.radius world.resolution"),
         ("duration=2.5", "duration=2.5 sensor.rate"),
-        ("sensor.noise=-1", "sensor.noise=-1.0"),
-        ("sensor.rate=0.7", "sensor.rate=0.7 robot.duration"),
+        ("sensor.rate=0.7", "sensor.rate=0.7 dynamics.duration"),
         ("duration=-1", "duration=-1.0"),
         ("network.loss=1", "network.loss=1.0"),
         ("network.delay=-1", "network.delay=-1.0 time"),
@@ -51,8 +50,6 @@ from gmmtorch.team.cli.runs.explorations import warn_of_robots_at_their_start
         ("map.window=[8,8]", "map.window=[8, three"),
         ("map.window=[8,8,8]", "map.window=[8, sensor.max_range"),
         ("map.noise=0", "map.noise=0.0"),
-        ("planner.prior=0", "planner.prior=0.0"),
-        ("planner.beams=0", "planner.beams=0"),
         ("information=x", "information='x' csqmi fsmi"),
         ("coordination=x", "coordination='x' myopic greedy"),
         ("rounds=0", "rounds=0"),
@@ -60,13 +57,10 @@ from gmmtorch.team.cli.runs.explorations import warn_of_robots_at_their_start
         ("transport=zenoh", "transport='zenoh' in_process"),
         ("evaluation.codecs=[jpeg]", "evaluation.codecs 'jpeg' octree draco"),
         ("evaluation.every=0", "evaluation.every=0.0"),
-        ("belief.prior=-1", "belief.prior=-1.0"),
         ("robot.radius=5", "robot.radius=5.0 room"),
         ("runtime.threads=0", "runtime.threads=0"),
         ("runtime.device=meta", "runtime.device=meta"),
         ("seed=-1", "seed=-1"),
-        ("checkpoint.folder=kept", "checkpoint.folder=kept hydra.run.dir=RUN"),
-        ("checkpoint.every=4", "checkpoint.every=4.0 hydra.run.dir=RUN"),
         ("experiment=fig4_4_entropy runtime.workers=0", "runtime.workers=0"),
         ("experiment=fig4_4_entropy study.name=other", "study.name='other' trials"),
         ("experiment=fig4_4_entropy study.variants=[]", "study.variants study.seeds"),

@@ -162,11 +162,11 @@ def test_options_reach_the_mission(run):
     options += ["network.jitter=0.02", "network.duplication=0.5", "network.reach=15", "network.delay=0.1"]
     options += ["network.partitions=[{begin: 1, end: 9, groups: [[0], [1]]}]", "duration=4"]
     options += ["network.announce=1.5", "network.budget=2000"]
-    options += ["evaluation.codecs=[octree]", "team.start=[[2,3,1.5,0],[5,3,1.5,3]]", "planner.prior=0.5"]
+    options += ["evaluation.codecs=[octree]", "team.start=[[2,3,1.5,0],[5,3,1.5,3]]"]
     done = succeeded(run(*options))
     (row,) = done.results()["rows"]
-    names = ["information", "coordination", "loss", "resolution", "planning_prior"]
-    assert [row[name] for name in names] == ["fsmi", "myopic", 0.5, 0.25, 0.5]
+    names = ["information", "coordination", "loss", "resolution"]
+    assert [row[name] for name in names] == ["fsmi", "myopic", 0.5, 0.25]
     names = ["delay", "jitter", "duplication", "reach", "partitions", "announce", "budget"]
     assert [row[name] for name in names] == [0.1, 0.02, 0.5, 15.0, [cut], 1.5, 2000.0]
     assert row["bytes_by_kind"]["announcements"] > 0

@@ -15,6 +15,7 @@ from gmmtorch.team.sharing.transport.security import KEY_VARIABLE
 def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
     """Runs a robot in this process, at a free address, without figures unless told otherwise."""
     monkeypatch.delenv(KEY_VARIABLE, raising=False)
+    monkeypatch.setenv("GMMTORCH_CACHE", str(tmp_path / "cache"))
 
     def run_command(*options: str, name: str = "run") -> Finished:
         chosen = {option.split("=")[0] for option in options}

@@ -8,11 +8,11 @@ from cli.command_runs import Finished
 
 Run = Callable[..., Finished]
 
-SMALL = ["sensor.width=48", "sensor.height=36", "runtime.cache=false"]
+SMALL = ["sensor.width=48", "sensor.height=36"]
 LOG = [
     "source=log",
     "dataset@log.dataset=synthetic_building_2d",
     "log.dataset.n_scans=12",
     "log.dataset.stride=2",
 ]
-LOG += ["map@log.map=windowed", "log.map.window=3", "settle=0"]
+LOG += ["log.map={name: windowed, window: 3}", "settle=0"]

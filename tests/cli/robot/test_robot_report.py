@@ -15,7 +15,7 @@ from cli.command_runs import Disk, as_it_was, composed
 from gmmtorch.cli import common
 from gmmtorch.errors import OutputError
 from gmmtorch.files import write_bytes
-from gmmtorch.team.cli.reporting.robot_report import Outputs, RobotReport, print_refusals, terse
+from gmmtorch.team.cli.robot_report import Outputs, RobotReport, print_refusals, terse
 
 
 class Toy:

@@ -1,31 +1,36 @@
-"""TeamOptions: how a team explores."""
+"""Options of a mission: its team, how robots move, learn and rest, and its world.
+
+Importing this file does not load torch, so that commands can show their options at once.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any
 
-from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, check_whole
+from gmmtorch.declarations import group, option
+from gmmtorch.errors import InvalidArgumentError, arg, check_choice, check_number, check_whole
+from gmmtorch.events import Event, ignore
 from gmmtorch.mapping import NoveltyRule
-from gmmtorch.simulation import DepthCamera
-from gmmtorch.team.exploration.planning.coordination import Coordination
-from gmmtorch.team.exploration.planning.planners import PLANNERS
-from gmmtorch.team.exploration.planning.primitives import Dynamics
-from gmmtorch.team.exploration.planning.view_evaluator import INFORMATION
-from gmmtorch.team.exploration.robot.agent import StoppingRule
-from gmmtorch.team.exploration.robot.gmm_mapper import FrameRule
-from gmmtorch.team.exploration.world.scoring import BeliefRule
-from gmmtorch.team.sharing import (
-    POINT_CODECS,
-    LinkConditions,
-    Partition,
-    Radio,
-    check_codec,
-)
+from gmmtorch.simulation import CameraOptions
+from gmmtorch.team.sharing import LinkConditions
 
-_MOST_ROBOTS = 31  # bits of the integer that stores which robots saw a cell
-_LATE_JITTERS = 5  # mean jitters. Less than 1 % of the datagrams arrive later.
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from gmmtorch.mapping import SurfaceFit
+    from gmmtorch.simulation import DepthCamera
+    from gmmtorch.team.exploration.world.scoring import BeliefRule
+    from gmmtorch.team.exploration.world.world import World
+
+_MOST_ROBOTS = 31
+"""Bits of the integer that stores which robots saw a cell."""
+_LATE_JITTERS = 5
+"""Mean jitters. Less than 1 % of the datagrams arrive later."""
+_EMPTY_LENGTH = 0.75
+"""Length of components of free space, as a share of that of surfaces."""
+_ROUNDING = 1e-9
 
 FRAMEWORKS = ("gmm_shared", "grid_shared", "grid_isolated", "gmm_thesis")
 """E0, E1 and E2 of the thesis; and `gmm_shared` with the options of `THESIS`."""
@@ -47,95 +52,259 @@ _CODEC = "quantized"
 
 
 @dataclass(frozen=True)
-class TeamOptions:
-    """How a team explores; the world is separate.
+class Dynamics:
+    """The limits of a robot's motion, in metres, radians and seconds.
 
-    framework: one of `FRAMEWORKS`; "gmm_thesis" sets the options of `THESIS`. size: number of robots.
-    duration: simulated seconds.
-    seed: of sensor noise, network and planners. rate: frames per second (Hz).
-    camera, dynamics, belief, novelty, frame: see their classes. A robot plans once every `dynamics.duration`.
-    window: cells along x, y, z, around the robot, in which it plans.
-    planner, information, coordination: names; see `planners`, `ViewEvaluator`, `Coordination`.
-    n_beams: of a view. n_rounds: of coordination. planning_prior: occupancy probability of unobserved cells
-        for the planner. rest: when a robot stops exploring.
-    codec: of components, see `sharing.messages`; losses are repaired for "quantized" only.
-    latency … partitions: of the simulated network, see `LinkConditions`.
-    announce_every: seconds, see `Radio`.
-    budget: bytes per second that a robot sends of its map and views; None: no limit.
-    sample_every: simulated seconds between the values of curves, rounded to whole frames.
-    codecs: other codecs whose bytes for the novel points are measured.
-    margin: metres between robots. start: (size, 4) poses; None: chosen by the world.
-    device: of the maps, of learning, and of the information of views. Sensing, planning and messages are on
-        the CPU.
+    Attributes:
+        speed, climb, yaw_rate: largest velocities along the heading, up or down, and of the yaw.
+        acceleration: largest acceleration along the heading and vertically, m/s².
+        yaw_acceleration: largest yaw acceleration, rad/s².
+        duration: of a primitive. step: time between two states of a path; it divides the duration.
+
+    Raises `InvalidArgumentError` unless all are above zero and the step divides the duration.
     """
 
-    framework: str = "gmm_shared"
-    size: int = 3
-    duration: float = 1600.0
-    seed: int = 0
-    rate: float = 1.0
-    camera: DepthCamera = field(default_factory=DepthCamera)
-    dynamics: Dynamics = field(default_factory=Dynamics)
-    belief: BeliefRule = field(default_factory=BeliefRule)
-    novelty: NoveltyRule = field(
-        default_factory=lambda: NoveltyRule(resolution=0.2, observed=0.5, distance=2.0)
+    speed: float = 1.5
+    climb: float = 0.75
+    yaw_rate: float = 1.2
+    acceleration: float = 1.5
+    yaw_acceleration: float = 3.0
+    duration: float = 2.0
+    step: float = 0.2
+    radius: float = option(0.3, "radius (m) of a sphere around the body")
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            check_number(item.name, getattr(self, item.name), above=True)
+        if self.n_steps < 1 or abs(self.n_steps * self.step - self.duration) > 1e-6 * self.duration:
+            raise InvalidArgumentError(
+                f"step={self.step} s does not divide duration={self.duration} s; use a fraction of it."
+            )
+
+    @property
+    def n_steps(self) -> int:
+        """Number of states on the path of a primitive."""
+        return round(self.duration / self.step)
+
+    @property
+    def n_braking_steps(self) -> int:
+        """Number of states until rest from the largest velocities."""
+        return int(self._n_ramp_steps(self._limits).max())
+
+    @property
+    def _limits(self) -> Tensor:
+        import torch
+
+        return torch.tensor([self.speed, self.climb, self.yaw_rate], dtype=torch.float64)
+
+    def _n_ramp_steps(self, change: Tensor) -> Tensor:
+        """Number of whole steps that changes (..., 3) of the velocities take."""
+        import torch
+
+        rates = [self.acceleration, self.acceleration, self.yaw_acceleration]
+        per_step = torch.tensor(rates, dtype=torch.float64) * self.step
+        return (change.abs() / per_step - _ROUNDING).ceil()
+
+    def velocities(self, states: Tensor, commands: Tensor, n_steps: int) -> Tensor:
+        """Return velocities (..., n_steps + 1, 3) from those of states (..., 7) to the commands (..., 3).
+
+        Each velocity changes linearly over the whole steps that the acceleration limit needs, then stays
+        constant. It is therefore linear within every step. Raises `InvalidArgumentError` for states
+        beyond the limits.
+        """
+        import torch
+
+        now = states[..., 4:]
+        if not bool((now.abs() <= self._limits * (1 + _ROUNDING)).all()):  # also catches NaN
+            worst = now.reshape(-1, 3).abs().amax(0).tolist()
+            raise InvalidArgumentError(
+                f"states have velocities up to {worst}; speed, climb and yaw_rate allow "
+                f"{self._limits.tolist()}."
+            )
+        change = commands - now
+        n_ramp = self._n_ramp_steps(change).clamp_min(1)[..., None, :]
+        time = torch.arange(n_steps + 1, dtype=torch.float64)[:, None]
+        ramp = now[..., None, :] + change[..., None, :] * (time / n_ramp)
+        return torch.where(time < n_ramp, ramp, commands[..., None, :])
+
+
+@dataclass(frozen=True)
+class FrameRule:
+    """How a frame becomes components; lengths in metres. See `IncrementalRule` for the first five.
+
+    rays: for each cell that a component covers; see `component_evidence`.
+    shell: cells before a component's surface that its rays do not count as free.
+    hits_per_ray: points drawn from a component of a surface for each of its rays.
+    novelty_block: pixels along the side of the blocks of the image whose novelty one beam decides.
+    update_novel: novel beams that components explain are counted to these, and only the others are learned.
+    update_stride: of the beams that are not novel, every `update_stride`-th is counted, with that weight, to
+        the components that explain it; None: none, they are discarded.
+    update_at: counts of a component are sent once they have grown by this factor; 1: always.
+    update_every: frames between two messages of counts: they are then few and large, and seldom change the
+        mixture.
+    """
+
+    noise: float = option(0.03, "metres; pieces up to twice as thick are flat")
+    length: float = 0.6
+    cell: float = 0.15
+    components: int = 200
+    iterations: int = 4
+    rays: float = 4.0
+    shell: float = 0.5
+    hits_per_ray: int = 8
+    novelty_block: int = 3
+    update_novel: bool = False
+    update_stride: int | None = 11
+    update_at: float = 3.0
+    update_every: int = 10
+
+    def __post_init__(self) -> None:
+        for name in ("noise", "length", "cell"):
+            if not getattr(self, name) > 0:
+                raise InvalidArgumentError(f"{name}={getattr(self, name)} must be above zero metres.")
+        check_number("rays", self.rays, above=True)
+        check_number("shell", self.shell)
+        for name in ("components", "iterations", "hits_per_ray", "novelty_block", "update_every"):
+            check_whole(name, getattr(self, name), 1)
+        if self.update_stride is not None:
+            check_whole("update_stride", self.update_stride, 1)
+        if not 1 <= self.update_at < math.inf:
+            raise InvalidArgumentError(f"update_at={self.update_at} must be at least 1, and finite.")
+
+    def surface_fit(self) -> SurfaceFit:
+        """How the returns of a frame become components."""
+        from gmmtorch.mapping import cell_fit
+
+        return cell_fit(self.noise, self.length, self.cell, self.components, self.iterations, 3)
+
+    def empty_fit(self) -> SurfaceFit:
+        """The same for no-return beams: finer, because they end at the edges of the field of view."""
+        return replace(self, length=_EMPTY_LENGTH * self.length).surface_fit()
+
+
+@dataclass(frozen=True)
+class StoppingRule:
+    """When a robot rests: once it has learned less in the last `window` seconds than `share` of the most that
+    it ever learned in one window. The window should be longer than a flight across the map."""
+
+    share: float = option(
+        0.01,
+        "a robot stops if two minutes give less than this share of its best two minutes; 0: never",
+        "rest",
     )
-    frame: FrameRule = field(default_factory=FrameRule)
-    window: tuple[int, int, int] = (80, 80, 40)
-    planner: str = "mcts"
-    information: str = "csqmi"
+    window: float = 120.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.share < 1:
+            raise InvalidArgumentError(f"share={self.share} must be at least 0, and below 1.")
+        check_number("window", self.window, above=True)
+
+
+def _camera() -> DepthCamera:
+    from gmmtorch.simulation import DepthCamera
+
+    return DepthCamera()
+
+
+def _novelty() -> NoveltyRule:
+    return NoveltyRule(resolution=0.2, observed=0.5, distance=2.0)
+
+
+def _belief() -> BeliefRule:
+    from gmmtorch.team.exploration.world.scoring import BeliefRule
+
+    return BeliefRule()
+
+
+@dataclass(frozen=True)
+class TeamOptions(LinkConditions):
+    """How a team explores; the world is separate.
+
+    belief: from evidence to occupancy, for every team and for the evaluation. n_beams: of a view.
+    planning_prior: occupancy of unobserved cells in the information of a view.
+    margin: metres between robots. device: of the maps, of learning, and of the information of views; sensing,
+    planning and messages are on the CPU. A robot plans once every `dynamics.duration`.
+    """
+
+    framework: str = option("gmm_shared", "gmm_shared, grid_shared, grid_isolated or gmm_thesis", "team.name")
+    size: int = option(3, "number of robots", "team.size")
+    duration: float = option(1600.0, "seconds that each robot flies; simulated seconds in gmmtorch-explore")
+    seed: int = option(0, "seed of sensor noise, network and planners")
+    rate: float = option(1.0, "frames per second", "sensor.rate")
+    camera: DepthCamera = group(CameraOptions, "sensor", make=_camera)
+    dynamics: Dynamics = group(Dynamics, "robot")
+    belief: BeliefRule = field(default_factory=_belief)
+    novelty: NoveltyRule = field(default_factory=_novelty)
+    frame: FrameRule = group(FrameRule, "map")
+    window: tuple[int, int, int] = option(
+        (80, 80, 40), "cells along x, y and z of the local map around a robot, for planning", "map.window"
+    )
+    planner: str = option("mcts", "mcts, frontier or random", "planner.name")
+    information: str = option("csqmi", "measure of the information of a view: csqmi or fsmi")
     n_beams: int = 160
-    coordination: str = "greedy"
-    n_rounds: int = 3
+    coordination: str = option("greedy", "myopic, greedy, distributed_greedy or random_partition")
+    n_rounds: int = option(3, "rounds of distributed_greedy and random_partition", "rounds")
     planning_prior: float = 0.125
-    rest: StoppingRule = field(default_factory=StoppingRule)
-    codec: str = _CODEC
-    latency: float = 0.05
-    jitter: float = 0.0
-    bandwidth: float | None = None
-    loss: float = 0.0
-    duplication: float = 0.0
-    reach: float | None = None
-    partitions: tuple[Partition, ...] = ()
-    announce_every: float = 5.0
-    budget: float | None = None
-    sample_every: float = 10.0
-    codecs: tuple[str, ...] = ()
+    rest: StoppingRule = group(StoppingRule, "planner")
+    codec: str = option(
+        _CODEC, "code of components: quantized (about 8.7 bytes each), float, or thesis (57 bytes)"
+    )
+    announce_every: float = option(
+        5.0, "seconds between announcements of a robot's records, while these change", "network.announce"
+    )
+    budget: float | None = option(
+        None,
+        "bytes per second that each robot sends of its map and views; null: no limit",
+        "network.budget",
+    )
+    sample_every: float = option(10.0, "seconds between the rows of a mission's curves", "evaluation.every")
+    codecs: tuple[str, ...] = option(
+        (), "further encodings of the novel points, for comparison: octree, draco", "evaluation.codecs"
+    )
     margin: float = 0.1
-    start: tuple[tuple[float, ...], ...] | None = None
+    start: tuple[tuple[float, ...], ...] | None = option(
+        None, "[[x,y,z,yaw], …] for each robot (m, rad); null: chosen from the world", "team.start"
+    )
     device: str = "cpu"
 
     def __post_init__(self) -> None:
+        from gmmtorch.team.exploration.planning.coordination import Coordination
+        from gmmtorch.team.exploration.planning.planners import PLANNERS
+        from gmmtorch.team.exploration.planning.view_evaluator import INFORMATION
+        from gmmtorch.team.sharing import POINT_CODECS, Radio, check_codec
+
+        super().__post_init__()
         check_choice("team", self.framework, FRAMEWORKS)
         check_choice("planner", self.planner, PLANNERS)
         check_choice("information", self.information, INFORMATION)
         for name in self.codecs:
-            check_choice("evaluation.codecs", name, tuple(POINT_CODECS))
+            check_choice("codecs", name, tuple(POINT_CODECS))
         if self.framework == "gmm_thesis":
             self._set_thesis()
-        check_whole("team.size", self.size, 1)
-        if self.size > _MOST_ROBOTS:
-            raise InvalidArgumentError(f"team.size={self.size} must be at most {_MOST_ROBOTS}.")
+        check_whole("size", self.size, 1, _MOST_ROBOTS)
         check_whole("seed", self.seed, 0)
         check_whole("n_beams", self.n_beams, 1)
         check_codec(self.codec)
         for name in ("duration", "rate", "sample_every"):
             check_number(name, getattr(self, name), above=True)
         check_number("margin", self.margin)
+        if self.start is not None:
+            object.__setattr__(self, "start", _checked_poses(self.start))
         # These check their own arguments.
         Coordination(self.coordination, self.n_rounds)
         Radio.check(self.announce_every, self.budget)
-        self.conditions.check_team(self.size)
+        self.check_team(self.size)
         if not 0 < self.planning_prior < 1:
-            raise InvalidArgumentError(f"planner.prior={self.planning_prior} must be between 0 and 1.")
+            raise InvalidArgumentError(f"planning_prior={self.planning_prior} must be between 0 and 1.")
         for name, ratio in (
             ("the planning period in frames", self.dynamics.duration * self.rate),
             ("the frame period in steps of the dynamics", 1 / (self.rate * self.dynamics.step)),
         ):
             if abs(ratio - round(ratio)) > 1e-6 or round(ratio) < 1:
                 raise InvalidArgumentError(
-                    f"sensor.rate={self.rate} Hz with robot.duration={self.dynamics.duration} s and "
-                    f"robot.step={self.dynamics.step} s makes {name} {ratio:g}; it must be a whole number."
+                    f"{arg('rate')}={self.rate} Hz with {arg('dynamics.duration')}="
+                    f"{self.dynamics.duration} s and steps of {self.dynamics.step} s makes {name} {ratio:g}; "
+                    "it must be a whole number."
                 )
 
         frames = self.duration * self.rate
@@ -144,7 +313,7 @@ class TeamOptions:
                 f"{n / self.rate:g}" for n in (math.floor(frames), math.floor(frames) + 1) if n
             )
             raise InvalidArgumentError(
-                f"duration={self.duration} s is no whole number of frames at sensor.rate={self.rate} Hz; "
+                f"duration={self.duration} s is no whole number of frames at {arg('rate')}={self.rate} Hz; "
                 f"take {near}."
             )
 
@@ -186,19 +355,6 @@ class TeamOptions:
         return max(1, round(self.sample_every * self.rate))
 
     @property
-    def conditions(self) -> LinkConditions:
-        """Conditions of the simulated network."""
-        return LinkConditions(
-            latency=self.latency,
-            jitter=self.jitter,
-            bandwidth=self.bandwidth,
-            loss=self.loss,
-            duplication=self.duplication,
-            reach=self.reach,
-            partitions=self.partitions,
-        )
-
-    @property
     def plan_slack(self) -> float:
         """Seconds to wait for the plan of the robot before; 0 if the network is too slow for one tick."""
         slack = 2 * self.latency + _LATE_JITTERS * self.jitter + 0.01
@@ -218,3 +374,53 @@ class TeamOptions:
     def shares(self) -> bool:
         """Whether robots send anything."""
         return self.framework != "grid_isolated"
+
+
+def _checked_poses(start: Any) -> tuple[tuple[float, ...], ...]:
+    """Start poses as tuples. Raises `InvalidArgumentError` unless each has four numbers."""
+    try:
+        poses = tuple(tuple(float(x) for x in pose) for pose in start)
+    except (TypeError, ValueError):
+        poses = ()
+    if not poses or any(len(pose) != 4 for pose in poses):
+        raise InvalidArgumentError(
+            f"start={start} must be poses of four numbers each: [[x, y, z, yaw], …], m and rad."
+        )
+    return poses
+
+
+@dataclass(frozen=True)
+class WorldOptions:
+    """Which world; see `world.open_world`. cache: keep computed properties on disk."""
+
+    name: str = option("warehouse", "warehouse, tunnels or mesh", "world.name")
+    path: str | None = option(None, "triangle mesh (PLY, OBJ, STL) in metres, z up", "world.path")
+    bounds: tuple[float, ...] | None = option(
+        None, "part of a mesh to explore, [x0,y0,z0,x1,y1,z1] (m); null: all", "world.bounds"
+    )
+    size: tuple[float, ...] | None = option(
+        None, "length, width and height (m) of a generated world", "world.size"
+    )
+    seed: int = option(0, "seed of a generated world", "world.seed")
+    resolution: float = option(
+        0.2, "side (m) of the cells of every map and of the evaluation", "world.resolution"
+    )
+    cache: bool = True
+
+    def open(self, team: TeamOptions, on_event: Event = ignore) -> World:
+        """The world for robots with this camera and this body."""
+        from gmmtorch.team.exploration.world.world import open_world
+
+        return open_world(
+            self.name,
+            path=self.path,
+            bounds=self.bounds,
+            seed=self.seed,
+            size=self.size,
+            resolution=self.resolution,
+            vertical_fov=team.camera.vertical_fov,
+            max_range=team.camera.max_range,
+            robot_radius=team.dynamics.radius,
+            cache=self.cache,
+            on_event=on_event,
+        )

@@ -26,7 +26,7 @@ from gmmtorch.occupancy import RollingWindow
 from gmmtorch.processes import end_with_parent
 from gmmtorch.team.exploration.mission.driver import SimulatedClock, Stopwatch, drive
 from gmmtorch.team.exploration.mission.mission import Mission, MissionScore
-from gmmtorch.team.exploration.mission.options import TeamOptions
+from gmmtorch.team.exploration.mission.options import TeamOptions, WorldOptions
 from gmmtorch.team.exploration.mission.results import mission_row
 from gmmtorch.team.exploration.planning.journeys import Roadmap
 from gmmtorch.team.exploration.planning.planners import make_planner
@@ -37,7 +37,7 @@ from gmmtorch.team.exploration.robot.gmm_mapper import GmmMapper
 from gmmtorch.team.exploration.robot.mapper import GridMapper, Mapper, Memo
 from gmmtorch.team.exploration.world import starts
 from gmmtorch.team.exploration.world.scoring import BeliefMap
-from gmmtorch.team.exploration.world.world import World, open_world
+from gmmtorch.team.exploration.world.world import World
 from gmmtorch.team.sharing import Broadcast, Network, Replica, Transport, ViewLibrary
 
 _SLACK = 24
@@ -59,7 +59,7 @@ def assemble(world: World, options: TeamOptions, watch: Stopwatch | None = None)
     watch: times the stages of all robots together; None: wall time.
     """
     poses = start_poses(world, options)
-    network = Network(options.size, options.conditions, seed=options.seed)
+    network = Network(options.size, options, seed=options.seed)
     memo, evidence = Memo(_CACHED_MESSAGES), Memo(_CACHED_EVIDENCE * options.size)
     watch = Stopwatch() if watch is None else watch
     agents = [
@@ -78,7 +78,7 @@ def start_poses(world: World, options: TeamOptions) -> Tensor:
     poses = torch.tensor(options.start, dtype=torch.float64)
     if poses.shape != (options.size, 4):
         raise InvalidArgumentError(
-            f"team.start has shape {tuple(poses.shape)}; expected a pose x, y, z, yaw for each of "
+            f"‹start› has shape {tuple(poses.shape)}; expected a pose x, y, z, yaw for each of "
             f"{options.size} robots."
         )
     return starts.check_start(world, poses, primitives)
@@ -144,9 +144,9 @@ def _check_window(options: TeamOptions, resolution: float) -> None:
         sight = (n / 2 - _ROUNDING) * resolution
         if sight < needed:
             raise InvalidArgumentError(
-                f"map.window={list(options.window)} cells of {resolution} m reaches {max(sight, 0):.3g} m "
+                f"‹window›={list(options.window)} cells of {resolution} m reaches {max(sight, 0):.3g} m "
                 f"around the robot along {axis}, less than the {needed:.3g} m that a camera of "
-                f"sensor.max_range={camera.max_range} m sees; take a larger window."
+                f"‹max_range›={camera.max_range} m sees; take a larger window."
             )
 
 
@@ -173,36 +173,6 @@ STAGE = "simulated seconds"
 _CONVERGENCE = 120.0  # simulated seconds after a mission in which the maps may become equal
 
 OnMission = Callable[[Mission], object]
-
-
-@dataclass(frozen=True)
-class WorldOptions:
-    """Which world; see `world.open_world`. size (m), seed: of generated worlds. path, bounds: of a mesh.
-    cache: keep computed properties on disk."""
-
-    name: str = "warehouse"
-    path: str | None = None
-    bounds: tuple[float, ...] | None = None
-    size: tuple[float, ...] | None = None
-    seed: int = 0
-    resolution: float = 0.2
-    cache: bool = True
-
-    def open(self, team: TeamOptions, on_event: Event = ignore) -> World:
-        """The world for robots with this camera and this body."""
-        return open_world(
-            self.name,
-            path=self.path,
-            bounds=self.bounds,
-            seed=self.seed,
-            size=self.size,
-            resolution=self.resolution,
-            vertical_fov=team.camera.vertical_fov,
-            max_range=team.camera.max_range,
-            robot_radius=team.dynamics.radius,
-            cache=self.cache,
-            on_event=on_event,
-        )
 
 
 @dataclass(frozen=True)
@@ -354,9 +324,9 @@ def _run_in_parallel(trials: dict[int, Trial], workers: int) -> Iterator[tuple[i
                     yield i, outcome
         except concurrent.futures.process.BrokenProcessPool as broken:
             raise GmmTorchError(
-                "A process that ran a mission was killed, perhaps because memory ran out. The same command "
-                "with hydra.run.dir=RUN continues with the missions that are missing; runtime.workers=1 "
-                "takes least memory."
+                "A process that ran a mission was killed, perhaps because memory ran out. The same trials in "
+                "the same folders continue with the missions that are missing; ‹workers›=1 takes least "
+                "memory."
             ) from broken
     if error is not None:
         raise error

@@ -7,90 +7,15 @@ frame, metres, radians, seconds. Yaw is not wrapped, so it has no jumps.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_number
 from gmmtorch.kernels import Motions
-
-_ROUNDING = 1e-9
+from gmmtorch.team.exploration.mission.options import Dynamics
 
 _QUADRATURE = ((0.5 - math.sqrt(0.15), 5 / 18), (0.5, 8 / 18), (0.5 + math.sqrt(0.15), 5 / 18))
 """Gauss–Legendre nodes and weights on [0, 1]."""
-
-
-@dataclass(frozen=True)
-class Dynamics:
-    """The limits of a robot's motion, in metres, radians and seconds.
-
-    Attributes:
-        speed, climb, yaw_rate: largest velocities along the heading, up or down, and of the yaw.
-        acceleration: largest acceleration along the heading and vertically, m/s².
-        yaw_acceleration: largest yaw acceleration, rad/s².
-        duration: of a primitive. step: time between two states of a path; it divides the duration.
-        radius: of a sphere around the body.
-
-    Raises `InvalidArgumentError` unless all are above zero and the step divides the duration.
-    """
-
-    speed: float = 1.5
-    climb: float = 0.75
-    yaw_rate: float = 1.2
-    acceleration: float = 1.5
-    yaw_acceleration: float = 3.0
-    duration: float = 2.0
-    step: float = 0.2
-    radius: float = 0.3
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            check_number(field.name, getattr(self, field.name), above=True)
-        if self.n_steps < 1 or abs(self.n_steps * self.step - self.duration) > 1e-6 * self.duration:
-            raise InvalidArgumentError(
-                f"step={self.step} s does not divide duration={self.duration} s; use a fraction of it."
-            )
-
-    @property
-    def n_steps(self) -> int:
-        """Number of states on the path of a primitive."""
-        return round(self.duration / self.step)
-
-    @property
-    def n_braking_steps(self) -> int:
-        """Number of states until rest from the largest velocities."""
-        return int(self._n_ramp_steps(self._limits).max())
-
-    @property
-    def _limits(self) -> Tensor:
-        return torch.tensor([self.speed, self.climb, self.yaw_rate], dtype=torch.float64)
-
-    def _n_ramp_steps(self, change: Tensor) -> Tensor:
-        """Number of whole steps that changes (..., 3) of the velocities take."""
-        rates = [self.acceleration, self.acceleration, self.yaw_acceleration]
-        per_step = torch.tensor(rates, dtype=torch.float64) * self.step
-        return (change.abs() / per_step - _ROUNDING).ceil()
-
-    def velocities(self, states: Tensor, commands: Tensor, n_steps: int) -> Tensor:
-        """Return velocities (..., n_steps + 1, 3) from those of states (..., 7) to the commands (..., 3).
-
-        Each velocity changes linearly over the whole steps that the acceleration limit needs, then stays
-        constant. It is therefore linear within every step. Raises `InvalidArgumentError` for states
-        beyond the limits.
-        """
-        now = states[..., 4:]
-        if not bool((now.abs() <= self._limits * (1 + _ROUNDING)).all()):  # also catches NaN
-            worst = now.reshape(-1, 3).abs().amax(0).tolist()
-            raise InvalidArgumentError(
-                f"states have velocities up to {worst}; speed, climb and yaw_rate allow "
-                f"{self._limits.tolist()}."
-            )
-        change = commands - now
-        n_ramp = self._n_ramp_steps(change).clamp_min(1)[..., None, :]
-        time = torch.arange(n_steps + 1, dtype=torch.float64)[:, None]
-        ramp = now[..., None, :] + change[..., None, :] * (time / n_ramp)
-        return torch.where(time < n_ramp, ramp, commands[..., None, :])
 
 
 class Primitives:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Collection
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_number
 from gmmtorch.simulation import DepthFrame, MeshWorld
 from gmmtorch.team.exploration.mission.driver import Stopwatch
+from gmmtorch.team.exploration.mission.options import StoppingRule, TeamOptions
 from gmmtorch.team.exploration.planning.collision_checking import local_map_of
 from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
 from gmmtorch.team.exploration.planning.journeys import Roadmap
@@ -39,25 +37,7 @@ from gmmtorch.team.sharing import (
     encode_plan,
 )
 
-if TYPE_CHECKING:
-    from gmmtorch.team.exploration.mission.options import TeamOptions
-
-
 _NEWS_SHARE = 0.25  # share of the best window that teammates must learn before a resting robot explores again
-
-
-@dataclass(frozen=True)
-class StoppingRule:
-    """A robot rests once it has learned less in the last `window` seconds than `share` of the most that it
-    ever learned in one window. share=0: never. The window should be longer than a flight across the map."""
-
-    share: float = 0.01
-    window: float = 120.0
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.share < 1:
-            raise InvalidArgumentError(f"planner.rest={self.share} must be at least 0, and below 1.")
-        check_number("window", self.window, above=True)
 
 
 class StoppingCriterion:

@@ -9,22 +9,18 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-import math
 import operator
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
 from gmmtorch.mapping import (
     Components,
     NoveltyRule,
-    SurfaceFit,
     all_origins,
     box_around,
-    cell_fit,
     count_explained,
     explained_within,
     fit_window,
@@ -33,68 +29,16 @@ from gmmtorch.mapping import (
 from gmmtorch.occupancy import Box, CellEvidence, RollingWindow, intersection
 from gmmtorch.scan import Scan
 from gmmtorch.simulation import DepthFrame
+from gmmtorch.team.exploration.mission.options import FrameRule
 from gmmtorch.team.exploration.robot.component_rays import MixtureTiles, component_evidence, regenerate
 from gmmtorch.team.exploration.robot.mapper import FrameUpdate, Mapper, Memo, novel_beams
 from gmmtorch.team.exploration.world.scoring import BeliefMap
 from gmmtorch.team.sharing import Broadcast, ReceivedMessage, Replica
 
 _LEEWAY = 0.5  # cells
-_EMPTY_LENGTH = 0.75  # of the length of components of surfaces
 _EMPTY_RAYS = 0.75  # of the rays of components of surfaces: components of free space overlap far more
 _EMPTY_CUTOFF = 2.0
 """Mahalanobis distance. Tails of components of free space reach through surfaces that beams just missed."""
-
-
-@dataclass(frozen=True)
-class FrameRule:
-    """How a frame becomes components; lengths in metres. See `IncrementalRule` for the first five.
-
-    rays: for each cell that a component covers; see `component_evidence`.
-    shell: cells in front of a component's surface that its rays do not count as free.
-    hits_per_ray: points drawn from a component of a surface for each of its rays.
-    novelty_block: pixels along the side of the blocks of the image whose novelty one beam decides.
-    update_novel: novel beams that components explain are counted to these, and only the others are learned.
-    update_stride: of the beams that are not novel, every `update_stride`-th is counted, with that weight, to
-        the components that explain it; null: none, they are discarded.
-    update_at: counts of a component are sent once they have grown by this factor; 1: always.
-    update_every: frames between two messages of counts: they are then few and large, and seldom change the
-        mixture.
-    """
-
-    noise: float = 0.03
-    length: float = 0.6
-    cell: float = 0.15
-    components: int = 200
-    iterations: int = 4
-    rays: float = 4.0
-    shell: float = 0.5
-    hits_per_ray: int = 8
-    novelty_block: int = 3
-    update_novel: bool = False
-    update_stride: int | None = 11
-    update_at: float = 3.0
-    update_every: int = 10
-
-    def __post_init__(self) -> None:
-        for name in ("noise", "length", "cell"):
-            if not getattr(self, name) > 0:
-                raise InvalidArgumentError(f"{name}={getattr(self, name)} must be above zero metres.")
-        check_number("rays", self.rays, above=True)
-        check_number("shell", self.shell)
-        for name in ("components", "iterations", "hits_per_ray", "novelty_block", "update_every"):
-            check_whole(name, getattr(self, name), 1)
-        if self.update_stride is not None:
-            check_whole("update_stride", self.update_stride, 1)
-        if not 1 <= self.update_at < math.inf:
-            raise InvalidArgumentError(f"update_at={self.update_at} must be at least 1, and finite.")
-
-    def surface_fit(self) -> SurfaceFit:
-        """How the returns of a frame become components."""
-        return cell_fit(self.noise, self.length, self.cell, self.components, self.iterations, 3)
-
-    def empty_fit(self) -> SurfaceFit:
-        """The same for no-return beams: finer, because they end at the edges of the field of view."""
-        return replace(self, length=_EMPTY_LENGTH * self.length).surface_fit()
 
 
 class GmmMapper(Mapper):

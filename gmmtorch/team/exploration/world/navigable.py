@@ -93,7 +93,7 @@ def connected(
     parts = torch.from_numpy(parts)
     if n_parts == 0:
         raise InvalidArgumentError(
-            f"{name}: no cell of {resolution} m is above a floor and farther than robot_radius={radius} m "
+            f"{name}: no cell of {resolution} m is above a floor and farther than ‹robot_radius›={radius} m "
             "from the mesh. Use a smaller radius or wider bounds; check that the mesh is in metres with z up."
         )
     if start is not None:

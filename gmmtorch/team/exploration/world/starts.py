@@ -41,9 +41,9 @@ def start_poses(world: World, n: int, primitives: Primitives) -> Tensor:
         robots = "1 robot that starts" if len(found) == 1 else f"{len(found)} robots that start"
         volume = len(centers) * world.resolution**3
         raise InvalidArgumentError(
-            f"{world.name} has room for {robots} {apart:.4g} m apart, but team.size={n}. "
+            f"{world.name} has room for {robots} {apart:.4g} m apart, but ‹size›={n}. "
             f"Only {volume:.3g} m³ are navigable (away from surfaces and above a floor). "
-            "Use fewer robots, or set team.start. If you expect more room, check that the mesh has a floor."
+            "Use fewer robots, or set ‹start›. If you expect more room, check that the mesh has a floor."
         )
     for _ in range(_TRIES):
         stuck = [place for place in found if initial_free_space(world, place, primitives) is None]
@@ -56,8 +56,8 @@ def start_poses(world: World, n: int, primitives: Primitives) -> Tensor:
         if len(found) < n:
             break
     raise InvalidArgumentError(
-        f"{world.name}: found no start poses from which a team of team.size={n} can fly off, with "
-        f"{_robot(world)}. Use a smaller radius, finer cells, slower or fewer robots, or set team.start."
+        f"{world.name}: found no start poses from which a team of ‹size›={n} can fly off, with "
+        f"{_robot(world)}. Use a smaller radius, finer cells, slower or fewer robots, or set ‹start›."
     )
 
 
@@ -67,11 +67,11 @@ def check_start(world: World, poses: Tensor, primitives: Primitives) -> Tensor:
     for i, pose in enumerate(poses):
         others = poses[:i, :3]
         if not bool(torch.isfinite(pose).all()):
-            raise InvalidArgumentError(f"team.start[{i}]={_text(pose)} is not finite.")
+            raise InvalidArgumentError(f"‹start›[{i}]={_text(pose)} is not finite.")
         fault = _fault(world, others, pose[:3], primitives)
         if fault is not None:
             instead = _instead(world, others, pose, primitives)
-            raise InvalidArgumentError(f"team.start[{i}]={_text(pose)} {fault}; {instead}.")
+            raise InvalidArgumentError(f"‹start›[{i}]={_text(pose)} {fault}; {instead}.")
     return poses
 
 
@@ -84,10 +84,10 @@ def _fault(world: World, others: Tensor, place: Tensor, primitives: Primitives) 
     clear = float(world.mesh.clearance(place[None]))
     near = f"is {clear:.2f} m from a surface"
     if clear <= world.robot_radius:
-        return f"{near}, where a robot of robot.radius={world.robot_radius:g} m touches it"
+        return f"{near}, where a robot of ‹radius›={world.robot_radius:g} m touches it"
     gap = (others - place).norm(dim=1)
     if bool((gap <= 2 * world.robot_radius).any()):
-        return f"touches the robot of team.start[{int(gap.argmin())}]"
+        return f"touches the robot of ‹start›[{int(gap.argmin())}]"
     launch = initial_free_space(world, place, primitives)
     flown = place if launch is None else launch.trail[0]
     if not bool(world.navigable[((flown / world.resolution).floor().long() - world.box.low).unbind()]):
@@ -95,7 +95,7 @@ def _fault(world: World, others: Tensor, place: Tensor, primitives: Primitives) 
             return f"has no surface of {world.name} below it, and robots fly above a floor"
         return (
             f"is not in the part of {world.name} that is flown in: it nearly touches a surface, is in a "
-            "solid, or in another part, which world.bounds=[x0,y0,z0,x1,y1,z1] around that would choose"
+            "solid, or in another part, which ‹bounds›=[x0,y0,z0,x1,y1,z1] around that would choose"
         )
     if launch is None:
         return f"{near}, and no safe motion leads away from there with {_robot(world)}"
@@ -117,7 +117,7 @@ def _instead(world: World, others: Tensor, pose: Tensor, primitives: Primitives)
 
 
 def _robot(world: World) -> str:
-    return f"robot.radius={world.robot_radius:g} m in cells of world.resolution={world.resolution:g} m"
+    return f"‹radius›={world.robot_radius:g} m in cells of ‹resolution›={world.resolution:g} m"
 
 
 def _text(numbers: Tensor) -> str:

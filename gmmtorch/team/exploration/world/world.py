@@ -216,8 +216,8 @@ def _check_sizes(
         check_number(key, value, above=True)
     if max_range <= robot_radius + 2 * resolution:
         raise InvalidArgumentError(
-            f"max_range={max_range} m ends within two cells of the robot (robot_radius={robot_radius} m, "
-            f"resolution={resolution} m); use a longer range or finer cells."
+            f"max_range={max_range} m ends within two cells of the robot (‹robot_radius›={robot_radius} m, "
+            f"‹resolution›={resolution} m); use a longer range or finer cells."
         )
 
 
@@ -259,7 +259,7 @@ def _lattice_box(
     if n_cells > MAX_CELLS:
         raise MemoryLimitError(
             f"{name}: {n_cells:.3g} cells of {resolution} m from {_text(low, high)} are more than "
-            f"{MAX_CELLS:.3g}. Use a coarser resolution (world.resolution) or tighter bounds (world.bounds); "
+            f"{MAX_CELLS:.3g}. Use a coarser ‹resolution› or tighter ‹bounds›; "
             "check that the mesh is in metres, not millimetres."
         )
     return Box(first.long(), last.long() + 1)
@@ -284,7 +284,7 @@ def open_world(
         file = Path("" if path is None else path).expanduser()
         if not file.is_file():
             raise MissingDataError(
-                f"world.path={path} is not a file; give a triangle mesh (PLY, OBJ, STL) in metres, z up."
+                f"‹path›={path} is not a file; give a triangle mesh (PLY, OBJ, STL) in metres, z up."
             )
         return World.from_mesh(read_triangles(file), bounds=bounds, name=file.stem, **options)
     if path is not None:

@@ -268,8 +268,8 @@ def _check_key(name: str, address: Address, key: TeamKey | None, insecure: bool)
     host = check_address(name, address)
     if key is None and not insecure and not host.is_loopback:
         raise InvalidArgumentError(
-            f"{name}={str(host)!r} reaches other machines, and there is no key (key=None): give one, "
-            f"take {LOOPBACK}, or set insecure=True to let anyone read and write."
+            f"{name}={str(host)!r} reaches other machines, and there is no key (‹key›=None): give one, "
+            f"take {LOOPBACK}, or set ‹insecure›=True to let anyone read and write."
         )
 
 
@@ -281,6 +281,6 @@ def _check_peers(peers: Sequence[Address], address: Address) -> None:
             raise InvalidArgumentError(f"peers={peer!r} is a group; use UdpTransport.multicast.")
         if is_local and not host.is_loopback:
             raise InvalidArgumentError(
-                f"peers={peer!r} cannot be reached from address={address[0]!r}, which only this machine "
+                f"peers={peer!r} cannot be reached from ‹address›={address[0]!r}, which only this machine "
                 "reaches; listen on 0.0.0.0, with a key."
             )

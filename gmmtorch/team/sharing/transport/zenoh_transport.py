@@ -25,7 +25,7 @@ _IP_PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws")
 _ADDRESS = re.compile(r"(?:\[([0-9a-fA-F:.]+)\]|([^\s:\[\]]+)):([0-9]{1,5})")
 _LARGEST_MESSAGE = 1 << 16
 """Bytes that Zenoh assembles from parts. Its default would accept a gigabyte from any stranger."""
-_KEY_REMEDY = "give one, or say insecure=True to let anybody read and write."
+_KEY_REMEDY = "give one, or say ‹insecure›=True to let anybody read and write."
 _REMEDIES = {
     "in use": "another process has that port. Stop it (`ss -tulpn` shows it), or give another port.",
     "assign requested": "this machine has no such address, or not yet. `ip address` lists those it has; "
@@ -57,13 +57,14 @@ def open_session(
     if `config` does not exist, and `DataError` if it is no configuration.
     """
     if is_local and (scouting or config is not None):
-        given = "scouting=True" if scouting else f"config={str(config)!r}"
+        given = "scouting=True" if scouting else f"‹config›={str(config)!r}"
         raise InvalidArgumentError(
-            f"{given} may reach other machines, and there is no key (key=None): {_KEY_REMEDY}"
+            f"{given} may reach other machines, and there is no key (‹key›=None): {_KEY_REMEDY}"
         )
     if not (listen or connect or scouting or config is not None):
         raise InvalidArgumentError(
-            "No robot is reached with listen=[], connect=[], scouting=None, config=None: give one of them."
+            "No robot is reached with ‹listen›=[], ‹connect›=[], scouting=None, ‹config›=None: give one of "
+            "them."
         )
     settings = _settings(
         _checked("listen", listen, 0, is_local), _checked("connect", connect, 1, is_local), scouting, config
@@ -80,8 +81,8 @@ def open_session(
         cause = _cause(error)
         remedies = (remedy for sign, remedy in _REMEDIES.items() if sign in cause)
         raise InvalidArgumentError(
-            f"listen={list(listen)}, connect={list(connect)}, config={str(config)!r} cannot be used by Zenoh "
-            f"({cause}): {next(remedies, 'see the documentation of Zenoh.')}"
+            f"listen={list(listen)}, ‹connect›={list(connect)}, ‹config›={str(config)!r} cannot be used by "
+            f"Zenoh ({cause}): {next(remedies, 'see the documentation of Zenoh.')}"
         ) from error
 
 
@@ -127,7 +128,7 @@ def _checked(name: str, endpoints: Sequence[str], least_port: int, is_local: boo
         host = _host(name, endpoint, least_port)
         if is_local and not _is_loopback(host):
             raise InvalidArgumentError(
-                f"{name}={endpoint!r} reaches other machines, and there is no key (key=None): "
+                f"{name}={endpoint!r} reaches other machines, and there is no key (‹key›=None): "
                 f"take 127.0.0.1, {_KEY_REMEDY}"
             )
     return list(endpoints)

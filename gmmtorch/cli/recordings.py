@@ -2,28 +2,38 @@
 
 from __future__ import annotations
 
+import contextlib
+import glob
+import hashlib
 import json
+import logging
 import os
 import platform
+import re
+import socket
 import tempfile
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 
-from gmmtorch.cli import common
-from gmmtorch.cli.from_options import maps
-from gmmtorch.cli.from_options.scans import open_with_trajectory
-from gmmtorch.cli.reporting import map_outputs
-from gmmtorch.cli.runs.inputs import find_recordings, local_copy
-from gmmtorch.cli.runs.tasks import Outcome, run_tasks
-from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MemoryLimitError
+from gmmtorch.cli import common, inputs
+from gmmtorch.cli.outputs import map_outputs
+from gmmtorch.errors import (
+    DataError,
+    GmmTorchError,
+    InvalidArgumentError,
+    MemoryLimitError,
+    MissingDataError,
+    check_whole,
+)
 from gmmtorch.events import Row
 from gmmtorch.files import write_bytes, write_json
 from gmmtorch.mapping import MapBuilder, TiledMap, check_same_run, merge, resident_bytes, tile_files
+from gmmtorch.optional_packages import load_ray
 from gmmtorch.report import ProgressBars
 
 _STAGE = "recordings"
@@ -52,7 +62,7 @@ def run(config: DictConfig) -> None:
             f"inputs are paths of dataset={config.dataset.name}: choose the data set whose files they are, "
             "such as dataset=rosbag, and leave dataset.path out."
         )
-    maps.map_factory(config, resolution=config.resolution)  # an invalid option fails before any work
+    inputs.map_factory(config, resolution=config.resolution)  # an invalid option fails before any work
     found = find_recordings(config.inputs)
     facts = {name: _facts(config, address) for name, address in found.items()}
     with ProgressBars(enabled=config.report.progress) as bars:
@@ -143,15 +153,15 @@ def map_recording(facts: dict[str, Any], options: dict[str, Any]) -> Mapped:
     except GmmTorchError as error:
         return Mapped({}, {}, str(error))
     except Exception as error:
-        return Mapped({}, {}, f"{traceback.format_exc()}{type(error).__name__}: {error}")
+        return Mapped({}, {}, f"{traceback.format_exc()}{type(error).__name__}: {error!s}")
 
 
 def _mapped(config: DictConfig, path: Path) -> Mapped:
     begin = time.process_time()
     device = common.use_runtime(config.runtime)
     config.dataset.path = str(path)
-    dataset, poses, odometry = open_with_trajectory(config.dataset)
-    builder = MapBuilder(dataset, maps.map_factory(config, resolution=config.resolution)(), device)
+    dataset, poses, odometry = inputs.open_with_trajectory(config.dataset)
+    builder = MapBuilder(dataset, inputs.map_factory(config, resolution=config.resolution)(), device)
     for _ in builder.insert_all():
         pass
     builder.finish()
@@ -207,8 +217,188 @@ def _show(
     try:
         built = tiled.open()
     except MemoryLimitError as error:
-        return [f"pictures  none: {error}"], [str(error)] if config.export else []
+        return [f"pictures  none: {error!s}"], [str(error)] if config.export else []
     exported, errors = map_outputs.write_exports(config, built, folder, bars)
     paths = [map_outputs.positions(place / map_outputs.TRAJECTORY, tiled.dim) for place in places]
     map_outputs.draw(config, built, paths, row, folder)
     return exported, errors
+
+
+# -- the recordings ----------------------------------------------------------------------------------
+
+
+_LONGEST_NAME = 60
+
+
+def find_recordings(inputs: Sequence[str]) -> dict[str, str]:
+    """The address of each recording by a name that is unique and a valid file name, sorted.
+
+    inputs: files or folders, globs with *, ? and **, and URLs such as s3://bucket/drives/*.mcap. What two of
+    them match is one recording.
+
+    Raises `MissingDataError` for an input that matches nothing, and `DataError` for a URL that cannot be
+    read.
+    """
+    found: dict[str, str] = {}
+    for pattern in inputs:
+        matches = _remote(pattern) if "://" in pattern else _local(pattern)
+        if not matches:
+            raise MissingDataError(
+                f"inputs={pattern!r} matches no file or folder; give paths, globs or URLs of recordings."
+            )
+        found |= {_name(address): address for address in matches}
+    return dict(sorted(found.items()))
+
+
+def _local(pattern: str) -> list[str]:
+    matches = glob.glob(str(Path(pattern).expanduser()), recursive=True)
+    return [str(Path(match).resolve()) for match in matches]
+
+
+def _remote(pattern: str) -> list[str]:
+    with _errors_of(pattern):
+        system, path = _file_system(pattern)
+        matches = system.glob(path) if glob.has_magic(path) else [path] if system.exists(path) else []
+        return [str(system.unstrip_protocol(match)) for match in matches]
+
+
+def _name(address: str) -> str:
+    """The last part of an address, and the start of its hash, because two folders can have equal names."""
+    last = address.rstrip("/").split("/")[-1] if "://" in address else Path(address).name
+    stem = re.sub(r"[^\w.-]+", "_", last)[:_LONGEST_NAME].strip(".")
+    return f"{stem or 'recording'}-{hashlib.sha256(address.encode()).hexdigest()[:8]}"
+
+
+@contextlib.contextmanager
+def local_copy(address: str) -> Iterator[Path]:
+    """A local path of a recording. A remote one is copied to a temporary folder, which is removed at the end.
+
+    Raises `DataError` if it cannot be copied.
+    """
+    if "://" not in address:
+        yield Path(address)
+        return
+    with tempfile.TemporaryDirectory(prefix="gmmtorch-") as folder:
+        target = Path(folder) / address.rstrip("/").split("/")[-1]
+        with _errors_of(address):
+            system, path = _file_system(address)
+            system.get(path, str(target), recursive=bool(system.isdir(path)))
+        yield target
+
+
+def _file_system(url: str) -> tuple[Any, str]:
+    import fsspec  # a dependency of torch
+
+    system, path = fsspec.core.url_to_fs(url)
+    return system, str(path)
+
+
+@contextlib.contextmanager
+def _errors_of(url: str) -> Iterator[None]:
+    """Errors of a file system become a `DataError` that names the URL."""
+    try:
+        yield
+    except ImportError as error:
+        protocol = url.partition("://")[0]
+        raise DataError(
+            f"inputs: {url} cannot be read: {error}. fsspec reads {protocol}:// with that package: install "
+            "it with pip."
+        ) from error
+    except Exception as error:  # every file system has errors of its own
+        raise DataError(
+            f"inputs: {url} cannot be read ({type(error).__name__}: {error}); check the address and your "
+            "access to it."
+        ) from error
+
+
+# -- tasks -------------------------------------------------------------------------------------------
+
+
+_TRIES = 3
+_REACH_SECONDS = 10.0
+_OBJECT_BYTES = 256 << 20  # memory that results of local tasks share until they are fetched
+
+
+class Outcome(NamedTuple):
+    """The result of a task, or its error. n_lost: workers that were lost while they ran it."""
+
+    name: str
+    result: Any
+    n_lost: int
+    error: str | None = None
+
+
+def run_tasks(
+    task: Callable[..., Any], arguments: Mapping[str, tuple[Any, ...]], workers: int, cluster: str | None
+) -> Iterator[Outcome]:
+    """Outcomes of `task(*arguments[name])` for each name, as they finish.
+
+    Args:
+        task: a function of a module that the workers can import. It raises nothing.
+        workers: processes of this machine; with 1 the tasks run in this process, and Ray is not needed.
+        cluster: address of a Ray cluster, such as ray://head:10001 or auto; then `workers` is not used.
+
+    A task whose worker is killed, or runs out of memory, runs again, on another worker.
+    Raises `GmmTorchError` if Ray is needed and does not load, or the cluster cannot be reached.
+    """
+    check_whole("workers", workers, 1)
+    if workers == 1 and cluster is None:
+        for name, values in arguments.items():
+            yield Outcome(name, task(*values), 0)
+        return
+    ray = load_ray()
+    if cluster is not None:
+        _check_reachable(cluster)
+    _start(ray, min(workers, len(arguments)), cluster)
+    try:
+        yield from _outcomes(ray, task, arguments)
+    finally:
+        ray.shutdown()
+
+
+def _start(ray: Any, workers: int, cluster: str | None) -> None:
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is reported to Ray's authors
+    options: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
+    if cluster is None:
+        options |= {"num_cpus": workers, "include_dashboard": False, "object_store_memory": _OBJECT_BYTES}
+    try:
+        ray.init(address=cluster or "local", **options)
+    except Exception as error:  # by the address: ConnectionError, ValueError, RuntimeError, errors of gRPC
+        place = f"cluster={cluster}" if cluster else f"workers={workers}"
+        raise GmmTorchError(
+            f"{place}: Ray does not start ({type(error).__name__}: {error}); check the address of the "
+            "cluster and that its Ray has this version, or use workers=1."
+        ) from error
+
+
+def _check_reachable(cluster: str) -> None:
+    """Raises `GmmTorchError` if nobody listens at an address with a port: Ray would wait for minutes."""
+    host, _, port = cluster.removeprefix("ray://").rpartition(":")
+    if not (host and port.isdigit()):
+        return
+    try:
+        socket.create_connection((host, int(port)), timeout=_REACH_SECONDS).close()
+    except (OSError, OverflowError) as error:
+        raise GmmTorchError(
+            f"cluster={cluster} cannot be reached ({error}); check the address of the cluster's "
+            "head, or leave cluster out."
+        ) from error
+
+
+def _outcomes(
+    ray: Any, task: Callable[..., Any], arguments: Mapping[str, tuple[Any, ...]]
+) -> Iterator[Outcome]:
+    remote = ray.remote(num_cpus=1, max_retries=0)(task)  # retries are counted here
+    running = {remote.remote(*values): (name, 0) for name, values in arguments.items()}
+    while running:
+        (done,), _ = ray.wait(list(running), num_returns=1)
+        name, n_lost = running.pop(done)
+        try:
+            yield Outcome(name, ray.get(done), n_lost)
+        except ray.exceptions.RayTaskError as error:  # such as a worker that lacks gmmtorch
+            yield Outcome(name, None, n_lost, f"its worker failed: {error}")
+        except ray.exceptions.RayError as error:
+            if n_lost + 1 < _TRIES:
+                running[remote.remote(*arguments[name])] = (name, n_lost + 1)
+            else:
+                yield Outcome(name, None, n_lost + 1, f"its worker was lost {n_lost + 1} times: {error}")

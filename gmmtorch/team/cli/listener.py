@@ -10,9 +10,8 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from gmmtorch.cli import map_factory
 from gmmtorch.live import LiveView
-from gmmtorch.team.cli.from_options import links, missions
+from gmmtorch.team.cli import links, missions, robots
 from gmmtorch.team.exploration import (
     RECEIVED,
     Agent,
@@ -80,6 +79,6 @@ def _of_log(
     config: DictConfig, number: int, transport: FramedTransport, traffic: _Traffic
 ) -> tuple[Callable[[float], object], ReplayMoments]:
     """A listener that holds the team's map."""
-    make_map = map_factory(missions.log_map_options(config))
+    make_map = robots.log_map(config)
     mission = ReplayMission(Replica(number), [], transport, make_map, announce_every=config.network.announce)
     return mission.exchange, ReplayMoments(mission, traffic)

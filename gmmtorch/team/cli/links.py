@@ -19,17 +19,13 @@ _ZENOH_NAMES = {
     **_NAMES,
     "listen": "link.listen_endpoints",
     "connect": "link.connect_endpoints",
-    "scouting": "link.scouting",
     "config": "link.zenoh_config",
     "team": "link.team",
 }
 _UDP_NAMES = {
     **_NAMES,
     "address": "link.listen",
-    "peers": "link.peers",
-    "group": "link.group",
-    "interface": "link.interface",
-    "ttl": "link.ttl",
+    **{name: f"link.{name}" for name in ("peers", "group", "interface")},
 }
 """Options by the arguments that they become, for error messages."""
 
@@ -68,7 +64,6 @@ def _zenoh(robot: int, link: dict[str, Any], key: TeamKey | None) -> FramedTrans
         link["team"],
         listen=link["listen_endpoints"],
         connect=link["connect_endpoints"],
-        scouting=link["scouting"],
         config=link["zenoh_config"],
         key=key,
         insecure=link["insecure"],
@@ -79,9 +74,7 @@ def _udp(robot: int, link: dict[str, Any], key: TeamKey | None) -> FramedTranspo
     insecure = link["insecure"]
     if link["group"] is not None:
         group = address("link.group", link["group"], least_port=1)
-        return UdpTransport.multicast(
-            robot, group, link["interface"], link["ttl"], key=key, insecure=insecure
-        )
+        return UdpTransport.multicast(robot, group, link["interface"], key=key, insecure=insecure)
     listen = address("link.listen", link["listen"])
     peers = [address("link.peers", peer, least_port=1) for peer in link["peers"]]
     return UdpTransport.unicast(robot, listen, peers, key=key, insecure=insecure)

@@ -12,8 +12,8 @@ import torch
 from omegaconf import DictConfig, ListConfig
 from torch import Tensor
 
-from gmmtorch.cli import common
-from gmmtorch.cli.reporting import map_outputs
+from gmmtorch.cli import common, schema
+from gmmtorch.cli.outputs import map_outputs
 from gmmtorch.datasets import Dataset, read_trajectory, to_nanoseconds
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.events import Row
@@ -76,7 +76,7 @@ def true_poses(config: DictConfig, dataset: Dataset, dim: int) -> Truth | None:
         matrices = torch.stack([blank if pose is None else pose.double() for pose in poses])
         truth = Truth(matrices, torch.tensor([pose is not None for pose in poses]))
     else:
-        with common.naming({"dataset.poses": "truth"}):
+        with schema.naming({"poses": "truth"}):
             trajectory = read_trajectory(config.truth, len(dataset))
         is_timed = bool((trajectory.times >= len(trajectory)).any()) or len(trajectory) != len(dataset)
         times = to_nanoseconds(scan_times(dataset).numpy()) if is_timed else trajectory.times

@@ -12,9 +12,9 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 import gmmtorch
-from gmmtorch.cli import common
-from gmmtorch.cli.options import map_schema
-from gmmtorch.cli.reporting import exported_files
+from gmmtorch.cli import common, schema
+from gmmtorch.cli.export import ExportOptions
+from gmmtorch.cli.outputs import exported_files
 from gmmtorch.datasets import Dataset, read_trajectory
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError, MissingDataError, check_number
 from gmmtorch.events import Event, Row
@@ -182,7 +182,7 @@ def write_exports(
             "runtime": {key: config.runtime[key] for key in ("device", "threads", "memory_limit")},
             **({"z_min": config.z_min, "z_max": config.z_max} if name == "map_server" else {}),
         }
-        merged: Any = OmegaConf.merge(OmegaConf.structured(map_schema.Export), options)
+        merged: Any = OmegaConf.merge(OmegaConf.structured(schema.schema_of(ExportOptions)), options)
         try:
             written = exported_files.write_space(merged, source, on_event)
         except GmmTorchError as error:

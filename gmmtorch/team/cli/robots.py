@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -10,11 +11,21 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from gmmtorch.cli import as_options, logger, map_factory, naming, open_dataset, run_dir
+from gmmtorch.cli import (
+    argument_names,
+    as_options,
+    chosen_map,
+    logger,
+    map_factory,
+    naming,
+    open_dataset,
+    run_dir,
+)
 from gmmtorch.datasets import DatasetShard, shard_indices, start_frame
 from gmmtorch.errors import check_choice, check_number, check_whole
+from gmmtorch.mapping import GaussianMap
 from gmmtorch.pose import Pose
-from gmmtorch.team.cli.from_options import links, missions
+from gmmtorch.team.cli import links, missions
 from gmmtorch.team.exploration import (
     Drivable,
     FlyingRobotView,
@@ -23,6 +34,7 @@ from gmmtorch.team.exploration import (
     ReplayMission,
     RobotView,
     Stopwatch,
+    TeamOptions,
     make_agent,
     start_poses,
 )
@@ -40,7 +52,8 @@ def flying(config: DictConfig, transport: FramedTransport, stack: ExitStack) -> 
     store = _opened_store(config, transport, stack)
     options = missions.team_options(config, config.seed, {})
     world = missions.open_world(missions.world_options(config), options)
-    pose, watch = start_poses(world, options)[config.id], Stopwatch()
+    with naming(argument_names(TeamOptions)):
+        pose, watch = start_poses(world, options)[config.id], Stopwatch()
     agent = make_agent(
         config.id, pose, world, options, transport, watch=watch, incarnation=drawn_incarnation()
     )
@@ -55,13 +68,28 @@ def flying(config: DictConfig, transport: FramedTransport, stack: ExitStack) -> 
     return mission, FlyingRobotView(mission, transport)
 
 
+def log_map(config: DictConfig) -> Callable[[], GaussianMap]:
+    """A factory of empty maps with the options `log.map`, on the CPU."""
+    runtime = {"memory_limit": config.runtime.memory_limit, "compile": False, "dtype": "float64"}
+    with naming({"map": "log.map"}):
+        return map_factory(
+            OmegaConf.create(
+                {
+                    "map": chosen_map(config.log.map, "log.map"),
+                    "runtime": runtime,
+                    "seed": config.seed,
+                }
+            ),
+            group="log.map",
+        )
+
+
 def replaying(config: DictConfig, transport: FramedTransport, stack: ExitStack) -> tuple[Drivable, RobotView]:
     """A robot that maps a recorded log, or its part of one."""
     store = _opened_store(config, transport, stack)
-    scans = open_dataset(config.log.dataset)
-    indices = range(0, len(scans), check_whole("log.every", config.log.every, 1))
-    part = shard_indices(len(indices), config.id, config.team.size, config.log.part)
-    chosen = [indices[row] for row in part]
+    scans = open_dataset(config.log.dataset, "log.dataset")
+    with naming({"split": "log.part"}):
+        chosen = list(shard_indices(len(scans), config.id, config.team.size, config.log.part))
     is_free = config.log.start == "unknown" and bool(chosen)
     frame = start_frame(scans, chosen[0]) if is_free else None
     replica = Replica(config.id, own_frame=is_free)
@@ -73,7 +101,7 @@ def replaying(config: DictConfig, transport: FramedTransport, stack: ExitStack) 
         replica,
         DatasetShard(scans, chosen, None if frame is None else Pose.from_matrix(frame).inverse().matrix),
         transport,
-        map_factory(missions.log_map_options(config)),
+        log_map(config),
         rate=config.log.rate,
         store=store,
         announce_every=config.network.announce,
@@ -126,7 +154,8 @@ def _facts_of_log(config: DictConfig) -> dict[str, Any]:
     return {
         "source": "log",
         **{f"log.dataset.{name}": value for name, value in dataset.items()},
-        **{f"log.{name}": config.log[name] for name in ("every", "part")},
+        "log.every": 1,  # of earlier versions, which wrote the same file
+        "log.part": config.log.part,
         **({"log.start": "unknown"} if config.log.start == "unknown" else {}),
         "team.size": config.team.size,
     }
@@ -154,7 +183,7 @@ def shared_map(config: DictConfig, stack: ExitStack) -> SharedMap | None:
     store.restore(replica)
     if is_free and replica.earlier_frames and replica.n_components:  # the fixed frame is where it was before
         replica.join(replica.earlier_frames[0], torch.eye(replica.components().dim + 1))
-    with naming({argument: f"network.{option}" for option, argument in missions.OF_ROBOTS.items()}):
+    with naming({"announce_every": "network.announce", "budget": "network.budget"}):
         return SharedMap(
             replica,
             transport,

@@ -9,7 +9,7 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from gmmtorch.cli.from_options import maps
+from gmmtorch.cli import inputs
 from gmmtorch.datasets import read_trajectory
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
 from gmmtorch.events import Event
@@ -75,7 +75,7 @@ def _components(config: DictConfig) -> PlainMixture:
     if path.suffix == ".npz":
         return read_npz(path)
     try:
-        found = maps.open_map(path, config.runtime, config.bounds).components()
+        found = inputs.open_map(path, config.runtime, config.bounds).components()
         surface = ~found.max_range
         return PlainMixture.of_support(
             found.means[surface], found.covariances[surface], found.support[surface]
@@ -100,7 +100,7 @@ def open_source(config: DictConfig) -> Source:
     """The map in a file or folder. Raises `DataError` with the errors of all readers if it has no map."""
     path = Path(config.path)
     try:
-        return maps.open_map(path, config.runtime, config.bounds, config.resolution)
+        return inputs.open_map(path, config.runtime, config.bounds, config.resolution)
     except DataError as error:
         no_map = error
     try:

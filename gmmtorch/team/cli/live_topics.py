@@ -27,7 +27,7 @@ from gmmtorch.cli import (
     write_trajectory,
 )
 from gmmtorch.datasets import Ranges
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import InvalidArgumentError, told
 from gmmtorch.events import Row
 from gmmtorch.export import write_tum
 from gmmtorch.live import (
@@ -162,8 +162,7 @@ def localize(config: DictConfig, node: Node, device: str) -> None:
 
 def _scans(config: DictConfig, node: Node) -> LiveScans:
     """The scans of the sensor's topic, which is found by itself if it is not given."""
-    options = as_options(config.sensor)
-    live = build(LiveOptions, options, "sensor")
+    live = build(LiveOptions, config, "sensor")
     with naming({name: f"sensor.{name}" for name in ("max_range", "no_return_range")}):
         ranges = Ranges(config.sensor.max_range, config.sensor.no_return_range)
     sensor = find_sensor(node, config.sensor.topic, config.wait)
@@ -190,16 +189,17 @@ def _until_stopped(
             if worker.step():
                 after_scan()
             elif not len(scans) and time.monotonic() - begin > config.wait:
-                node.warn("silence", f"no scan can be used: {_trouble(node, scans)}.")
+                node.warn("silence", f"no scan can be used: {_trouble(config, node, scans)}.")
 
 
-def _trouble(node: Node, scans: LiveScans) -> str:
+def _trouble(config: DictConfig, node: Node, scans: LiveScans) -> str:
     """Why no scan was mapped so far."""
     silent = [s for s in node.subscriptions if s.n_received == 0 and not s.topic.endswith("/tf_static")]
     if silent:
         return "; ".join(node.explain_silence(subscription) for subscription in silent)
     reasons = ", ".join(f"{reason} ({n} scans)" for reason, n in scans.skipped.items())
-    return "; ".join(text for text in (reasons, scans.trouble) if text) or "the scans wait for their poses"
+    trouble = told(scans.trouble, {name: f"sensor.{name}" for name in map(str, config.sensor)})
+    return "; ".join(text for text in (reasons, trouble) if text) or "the scans wait for their poses"
 
 
 def _write(

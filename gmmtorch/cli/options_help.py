@@ -1,13 +1,13 @@
 """What a command can run: its options, with a line on each, and the choices of its groups.
 
-The lines come from the docstrings of the dataclasses that make the schema. `--help`, completion and the
-errors for mistyped options use this file. It composes configurations, and imports nothing heavy.
+The lines come from the dataclasses that make the schema. `--help`, completion, the errors for mistyped
+options and the tables of docs/commands.md use this file. It composes configurations, and imports nothing
+heavy.
 """
 
 from __future__ import annotations
 
 import functools
-import inspect
 import re
 from collections.abc import Collection, Iterator, Sequence
 from difflib import SequenceMatcher
@@ -26,15 +26,63 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gmmtorch.cli import common
-from gmmtorch.cli.options.structured import DOCUMENTED
+from gmmtorch.cli.schema import about_of
 from gmmtorch.errors import InvalidArgumentError
 
 _NEAR = 0.6
 """Least similarity of a name to the name that is proposed for it."""
+_CONSTANT = "it is a constant; in Python, %s."
 _REPLACED = {
     "map.hit_length": "map.prior=1 gives the probabilities of counts; without it they are calibrated.",
+    "map.bounds": "give bounds=[…].",
+    "map@log.map": "give options of the map as in 'log.map={name: windowed, window: 20}'.",
+    "log.every": "use log.dataset.stride.",
+    "journal.sync": "every store survives a loss of power.",
+    "link.scouting": "set scouting in the file of link.zenoh_config.",
+    "link.ttl": "robots of a multicast group share one network.",
+    "runtime.cache": "results that depend only on the world are always stored.",
+    "stream.checkpoint_seconds": "use checkpoint_seconds.",
+    "planner.beams": _CONSTANT % "`TeamOptions.n_beams`",
+    "planner.prior": _CONSTANT % "`TeamOptions.planning_prior`, which a variant of a study may set",
 }
 """Options of earlier versions, and what replaces them."""
+_REPLACED_GROUPS = (
+    ("", "distance angle", "a first pose may be off by 0.5 m and 0.175 rad; pose=null searches the map."),
+    (
+        "checkpoint.",
+        "every folder",
+        "missions have no checkpoints. A study that was killed continues with the missions that are missing "
+        "if you run the same command with hydra.run.dir=RUN, the folder of the killed run.",
+    ),
+    ("belief.", "prior clamp free occupied", _CONSTANT % "`BeliefRule`"),
+    (
+        "map.",
+        "cell iterations length max_cells max_origins mean_origins planarity min_density_share min_points "
+        "min_support sampling window_components components distance distance_for hits_per_ray novelty_block "
+        "observed rays shell threshold update_at update_every update_novel update_stride",
+        _CONSTANT % "a field of the learning rule, of `QueryOptions` or of `FrameRule`; a study may vary it",
+    ),
+    ("mixture.", "max_cells min_density_share min_support reg_covar", _CONSTANT % "the estimator has it"),
+    (
+        "robot.",
+        "speed climb yaw_rate acceleration yaw_acceleration duration step",
+        _CONSTANT % "`Dynamics` has it",
+    ),
+    (
+        "sensor.",
+        "horizontal_fov vertical_fov noise dropout max_gap deskew depth_scale",
+        _CONSTANT % "`DepthCamera` or `LiveOptions` has it",
+    ),
+    (
+        "study.",
+        "bandwidths bgk_points dims forms init_params max_beams max_iter max_origins method methods "
+        "multiples n_cells n_large_samples n_neighbors n_pixels n_points n_rays n_samples n_scans noise "
+        "others prior railing_scans resolution sensor support test_every thin_width tol "
+        "tolerance variance_threshold window window_components",
+        _CONSTANT % "the class of the study has it",
+    ),
+)
+"""The same for several options: the beginning of their names, the ends, and what replaces them."""
 _LAUNCHERS = ("joblib", "ray")
 """Hydra's launchers of the extra [sweep]."""
 _GROUPS = "== Configuration groups =="
@@ -62,10 +110,10 @@ def configuration(command: str, overrides: Sequence[str] = ()) -> DictConfig:
 def options_of(config: DictConfig) -> list[Option]:
     """The options of a composed configuration that the command line can set, in its order.
 
-    Without those of Hydra, options that were removed, and the study, which `experiment=` sets.
+    Without those of Hydra, and the study, which `experiment=` sets.
     """
     found = [option for name in config if name != "hydra" for option in _options(config, str(name), "")]
-    return [one for one in found if one.name != "study" and "removed:" not in one.about]
+    return [one for one in found if one.name != "study"]
 
 
 def _options(node: DictConfig, name: str, prefix: str) -> Iterator[Option]:
@@ -75,10 +123,7 @@ def _options(node: DictConfig, name: str, prefix: str) -> Iterator[Option]:
             if inner != "name":  # set by the choice of a group
                 yield from _options(value, str(inner), f"{prefix}{name}.")
         return
-    about = ""
-    for kind in inspect.getmro(OmegaConf.get_type(node) or object):
-        documented = {*node, *getattr(kind, DOCUMENTED, ())}
-        about = about or descriptions(kind.__doc__ or "", documented).get(name, "")
+    about = about_of(node, name).replace("None", "null")
     shown = "???" if OmegaConf.is_missing(node, name) else node[name]
     yield Option(f"{prefix}{name}", shown, about)
 
@@ -88,36 +133,14 @@ def _is_dict(node: DictConfig) -> bool:
     return OmegaConf.get_type(node) is dict
 
 
-def descriptions(doc: str, names: Collection[Any]) -> dict[str, str]:
-    """What a docstring says about each of the names, from `name: text` and `name, other: text`."""
-    found: dict[str, str] = {}
-    for paragraph in inspect.cleandoc(doc).split("\n\n"):
-        found |= _described(" ".join(paragraph.split()), names)
-    return found
-
-
-def _described(text: str, names: Collection[Any]) -> dict[str, str]:
-    heads = [
-        match
-        for match in re.finditer(r"(?:(?<=[.:;)…] )|^)(\w+(?:, \w+)*)(?: \([^)]*\))?: ", text)
-        if all(name in names for name in match[1].split(", "))
-    ]
-    ends = [match.start() for match in heads[1:]] + [len(text)] * bool(heads)
-    return {
-        name: _brief(text[head.end() : end].strip())
-        for head, end in zip(heads, ends, strict=True)
-        for name in head[1].split(", ")
-    }
-
-
 def _brief(text: str) -> str:
-    """The first sentences of a text that fit a line, with the words of the command line."""
+    """The first sentences of a text that fit a line."""
     kept, *others = re.split(r"(?<=\.) (?=[A-Z])", text)
     for other in others:
         if len(kept) + len(other) > _LINE:
             break
         kept += f" {other}"
-    return kept.replace("None", "null").rstrip(".")
+    return kept.rstrip(".")
 
 
 # -- groups ---------------------------------------------------------------------------------------
@@ -149,11 +172,11 @@ def help_text(command: str, overrides: Sequence[str] = ()) -> str:
 
 
 def _line(option: Option) -> str:
-    head = f"{option.name}={_text(option.value)}"
-    return f"{head:<{_VALUES}}  {option.about}".rstrip()
+    head = f"{option.name}={text_of_value(option.value)}"
+    return f"{head:<{_VALUES}}  {_brief(option.about)}".rstrip()
 
 
-def _text(value: Any) -> str:
+def text_of_value(value: Any) -> str:
     """A value as the command line takes it."""
     if OmegaConf.is_config(value):
         return re.sub(r"(?<=[,:]) ", "", str(OmegaConf.to_container(value)).replace("'", ""))
@@ -239,8 +262,8 @@ def explained(command: str, overrides: Sequence[str], error: Exception) -> str:
         name = _key(one)
         if "/" in name or name in groups or name in names or _is_free(config, name):
             continue
-        if name in _REPLACED:
-            return f"{name} is no longer an option: {_REPLACED[name]}"
+        if instead := _instead_of(name):
+            return f"{name} is no longer an option: {instead}"
         known = [option.name for option in options_of(config)]
         known += [*groups, *_of_other_choices(groups)]
         if name.startswith("hydra"):
@@ -251,6 +274,14 @@ def explained(command: str, overrides: Sequence[str], error: Exception) -> str:
         hint = f"; another choice of {group}= has it." if name in known else _hint(name, known)
         return f"{name} is not an option of gmmtorch-{command}{chosen}{hint} --help lists all options."
     return _first_lines(error)
+
+
+def _instead_of(name: str) -> str | None:
+    """What replaces an option of an earlier version; None if there was none of this name."""
+    for start, ends, text in _REPLACED_GROUPS:
+        if name.startswith(start) and name.removeprefix(start) in ends.split():
+            return text
+    return _REPLACED.get(name)
 
 
 def check_choices(command: str, overrides: Sequence[str]) -> None:

@@ -6,18 +6,19 @@ from collections.abc import Sequence
 
 from omegaconf import DictConfig
 
-from gmmtorch.cli import as_options, logger, naming, print_table, run_dir, write_results
+from gmmtorch.cli import argument_names, as_options, logger, naming, print_table, run_dir, write_results
 from gmmtorch.errors import check_whole
 from gmmtorch.events import Row
 from gmmtorch.live import LiveView
 from gmmtorch.report import ProgressBars
-from gmmtorch.team.cli.from_options import missions
-from gmmtorch.team.cli.reporting.explore_pictures import MissionRecorder, save_comparison
+from gmmtorch.team.cli import missions
+from gmmtorch.team.cli.explore_pictures import MissionRecorder, save_comparison
 from gmmtorch.team.exploration import (
     NETWORK,
     STAGE,
     Mission,
     MissionMoments,
+    TeamOptions,
     compared,
     differing,
     run_mission,
@@ -57,7 +58,7 @@ def explore(config: DictConfig, bars: ProgressBars, view: LiveView | None) -> Ro
                 moments.note()
             (view.finish if mission.is_over else view.offer)(moments)
 
-    with naming(missions.NAMES):
+    with naming(argument_names(TeamOptions)):
         mission, row = run_mission(trial, world, on_tick)
     (row,) = compared([row])
     write_results("explore", config, [row], folder)
@@ -107,7 +108,7 @@ def compare(config: DictConfig, bars: ProgressBars) -> list[Row]:
     def on_sample(mission: Mission) -> None:
         bars.note(STAGE, _status(mission))
 
-    with naming(missions.NAMES):
+    with naming(argument_names(TeamOptions)):
         rows = compared(run_trials(trials, config.runtime.workers, on_row, bars, on_sample))
     write_results("explore", config, rows, folder)
     save_comparison(config, rows, folder)

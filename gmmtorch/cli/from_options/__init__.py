@@ -1,1 +1,0 @@
-"""Objects of the library made from the options of a command."""

@@ -1,1 +1,0 @@
-"""The options of the commands: their schemas, help and conversion to objects of the library."""

@@ -1,1 +1,0 @@
-"""What commands do that is too large for their own file."""

@@ -1,1 +1,0 @@
-"""Objects of a team from the options of a command."""
