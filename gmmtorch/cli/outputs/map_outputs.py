@@ -12,9 +12,9 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 import gmmtorch
+from gmmtorch import report  # its parts load when they are used
 from gmmtorch.cli import common, schema
 from gmmtorch.cli.export import ExportOptions
-from gmmtorch.cli.outputs import exported_files
 from gmmtorch.datasets import Dataset, read_trajectory
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError, MissingDataError, check_number
 from gmmtorch.events import Event, Row
@@ -24,18 +24,6 @@ from gmmtorch.mapping import Components, GaussianMap, MapBuilder
 from gmmtorch.occupancy import reliability_of, scores_of
 from gmmtorch.optional_packages import load_pyoctomap
 from gmmtorch.pose import Pose
-from gmmtorch.report import (
-    Board,
-    MapPanel,
-    byte_text,
-    first_viewpoints,
-    map_figure,
-    metres,
-    mixture_figure,
-    mixture_scene_figure,
-    reliability_figure,
-    robust_bounds,
-)
 
 EXPORTS = {
     "map_server": ("map_server", "navigation.yaml"),
@@ -171,6 +159,8 @@ def write_exports(
     config: DictConfig, source: GaussianMap, folder: Path, on_event: Event
 ) -> tuple[list[str], list[str]]:
     """Write the exports that the options name; returns messages, and the errors of those that failed."""
+    from gmmtorch.cli.outputs import exported_files  # takes a second, for exports only
+
     messages, errors = [], []
     for name in config.export:
         form, file = EXPORTS[name]
@@ -239,7 +229,7 @@ def draw(
     trajectories: sensor positions (S, D) of each recording. row: of results.json.
     """
 
-    def write(board: Board) -> None:
+    def write(board: report.Board) -> None:
         for entry in row.get("history", ()):
             board.scalars(entry, "map", step=entry["n_read"])
         surfaces = surfaces_of(built.components())
@@ -250,16 +240,16 @@ def draw(
     common.show(config, folder, lambda: _figures(built, trajectories, row), write)
 
 
-def map_panel(built: GaussianMap, trajectories: Sequence[Tensor]) -> MapPanel:
+def map_panel(built: GaussianMap, trajectories: Sequence[Tensor]) -> report.MapPanel:
     """The region of a map around its surfaces and the sensor positions (S, D), for pictures."""
-    low, high = robust_bounds(_shown(built).means.cpu(), torch.cat(list(trajectories)))
+    low, high = report.robust_bounds(_shown(built).means.cpu(), torch.cat(list(trajectories)))
     side = max(b - a for a, b in zip(low[:2], high[:2], strict=True))
     resolution = built.resolution * max(1, math.ceil(side / (_MOST_CELLS * built.resolution)))
 
     def answer(points: Tensor) -> Tensor:
         return built.occupancy(points, resolution)  # type: ignore[return-value]
 
-    return MapPanel("occupancy", answer, resolution, low, high)
+    return report.MapPanel("occupancy", answer, resolution, low, high)
 
 
 def surfaces_of(components: Components) -> Components:
@@ -277,25 +267,27 @@ def _shown(built: GaussianMap) -> Components:
 def _figures(built: GaussianMap, trajectories: Sequence[Tensor], row: Row) -> dict[str, Any]:
     """The map from above, its components, in 3D in space, and how reliable its predictions were."""
     surfaces = _shown(built)
-    title = f"{row['dataset']}: {row['n_components']:,} components, {byte_text(row['nbytes'])}"
+    title = f"{row['dataset']}: {row['n_components']:,} components, {report.byte_text(row['nbytes'])}"
     title += f", {row['metres']:,.0f} m travelled" if row["metres"] >= _STANDING else ""
     panel = map_panel(built, trajectories)
-    figures = {"above": map_figure([panel], trajectories, title=title)}
+    figures = {"above": report.map_figure([panel], trajectories, title=title)}
     if built.predictions:
         curves = {
-            f"cubes of {metres(side)}, {float(tally[:, 0].sum()):,.0f} predictions": reliability_of(tally)
+            f"cubes of {report.metres(side)}, {float(tally[:, 0].sum()):,.0f} predictions": reliability_of(
+                tally
+            )
             for side, tally in built.predictions.items()
         }
         heading = f"{row['dataset']}: what each window showed, and what the map predicted"
-        figures["reliability"] = reliability_figure(curves, heading)
+        figures["reliability"] = report.reliability_figure(curves, heading)
     shown = surfaces.means.cpu(), surfaces.covariances.cpu()
     if surfaces.dim == 3:
-        seen_from = first_viewpoints(surfaces).cpu()
-        figures["components"] = mixture_scene_figure(
+        seen_from = report.first_viewpoints(surfaces).cpu()
+        figures["components"] = report.mixture_scene_figure(
             *shown, seen_from=seen_from, trajectories=trajectories, traveller="recording", title=title
         )
     else:
-        figures["components"] = mixture_figure(
+        figures["components"] = report.mixture_figure(
             surfaces.means[:0].cpu(),
             *shown,
             surfaces.support.cpu(),

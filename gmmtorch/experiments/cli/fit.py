@@ -121,7 +121,7 @@ def run(config: DictConfig) -> float | None:
 
     Workers of a streamed fit return None.
     """
-    from gmmtorch.experiments.cli import fit_outputs, fit_stream, studies
+    from gmmtorch.experiments.cli import fit_outputs, fit_stream
 
     folder = run_dir()
     if fit_stream.is_wanted(config):
@@ -134,6 +134,8 @@ def run(config: DictConfig) -> float | None:
             if config.study is None:
                 row = _compare(config, device, folder, bars)[-1]
             else:
+                from gmmtorch.experiments.cli import studies
+
                 row = studies.run("fit", config, device, folder, bars)[-1]
     print_files(folder)
     return fit_outputs.log_likelihood(row)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
 from torch import Tensor
@@ -12,7 +12,9 @@ from torch import Tensor
 from gmmtorch.cli import chosen_options, show
 from gmmtorch.events import Row
 from gmmtorch.experiments.evaluation import NO_LIKELIHOODS, FitOutcome, in_use
-from gmmtorch.report import Board, comparison_figure, convergence_figure, label_of, mixture_figure
+
+if TYPE_CHECKING:
+    from gmmtorch.report import Board
 
 
 def headline(rows: Sequence[Row]) -> str:
@@ -33,6 +35,8 @@ def draw(config: DictConfig, points: Tensor, outcome: FitOutcome, folder: Path) 
     """
 
     def figures() -> dict[str, Any]:
+        from gmmtorch.report import comparison_figure, convergence_figure, label_of, mixture_figure
+
         likelihoods = {name: b for name, b in outcome.lower_bounds.items() if name not in NO_LIKELIHOODS}
         found = {"convergence": convergence_figure(likelihoods)}
         if len(outcome.rows) > 1:

@@ -14,8 +14,6 @@ from statistics import fmean
 from typing import Any, NamedTuple
 
 import torch
-from sklearn.mixture import BayesianGaussianMixture as ScikitLearnBayesianMixture
-from sklearn.mixture import GaussianMixture as ScikitLearnMixture
 from torch import Tensor
 
 from gmmtorch.datasets import PointChunks, in_memory
@@ -97,24 +95,33 @@ def _known(views: Views | None) -> Views:
     return views
 
 
-ESTIMATORS: dict[str, type] = {
+_OURS: dict[str, type] = {
     "em": GaussianMixture,
     "hierarchical": HierarchicalGaussianMixture,
     "variational": VariationalGaussianMixture,
     "riemannian": RiemannianGaussianMixture,
     "sliced_wasserstein": SlicedWassersteinGaussianMixture,
-    "scikit_learn": ScikitLearnMixture,
-    "scikit_learn_bayesian": ScikitLearnBayesianMixture,
 }
+_SCIKIT_LEARN = {"scikit_learn": "GaussianMixture", "scikit_learn_bayesian": "BayesianGaussianMixture"}
+ESTIMATORS = (*_OURS, *_SCIKIT_LEARN)
 
 NO_LIKELIHOODS = frozenset({"variational", "sliced_wasserstein", "scikit_learn_bayesian"})
 """Methods whose lower bound does not bound the mean log-likelihood, so it is not comparable with others."""
 
 
+def _estimator(method: str) -> Any:
+    """The class of an estimator."""
+    if method in _SCIKIT_LEARN:
+        from sklearn import mixture  # takes half a second, which only a comparison waits for
+
+        return getattr(mixture, _SCIKIT_LEARN[method])
+    return _OURS[method]
+
+
 def _fit_ours(
     method: str, data: FitData, options: FitOptions, seed: int, on_event: Event, own: Mapping[str, Any]
 ) -> MixtureEstimator:
-    mixture: Any = ESTIMATORS[method](**_arguments(method, options, seed, own))
+    mixture: Any = _estimator(method)(**_arguments(method, options, seed, own))
     on_event(method, 0, options.max_iter)
 
     def on_iteration(iteration: int, lower_bound: float) -> None:
@@ -142,7 +149,7 @@ def _fit_scikit_learn(
     if options.n_components is None:
         raise InvalidArgumentError(f"n_components=None: method {method} needs a number.")
     on_event(method, 0, 1)
-    fitted = ESTIMATORS[method](**arguments)
+    fitted = _estimator(method)(**arguments)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         fitted.fit(data.train.cpu().numpy())
@@ -158,7 +165,7 @@ def _fit_scikit_learn(
 
 def _arguments(method: str, options: FitOptions, seed: int, own: Mapping[str, Any]) -> dict[str, Any]:
     """Arguments of the estimator's constructor: the options that it has, the seed, and its own options."""
-    estimator = ESTIMATORS[method]
+    estimator = _estimator(method)
     known = inspect.signature(estimator).parameters
     for name in own:
         if name not in known:
@@ -238,7 +245,7 @@ def compare(
         begin = time.perf_counter()
         is_tree = method == "hierarchical"  # which is pruned while it grows
         more = tree_options(pruning, data.train, data.views) if is_tree else {}
-        fit = _fit_ours if issubclass(ESTIMATORS[method], MixtureEstimator) else _fit_scikit_learn
+        fit = _fit_ours if issubclass(_estimator(method), MixtureEstimator) else _fit_scikit_learn
         mixture = fit(method, data, options, seed, on_event, {**more, **own.get(method, {})})
         if not is_tree:
             mixture = pruned(mixture, pruning, data.train, data.views)
