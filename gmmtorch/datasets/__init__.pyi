@@ -4,6 +4,7 @@ from .base import Ranges as Ranges
 from .base import shard_indices as shard_indices
 from .base import start_frame as start_frame
 from .dataset_options import OPTIONS as OPTIONS
+from .dataset_options import point_path as point_path
 from .point_files.mesh_files import read_triangles as read_triangles
 from .point_files.point_chunks import PointChunks as PointChunks
 from .point_files.point_chunks import Survey as Survey
@@ -11,7 +12,6 @@ from .point_files.point_chunks import in_memory as in_memory
 from .point_files.point_chunks import merge_surveys as merge_surveys
 from .point_files.point_chunks import open_points as open_points
 from .point_files.point_chunks import survey as survey
-from .point_files.point_rows import point_path as point_path
 from .ros.bag_poses import PoseSource as PoseSource
 from .ros.bag_poses import Record as Record
 from .ros.bag_poses import Standing as Standing

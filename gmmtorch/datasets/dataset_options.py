@@ -1,13 +1,17 @@
-"""Options of the data sets. Importing this file does not load torch."""
+"""Options of the data sets, and the check of a point file's path. Importing this file does not load torch."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from gmmtorch.declarations import option, repeated
+from gmmtorch.errors import InvalidArgumentError, MissingDataError
 
 _REQUIRED = "???"
 """A value that must be given, as Hydra writes it."""
+SUFFIXES = (".npy", ".las", ".laz", ".pcd", ".ply")
+"""Suffixes of the files of points that are read in chunks."""
 
 
 @dataclass(kw_only=True)
@@ -164,3 +168,18 @@ OPTIONS: dict[str, type[DatasetOptions]] = {
     "synthetic_building_2d": SyntheticOptions,
 }
 """The options of each data set."""
+
+
+def point_path(path: str | Path) -> Path:
+    """The path of a point file, with ~ expanded.
+
+    Raises `InvalidArgumentError` for an unknown suffix, and `MissingDataError` if the file does not exist.
+    """
+    path = Path(path).expanduser()
+    known = ", ".join(SUFFIXES)
+    if path.suffix.lower() not in SUFFIXES:
+        raise InvalidArgumentError(f"points={path} has an unknown suffix {path.suffix!r}; known are {known}.")
+    if not path.is_file():
+        what = "is not a file" if path.exists() else "does not exist"
+        raise MissingDataError(f"points={path} {what}; give a file of points ({known}).")
+    return path

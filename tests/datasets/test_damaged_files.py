@@ -14,7 +14,7 @@ import pytest
 def failures(folder: Path, count: int, names: list[str], seed: int = 0) -> str:
     """What `damaged_files.py` prints: a line for each wrong outcome, and "done" unless it crashed."""
     here = Path(__file__).parent
-    path = os.pathsep.join([str(here.parents[1]), str(here)])
+    path = os.pathsep.join(map(str, (here.parents[1], here.parent, here)))
     command = [sys.executable, str(here / "damaged_files.py"), str(folder), str(seed), str(count), *names]
     done = subprocess.run(command, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True)
     lines = [line for line in done.stdout.splitlines() if line.startswith(("{", "done"))]

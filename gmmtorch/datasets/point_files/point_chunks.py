@@ -19,10 +19,11 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike
 from gmmtorch.datasets.base import is_beyond
+from gmmtorch.datasets.dataset_options import SUFFIXES, point_path
 from gmmtorch.datasets.point_files.las_files import LasRows
 from gmmtorch.datasets.point_files.mesh_files import ply_rows
 from gmmtorch.datasets.point_files.pcd_files import pcd_rows
-from gmmtorch.datasets.point_files.point_rows import SUFFIXES, ArrayRows, NpyRows, Rows, point_path
+from gmmtorch.datasets.point_files.point_rows import ArrayRows, NpyRows, Rows
 from gmmtorch.errors import InvalidArgumentError, check_whole
 
 CHUNK_POINTS = 1 << 17

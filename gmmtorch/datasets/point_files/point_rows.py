@@ -20,7 +20,7 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor, check_unmasked
 from gmmtorch.datasets.base import number_rows
-from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
+from gmmtorch.errors import DataError
 
 
 class Rows(Protocol):
@@ -162,24 +162,8 @@ def check_count(path: Path, first: int, found: int, wanted: int, announced: int)
 
 
 AXES = ("x", "y", "z")
-SUFFIXES = (".npy", ".las", ".laz", ".pcd", ".ply")
 _HEADER_BYTES = 1 << 16
 _MAX_PADDING = 1 << 16
-
-
-def point_path(path: str | Path) -> Path:
-    """The path of a point file, with ~ expanded.
-
-    Raises `InvalidArgumentError` for an unknown suffix, and `MissingDataError` if the file does not exist.
-    """
-    path = Path(path).expanduser()
-    known = ", ".join(SUFFIXES)
-    if path.suffix.lower() not in SUFFIXES:
-        raise InvalidArgumentError(f"points={path} has an unknown suffix {path.suffix!r}; known are {known}.")
-    if not path.is_file():
-        what = "is not a file" if path.exists() else "does not exist"
-        raise MissingDataError(f"points={path} {what}; give a file of points ({known}).")
-    return path
 
 
 @contextmanager
