@@ -235,8 +235,12 @@ class Pose:
     # -- motions --------------------------------------------------------------------------------------
 
     def inverse(self) -> Pose:
-        """The motions back."""
-        back = self.rotation.mT
+        """The motions back.
+
+        A rotation that was rounded is inverted, not transposed: in a chain of predictions, each from the last
+        motion, the error of a transpose grows exponentially.
+        """
+        back = torch.linalg.inv_ex(self.rotation).inverse
         return Pose(back, -(back @ self.translation[..., None])[..., 0])
 
     def __matmul__(self, other: Pose) -> Pose:

@@ -175,3 +175,13 @@ def test_a_quaternion_without_a_direction_is_refused(quaternion):
         Pose.from_quaternion([[0.0, 0, 0], [1, 2, 3]], [[0.0, 0, 0, 1], quaternion])
     with pytest.raises(InvalidArgumentError, match="is not a pose"):
         Pose.from_quaternion([math.inf, 0, 0], [0.0, 0, 0, 1])
+
+
+def test_a_chain_of_predictions_from_a_rounded_pose_stays_rigid():
+    turn = Pose.from_turn(torch.tensor([0.02, -0.01, 0.05]).double(), torch.tensor([0.1, 0.0, 0.02]).double())
+    rounded = Pose(turn.rotation.float().double() * (1 + 8e-7), turn.translation)  # as a file has it
+    last, now = Pose.identity(3), rounded
+    for _ in range(200):
+        last, now = now, now @ (last.inverse() @ now)
+    error = now.rotation @ now.rotation.mT - torch.eye(3)
+    assert float(error.abs().max()) < 1e-3  # 200 steps of the first error, which does not grow faster
