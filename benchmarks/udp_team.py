@@ -28,7 +28,7 @@ from typing import Any
 from gmmtorch.experiments.harness import Case, Row, run
 from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.team.cli.links import free_addresses
+from gmmtorch.team.cli.from_options.links import free_addresses
 from gmmtorch.team.sharing.replica.materialized_view import fingerprints
 
 _PAUSE = 0.1

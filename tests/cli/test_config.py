@@ -33,7 +33,7 @@ from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
 from gmmtorch.simulation.mine import tunnels
 from gmmtorch.simulation.warehouses import warehouse
-from gmmtorch.team.cli import missions
+from gmmtorch.team.cli.from_options import missions
 from gmmtorch.team.exploration.mission.options import FRAMEWORKS, THESIS, TeamOptions
 from gmmtorch.team.exploration.mission.trials import WorldOptions
 from gmmtorch.team.exploration.planning.planners import PLANNERS

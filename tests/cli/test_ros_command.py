@@ -33,8 +33,8 @@ from gmmtorch.live.live_scans import LiveOptions, LiveScans
 from gmmtorch.live.ros import Node
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.map_builder import MapBuilder
-from gmmtorch.team.cli import links, robots
-from gmmtorch.team.cli.robots import shared_map
+from gmmtorch.team.cli.from_options import links, robots
+from gmmtorch.team.cli.from_options.robots import shared_map
 from gmmtorch.team.sharing import Replica
 from gmmtorch.team.sharing.shared_map import SharedMap
 from gmmtorch.team.sharing.transport.udp import UdpTransport

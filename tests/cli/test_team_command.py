@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 from sharing.replica_histories import everything
 
 from gmmtorch.team.cli import team
-from gmmtorch.team.cli.robots import facts_of
+from gmmtorch.team.cli.from_options.robots import facts_of
 from gmmtorch.team.cli.team import RobotProcess
 from gmmtorch.team.sharing.replica.replica import Replica
 from gmmtorch.team.sharing.store import Store

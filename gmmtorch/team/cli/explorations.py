@@ -11,8 +11,8 @@ from gmmtorch.errors import check_whole
 from gmmtorch.events import Row
 from gmmtorch.live import LiveView
 from gmmtorch.report import ProgressBars
-from gmmtorch.team.cli import missions
 from gmmtorch.team.cli.explore_pictures import MissionRecorder, save_comparison
+from gmmtorch.team.cli.from_options import missions
 from gmmtorch.team.exploration import (
     NETWORK,
     STAGE,

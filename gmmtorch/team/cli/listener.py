@@ -11,7 +11,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from gmmtorch.live import LiveView
-from gmmtorch.team.cli import links, missions, robots
+from gmmtorch.team.cli.from_options import links, missions, robots
 from gmmtorch.team.exploration import (
     RECEIVED,
     Agent,

@@ -100,7 +100,7 @@ def main() -> None:
 
 def run(config: DictConfig) -> None:
     """Runs a robot until its work is done and the team is quiet, or until it is stopped."""
-    from gmmtorch.team.cli import links, robots
+    from gmmtorch.team.cli.from_options import links, robots
 
     check_options(config)
     folder = run_dir()
@@ -115,7 +115,7 @@ def run(config: DictConfig) -> None:
 
 def check_options(config: DictConfig) -> None:
     """Raises `InvalidArgumentError` for bad options of a robot or a team, before anything is opened."""
-    from gmmtorch.team.cli import links
+    from gmmtorch.team.cli.from_options import links
 
     if set_up(config) != "cpu" and config.source == "log":
         raise InvalidArgumentError(

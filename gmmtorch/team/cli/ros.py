@@ -108,7 +108,7 @@ def main() -> None:
 def run(config: DictConfig) -> None:
     """Run the command until Ctrl-C, or until the recording has been played."""
     from gmmtorch.team.cli import live_topics
-    from gmmtorch.team.cli.robots import shared_map
+    from gmmtorch.team.cli.from_options.robots import shared_map
 
     device = set_up(config)
     check_number("wait", config.wait)

@@ -169,7 +169,7 @@ def run(config: DictConfig) -> None:
 
 def _prepare(config: DictConfig, bars: ProgressBars) -> None:
     """Computes the world's properties once for all robots, and raises errors of the options once."""
-    from gmmtorch.team.cli import missions
+    from gmmtorch.team.cli.from_options import missions
     from gmmtorch.team.exploration import TeamOptions, start_poses
 
     if config.source == "world":
@@ -211,7 +211,7 @@ def _given_options() -> list[str]:
 
 def _addresses(config: DictConfig) -> list[list[str]]:
     """The options of each robot that say where it listens, and where it sends to; of a view, too."""
-    from gmmtorch.team.cli import links
+    from gmmtorch.team.cli.from_options import links
 
     n = config.team.size + (1 if config.view else 0)
     if config.transport == "zenoh":

@@ -33,7 +33,8 @@ from cli.robot.robot_cases import LOG, SMALL
 from exploration.replays import content
 
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.team.cli import links, robot
+from gmmtorch.team.cli import robot
+from gmmtorch.team.cli.from_options import links
 from gmmtorch.team.exploration.mission.replay import ReplayMission
 from gmmtorch.team.sharing.messages.mission_messages import encode_plan
 from gmmtorch.team.sharing.replica.replica import Replica

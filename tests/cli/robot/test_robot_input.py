@@ -8,8 +8,8 @@ import pytest
 from cli.command_runs import as_it_was, composed, refused, room_mesh, succeeded
 from cli.robot.robot_cases import LOG
 
-from gmmtorch.team.cli import links
-from gmmtorch.team.cli.robots import facts_of
+from gmmtorch.team.cli.from_options import links
+from gmmtorch.team.cli.from_options.robots import facts_of
 from gmmtorch.team.sharing.store import Store
 
 

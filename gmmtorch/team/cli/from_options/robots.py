@@ -25,7 +25,7 @@ from gmmtorch.datasets import DatasetShard, shard_indices, start_frame
 from gmmtorch.errors import check_choice, check_number, check_whole
 from gmmtorch.mapping import GaussianMap
 from gmmtorch.pose import Pose
-from gmmtorch.team.cli import links, missions
+from gmmtorch.team.cli.from_options import links, missions
 from gmmtorch.team.exploration import (
     Drivable,
     FlyingRobotView,

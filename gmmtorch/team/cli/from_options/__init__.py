@@ -1,0 +1,1 @@
+"""Networks, missions and robots from the options of a command."""
