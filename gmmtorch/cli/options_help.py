@@ -70,7 +70,7 @@ _REPLACED_GROUPS = (
     ),
     (
         "sensor.",
-        "horizontal_fov vertical_fov noise dropout max_gap deskew depth_scale",
+        "horizontal_fov vertical_fov noise dropout max_gap deskew",
         _CONSTANT % "`DepthCamera` or `LiveOptions` has it",
     ),
     (

@@ -14,7 +14,6 @@ class LiveOptions:
 
     max_gap: longest time (s) between two poses that are interpolated.
     deskew: each point with a time gets the pose of its own time.
-    depth_scale: metres per unit of depth images; None: 0.001 for whole numbers, 1 for floating ones.
     """
 
     poses: str = option(
@@ -36,7 +35,9 @@ class LiveOptions:
     deskew: bool = True
     stride: int = option(1, "use every n-th scan")
     pixel_stride: int = option(1, "every n-th pixel of every n-th row of depth images")
-    depth_scale: float | None = None
+    depth_scale: float | None = option(
+        None, "metres per unit of depth images; null: 0.001 for whole numbers, 1 for floating ones"
+    )
     intrinsics: list[float] | None = option(
         None, "[fx,fy,cx,cy] in pixels of depth images without distortion; null: of the CameraInfo"
     )
