@@ -263,7 +263,7 @@ def test_max_beams_draws_a_random_subset():
 
 def test_test_scans_without_returns_raise():
     scan = Scan(torch.empty(0, 2), torch.zeros(2), torch.ones(5, 2))
-    with pytest.raises(InvalidArgumentError, match=r"no return beams.*evaluation\.test_every"):
+    with pytest.raises(InvalidArgumentError, match=r"no return beams.*test_every"):
         query_points.test_beams([scan, scan], MANY, seed=0)
 
 

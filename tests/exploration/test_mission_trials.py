@@ -206,7 +206,7 @@ def test_a_killed_worker_is_reported_with_the_remedy(monkeypatch: pytest.MonkeyP
             raise BrokenProcessPool
 
     monkeypatch.setattr(__import__("joblib"), "Parallel", Broken)
-    with pytest.raises(GmmTorchError, match=r"was killed.*hydra\.run\.dir=RUN.*runtime\.workers=1"):
+    with pytest.raises(GmmTorchError, match=r"was killed.*in the same folders.*workers=1"):
         run_trials([trial("room.ply", None, seed=seed) for seed in range(3)], workers=2)
 
 

@@ -272,9 +272,9 @@ def test_a_zero_share_never_rests():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"share": -0.1}, "planner.rest=-0.1"),
-        ({"share": 1.0}, "planner.rest=1.0"),
-        ({"share": float("nan")}, "planner.rest=nan"),
+        ({"share": -0.1}, "share=-0.1"),
+        ({"share": 1.0}, "share=1.0"),
+        ({"share": float("nan")}, "share=nan"),
         ({"window": 0.0}, "window=0.0"),
         ({"window": float("inf")}, "window=inf"),
     ],

@@ -120,27 +120,23 @@ def test_start_without_safe_motion_is_rejected_with_a_better_place() -> None:
     hall = World.from_mesh(room(closet), cache=False, name="hall")
     inside = World.from_mesh(room(closet), start=(3.9, 3.9, 1.1), cache=False, name="hall")
     with pytest.raises(
-        InvalidArgumentError, match=r"team.start\[0\]=\[3.9, 3.9, 1.1, 0\] is not in the part .*for instance"
+        InvalidArgumentError, match=r"start\[0\]=\[3.9, 3.9, 1.1, 0\] is not in the part .*for instance"
     ) as error:
         flown(hall, (3.9, 3.9, 1.1, 0.0))
     moved = tuple(float(x) for x in str(error.value).split("for instance to [")[1].split("]")[0].split(","))
     assert len(start_poses(hall, replace(ALONE, start=(moved,)))) == 1
-    with pytest.raises(
-        InvalidArgumentError, match=r"team.start\[0\].* no safe motion leads away .*robot.radius=0.3 m"
-    ):
+    with pytest.raises(InvalidArgumentError, match=r"start\[0\].* no safe motion leads away .*radius=0.3 m"):
         flown(inside, (3.9, 3.9, 1.1, 0.0))
-    with pytest.raises(InvalidArgumentError, match=r"found no start poses .*robot.radius=0.3 .*team.start"):
+    with pytest.raises(InvalidArgumentError, match=r"found no start poses .*radius=0.3 .*start"):
         flown(inside)
 
 
 def test_start_without_a_floor_is_rejected() -> None:
     floorless = torch.cat([room()[:10], box((1.1, 1.1, 0.1), (3.1, 3.1, 0.3))])
     world = World.from_mesh(floorless, cache=False, name="hall")
-    with pytest.raises(
-        InvalidArgumentError, match=r"room for \d robots? that starts? .*team.size=9.*a floor"
-    ):
+    with pytest.raises(InvalidArgumentError, match=r"room for \d robots? that starts? .*size=9.*a floor"):
         flown(world, size=9)
-    with pytest.raises(InvalidArgumentError, match=r"team.start\[0\].* has no surface of hall below it"):
+    with pytest.raises(InvalidArgumentError, match=r"start\[0\].* has no surface of hall below it"):
         flown(world, (6.0, 5.0, 1.5, 0.0))
 
 
@@ -171,7 +167,7 @@ def test_default_start_poses_lie_at_an_end_and_fit_large_teams(divided: World) -
     assert len(starts.check_start(divided, starts.start_poses(divided, 16, PRIMITIVES), PRIMITIVES)) == 16
     tube = World.from_mesh(box((0.1, 0.1, 0.1), (30.1, 1.7, 1.7)), cache=False, name="tube")
     assert len(starts.start_poses(tube, 12, PRIMITIVES)) == 12  # one behind another
-    with pytest.raises(InvalidArgumentError, match=r"hall has room for \d+ robots .* team.size=500.*a floor"):
+    with pytest.raises(InvalidArgumentError, match=r"hall has room for \d+ robots .* size=500.*a floor"):
         starts.start_poses(divided, 500, PRIMITIVES)
 
 
@@ -180,14 +176,14 @@ def test_default_start_poses_lie_at_an_end_and_fit_large_teams(divided: World) -
     [
         (
             (0.25, 3.0, 1.5, 0.0),
-            r"team.start\[1\]=\[0.25, 3, 1.5, 0\] is 0.15 m from .*move it, for instance to \[",
+            r"start\[1\]=\[0.25, 3, 1.5, 0\] is 0.15 m from .*move it, for instance to \[",
         ),
         ((4.1, 2.0, 1.5, 0.0), "from a surface"),
-        ((7.8, 4.6, 0.85, 0.0), "is in a solid, or in another part, which world.bounds="),
+        ((7.8, 4.6, 0.85, 0.0), "is in a solid, or in another part, which bounds="),
         ((-3.0, 2.0, 1.5, 0.0), r"outside the bounds of hall, \[0, 0, 0\] to \[10, 6, 3\] m"),
         ((2.0, 2.0, 1.5, math.nan), "not finite"),
         ((math.inf, 2.0, 1.5, 0.0), "not finite"),
-        ((1.3, 1.0, 1.5, 0.0), r"touches the robot of team.start\[0\]"),
+        ((1.3, 1.0, 1.5, 0.0), r"touches the robot of start\[0\]"),
     ],
 )
 def test_check_start_names_impossible_poses(divided: World, pose: tuple[float, ...], message: str) -> None:

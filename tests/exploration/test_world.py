@@ -140,7 +140,7 @@ def test_world_rejects_bad_meshes_and_too_many_cells():
         World.from_mesh(HALL[:0], cache=False)
     with pytest.raises(MemoryLimitError, match="coarser resolution"):
         World.from_mesh(HALL, 0.001, cache=False)
-    with pytest.raises(MemoryLimitError, match=r"world\.bounds.*not millimetres"):
+    with pytest.raises(MemoryLimitError, match=r"bounds.*not millimetres"):
         World.from_mesh(1000 * HALL, cache=False)
 
 
@@ -221,9 +221,9 @@ def test_open_world_opens_each_name():
 def test_open_world_rejects_unknown_names_and_options(tmp_path):
     with pytest.raises(InvalidArgumentError, match="world='moon'"):
         open_world("moon")
-    with pytest.raises(MissingDataError, match=r"world.path=.*nowhere\.ply"):
+    with pytest.raises(MissingDataError, match=r"path=.*nowhere\.ply"):
         open_world("mesh", path=tmp_path / "nowhere.ply")
-    with pytest.raises(MissingDataError, match=r"world.path=None"):
+    with pytest.raises(MissingDataError, match=r"path=None"):
         open_world("mesh")
     with pytest.raises(InvalidArgumentError, match="path"):
         open_world("warehouse", path="x.ply")

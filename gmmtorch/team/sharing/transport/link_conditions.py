@@ -33,7 +33,7 @@ class Partition(NamedTuple):
         return next((number for number, group in enumerate(self.groups) if robot in group), -1)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LinkConditions:
     """Conditions of all links of a network. Raises `InvalidArgumentError` for values out of range."""
 
