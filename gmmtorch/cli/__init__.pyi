@@ -23,11 +23,11 @@ from .inputs import map_factory as map_factory
 from .inputs import open_dataset as open_dataset
 from .inputs import open_map as open_map
 from .inputs import read_scans as read_scans
-from .outputs.map_outputs import TRAJECTORY as TRAJECTORY
-from .outputs.map_outputs import Checkpoint as Checkpoint
-from .outputs.map_outputs import print_skipped as print_skipped
-from .outputs.map_outputs import surfaces_of as surfaces_of
-from .outputs.map_outputs import write_trajectory as write_trajectory
+from .reporting.map_outputs import TRAJECTORY as TRAJECTORY
+from .reporting.map_outputs import Checkpoint as Checkpoint
+from .reporting.map_outputs import print_skipped as print_skipped
+from .reporting.map_outputs import surfaces_of as surfaces_of
+from .reporting.map_outputs import write_trajectory as write_trajectory
 from .schema import argument_names as argument_names
 from .schema import build as build
 from .schema import naming as naming

@@ -80,7 +80,7 @@ def run(config: DictConfig) -> None:
         if not config[name]:
             raise InvalidArgumentError(f"{name} is not set; give {name}=FILE.")
     config.format = _format(config)
-    from gmmtorch.cli.outputs import exported_files  # takes seconds, so options are checked first
+    from gmmtorch.cli.reporting import exported_files  # takes seconds, so options are checked first
 
     if config.format == "octomap":
         load_pyoctomap()  # before the cells are computed

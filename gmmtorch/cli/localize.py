@@ -86,7 +86,7 @@ def overrides(words: Sequence[str]) -> list[str]:
 def run(config: DictConfig) -> None:
     """Run the command."""
     from gmmtorch.cli import inputs
-    from gmmtorch.cli.outputs import localization_outputs
+    from gmmtorch.cli.reporting import localization_outputs
     from gmmtorch.localization import ALIGNMENTS, MOTIONS, Tracker
 
     if not config.map.path:

@@ -16,7 +16,7 @@ from gmmtorch.errors import check_resolution
 from gmmtorch.report import ProgressBars, byte_text
 
 if TYPE_CHECKING:
-    from gmmtorch.cli.outputs.map_outputs import Checkpoint
+    from gmmtorch.cli.reporting.map_outputs import Checkpoint
     from gmmtorch.live import LiveView
     from gmmtorch.mapping import MapBuilder
 
@@ -72,7 +72,7 @@ def main() -> None:
 def run(config: DictConfig) -> None:
     """Run the command. A run directory that contains a checkpoint of the same run is continued."""
     from gmmtorch.cli import inputs, recordings
-    from gmmtorch.cli.outputs import map_outputs
+    from gmmtorch.cli.reporting import map_outputs
     from gmmtorch.mapping import MapBuilder
 
     device, folder = common.set_up(config), common.run_dir()

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 from omegaconf import DictConfig, OmegaConf
 
 from gmmtorch.cli import common, inputs
-from gmmtorch.cli.outputs import map_outputs
+from gmmtorch.cli.reporting import map_outputs
 from gmmtorch.errors import (
     DataError,
     GmmTorchError,

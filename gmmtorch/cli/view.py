@@ -92,7 +92,7 @@ def _assigned(name: str, value: str) -> str:
 def run(config: DictConfig) -> None:
     """Run the command. Without `html` it serves the page until it is interrupted."""
     from gmmtorch.cli import inputs
-    from gmmtorch.cli.outputs import map_outputs
+    from gmmtorch.cli.reporting import map_outputs
     from gmmtorch.live import MapViewer, write_page
 
     if not config.path:

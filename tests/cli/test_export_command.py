@@ -14,7 +14,7 @@ from command_runs import Finished, as_it_was, refused, run_here, succeeded
 from export.map_examples import read_map_image
 
 from gmmtorch.cli import common
-from gmmtorch.cli.outputs import exported_files
+from gmmtorch.cli.reporting import exported_files
 from gmmtorch.datasets import load
 from gmmtorch.export.mixture_formats import read_gira_csv, read_npz
 from gmmtorch.export.trajectory_files import write_tum

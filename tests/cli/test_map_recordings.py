@@ -15,8 +15,8 @@ import torch
 from command_runs import QUIET, Finished, refused, run_here, succeeded
 
 from gmmtorch.cli import recordings as map_recordings
-from gmmtorch.cli.outputs import map_outputs
 from gmmtorch.cli.recordings import find_recordings, run_tasks
+from gmmtorch.cli.reporting import map_outputs
 from gmmtorch.datasets import load
 from gmmtorch.errors import MissingDataError
 from gmmtorch.mapping.components import Components

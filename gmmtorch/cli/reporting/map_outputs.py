@@ -159,7 +159,7 @@ def write_exports(
     config: DictConfig, source: GaussianMap, folder: Path, on_event: Event
 ) -> tuple[list[str], list[str]]:
     """Write the exports that the options name; returns messages, and the errors of those that failed."""
-    from gmmtorch.cli.outputs import exported_files  # takes a second, for exports only
+    from gmmtorch.cli.reporting import exported_files  # takes a second, for exports only
 
     messages, errors = [], []
     for name in config.export:

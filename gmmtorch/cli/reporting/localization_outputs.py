@@ -13,7 +13,7 @@ from omegaconf import DictConfig, ListConfig
 from torch import Tensor
 
 from gmmtorch.cli import common, schema
-from gmmtorch.cli.outputs import map_outputs
+from gmmtorch.cli.reporting import map_outputs
 from gmmtorch.datasets import Dataset, read_trajectory, to_nanoseconds
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.events import Row
