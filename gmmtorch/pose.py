@@ -22,6 +22,7 @@ MIN_NORM = 1e-6
 """A quaternion with a smaller norm states no rotation."""
 _ORTHONORMAL = 1e-5  # largest error of an entry of R Rᵀ
 _LAST_ROW = 1e-12  # largest error of an entry of the last row: that of an inverse
+_ROUNDING = 1e-12  # largest error of an entry of R Rᵀ after some computations in float64
 _SMALL_TURN = 1e-8  # rad²
 
 
@@ -172,9 +173,11 @@ class Pose:
         return torch.cat([upper, torch.cat([last, one], -1)], -2)
 
     def quaternion(self) -> Tensor:
-        """Unit quaternions (…, 4) in the order x, y, z, w. Their largest component (w first, then x, y, z, if
-        some are as large) is above zero."""
+        """Unit quaternions (…, 4) in the order x, y, z, w, of the nearest rotations. Their largest component
+        (w first, then x, y, z, if some are as large) is above zero."""
         rotation = self.in_space().rotation
+        if bool(((rotation @ rotation.mT - torch.eye(3).to(rotation)).abs() > _ROUNDING).any()):
+            rotation = self.in_space().orthonormal().rotation
         diagonal = rotation.diagonal(dim1=-2, dim2=-1)
         trace = diagonal.sum(-1, keepdim=True)
         (_, xy, xz), (yx, _, yz), (zx, zy, _) = (row.unbind(-1) for row in rotation.unbind(-2))

@@ -127,6 +127,9 @@ def test_small_motions_are_exponentials_and_change_frames_by_the_adjoint(pose, s
     rounded = Pose(pose.rotation + 1e-3 * steps[0, 0].cos(), pose.translation)
     nearest = np.stack([polar(matrix)[0] for matrix in rounded.rotation.numpy()])
     close(rounded.orthonormal().rotation, nearest)
+    if dim == 3:
+        again = Pose.from_quaternion(rounded.translation, rounded.quaternion())
+        close(again.rotation, nearest)
     assert bool((pose.angle() - pose.chord() >= -1e-12).all())
 
 

@@ -62,7 +62,7 @@ _MOST_FREE = 1.5  # times the share that need not be explained: points in free s
 class Tracker:
     """Localises the scans of a sensor, one after the other, in a map that does not change.
 
-    A scan is aligned with the surfaces of the map (`registration.alignment`), from the pose that the last
+    A scan is aligned with the surfaces of the map (`localization.alignment`), from the pose that the last
     motion predicts. If this fails, starts around the prediction are tried, then four times as far. After
     a lost scan, and for the first scan without a pose, the whole map is searched: all headings at the places
     from which the map was seen.
@@ -128,8 +128,8 @@ class Tracker:
         self._motion: Pose | None = None
         self._last: Pose | None = None  # about the centre
         if pose is not None:
-            start = Pose.checked(pose, self.dim, "pose", device=self._center.device)
-            self._last = start.shifted(-self._center)
+            start = as_tensor(pose, "pose", torch.float64, self._center.device).detach().clone()
+            self._last = Pose.checked(start, self.dim, "pose").shifted(-self._center)
 
     def locate(self, points: ArrayLike, motion: ArrayLike | None = None) -> Location:
         """The pose of the next scan; if it is not `found`, the best guess.

@@ -142,7 +142,7 @@ class World:
             start: (3,), a point in the connected part to fly in. Default: the part with most places that are
                 surrounded by walls (`MeshWorld.standing_places`), else the largest part.
             spacing: distance (m) between the viewpoints that determine the observable cells.
-            cache: read the result from disk, or store it there (see `world_cache`).
+            cache: read the result from disk, or store it there (see `cached_cells`).
             on_event: callback for the stages.
 
         Raises `DataError` for a mesh in which no rays can be cast, `InvalidArgumentError` for bounds that
