@@ -6,6 +6,7 @@ One pass over the bag collects the headers of the sensor and all transforms.
 from __future__ import annotations
 
 import logging
+from array import array
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,8 +27,9 @@ from gmmtorch.datasets.ros.bag_reader import (
 from gmmtorch.datasets.ros.transform_tree import (
     TransformTree,
     frame_name,
-    pose_of,
+    pose_numbers,
     stamp_of,
+    trajectory_of,
 )
 from gmmtorch.datasets.trajectory import NANOSECONDS, PosesAt, Trajectory, read_trajectory
 from gmmtorch.errors import DataError, InvalidArgumentError
@@ -149,21 +151,20 @@ class RegisteredPoses:
         return self._source.explain(time, self.sensor)
 
 
-def pose_sample(message: dict[str, Any]) -> tuple[int, Pose, str, str]:
-    """(time in ns, world ← body, frames of world and body or "") of a message of a pose topic.
-
-    Raises `ValueError` if it is not a pose.
+def pose_sample(message: dict[str, Any]) -> tuple[int, list[float], str, str]:
+    """(time in ns, `pose_numbers` of world ← body, frames of world and body or "") of a message of a pose
+    topic.
     """
     time = stamp_of(message["header"])
     if "transform" in message:
         content = message["transform"]
-        pose = pose_of(content["translation"], content["rotation"])
+        numbers = pose_numbers(content["translation"], content["rotation"])
     else:
         content = message["pose"]
         content = content.get("pose", content)  # with covariance
-        pose = pose_of(content["position"], content["orientation"])
+        numbers = pose_numbers(content["position"], content["orientation"])
     world, body = message["header"]["frame_id"], message.get("child_frame_id", "")
-    return time, pose, frame_name(world), frame_name(body)
+    return time, numbers, frame_name(world), frame_name(body)
 
 
 def mount_of(extrinsic: list[float] | None) -> Pose | None:
@@ -244,7 +245,7 @@ class BagSurvey:
                 )
         self.heads: list[tuple[int, bytes]] = []
         self.tree = TransformTree()
-        self._samples: list[tuple[int, Pose]] = []
+        self._samples = array("q"), array("d")  # as of TF: a list of poses would take far more memory
         self._frames: Counter[tuple[str, str]] = Counter()  # of world and body
         for message in reader.messages(
             {topic, *transforms, *(name for name in (info_topic, self._pose_topic) if name)}
@@ -265,10 +266,11 @@ class BagSurvey:
             if message.type in TF_TYPES:
                 self.tree.add(content, static=message.topic.endswith("tf_static"))
                 return
-            time, pose, *pose_frames = pose_sample(content)
+            time, numbers, *pose_frames = pose_sample(content)
         except (DataError, ValueError, KeyError, TypeError):  # also a definition in the bag that is damaged
             return  # a transform that is missed leaves a gap, which `max_gap` notices
-        self._samples.append((time, pose))
+        self._samples[0].append(time)
+        self._samples[1].extend(numbers)
         self._frames[pose_frames[0], pose_frames[1]] += 1
 
     def camera_info(self) -> dict[str, Any] | None:
@@ -349,9 +351,7 @@ class BagSurvey:
         if self._poses in (None, "tf"):
             return self._from_tf(frames, where, seen_from, first if sensor_frame is None else None)
         if self._pose_topic is not None:
-            stamps = np.array([time for time, _ in self._samples], np.int64)
-            poses = Pose.stack([pose for _, pose in self._samples] or [Pose.identity(3)])[: len(stamps)]
-            trajectory = Trajectory.from_samples(stamps, poses)
+            trajectory = trajectory_of(*self._samples)
             sensors = frames if seen_from is None else [seen_from]
             mounts = {frame: self._mount(frame, where) if mount is None else mount for frame in sensors}
             source = BodyPoses(trajectory, mounts, self.max_gap, f"topic {self._pose_topic}")

@@ -35,10 +35,10 @@ class TransformTree:
         """The transforms of a decoded TFMessage. Those that are not rigid are left out."""
         for entry in message["transforms"]:
             child, parent = frame_name(entry["child_frame_id"]), frame_name(entry["header"]["frame_id"])
-            translation, rotation = entry["transform"]["translation"], entry["transform"]["rotation"]
+            sample = pose_numbers(entry["transform"]["translation"], entry["transform"]["rotation"])
             if static:
                 try:
-                    self._static[child] = pose_of(translation, rotation)
+                    self._static[child] = Pose.from_quaternion(sample[:3], sample[3:])
                 except ValueError:
                     continue
             else:
@@ -46,7 +46,7 @@ class TransformTree:
                 stamp = stamp_of(entry["header"])
                 self._forget(times, numbers, stamp)
                 times.append(stamp)
-                numbers.extend([*(translation[a] for a in "xyz"), *(rotation[a] for a in "xyzw")])
+                numbers.extend(sample)
                 self._edges.pop(child, None)
             self._parents.setdefault(child, Counter())[parent] += 1
 
@@ -202,12 +202,20 @@ class TransformTree:
 
     def _edge(self, child: str) -> Trajectory:
         if child not in self._edges:
-            times, numbers = (np.array(column) for column in self._samples[child])
-            numbers = numbers.reshape(-1, 7)
-            valid = np.isfinite(numbers).all(1) & (np.linalg.norm(numbers[:, 3:], axis=1) > MIN_NORM)
-            poses = Pose.from_quaternion(numbers[valid, :3], numbers[valid, 3:])
-            self._edges[child] = Trajectory.from_samples(times[valid], poses)
+            self._edges[child] = trajectory_of(*self._samples[child])
         return self._edges[child]
+
+
+def trajectory_of(times: array[int], numbers: array[float]) -> Trajectory:
+    """The trajectory of samples at times (N,), ns, without those that are not poses.
+
+    numbers: of `pose_numbers`, of one sample after the other.
+    """
+    stamps, rows = np.array(times, np.int64), np.array(numbers).reshape(-1, 7)
+    with np.errstate(over="ignore"):
+        norm = np.linalg.norm(rows[:, 3:], axis=1)
+    valid = np.isfinite(rows).all(1) & np.isfinite(norm) & (norm > MIN_NORM)
+    return Trajectory.from_samples(stamps[valid], Pose.from_quaternion(rows[valid, :3], rows[valid, 3:]))
 
 
 def frame_name(name: str) -> str:
@@ -220,6 +228,7 @@ def stamp_of(header: dict[str, Any]) -> int:
     return int(header["stamp"]["sec"]) * NANOSECONDS + int(header["stamp"]["nanosec"])
 
 
-def pose_of(translation: dict[str, float], rotation: dict[str, float]) -> Pose:
-    """The pose of a Transform or Pose message. Raises `ValueError` if it is not one."""
-    return Pose.from_quaternion([translation[axis] for axis in "xyz"], [rotation[axis] for axis in "xyzw"])
+def pose_numbers(translation: dict[str, float], rotation: dict[str, float]) -> list[float]:
+    """x, y, z, qx, qy, qz, qw of a Transform or Pose message."""
+    numbers = *(translation[axis] for axis in "xyz"), *(rotation[axis] for axis in "xyzw")
+    return [float(number) for number in numbers]
