@@ -91,7 +91,7 @@ class FramedTransport(ABC):
 
     def disown(self, former: Iterable[bytes]) -> None:
         """Set the sessions of this robot's former starts. Their frames are no sign of a duplicate robot id.
-        Without them, `sessions.OwnIdWatch` decides by the frames' numbers and times."""
+        Without them, `security.OwnIdWatch` decides by the frames' numbers and times."""
         self._opener.former = frozenset(former)
 
     @property
