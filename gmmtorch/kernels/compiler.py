@@ -79,7 +79,7 @@ class FusedKernel:
         self._threads = threading.local()
 
     def __call__(self, n_items: int, *arguments: Tensor | float | None, device: torch.device) -> None:
-        """Run the body for the items 0 … n_items − 1.
+        """Run the function for the items 0 … n_items − 1.
 
         Tensors must be on `device` and of the type of their pointers; this is not checked. Raises
         `GmmTorchError` for a tensor that is not contiguous, unless it is `strided`. On a CPU the items are
@@ -267,7 +267,10 @@ class _Parameter(NamedTuple):
 
 
 def _declared(declarations: list[str], values: dict[str, str]) -> list[_Parameter]:
-    """Declarations of one variable each, or of an array; values: the arguments of a template."""
+    """The parameters that declarations name, one for each entry of an array.
+
+    values: the arguments of the template, by name.
+    """
     found = []
     for declaration in declarations:
         const, kind, star, label, size = re.findall(r"(const )?(\w+)(\*?) (\w+)(?:\[(\d)\])?", declaration)[0]

@@ -101,17 +101,16 @@ class MixtureDensity(DensityMixin, BaseEstimator, DeviceModule):
         parameters = Parameters(self.weights, self.means - center, self._typed_covariances())
         if dim > 3:
             joint = by_type.log_joint(parameters, kind)
-            rows = by_type.rows_of_chunk(k, dim, kind, points.device)
-        else:
-            full = parameters._replace(covariances=self.covariances)
-            rows = max(64, chunk_elements(points.device) // k)
-            if em.is_ill_conditioned(full) or bool(((points - center).abs() > _FAR).any()):
-                yield from (em.log_joint(part - center, full).T for part in points.split(rows))
-                return
-            natural = em.natural_parameters(full)
-            yield from (natural @ em.quadratic_features(part - center).T for part in points.split(rows))
+            parts = points.split(by_type.rows_of_chunk(k, dim, kind, points.device))
+            yield from (joint(part - center) for part in parts)
             return
-        yield from (joint(part - center) for part in points.split(rows))
+        full = parameters._replace(covariances=self.covariances)
+        parts = points.split(max(64, chunk_elements(points.device) // k))
+        if em.is_ill_conditioned(full) or bool(((points - center).abs() > _FAR).any()):
+            yield from (em.log_joint(part - center, full).T for part in parts)
+            return
+        natural = em.natural_parameters(full)
+        yield from (natural @ em.quadratic_features(part - center).T for part in parts)
 
     def n_parameters(self) -> int:
         """Number of free parameters: for full covariances K(1 + D + D(D+1)/2) − 1."""

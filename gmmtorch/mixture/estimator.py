@@ -107,10 +107,14 @@ class MixtureEstimator(MixtureDensity):
     """Abstract Gaussian mixture with scikit-learn's interface that is also a torch module.
 
     A subclass has its parameters as fields of a dataclass, declares their valid values in
-    `_parameter_constraints` (of scikit-learn), and learns in `_learn`: `_best_start` returns the best of
-    several starts, and `_store_fit` stores the result. If `fit` has further arguments, the subclass overrides
-    it and begins with `_prepare`. Further results (a posterior, a tree) are passed to `_store_fit` as the
-    tensors that `_extra_names` lists. Files, states, copies and motions then include them.
+    `_parameter_constraints` (of scikit-learn), and defines one of two methods. `_learn` is enough if `fit`
+    needs no further arguments. Otherwise the subclass overrides `fit` itself, as
+    `HierarchicalGaussianMixture` does for sensor origins and `DeconvolvedGaussianMixture` for noise: such a
+    `fit` begins with `_prepare`, ends with `_warn_unless_converged`, and needs no `_learn`.
+
+    In both, `_best_start` returns the best of several starts, and `_store_fit` stores the result. Further
+    results (a posterior, a tree) are passed to `_store_fit` as the tensors that `_extra_names` lists. Files,
+    states, copies and motions then include them.
 
     Parameters are float64, and clouds are centred during the fit, so that points 500 km from the
     origin lose no digits.
@@ -180,8 +184,12 @@ class MixtureEstimator(MixtureDensity):
         return self
 
     def _learn(self, cloud: Cloud, on_iteration: OnIteration | None) -> None:
-        """Fit the mixture to a cloud."""
-        raise NotImplementedError
+        """Fit the mixture to a prepared cloud and store the result with `_store_fit`.
+
+        Only `fit` of this class calls it. It is not abstract, because a subclass with a `fit` of its own has
+        none.
+        """
+        raise NotImplementedError(f"{type(self).__name__} must define _learn, or a fit of its own.")
 
     def fit_predict(self, X: Array, y: Any = None, sample_weight: Array | None = None) -> Array:
         """Fit, then return the most likely component (N,) of each point."""

@@ -39,7 +39,7 @@ def add_row_flux(
         cones: (C, 16) float64: whitening W (3 × 3), sensor origin, W(μ − s), and 1/√det 2πΣ; zeros for the
             third coordinate in the plane. See `whitened_rows`.
         counts: (C,) float64.
-        rows: cone, plane, forward (R,) and first, number (R, D − 1) of `culling.FaceRows`.
+        rows: cone, plane, forward (R,) and first, number (R, D − 1) of `FaceRows` (`occupancy.cones`).
         grid: its origin (m), the side of its cells (m), and their number along each axis.
         limits: largest variation of a panel for Gauss-Legendre rules of 1, 2, 3 and 4 nodes.
         target: (R,) where in `misses` the flux of each row is added.
@@ -94,7 +94,7 @@ def add_cell_mass(
     Args:
         hits: (cells,) float64, row-major; or (M,), of any cells, if `target` is given.
         cones, counts: as in `add_row_flux`.
-        boxes: cone (R,) and first, number (R, D) of `culling.BallRows`.
+        boxes: cone (R,) and first, number (R, D) of `BallRows` (`occupancy.cones`).
         grid, limits, target: as in `add_row_flux`.
     """
     cone, first, number = (part.contiguous() for part in boxes)

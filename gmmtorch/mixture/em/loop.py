@@ -225,7 +225,7 @@ def guarded_step(
 
 
 def of_type(parameters: Parameters, covariance_type: str) -> Parameters:
-    """The parameters with the nearest covariances (K, D, D) of the type (see `covariance_types`)."""
+    """The parameters with the nearest covariances (K, D, D) of the type (see `exact.constrain`)."""
     covariances = constrain(parameters.covariances, covariance_type, parameters.weights)
     return parameters._replace(covariances=covariances)
 

@@ -240,7 +240,7 @@ def coarsest_allowed(pooled: Callable[[int], T | None], enough: int) -> tuple[in
 def _sums_by_key(
     points: Tensor, weight: Tensor, cells: Tensor, max_cells: int
 ) -> tuple[Tensor, Tensor] | None:
-    """The twin of `kernels.mixtures.cell_moments`: sums (C, F) over equal cells, and each point's cell."""
+    """The twin of `kernels.cell_moments`: sums (C, F) over equal cells, and each point's cell."""
     key = cells[:, 0]
     for axis in range(1, cells.shape[1]):
         key = key << KEY_BITS | cells[:, axis]

@@ -4,10 +4,9 @@ A ray that leaves a convex cell through one of its faces ends beyond it. So the 
 flux out of its faces, and its hits are the mass of the Gaussian in it. No samples are drawn.
 
 A region is any simple polygon in 2D, or any closed triangle mesh in 3D. The two surface integrals are those
-of boxes, over its boundary. Misses are the expected
-number of times that rays leave the region: a ray that passes through twice counts twice, and a ray that
-ends inside counts its earlier passes. For a convex region this equals the expected number of rays that pass
-through and end beyond.
+of boxes, over its boundary. Misses are the expected number of times that rays leave the region: a ray that
+passes through twice counts twice, and a ray that ends inside counts its earlier passes. For a convex region
+this equals the expected number of rays that pass through and end beyond.
 """
 
 from __future__ import annotations
@@ -119,8 +118,9 @@ class FacePatches(Patches):
 
     def sums(self, rule: Rule, simple: bool) -> Tensor:
         # With w = W(q − s), d = W(q − μ), a = d·w/|w| and b = |w| − a the integral is
-        # e^{−½|d − a w/|w||²} ∫_a^∞ (x + b)^{D−1} e^{−x²/2} dx / |w|^D, see `point.tail_moment`. The
-        # vectors are affine in f, so each of their products is a polynomial in f.
+        # e^{−½|d − a w/|w||²} ∫_a^∞ (x + b)^{D−1} e^{−x²/2} dx / |w|^D, see `tail_moment` of
+        # kernels/evidence/point_evidence.py. The vectors are affine in f, so each of their products is a
+        # polynomial in f.
         monomials, mean = rule.monomials(), self.ray - self.offset
         # d × w = d₀ × w₀ + Σ f_i edge_i × m, since w − d = m is the same everywhere.
         square = square_on(monomials, self.ray, self.edges).clamp_min(1e-30)
@@ -207,7 +207,7 @@ def _add_faces(
     rows: FaceRows,
     how: Rules,
 ) -> Tensor:
-    """misses (cells,) and the flux through rows of faces; the twin of `kernels.evidence.face_flux`."""
+    """misses (cells,) and the flux through rows of faces; the twin of `kernels.add_row_flux`."""
     for row, cells in cells_in_chunks(rows.first, rows.number, CHUNK_FACES):
         cone, plane, forward = rows.cone[row], rows.plane[row], rows.forward[row]
         middle = cells.double() + 0.5
