@@ -156,7 +156,8 @@ def _initialization(setting: Setting) -> list[Row]:
 def _sensor_model(setting: Setting) -> list[Row]:
     """Fields of a fit that this study does not measure are None."""
     study = setting.study(SensorModelStudy)
-    with naming({name: f"study.{name}" for name in ("sensor", "sensor_options")}):
+    names = {name: f"study.sensor_options.{name}" for name in study.sensor_options}
+    with naming({**names, **{name: f"study.{name}" for name in ("sensor", "sensor_options")}}):
         sensor_model(study)  # an invalid option fails before the scans are read
     dataset, scans = selected_scans(setting.config, setting.device, setting.on_event)
     unmeasured = {"log_likelihood": None, "psnr2_db": None}
