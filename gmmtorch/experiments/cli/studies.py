@@ -27,7 +27,6 @@ from gmmtorch.cli import (
     write_results,
 )
 from gmmtorch.errors import InvalidArgumentError, check_choice
-from gmmtorch.events import Event, OnRows, Row
 from gmmtorch.experiments.cli import fit_outputs, methods_of_options
 from gmmtorch.experiments.cli.fits_of_options import fit_data, fit_data_of, fit_options, selected_scans
 from gmmtorch.experiments.evaluation import Form, Protocol, baseline, choose, means
@@ -69,7 +68,7 @@ from gmmtorch.experiments.studies import (
     sensor_model,
 )
 from gmmtorch.mapping import METHODS, GaussianMap, MixtureRule
-from gmmtorch.report import Board
+from gmmtorch.report import Board, Event, OnRows, Row
 from gmmtorch.scan import Scan
 
 T = TypeVar("T")
