@@ -12,9 +12,10 @@ _LARGEST_CELL = 1e9  # metres; powers of larger sides overflow
 _MARKED = re.compile(r"‹([\w.]+)›")
 _HEAD = re.compile(r"‹([\w.]+)›|([\w.]+)(?=(?:\[\d+\](?:\.\w+)?)?=)")
 _REST = re.compile(
-    r"(?:=(?P<value>.*?))?:? (?P<fault>(?:must|is|are|has|needs|does)\b.*?)(?:; (?P<remedy>.*))?"
+    r"(?:\[\d+\](?:\.\w+)?)?(?:=(?P<value>.*?))?:? "
+    r"(?P<fault>(?:The '\w+' parameter|must|is|are|has|needs|does|cannot|would)\b.*?)(?:; (?P<remedy>.*))?"
 )
-"""The argument at the beginning of a text, and =value fault; remedy."""
+"""The argument at the beginning of a text; and =value fault; remedy, of the argument or of one entry."""
 
 
 def arg(name: str) -> str:

@@ -27,6 +27,25 @@ def test_a_hostile_file_name_does_not_reach_the_terminal(tmp_path):
     assert r"a\x1b[2J\n.ply has no header" in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("noise=-1 must be above 0.", ("noise", "-1", "must be above 0.", None)),
+        ("weights[1]=-1.0 must be at least 0.", ("weights", "-1.0", "must be at least 0.", None)),
+        ("‹start›[1]=[nan, 0] is bad; move it.", ("start", "[nan, 0]", "is bad", "move it.")),
+        ("motion=imu cannot be used: it has none.", ("motion", "imu", "cannot be used: it has none.", None)),
+        (
+            "tol=-1: The 'tol' parameter of X must be a float.",
+            ("tol", "-1", "The 'tol' parameter of X must be a float.", None),
+        ),
+        ("a.ply has no header.", (None, None, None, None)),
+    ],
+)
+def test_the_text_of_an_error_has_parts(text, parts):
+    error = errors.InvalidArgumentError(text)
+    assert (error.argument, error.value, error.fault, error.remedy) == parts
+
+
 def test_an_error_has_the_parts_of_its_text_and_can_name_options():
     error = errors.InvalidArgumentError.of("poses", "x", "is neither tf nor a file", "choose ‹poses›=tf")
     assert str(error) == "poses=x is neither tf nor a file; choose poses=tf."

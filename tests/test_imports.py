@@ -26,7 +26,6 @@ GROUND = [
     "linalg",
     "pose",
     "files",
-    "events",
     "scan",
     "pinhole",
     "optional_packages",

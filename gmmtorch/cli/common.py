@@ -17,8 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from gmmtorch.cli.schema import naming
 from gmmtorch.declarations import option
 from gmmtorch.errors import InvalidArgumentError, MissingDataError, check_whole
-from gmmtorch.events import Row
-from gmmtorch.report import format_table
+from gmmtorch.report import Row, format_table
 
 if TYPE_CHECKING:
     from gmmtorch.report import Board

@@ -14,7 +14,6 @@ from gmmtorch import datasets
 from gmmtorch.cli import common, schema
 from gmmtorch.datasets import Dataset, Reposed
 from gmmtorch.errors import DataError, InvalidArgumentError, arg, check_choice
-from gmmtorch.events import Event, Row
 from gmmtorch.localization import (
     METHODS,
     MOTIONS,
@@ -34,6 +33,7 @@ from gmmtorch.mapping import (
     TiledMap,
     WindowedRule,
 )
+from gmmtorch.report import Event, Row
 from gmmtorch.scan import Scan
 
 _WITHOUT_POSES = ("scan_folder", "rosbag")  # data sets that `dataset.poses=standing` reads without poses

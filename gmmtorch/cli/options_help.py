@@ -32,10 +32,11 @@ from gmmtorch.errors import InvalidArgumentError
 _NEAR = 0.6
 """Least similarity of a name to the name that is proposed for it."""
 _CONSTANT = "it is a constant; in Python, %s."
+_LOG_MAP = "give options of the map as in 'log.map={name: windowed, window: 20}'."
 _REPLACED = {
     "map.hit_length": "map.prior=1 gives the probabilities of counts; without it they are calibrated.",
     "map.bounds": "give bounds=[…].",
-    "map@log.map": "give options of the map as in 'log.map={name: windowed, window: 20}'.",
+    "map@log.map": _LOG_MAP,
     "log.every": "use log.dataset.stride.",
     "journal.sync": "every store survives a loss of power.",
     "link.scouting": "set scouting in the file of link.zenoh_config.",
@@ -281,7 +282,7 @@ def _instead_of(name: str) -> str | None:
     for start, ends, text in _REPLACED_GROUPS:
         if name.startswith(start) and name.removeprefix(start) in ends.split():
             return text
-    return _REPLACED.get(name)
+    return _LOG_MAP if name.startswith("log.map.") else _REPLACED.get(name)
 
 
 def check_choices(command: str, overrides: Sequence[str]) -> None:

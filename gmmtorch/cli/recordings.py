@@ -30,11 +30,10 @@ from gmmtorch.errors import (
     MissingDataError,
     check_whole,
 )
-from gmmtorch.events import Row
 from gmmtorch.files import write_bytes, write_json
 from gmmtorch.mapping import MapBuilder, TiledMap, check_same_run, merge, resident_bytes, tile_files
 from gmmtorch.optional_packages import load_ray
-from gmmtorch.report import ProgressBars
+from gmmtorch.report import ProgressBars, Row
 
 _STAGE = "recordings"
 _DONE = "recording.json"  # written last: it says that a recording is complete

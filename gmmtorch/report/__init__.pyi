@@ -66,8 +66,12 @@ from .style import save_figure as save_figure
 from .style import stacked_bars as stacked_bars
 from .style import tick_text as tick_text
 from .tensorboard_writer import Board as Board
+from .text import Event as Event
+from .text import OnRows as OnRows
 from .text import ProgressBars as ProgressBars
+from .text import Row as Row
 from .text import byte_text as byte_text
 from .text import count_text as count_text
 from .text import format_table as format_table
+from .text import ignore as ignore
 from .text import ratio_text as ratio_text

@@ -1,11 +1,20 @@
-"""Values as short text, result rows as plain-text tables, and progress bars on standard error."""
+"""Values as short text, result rows as plain-text tables, and the progress of long work as bars."""
 
 from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
+
+Event = Callable[[str, int, int | None], None]
+"""(stage, done, total): the name of the stage, the work done so far, and all its work (None if unknown)."""
+
+Row = dict[str, Any]
+"""One row of results.json: values by field."""
+
+OnRows = Callable[[list[Row]], object]
+"""Called with all rows so far after each new row, so that a run that fails late keeps its rows."""
 
 _UNITS = (("TB", 1e12), ("GB", 1e9), ("MB", 1e6), ("kB", 1e3))
 
@@ -92,6 +101,10 @@ def _aligned(cells: Sequence[str], widths: Sequence[int], right: Sequence[bool])
         for cell, width, is_right in zip(cells, widths, right, strict=True)
     )
     return "  ".join(padded).rstrip()
+
+
+def ignore(stage: str, done: int, total: int | None) -> None:
+    """The default callback of long work: ignores all events."""
 
 
 class ProgressBars:

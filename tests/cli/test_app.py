@@ -71,6 +71,7 @@ def test_an_interrupt_that_python_drops_ends_the_command(monkeypatch, tmp_path):
         ("fit", "-m mixture.n_componets=3,4", "did you mean mixture.n_components?"),
         ("robot", "dataset@log.dataset=carmn", "did you mean dataset@log.dataset=carmen?"),
         ("explore", "network.los=0.1", "did you mean network.loss?"),
+        ("robot", "log.map.window=5", "log.map.window is no longer an option: give;log.map={name: windowed"),
         ("map", "map.hit_length=2", "map.hit_length is no longer an option: map.prior=1"),
         ("map", "map.min_points=2", "map.min_points is no longer an option: it is a constant;learning rule"),
         ("explore", "checkpoint.every=60", "checkpoint.every is no longer;continues;hydra.run.dir=RUN"),

@@ -353,6 +353,7 @@ def test_an_invalid_map_option_gives_a_one_line_error(options, words, run):
         ("+method_options.em.branching=2", "method_options.em.branching warm_start"),
         ("+method_options.hierarchical.branching=1 method=[hierarchical]", "branching=1"),
         ("experiment=sensor_model +study.sensor_options.axial=1", "study.sensor_options axial noise"),
+        ("experiment=sensor_model study.sensor_options.noise=-1", "study.sensor_options.noise=-1"),
         ("experiment=fig2_1_initialization study.name=history", "study.name='history' initialization"),
     ],
 )

@@ -10,13 +10,13 @@ import torch
 from pillar_room import timeless
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.events import ignore
 from gmmtorch.experiments.evaluation.fits import FitData, Row, compare, split
 from gmmtorch.experiments.evaluation.protocol_options import FitOptions
 from gmmtorch.experiments.studies import fit_studies as initialization
 from gmmtorch.experiments.studies.fit_studies import box_covariances, fit_timed, run_initialization
 from gmmtorch.experiments.studies.study_options import InitializationStudy
 from gmmtorch.mixture.em.initialization import INITIALIZATIONS
+from gmmtorch.report import ignore
 
 EM = FitOptions(max_iter=20, algorithm="exact")
 SMALL = InitializationStudy(n_components=(2, 5), init_params=("random_points", "kmeans"), n_seeds=2)

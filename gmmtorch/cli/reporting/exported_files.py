@@ -12,7 +12,6 @@ from torch import Tensor
 from gmmtorch.cli import inputs
 from gmmtorch.datasets import read_trajectory
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
-from gmmtorch.events import Event
 from gmmtorch.export import (
     CellCloud,
     PlainMixture,
@@ -37,6 +36,7 @@ from gmmtorch.export import (
 from gmmtorch.mapping import GaussianMap
 from gmmtorch.mixture import GaussianMixture
 from gmmtorch.occupancy import OccupancyGrid, Thresholds, VoxelGrid, check_resolution, rasterize
+from gmmtorch.report import Event
 
 _EXTENT = 3.0  # standard deviations around each component that the cells cover
 

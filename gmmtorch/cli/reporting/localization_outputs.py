@@ -16,7 +16,6 @@ from gmmtorch.cli import common, schema
 from gmmtorch.cli.reporting import map_outputs
 from gmmtorch.datasets import Dataset, read_trajectory, to_nanoseconds
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.events import Row
 from gmmtorch.export import write_pose_table, write_tum
 from gmmtorch.localization import (
     UNSCORED,
@@ -28,7 +27,7 @@ from gmmtorch.localization import (
 )
 from gmmtorch.mapping import GaussianMap
 from gmmtorch.pose import Pose
-from gmmtorch.report import Board, map_figure
+from gmmtorch.report import Board, Row, map_figure
 
 _FORMS = {2: "[x,y,yaw]", 3: "[x,y,z,yaw] or [x,y,z,qx,qy,qz,qw]"}
 FOUND, ALL = "trajectory.tum", "trajectory.csv"

@@ -17,13 +17,13 @@ from gmmtorch.cli import common, schema
 from gmmtorch.cli.export import ExportOptions
 from gmmtorch.datasets import Dataset, read_trajectory
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError, MissingDataError, check_number
-from gmmtorch.events import Event, Row
 from gmmtorch.export import write_pose_table, write_tum
 from gmmtorch.localization import Trajectory, scan_times
 from gmmtorch.mapping import Components, GaussianMap, MapBuilder
 from gmmtorch.occupancy import reliability_of, scores_of
 from gmmtorch.optional_packages import load_pyoctomap
 from gmmtorch.pose import Pose
+from gmmtorch.report import Event, Row
 
 EXPORTS = {
     "map_server": ("map_server", "navigation.yaml"),

@@ -29,11 +29,10 @@ from gmmtorch.cli import (
     write_results,
 )
 from gmmtorch.declarations import group, option
-from gmmtorch.events import Event, Row
 from gmmtorch.experiments.cli import experiment_schema
 from gmmtorch.experiments.evaluation import FitOptions
 from gmmtorch.mixture import PruneOptions
-from gmmtorch.report import ProgressBars
+from gmmtorch.report import Event, ProgressBars, Row
 
 TABLE = (
     "method n_components n_components_used seconds n_iterations log_likelihood held_out_log_likelihood "

@@ -10,8 +10,8 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from gmmtorch.cli import chosen_options, show
-from gmmtorch.events import Row
 from gmmtorch.experiments.evaluation import NO_LIKELIHOODS, FitOutcome, in_use
+from gmmtorch.report import Row
 
 if TYPE_CHECKING:
     from gmmtorch.report import Board

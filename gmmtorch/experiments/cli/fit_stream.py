@@ -11,12 +11,11 @@ from omegaconf import DictConfig
 from gmmtorch.cli import logger, print_table, set_up, write_results
 from gmmtorch.datasets import open_points
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.events import Event, Row
 from gmmtorch.experiments.cli import fit_outputs
 from gmmtorch.experiments.cli.fits_of_options import fit_data, fit_options
 from gmmtorch.experiments.evaluation import FitOutcome, Split, fit_streamed, split_data, split_source
 from gmmtorch.mixture import Checkpoint, is_launched, joined
-from gmmtorch.report import ProgressBars
+from gmmtorch.report import Event, ProgressBars, Row
 
 
 def is_wanted(config: DictConfig) -> bool:

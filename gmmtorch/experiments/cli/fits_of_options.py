@@ -10,8 +10,8 @@ from torch import Tensor
 
 from gmmtorch.cli import build, open_dataset, read_scans
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.events import Event
 from gmmtorch.experiments.evaluation import FitData, FitOptions, Views, split
+from gmmtorch.report import Event
 from gmmtorch.scan import Scan
 
 

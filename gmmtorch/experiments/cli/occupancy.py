@@ -23,10 +23,9 @@ from gmmtorch.cli import (
 )
 from gmmtorch.declarations import group, option
 from gmmtorch.errors import check_whole
-from gmmtorch.events import Event, Row
 from gmmtorch.experiments.cli import experiment_schema
 from gmmtorch.experiments.evaluation import Protocol
-from gmmtorch.report import ProgressBars
+from gmmtorch.report import Event, ProgressBars, Row
 
 TABLE = (
     "method resolution kept auc auc_low auc_high ece log_loss_bits accuracy n_components nbytes "

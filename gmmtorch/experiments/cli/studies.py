@@ -27,7 +27,6 @@ from gmmtorch.cli import (
     write_results,
 )
 from gmmtorch.errors import InvalidArgumentError, check_choice
-from gmmtorch.events import Event, OnRows, Row
 from gmmtorch.experiments.cli import fit_outputs, methods_of_options
 from gmmtorch.experiments.cli.fits_of_options import fit_data, fit_data_of, fit_options, selected_scans
 from gmmtorch.experiments.evaluation import Form, Protocol, baseline, choose, means
@@ -69,7 +68,7 @@ from gmmtorch.experiments.studies import (
     sensor_model,
 )
 from gmmtorch.mapping import METHODS, GaussianMap, MixtureRule
-from gmmtorch.report import Board
+from gmmtorch.report import Board, Event, OnRows, Row
 from gmmtorch.scan import Scan
 
 T = TypeVar("T")
@@ -156,7 +155,8 @@ def _initialization(setting: Setting) -> list[Row]:
 def _sensor_model(setting: Setting) -> list[Row]:
     """Fields of a fit that this study does not measure are None."""
     study = setting.study(SensorModelStudy)
-    with naming({name: f"study.{name}" for name in ("sensor", "sensor_options")}):
+    names = {name: f"study.sensor_options.{name}" for name in study.sensor_options}
+    with naming({**names, **{name: f"study.{name}" for name in ("sensor", "sensor_options")}}):
         sensor_model(study)  # an invalid option fails before the scans are read
     dataset, scans = selected_scans(setting.config, setting.device, setting.on_event)
     unmeasured = {"log_likelihood": None, "psnr2_db": None}

@@ -18,7 +18,6 @@ from torch import Tensor
 
 from gmmtorch.datasets import PointChunks, in_memory
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.events import Event, OnRows, Row
 from gmmtorch.experiments.evaluation.metrics import psnr2, psnr_terms
 from gmmtorch.experiments.evaluation.protocol_options import FitOptions
 from gmmtorch.mixture import (
@@ -39,6 +38,7 @@ from gmmtorch.mixture import (
     score_stream,
     survey_all,
 )
+from gmmtorch.report import Event, OnRows, Row
 
 
 class Views(NamedTuple):

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.events import Event, OnRows, Row, ignore
 from gmmtorch.experiments.evaluation import metrics, queries
 from gmmtorch.experiments.evaluation.mapping_methods import Form, MapFactory
 from gmmtorch.experiments.evaluation.metrics import SeenPredictions
@@ -21,6 +20,7 @@ from gmmtorch.experiments.evaluation.queries import UNKNOWN, Queries
 from gmmtorch.files import check_writable
 from gmmtorch.mapping import GaussianMap
 from gmmtorch.occupancy import OccupancyMap
+from gmmtorch.report import Event, OnRows, Row, ignore
 from gmmtorch.scan import Scan
 
 _PREDICTED_SCANS = 50  # of which a map without a calibration predicts some beams

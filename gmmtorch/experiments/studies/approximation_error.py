@@ -21,7 +21,6 @@ import torch
 from torch import Tensor
 
 from gmmtorch import datasets
-from gmmtorch.events import Event, OnRows, Row, ignore
 from gmmtorch.experiments.studies.angular_reference import angular_evidence
 from gmmtorch.experiments.studies.study_options import ApproximationErrorStudy
 from gmmtorch.mapping import GaussianMap
@@ -37,6 +36,7 @@ from gmmtorch.occupancy import (
     point_evidence,
     sample_rays,
 )
+from gmmtorch.report import Event, OnRows, Row, ignore
 
 # -- test scenes ---------------------------------------------------------------------------------------
 

@@ -32,7 +32,6 @@ from sklearn.exceptions import ConvergenceWarning
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.events import Event, OnRows, Row, ignore
 from gmmtorch.experiments.evaluation import FitData, FitOptions, MapFactory, Protocol, evaluate, row_of
 from gmmtorch.experiments.studies.map_studies import held_out_points, surface_score
 from gmmtorch.experiments.studies.study_options import ComponentCountStudy, InitializationStudy
@@ -48,6 +47,7 @@ from gmmtorch.mixture import (
     run_em,
     surface_pieces,
 )
+from gmmtorch.report import Event, OnRows, Row, ignore
 from gmmtorch.scan import Scan
 
 # -- the start of EM -----------------------------------------------------------------------------------

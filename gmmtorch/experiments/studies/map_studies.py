@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.events import Event, OnRows, Row, ignore
 from gmmtorch.experiments.evaluation import (
     Built,
     Form,
@@ -35,6 +34,7 @@ from gmmtorch.experiments.evaluation import (
 from gmmtorch.mapping import GaussianMap
 from gmmtorch.mixture import GaussianMixture
 from gmmtorch.pose import Pose
+from gmmtorch.report import Event, OnRows, Row, ignore
 from gmmtorch.scan import Scan
 
 # -- AUC against size ----------------------------------------------------------------------------------

@@ -25,7 +25,6 @@ from sklearn.exceptions import ConvergenceWarning
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_choice
-from gmmtorch.events import Event, Row, ignore
 from gmmtorch.experiments.evaluation import (
     Queries,
     auc_interval,
@@ -44,6 +43,7 @@ from gmmtorch.mixture import (
     SensorModel,
     estimate_normals,
 )
+from gmmtorch.report import Event, Row, ignore
 from gmmtorch.scan import Scan
 
 SENSORS: dict[str, type[DepthCameraModel] | type[LidarModel] | type[LaserModel]] = {

@@ -16,11 +16,11 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gmmtorch.events import Event, OnRows, Row, ignore
 from gmmtorch.experiments.evaluation import FREE, OCCUPIED, hit_and_free, roc, split_indices, test_beams
 from gmmtorch.experiments.studies.study_options import COUNTS, VarianceThresholdStudy
 from gmmtorch.mapping import GaussianMap, Query
 from gmmtorch.occupancy import Calibration, CellClass, PointEvidence, SparseEvidence, classify, probability
+from gmmtorch.report import Event, OnRows, Row, ignore
 from gmmtorch.scan import Scan
 from gmmtorch.simulation import box, ray_triangles, sense, spinning_lidar
 

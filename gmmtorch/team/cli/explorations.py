@@ -8,9 +8,8 @@ from omegaconf import DictConfig
 
 from gmmtorch.cli import argument_names, as_options, logger, naming, print_table, run_dir, write_results
 from gmmtorch.errors import check_whole
-from gmmtorch.events import Row
 from gmmtorch.live import LiveView
-from gmmtorch.report import ProgressBars
+from gmmtorch.report import ProgressBars, Row
 from gmmtorch.team.cli.explore_pictures import MissionRecorder, save_comparison
 from gmmtorch.team.cli.from_options import missions
 from gmmtorch.team.exploration import (

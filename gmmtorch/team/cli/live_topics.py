@@ -28,7 +28,6 @@ from gmmtorch.cli import (
 )
 from gmmtorch.datasets import Ranges
 from gmmtorch.errors import InvalidArgumentError, told
-from gmmtorch.events import Row
 from gmmtorch.export import write_tum
 from gmmtorch.live import (
     MAP,
@@ -45,7 +44,7 @@ from gmmtorch.live import (
     warm_up,
 )
 from gmmtorch.mapping import GaussianMap
-from gmmtorch.report import ProgressBars
+from gmmtorch.report import ProgressBars, Row
 from gmmtorch.team.exploration import WallClock, settle
 from gmmtorch.team.sharing import SharedMap
 

@@ -152,6 +152,7 @@ def test_a_robot_starts_without_a_writable_store(run, tmp_path):
     (tmp_path / "file").write_text("")
     done = succeeded(run(*LOG, f"journal.folder={tmp_path / 'file'}", "log.rate=50"))
     assert done.stdout.count("Choose another folder, or run without a store") == 1
+    assert done.stdout.count("Set journal.folder to another folder, or journal.enabled=false") == 1
     (row,) = done.results()["rows"]
     assert row["scans"] == 6
 

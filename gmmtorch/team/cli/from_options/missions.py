@@ -12,7 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gmmtorch.cli import argument_names, as_options, build, naming
 from gmmtorch.errors import InvalidArgumentError, check_choice
-from gmmtorch.events import Event, ignore
+from gmmtorch.report import Event, ignore
 from gmmtorch.team.exploration import PLANNING, THESIS, FrameRule, TeamOptions, Trial, World, WorldOptions
 
 _OF_VARIANTS = {

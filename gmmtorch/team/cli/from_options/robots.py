@@ -124,6 +124,8 @@ def _opened_store(config: DictConfig, transport: FramedTransport, stack: ExitSta
         logger.warning("journal.folder=%s holds no %s: the map starts empty.", given, path.name)
     with naming({"path": "hydra.run.dir" if given is None else "journal.folder"}):
         store = stack.enter_context(Store(path, config.id, facts_of(config)))
+    if not store.is_writable:  # the store's own warning knows no options
+        logger.warning("Set journal.folder to another folder, or journal.enabled=false.")
     transport.disown(store.begin_session(transport.session))
     return store
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from gmmtorch.declarations import group, option
 from gmmtorch.errors import InvalidArgumentError, arg, check_choice, check_number, check_whole
-from gmmtorch.events import Event, ignore
 from gmmtorch.mapping import NoveltyRule
+from gmmtorch.report import Event, ignore
 from gmmtorch.simulation import CameraOptions
 from gmmtorch.team.sharing import LinkConditions
 

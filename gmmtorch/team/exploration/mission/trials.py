@@ -20,10 +20,10 @@ from torch import Tensor
 
 from gmmtorch import __version__
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
-from gmmtorch.events import Event, ignore
 from gmmtorch.files import check_writable, write_json
 from gmmtorch.occupancy import RollingWindow
 from gmmtorch.processes import end_with_parent
+from gmmtorch.report import Event, ignore
 from gmmtorch.team.exploration.mission.driver import SimulatedClock, Stopwatch, drive
 from gmmtorch.team.exploration.mission.mission import Mission, MissionScore
 from gmmtorch.team.exploration.mission.options import TeamOptions, WorldOptions

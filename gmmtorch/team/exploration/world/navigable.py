@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.events import Event, ignore
 from gmmtorch.kernels import row_major_strides
 from gmmtorch.occupancy import Box, occupied_cells
+from gmmtorch.report import Event, ignore
 from gmmtorch.simulation import MeshWorld
 
 ON_PLANE = 1e-6

@@ -26,9 +26,9 @@ from gmmtorch.errors import (
     check_choice,
     check_number,
 )
-from gmmtorch.events import Event, ignore
 from gmmtorch.files import pack_tensors, read_tensors, require, write_bytes
 from gmmtorch.occupancy import Box, check_resolution
+from gmmtorch.report import Event, ignore
 from gmmtorch.simulation import MeshWorld, checked_triangles, tunnels, warehouse, warehouse_start
 from gmmtorch.team.exploration.world.navigable import (
     ON_PLANE,
