@@ -79,8 +79,10 @@ def test_a_part_that_is_measured_again_replaces_its_rows_only(loaded, run):
     assert found["command"] == "python benchmarks/some.py"
     assert found["rows"] == [["a", 1.0], ["b", 2.0]]
     assert run(some, words="--names b")["some"]["rows"] == [["a", 1.0], ["b", 3.0]]
+    seeds = {"seed": {"type": int, "default": 0}}
     only_b = some._replace(data=("b",))
-    assert run(only_b)["some"]["rows"] == [["b", 4.0]], "a whole run leaves no other rows"
+    assert run(only_b, words="--seed 1", **seeds)["some"]["rows"] == [["a", 1.0], ["b", 4.0]]
+    assert run(only_b, **seeds)["some"]["rows"] == [["b", 5.0]], "a whole run leaves no other rows"
 
 
 def test_the_file_is_named_after_threads_and_its_rows_are_written_one_by_one(loaded, run):

@@ -201,6 +201,7 @@ def run(text: str, *cases: Case, **arguments: dict[str, Any]) -> None:
     for name, settings in {**common, **arguments}.items():
         parser.add_argument(f"--{name.replace('_', '-')}", **settings)
     options = parser.parse_args()
+    options.is_whole = all(getattr(options, name) == parser.get_default(name) for name in arguments)
     chosen = [
         case for case in cases if case.file("cpu", 1) in getattr(options, "only", (case.file("cpu", 1),))
     ]
@@ -244,7 +245,8 @@ def measured(case: Case, options: argparse.Namespace) -> Table:
         print(*(shown(cell, case.columns.get(name, "")) for name, cell in row.items()), sep=" | ", flush=True)
         new[_key(case, row)] = row
         write((kept | new).values())
-    if new and len(options.names) == len(case.data) and len(options.methods) == len(case.methods):
+    is_whole = options.names == list(case.data) and options.methods == list(case.methods) and options.is_whole
+    if new and is_whole:
         write(new.values())  # rows that are not measured any more go
     return table
 

@@ -264,7 +264,7 @@ class LiveLocalizer:
                 f"{dim}D; give a map of this kind of sensor."
             )
         pose = Pose.from_matrix(placed)
-        points = pose.inverse().apply(newest.scan.points)
+        points = pose.inverse().apply(newest.scan.points.double())
         motion = None if self._last is None or not self._has_motion else (self._last.inverse() @ pose).matrix
         self._last = pose
         location = self._tracker.locate(points.to(self._device), motion)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, check_choice
+from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, arg, check_choice
 from gmmtorch.export import (
     CellCloud,
     cloud_fields,
@@ -285,8 +285,8 @@ class Diagnostics:
             self._node.warn(
                 "clock",
                 f"stamps are {seconds:.0f} s away from the clock of this node. For a recording that is "
-                "played set use_sim_time=true; for a sensor with a clock of its own "
-                "clock=received.",
+                f"played set {arg('use_sim_time')}=true; for a sensor with a clock of its own "
+                f"{arg('clock')}=received.",
             )
             return
         self._latencies.append(seconds)

@@ -20,7 +20,7 @@ from gmmtorch.datasets import load
 from gmmtorch.datasets.base import Ranges
 from gmmtorch.datasets.ros.bag_reader import CLOUD, LASER, Sensor, Topic
 from gmmtorch.datasets.ros.transform_tree import TransformTree
-from gmmtorch.errors import GmmTorchError, InvalidArgumentError
+from gmmtorch.errors import GmmTorchError, InvalidArgumentError, told
 from gmmtorch.live.bag_player import BagPlayer
 from gmmtorch.live.live_mapper import LiveMapper
 from gmmtorch.live.live_scans import LiveOptions, LiveScans, find_sensor, open_scans
@@ -238,9 +238,10 @@ def test_stamps_of_another_clock_are_said_and_do_not_count_as_latency():
     diagnostics = Diagnostics(user, scans)
     for seconds in (0.5, -1.7e9, 3600.0, 0.7):
         diagnostics.note_latency(seconds)
-    warnings = user.take("warning")
+    options = {"use_sim_time": "node.use_sim_time", "clock": "sensor.clock"}
+    warnings = [told(text, options) for text in user.take("warning")]
     assert len(warnings) == 2
-    assert all("use_sim_time=true" in text and "clock=received" in text for text in warnings)
+    assert all("node.use_sim_time=true" in text and "sensor.clock=received" in text for text in warnings)
     assert "3600 s away" in warnings[1]
     assert diagnostics.numbers(4, 0)["latency_median"] == pytest.approx(0.6)
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, arg
 from gmmtorch.export.bag import cloud_fields, transform_fields
 from gmmtorch.live.ros import Node
 from gmmtorch.live.ros.dds import _settings
@@ -246,6 +246,12 @@ def test_messages_that_are_too_large_are_counted(node, monkeypatch, caplog):
         node._receive(subscription, node.types.encode(STRING, {"data": text}))
     assert (subscription.n_malformed, len(subscription.waiting)) == (1, 1)
     assert "49 bytes are more than 20" in caplog.text
+
+
+def test_warnings_name_the_options_of_a_command(node, caplog):
+    node.option_names = {"clock": "sensor.clock"}
+    node.warn("clock", f"set {arg('clock')}=received, or {arg('use_sim_time')}=true")
+    assert "set sensor.clock=received, or use_sim_time=true" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -69,7 +69,7 @@ def evaluate(
     Args:
         name: of the data set, for the rows.
         scans: in time order, all in memory.
-        factories: the methods; see `methods.choose`.
+        factories: the methods; see `choose`.
         protocol: the test.
         seed: of the random choice of training data, the free points and the bootstrap.
         on_event: progress callback.

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from gmmtorch.datasets import TransformTree
-from gmmtorch.errors import DataError, InvalidArgumentError, check_choice
+from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, told
 from gmmtorch.live.ros import dds, zenoh_middleware
 from gmmtorch.live.ros.topics import (
     MAX_MESSAGE_BYTES,
@@ -124,6 +124,7 @@ class Node:
         self._n_arrived = 0
         self.subscriptions: list[Subscription] = []
         self._warned: dict[str, float] = {}
+        self.option_names: Mapping[str, str] = {}  # of arguments that are marked in warnings
         self.arrival = Arrival(0, 0, 0.0, b"")
         self._clock = 0
         self._clock_topic: Subscription | None = None
@@ -253,7 +254,7 @@ class Node:
         now = time.monotonic()
         if now - self._warned.get(kind, -_REPEAT) >= _REPEAT:
             self._warned[kind] = now
-            logger.warning("%s", text)
+            logger.warning("%s", told(text, self.option_names))
 
     @property
     def counts(self) -> dict[str, Counter[str]]:

@@ -27,7 +27,7 @@ from gmmtorch.cli import (
     write_trajectory,
 )
 from gmmtorch.datasets import Ranges
-from gmmtorch.errors import InvalidArgumentError, told
+from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.export import write_tum
 from gmmtorch.live import (
     MAP,
@@ -60,8 +60,11 @@ def open_node(config: DictConfig) -> Node:
     if not isinstance(remap, Mapping):
         raise InvalidArgumentError(f"remap={remap} must be {{/topic: /other_topic}}.")
     remap = {str(topic): str(other) for topic, other in remap.items()}
-    with naming({name: f"node.{name}" for name in options}):
-        return Node("gmmtorch_player" if config.play else "gmmtorch", **options, remap=remap)
+    names = {name: f"node.{name}" for name in options}
+    with naming(names):
+        node = Node("gmmtorch_player" if config.play else "gmmtorch", **options, remap=remap)
+    node.option_names = names | {name: f"sensor.{name}" for name in map(str, config.sensor)}
+    return node
 
 
 # -- playing --------------------------------------------------------------------------------------
@@ -188,17 +191,16 @@ def _until_stopped(
             if worker.step():
                 after_scan()
             elif not len(scans) and time.monotonic() - begin > config.wait:
-                node.warn("silence", f"no scan can be used: {_trouble(config, node, scans)}.")
+                node.warn("silence", f"no scan can be used: {_trouble(node, scans)}.")
 
 
-def _trouble(config: DictConfig, node: Node, scans: LiveScans) -> str:
+def _trouble(node: Node, scans: LiveScans) -> str:
     """Why no scan was mapped so far."""
     silent = [s for s in node.subscriptions if s.n_received == 0 and not s.topic.endswith("/tf_static")]
     if silent:
         return "; ".join(node.explain_silence(subscription) for subscription in silent)
     reasons = ", ".join(f"{reason} ({n} scans)" for reason, n in scans.skipped.items())
-    trouble = told(scans.trouble, {name: f"sensor.{name}" for name in map(str, config.sensor)})
-    return "; ".join(text for text in (reasons, trouble) if text) or "the scans wait for their poses"
+    return "; ".join(text for text in (reasons, scans.trouble) if text) or "the scans wait for their poses"
 
 
 def _write(
