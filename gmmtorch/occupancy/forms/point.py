@@ -234,8 +234,8 @@ class PointForm:
         if len(points) * len(self.rows) <= _FEW_PAIRS:
             bucket = torch.zeros_like(points[:, 0], dtype=torch.int64)
             every = torch.arange(len(self.rows), dtype=torch.int32, device=points.device)
-            order = torch.arange(len(points), device=points.device)
-            bucket[(points.abs() > _FARTHEST).any(1)] = -1
+            # Lanes of the kernel take each list once where its points follow each other.
+            order = (points.abs() <= _FARTHEST).all(1).nonzero().squeeze(1)
             listed_evidence(points, order, bucket, Lists.of(order.new_tensor([len(every)]), every), *settings)
             return found
         for rows, number in self.index.parts(points):
