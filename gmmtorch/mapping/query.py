@@ -25,7 +25,6 @@ from gmmtorch.occupancy import (
     SparseEvidence,
     VoxelGrid,
     cell_flux,
-    cone_bounds,
     cone_evidence,
     flux_evidence,
     former_rows,
@@ -52,19 +51,19 @@ def cutoff_of(n_seen: int, n_many: int) -> float:
     return _SHARP_CUTOFF if n_seen - n_many <= (n_seen - 1) // 2 else CUTOFF
 
 
-def mean_range(parts: Iterable[Cones]) -> float:
+def mean_range(parts: Iterable[Components]) -> float:
     """Mean range (m) of the beams with a return, to their components' means; 1 if there are none."""
     total = count = 0.0
-    for cones in parts:
-        weight = cones.counts * ~cones.max_range
-        ranges = (cones.means - cones.origins).norm(dim=1)
+    for c in parts:
+        weight = c.seen_count * ~c.max_range[c.seen_by]
+        ranges = (c.means[c.seen_by] - c.origins[c.seen_from]).norm(dim=1)
         found = torch.stack([(weight * ranges).sum(), weight.sum()]).tolist()
         total, count = total + found[0], count + found[1]
     return total / count if total > 0 else 1.0
 
 
-def rule_of(options: QueryOptions, parts: Iterable[Cones]) -> Rule:
-    """How probabilities follow from evidence; without a prior or a calibration, from the ranges of cones."""
+def rule_of(options: QueryOptions, parts: Iterable[Components]) -> Rule:
+    """How probabilities follow from evidence; without a prior or a calibration, from the ranges of beams."""
     if options.prior is not None:
         return float(options.prior)
     return options.calibration or Calibration.prior(mean_range(parts))
@@ -101,18 +100,16 @@ class _Block:
         self.components, self.cutoff = components, cutoff
         self.forms: dict[float, PointForm] = {}
         self.indices: dict[float, ConeIndex] = {}
-        cones = components.cones()
-        self.low, self.high = (
-            torch.cat([corner.detach(), components.means.detach().double()])
-            for corner in cone_bounds(cones, cutoff)
-        )
-        self.low, self.high = self.low.amin(0), self.high.amax(0)
-        distance = (cones.means - cones.origins).detach().double().norm(dim=1)
-        self.distance = torch.cat([distance, distance.new_zeros(1)]).amax()
+        c = components
+        means, origins = c.means.detach().double(), c.origins.detach().double()[c.seen_from]
+        extent = cutoff * c.covariances.detach().double().diagonal(dim1=1, dim2=2).sqrt()
+        self.low = torch.minimum((means - extent).amin(0), origins.amin(0))
+        self.high = torch.maximum((means + extent).amax(0), origins.amax(0))
+        self.distance = (means[c.seen_by] - origins).norm(dim=1).amax()
 
-    def form(self, resolution: float) -> PointForm:
+    def form(self, resolution: float, share: float) -> PointForm:
         if resolution not in self.forms:
-            self.forms[resolution] = PointForm(self.components.cones(), resolution, self.cutoff)
+            self.forms[resolution] = PointForm(self.components.cones(), resolution, self.cutoff, share)
         return self.forms[resolution]
 
     def index(self, resolution: float) -> ConeIndex:
@@ -179,8 +176,7 @@ class Query:
     def _set(self, components: Components, options: QueryOptions, recent: Sequence[Components]) -> None:
         self.components, self.options, self.dim = components, options, components.dim
         parts = [components, *recent]
-        known = options.prior is not None or options.calibration is not None
-        self.rule = rule_of(options, () if known else (part.cones() for part in parts))
+        self.rule = rule_of(options, parts)
         self.cutoff = options.cutoff or cutoff_of(*count_many(torch.cat([part.seen_count for part in parts])))
         self._lattices: dict[float, SparseEvidence] = {}
         self._bounds: tuple[Tensor, Tensor, Tensor] | None = None
@@ -315,7 +311,7 @@ class Query:
         """Evidence of the point form. The sum over all cones has one order, in whichever blocks they are."""
         found = PointEvidence(*torch.zeros(2, len(points), dtype=points.dtype, device=points.device))
         for block, rows in self._near(points, resolution):
-            form = block.form(resolution)
+            form = block.form(resolution, 1 / max(1, len(self._blocks)))
             if rows is None:
                 found = form(points, found)
             else:

@@ -120,8 +120,7 @@ class TiledMap:
         those of version 1.0 all are read once, for the ranges of the sensor model."""
         options = self.query_options
         if options.prior is None and options.calibration is None:
-            cones = (self.components(row).cones() for row in range(len(self.index)))
-            known = Calibration.prior(mean_range(cones))
+            known = Calibration.prior(mean_range(map(self.components, range(len(self.index)))))
             self.query_options = replace(options, calibration=known)
         return rule_of(self.query_options, ())
 
@@ -475,7 +474,7 @@ def _calibrated(settings: MapSettings, components: Components) -> MapSettings:
     none. A tile alone does not show these ranges."""
     if settings.query.calibration is not None or settings.query.prior is not None:
         return settings
-    return _with(settings, Calibration.prior(mean_range([components.cones()])))
+    return _with(settings, Calibration.prior(mean_range([components])))
 
 
 def _with(settings: MapSettings, calibration: Calibration | None) -> MapSettings:
