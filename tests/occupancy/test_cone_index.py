@@ -252,8 +252,8 @@ def test_places_that_are_asked_again_get_shorter_lists_and_the_same_answers(monk
     form, n_listed = PointForm(cones, 0.1), []
     for _ in range(8):
         same_evidence(form(places), brute(cones, places, 0.1))
-        listed = form.index.lists.lengths()[form.index.buckets(places).clamp_min(0)]
-        n_listed.append(int(listed.sum()))
+        number = form.index.buckets(places).clamp_min(0)
+        n_listed.append(int(form.index.lists.lengths()[number].sum()))
     assert n_listed[-1] < 0.7 * n_listed[0]
 
 
