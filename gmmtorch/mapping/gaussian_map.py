@@ -15,6 +15,7 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_whole
 from gmmtorch.files import write_bytes
+from gmmtorch.mapping.attributes.answers import Prediction, predictions
 from gmmtorch.mapping.codec.component_batch import CODECS, MapSettings, map_bytes, read_map
 from gmmtorch.mapping.codec.quantization import quantized_after
 from gmmtorch.mapping.components import Components
@@ -233,12 +234,12 @@ class GaussianMap(MapState):
     def components(self) -> Components:
         """All components as the codec rounds them, with those of the unfinished window."""
         if self._rounded is None:
-            learned, final = self._with_pending(), self._final()
+            learned, final = self.unrounded(), self._final()
             if self.codec == "float":
                 return learned
             none = Components.empty(final.dim, final.means.device)
             known, rounded = self._final_rounded or (none, none)
-            if any(value is not getattr(final, name) for name, value in vars(known).items()):
+            if any(value is not getattr(final, name) for name, value in known.tensors().items()):
                 known, rounded = self._final_rounded = final, quantized_after(known, rounded, final)
             self._rounded = quantized_after(known, rounded, learned) if self.n_pending else rounded
         return self._rounded
@@ -259,7 +260,7 @@ class GaussianMap(MapState):
     def revise(self, change: Callable[[Components], Components]) -> None:
         """Replaces all components by the result of `change` for them, not rounded. An unfinished window is
         learned first."""
-        self._commit(change(self._with_pending()))
+        self._commit(change(self.unrounded()))
 
     @property
     def n_components(self) -> int:
@@ -302,6 +303,18 @@ class GaussianMap(MapState):
                 f"grid is {grid.dim}-dimensional, but the map is {self.dim}-dimensional."
             )
         return self._answers().evidence(grid, method)
+
+    def attributes(self, points: ArrayLike) -> dict[str, Prediction]:
+        """Each channel of the map, such as "colour", at points (M, D) in metres; see `Prediction`.
+
+        Unknown where no component is near, and without channels while no scan had any. Differentiable in the
+        points; tensors are on their device.
+        """
+        query = check_queries(points, self.dim)
+        if self.dim is None:
+            return {}
+        found = predictions(self.components(), query.to(self._device))
+        return {name: prediction.to(query.device) for name, prediction in found.items()}
 
     def _answers(self) -> Query:
         if self._query is None or self._is_stale:
