@@ -23,9 +23,9 @@ from gmmtorch.mapping.attributes.moments import Attributes, Labels, Numbers
 from gmmtorch.mapping.codec.attribute_block import decode_attributes, encode_attributes
 from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.merging import merged
+from gmmtorch.mapping.learning.merging import compact, merged
 from gmmtorch.mapping.tiles import TiledMap, tile_files
-from gmmtorch.mixture import merge_components
+from gmmtorch.mixture import Cells, merge_components, quadratic_features
 from gmmtorch.scan import Scan, display_colours, linear_colours
 
 
@@ -81,19 +81,25 @@ def joint(c: Components, name: str = "heat") -> tuple[Tensor, Tensor]:
 # -- learning --------------------------------------------------------------------------------------------
 
 
+def cells_of(points: Tensor) -> Cells:
+    """Every point in a cell of its own, in a random order."""
+    order = torch.randperm(len(points), generator=seeded(3))
+    return Cells(quadratic_features(points[order]), torch.ones(len(points)).double(), order.argsort())
+
+
 def test_a_slope_is_that_of_least_squares_with_points_without_slope():
     points, owner = normal(400, 3), torch.arange(400) % 2
-    values = points @ normal(3, 2, seed=1) + 0.1 * normal(400, 2, seed=2)
+    values = 1000 + points @ normal(3, 2, seed=1) + 0.1 * normal(400, 2, seed=2)
     means = torch.stack([points[owner == i].mean(0) for i in (0, 1)])
     covariances = torch.eye(3, dtype=torch.float64).repeat(2, 1, 1)
-    found = moments.learned({"heat": values}, points, owner, means, covariances).channels["heat"]
+    cells = cells_of(points)
+    of_cells = owner[cells.member.argsort()]
+    found = moments.learned({"heat": values}, cells, of_cells, means, covariances).channels["heat"]
     for i in (0, 1):
         offset, own = (points[owner == i] - means[i]).numpy(), values[owner == i].numpy()
-        prior = np.sqrt(3.0) * np.eye(3)  # three points, spread like the component
-        slope, *_ = np.linalg.lstsq(
-            np.vstack([offset, prior]), np.vstack([own - own.mean(0), np.zeros((3, 2))]), None
-        )
-        np.testing.assert_allclose(found.slope[i].numpy(), slope.T, rtol=1e-9)
+        rows = np.vstack([offset, np.sqrt(3.0) * np.eye(3)])  # three points, spread like the component
+        slope, *_ = np.linalg.lstsq(rows, np.vstack([own - own.mean(0), np.zeros((3, 2))]), None)
+        np.testing.assert_allclose(found.slope[i].numpy(), slope.T, rtol=1e-8)
         np.testing.assert_allclose(found.mean[i].numpy(), own.mean(0), rtol=1e-9)
         left = own - own.mean(0) - offset @ slope
         np.testing.assert_allclose(found.covariance[i].numpy(), left.T @ left / 200, atol=1e-4)
@@ -102,14 +108,31 @@ def test_a_slope_is_that_of_least_squares_with_points_without_slope():
 
 def test_points_without_a_value_and_components_without_points_do_not_count():
     values = torch.tensor([[1.0], [torch.nan], [3.0]], dtype=torch.float64)
-    owner = torch.tensor([0, 0, -1])
+    cells = cells_of(torch.zeros(3, 3).double())
+    owner = torch.tensor([0, 0, -1])[cells.member.argsort()]
     means, covariances = torch.zeros(2, 3).double(), torch.eye(3).double().repeat(2, 1, 1)
     channels = {"heat": values, "class": torch.tensor([4, -1, 4])}
-    found = moments.learned(channels, torch.zeros(3, 3).double(), owner, means, covariances).channels
+    found = moments.learned(channels, cells, owner, means, covariances).channels
     assert found["heat"].share.tolist() == [0.5, 0.0]
     assert found["heat"].mean.tolist() == [[1.0], [0.0]]
     assert found["class"].share.tolist() == [[0.5], [0.0]]
     assert found["class"].labels.tolist() == [4]
+
+
+def test_merges_of_neighbours_with_different_colours_cost_more():
+    """Two pairs of equal geometry; the one of one colour is merged."""
+    means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [10, 0, 0], [11, 0, 0]]).double()
+    c = Components.given(means, torch.eye(3).double().repeat(4, 1, 1), torch.ones(4), means + 5, None, 0)
+    for rows, merged_pair in (([0.2, 0.8, 0.2, 0.2], 10.5), ([0.2, 0.2, 0.2, 0.8], 0.5)):
+        mean = torch.tensor(rows).double()[:, None].expand(4, 3)
+        own = Numbers(
+            torch.ones(4).double(),
+            mean,
+            torch.zeros(4, 3, 3).double(),
+            1e-4 * torch.eye(3).double().repeat(4, 1, 1),
+        )
+        found = compact(replace(c, attributes=Attributes({"colour": own})), 3)
+        assert merged_pair in found.means[:, 0].tolist()
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -291,6 +314,20 @@ def test_rounding_is_bounded_in_deviations_and_changes_nothing_twice():
     ratio = noise / own.covariance.diagonal(dim1=1, dim2=2).sqrt()
     assert float(ratio.min()) > 2**-0.26
     assert float(ratio.max()) < 2**0.26
+
+
+@given(st.integers(0, 2**32), st.floats(-12, 12), st.floats(-12, 12))
+def test_rounding_again_changes_nothing_at_any_scale(seed, mean, noise):
+    c = coloured_components(k=8)
+    own = Numbers(
+        torch.ones(8).double(),
+        10.0**mean * normal(8, 2, seed=seed),
+        10.0**noise * normal(8, 2, 3, seed=seed),
+        10.0 ** (2 * noise) * torch.diag_embed(normal(8, 2, seed=seed).square()),
+    )
+    once = quantized(replace(c, attributes=Attributes({"heat": own})))
+    for name, value in once.attributes.tensors().items():
+        torch.testing.assert_close(quantized(once).attributes.tensors()[name], value, rtol=1e-9, atol=1e-300)
 
 
 def test_colour_takes_four_bytes_and_a_class_one():

@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.linalg import unpack_symmetric
+from gmmtorch.linalg import pack_symmetric, triangle_indices, unpack_symmetric
+from gmmtorch.mixture import Cells
 
 _SLOPE_PRIOR = 3.0  # points, spread like the component, that show no slope
 _NOISE_PRIOR = 1.0  # points that deviate like those of all components
@@ -197,72 +198,115 @@ def of_scans(scans: Sequence[Mapping[str, Tensor]], sizes: Sequence[int]) -> dic
 
 
 def learned(
-    channels: Mapping[str, Tensor], points: Tensor, owner: Tensor, means: Tensor, covariances: Tensor
+    channels: Mapping[str, Tensor], cells: Cells, owner: Tensor, means: Tensor, covariances: Tensor
 ) -> Attributes:
-    """The attributes of K components.
+    """The attributes of K components, from the values of points that are summed into C cells.
 
     Args:
         channels: of the points, as in `Scan`.
-        points: (N, D). owner: (N,) the component of each point, −1 for those without one.
-        means, covariances: of the components.
+        owner: (C,) the component of each cell, −1 for those without one.
+        means, covariances: of the components, in the frame of the cells.
     """
-    if bool((owner < 0).any()):
-        kept = owner >= 0
-        points, owner = points[kept], owner[kept]
-        channels = {name: values[kept] for name, values in channels.items()}
-    total = torch.bincount(owner, minlength=len(means)).double()
+    kept = (owner >= 0).nonzero().squeeze(1)
+    owner = owner[kept]
+    total = _sums(owner, len(means), cells.weight[kept])
     found: dict[str, Channel] = {}
     for name, values in channels.items():
         if values.is_floating_point():
-            found[name] = _regression(values.double(), points, owner, means, covariances, total)
+            sums = _cell_sums(values.double(), cells).index_select(0, kept)
+            places = cells.features.index_select(0, kept)
+            found[name] = _regression(sums, values.shape[1], places, owner, means, covariances, total)
         else:
-            found[name] = _label_shares(values, owner, total)
+            found[name] = _label_shares(values, cells, kept, owner, total)
     return Attributes(found)
 
 
-def _label_shares(values: Tensor, owner: Tensor, total: Tensor) -> Labels:
+def _sums(group: Tensor, n: int, values: Tensor) -> Tensor:
+    """The sum (n,) of the values (N,) of each group; for a few columns much faster than `index_add`."""
+    return torch.bincount(group, values, minlength=n)
+
+
+def _cell_sums(values: Tensor, cells: Cells) -> Tensor:
+    """Of the values (N, A), NaN where unknown, in each of C cells: their number, sums, and sums of products,
+    (C, 1 + A + A(A+1)/2)."""
+    member, n = cells.member, len(cells.weight)
+    known = torch.isfinite(values.sum(1))
+    if not bool(known.all()):
+        values, member = values[known], member[known]
+    columns = [column.contiguous() for column in values.T]
+    rows, others = triangle_indices(len(columns))
+    products = [columns[i] * columns[j] for i, j in zip(rows.tolist(), others.tolist(), strict=True)]
+    count = torch.bincount(member, minlength=n).double()
+    return torch.stack([count, *(_sums(member, n, column) for column in [*columns, *products])], 1)
+
+
+def _label_shares(values: Tensor, cells: Cells, kept: Tensor, owner: Tensor, total: Tensor) -> Labels:
     known = values >= 0
     labels, code = torch.unique(values[known], return_inverse=True)
-    counts = torch.bincount(owner[known] * len(labels) + code, minlength=len(total) * len(labels))
+    place = torch.full_like(cells.weight, -1, dtype=torch.int64).index_copy(0, kept, owner)
+    group = place[cells.member[known]]
+    group, code = group[group >= 0], code[group >= 0]
+    counts = torch.bincount(group * len(labels) + code, minlength=len(total) * len(labels))
     return Labels(counts.view(len(total), len(labels)) / total.clamp_min(1)[:, None], labels)
 
 
 def _regression(
-    values: Tensor, points: Tensor, owner: Tensor, means: Tensor, covariances: Tensor, total: Tensor
+    sums: Tensor,
+    width: int,
+    places: Tensor,
+    owner: Tensor,
+    means: Tensor,
+    covariances: Tensor,
+    total: Tensor,
 ) -> Numbers:
-    """The regression of values (N, A), NaN where unknown, on the positions of the points of each component.
+    """The regression of values on the positions of the points of each component.
 
-    A few points do not show a slope: the prior adds points without one. The deviations of a component with
-    few points are close to those of all.
+    Values vary within a cell as if its points were at its mean. A few points do not show a slope: the prior
+    adds points without one. The deviations of a component with few points are close to those of all.
+
+    Args:
+        sums: (C, …) of the cells, as in `_cell_sums`. places: (C, F) their mean features.
+        owner, means, covariances: as in `learned`. total: (K,) points of the components.
     """
-    known = torch.isfinite(values).all(1)
-    if not bool(known.all()):
-        values, points, owner = values[known], points[known], owner[known]
-    (k, dim), width = means.shape, values.shape[1]
-    n = torch.bincount(owner, minlength=k).double()
-    middle = values.mean(0) if len(values) else values.new_zeros(width)
-    joint = torch.cat([points - means[owner], values - middle], 1)
-    rows, columns = torch.triu_indices(dim + width, dim + width, device=joint.device)
-    features = torch.cat([joint, joint[:, rows] * joint[:, columns]], 1)
-    sums = features.new_zeros(k, features.shape[1]).index_add_(0, owner, features)
-    first, second = (sums / n.clamp_min(1)[:, None]).split([dim + width, len(rows)], 1)
-    square = unpack_symmetric(second, dim + width) - first[:, :, None] * first[:, None]
-    at, spread = first[:, :dim], square[:, :dim, :dim]
-    both, own = square[:, dim:, :dim], square[:, dim:, dim:]
+    k, dim = means.shape
+    count, value, product = sums.split([1, width, sums.shape[1] - 1 - width], 1)
+    middle = value.sum(0) / count.sum().clamp_min(1)
+    at = places[:, 1 : 1 + dim]
+    within = unpack_symmetric(places[:, 1 + dim :], dim) - at[:, :, None] * at[:, None]
+    offset = at - means[owner]
+    away = value - count * middle
+    cross = away[:, :, None] * offset[:, None]
+    spread = count[:, :, None] * (within + offset[:, :, None] * offset[:, None])
+    features = [count, count * offset, away, pack_symmetric(spread), cross.flatten(1), product]
+    joined = torch.cat(features, 1)
+    whole = joined.new_zeros(k, joined.shape[1]).index_add_(0, owner, joined)
+    n = whole[:, 0]
+    parts = (whole / n.clamp_min(1)[:, None]).split([f.shape[1] for f in features], 1)
+    _, at, mean, *packed = parts
+    spread = unpack_symmetric(packed[0], dim) - at[:, :, None] * at[:, None]
+    cross = packed[1].view(k, width, dim) - mean[:, :, None] * at[:, None]
+    true_mean = mean + middle
+    own = unpack_symmetric(packed[2], width) - true_mean[:, :, None] * true_mean[:, None]
     prior = covariances * (_SLOPE_PRIOR / n.clamp_min(1))[:, None, None]
-    slope = torch.linalg.solve(spread + prior, both.mT).mT
-    cross = slope @ both.mT
-    left = own - cross - cross.mT + slope @ spread @ slope.mT
+    slope = torch.linalg.solve(spread + prior, cross.mT).mT
+    explained = slope @ cross.mT
+    left = own - explained - explained.mT + slope @ spread @ slope.mT
     usual = (n[:, None, None] * left).sum(0) / n.sum().clamp_min(1)
     weight = (n / (n + _NOISE_PRIOR))[:, None, None]
-    mean = first[:, dim:] + middle - (slope @ at[:, :, None])[:, :, 0]
     has = (n > 0).double()
+    noise = _definite(weight * left + (1 - weight) * usual)
     return Numbers(
         n / total.clamp_min(1),
-        mean * has[:, None],
+        (true_mean - (slope @ at[:, :, None])[:, :, 0]) * has[:, None],
         slope * has[:, None, None],
-        (weight * left + (1 - weight) * usual) * has[:, None, None],
+        noise * has[:, None, None],
     )
+
+
+def _definite(matrices: Tensor) -> Tensor:
+    """Symmetric matrices (K, A, A) without negative eigenvalues, which rounding can cause."""
+    values, axes = torch.linalg.eigh((matrices + matrices.mT) / 2)
+    return (axes * values.clamp_min(0)[:, None]) @ axes.mT
 
 
 # -- merging ---------------------------------------------------------------------------------------------
@@ -292,26 +336,64 @@ def merged(
         if isinstance(c, Labels):
             found[name] = c._replace(share=_ratio(summed(weights[:, None] * c.share), total))
             continue
-        (means, covariances), width = before, c.mean.shape[1]
+        width, dim = c.mean.shape[1], before[0].shape[1]
         weight = weights * c.share
         known = summed(weight)
-        center = _ratio(summed(weight[:, None] * torch.cat([means, c.mean], 1)), known)
-        both = c.slope @ covariances
-        joint = torch.cat(
-            [torch.cat([covariances, both.mT], 2), torch.cat([both, c.covariance + both @ c.slope.mT], 2)], 1
-        )
-        away = torch.cat([means, c.mean], 1) - center[labels]
+        means, joint = _joint(c, *before)
+        center = _ratio(summed(weight[:, None] * means), known)
+        away = means - center[labels]
         joint = joint + away[:, :, None] * away[:, None]
         joint = _ratio(summed(weight[:, None, None] * joint), known)
-        dim = means.shape[1]
         spread = torch.where((known > 0)[:, None, None], joint[:, :dim, :dim], after[1])
         slope = torch.linalg.solve(spread, joint[:, :dim, dim:]).mT
         left = joint[:, dim:, dim:] - slope @ joint[:, :dim, dim:]
         shift = (slope @ (after[0] - center[:, :dim])[:, :, None])[:, :, 0]
         has = (known > 0).to(shift)
         mean = (center[:, dim : dim + width] + shift) * has[:, None]
-        found[name] = Numbers(_ratio(known, total), mean, slope * has[:, None, None], (left + left.mT) / 2)
+        found[name] = Numbers(_ratio(known, total), mean, slope * has[:, None, None], _definite(left))
     return Attributes(found)
+
+
+def _joint(c: Numbers, means: Tensor, covariances: Tensor) -> tuple[Tensor, Tensor]:
+    """Means (K, D+A) and covariances of position and attribute."""
+    both = c.slope @ covariances
+    upper = torch.cat([covariances, both.mT], 2)
+    lower = torch.cat([both, c.covariance + both @ c.slope.mT], 2)
+    return torch.cat([means, c.mean], 1), torch.cat([upper, lower], 1)
+
+
+_FINE = 0.1  # of a channel's deviation in the map: smaller differences hardly hinder a merge
+_SMALL = 1e-3  # of a metre for a deviation: partners of a merge are neighbours in space
+
+
+def joint_moments(
+    attributes: Attributes, weights: Tensor, means: Tensor, covariances: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Means (K, F) and covariances of the positions and all numbers of K components, for choosing merges.
+
+    A channel is measured in its deviation in the map, which becomes a millimetre, and has a noise of a tenth
+    of it. The Kullback–Leibler divergence does not depend on units. Components without values have the
+    moments of all.
+    """
+    dim = means.shape[1]
+    for c in attributes.channels.values():
+        if not isinstance(c, Numbers):
+            continue
+        weight = weights * c.share
+        total = weight.sum().clamp_min(torch.finfo(weight.dtype).tiny)
+        middle = (weight @ c.mean) / total
+        around = c.covariance.diagonal(dim1=1, dim2=2) + (c.mean - middle).square()
+        scale = _SMALL / ((weight @ around) / total).sqrt().clamp_min(1e-30)
+        has = (c.share > 0)[:, None]
+        mean = torch.where(has, (c.mean - middle) * scale, 0.0)
+        slope = torch.where(has[..., None], c.slope * scale[:, None], 0.0)
+        noise = c.covariance * scale[:, None] * scale
+        unknown = torch.diag(torch.full_like(scale, _SMALL**2))
+        noise = torch.where(has[..., None], noise + (_FINE**2) * unknown, unknown)
+        padded = slope.new_zeros(len(slope), slope.shape[1], means.shape[1])
+        padded[:, :, :dim] = slope
+        means, covariances = _joint(Numbers(c.share, mean, padded, noise), means, covariances)
+    return means, covariances
 
 
 def _ratio(values: Tensor, total: Tensor) -> Tensor:

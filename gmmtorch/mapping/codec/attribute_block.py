@@ -191,22 +191,28 @@ def _steps(name: str, channel: Channel, covariances: Tensor) -> _NumberSteps | _
     share = torch.where((channel.share > 0) & (share == 0), 1, share)
     rows = share > 0
     basis = _basis(name, channel.mean)
-    mean = channel.mean[rows] @ basis.T
-    noise = (basis @ channel.covariance[rows] @ basis.T).diagonal(dim1=1, dim2=2).clamp_min(0).sqrt()
-    least = torch.full_like(mean, _LEAST_COLOUR) if name == COLOUR else _LEAST_RELATIVE * mean.abs()
-    # Twice the least, so that a raised deviation is not raised again after the mean is rounded.
-    noise = torch.where(noise < 0.5 * least, least, noise)
-    deviation = (2 * noise.clamp_min(1e-30).log2()).round().long().clamp_min(_DEVIATIONS[0])
+    given = channel.mean[rows] @ basis.T
+    noise = (basis @ channel.covariance[rows] @ basis.T).diagonal(dim1=1, dim2=2).clamp_min(1e-30).sqrt()
+    deviation, mean = _log(noise), given
+    for _ in range(3):  # the second time for the rounded mean, so that rounding again changes nothing
+        least = torch.full_like(mean, _LEAST_COLOUR) if name == COLOUR else _LEAST_RELATIVE * mean.abs()
+        deviation = torch.where(deviation < _log(least) - 2, _log(least), deviation).clamp_min(_DEVIATIONS[0])
+        mean = (given / _power(deviation) * _MEAN_STEPS).round() * _power(deviation) / _MEAN_STEPS
     if bool((deviation > _DEVIATIONS[1]).any()):
         raise InvalidArgumentError(
-            f"attributes {name!r} reach {float(mean.abs().max()):g}, too large to be stored."
+            f"attributes {name!r} reach {float(given.abs().max()):g}, too large to be stored."
         )
     unit = _power(deviation)
     along = (basis @ channel.slope[rows]) @ _factors(covariances[rows])[:, :, :-1]
-    steps = (mean / unit * _MEAN_STEPS).round(), (along / unit[:, :, None] * _SLOPE_STEPS).round()
+    steps = (given / unit * _MEAN_STEPS).round(), (along / unit[:, :, None] * _SLOPE_STEPS).round()
     return _NumberSteps(
         share, deviation, *(values.clamp(-_MOST_STEPS, _MOST_STEPS).long() for values in steps)
     )
+
+
+def _log(noise: Tensor) -> Tensor:
+    """Deviations as whole powers of √2."""
+    return (2 * noise.clamp_min(1e-30).log2()).round().long()
 
 
 def _label_steps(channel: Labels) -> _LabelSteps:

@@ -257,11 +257,10 @@ def fit_points(
     sensor = _measured_sensor(clouds, origins) if rule.prune == "density" else None
     window = _Window(points.sub_(center), scan, origins.double() - center, sensor)
     learn = _LEARNERS[rule.learner]
-    found, counts, n_learned, owner = learn(window, replace(fit, rule=rule))
+    found, counts, n_learned, cells, owner = learn(window, replace(fit, rule=rule))
     known = None
     if any(attributes):
-        channels = of_scans(attributes, sizes)
-        known = learned(channels, window.points, owner(), found.means, found.covariances)
+        known = learned(of_scans(attributes, sizes), cells, owner, found.means, found.covariances)
     found = found._replace(means=found.means + center)
     return _components(found, viewpoints(counts, found.weights, n_learned), origins, max_range, known)
 
@@ -353,14 +352,15 @@ class _Window(NamedTuple):
 
 class _Learned(NamedTuple):
     """mixture; counts (K, S): its points in each scan, of which each belongs to its most likely component;
-    n_points: number of points that pruning leaves. owner: gives the component (N,) of each point, −1 if it
-    is pruned.
+    n_points: number of points that pruning leaves. cells: of the points; owner: their component (C,), −1 if
+    it is pruned.
     """
 
     mixture: Parameters
     counts: Tensor
     n_points: float
-    owner: Callable[[], Tensor]
+    cells: Cells
+    owner: Tensor
 
 
 def _from_flat_pieces(window: _Window, fit: SurfaceFit) -> _Learned:
@@ -371,7 +371,7 @@ def _from_flat_pieces(window: _Window, fit: SurfaceFit) -> _Learned:
     counts = window.counts(owner[cells.member], mixture.weights.shape[0])
     n_points, rule = len(window.points), fit.rule
     if rule.prune == "none":
-        return _Learned(mixture, counts, n_points, lambda: owner[cells.member])
+        return _Learned(mixture, counts, n_points, cells, owner)
     support = mixture.weights * n_points
     if window.sensor is None:
         kept = support >= rule.min_support
@@ -383,7 +383,7 @@ def _from_flat_pieces(window: _Window, fit: SurfaceFit) -> _Learned:
     weights = mixture.weights[kept]
     left = Parameters(weights / weights.sum(), mixture.means[kept], mixture.covariances[kept])
     number = torch.where(kept, kept.cumsum(0) - 1, -1)
-    return _Learned(left, counts[kept], float(support[kept].sum()), lambda: number[owner][cells.member])
+    return _Learned(left, counts[kept], float(support[kept].sum()), cells, number[owner])
 
 
 def _from_tree(window: _Window, fit: SurfaceFit) -> _Learned:
@@ -410,8 +410,8 @@ def _from_tree(window: _Window, fit: SurfaceFit) -> _Learned:
     leaves = grown.leaves()
     mixture = Parameters(grown.weights[leaves], grown.means[leaves], grown.covariances[leaves])
     owner = most_likely_component(cells.features, mixture)
-    of_points = owner[cells.member]
-    return _Learned(mixture, window.counts(of_points, len(leaves)), len(window.points), lambda: of_points)
+    counts = window.counts(owner[cells.member], len(leaves))
+    return _Learned(mixture, counts, len(window.points), cells, owner)
 
 
 _LEARNERS: dict[str, Callable[[_Window, SurfaceFit], _Learned]] = {

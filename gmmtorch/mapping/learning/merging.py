@@ -246,6 +246,9 @@ def _merged_by_kind(components: Components, limit: int | None, max_cost: float |
             surfaces = (~components.max_range).nonzero().squeeze(1)
             return _merged_by_kind(components.selected(surfaces), limit, max_cost)
         given = Parameters(components.support[rows], components.means[rows], components.covariances[rows])
+        if components.attributes and not flag:
+            joint = moments.joint_moments(components.attributes.selected(rows), *given)
+            given = Parameters(given.weights, *joint)
         cost = "hellinger" if limit is None else "kullback_leibler"
         found = simplify(given, share, max_cost, cost, most_exact=0)
         labels[rows] = found.labels + n_labels
