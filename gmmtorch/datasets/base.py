@@ -8,7 +8,7 @@ import math
 import re
 import zlib
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import overload
@@ -173,6 +173,11 @@ class Dataset(Sequence[Scan]):
         final after the last scan.
         """
         return {reason: len(scans) for reason, scans in self._skipped.items()}
+
+    def _without(self, channels: Iterable[str], index: int) -> None:
+        """Counts a scan that lacks some of the channels that it should have."""
+        for name in channels:
+            self._skip(f"read without {name}, which they lack", index)
 
     def can_continue(self, n_read: int) -> bool:
         """Whether reading can go on after `n_read` scans that were read in an earlier run."""

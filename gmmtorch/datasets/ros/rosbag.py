@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from array import array
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset, Ranges, require_path
+from gmmtorch.datasets.point_files.channels import check_channels
 from gmmtorch.datasets.ros.bag_poses import BagSurvey, Record, RegisteredPoses
 from gmmtorch.datasets.ros.bag_reader import (
     IMU_TYPE,
@@ -56,6 +57,7 @@ def open_rosbag(
     depth_scale: float | None = None,
     intrinsics: list[float] | None = None,
     imu_topic: str | None = None,
+    attributes: Iterable[str] = (),
 ) -> RosBag:
     """The scans of one topic of a bag; see docs/recordings.md.
 
@@ -75,6 +77,7 @@ def open_rosbag(
         depth_scale: metres per unit of depth images; None: 0.001 for whole numbers, 1 for floating ones.
         intrinsics: fx, fy, cx, cy in pixels of depth images without distortion; None: of `camera_info`.
         imu_topic: of the IMU of `RosBag.turns`; None: the only one.
+        attributes: channels of point clouds that are read, such as "intensity" and "colour".
     """
     source = "A bag of ROS 1 is a file; one of ROS 2 is a file or its folder."
     file = require_path(path, "file or folder", "a ROS bag (.bag, .mcap, .db3)", source)
@@ -88,7 +91,7 @@ def open_rosbag(
         info = choose_camera_info(reader, sensor.topic.name, camera_info)
     survey = BagSurvey(reader, sensor, info, poses, frame, extrinsic, max_gap)
     camera = ImageCamera(sensor, survey.camera_info(), pixel_stride, depth_scale, intrinsics)
-    options = sensor_frame, clock, deskew, imu_topic
+    options = sensor_frame, clock, deskew, imu_topic, check_channels(attributes)
     if sensor.is_camera:
         return DepthBag(reader, sensor, survey, ranges, stride, *options, camera)
     return RosBag(reader, sensor, survey, ranges, stride, *options)
@@ -116,6 +119,7 @@ class RosBag(Dataset):
         clock: str,
         deskew: bool,
         imu_topic: str | None,
+        attributes: tuple[str, ...],
         camera: ImageCamera | None = None,
     ) -> None:
         super().__init__(reader.path.stem, ranges, stride)
@@ -134,7 +138,7 @@ class RosBag(Dataset):
             records = kept
         records = self._ordered(records)
         self._source = survey.source(records, self._where, sensor_frame)
-        self._conversion = ScanConversion(sensor, ranges, self._source, deskew, camera)
+        self._conversion = ScanConversion(sensor, ranges, self._source, deskew, camera, attributes)
         self._records, self._in_space = self._posed(records)
         self._samples = self._first_readings()
         rate = Rate.of(records, clock)
