@@ -411,6 +411,12 @@ def test_forged_array_lengths_allocate_no_memory(k, what, version):
         decode(sealed(bytes([version]) + writer.to_bytes() + bytes(2000)))
 
 
+def test_a_limit_on_components_is_kept_before_they_are_read(sound):
+    assert len(decode(sound, most=40)) == 12
+    with pytest.raises(DataError, match="12 components and"):
+        decode(sound, most=11)
+
+
 # -- earlier versions and the two coders -----------------------------------------------------------------
 
 

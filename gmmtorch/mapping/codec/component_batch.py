@@ -74,14 +74,14 @@ def encode_quantized(values: Quantized) -> bytes:
     return body + zlib.crc32(body).to_bytes(_CHECKSUM_BYTES, "little")
 
 
-def decode(data: bytes) -> Components:
-    """The components of a batch, on the CPU.
+def decode(data: bytes, most: int | None = None) -> Components:
+    """The components of a batch, on the CPU. most: largest number of components, and of viewpoints.
 
     Raises `DataError`, with the reason, for data that `encode` did not write. Memory is bounded in proportion
     to the length of the data, for any numbers in them.
     """
     try:
-        return _values(data).restored().checked()
+        return _values(data, most).restored().checked()
     except DataError:
         raise
     except GmmTorchError as error:
@@ -93,7 +93,7 @@ def ids_of_batch(data: bytes) -> Tensor:
     return _values(data).ids
 
 
-def _values(data: bytes) -> Quantized:
+def _values(data: bytes, most: int | None = None) -> Quantized:
     body, checksum = data[:-_CHECKSUM_BYTES], data[-_CHECKSUM_BYTES:]
     if len(data) <= _CHECKSUM_BYTES:
         raise DataError(f"{len(data)} bytes are too few for a batch of components: it is truncated.")
@@ -104,10 +104,11 @@ def _values(data: bytes) -> Quantized:
         )
     if zlib.crc32(body) != int.from_bytes(checksum, "little"):
         raise DataError("The batch of components does not match its checksum: it is truncated or damaged.")
-    return (read_first if body[0] == FIRST_VERSION else _read)(body[_VERSION_BYTES:])
+    rest = body[_VERSION_BYTES:]
+    return read_first(rest) if body[0] == FIRST_VERSION else _read(rest, most)
 
 
-def _read(data: bytes) -> Quantized:
+def _read(data: bytes, most: int | None) -> Quantized:
     """The components of a batch without version and checksum."""
     reader = BitReader(data[:_LONGEST_SIZES])
     n_bits = reader.left
@@ -117,7 +118,9 @@ def _read(data: bytes) -> Quantized:
     least = _least_bytes(k, n_origins, e)
     stream = data[begin:]
     is_whole = len(stream) == max(len(stream.rstrip(b"\0")), least)
-    if min(k, n_origins, e) < 0 or side > LARGEST_SIDE or not is_whole:
+    if most is not None and max(k, e) > most:
+        raise DataError(f"{k} components and {e} viewpoints; {most} of each are the most.")
+    if min(k, n_origins, e) < 0 or n_origins > e or side > LARGEST_SIDE or not is_whole:
         raise DataError(
             f"{k} components, {n_origins} origins and {e} viewpoints in {len(stream)} bytes: it is damaged."
         )

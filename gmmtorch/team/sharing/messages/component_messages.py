@@ -127,12 +127,13 @@ def _quantized(components: Components) -> bytes:
 
 
 def read_quantized(body: bytes) -> ComponentsMessage:
-    return _message(read_batch(body))
+    return _message(read_batch(body, MOST_COMPONENTS_SENT))
 
 
-def read_batch(data: bytes) -> Components:
-    """The components of a codec batch of any size. Raises `DataError` if they are damaged or out of range."""
-    components = decode(data)
+def read_batch(data: bytes, most: int | None = None) -> Components:
+    """The components of a codec batch of any size, or of `most` components and viewpoints. Raises `DataError`
+    if they are damaged or out of range."""
+    components = decode(data, most)
     try:
         _check_range(components.means, components.origins, components.ids)
     except InvalidArgumentError as error:
