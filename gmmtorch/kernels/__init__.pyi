@@ -5,6 +5,9 @@ from .choice import use_kernels as use_kernels
 from .chunks import chunk_elements as chunk_elements
 from .chunks import chunked as chunked
 from .chunks import memory_error as memory_error
+from .codes.context_coding import ChanceTables as ChanceTables
+from .codes.context_coding import CodedBatch as CodedBatch
+from .codes.context_coding import context_coding as context_coding
 from .evidence.beam_passes import PassLimits as PassLimits
 from .evidence.beam_passes import beam_passes as beam_passes
 from .evidence.grid_flux import add_cell_mass as add_cell_mass
