@@ -15,6 +15,7 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_whole
 from gmmtorch.files import write_bytes
+from gmmtorch.mapping.attributes.answers import Prediction, predictions
 from gmmtorch.mapping.codec.component_batch import CODECS, MapSettings, map_bytes, read_map
 from gmmtorch.mapping.codec.quantization import quantized_after
 from gmmtorch.mapping.components import Components
@@ -234,7 +235,7 @@ class GaussianMap(MapState):
     def components(self) -> Components:
         """All components as the codec rounds them, with those of the unfinished window."""
         if self._rounded is None:
-            learned, known, rounded = self._with_pending(), *self._rounded_final()
+            learned, known, rounded = self.unrounded(), *self._rounded_final()
             is_known = self.codec == "float" or not self.n_pending
             self._rounded = (
                 (learned if self.codec == "float" else rounded)
@@ -250,7 +251,7 @@ class GaussianMap(MapState):
             return final, final
         none = Components.empty(final.dim, final.means.device)
         known, rounded = self._final_rounded or (none, none)
-        if any(value is not getattr(final, name) for name, value in vars(known).items()):
+        if any(value is not getattr(final, name) for name, value in known.tensors().items()):
             self._final_rounded = final, quantized_after(known, rounded, final)
         return self._final_rounded or (final, rounded)
 
@@ -270,7 +271,7 @@ class GaussianMap(MapState):
     def revise(self, change: Callable[[Components], Components]) -> None:
         """Replaces all components by the result of `change` for them, not rounded. An unfinished window is
         learned first."""
-        self._commit(change(self._with_pending()))
+        self._commit(change(self.unrounded()))
 
     @property
     def n_components(self) -> int:
@@ -313,6 +314,18 @@ class GaussianMap(MapState):
                 f"grid is {grid.dim}-dimensional, but the map is {self.dim}-dimensional."
             )
         return self._answers().evidence(grid, method)
+
+    def attributes(self, points: ArrayLike) -> dict[str, Prediction]:
+        """Each channel of the map, such as "colour", at points (M, D) in metres; see `Prediction`.
+
+        Unknown where no component is near, and without channels while no scan had any. Differentiable in the
+        points; tensors are on their device.
+        """
+        query = check_queries(points, self.dim)
+        if self.dim is None:
+            return {}
+        found = predictions(self.components(), query.to(self._device))
+        return {name: prediction.to(query.device) for name, prediction in found.items()}
 
     def _answers(self) -> Query:
         if self._query is None or self._is_stale:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, Self, cast
 
@@ -12,9 +12,10 @@ from torch import Tensor
 
 from gmmtorch.arrays import DeviceModule
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
+from gmmtorch.mapping.attributes.moments import Attributes
 from gmmtorch.mapping.codec.component_batch import MapSettings, file_size
 from gmmtorch.mapping.codec.quantization import number_after, numbered
-from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.components import TENSORS, Components
 from gmmtorch.mapping.learning.fitting import DepthFrame, as_scans
 from gmmtorch.mapping.learning.rules import LearningRule, WindowedRule, read_rule, rule_facts
 from gmmtorch.mapping.learning.windows import (
@@ -35,7 +36,6 @@ from gmmtorch.scan import Scan
 
 _PART = 5_000  # beams of a part of an unfinished window, at least
 _LONGEST_WINDOW = 40  # scans, if no scan yet shows how many points it holds
-_BUFFERS = tuple(f.name for f in fields(Components))
 _STATE = "_extra_state"  # torch's name of it in a state dict
 
 
@@ -45,7 +45,7 @@ def _field(name: str, about: str) -> Any:
     def read(self: MapState) -> Tensor:
         if self.dim is None:
             raise AttributeError(name)  # `__getattr__` explains it
-        return cast(Tensor, getattr(self._with_pending(), name))
+        return cast(Tensor, getattr(self.unrounded(), name))
 
     return property(read, doc=f"{about} Not rounded; with the components of the unfinished window.")
 
@@ -81,6 +81,7 @@ class MapState(DeviceModule):
         self._calibrator = None if known is None else Calibrator.continued(known, len(SIDES))
         self.learning = learning
         self._random_state = random_state
+        self._attributes = Attributes()  # of the final components
         self._pending: list[Scan] = []
         self._n_windows = 0
         self._next_number = 0  # of the next new component
@@ -93,7 +94,7 @@ class MapState(DeviceModule):
         self._is_stale = False  # the query is of earlier components
 
     def __getattr__(self, name: str) -> Any:
-        if name in _BUFFERS:
+        if name in TENSORS:
             raise AttributeError(f"{name}: the map is empty; insert a scan first.")
         return super().__getattr__(name)
 
@@ -149,10 +150,11 @@ class MapState(DeviceModule):
         """The components without those of the unfinished window, not rounded."""
         if self.dim is None:
             raise InvalidArgumentError("The map is empty; insert a scan first.")
-        buffers = {name: self._buffers[name] for name in _BUFFERS}
-        return Components(**{name: value for name, value in buffers.items() if value is not None})
+        buffers = {name: self._buffers[name] for name in TENSORS}
+        known = {name: value for name, value in buffers.items() if value is not None}
+        return Components(**known, attributes=self._attributes)
 
-    def _with_pending(self) -> Components:
+    def unrounded(self) -> Components:
         """All components, not rounded."""
         return self._upcoming()[0]
 
@@ -259,8 +261,9 @@ class MapState(DeviceModule):
         self._set(components)
 
     def _set(self, components: Components) -> None:
-        for name in _BUFFERS:
+        for name in TENSORS:
             self._buffers[name] = getattr(components, name)  # properties have the names of the buffers
+        self._attributes = components.attributes
         self._forget()
 
     def _forget(self) -> None:
@@ -274,6 +277,7 @@ class MapState(DeviceModule):
         super()._apply(fn, recurse)
         if self.dim is not None:
             self._pending = [scan.to(self._device) for scan in self._pending]
+            self._attributes = self._attributes.changed(lambda value: value.to(self._device))
         self._parts = {}
         self._query = self._final_rounded = None  # are on the former device
         self._forget()
@@ -284,6 +288,7 @@ class MapState(DeviceModule):
         return {
             "learning": rule_facts(self.learning),
             "pending": [dict(vars(scan)) for scan in self._pending],
+            "attributes": self._attributes.tensors(),
             "n_windows": self._n_windows,
             "n_numbered": self._next_number,
             "doubts": dict(vars(self._doubts)),
@@ -304,19 +309,22 @@ class MapState(DeviceModule):
         map whose components are all final. Raises `DataError` for a damaged state, and changes nothing."""
         own = {key.removeprefix(prefix): v for key, v in state_dict.items() if key.startswith(prefix)}
         state = own.pop(_STATE, None)
-        missing = [name for name in _BUFFERS if name not in own]
+        missing = [name for name in TENSORS if name not in own]
         if strict:
-            unexpected_keys += [prefix + name for name in own if name not in _BUFFERS]
-        if missing and (state is None or len(missing) < len(_BUFFERS)):
+            unexpected_keys += [prefix + name for name in own if name not in TENSORS]
+        if missing and (state is None or len(missing) < len(TENSORS)):
             missing_keys += [prefix + name for name in missing]
             return
         try:
             extra = None if state is None else _read_extra(state)
-            components = None if missing else Components(**{name: own[name] for name in _BUFFERS}).checked()
+            components = None
+            if not missing:
+                known = Attributes.of((state or {}).get("attributes", {}))
+                components = Components(**{name: own[name] for name in TENSORS}, attributes=known).checked()
         except (GmmTorchError, KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise DataError(f"The state of the map is damaged ({error}).") from error
         device = self._device
-        for name in _BUFFERS:
+        for name in TENSORS:
             self._buffers.pop(name, None)
         self._pending, self._parts = [], {}
         if extra is not None:
@@ -324,7 +332,9 @@ class MapState(DeviceModule):
             self._calibrator = extra[5]
             self._next_doubts = self._doubts
         if components is not None:
-            self._set(Components(**{n: v.detach().clone().to(device) for n, v in vars(components).items()}))
+            tensors = {n: v.detach().clone().to(device) for n, v in components.tensors().items()}
+            known = components.attributes.changed(lambda value: value.detach().clone().to(device))
+            self._set(Components(**tensors, attributes=known))
             self._next_number = number_after(components.ids, self._next_number)
         self._forget()
 
