@@ -338,9 +338,10 @@ class GaussianMap(MapState):
 
     # -- files and state ------------------------------------------------------------------------------
 
-    def _file(self) -> bytes:
-        rule = self.learning.fitted(self._pending)
-        return map_bytes(self.components(), rule, self.settings, self._next_number)
+    def _file(self, components: Components | None = None) -> bytes:
+        """The map's file. `components`: instead of all."""
+        found = self.components() if components is None else components
+        return map_bytes(found, self.learning.fitted(self._pending), self.settings, self._next_number)
 
     @property
     def nbytes(self) -> int:
