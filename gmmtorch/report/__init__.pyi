@@ -61,6 +61,7 @@ from .style import line_style as line_style
 from .style import log_axis as log_axis
 from .style import metres as metres
 from .style import new_figure as new_figure
+from .style import picture as picture
 from .style import place_labels as place_labels
 from .style import save_figure as save_figure
 from .style import stacked_bars as stacked_bars

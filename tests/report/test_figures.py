@@ -127,11 +127,12 @@ from gmmtorch.report.accuracy_figures import roc_figure
 from gmmtorch.report.map_figures import map_figure
 from gmmtorch.report.map_images import MapPanel
 from gmmtorch.report.mixture_figures import mixture_figure
-from gmmtorch.report.style import save_figure
+from gmmtorch.report.style import picture, save_figure
 eye, panel = torch.eye(2)[None], MapPanel("m", lambda x: x[:, 0] * 0 + 0.2, 0.5, (0, 0, 0), (1, 1, 1))
 with Board(sys.argv[1]) as board:
-    board.figure("map", map_figure([panel], [torch.zeros(2, 3)]))
-    board.figure("mixture", mixture_figure(torch.zeros(1, 2), torch.zeros(1, 2), eye, torch.ones(1)))
+    board.figure("map", picture(map_figure([panel], [torch.zeros(2, 3)])))
+    mixture = mixture_figure(torch.zeros(1, 2), torch.zeros(1, 2), eye, torch.ones(1))
+    board.figure("mixture", picture(mixture))
     board.curve("c", torch.tensor([0, 1]), torch.tensor([0.1, 0.9]))
 save_figure(roc_figure({}), sys.argv[1] + "/roc.png")
 assert "matplotlib.pyplot" not in sys.modules

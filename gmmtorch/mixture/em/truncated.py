@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gmmtorch.kernels import (
@@ -360,6 +359,8 @@ def owners_of(groups: Groups) -> Tensor:
 
 def nearest(points: Tensor, means: Tensor) -> Tensor:
     """The component (N,) whose mean (K, D) is nearest to each point (N, D)."""
+    from scipy.spatial import cKDTree
+
     tree = cKDTree(means.detach().cpu().numpy())
     return torch.from_numpy(tree.query(points.detach().cpu().numpy())[1]).to(points.device)
 
