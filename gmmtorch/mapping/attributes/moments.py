@@ -80,6 +80,10 @@ class Attributes:
         """The attributes with `change` applied to each tensor."""
         return Attributes({name: type(c)(*map(change, c)) for name, c in self.channels.items()})
 
+    def on_cpu(self) -> Attributes:
+        """The attributes on the CPU, without gradients."""
+        return self.changed(lambda value: value.detach().cpu())
+
     def selected(self, rows: Tensor) -> Attributes:
         """Those of some components (J,), in that order."""
         return self._of_rows(lambda value: value[rows])
@@ -111,16 +115,14 @@ class Attributes:
             }
         )
 
-    def where(self, chosen: Tensor, other: Attributes) -> Attributes:
-        """These attributes where `chosen` (K,), else others with the same channels."""
-
-        def either(one: Tensor, two: Tensor) -> Tensor:
-            return torch.where(chosen.view(-1, *[1] * (one.ndim - 1)), one, two)
-
+    def replaced(self, rows: Tensor, other: Attributes) -> Attributes:
+        """These attributes with those of other components in some rows (J,)."""
         found: dict[str, Channel] = {}
         for name, c in self.channels.items():
             both = zip(c._fields, c, other.channels[name], strict=True)
-            found[name] = type(c)(*(a if part == _LABELS else either(a, b) for part, a, b in both))
+            found[name] = type(c)(
+                *(a if part == _LABELS else a.index_copy(0, rows, b) for part, a, b in both)
+            )
         return Attributes(found)
 
     def checked(self, k: int, dim: int) -> Attributes:

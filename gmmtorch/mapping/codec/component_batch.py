@@ -29,7 +29,7 @@ from torch import Tensor
 from gmmtorch.errors import DataError, GmmTorchError, check_choice, check_resolution, check_whole
 from gmmtorch.files import pack_tensors, read_tensors, require, unpack_tensors
 from gmmtorch.mapping.attributes.moments import Attributes
-from gmmtorch.mapping.codec.attribute_block import decode_attributes, encode_attributes
+from gmmtorch.mapping.codec.attribute_block import decode_attributes, encode_attributes, rounded
 from gmmtorch.mapping.codec.bitstream import BitCounter, BitReader, BitWriter, Ints
 from gmmtorch.mapping.codec.lattice import (
     AXIS_ORDERS,
@@ -52,10 +52,8 @@ from gmmtorch.mapping.codec.quantization import (
     cells_of,
     ints,
     number_after,
-    numbered,
     quantize,
     quantize_numbered,
-    quantized,
     raster,
 )
 from gmmtorch.mapping.components import TENSORS, Components
@@ -319,13 +317,14 @@ def file_size(components: Components, rule: LearningRule, settings: MapSettings,
     facts = _facts(rule, settings, number_after(components.ids, next_number + n_new))
     if settings.codec == "float":
         data = _exact_file(components, facts)
-    elif components.attributes:
-        data = map_bytes(
-            quantized(numbered(components, settings.robot, next_number)[0]), rule, settings, next_number
-        )
     else:
-        values = quantize_numbered(components, settings.robot, next_number)
-        data = _container(bytes(batch_bytes(values)), b"", facts)
+        values, order = quantize_numbered(components, settings.robot, next_number)
+        block = b""
+        if components.attributes:
+            found, given = values.restored(), components.attributes.on_cpu().selected(order)
+            moved = rounded(given, components.means.detach().cpu()[order], found.means, found.covariances)
+            block = encode_attributes(moved, found.covariances)
+        data = _container(bytes(batch_bytes(values)), block, facts)
     return len(data) + _ROOM_FOR_SETTINGS
 
 
