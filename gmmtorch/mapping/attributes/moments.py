@@ -215,7 +215,7 @@ def learned(
     found: dict[str, Channel] = {}
     for name, values in channels.items():
         if values.is_floating_point():
-            sums = _cell_sums(values.double(), cells).index_select(0, kept)
+            sums = _cell_sums(values, cells).index_select(0, kept)
             places = cells.features.index_select(0, kept)
             found[name] = _regression(sums, values.shape[1], places, owner, means, covariances, total)
         else:
@@ -232,13 +232,12 @@ def _cell_sums(values: Tensor, cells: Cells) -> Tensor:
     """Of the values (N, A), NaN where unknown, in each of C cells: their number, sums, and sums of products,
     (C, 1 + A + A(A+1)/2)."""
     member, n = cells.member, len(cells.weight)
-    known = torch.isfinite(values.sum(1))
-    if not bool(known.all()):
-        values, member = values[known], member[known]
-    columns = [column.contiguous() for column in values.T]
+    columns = list(values.T.double().contiguous())
+    known = torch.isfinite(sum(columns))
+    columns = [torch.where(known, column, 0.0) for column in columns]
     rows, others = triangle_indices(len(columns))
     products = [columns[i] * columns[j] for i, j in zip(rows.tolist(), others.tolist(), strict=True)]
-    count = torch.bincount(member, minlength=n).double()
+    count = _sums(member, n, known.double())
     return torch.stack([count, *(_sums(member, n, column) for column in [*columns, *products])], 1)
 
 
