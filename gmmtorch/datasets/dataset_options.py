@@ -125,6 +125,7 @@ class RosbagOptions(TumOptions):
         None, "topic of the camera parameters of depth images; null: the nearest by name"
     )
     imu_topic: str | None = option(None, "topic of the IMU of motion=imu; null: the only one")
+    damaged: str = option("read", "read: the intact part of a damaged bag; refuse: a damaged bag is an error")
 
 
 @dataclass(kw_only=True)

@@ -193,6 +193,26 @@ class Components:
             attributes=self.attributes.selected(rows),
         )
 
+    def split(self, ends: Sequence[int]) -> list[Components]:
+        """The components up to each of the rising rows `ends`, from the one before, with all origins. Parts
+        share memory with this, if its viewpoints are sorted by component."""
+        by, each = self.seen_by, self
+        if not bool((by[1:] >= by[:-1]).all()):
+            order = argsort(by)
+            each = replace(
+                self, seen_by=by[order], seen_from=self.seen_from[order], seen_count=self.seen_count[order]
+            )
+        begins, found = [0, *ends[:-1]], []
+        places = torch.searchsorted(each.seen_by, by.new_tensor([begins, list(ends)])).tolist()
+        for begin, end, first, last in zip(begins, ends, *places, strict=True):
+            part = {name: getattr(each, name)[begin:end] for name in _PER_COMPONENT}
+            part |= {name: getattr(each, name)[first:last] for name in ("seen_from", "seen_count")}
+            attributes = self.attributes.selected(slice(begin, end))
+            found.append(
+                replace(each, **part, seen_by=each.seen_by[first:last] - begin, attributes=attributes)
+            )
+        return found
+
     def with_used_origins(self) -> Components:
         """The components without the origins that have no viewpoint."""
         used, seen_from = torch.unique(self.seen_from, return_inverse=True)

@@ -24,7 +24,9 @@ from gmmtorch.mapping.learning.windows import (
     Doubts,
     absorb,
     joined,
+    learn_part,
     learn_window,
+    learns_in_parts,
     predicted,
 )
 from gmmtorch.mapping.query import Query
@@ -32,6 +34,7 @@ from gmmtorch.mapping.query_options import QueryOptions
 from gmmtorch.occupancy import Calibrator
 from gmmtorch.scan import Scan
 
+_PART = 5_000  # beams of a part of an unfinished window, at least
 _LONGEST_WINDOW = 40  # scans, if no scan yet shows how many points it holds
 _STATE = "_extra_state"  # torch's name of it in a state dict
 
@@ -84,6 +87,7 @@ class MapState(DeviceModule):
         self._next_number = 0  # of the next new component
         self._doubts = self._next_doubts = Doubts.none()  # of the final components; after the pending scans
         self._learned: tuple[Components, int] | None = None  # what follows from buffers and pending scans
+        self._parts: dict[tuple[int, int], Components] = {}  # learned from these pending scans
         self._rounded: Components | None = None
         self._final_rounded: tuple[Components, Components] | None = None  # final components, and rounded
         self._query: Query | None = None
@@ -160,7 +164,32 @@ class MapState(DeviceModule):
             return self._final(), self._next_number
         if self._learned is None:
             self._learned = self._absorbed(self._pending, self.learning.fitted(self._pending))
+            self._is_stale = True  # the query may be of parts of the window
         return self._learned
+
+    def _window_parts(self) -> list[Components] | None:
+        """The components of the unfinished window for a query, learned from some scans at a time, so that a
+        scan makes the next query learn from few beams. None: the window is learned as a whole, if it is small
+        or already learned."""
+        sizes = [scan.n_beams for scan in self._pending]
+        if self._learned is not None or sum(sizes) <= _PART or not learns_in_parts(self.learning):
+            return None
+        found, begin, size = {}, 0, 0
+        for end, n_beams in enumerate(sizes, 1):
+            size += n_beams
+            if size >= _PART or end == len(sizes):
+                found[begin, end] = self._parts.get((begin, end)) or self._part(begin, end)
+                begin, size = end, 0
+        self._parts = found
+        return list(found.values())
+
+    def _part(self, begin: int, end: int) -> Components:
+        rule = self.learning.fitted(self._pending[:end])
+        return learn_part(self._pending[begin:end], rule, self._generator())
+
+    def _generator(self) -> torch.Generator:
+        """Random numbers for the unfinished window."""
+        return torch.Generator().manual_seed(hash((self._random_state, self._n_windows)) % 2**63)
 
     def _absorbed(
         self,
@@ -175,9 +204,8 @@ class MapState(DeviceModule):
         """
         known = self._final()
         if isinstance(rule, WindowedRule):
-            generator = torch.Generator().manual_seed(hash((self._random_state, self._n_windows)) % 2**63)
             window = as_scans(scans)
-            new = learn_window(window, rule, generator)
+            new = learn_window(window, rule, self._generator())
             learned, self._next_doubts = joined(known, new, window, rule, self._doubts)
         else:
             size = partial(file_size, rule=rule, settings=self.settings, next_number=self._next_number)
@@ -228,7 +256,7 @@ class MapState(DeviceModule):
         self.learning = self.learning.fitted(self._pending)
         self._doubts = self._next_doubts
         self._n_windows += bool(self._pending)
-        self._pending = []
+        self._pending, self._parts = [], {}
         self._next_number = next_number or number_after(components.ids, self._next_number)
         self._set(components)
 
@@ -250,6 +278,7 @@ class MapState(DeviceModule):
         if self.dim is not None:
             self._pending = [scan.to(self._device) for scan in self._pending]
             self._attributes = self._attributes.changed(lambda value: value.to(self._device))
+        self._parts = {}
         self._query = self._final_rounded = None  # are on the former device
         self._forget()
         return self
@@ -297,7 +326,7 @@ class MapState(DeviceModule):
         device = self._device
         for name in TENSORS:
             self._buffers.pop(name, None)
-        self._pending = []
+        self._pending, self._parts = [], {}
         if extra is not None:
             self.learning, self._pending, self._n_windows, self._next_number, self._doubts = extra[:5]
             self._calibrator = extra[5]

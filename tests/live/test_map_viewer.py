@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import socket
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -12,7 +13,7 @@ import pytest
 import torch
 
 from gmmtorch.datasets import load
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.live import viewer_scene
 from gmmtorch.mapping import Attributes, Labels, Numbers
 from gmmtorch.mapping.gaussian_map import GaussianMap
@@ -21,6 +22,7 @@ from gmmtorch.report.ellipsoids import unit_sphere
 from gmmtorch.scan import display_colours
 
 pytest.importorskip("viser")
+from viser_client import Client
 
 
 @pytest.fixture(scope="module")
@@ -170,7 +172,7 @@ def test_a_place_has_the_evidence_from_which_its_occupancy_follows(dim, maps):
     position = built.components().means[3]
     theta, hits, misses = viewer_scene.place_at(built, position, 0.1)
     given = (torch.tensor(value).double() for value in (hits, misses))
-    expected = Query(built.components().cones(), built.query_options).rule.probability(*given, 0.1, dim)
+    expected = Query(built.components(), built.query_options).rule.probability(*given, 0.1, dim)
     assert hits > 0
     assert theta == pytest.approx(float(expected))
 
@@ -221,3 +223,101 @@ def test_a_growing_map_is_shown_from_its_first_components(maps):
         assert not made._height.visible
     finally:
         made.stop()
+
+
+# -- who may see the page -------------------------------------------------------------------------
+
+
+PORT = 8394
+OWN, PROXY = f"127.0.0.1:{PORT}", "https://map.example.org"
+
+
+@pytest.fixture(scope="module")
+def guarded(maps) -> Iterator:
+    from gmmtorch.live.map_viewer import MapViewer
+
+    made = MapViewer(*maps[2], port=PORT, origins=[PROXY])
+    yield made
+    made.stop()
+
+
+def status_of(viewer, *headers: str) -> int:
+    """The status of a request for the page with these headers, sent without a library that would add some."""
+    with socket.create_connection(("127.0.0.1", viewer.server.get_port()), timeout=10) as connection:
+        connection.sendall("\r\n".join(["GET / HTTP/1.1", *headers, "", ""]).encode())
+        return int(connection.recv(64).split()[1])
+
+
+@pytest.mark.parametrize(
+    ("headers", "is_admitted"),
+    [
+        ([f"Host: {OWN}"], True),
+        ([f"Host: localhost:{PORT}", f"Origin: http://localhost:{PORT}"], True),
+        (["Host: localhost:9000", "Origin: http://localhost:9000"], True),  # through a tunnel of ssh
+        (["Host: 192.168.1.7:8080"], True),
+        (["Host: [::1]:8080", "Origin: http://[::1]:8080"], True),
+        ([f"Host: {socket.gethostname()}:{PORT}"], True),
+        (["Host: map.example.org", f"Origin: {PROXY}"], True),
+        ([f"Host: {OWN}", f"Origin: {PROXY}"], True),
+        (["Host: evil.example"], False),
+        (["Host: evil.example", f"Origin: http://{OWN}"], False),
+        (["Host: 127.0.0.1.evil.example:8080"], False),
+        ([f"Host: {OWN}", "Origin: http://evil.example"], False),
+        ([f"Host: {OWN}", f"Origin: {PROXY}.evil.example"], False),
+        ([f"Host: {OWN}", "Origin: null"], False),
+        ([f"Host: {OWN}", "Origin: http://127.0.0.1:1"], False),
+        ([f"Host: {OWN}", "Host: evil.example"], False),
+        ([f"Host: {OWN}", f"Origin: http://{OWN}", "Origin: http://evil.example"], False),
+        (["Host: ]["], False),
+        (["Host:"], False),
+        ([], False),
+    ],
+)
+def test_only_the_pages_own_addresses_are_answered(guarded, headers, is_admitted):
+    assert status_of(guarded, *headers) == (200 if is_admitted else 403)
+
+
+def test_a_foreign_page_gets_no_connection(guarded):
+    """What each page in the user's browser could open, and the same from the map's own page."""
+    from websockets.exceptions import InvalidStatus
+
+    with Client(guarded.url, origin=guarded.url) as client:
+        client.received(b"GuiFolderMessage")
+    with Client(guarded.url) as client:  # a program
+        client.received(b"GuiFolderMessage")
+    for headers in ({"origin": "http://evil.example"}, {"additional_headers": {"Origin": "null"}}):
+        with pytest.raises(InvalidStatus, match="403"):
+            Client(guarded.url, **headers)
+
+
+def test_origins_are_checked(maps):
+    from gmmtorch.live.map_viewer import MapViewer
+
+    for origin in ("map.example.org", "ftp://map.example.org", "https://map.example.org/page"):
+        with pytest.raises(InvalidArgumentError, match=r"origins=.* is not the origin of a page"):
+            MapViewer(GaussianMap(), port=8395, origins=[origin])
+
+
+def test_a_server_that_cannot_be_guarded_is_not_used(monkeypatch):
+    import viser
+
+    from gmmtorch.live.map_viewer import MapViewer
+
+    monkeypatch.setattr(viser, "ViserServer", lambda *_, **__: None)
+    with pytest.raises(GmmTorchError, match="foreign pages"):
+        MapViewer(GaussianMap(), port=8396)
+
+
+def test_the_viewer_survives_a_thousand_connections(guarded):
+    """They send nothing, or a part of a request; the page is served beside them, and after them."""
+    kept = []
+    try:
+        for number in range(1000):
+            kept.append(socket.create_connection(("127.0.0.1", PORT), timeout=10))
+            if number % 2:
+                kept[-1].sendall(b"GET / HTTP/1.1\r\nHost: ")
+        assert status_of(guarded, f"Host: {OWN}") == 200
+    finally:
+        for connection in kept:
+            connection.close()
+    assert status_of(guarded, f"Host: {OWN}") == 200

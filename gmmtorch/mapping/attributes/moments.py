@@ -84,7 +84,7 @@ class Attributes:
         """The attributes on the CPU, without gradients."""
         return self.changed(lambda value: value.detach().cpu())
 
-    def selected(self, rows: Tensor) -> Attributes:
+    def selected(self, rows: Tensor | slice) -> Attributes:
         """Those of some components (J,), in that order."""
         return self._of_rows(lambda value: value[rows])
 
