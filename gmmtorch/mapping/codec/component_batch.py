@@ -26,7 +26,7 @@ from gmmtorch.errors import DataError, GmmTorchError, check_choice, check_resolu
 from gmmtorch.files import pack_tensors, read_tensors, require, unpack_tensors
 from gmmtorch.kernels import CodedBatch
 from gmmtorch.mapping.attributes.moments import Attributes
-from gmmtorch.mapping.codec.attribute_block import decode_attributes, encode_attributes
+from gmmtorch.mapping.codec.attribute_block import decode_attributes, encode_attributes, rounded
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter
 from gmmtorch.mapping.codec.context_model import read_batch, write_batch
 from gmmtorch.mapping.codec.first_version import read_first
@@ -39,10 +39,8 @@ from gmmtorch.mapping.codec.quantization import (
     cell_exponent,
     cells_of,
     number_after,
-    numbered,
     quantize,
     quantize_numbered,
-    quantized,
 )
 from gmmtorch.mapping.components import TENSORS, Components
 from gmmtorch.mapping.learning.rules import LearningRule, changed_options, rule_facts
@@ -209,13 +207,14 @@ def file_size(components: Components, rule: LearningRule, settings: MapSettings,
     facts = _facts(rule, settings, number_after(components.ids, next_number + n_new))
     if settings.codec == "float":
         data = _exact_file(components, facts)
-    elif components.attributes:
-        data = map_bytes(
-            quantized(numbered(components, settings.robot, next_number)[0]), rule, settings, next_number
-        )
     else:
-        values = quantize_numbered(components, settings.robot, next_number)
-        data = _container(encode_quantized(values), b"", facts)
+        values, order = quantize_numbered(components, settings.robot, next_number)
+        block = b""
+        if components.attributes:
+            found, given = values.restored(), components.attributes.on_cpu().selected(order)
+            moved = rounded(given, components.means.detach().cpu()[order], found.means, found.covariances)
+            block = encode_attributes(moved, found.covariances)
+        data = _container(encode_quantized(values), block, facts)
     return len(data) + _ROOM_FOR_SETTINGS
 
 

@@ -283,12 +283,13 @@ def number_after(ids: Tensor, next_number: int) -> int:
     return max(next_number, int(ids[:, 1].max()) + 1 if len(ids) else 0)
 
 
-def quantize_numbered(components: Components, robot: int, first: int) -> Quantized:
-    """The same as `quantize(numbered(components, robot, first)[0])`, rounding every component once."""
+def quantize_numbered(components: Components, robot: int, first: int) -> tuple[Quantized, Tensor]:
+    """The same as `quantize(numbered(components, robot, first)[0])`, rounding every component once; and the
+    rows (K,) of the components in that order."""
     values = quantize(components)
     new = (values.ids[:, 1] < 0).nonzero().squeeze(1)
     ids, order = _numbering(values.ids, order_of(values.places.taken(new)), robot, first)
-    return replace(values.reordered(order), ids=ids)
+    return replace(values.reordered(order), ids=ids), order
 
 
 def _numbering(ids: Tensor, by_place: Tensor, robot: int, first: int) -> tuple[Tensor, Tensor]:

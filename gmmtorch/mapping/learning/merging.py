@@ -188,10 +188,14 @@ def merged(components: Components, labels: Tensor) -> Components:
     seen_by, seen_from, seen_count = union_of_viewpoints(components, labels)
     attributes = components.attributes
     if attributes:
-        both = (components.means, components.covariances), (joined.means, joined.covariances)
-        attributes = attributes.selected(first).where(
-            single, moments.merged(attributes, labels, components.support, *both)
+        rows, groups = (~single[labels]).nonzero().squeeze(1), (~single).nonzero().squeeze(1)
+        number = ((~single).cumsum(0) - 1)[labels[rows]]
+        before, after = (
+            (components.means[rows], components.covariances[rows]),
+            (joined.means[groups], joined.covariances[groups]),
         )
+        made = moments.merged(attributes.selected(rows), number, components.support[rows], before, after)
+        attributes = attributes.selected(first).replaced(groups, made)
     return replace(
         components,
         means=torch.where(single[:, None], components.means[first], joined.means),
