@@ -38,6 +38,7 @@ from .mixtures.em_steps import in_spatial_order as in_spatial_order
 from .mixtures.em_steps import is_m_step_fused as is_m_step_fused
 from .mixtures.em_steps import is_truncated_e_step_fused as is_truncated_e_step_fused
 from .mixtures.em_steps import most_likely as most_likely
+from .mixtures.em_steps import nearest_centers as nearest_centers
 from .mixtures.em_steps import softmax as softmax
 from .mixtures.lattice_rounding import LatticeConstants as LatticeConstants
 from .mixtures.lattice_rounding import lattice_restoring as lattice_restoring
