@@ -24,6 +24,7 @@ _APART = 15  # keyframes between two visits of a place
 _REACH = 3.0  # metres between the places of a closure, and
 _DRIFT = 0.02  # metres for each metre of path between both, up to
 _FARTHEST = 10.0  # metres
+_FROM_LOST = 20.0  # metres between places of different parts, whose relative poses are a guess
 _NEIGHBOURS = 3  # keyframes before and after an old one, in the map of its place
 _SPACING = 3  # every third keyframe looks for closures
 _MOST_EXPLAINED = 0.8  # share of the points that a closure explains at least
@@ -164,7 +165,9 @@ def _candidates(
     reach = (_REACH + _DRIFT * (path[new, None] - path)).clamp_max(_FARTHEST)
     is_apart = new[:, None] - order >= _APART
     if parts is not None:
-        is_apart |= parts[new, None] > parts
+        is_other = parts[new, None] > parts
+        is_apart |= is_other
+        reach = torch.where(is_other, _FROM_LOST, reach)
     allowed = is_apart & (gap <= reach)
     nearest = torch.where(allowed, gap, torch.inf).argmin(1)
     step = _SPACING if rows is None else 1
