@@ -45,10 +45,12 @@ from .mixtures.lattice_rounding import lattice_restoring as lattice_restoring
 from .mixtures.lattice_rounding import lattice_rounding as lattice_rounding
 from .mixtures.matching import MOST_TESTED as MOST_TESTED
 from .mixtures.matching import AlignmentSums as AlignmentSums
+from .mixtures.matching import NearLists as NearLists
 from .mixtures.matching import alignment_sums as alignment_sums
 from .mixtures.matching import explained_points as explained_points
 from .mixtures.matching import near_pairs as near_pairs
 from .mixtures.matching import overlap_sums as overlap_sums
+from .mixtures.matching import raster_sums as raster_sums
 from .rays.beam_information import Beams as Beams
 from .rays.beam_information import Cells as Cells
 from .rays.beam_information import information_by_block as information_by_block

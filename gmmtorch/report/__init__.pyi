@@ -3,6 +3,7 @@ from .accuracy_figures import comparison_figure as comparison_figure
 from .accuracy_figures import convergence_figure as convergence_figure
 from .accuracy_figures import reliability_figure as reliability_figure
 from .accuracy_figures import roc_figure as roc_figure
+from .accuracy_figures import trajectory_figure as trajectory_figure
 from .ellipsoids import checked_components as checked_components
 from .ellipsoids import cut_away as cut_away
 from .ellipsoids import ellipse_outlines as ellipse_outlines

@@ -16,6 +16,7 @@ from gmmtorch.report.accuracy_figures import (
     convergence_figure,
     reliability_figure,
     roc_figure,
+    trajectory_figure,
 )
 from gmmtorch.report.mixture_figures import mixture_figure
 from gmmtorch.report.style import save_figure
@@ -77,6 +78,17 @@ def test_convergence_draws_each_fit():
     figure = convergence_figure({"fit": [-3.0, -2.0, -1.5], "none": [], "one": [-1.0]})
     assert [len(line.get_xdata()) for line in figure.axes[0].lines] == [3, 1, 1, 1]
     convergence_figure({}).canvas.draw()
+
+
+def test_a_trajectory_is_drawn_beside_the_truth_with_the_distances():
+    truth = np.stack([np.arange(5.0), np.zeros(5)], 1)
+    estimate = truth + np.array([0.0, 0.3])
+    figure = trajectory_figure(estimate, truth, np.array([True, True, False, True, True]))
+    upper, lower = figure.axes
+    assert np.array_equal(upper.lines[0].get_xydata(), truth)
+    assert np.array_equal(upper.lines[2].get_xydata(), estimate[2:3])
+    assert np.allclose(lower.lines[0].get_ydata(), 0.3)
+    assert len(trajectory_figure(estimate, truth, np.ones(5, dtype=bool)).axes[0].lines) == 2
 
 
 def row(method: str, resolution: float, kept: float, auc: float | None, **more: object) -> dict[str, object]:

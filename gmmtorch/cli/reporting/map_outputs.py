@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -15,7 +15,7 @@ import gmmtorch
 from gmmtorch import localization, report  # whose parts load when they are used
 from gmmtorch.cli import common, schema
 from gmmtorch.cli.export import ExportOptions
-from gmmtorch.datasets import Dataset, read_trajectory
+from gmmtorch.datasets import Dataset, Reposed, read_trajectory
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError, MissingDataError, check_number
 from gmmtorch.export import write_pose_table, write_tum
 from gmmtorch.mapping import Components, GaussianMap, MapBuilder
@@ -23,6 +23,9 @@ from gmmtorch.occupancy import reliability_of, scores_of
 from gmmtorch.optional_packages import load_pyoctomap
 from gmmtorch.pose import Pose
 from gmmtorch.report import Event, Row
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 EXPORTS = {
     "map_server": ("map_server", "navigation.yaml"),
@@ -221,11 +224,17 @@ def bytes_per_metre(nbytes: int, metres: float) -> float | None:
 
 
 def draw(
-    config: DictConfig, built: GaussianMap, trajectories: Sequence[Tensor], row: Row, folder: Path
+    config: DictConfig,
+    built: GaussianMap,
+    trajectories: Sequence[Tensor],
+    row: Row,
+    folder: Path,
+    odometry: Figure | None = None,
 ) -> None:
     """Write the figures as PNG, and figures and numbers to TensorBoard.
 
-    trajectories: sensor positions (S, D) of each recording. row: of results.json.
+    trajectories: sensor positions (S, D) of each recording. row: of results.json. odometry: of
+    `odometry_figure`.
     """
 
     def write(board: report.Board) -> None:
@@ -236,7 +245,22 @@ def draw(
         board.paths("trajectory", trajectories)
         board.hparams(common.chosen_options(config), {key: row[key] for key in ("n_components", "nbytes")})
 
-    common.show(config, folder, lambda: _figures(built, trajectories, row), write)
+    def figures() -> dict[str, Any]:
+        return _figures(built, trajectories, row) | ({} if odometry is None else {"odometry": odometry})
+
+    common.show(config, folder, figures, write)
+
+
+def odometry_figure(dataset: Dataset, estimated: localization.Trajectory | None, row: Row) -> Figure | None:
+    """The estimated path beside that of the data set; None if one of them is missing."""
+    facts = row.get("odometry")
+    if estimated is None or facts is None or facts["ate"] is None or not isinstance(dataset, Reposed):
+        return None
+    true = torch.stack([dataset.own_pose(index) for index in range(len(dataset))])
+    moved = localization.aligned(estimated.poses, true, facts["align"])
+    path, true_path = (poses[:, :-1, -1].numpy() for poses in (moved, true))
+    title = f"{row['dataset']}: ATE {facts['ate']:.3g} m, RPE {facts['rpe']:.3g} m, {facts['n_lost']} lost"
+    return report.trajectory_figure(path, true_path, estimated.found.numpy(), title)
 
 
 def map_panel(built: GaussianMap, trajectories: Sequence[Tensor]) -> report.MapPanel:
