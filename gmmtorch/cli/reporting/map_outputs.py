@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -23,9 +23,6 @@ from gmmtorch.occupancy import reliability_of, scores_of
 from gmmtorch.optional_packages import load_pyoctomap
 from gmmtorch.pose import Pose
 from gmmtorch.report import Event, Row
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 EXPORTS = {
     "map_server": ("map_server", "navigation.yaml"),
@@ -229,7 +226,7 @@ def draw(
     trajectories: Sequence[Tensor],
     row: Row,
     folder: Path,
-    odometry: Figure | None = None,
+    odometry: Any = None,
 ) -> None:
     """Write the figures as PNG, and figures and numbers to TensorBoard.
 
@@ -251,8 +248,8 @@ def draw(
     common.show(config, folder, figures, write)
 
 
-def odometry_figure(dataset: Dataset, estimated: localization.Trajectory | None, row: Row) -> Figure | None:
-    """The estimated path beside that of the data set; None if one of them is missing."""
+def odometry_figure(dataset: Dataset, estimated: localization.Trajectory | None, row: Row) -> Any:
+    """A figure of the estimated path beside that of the data set; None if one of them is missing."""
     facts = row.get("odometry")
     if estimated is None or facts is None or facts["ate"] is None or not isinstance(dataset, Reposed):
         return None
