@@ -411,6 +411,17 @@ def test_forged_array_lengths_allocate_no_memory(k, what, version):
         decode(sealed(bytes([version]) + writer.to_bytes() + bytes(2000)))
 
 
+@pytest.mark.parametrize("n", [1, 60, 500])
+def test_streams_that_end_in_any_number_of_zeros_are_decoded(n):
+    """Equal counts of many origins cost almost nothing: zeros remain beyond what a reader looks ahead."""
+    one = random_components(3, k=1, n_origins=n, max_sightings=1)
+    count = torch.ones(n, dtype=torch.float64)
+    every = torch.arange(n)
+    made = replace(one, seen_by=0 * every, seen_from=every, seen_count=count, support=count.sum()[None])
+    for found in by_both(lambda: decode(encode(made))):
+        assert_same_components(found, quantized(made))
+
+
 def test_a_limit_on_components_is_kept_before_they_are_read(sound):
     assert len(decode(sound, most=40)) == 12
     with pytest.raises(DataError, match="12 components and"):

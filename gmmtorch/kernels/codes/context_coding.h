@@ -87,9 +87,9 @@ struct RangeCoder {
             for (int i = 0; i < 4; ++i) code = code << 8 | next();
     }
 
+    // Zeros follow the stream: those at its end are not written.
     GMM_INLINE uint8_t next() {
         const uint8_t byte = at < out.size ? out.bytes[at] : 0;
-        good = good && at < out.size + 4;
         ++at;
         return byte;
     }

@@ -242,10 +242,8 @@ class _Reader(_RangeCoder):
 
     def _renew(self) -> None:
         while self.range < 1 << 24:
-            if self._at >= len(self._data) + 4:
-                raise DataError("The components of a batch take more bytes than it has: it is truncated.")
             self.range <<= 8
-            byte = self._data[self._at] if self._at < len(self._data) else 0
+            byte = self._data[self._at] if self._at < len(self._data) else 0  # zeros are not written
             self._code = (self._code << 8 | byte) & 0xFFFFFFFF
             self._at += 1
 
