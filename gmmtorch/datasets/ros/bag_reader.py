@@ -14,7 +14,7 @@ import logging
 import re
 import shutil
 import tempfile
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
@@ -327,9 +327,7 @@ def choose_sensor(reader: BagReader, wanted: str | None) -> Sensor:
             f"{reader.path}: topic {wanted} has messages of {len(named)} types: {listed(named)}. Choose "
             "another ‹topic›, or write each type to a topic of its own."
         )
-    found = [
-        sensor for topic in named or reader.topics if topic.n_messages and (sensor := _sensor(reader, topic))
-    ]
+    found = sensors(reader, named)
     if not found:
         what = f"‹topic›={wanted} is not" if wanted else "has no topic of"
         remedy = "Choose another ‹topic›." if wanted else "Record such a topic."
@@ -345,6 +343,12 @@ def choose_sensor(reader: BagReader, wanted: str | None) -> Sensor:
             f"{listed([sensor.topic for sensor in found])}. Choose one: ‹topic›={found[0].topic.name}."
         )
     return found[0]
+
+
+def sensors(reader: BagReader, topics: Sequence[Topic] = ()) -> list[Sensor]:
+    """The range sensors with messages among some topics, or among all."""
+    chosen = [topic for topic in topics or reader.topics if topic.n_messages]
+    return [sensor for topic in chosen if (sensor := _sensor(reader, topic)) is not None]
 
 
 def listed(topics: list[Topic]) -> str:
