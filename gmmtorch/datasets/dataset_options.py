@@ -159,6 +159,7 @@ OPTIONS: dict[str, type[DatasetOptions]] = {
     "scan_folder": FileOptions,
     "pcd_viewpoint": FileOptions,
     "depth_frames": DepthFramesOptions,
+    "e57": FileOptions,
     "octomap_log": FileOptions,
     "rosbag": RosbagOptions,
     "kitti": KittiOptions,
