@@ -129,3 +129,22 @@ def test_folders_of_scans(check, tmp_path):
     done = check(tmp_path, "dataset=scan_folder")
     assert done.status == 0
     assert "the sensor stands still" in words(done)
+
+
+def test_names_cannot_control_the_terminal(check, tmp_path):
+    """Those of topics, frames and files, in the table, the error and the log."""
+    evil = "\x1b]0;owned\x07\x1b[31m"
+    path = tmp_path / f"a{evil}.mcap"
+    with BagWriter(path) as writer:
+        for i in range(9):
+            writer.transforms(i * 0.1, {(f"odom{evil}", f"lidar{evil}"): moved(i * 0.1)})
+            table = np.ascontiguousarray(RING, "<f4").view([(axis, "<f4") for axis in "xyz"])[:, 0]
+            fields = cloud_fields(f"odom{evil}", table)
+            writer.message(f"/points{evil}", "sensor_msgs/msg/PointCloud2", i * 0.1, fields)
+    for options in (["dataset.topic=/none"], []):
+        done = check(f"'{path}'", "dataset=rosbag", *options)
+        assert "owned" in done.stdout
+        assert "\x1b" not in done.stdout + done.stderr
+    log = (done.folder / "map.log").read_text()
+    assert "points are in the fixed frame" in log
+    assert "\x1b" not in log

@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 from gmmtorch import datasets
 from gmmtorch.cli import inputs
 from gmmtorch.datasets import NANOSECONDS, BagFacts, BagReader, Dataset, bag_facts, whole_or_intact
-from gmmtorch.errors import GmmTorchError, told
+from gmmtorch.errors import GmmTorchError, printable, told
 from gmmtorch.report import Row, byte_text, count_text, format_table
 
 _N_SAMPLES = 40  # scans that are read
@@ -58,7 +58,11 @@ def check(config: DictConfig) -> bool:
 
 
 def _print_wrapped(label: str, text: str) -> None:
-    print(textwrap.fill(text, _WIDTH, initial_indent=label, subsequent_indent=" " * len(label.lstrip("\n"))))
+    print(
+        textwrap.fill(
+            printable(text), _WIDTH, initial_indent=label, subsequent_indent=" " * len(label.lstrip("\n"))
+        )
+    )
 
 
 # -- the bag -----------------------------------------------------------------------------------------
@@ -77,7 +81,7 @@ def _bag(options: DictConfig) -> BagFacts | None:
     begin = datetime.datetime.fromtimestamp(facts.first / NANOSECONDS, datetime.UTC)
     n_messages = sum(one.topic.n_messages for one in facts.topics)
     print(
-        f"\nrecording  {path}, {byte_text(sum(file.stat().st_size for file in files))}: "
+        f"\nrecording  {printable(str(path))}, {byte_text(sum(file.stat().st_size for file in files))}: "
         f"{count_text(n_messages, 'message')} in {(facts.last - facts.first) / NANOSECONDS:.1f} s from "
         f"{begin:%Y-%m-%d %H:%M:%S} UTC"
     )
@@ -85,13 +89,13 @@ def _bag(options: DictConfig) -> BagFacts | None:
         _print_wrapped("damage     ", facts.damage)
     rows: list[Row] = [
         {
-            "topic": one.topic.name,
-            "type": one.topic.type.replace("/msg/", "/"),
+            "topic": printable(one.topic.name),
+            "type": printable(one.topic.type).replace("/msg/", "/"),
             "messages": one.topic.n_messages,
             "per_second": one.rate,
             "longest_gap_s": one.gap,
             "stamp_age_s": _age(one.offset),
-            "gives": told(one.use, _OPTIONS) or "nothing",
+            "gives": printable(told(one.use, _OPTIONS)) or "nothing",
         }
         for one in facts.topics
     ]
@@ -135,13 +139,13 @@ def _print_scans(found: Dataset, advice: list[str]) -> float:
     n_left_out = sum(found.skipped.values())
     topic = getattr(found, "topic", "")
     usable = [scan for scan in scans if scan.n_beams]
-    text = f"\nscans      {n_scans:,} would be read{f' of {topic}' if topic else ''}"
+    text = f"\nscans      {n_scans:,} would be read{f' of {printable(topic)}' if topic else ''}"
     print(text + (f", in {usable[0].dim}D" if usable else "") + _timing(found, advice))
     if usable:
         _print_ranges(usable, advice)
     _print_poses(found, advice)
     for reason, count in found.skipped.items():
-        print(f"note       {count_text(count, 'scan')}: {reason}")
+        print(f"note       {count_text(count, 'scan')}: {printable(reason)}")
     for reason in dict.fromkeys(unread):
         _print_wrapped("note       ", f"a scan cannot be read: {reason}")
     share = len(usable) / max(len(indices), 1)
