@@ -41,7 +41,7 @@ class MapViewer:
     Args:
         shown: the map; an empty map is shown once `update` gives another one.
         trajectories: (S, D) sensor positions of each recording, world metres.
-        shape: one of `viewer_scene.SHAPES`. colour: one of `viewer_scene.COLOURS`.
+        shape: one of `viewer_scene.SHAPES`. colour: one of `viewer_scene.colour_choices`.
         host, port: where the page is served; another port is taken if this one is in use.
         origins: of the page at a proxy, such as https://map.example.org; others are refused, see `admits`.
 
@@ -68,7 +68,8 @@ class MapViewer:
         origins: Sequence[str] = (),
     ) -> None:
         check_choice("shape", shape, viewer_scene.SHAPES)
-        check_choice("colour", colour, viewer_scene.COLOURS)
+        known = shown.components() if shown.dim else Components.empty(3)
+        check_choice("colour", colour, viewer_scene.colour_choices(known))
         with needs_extra("The browser viewer needs", "viser", "viewer"):
             import viser
         _check_address(host, port)
@@ -118,6 +119,9 @@ class MapViewer:
             if shown.dim is None:
                 return
             self._map, self._components = shown, shown.components()
+            choices = viewer_scene.colour_choices(self._components)
+            if choices != self._colour.options:  # a channel of an earlier map may be gone
+                self._colour.options = choices
             self._paths, self._path_colours = viewer_scene.in_space(trajectories), colours
             self._show(viewer_scene.frame(self._components, self._paths))
             self._draw_components()
@@ -248,7 +252,7 @@ class MapViewer:
         components, occupancy, place = self._folders
         with components:
             self._shape = gui.add_dropdown("shape", viewer_scene.SHAPES, initial_value=shape)
-            self._colour = gui.add_dropdown("colour", viewer_scene.COLOURS, initial_value=colour)
+            self._colour = gui.add_dropdown("colour", (*viewer_scene.COLOURS, colour), initial_value=colour)
             self._cut = gui.add_slider("hide above [m]", 0.0, 1.0, 0.05, 1.0)
             self._with_paths = gui.add_checkbox("trajectory", True)
         with occupancy:

@@ -6,6 +6,7 @@ import math
 import re
 import socket
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,9 +15,11 @@ import torch
 from gmmtorch.datasets import load
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.live import viewer_scene
+from gmmtorch.mapping import Attributes, Labels, Numbers
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.query import Query
 from gmmtorch.report.ellipsoids import unit_sphere
+from gmmtorch.scan import display_colours
 
 pytest.importorskip("viser")
 from viser_client import Client
@@ -84,12 +87,50 @@ def test_colours_follow_the_order_of_their_quantity(by, maps):
     components = maps[3][0].components()
     solid = viewer_scene.surfaces(components)
     colours = viewer_scene.colours(components, solid, by).rgb.astype(int)
-    quantity = {"height": solid.means[:, 2], "support": components.support, "age": components.ids[:, 1]}[by]
-    quantity = quantity if by == "height" else quantity[solid.rows]
+    quantity = {
+        "height": solid.means[:, 2],
+        "support": components.support[solid.rows],
+        "age": components.ids[solid.rows, 1],
+        "uncertainty": torch.linalg.eigvalsh(solid.covariances)[:, 0],
+    }[by]
     low, high = int(quantity.argmin()), int(quantity.argmax())
     assert colours[high, 1] > colours[low, 1] + 100  # viridis: from violet to yellow, with rising green
     with pytest.raises(InvalidArgumentError, match="colour"):
         viewer_scene.colours(components, solid, "taste")
+
+
+def test_channels_of_the_map_colour_its_components(maps):
+    components = maps[3][0].components()
+    solid, k = viewer_scene.surfaces(components), len(components)
+    none = torch.zeros(k, 3, 3).double()
+    colour = torch.rand(k, 3, generator=torch.Generator().manual_seed(0)).double()
+    share = torch.ones(k).double()
+    share[solid.rows[0]] = 0
+    heat = torch.arange(k).double()[:, None]
+    labels = torch.nn.functional.one_hot(torch.arange(k) % 2, 2).double()
+    attributes = Attributes(
+        {
+            "colour": Numbers(share, colour, none, none),
+            "heat": Numbers(share, heat, none[:, :1], none[:, :1, :1]),
+            "class": Labels(labels, torch.tensor([4, 9])),
+        }
+    )
+    known = replace(components, attributes=attributes)
+    assert viewer_scene.colour_choices(known) == (*viewer_scene.COLOURS, "colour", "heat", "class")
+    found = viewer_scene.colours(known, solid, "colour")
+    expected = (255 * display_colours(colour[solid.rows])).round().numpy()
+    np.testing.assert_array_equal(found.rgb[1:], expected[1:])
+    assert found.rgb[0].tolist() == [160, 160, 160]  # unknown
+    assert found.ends is None
+    shades = viewer_scene.colours(known, solid, "heat")
+    assert int(shades.rgb[-1, 1]) > int(shades.rgb[1, 1]) + 100
+    classes = viewer_scene.colours(known, solid, "class")
+    assert [name for name, _ in classes.legend] == ["4", "9"]
+    of_rows = {tuple(rgb) for rgb in classes.rgb[(solid.rows % 2 == 0).numpy()].tolist()}
+    assert len(of_rows) == 1
+    assert classes.legend[0][1] == "rgb({}, {}, {})".format(*of_rows.pop())
+    with pytest.raises(InvalidArgumentError, match="colour='heat'"):
+        viewer_scene.colours(components, solid, "heat")
 
 
 def test_slice_has_the_occupancy_of_the_map_with_the_highest_y_first(maps):
@@ -131,7 +172,7 @@ def test_a_place_has_the_evidence_from_which_its_occupancy_follows(dim, maps):
     position = built.components().means[3]
     theta, hits, misses = viewer_scene.place_at(built, position, 0.1)
     given = (torch.tensor(value).double() for value in (hits, misses))
-    expected = Query(built.components().cones(), built.query_options).rule.probability(*given, 0.1, dim)
+    expected = Query(built.components(), built.query_options).rule.probability(*given, 0.1, dim)
     assert hits > 0
     assert theta == pytest.approx(float(expected))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset, Ranges, require_path
+from gmmtorch.datasets.point_files.channels import check_channels
 from gmmtorch.datasets.ros.bag_poses import BagSurvey, Record, RegisteredPoses
 from gmmtorch.datasets.ros.bag_reader import (
     IMU_TYPE,
@@ -59,6 +60,7 @@ def open_rosbag(
     intrinsics: list[float] | None = None,
     imu_topic: str | None = None,
     damaged: str = "read",
+    attributes: Iterable[str] = (),
 ) -> RosBag:
     """The scans of one topic of a bag; see docs/recordings.md.
 
@@ -79,6 +81,7 @@ def open_rosbag(
         intrinsics: fx, fy, cx, cy in pixels of depth images without distortion; None: of `camera_info`.
         imu_topic: of the IMU of `RosBag.turns`; None: the only one.
         damaged: "read" reads the intact part of a damaged bag; "refuse" raises an error.
+        attributes: channels of point clouds that are read, such as "intensity" and "colour".
     """
     source = "A bag of ROS 1 is a file; one of ROS 2 is a file or its folder."
     file = require_path(path, "file or folder", "a ROS bag (.bag, .mcap, .db3)", source)
@@ -97,7 +100,7 @@ def open_rosbag(
             info = choose_camera_info(reader, sensor.topic.name, camera_info)
         survey = BagSurvey(reader, sensor, info, poses, frame, extrinsic, max_gap)
         camera = ImageCamera(sensor, survey.camera_info(), pixel_stride, depth_scale, intrinsics)
-        options = sensor_frame, clock, deskew, imu_topic
+        options = sensor_frame, clock, deskew, imu_topic, check_channels(attributes)
         if sensor.is_camera:
             return DepthBag(reader, sensor, survey, ranges, stride, *options, camera)
         return RosBag(reader, sensor, survey, ranges, stride, *options)
@@ -143,6 +146,7 @@ class RosBag(Dataset):
         clock: str,
         deskew: bool,
         imu_topic: str | None,
+        attributes: tuple[str, ...],
         camera: ImageCamera | None = None,
     ) -> None:
         super().__init__(reader.path.stem, ranges, stride)
@@ -161,7 +165,7 @@ class RosBag(Dataset):
             records = kept
         records = self._ordered(records)
         self._source = survey.source(records, self._where, sensor_frame)
-        self._conversion = ScanConversion(sensor, ranges, self._source, deskew, camera)
+        self._conversion = ScanConversion(sensor, ranges, self._source, deskew, camera, attributes)
         self._records, self._in_space = self._posed(records)
         self._samples = self._first_readings()
         rate = Rate.of(records, clock)
