@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import collections
+import contextlib
 import json
 import logging
 import os
@@ -189,6 +190,13 @@ def clouds(folder: Path, points: torch.Tensor) -> dict[str, Target]:
         "ply": Target(taken(folder, "text.ply", "binary.ply"), read_cloud),
         "npy": Target(taken(folder, "a.npy"), read_cloud),
     }
+    with contextlib.suppress(ImportError):
+        import pye57
+
+        with pye57.E57(str(folder / "a.e57"), mode="w") as file:
+            data = {f"cartesian{axis}": points.numpy()[:60, k].copy() for k, axis in enumerate("XYZ")}
+            file.write_scan_raw(data, rotation=np.eye(4)[0], translation=np.ones(3))
+        found["e57"] = Target(taken(folder, "a.e57"), lambda path: read_all("e57", path), mended_e57)
     try:
         import laspy
     except ImportError:
@@ -198,6 +206,14 @@ def clouds(folder: Path, points: torch.Tensor) -> dict[str, Target]:
     for name in ("a.las", "a.laz"):
         las.write(folder / name)
     return {**found, "las": Target(taken(folder, "a.las", "a.laz"), read_cloud)}
+
+
+def mended_e57(data: bytes) -> bytes:
+    """Pages of 1024 bytes, of which the last four are a CRC-32C."""
+    from tensorboard.compat.tensorflow_stub.pywrap_tensorflow import crc32c
+
+    pages = [data[begin : begin + 1020] for begin in range(0, len(data) - 1023, 1024)]
+    return b"".join(page + struct.pack(">I", crc32c(page)) for page in pages)
 
 
 def logs() -> dict[str, Target]:

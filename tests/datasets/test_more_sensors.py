@@ -112,6 +112,14 @@ def test_damaged_packets_are_counted(tmp_path):
         load("rosbag", packets(tmp_path / "a.mcap", bytes(1206)))
 
 
+def test_a_message_without_packets_has_no_points():
+    """The package alone would end the process."""
+    pytest.importorskip("velodyne_decoder")
+    from gmmtorch.datasets.ros.lidar_packets import VelodynePackets
+
+    assert len(VelodynePackets().points({"packets": []}).points) == 0
+
+
 def test_packets_without_a_definition_in_the_bag_are_read(tmp_path):
     """As bags of SQLite before ROS 2 Iron are."""
     pytest.importorskip("velodyne_decoder")
