@@ -29,6 +29,11 @@ def told(text: str, names: Mapping[str, str] | None = None) -> str:
     return _MARKED.sub(lambda found: (names or {}).get(found[1], found[1]), text)
 
 
+def printable(text: str) -> str:
+    """A text whose control characters, such as those of a terminal, are escaped."""
+    return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
 def text_of(error: Exception) -> str:
     """The text of an error with its marks, for `told`."""
     return str(error.args[0]) if error.args else ""
@@ -87,7 +92,7 @@ class GmmTorchError(Exception):
 
     def __format__(self, spec: str) -> str:
         """The text for another error, with its marks."""
-        return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text_of(self))
+        return printable(text_of(self))
 
 
 class InvalidArgumentError(GmmTorchError, ValueError):

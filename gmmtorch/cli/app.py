@@ -9,6 +9,7 @@ from __future__ import annotations
 import _thread
 import argparse
 import io
+import logging
 import math
 import os
 import signal
@@ -27,7 +28,7 @@ from omegaconf import DictConfig
 
 from gmmtorch.cli import common, options_help, schema
 from gmmtorch.cli.sweep_table import ERROR_FILE
-from gmmtorch.errors import GmmTorchError, OutputError
+from gmmtorch.errors import GmmTorchError, OutputError, printable
 from gmmtorch.processes import end_with_parent
 
 _FULL_ERROR = "HYDRA_FULL_ERROR"
@@ -45,6 +46,7 @@ def start(name: str, run: Callable[[DictConfig], Any], register: Callable[[], No
     """
     register()
     _print_any_text()
+    _log_printable_text()
     try:
         with interruptible(), _any_help():
             _hydra_main(name, run)
@@ -63,6 +65,20 @@ def _print_any_text() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
+
+
+def _log_printable_text() -> None:
+    """Names in logs, such as those of frames in a bag, cannot send control characters to the terminal."""
+    make = logging.getLogRecordFactory()
+    if make.__name__ == "printable_record":
+        return
+
+    def printable_record(*arguments: Any, **options: Any) -> logging.LogRecord:
+        record = make(*arguments, **options)
+        record.msg, record.args = printable(record.getMessage()), None
+        return record
+
+    logging.setLogRecordFactory(printable_record)
 
 
 @contextmanager

@@ -44,6 +44,9 @@ class MapOptions(ViewOptions):
     )
     z_max: float | None = option(None, "highest height (m) of map_server in 3D")
     checkpoint_seconds: float = option(30.0, "computing time between two checkpoints")
+    check: bool = option(
+        False, "only report what dataset.path contains, what would be mapped, and which options would help"
+    )
     inputs: list[str] = option(
         [], "list of paths, globs and URLs of recordings, in place of dataset.path; maps are merged in tiles"
     )
@@ -78,6 +81,10 @@ def run(config: DictConfig) -> None:
     device, folder = common.set_up(config), common.run_dir()
     check_resolution(config.resolution)
     map_outputs.check_exports(config)
+    if config.check:
+        from gmmtorch.cli.reporting import recording_check
+
+        sys.exit(0 if recording_check.check(config) else 1)
     if config.inputs:
         recordings.run(config)
         return

@@ -30,12 +30,15 @@ from .ros.bag_reader import RawMessage as RawMessage
 from .ros.bag_reader import Sensor as Sensor
 from .ros.bag_reader import Topic as Topic
 from .ros.bag_reader import nearest_names as nearest_names
+from .ros.bag_topics import BagFacts as BagFacts
+from .ros.bag_topics import bag_facts as bag_facts
 from .ros.image_camera import ImageCamera as ImageCamera
 from .ros.message_decoder import ARRAY as ARRAY
 from .ros.message_decoder import BASE as BASE
 from .ros.message_decoder import NAME as NAME
 from .ros.message_decoder import MessageDecoder as MessageDecoder
 from .ros.point_times import Rate as Rate
+from .ros.rosbag import whole_or_intact as whole_or_intact
 from .ros.scan_conversion import ScanConversion as ScanConversion
 from .ros.sensor_messages import Reading as Reading
 from .ros.transform_tree import TransformTree as TransformTree

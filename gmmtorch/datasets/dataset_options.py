@@ -168,6 +168,7 @@ OPTIONS: dict[str, type[DatasetOptions]] = {
     "scan_folder": ChannelOptions,
     "pcd_viewpoint": ChannelOptions,
     "depth_frames": DepthFramesOptions,
+    "e57": FileOptions,
     "octomap_log": FileOptions,
     "rosbag": RosbagOptions,
     "kitti": KittiOptions,

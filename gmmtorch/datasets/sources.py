@@ -25,6 +25,7 @@ _SOURCES = {
     "scan_folder": _Source("scan_folders", "ScanFolder"),
     "pcd_viewpoint": _Source("scan_folders", "PcdViewpoint"),
     "depth_frames": _Source("depth_images", "DepthFrames"),
+    "e57": _Source("point_files.e57_files", "E57Scans"),
     "octomap_log": _Source("scan_logs", "OctomapLog"),
     "rosbag": _Source("ros.rosbag", "open_rosbag"),
     "kitti": _Source("scan_folders", "Kitti"),
@@ -49,7 +50,7 @@ def load(
     """The data set `name`: a sequence of scans, each read when it is accessed.
 
     Args:
-        name: carmen, scan_folder, pcd_viewpoint, depth_frames, octomap_log, rosbag, kitti, tum, mesh or
+        name: carmen, scan_folder, pcd_viewpoint, depth_frames, e57, octomap_log, rosbag, kitti, tum, mesh or
             mesh_scans, which need a `path`; synthetic_building or synthetic_building_2d, which need none.
         path: the file or folder.
         max_range: a reading at this distance (m) or beyond is a beam without return. None: 50 for CARMEN

@@ -3,7 +3,7 @@
 Bags are hostile input. Files are read within their length, compressed chunks are unpacked up to a limit, and
 messages are decoded by `MessageDecoder`; definitions in a bag are used only for types that ROS does not have.
 
-It also knows which topics of a bag are sensors or an IMU, and chooses between them.
+It also chooses between the topics of sensors.
 """
 
 from __future__ import annotations
@@ -14,12 +14,13 @@ import logging
 import re
 import shutil
 import tempfile
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, BinaryIO, NamedTuple
 
+from gmmtorch.datasets.ros.lidar_packets import DEFINITION, VELODYNE
 from gmmtorch.datasets.ros.message_decoder import BASE, NAME, SEQUENCE, MessageDecoder
 from gmmtorch.datasets.ros.salvage import Salvage
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
@@ -131,24 +132,19 @@ class BagReader:
         if found.gaps:
             longest = max(found.gaps, key=lambda gap: gap[1] - gap[0])
             text += (
-                f"; {found.missing_seconds:.1f} s in {len(found.gaps)} gaps are missing, the longest from "
+                f"; {found.missing_seconds:.1f} s in {len(found.gaps)} gap(s) are missing, the longest from "
                 f"{(longest[0] - first) / 1e9:.1f} to {(longest[1] - first) / 1e9:.1f} s"
             )
         if end:
             return f"{text}; {max(0, end - found.last) / 1e9:.1f} s at the end are missing"
-        return (
-            f"{text}; the file is cut off there, and does not state how much is missing"
-            if found.is_cut
-            else text
-        )
+        return text + "; the file is cut off there, and does not state how much is missing" * found.is_cut
 
     def _salvaged(self) -> Salvage:
         reader_class(self._is_ros1)  # puts limits on rosbags
         files = sorted(self.path.iterdir()) if self.path.is_dir() else [self.path]
+        files = [file for file in files if file.suffix in _SUFFIXES]
         try:
-            return Salvage(
-                [file for file in files if file.suffix in _SUFFIXES], _unpack_chunk, MAX_CHUNK_BYTES
-            )
+            return Salvage(files, _unpack_chunk, MAX_CHUNK_BYTES)
         except DataError as error:
             raise DamagedBagError(str(error)) from error
 
@@ -173,7 +169,8 @@ class BagReader:
         """Definitions in the bag. One that cannot be parsed is left out."""
         found: dict[str, Any] = {}
         for c in self._connections:
-            if c.msgtype not in found and (parsed := parsed_definitions(c.msgdef, c.msgtype)):
+            stated = c.msgdef if c.msgdef.data or c.msgtype != VELODYNE else DEFINITION
+            if c.msgtype not in found and (parsed := parsed_definitions(stated, c.msgtype)):
                 found.update(parsed)
         return found
 
@@ -284,17 +281,27 @@ POSE_TYPES = (
 )
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 IMU_TYPE = "sensor_msgs/msg/Imu"
+_LISTS = {"sensor_msgs/msg/PointCloud": "points"}
 _IMAGE, _COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")
 
-CLOUD, LIST, LASER, DEPTH, COMPRESSED = (
+CLOUD, LIST, PACKETS, LASER, ECHOES, DEPTH, COMPRESSED = (
     "cloud",
     "list of points",
+    "lidar packets",
     "laser",
+    "laser with echoes",
     "depth image",
     "compressed depth image",
 )
-_PREFERENCE = (CLOUD, LIST, LASER, DEPTH, COMPRESSED)
+LASERS = (LASER, ECHOES)
+_PREFERENCE = (CLOUD, LIST, PACKETS, *LASERS, DEPTH, COMPRESSED)
+_KINDS = {
+    "sensor_msgs/msg/PointCloud2": CLOUD,
+    "sensor_msgs/msg/LaserScan": LASER,
+    "sensor_msgs/msg/MultiEchoLaserScan": ECHOES,
+    VELODYNE: PACKETS,
+}
 
 
 class Sensor(NamedTuple):
@@ -313,7 +320,7 @@ class Sensor(NamedTuple):
 def choose_sensor(reader: BagReader, wanted: str | None) -> Sensor:
     """The topic `wanted`, or else the only one of the most preferred kind that the bag has.
 
-    Kinds in order: clouds, lists of points, lasers, depth images. Raises `DataError` or
+    Kinds in order: clouds, lists of points, packets of lidars, lasers, depth images. Raises `DataError` or
     `InvalidArgumentError`, which list the topics, if there is none, or a choice.
     """
     named = [topic for topic in reader.topics if topic.name == wanted]
@@ -327,9 +334,7 @@ def choose_sensor(reader: BagReader, wanted: str | None) -> Sensor:
             f"{reader.path}: topic {wanted} has messages of {len(named)} types: {listed(named)}. Choose "
             "another ‹topic›, or write each type to a topic of its own."
         )
-    found = [
-        sensor for topic in named or reader.topics if topic.n_messages and (sensor := _sensor(reader, topic))
-    ]
+    found = sensors(reader, named)
     if not found:
         what = f"‹topic›={wanted} is not" if wanted else "has no topic of"
         remedy = "Choose another ‹topic›." if wanted else "Record such a topic."
@@ -347,16 +352,22 @@ def choose_sensor(reader: BagReader, wanted: str | None) -> Sensor:
     return found[0]
 
 
+def sensors(reader: BagReader, topics: Sequence[Topic] = ()) -> list[Sensor]:
+    """The range sensors with messages among some topics, or among all."""
+    chosen = [topic for topic in topics or reader.topics if topic.n_messages]
+    return [sensor for topic in chosen if (sensor := _sensor(reader, topic)) is not None]
+
+
 def listed(topics: list[Topic]) -> str:
     """Topics with types and counts, for messages."""
     return "; ".join(f"{t.name} ({t.type}, {t.n_messages} messages)" for t in topics) or "none"
 
 
 def _sensor(reader: BagReader, topic: Topic) -> Sensor | None:
-    if topic.type == "sensor_msgs/msg/PointCloud2":
-        return Sensor(topic, CLOUD)
-    if topic.type == "sensor_msgs/msg/LaserScan":
-        return Sensor(topic, LASER)
+    if topic.type in _KINDS:
+        return Sensor(topic, _KINDS[topic.type])
+    if topic.type in _LISTS:
+        return Sensor(topic, LIST, _LISTS[topic.type])
     if topic.type in (_IMAGE, _COMPRESSED_IMAGE):
         return _camera(reader, topic)
     if not topic.type.startswith(("sensor_msgs/", "std_msgs/", "geometry_msgs/", "nav_msgs/")):

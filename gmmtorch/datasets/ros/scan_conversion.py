@@ -15,6 +15,7 @@ from gmmtorch.datasets.ros import bag_reader, sensor_messages
 from gmmtorch.datasets.ros.bag_poses import PoseSource, RegisteredPoses
 from gmmtorch.datasets.ros.bag_reader import Sensor
 from gmmtorch.datasets.ros.image_camera import ImageCamera
+from gmmtorch.datasets.ros.lidar_packets import VelodynePackets
 from gmmtorch.datasets.ros.point_times import N_SAMPLES, PointTimes, Rate
 from gmmtorch.datasets.ros.sensor_messages import Reading
 from gmmtorch.errors import DataError
@@ -54,7 +55,8 @@ class ScanConversion:
         self._attributes = attributes
         self.source, self._camera = source, camera
         self._sensor, self._ranges = sensor, ranges
-        self._times = PointTimes(sensor.kind == bag_reader.LASER) if deskew and source.can_deskew else None
+        self._packets = VelodynePackets() if sensor.kind == bag_reader.PACKETS else None
+        self._times = PointTimes(sensor.kind in bag_reader.LASERS) if deskew and source.can_deskew else None
 
     def points(self, message: dict[str, Any]) -> Reading:
         """The points of a decoded message, in the sensor's frame."""
@@ -63,8 +65,10 @@ class ScanConversion:
             return sensor_messages.cloud_points(message, self._attributes)
         if kind == bag_reader.LIST:
             return sensor_messages.listed_points(message, self._sensor.field)
-        if kind == bag_reader.LASER:
+        if kind in bag_reader.LASERS:
             return sensor_messages.laser_points(message)
+        if self._packets is not None:
+            return self._packets.points(message)
         assert self._camera is not None
         return sensor_messages.reading(self._camera.points(message), None, None)
 
@@ -80,7 +84,7 @@ class ScanConversion:
         """
         planar = [is_planar(found) for found in samples if len(found.points) >= _MIN_PLANAR]
         is_planar_cloud = not self._sensor.is_camera and 2 * sum(planar) > len(planar)
-        is_planar_sensor = self._sensor.kind == bag_reader.LASER or is_planar_cloud
+        is_planar_sensor = self._sensor.kind in bag_reader.LASERS or is_planar_cloud
         return is_planar_sensor and self.is_level(poses)
 
     def learn_times(self, found: Reading, stamp: int, rate: Rate) -> None:

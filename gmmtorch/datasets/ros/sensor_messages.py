@@ -151,8 +151,9 @@ def listed_points(message: dict[str, Any], field: str) -> Reading:
 
 
 def laser_points(message: dict[str, Any]) -> Reading:
-    """The beam ends of a LaserScan. Infinite ranges and too long ones have no return."""
-    ranges = message["ranges"].astype(np.float64)
+    """The beam ends of a LaserScan, or the nearest echoes of a MultiEchoLaserScan. Infinite ranges and too
+    long ones have no return, and so have beams without an echo."""
+    ranges = _nearest_echoes(message["ranges"])
     farthest = float(message["range_max"])
     limit = farthest if 0 < farthest < np.inf else np.inf
     angles = float(message["angle_min"]) + np.arange(len(ranges)) * float(message["angle_increment"])
@@ -164,6 +165,17 @@ def laser_points(message: dict[str, Any]) -> Reading:
     points = np.stack([length * np.cos(angles), length * np.sin(angles), np.zeros_like(length)], 1)
     times, doubt = _beam_times(message, len(ranges))
     return reading(points, no_return, times)._replace(doubt=doubt)
+
+
+def _nearest_echoes(ranges: Any) -> np.ndarray:
+    """Ranges (N,), float64, in metres: of beams, or of beams with echoes, whose nearest counts."""
+    if isinstance(ranges, np.ndarray):
+        return ranges.astype(np.float64)
+    counts = np.array([len(beam["echoes"]) for beam in ranges], np.int64)
+    echoes = np.concatenate([np.empty(0), *(beam["echoes"] for beam in ranges)])
+    found = np.where(counts > 0, np.nan, np.inf)
+    np.fmin.at(found, np.repeat(np.arange(len(counts)), counts), np.where(echoes > 0, echoes, np.nan))
+    return found
 
 
 def _beam_times(message: dict[str, Any], n_beams: int) -> tuple[np.ndarray | None, str]:

@@ -1,0 +1,249 @@
+"""What a recording contains, what of it would be mapped, and which options would help: check=true."""
+
+from __future__ import annotations
+
+import datetime
+import textwrap
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+
+from gmmtorch import datasets
+from gmmtorch.cli import inputs
+from gmmtorch.datasets import NANOSECONDS, BagFacts, BagReader, Dataset, bag_facts, whole_or_intact
+from gmmtorch.errors import GmmTorchError, printable, told
+from gmmtorch.report import Row, byte_text, count_text, format_table
+
+_N_SAMPLES = 40  # scans that are read
+_MOST_TRIALS = 12  # openings of the recording with other options
+_CLOCKS_DIFFER = 0.5  # s
+_NEAREST, _FARTHEST = 0.03, 300.0  # m, of a usual median range
+_FASTEST = 60.0  # m/s of a usual robot
+_FEW_SCANS = 0.9  # share of scans below which other options are tried
+_OPTIONS = {name: f"dataset.{name}" for name in ("poses", "motion")}
+_DAY = 86_400.0  # s
+_LONG_GAP, _MANY_PERIODS = 1.0, 5  # s, and periods of the scans
+_MOVES = 0.05  # m of a path
+_WIDTH = 110
+
+
+def check(config: DictConfig) -> bool:
+    """Prints what the data set `dataset.*` contains and would give; returns whether a map can be built."""
+    options = config.dataset
+    facts = _bag(options) if options.name == "rosbag" else None
+    found, problem = None, ""
+    try:
+        found = inputs.open_dataset(options)
+    except GmmTorchError as error:
+        problem = str(error)
+    if found is not None and len(found) == 0:
+        problem = f"{found.name} has no scan."
+    advice = list(_clock_advice(facts)) if facts else []
+    share = 0.0
+    if found is not None and not problem:
+        share = _print_scans(found, advice)
+    else:
+        _print_wrapped("\nproblem    ", problem)
+    if facts is not None and share < _FEW_SCANS:
+        advice += _trials(options, facts, 0 if found is None else len(found))
+    print("\nadvice")
+    best = "no option that was tried helps; the problem above says what is missing"
+    good = "nothing looks wrong; build the map with the same options without check=true"
+    for number, text in enumerate(advice or [good if share else best], 1):
+        _print_wrapped(f"  {number}. ", text)
+    return share > 0
+
+
+def _print_wrapped(label: str, text: str) -> None:
+    print(
+        textwrap.fill(
+            printable(text), _WIDTH, initial_indent=label, subsequent_indent=" " * len(label.lstrip("\n"))
+        )
+    )
+
+
+# -- the bag -----------------------------------------------------------------------------------------
+
+
+def _bag(options: DictConfig) -> BagFacts | None:
+    """The facts of a bag, printed; None if it cannot be read at all, which the data set's error explains."""
+    path = Path(str(options.path)).expanduser()
+    try:
+        facts = whole_or_intact(
+            lambda is_salvaged: bag_facts(BagReader(path, is_salvaged)), options.damaged == "read"
+        )
+    except GmmTorchError:
+        return None
+    files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
+    begin = datetime.datetime.fromtimestamp(facts.first / NANOSECONDS, datetime.UTC)
+    n_messages = sum(one.topic.n_messages for one in facts.topics)
+    print(
+        f"\nrecording  {printable(str(path))}, {byte_text(sum(file.stat().st_size for file in files))}: "
+        f"{count_text(n_messages, 'message')} in {(facts.last - facts.first) / NANOSECONDS:.1f} s from "
+        f"{begin:%Y-%m-%d %H:%M:%S} UTC"
+    )
+    if facts.damage:
+        _print_wrapped("damage     ", facts.damage)
+    rows: list[Row] = [
+        {
+            "topic": printable(one.topic.name),
+            "type": printable(one.topic.type).replace("/msg/", "/"),
+            "messages": one.topic.n_messages,
+            "per_second": one.rate,
+            "longest_gap_s": one.gap,
+            "stamp_age_s": _age(one.offset),
+            "gives": printable(told(one.use, _OPTIONS)) or "nothing",
+        }
+        for one in facts.topics
+    ]
+    print(f"\n{format_table(rows)}" if rows else "\nIt has no topics.")
+    return facts
+
+
+def _age(offset: float | None) -> float | str | None:
+    return "another clock" if offset is not None and abs(offset) > _DAY else offset
+
+
+def _clock_advice(facts: BagFacts) -> Iterator[str]:
+    """Warnings of sensors whose stamps are of another clock than those of the poses."""
+    known = [one for one in facts.topics if one.offset is not None and one.use]
+    poses = [one for one in known if one.use.startswith("poses") and not one.topic.name.endswith("static")]
+    for sensor in (one for one in known if one.use.startswith("scans")):
+        for other in poses[:1]:
+            assert sensor.offset is not None
+            assert other.offset is not None
+            apart = sensor.offset - other.offset
+            if abs(apart) > _CLOCKS_DIFFER:
+                yield (
+                    f"stamps of {sensor.topic.name} and {other.topic.name} that were recorded together are "
+                    f"{abs(apart):,.1f} s apart: their clocks differ, which dataset.clock=received may mend"
+                )
+
+
+# -- scans and poses ---------------------------------------------------------------------------------
+
+
+def _print_scans(found: Dataset, advice: list[str]) -> float:
+    """Prints facts about scans and poses, and adds what looks wrong; returns the share of usable scans."""
+    n_scans = len(found)
+    indices = torch.linspace(0, n_scans - 1, min(n_scans, _N_SAMPLES)).long().unique().tolist()
+    scans, unread = [], []
+    for index in indices:
+        try:
+            scans.append(found[index])
+        except GmmTorchError as error:
+            unread.append(str(error))
+    n_left_out = sum(found.skipped.values())
+    topic = getattr(found, "topic", "")
+    usable = [scan for scan in scans if scan.n_beams]
+    text = f"\nscans      {n_scans:,} would be read{f' of {printable(topic)}' if topic else ''}"
+    print(text + (f", in {usable[0].dim}D" if usable else "") + _timing(found, advice))
+    if usable:
+        _print_ranges(usable, advice)
+    _print_poses(found, advice)
+    for reason, count in found.skipped.items():
+        print(f"note       {count_text(count, 'scan')}: {printable(reason)}")
+    for reason in dict.fromkeys(unread):
+        _print_wrapped("note       ", f"a scan cannot be read: {reason}")
+    share = len(usable) / max(len(indices), 1)
+    n_whole = n_scans * found.stride
+    return share * n_whole / (n_whole + n_left_out * (share == 1))
+
+
+def _timing(found: Dataset, advice: list[str]) -> str:
+    times = found.times
+    if times is None or len(times) < 2:
+        return ""
+    steps = times.diff()
+    middle, longest = float(steps.median()), float(steps.max())
+    if longest > max(_LONG_GAP, _MANY_PERIODS * middle):
+        begin = float(times[steps.argmax()] - times[0])
+        advice.append(
+            f"no scan for {longest:.1f} s from {begin:.1f} s on: the map lacks what was passed there"
+        )
+    rate = f" at {1 / middle:.1f} a second" if middle > 0 else ""
+    return f"{rate}; the longest gap is {longest:.2f} s"
+
+
+def _print_ranges(scans: list[Any], advice: list[str]) -> None:
+    ranges = torch.cat([(scan.points - scan.origin).norm(dim=1).double() for scan in scans])
+    counts = torch.tensor([len(scan.points) for scan in scans]).double()
+    n_beams = sum(scan.n_beams for scan in scans)
+    text = f"           {int(counts.median()):,} points in a scan (median of {len(scans)})"
+    if len(ranges):
+        low, middle, high = (float(ranges.sort().values[int(q * (len(ranges) - 1))]) for q in (0, 0.5, 1))
+        text += f", {low:.2f} to {high:.1f} m away, half of them within {middle:.2f} m"
+        if not _NEAREST < middle < _FARTHEST:
+            advice.append(
+                f"half of the points are within {middle:.3g} m, which is unusual: is the unit metres? "
+                "dataset.depth_scale states the unit of depth images; convert other recordings"
+            )
+    if len(ranges) < n_beams:
+        text += f"; {1 - len(ranges) / n_beams:.0%} of the beams have no return"
+    print(text)
+
+
+def _print_poses(found: Dataset, advice: list[str]) -> None:
+    if found.pose(0) is None:
+        print("poses      none in the data set")
+        advice.append("the data set states no poses; estimate them: dataset.odometry=auto")
+        return
+    poses = torch.stack([pose for i in range(len(found)) if (pose := found.pose(i)) is not None])
+    steps = poses[:, :-1, -1].diff(dim=0).norm(dim=1)
+    text = f"poses      for all of them; path of {float(steps.sum()):.1f} m"
+    times = found.times
+    if times is not None and len(times) > 1:
+        speed = float((steps / times.diff().clamp_min(1e-3)).max())
+        text += f", at most {speed:.1f} m/s"
+        if speed > _FASTEST:
+            advice.append(
+                f"poses jump: {speed:,.0f} m/s between two scans; estimate them: dataset.odometry=mixture"
+            )
+    print(text)
+    if float(steps.sum()) < _MOVES and len(poses) > 1:
+        advice.append(
+            "by its poses the sensor stands still; if it moved, estimate them: dataset.odometry=mixture"
+        )
+
+
+# -- other options -----------------------------------------------------------------------------------
+
+
+def _trials(options: DictConfig, facts: BagFacts, n_found: int) -> list[str]:
+    """Options with which more scans can be read, each tried on the recording."""
+    given = {str(key): options[key] for key in options if options[key] is not None}
+    for name in ("name", "path", "odometry", "motion"):
+        given.pop(name, None)
+    sensors = [one.topic.name for one in facts.topics if one.use.startswith("scans")]
+    topics: list[Mapping[str, Any]] = [{"topic": name} for name in sensors] if options.topic is None else [{}]
+    sources = [one.topic.name for one in facts.topics if one.use.startswith("poses, if")]
+    changes: list[Mapping[str, Any]] = [
+        {},
+        *({"poses": name} for name in sources),
+        {"clock": "received"},
+        {"max_gap": 10.0},
+        {"poses": "standing"},
+    ]
+    advice, n_trials = [], 0
+    for chosen in topics if len(sensors) > 1 else [{}]:
+        for change in changes:
+            tried = {**chosen, **change}
+            if not tried or n_trials == _MOST_TRIALS:
+                continue
+            n_trials += 1
+            try:
+                n_scans = len(datasets.load("rosbag", options.path, **{**given, **tried}))
+            except GmmTorchError:
+                continue
+            if n_scans > n_found:
+                if change.get("poses") == "standing":
+                    tried = {**chosen, "odometry": "auto"}
+                words = " ".join(f"dataset.{name}={value}" for name, value in tried.items())
+                note = " with poses estimated from the scans" if "odometry" in tried else ""
+                advice.append(f"{words} reads {count_text(n_scans, 'scan')}{note}")
+                if not change or change.get("poses") in sources:
+                    break
+    return advice

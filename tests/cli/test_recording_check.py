@@ -1,0 +1,150 @@
+"""gmmtorch-map check=true: what it says of recordings, and that its advice is right."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_runs import QUIET, Finished, run_here
+
+pytest.importorskip("rosbags")
+
+from sensor_bags import BagWriter
+
+from gmmtorch.export.bag import cloud_fields
+
+Run = Callable[..., Finished]
+RING = np.stack(
+    [4 * np.cos(np.arange(0, 6.2, 0.1)), 3 * np.sin(np.arange(0, 6.2, 0.1)), np.arange(62) / 60], 1
+)
+
+
+def moved(x: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[0, 3] = x
+    return pose
+
+
+@pytest.fixture
+def check(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
+    def run(path: Path, *options: str) -> Finished:
+        given = [f"dataset.path={path}", "check=true", *QUIET, *options]
+        return run_here(monkeypatch, "map", tmp_path / "run", *given)
+
+    return run
+
+
+def words(done: Finished) -> str:
+    return " ".join(done.stdout.split())
+
+
+def bag(
+    path: Path, sensor_delay: float = 0.0, scale: float = 1.0, odometry: str = "tf", gap: int = 0
+) -> Path:
+    """A drive of 20 clouds, whose stamps may be those of another clock, with poses every 0.05 s."""
+    with BagWriter(path) as writer:
+        for i in range(120):
+            if odometry == "tf":
+                writer.transforms(i * 0.05, {("odom", "lidar"): moved(i * 0.05)})
+            elif odometry:
+                writer.odometry(odometry, i * 0.05, "odom", "lidar", moved(i * 0.05))
+        for i in range(20):
+            time = i * 0.1 + (3.0 if 0 < gap <= i else 0.0)
+            table = np.ascontiguousarray(RING * scale, "<f4").view([(axis, "<f4") for axis in "xyz"])[:, 0]
+            fields = cloud_fields("lidar", table)
+            writer.message("/points", "sensor_msgs/msg/PointCloud2", time - sensor_delay, fields, time)
+    return path
+
+
+def test_a_good_bag_has_a_table_and_no_advice(check, tmp_path):
+    done = check(bag(tmp_path / "a.mcap"), "dataset=rosbag")
+    assert done.status == 0
+    assert re.search(r"/points +sensor_msgs/PointCloud2 +20 +10 +0.1 .* scans \(cloud\)", done.stdout)
+    assert re.search(r"/tf +tf2_msgs/TFMessage +120 +20 +0.05 .* poses \(TF\)", done.stdout)
+    assert "scans 20 would be read of /points, in 3D at 10.0 a second" in words(done)
+    assert "62 points in a scan" in done.stdout
+    assert "path of 1.9 m, at most 1.0 m/s" in done.stdout
+    assert "1. nothing looks wrong" in done.stdout
+    assert not list(done.folder.glob("*.safetensors"))
+
+
+@pytest.mark.parametrize(
+    ("options", "advice"),
+    [
+        ({"odometry": "/odom"}, "dataset.poses=/odom reads 20 scans"),
+        ({"odometry": ""}, "dataset.odometry=auto reads 20 scans with poses estimated from the scans"),
+        ({"sensor_delay": 5000.0}, "dataset.clock=received reads 20 scans"),
+    ],
+)
+def test_its_advice_reads_the_recording(check, tmp_path, options, advice):
+    path = bag(tmp_path / "a.mcap", **options)
+    refused = check(path, "dataset=rosbag")
+    assert refused.status == 1
+    assert "problem" in refused.stdout
+    assert advice in words(refused)
+    helped = check(path, "dataset=rosbag", advice.split()[0])
+    assert helped.status == 0
+    assert "20 would be read" in helped.stdout
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"scale": 1000.0}, "is the unit metres?"),
+        ({"gap": 10}, "no scan for 3.1 s from 0.9 s on"),
+        ({"sensor_delay": 0.7}, "are 0.7 s apart: their clocks differ"),
+    ],
+)
+def test_what_looks_wrong_is_said(check, tmp_path, options, text):
+    assert text in words(check(bag(tmp_path / "a.bag", **options), "dataset=rosbag", "dataset.max_gap=9"))
+
+
+def test_damage_and_files_that_are_no_bags(check, tmp_path):
+    path = bag(tmp_path / "a.db3")
+    path.write_bytes(path.read_bytes()[:-12_288])
+    done = check(path, "dataset=rosbag")
+    assert re.search(r"damage +\d+ messages in .* s are intact", done.stdout)
+    assert "dataset.damaged=refuse" not in done.stdout
+    path.write_bytes(b"nothing" * 100)
+    done = check(path, "dataset=rosbag")
+    assert done.status == 1
+    assert "cannot be read as a ROS bag" in words(done)
+    assert "no option that was tried helps" in done.stdout
+
+
+def test_folders_of_scans(check, tmp_path):
+    (tmp_path / "scans").mkdir()
+    done = check(tmp_path, "dataset=scan_folder")
+    assert done.status == 1
+    assert "contains no .pcd" in words(done)
+    for i in range(3):
+        rows = "\n".join(" ".join(map(str, point)) for point in RING)
+        header = "ply\nformat ascii 1.0\nelement vertex 62\n"
+        header += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
+        (tmp_path / "scans" / f"{i}.ply").write_text(f"{header}{rows}\n")
+    (tmp_path / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
+    done = check(tmp_path, "dataset=scan_folder")
+    assert done.status == 0
+    assert "the sensor stands still" in words(done)
+
+
+def test_names_cannot_control_the_terminal(check, tmp_path):
+    """Those of topics, frames and files, in the table, the error and the log."""
+    evil = "\x1b]0;owned\x07\x1b[31m"
+    path = tmp_path / f"a{evil}.mcap"
+    with BagWriter(path) as writer:
+        for i in range(9):
+            writer.transforms(i * 0.1, {(f"odom{evil}", f"lidar{evil}"): moved(i * 0.1)})
+            table = np.ascontiguousarray(RING, "<f4").view([(axis, "<f4") for axis in "xyz"])[:, 0]
+            fields = cloud_fields(f"odom{evil}", table)
+            writer.message(f"/points{evil}", "sensor_msgs/msg/PointCloud2", i * 0.1, fields)
+    for options in (["dataset.topic=/none"], []):
+        done = check(f"'{path}'", "dataset=rosbag", *options)
+        assert "owned" in done.stdout
+        assert "\x1b" not in done.stdout + done.stderr
+    log = (done.folder / "map.log").read_text()
+    assert "points are in the fixed frame" in log
+    assert "\x1b" not in log

@@ -1,0 +1,31 @@
+"""scripts/fuzz.py finds no fault in a short run, and finds one that is there."""
+
+from __future__ import annotations
+
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+
+FUZZ = Path(__file__).resolve().parents[1] / "scripts" / "fuzz.py"
+
+
+@pytest.mark.slow
+def test_a_short_run_finds_nothing(monkeypatch, tmp_path, capfd):
+    options = ["--inputs", "200", "--targets", "trajectory,png,pcd", "--folder", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", ["fuzz.py", *options])
+    assert runpy.run_path(str(FUZZ))["main"]() == 0, capfd.readouterr().out
+
+
+@pytest.mark.slow
+def test_faults_are_found_and_their_inputs_kept(tmp_path):
+    script = runpy.run_path(str(FUZZ))
+
+    def read(path: Path) -> None:
+        raise KeyError(path.name)
+
+    outcomes = list(script["batch"](script["Target"]({"a.txt": b"sound"}, read), 0, 5, tmp_path))
+    assert len(outcomes) == 5
+    assert all(outcome.startswith("fault: KeyError") for outcome in outcomes)
+    assert list(tmp_path.glob("fault-*-a.txt"))
