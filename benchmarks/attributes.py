@@ -156,8 +156,8 @@ def measure(options: Any) -> Iterator[Row]:
         rows = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:N_POINTS]
         points, values = points[rows], values[rows]
         for budget in BUDGETS[name]:
-            plain = min(built(train, budget, False)[1] for _ in range(3))
-            made, seconds = min((built(train, budget, True) for _ in range(3)), key=lambda pair: pair[1])
+            plain = min(built(train, budget, False)[1] for _ in range(2))
+            made, seconds = min((built(train, budget, True) for _ in range(2)), key=lambda pair: pair[1])
             found = made.attributes(points)[channel]
             value = found.most_likely if channel == "class" else found.mean
             size = f"map, {len(made.components()):,} components"

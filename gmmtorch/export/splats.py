@@ -124,7 +124,7 @@ def _spz(splats: Splats) -> bytes:
         _packed_quaternions(splats.quaternions().numpy()),
     ]
     header = _SPZ_HEADER.pack(_SPZ_MAGIC, _SPZ_VERSION, len(splats.means), 0, fraction, 0, 0)
-    return gzip.compress(header + b"".join(part.tobytes() for part in parts), mtime=0)
+    return gzip.compress(header + b"".join(part.tobytes() for part in parts), 6, mtime=0)
 
 
 def _bytes(values: Tensor) -> np.ndarray:
