@@ -112,10 +112,10 @@ class MixtureDensity(DensityMixin, BaseEstimator, DeviceModule):
         center = (self.weights[:, None] * self.means).sum(0)
         full = Parameters(self.weights, self.means - center, self.covariances)
         parts = points.split(max(64, chunk_elements(points.device) // k))
-        if em.is_ill_conditioned(full) or bool(((points - center).abs() > _FAR).any()):
+        natural = em.natural_parameters(full)
+        if em.is_ill_conditioned(full, natural) or bool(((points - center).abs() > _FAR).any()):
             yield from (em.log_joint(part - center, full).T for part in parts)
             return
-        natural = em.natural_parameters(full)
         yield from (natural @ em.quadratic_features(part - center).T for part in parts)
 
     def _typed_joint(self) -> by_type.Joint:

@@ -144,14 +144,15 @@ def feature_dimension(n_features: int) -> int:
 # -- the direct form: slower, without cancellation ------------------------------------------------
 
 
-def is_ill_conditioned(parameters: Parameters) -> bool:
-    """Whether natural parameters lose more than about 1e-6 nats to cancellation in float64.
+def is_ill_conditioned(parameters: Parameters, natural: Tensor | None = None) -> bool:
+    """Whether the natural parameters, given if known, lose more than about 1e-6 nats to cancellation.
 
     φ·W sums terms as large as μᵀΣ⁻¹μ to a few nats. For a component 1 mm thick this fails 10 km from the
     centre of the cloud.
     """
     weights, means, _ = parameters
-    size = (natural_parameters(parameters)[:, 1 : 1 + means.shape[1]] * means).sum(1)
+    natural = natural_parameters(parameters) if natural is None else natural
+    size = (natural[:, 1 : 1 + means.shape[1]] * means).sum(1)
     return bool((size * weights.sign()).max() * torch.finfo(size.dtype).eps > 1e-6)
 
 
