@@ -4,14 +4,18 @@
     OMP_NUM_THREADS=1 python benchmarks/growing_world.py --data $GMMTORCH_DATA
 
 `growing-world` has embedded halls side by side. `growing-map` has the scans of the folder `street`: after
-each one the map is asked about 500 points on its beams.
+each one the map is asked about 500 points on its beams. `growing-tiles` has a city in tiles on disk.
 """
 
 from __future__ import annotations
 
 import math
+import tempfile
 import time
 from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from itertools import islice
 from typing import Any
 
 import torch
@@ -20,10 +24,13 @@ from gmmtorch import GaussianMap, IncrementalRule, Scan, datasets
 from gmmtorch.datasets.base import Dataset
 from gmmtorch.experiments.harness import Case, Row, cpu_seconds, recording, run
 from gmmtorch.kernels import kernels
+from gmmtorch.mapping import TiledMap
+from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.map_builder import resident_bytes
 
 N_SCANS, APART = 24, 40.0  # scans of a hall; metres from one hall to the next
 N_POINTS = 500  # of a query after a scan
+PART = 200_000  # components of a city that are in memory
 PER_HALL = 1000  # components, where there is a budget
 
 
@@ -52,7 +59,6 @@ def asked_after_each_scan(scans: Dataset, choice: str) -> Iterator[Row]:
             points = scan.origin + share * (scan.points[chosen] - scan.origin)
             begin = time.process_time()
             built.insert(scan)
-            built.finish()
             learned = time.process_time()
             built.occupancy(points)
             spent.append((learned - begin, time.process_time() - learned))
@@ -79,6 +85,47 @@ def growing_map(options: Any) -> Iterator[Row]:
     )
 
 
+def city(found: Components, n_components: int) -> Iterator[Components]:
+    """At least so many components: the given ones side by side, in parts."""
+    n = -(-n_components // len(found))
+    row, size = math.isqrt(n - 1) + 1, 1.1 * (found.means.amax(0) - found.means.amin(0))
+    shifts = torch.zeros(n, found.dim, dtype=torch.float64)
+    shifts[:, 0], shifts[:, 1] = torch.arange(n) % row * size[0], torch.arange(n) // row * size[1]
+    for some in shifts.split(PART // len(found)):
+        moved = [replace(found, means=found.means + s, origins=found.origins + s) for s in some]
+        yield Components.concatenate(moved)
+
+
+def growing_tiles(options: Any) -> Iterator[Row]:
+    scans = list(islice(recording(options.data, "street"), 66))
+    source = GaussianMap()
+    for scan in scans:
+        source.insert(scan)
+    found, generator = source.components(), torch.Generator().manual_seed(0)
+    for size in options.components:
+        begin, calibration = resident_bytes(), source.query_options.calibration
+        with tempfile.TemporaryDirectory() as folder:
+            tiled = TiledMap.create(folder, GaussianMap(calibration=calibration), 3, memory=options.memory)
+            written = 0.0
+            for part in city(found, size):
+                written += cpu_seconds(partial(tiled.add, part))[0]
+            tiled = TiledMap(folder, memory=options.memory)
+            spent: list[tuple[float, float]] = []
+            for scan in scans[:44]:
+                chosen = torch.randint(len(scan.points), (N_POINTS,), generator=generator)
+                share = torch.rand(N_POINTS, 1, generator=generator, dtype=torch.float64)
+                points = scan.origin + share * (scan.points[chosen] - scan.origin)
+                spent.append(
+                    (
+                        cpu_seconds(partial(tiled.insert, scan))[0],
+                        cpu_seconds(partial(tiled.occupancy, points))[0],
+                    )
+                )
+            learning, query = (1e3 * torch.tensor(spent)).mean(0).tolist()
+            held = (resident_bytes() - begin) / 1e6
+            yield tiled.n_components, len(tiled.index), tiled.nbytes / 1e6, written, learning, query, held
+
+
 def growing_world(options: Any) -> Iterator[Row]:
     scans = list(datasets.load("synthetic_building", n_scans=N_SCANS))
     milliseconds(scans, 1, IncrementalRule())  # what is loaded but once
@@ -90,6 +137,15 @@ def growing_world(options: Any) -> Iterator[Row]:
 
 COSTS = {"halls": ".0f", "components": ",.0f", "no budget": ".0f", f"{PER_HALL:,} components a hall": ".0f"}
 SPENT = ("scans", "components", "learning, ms a scan", "query, ms", "longest query, ms", "MB")
+TILED = (
+    "components",
+    "tiles",
+    "MB on disk",
+    "written in, s",
+    "learning, ms a scan",
+    "query, ms",
+    "MB in memory",
+)
 CASES = (
     Case(
         "growing-world",
@@ -106,8 +162,17 @@ CASES = (
         {"kernels": "", **dict.fromkeys(SPENT, ".0f")},
         key=2,
     ),
+    Case(
+        "growing-tiles",
+        growing_tiles,
+        "A city of streets side by side, in tiles of 100 m on disk; then 44 scans of 19,000 points, each "
+        "followed by a query of 500 points. Tiles hold at most the bytes of --memory between queries.",
+        {**dict.fromkeys(TILED, ".0f"), "components": ",.0f", "MB on disk": ".1f"},
+    ),
 )
 
 if __name__ == "__main__":
     halls = {"type": int, "nargs": "+", "default": [1, 4, 16], "help": "square numbers"}
-    run(__doc__, *CASES, halls=halls)
+    components = {"type": int, "nargs": "+", "default": [1000, 100_000, 1_000_000], "help": "of the cities"}
+    memory = {"type": int, "default": 10**8, "help": "bytes of the tiles in memory"}
+    run(__doc__, *CASES, halls=halls, components=components, memory=memory)

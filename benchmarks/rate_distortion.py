@@ -28,13 +28,13 @@ import joblib
 import torch
 from frames import RESOLUTIONS, SEED, Frame, material
 from pages import ROOT
+from rate_distortion_figures import QUALITIES, bytes_for, figures, leads
 from torch import Tensor
 
 from gmmtorch import GaussianMap, IncrementalRule
 from gmmtorch.experiments.evaluation.metrics import psnr_terms
 from gmmtorch.experiments.evaluation.queries import Queries
 from gmmtorch.experiments.harness import Case, Row, run, score
-from gmmtorch.experiments.report.rate_distortion_figures import QUALITIES, bytes_for, figures, leads
 from gmmtorch.mapping.codec.quantization import spatial_order
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.fitting import SurfaceFit, fit_points
@@ -232,8 +232,8 @@ def row(
         "nbytes": statistics.mean(map(len, data)),
         "psnr2_db": statistics.mean(map(sum, terms)),  # infinite where nothing is lost
         "psnr_lesser_db": statistics.mean(map(min, terms)),
-        "psnr_forward_db": statistics.mean(term.forward for term in terms),
-        "psnr_backward_db": statistics.mean(term.backward for term in terms),
+        "psnr_forward_db": statistics.mean(forward for forward, _ in terms),
+        "psnr_backward_db": statistics.mean(backward for _, backward in terms),
         "auc": scores[best],
         "receiver": best,
         "auc_of_receivers": scores,

@@ -12,9 +12,9 @@ from .common import logger as logger
 from .common import print_files as print_files
 from .common import print_table as print_table
 from .common import run_dir as run_dir
-from .common import save_figures as save_figures
 from .common import set_up as set_up
 from .common import show as show
+from .common import show_figures as show_figures
 from .common import write_results as write_results
 from .inputs import all_scans as all_scans
 from .inputs import chosen_map as chosen_map

@@ -214,6 +214,7 @@ def _result_of(run: Callable[[DictConfig], Any], config: DictConfig) -> Any:
     `MemoryLimitError` if the memory of the device is too small.
     """
     common.check_inputs(config)
+    common.print_start()
     try:
         return run(config)
     except RuntimeError as error:

@@ -6,6 +6,7 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -106,6 +107,13 @@ def is_job_of_sweep() -> bool:
     return config.mode == RunMode.MULTIRUN and config.output_subdir is not None
 
 
+def print_start() -> None:
+    """Print the folder of the run, before the imports that take seconds; not in a sweep, or without files."""
+    config = HydraConfig.get()
+    if config.mode == RunMode.RUN and config.output_subdir is not None:
+        print(f"gmmtorch-{config.job.config_name} writes to {run_dir()}", flush=True)
+
+
 def drop_unwritable() -> None:
     """Drops text that standard error does not take, as on a full disk, and all later text.
 
@@ -183,14 +191,17 @@ def write_results(command: str, config: DictConfig, rows: list[Row], folder: Pat
     return write_json(folder / "results.json", results)
 
 
-def save_figures(config: DictConfig, figures: Mapping[str, Any], folder: Path) -> None:
-    """Write every figure as NAME.png if `report.figures` is set."""
-    if not config.report.figures:
-        return
-    from gmmtorch.report import save_figure
+def show_figures(config: DictConfig, figures: Mapping[str, Any], folder: Path, board: Board | None) -> None:
+    """Write every figure as NAME.png if `report.figures` is set, and to TensorBoard if there is a board."""
+    from gmmtorch.files import write_bytes
+    from gmmtorch.report import picture
 
     for name, figure in figures.items():
-        save_figure(figure, folder / f"{name}.png")
+        png = picture(figure)
+        if config.report.figures:
+            write_bytes(folder / f"{name}.png", png)
+        if board is not None:
+            board.figure(f"figures/{name}", png)
 
 
 def show(
@@ -207,15 +218,13 @@ def show(
     """
     if not (config.report.figures or config.report.tensorboard):
         return
-    made = figures()
-    save_figures(config, made, folder)
-    if config.report.tensorboard:
-        from gmmtorch.report import Board
+    from gmmtorch.report import Board
 
-        with Board(folder / "tensorboard") as board:
+    made = figures()
+    with Board(folder / "tensorboard") if config.report.tensorboard else nullcontext() as board:
+        if board is not None:
             write(board)
-            for name, figure in made.items():
-                board.figure(f"figures/{name}", figure)
+        show_figures(config, made, folder, board)
 
 
 def print_table(rows: Sequence[Row], columns: Sequence[str], title: str) -> None:

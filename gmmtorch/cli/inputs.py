@@ -5,24 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from gmmtorch import datasets
+from gmmtorch import datasets, localization  # whose parts load when they are used
 from gmmtorch.cli import common, schema
 from gmmtorch.datasets import Dataset, Reposed
 from gmmtorch.errors import DataError, InvalidArgumentError, arg, check_choice
-from gmmtorch.localization import (
-    METHODS,
-    MOTIONS,
-    UNSCORED,
-    Trajectory,
-    absolute_trajectory_error,
-    relative_pose_error,
-    with_odometry,
-)
 from gmmtorch.mapping import (
     INDEX,
     SOFTMAX_DTYPES,
@@ -35,6 +26,9 @@ from gmmtorch.mapping import (
 )
 from gmmtorch.report import Event, Row
 from gmmtorch.scan import Scan
+
+if TYPE_CHECKING:
+    from gmmtorch.localization import Trajectory
 
 _WITHOUT_POSES = ("scan_folder", "rosbag")  # data sets that `dataset.poses=standing` reads without poses
 
@@ -67,8 +61,9 @@ def _opened(config: DictConfig) -> OpenedDataset:
     }
     method, name = options.pop("odometry", "none"), options.pop("name")
     motion = options.pop("motion", "constant")
-    check_choice("odometry", method, ("none", "auto", *METHODS))
-    check_choice("motion", motion, MOTIONS)
+    if (method, motion) != ("none", "constant"):
+        check_choice("odometry", method, ("none", "auto", *localization.METHODS))
+        check_choice("motion", motion, localization.MOTIONS)
     if method == "none" and motion != "constant":
         raise InvalidArgumentError(
             f"motion={motion} predicts the poses of odometry, but {arg('odometry')}=none estimates no poses; "
@@ -89,7 +84,7 @@ def _opened(config: DictConfig) -> OpenedDataset:
 
 def _with_odometry(source: Dataset, method: str, motion: str, has_truth: bool) -> OpenedDataset:
     """The data set with estimated poses. Prints the errors against its own poses, if it has some."""
-    posed, trajectory = with_odometry(source, method, motion=motion)
+    posed, trajectory = localization.with_odometry(source, method, motion=motion)
     facts: Row = {
         "method": method,
         "n_lost": int((~trajectory.found).sum()),
@@ -106,16 +101,16 @@ def _with_odometry(source: Dataset, method: str, motion: str, has_truth: bool) -
 
 def _trajectory_scores(posed: Reposed, trajectory: Trajectory, has_truth: bool) -> Row:
     """ATE and RPE against the data set's own poses; None where they cannot be computed."""
-    scores: Row = {"align": None, **UNSCORED}
+    scores: Row = {"align": None, **localization.UNSCORED}
     if not has_truth or len(posed) < 3:
         return scores
     true = torch.stack([posed.own_pose(index) for index in range(len(posed))])
-    scores |= relative_pose_error(trajectory.poses, true).scores("rpe")
+    scores |= localization.relative_pose_error(trajectory.poses, true).scores("rpe")
     try:
-        ate = absolute_trajectory_error(trajectory.poses, true, "rigid").scores("ate")
+        ate = localization.absolute_trajectory_error(trajectory.poses, true, "rigid").scores("ate")
         return scores | ate | {"align": "rigid"}
     except InvalidArgumentError:  # positions on a line determine no rotation
-        ate = absolute_trajectory_error(trajectory.poses, true, "first").scores("ate")
+        ate = localization.absolute_trajectory_error(trajectory.poses, true, "first").scores("ate")
         return scores | ate | {"align": "first"}
 
 

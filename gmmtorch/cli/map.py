@@ -102,7 +102,8 @@ def run(config: DictConfig) -> None:
             map_outputs.write_estimated_poses(dataset, poses, folder)
         exported, errors = map_outputs.write_exports(config, target, folder, bars)
         common.write_results("map", config, [row], folder)
-        map_outputs.draw(config, target, [trajectory], row, folder)
+        paths = map_outputs.odometry_figure(dataset, poses, row) if config.report.figures else None
+        map_outputs.draw(config, target, [trajectory], row, folder, paths)
     checkpoint.remove()
     common.print_table([row], TABLE.split(), f"{dataset.name}: {row['n_scans']} scans")
     map_outputs.print_skipped(builder.skipped)

@@ -17,4 +17,5 @@ from .tracker import scan_times as scan_times
 from .trajectory_errors import ALIGNMENTS as ALIGNMENTS
 from .trajectory_errors import UNSCORED as UNSCORED
 from .trajectory_errors import absolute_trajectory_error as absolute_trajectory_error
+from .trajectory_errors import aligned as aligned
 from .trajectory_errors import relative_pose_error as relative_pose_error

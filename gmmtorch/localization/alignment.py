@@ -19,10 +19,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels import AlignmentSums, alignment_sums
+from gmmtorch.kernels import AlignmentSums, NearLists, alignment_sums
 from gmmtorch.mapping import Components
 from gmmtorch.mixture import Parameters, merge_components
-from gmmtorch.occupancy import ConeIndex, Cones
 from gmmtorch.pose import Pose
 
 CUTOFF = 3.5
@@ -32,7 +31,8 @@ _OUTLIERS = 0.05  # ε, relative to the peak of a component
 _EXPLAINED = 0.1  # q above which components explain a point
 _SETTLED = 0.05  # of the blur: steps below this end a climb
 _SADDLE = 0.05  # of EM's information: with less curvature Newton's step is too long
-_ENTRIES = {2: 16, 3: 64}  # of the index, for each component
+_SIDE = 2.0  # blurs of a cell of the lists
+_MOST_CELLS = 1 << 20  # of the lists, and entries
 _RIDGE = 1e-9
 _TURNED = math.radians(10)  # between the headings of neighbouring starts, for each metre between their places
 _FLAT = 0.25  # of the next deviation: thinner components have a face
@@ -66,20 +66,41 @@ class AlignmentTarget:
     def __init__(self, surfaces: Parameters, blur: float, normals: Tensor | None = None) -> None:
         means, dim = surfaces.means, surfaces.means.shape[1]
         covariances = surfaces.covariances + blur**2 * torch.eye(dim).to(means)
-        normals = torch.zeros_like(means) if normals is None else normals
+        normals = torch.zeros_like(means) if normals is None else normals.to(means)
         self.blur, self.means, self.normals = blur, means.contiguous(), normals.contiguous()
         self.precisions = torch.linalg.inv(covariances).contiguous()  # else each sum would copy them
-        nothing = torch.zeros(len(means), dtype=torch.bool, device=means.device)
-        # A cone whose sensor is at the component's mean is the component's ellipsoid.
-        ellipsoids = Cones(means, covariances, means, surfaces.weights, nothing)
-        self.index = ConeIndex(ellipsoids, 1e-3 * blur, CUTOFF, entries_per_cone=_ENTRIES[dim], smallest=True)
+        self.lists = _near_lists(means, covariances, blur)
 
     def sums(self, points: Tensor, motions: Pose) -> AlignmentSums:
         """ℓ of points (N, D) under each motion, and its derivatives."""
-        lists = self.index.buckets(motions.apply(points).flatten(0, 1)), *self.index.lists
         target = self.means, self.precisions, self.normals
         limits = self.blur, CUTOFF**2, _OUTLIERS, _EXPLAINED
-        return alignment_sums(points, motions.parts, lists, target, limits)
+        return alignment_sums(points, motions.parts, self.lists, target, limits)
+
+
+def _near_lists(means: Tensor, covariances: Tensor, blur: float) -> NearLists:
+    """For each cell of a lattice, the components whose box of `CUTOFF` deviations meets it."""
+    half = CUTOFF * covariances.diagonal(dim1=1, dim2=2).sqrt()
+    low = (means - half).amin(0)
+    side = _SIDE * blur
+    while True:
+        first, last = (((means + way * half - low) / side).floor().clamp_min(0).long() for way in (-1, 1))
+        shape = last.amax(0) + 1
+        n_each = (last - first + 1).prod(1)
+        if math.prod(shape.tolist()) <= _MOST_CELLS and int(n_each.sum()) <= _MOST_CELLS:
+            break
+        side *= 1.5
+    row = torch.repeat_interleave(n_each)
+    rest = torch.arange(len(row), device=row.device) - (n_each.cumsum(0) - n_each)[row]
+    cell, stride = torch.zeros_like(row), torch.ones_like(shape[0])
+    for axis in range(means.shape[1] - 1, -1, -1):
+        width = (last - first + 1)[row, axis]
+        cell = cell + (first[row, axis] + rest % width) * stride
+        rest, stride = rest // width, stride * shape[axis]
+    order = cell.argsort(stable=True)
+    n_before = torch.bincount(cell, minlength=math.prod(shape.tolist())).cumsum(0)
+    starts = torch.cat([n_before.new_zeros(1), n_before])
+    return NearLists(low, side, shape, starts, row[order].int())
 
 
 def seen_normals(surfaces: Components) -> Tensor:

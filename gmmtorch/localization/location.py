@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
+from gmmtorch.localization.pose_search import CORRELATED
 from gmmtorch.pose import Pose, skew
 
 UNSEEN = 10.0
 """Metres of standard deviation of a direction that no surface fixes."""
-
-CORRELATED = 10.0
-"""Points that share one error, that of their component (measured on a hall and an office)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,12 +25,14 @@ class Location:
         the sensor, F = D + D(D−1)/2. No direction has a standard deviation above 10 m.
     explained: share of the points that lie on surfaces of the map.
     doubts: reasons against the pose; the sensor is `found` if there are none.
+    probability: that the pose is right; NaN if it is not estimated.
     """
 
     pose: Tensor
     covariance: Tensor
     explained: float
     doubts: tuple[str, ...]
+    probability: float = math.nan
 
     @property
     def found(self) -> bool:

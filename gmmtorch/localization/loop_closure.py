@@ -12,9 +12,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.localization.local_map import Expectation, Keyframe, LocalMap
+from gmmtorch.localization.local_map import Keyframe, LocalMap
 from gmmtorch.localization.location import Location
 from gmmtorch.localization.pose_graph import Edges, optimised
+from gmmtorch.localization.pose_search import Expectation
 from gmmtorch.mapping import WindowedRule
 from gmmtorch.pose import Pose
 
@@ -23,6 +24,7 @@ _APART = 15  # keyframes between two visits of a place
 _REACH = 3.0  # metres between the places of a closure, and
 _DRIFT = 0.02  # metres for each metre of path between both, up to
 _FARTHEST = 10.0  # metres
+_FROM_LOST = 20.0  # metres between places of different parts, whose relative poses are a guess
 _NEIGHBOURS = 3  # keyframes before and after an old one, in the map of its place
 _SPACING = 3  # every third keyframe looks for closures
 _MOST_EXPLAINED = 0.8  # share of the points that a closure explains at least
@@ -48,6 +50,7 @@ def closed(
     poses: Pose,
     edges: Edges,
     places: Sequence[tuple[int, Keyframe]],
+    parts: Tensor,
     least_explained: float,
     rule: WindowedRule,
 ) -> Edges:
@@ -55,14 +58,18 @@ def closed(
 
     Args:
         poses: (N), world ← sensor. edges: of odometry.
-        places: number of the pose, and keyframe, in order.
+        places: number of the pose, and keyframe, in order. parts: (K,), of the keyframes; between two parts
+            the sensor was lost, and the poses of one relative to the other are a guess.
     """
     tried: set[tuple[int, int]] = set()
     for _ in range(_ROUNDS):
-        pairs = [
-            pair for pair in _candidates(poses.translation[[at for at, _ in places]]) if pair not in tried
+        at = poses.translation[[number for number, _ in places]]
+        pairs = [pair for pair in _candidates(at, parts=parts) if pair not in tried]
+        found = [
+            edge
+            for old, new in pairs
+            if (edge := _closure(poses, places, old, new, least_explained, rule, parts))
         ]
-        found = [edge for pair in pairs if (edge := _closure(poses, places, *pair, least_explained, rule))]
         tried.update(pairs)
         if not found:
             break
@@ -141,10 +148,13 @@ def _edges(closures: Sequence[_Closure]) -> Edges:
     )
 
 
-def _candidates(at: Tensor, rows: Sequence[int] | None = None) -> list[tuple[int, int]]:
+def _candidates(
+    at: Tensor, rows: Sequence[int] | None = None, parts: Tensor | None = None
+) -> list[tuple[int, int]]:
     """Pairs (old, new) of rows of keyframes that may be at one place: for each new one, the nearest.
 
-    at: positions (K, D) of the keyframes. rows: new ones; None: every third.
+    at: positions (K, D) of the keyframes. rows: new ones; None: every third. parts: (K,), see `closed`: of
+    other parts, keyframes may be nearer in time.
     """
     if not len(at):
         return []
@@ -153,7 +163,12 @@ def _candidates(at: Tensor, rows: Sequence[int] | None = None) -> list[tuple[int
     new = order if rows is None else torch.tensor(rows)
     gap = torch.cdist(at[new], at)
     reach = (_REACH + _DRIFT * (path[new, None] - path)).clamp_max(_FARTHEST)
-    allowed = (new[:, None] - order >= _APART) & (gap <= reach)
+    is_apart = new[:, None] - order >= _APART
+    if parts is not None:
+        is_other = parts[new, None] > parts
+        is_apart |= is_other
+        reach = torch.where(is_other, _FROM_LOST, reach)
+    allowed = is_apart & (gap <= reach)
     nearest = torch.where(allowed, gap, torch.inf).argmin(1)
     step = _SPACING if rows is None else 1
     return [
@@ -170,15 +185,19 @@ def _closure(
     new: int,
     least_explained: float,
     rule: WindowedRule,
+    parts: Tensor | None = None,
 ) -> _Closure | None:
     """The closure between two rows of keyframes, if they see one place."""
     around = range(max(old - _NEIGHBOURS, 0), min(old + _NEIGHBOURS + 1, len(places)))
-    order = [row for row in around if row != old] + [old]  # the last one is the centre of a local map
+    around_old = [row for row in around if row != old and (parts is None or parts[row] == parts[old])]
+    order = [*around_old, old]  # the last one is the centre of a local map
+    is_lost = parts is not None and bool(parts[old] != parts[new])
+    reach = (_FARTHEST, math.pi) if is_lost else (_REACH, 3 * _ANGLE)
     local = LocalMap(
         [places[row][1]._replace(pose=poses[places[row][0]]) for row in order], least_explained, rule
     )
     source, target = places[old][0], places[new][0]
-    expected = Expectation(poses[[target]], _REACH / 2, _ANGLE, _MOST_EXPLAINED)
+    expected = Expectation(poses[[target]], _REACH / 2, _ANGLE, _MOST_EXPLAINED, *reach)
     location = local.locate(places[new][1], expected)
     if not location.found or location.explained < _MOST_EXPLAINED:
         return None

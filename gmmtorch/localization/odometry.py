@@ -8,19 +8,21 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.datasets import Dataset, Reposed, with_poses
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_number, check_whole
-from gmmtorch.localization.local_map import LOST, Expectation, Keyframe, LocalMap, nowhere
+from gmmtorch.localization.local_map import LOST, Keyframe, LocalMap, nowhere
 from gmmtorch.localization.location import Location, continued, measured_motion
 from gmmtorch.localization.loop_closure import LoopCloser, closed, information_of
 from gmmtorch.localization.pose_graph import Edges, optimised
-from gmmtorch.mapping import Components, WindowedRule, learn_window
+from gmmtorch.localization.pose_search import Expectation
+from gmmtorch.mapping import WindowedRule
 from gmmtorch.optional_packages import needs_extra
 from gmmtorch.pose import Pose
-from gmmtorch.scan import Scan
 
 METHODS = ("kiss_icp", "mixture")
 MOTIONS = ("constant", "dataset", "imu")
@@ -30,6 +32,8 @@ _KEYFRAMES = 10  # in the local map,
 _MANY_KEYFRAMES = 80  # or of a sensor that looks in one direction
 _NARROW = 0.8  # length of the mean direction of its points; 0.64 for a half circle, 0.9 for a cone of 70°
 _GIVEN_UP = 3  # lost scans in a row, after which the next one begins a new local map
+_APART = "the sensor was lost before, and no place that it saw later is known from before"
+_LONGEST_GAP = 2  # steps that a sensor may have moved since the last pose that was found, at most
 _FEWEST = 10  # returns of a scan that can be located
 _FIRST_STEP = 1.0, math.radians(30)  # standard deviations (m, rad) of the first motions
 _SURPRISE = 0.3, math.radians(10)  # least standard deviations of a motion from the predicted one
@@ -61,10 +65,12 @@ class Odometry:
         poses = odometry.trajectory().poses
 
     The pose of a scan is the one that best explains its points by one mixture of the last keyframes and is
-    not far from the prediction. The search climbs from the best of a lattice of starts and, in 3D,
-    from where the mixture of the scan is registered. The prediction continues the last motion. `trajectory`
+    not far from the prediction. In 2D the poses that the sensor can have reached are searched by branch and
+    bound (`localization.pose_search`), and the mixture is climbed from the best ones; in 3D it is climbed
+    from the best of a lattice of starts. The prediction continues the last motion. `trajectory`
     finds the places that were seen twice and corrects all poses by a pose graph
-    (`localization.pose_graph`).
+    (`localization.pose_graph`). A scan that is not found never enters the local map. The
+    fourth of them in a row begins a new one, whose poses are found if a closure joins them with the first.
 
     Args:
         n_keyframes: in the local map. None: 10, or 80 for a sensor with a narrow field of view, such as a
@@ -87,7 +93,7 @@ class Odometry:
         n_points: int = 1000,
         least_explained: float = 0.5,
         rule: WindowedRule = _RULE,
-        max_step: float = 4.0,
+        max_step: float = 8.0,
         max_turn: float = math.pi,
     ) -> None:
         self.n_keyframes = None if n_keyframes is None else check_whole("n_keyframes", n_keyframes, 1)
@@ -104,8 +110,9 @@ class Odometry:
         self._poses: list[Pose] = []
         self._locations: list[Location] = []
         self._frames: list[int] = []  # scans that are keyframes
-        self._last_frame = 0
+        self._last_frame = self._last_found = 0
         self._n_lost = 0
+        self._parts: list[int] = []  # keyframes that begin a map of their own, because the sensor was lost
         self._edges: list[tuple[int, Pose, Tensor]] = []  # from which scan, motion, information
         self._motion: Pose | None = None
         self._surprise = _FIRST_STEP
@@ -168,8 +175,7 @@ class Odometry:
         after = motions[last.clamp_min(0)] @ before
         self._poses = [after[number] for number in range(len(before))]
         self.keyframes = [frame._replace(pose=found[row]) for row, frame in enumerate(self.keyframes)]
-        recent = self.keyframes[-(self.n_keyframes or 1) :]
-        self._local = LocalMap(recent, self.least_explained, self.rule, self.n_points)
+        self._set_local_map(self.n_keyframes or 1)
         return True
 
     def trajectory(self, loops: bool = True) -> Trajectory:
@@ -180,10 +186,16 @@ class Odometry:
         found = torch.tensor([location.found for location in self._locations])
         if loops:
             places = list(zip(self._frames, self.keyframes, strict=True))
-            edges = closed(poses, edges, places, self.least_explained, self.rule)
+            parts = torch.bucketize(torch.arange(len(places)), torch.tensor(self._parts), right=True)
+            edges = closed(poses, edges, places, parts, self.least_explained, self.rule)
         best = optimised(poses, edges)
         used = edges.is_closure & (best.weights > 0.5)
         doubts = tuple("; ".join(location.doubts) for location in self._locations)
+        is_apart = self._is_apart(edges.at(used))
+        doubts = tuple(f"{doubt}; {_APART}" if apart and doubt else _APART if apart else doubt
+                       for doubt, apart in zip(doubts, is_apart.tolist(), strict=True))  # fmt: skip
+        best = best._replace(poses=_bridged(best.poses, found))
+        found &= ~is_apart
         return Trajectory(best.poses.matrix, best.covariances, found, int(used.sum()), doubts)
 
     # -- one scan -------------------------------------------------------------------------------------
@@ -197,14 +209,9 @@ class Odometry:
         return rows[torch.isfinite(rows).all(1)]
 
     def _scan(self, rows: Tensor) -> Keyframe:
-        dim = rows.shape[1]
         draw = torch.Generator().manual_seed(0)
         chosen = rows[torch.randperm(len(rows), generator=draw)[:_STORED]]
-        mixture = Components.empty(dim)
-        if len(rows) >= _FEWEST:
-            seen = Scan(rows, rows.new_zeros(dim))
-            mixture = learn_window([seen], self.rule, torch.Generator().manual_seed(0))
-        return Keyframe(chosen, mixture, Pose.identity(dim))
+        return Keyframe(chosen, Pose.identity(rows.shape[1]))
 
     def _clock(self, stamp: float | None) -> float:
         """How many times longer than the last motion this one takes; 1 if the clocks do not say."""
@@ -218,7 +225,7 @@ class Odometry:
         return now / before
 
     def _located(self, scan: Keyframe, measured: Pose | Tensor | None, ratio: float) -> Location:
-        last = self._poses[-1]
+        last = self._poses[self._last_found]
         step = rest = Pose.identity(last.dim)
         if isinstance(measured, Tensor):
             step, rest = continued(measured, self._motion, ratio), continued(measured, None)
@@ -226,11 +233,16 @@ class Odometry:
             step = measured
         elif self._motion is not None:
             step = self._motion if ratio == 1.0 else rest.towards(self._motion, ratio)
-        poses, bounds = Pose.stack([last @ step, last @ rest]), (self.max_step, self.max_turn)
-        expected = Expectation(poses, *self._surprise, self._explained, *bounds)
-        if not len(scan.mixture) or self._local is None:
-            doubt = "the scan has too few points" if not len(scan.mixture) else "no scan before had points"
-            return Location(poses[0].matrix, nowhere(last.dim), 0.0, (doubt,))
+        guess = self._poses[-1] @ step  # of a scan that was lost, too
+        reach = self.max_step * min(self._n_lost + 1, _LONGEST_GAP)
+        expected = Expectation(
+            Pose.stack([guess, last @ rest]), *self._surprise, self._explained, reach, self.max_turn
+        )
+        if len(scan.points) < _FEWEST or self._local is None:
+            doubt = (
+                "the scan has too few points" if len(scan.points) < _FEWEST else "no scan before had points"
+            )
+            return Location(guess.matrix, nowhere(last.dim), 0.0, (doubt,))
         location = self._local.locate(scan, expected)
         self._note_surprise(location, expected)
         return location
@@ -254,14 +266,19 @@ class Odometry:
             since = self._poses[self._last_frame].inverse() @ pose
             self._edges.append((self._last_frame, since, information_of(location)))
             if location.found:
-                self._motion = self._poses[-1].inverse() @ pose
+                self._motion = self._poses[-1].inverse() @ pose if not self._n_lost else None
+                self._last_found = number
             elif self._n_lost >= _GIVEN_UP:
                 self._motion = None  # a sensor that is covered for long may have stopped
         self._poses.append(pose)
         self._locations.append(location)
         self._n_lost = 0 if location.found else self._n_lost + 1
-        is_sure = location.found or self._local is None or self._n_lost > _GIVEN_UP
-        if is_sure and len(scan.mixture) and self._is_new(pose):
+        begins = self._local is None or self._n_lost > _GIVEN_UP
+        is_new = begins or (location.found and self._is_new(pose))
+        if is_new and len(scan.points) >= _FEWEST:
+            if begins:
+                self._parts.append(len(self.keyframes))
+                self._n_lost, self._last_found = 0, number
             self._last_frame = number
             self._frames.append(number)
             self.keyframes.append(scan._replace(pose=pose))
@@ -269,8 +286,12 @@ class Odometry:
                 directions = torch.nn.functional.normalize(scan.points, dim=1)
                 is_narrow = float(directions.mean(0).norm()) > _NARROW
                 self.n_keyframes = _MANY_KEYFRAMES if is_narrow else _KEYFRAMES
-            recent = self.keyframes[-self.n_keyframes :]
-            self._local = LocalMap(recent, self.least_explained, self.rule, self.n_points)
+            self._set_local_map(self.n_keyframes)
+
+    def _set_local_map(self, n: int) -> None:
+        """Of the last n keyframes at most, and not of those before the sensor was lost."""
+        recent = self.keyframes[max(self._parts[-1], len(self.keyframes) - n) :]
+        self._local = LocalMap(recent, self.least_explained, self.rule, self.n_points)
 
     def _is_new(self, pose: Pose) -> bool:
         """Whether the sensor has moved or turned enough since the last keyframe."""
@@ -278,6 +299,15 @@ class Odometry:
             return True
         off = self.keyframes[-1].pose.inverse() @ pose
         return bool(off.translation.norm() >= self.distance) or bool(off.chord() >= self.angle)
+
+    def _is_apart(self, closures: Edges) -> Tensor:
+        """Whether the map of each scan (N,) is joined with the first one by no closure, directly or not."""
+        begins = torch.tensor([self._frames[row] for row in self._parts[1:]], dtype=torch.int64)
+        n, part = len(begins) + 1, torch.bucketize(torch.arange(len(self._poses)), begins, right=True)
+        ends = part[closures.source].numpy(), part[closures.target].numpy()
+        links = coo_matrix((torch.ones(len(closures.source)).numpy(), ends), shape=(n, n))
+        _, group = connected_components(links, directed=False)
+        return torch.from_numpy(group != group[0])[part]
 
     def _all_edges(self) -> Edges:
         target = torch.arange(1, len(self._poses))
@@ -288,6 +318,19 @@ class Odometry:
             return Edges(target, target, Pose.identity(dim, 0), torch.zeros(0, free, free).double(), none)
         source, motions, information = zip(*self._edges, strict=True)
         return Edges(torch.tensor(source), target, Pose.stack(motions), torch.stack(information), none)
+
+
+def _bridged(poses: Pose, found: Tensor) -> Pose:
+    """The poses (N), with lost ones on the way from the last found pose to the next one."""
+    number, good = torch.arange(len(poses)), found.nonzero()[:, 0]
+    after = torch.searchsorted(good, number).clamp_max(len(good) - 1)
+    before = (torch.searchsorted(good, number, right=True) - 1).clamp_min(0)
+    first, last = good[before], good[after]
+    share = ((number - first) / (last - first).clamp_min(1)).clamp(0, 1).double()
+    way = poses[first].towards(poses[last], share)
+    is_between = ~found & (first < number) & (number < last)
+    shift = torch.where(is_between[:, None], way.translation, poses.translation)
+    return Pose(torch.where(is_between[:, None, None], way.rotation, poses.rotation), shift)
 
 
 def _mean(before: float, now: float) -> float:

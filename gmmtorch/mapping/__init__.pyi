@@ -10,7 +10,7 @@ from .codec.bitstream import zigzag as zigzag
 from .codec.component_batch import decode as decode
 from .codec.component_batch import encode as encode
 from .codec.component_batch import encode_quantized as encode_quantized
-from .codec.lattice import AXIS_ORDERS as AXIS_ORDERS
+from .codec.component_batch import ids_of_batch as ids_of_batch
 from .codec.lattice import LARGEST_VARIANCE as LARGEST_VARIANCE
 from .codec.lattice import scaled as scaled
 from .codec.quantization import LARGEST_COUNT as LARGEST_COUNT
@@ -62,7 +62,7 @@ from .surfaces import collision_probability as collision_probability
 from .surfaces import expected_returns as expected_returns
 from .surfaces import surface_mixture as surface_mixture
 from .surfaces import touching as touching
-from .tiles import INDEX as INDEX
+from .tile_index import INDEX as INDEX
 from .tiles import TiledMap as TiledMap
 from .tiles import merge as merge
 from .tiles import tile_files as tile_files

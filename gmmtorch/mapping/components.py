@@ -158,8 +158,7 @@ class Components:
 
     def on_cpu(self) -> Components:
         """The components on the CPU, without gradients."""
-        attributes = self.attributes.changed(lambda value: value.detach().cpu())
-        return Components(*on_cpu(*self.tensors().values()), attributes=attributes)
+        return Components(*on_cpu(*self.tensors().values()), attributes=self.attributes.on_cpu())
 
     def cones(self) -> Cones:
         """One cone for each viewpoint: the argument of the evidence functions."""
@@ -208,7 +207,10 @@ class Components:
         for begin, end, first, last in zip(begins, ends, *places, strict=True):
             part = {name: getattr(each, name)[begin:end] for name in _PER_COMPONENT}
             part |= {name: getattr(each, name)[first:last] for name in ("seen_from", "seen_count")}
-            found.append(replace(each, **part, seen_by=each.seen_by[first:last] - begin))
+            attributes = self.attributes.selected(slice(begin, end))
+            found.append(
+                replace(each, **part, seen_by=each.seen_by[first:last] - begin, attributes=attributes)
+            )
         return found
 
     def with_used_origins(self) -> Components:
@@ -233,7 +235,7 @@ class Components:
     def transformed(self, transform: Tensor, chosen: Tensor) -> Components:
         """The components `chosen` (K,) and their origins moved by a rigid motion (D+1, D+1)."""
         rotation, translation = transform[:-1, :-1], transform[:-1, -1]
-        moved_viewpoint = chosen[self.seen_by]
+        moved_viewpoint, rows = chosen[self.seen_by], chosen.nonzero().squeeze(1)
         origins = torch.cat([self.origins, self.origins @ rotation.T + translation])
         seen_from = self.seen_from + moved_viewpoint.long() * self.origins.shape[0]
         moved = replace(
@@ -244,7 +246,7 @@ class Components:
             ),
             origins=origins,
             seen_from=seen_from,
-            attributes=self.attributes.turned(rotation).where(chosen, self.attributes),
+            attributes=self.attributes.replaced(rows, self.attributes.selected(rows).turned(rotation)),
         )
         return moved.with_used_origins()
 

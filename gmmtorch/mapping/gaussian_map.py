@@ -53,7 +53,7 @@ class GaussianMap(MapState):
             cell that contains the point: "flux" (exact), "cone" (the thesis's) or "monte_carlo" (rays).
         random_state: seed. The same scans in the same order give the same map and the same answers.
         robot: first half of the components' ids.
-        codec: rounding of components in files and queries: "quantized", about 10 bytes a component, or
+        codec: rounding of components in files and queries: "quantized", about 8 bytes a component, or
             "float", every number as it is.
         prior: None: probabilities are calibrated: the map predicts each window before it learns from it, see
             `occupancy.calibrator`. A number N_p: they follow from counts, as in the thesis (3.9).
@@ -338,9 +338,10 @@ class GaussianMap(MapState):
 
     # -- files and state ------------------------------------------------------------------------------
 
-    def _file(self) -> bytes:
-        rule = self.learning.fitted(self._pending)
-        return map_bytes(self.components(), rule, self.settings, self._next_number)
+    def _file(self, components: Components | None = None) -> bytes:
+        """The map's file. `components`: instead of all."""
+        found = self.components() if components is None else components
+        return map_bytes(found, self.learning.fitted(self._pending), self.settings, self._next_number)
 
     @property
     def nbytes(self) -> int:

@@ -6,6 +6,9 @@ no evidence, and a query opens exactly the tiles whose box contains it. Evidence
 the answers are those of the whole map, up to the rounding of sums.
 
 `tile_files` makes the files from components; `merge` merges the tiles of several recordings.
+`TiledMap.create` makes a map that grows in its folder: one more file has the components of recent windows.
+Files are never changed: new ones have other names, and count once the index names them. So a map that is
+stopped at any moment opens with all finished windows.
 """
 
 from __future__ import annotations
@@ -13,8 +16,8 @@ from __future__ import annotations
 import math
 import zlib
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,14 +29,13 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import (
     DataError,
-    GmmTorchError,
     InvalidArgumentError,
     MemoryLimitError,
     MissingDataError,
     check_number,
     check_whole,
 )
-from gmmtorch.files import MAX_FILE_BYTES, pack_tensors, read_tensors, require, write_bytes
+from gmmtorch.files import write_bytes
 from gmmtorch.mapping.codec.component_batch import (
     MapSettings,
     file_size,
@@ -47,8 +49,10 @@ from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.merging import compact_to_bytes
 from gmmtorch.mapping.learning.rules import IncrementalRule
-from gmmtorch.mapping.query import Query, count_many, cutoff_of, evidence_boxes, mean_range, rule_of
+from gmmtorch.mapping.learning.windows import learns_in_parts
+from gmmtorch.mapping.query import Query, count_many, cutoff_of, mean_range, rule_of
 from gmmtorch.mapping.query_options import check_method
+from gmmtorch.mapping.tile_index import INDEX, TileIndex, index_row, read_index, tile_name
 from gmmtorch.occupancy import (
     CUTOFF,
     Calibration,
@@ -56,12 +60,14 @@ from gmmtorch.occupancy import (
     Rule,
     check_queries,
     check_resolution,
-    cone_bounds,
     probability,
 )
-from gmmtorch.scan import FARTHEST
+from gmmtorch.scan import Scan
 
-_BYTES_EACH = 4096  # memory of a component that answers queries, most of it in the spatial index
+SIDE = 100.0
+"""Side (m) of the tiles if none is given."""
+_BYTES_EACH = 1536  # memory of a component that answers queries, with its part of the spatial index
+_RECENT = 4096  # components in memory before the older half goes into tiles
 _REMEDY = "copy the folder again from where it was written, or merge the recordings again"
 
 
@@ -72,12 +78,15 @@ class TiledMap:
         tiled.occupancy(points)  # opens the tiles that give evidence at the points
         tiled.open(low, high)  # a GaussianMap of the tiles that give evidence in a box
 
-    `tile_files` and `merge` make such folders.
+        growing = TiledMap.create("city", GaussianMap(), dim=3, memory=10**9)
+        growing.insert(scan)  # writes the components of each full window
+
+    `tile_files` and `merge` make such folders, too; their maps do not grow.
 
     Args:
         folder: with the index file.
         device: of the evidence.
-        most_open: number of tiles that stay in memory between queries.
+        memory: bytes of the tiles that stay in memory between queries, at most, or a single tile.
         memory_limit: bytes of the evidence, and of the components of an opened box, at most.
 
     Attributes:
@@ -93,20 +102,151 @@ class TiledMap:
         self,
         folder: str | Path,
         device: str | torch.device = "cpu",
-        most_open: int = 16,
+        memory: int = 1 << 30,
         memory_limit: int = 4 << 30,
     ) -> None:
         self.folder, self.device = Path(folder), torch.device(device)
-        self.most_open = check_whole("most_open", most_open, 1)
+        self.memory = check_whole("memory", memory, 1)
         self.index, facts = read_index(self.folder / INDEX)
         self.dim, self.side = self.index.dim, float(facts["side"])
         self.settings = read_settings(facts, self.folder / INDEX)
         self.resolution, self.method = self.settings.resolution, self.settings.method
-        query = self.settings.query
-        self._cutoff = self.index.cutoff if query.cutoff is None else query.cutoff
-        self.query_options = replace(query, cutoff=self._cutoff, memory_limit=memory_limit)
+        self._cutoff, self._memory_limit = CUTOFF, memory_limit
+        self.query_options = self.settings.query
         self.n_read = 0
-        self._open: OrderedDict[int, Query] = OrderedDict()
+        self._open: OrderedDict[str, tuple[Query, int]] = OrderedDict()
+        self._crc32 = int(facts.get("recent", 0))  # of the file with the recent components
+        self._recent = self._read_recent() if "recent" in facts else None
+        self._update()
+
+    @classmethod
+    def create(
+        cls, folder: str | Path, target: GaussianMap, dim: int, side: float = SIDE, **options: Any
+    ) -> TiledMap:
+        """A map that grows in a folder, with the learning and the settings of `target`, which it takes over.
+
+        Args:
+            dim: 2 or 3, of the scans.
+            side: of the tiles (m).
+            options: as for `TiledMap`.
+
+        Raises `InvalidArgumentError` if the folder has an index, or the rule needs all of the map: with
+        novelty, forgetting or a budget.
+        """
+        folder, rule = Path(folder), target.learning
+        if (folder / INDEX).exists():
+            raise InvalidArgumentError(f"{folder} has a map; open it by TiledMap, or choose another folder.")
+        budgets = [name for name in ("n_components", "max_bytes", "max_cost") if getattr(rule, name, None)]
+        if not learns_in_parts(rule) or (budgets and isinstance(rule, IncrementalRule)):
+            raise InvalidArgumentError(
+                "The learning rule has novelty, forgetting or a budget, which need all of the map; give a "
+                "rule without them."
+            )
+        check_number("side", side, above=True)
+        target._prepare(dim, torch.device("cpu"), "dim is")
+        index = TileIndex.joined([], dim)
+        settings = replace(target.settings, robot=0)
+        data = target._file()
+        write_bytes(folder / _recent_name(zlib.crc32(data)), data)
+        facts = settings_facts(settings) | {"recent": zlib.crc32(data)}
+        write_bytes(folder / INDEX, index.to_bytes(side=float(side), **facts))
+        made = cls(folder, **options)
+        made._recent = target.to(made.device)
+        return made
+
+    def _read_recent(self) -> GaussianMap:
+        path = self.folder / _recent_name(self._crc32)
+        if path.is_file() and zlib.crc32(path.read_bytes()) != self._crc32:
+            raise DataError(f"{path} is not the file that {INDEX} lists; {_REMEDY}.")
+        return GaussianMap.load(path).to(self.device)
+
+    def _update(self) -> None:
+        """Brings cutoff and calibration up to date with all components."""
+        given, counts = self.settings.query.cutoff, [self.index.n_seen.sum(), self.index.n_many.sum()]
+        if self._recent is not None:
+            added = count_many(self._recent._final().seen_count)
+            counts = [count + more for count, more in zip(counts, added, strict=True)]
+        cutoff = cutoff_of(*map(int, counts)) if given is None else given
+        if cutoff != self._cutoff:
+            self._open.clear()
+        self._cutoff = cutoff
+        self.query_options = replace(self.settings.query, cutoff=cutoff, memory_limit=self._memory_limit)
+        if self._recent is not None:
+            self._recent._query_options = replace(self._recent._query_options, cutoff=cutoff)
+
+    # -- learning -------------------------------------------------------------------------------------
+
+    @property
+    def n_pending(self) -> int:
+        """Number of scans of the unfinished window, which are not in the files."""
+        return 0 if self._recent is None else self._recent.n_pending
+
+    def insert(self, scan: Scan) -> None:
+        """Learns from a scan. Queries use it at once; it is in the files when its window is full.
+
+        The cost does not depend on the size of the map. Raises `InvalidArgumentError` if the map does not
+        grow, and `OutputError` if a file cannot be written: the scan is then in memory, and the next full
+        window, or `finish`, writes it.
+        """
+        self._growing().insert(scan)
+        if not self.n_pending:
+            self._store()
+
+    def finish(self) -> None:
+        """Ends the unfinished window, and writes all that is not in the files."""
+        recent = self._growing()
+        if recent.n_pending:
+            recent.revise(lambda components: components)
+        self._store()
+
+    def add(self, components: Components) -> None:
+        """Adds components, such as those of another map, and writes them. An unfinished window ends."""
+        recent = self._growing()
+        numbers = recent._next_number + torch.arange(len(components), device=self.device)
+        ids = torch.stack([torch.full_like(numbers, recent.robot), numbers], 1)
+        added = replace(components.to(self.device), ids=ids)
+        recent.revise(lambda known: Components.concatenate([known, added]))
+        self._store()
+
+    def _growing(self) -> GaussianMap:
+        if self._recent is None:
+            raise InvalidArgumentError(f"{self.folder} has merged tiles, which do not grow; use `create`.")
+        return self._recent
+
+    def _store(self) -> None:
+        """Writes the recent components; if there are more than `_RECENT`, the older ones into tiles."""
+        recent = self._growing()
+        found, cutoff = recent.components(), self.settings.query.cutoff
+        settings = replace(recent.settings, query=replace(recent.query_options, cutoff=cutoff), robot=0)
+        settings = _calibrated(settings, found)
+        n_old = len(found) - _RECENT // 2 if len(found) > _RECENT else 0
+        rows, index, old = [], self.index, [_recent_name(self._crc32)]
+        number = {tuple(tile): row for row, tile in enumerate(index.tiles.tolist())} if n_old else {}
+        for tile, part in _by_tile(found.selected(torch.arange(n_old, device=self.device)), self.side):
+            row = number.get(tuple(tile))
+            parts = [part.on_cpu()] if row is None else [self.components(row), part.on_cpu()]
+            data, made = _tile(tile, Components.concatenate(parts), settings, None)
+            write_bytes(self.folder / tile_name(tile, made["crc32"]), data)
+            rows.append(made)
+            old += [] if row is None else [self._name(row)]
+        if rows:
+            index = index.replaced(rows)
+        left = torch.arange(n_old, len(found), device=self.device)
+        data = recent._file(found.selected(left).with_used_origins())
+        crc32 = zlib.crc32(data)
+        write_bytes(self.folder / _recent_name(crc32), data)
+        facts = settings_facts(settings) | {"recent": crc32}
+        write_bytes(self.folder / INDEX, index.to_bytes(side=self.side, **facts))
+        self.index, self.settings, self._crc32 = index, settings, crc32
+        if n_old:
+            recent.revise(lambda components: components.selected(left).with_used_origins())
+        self._update()
+        for name in {*old} - {_recent_name(crc32), *(tile_name(row["tiles"], row["crc32"]) for row in rows)}:
+            (self.folder / name).unlink(missing_ok=True)
+
+    def _name(self, row: int) -> str:
+        crc32 = None if self._recent is None else int(self.index.crc32[row])
+        return tile_name(self.index.tiles[row].tolist(), crc32)
 
     def __repr__(self) -> str:
         return (
@@ -120,19 +260,24 @@ class TiledMap:
         those of version 1.0 all are read once, for the ranges of the sensor model."""
         options = self.query_options
         if options.prior is None and options.calibration is None:
+            if self._recent is not None:  # its first window is not finished
+                return self._recent._answers().rule
             known = Calibration.prior(mean_range(map(self.components, range(len(self.index)))))
             self.query_options = replace(options, calibration=known)
         return rule_of(self.query_options, ())
 
     @property
     def n_components(self) -> int:
-        """Number of components in all tiles."""
-        return int(self.index.n_components.sum())
+        """Number of components without those of an unfinished window."""
+        return int(self.index.n_components.sum()) + (self._recent.n_final if self._recent else 0)
 
     @property
     def nbytes(self) -> int:
         """Bytes of all files, the index included."""
-        return int(self.index.n_bytes.sum()) + (self.folder / INDEX).stat().st_size
+        files = [self.folder / INDEX] + (
+            [] if self._recent is None else [self.folder / _recent_name(self._crc32)]
+        )
+        return int(self.index.n_bytes.sum()) + sum(path.stat().st_size for path in files)
 
     # -- queries --------------------------------------------------------------------------------------
 
@@ -155,6 +300,8 @@ class TiledMap:
         """Hits and misses (M,) at points (M, D), added up over the tiles."""
         hits = torch.zeros_like(points[:, 0])
         misses = hits.clone()
+        if self._recent is not None:
+            hits, misses = self._recent._answers().evidence_at(points, resolution, method)
         finite = points.detach()[torch.isfinite(points).all(1)].cpu()
         if len(finite) == 0:
             return PointEvidence(hits, misses)
@@ -196,13 +343,17 @@ class TiledMap:
         """
         far = torch.full((self.dim,), math.inf)
         rows = self.near(-far if low is None else low, far if high is None else high, resolution)
-        n, limit = int(self.index.n_components[rows].sum()), self.query_options.memory_limit
+        recent = [] if self._recent is None else [self._recent.components().on_cpu()]
+        n, limit = (
+            int(self.index.n_components[rows].sum()) + sum(map(len, recent)),
+            self.query_options.memory_limit,
+        )
         if n * _BYTES_EACH > limit:
             raise MemoryLimitError(
                 f"{len(rows)} tiles with {n:,} components need about {n * _BYTES_EACH:,} bytes, more than "
                 f"memory_limit={limit:,}; give the bounds of a smaller box, or a higher limit."
             )
-        found = Components.concatenate([Components.empty(self.dim), *map(self.components, rows)])
+        found = Components.concatenate([Components.empty(self.dim), *map(self.components, rows), *recent])
         numbers = torch.stack([torch.zeros(n, dtype=torch.int64), torch.arange(n)], 1)
         options = {**vars(self.query_options), "resolution": self.resolution, "method": self.method}
         return GaussianMap.of(replace(found, ids=numbers), codec=self.settings.codec, **options).to(
@@ -214,7 +365,7 @@ class TiledMap:
 
         Raises `MissingDataError` if the file is missing, and `DataError` if it is not the one of the index.
         """
-        path = self.folder / tile_name(self.index.tiles[row].tolist())
+        path = self.folder / self._name(row)
         if not path.is_file():
             raise MissingDataError(f"{path} is missing, but {INDEX} lists it; {_REMEDY}.")
         n_bytes, crc32 = int(self.index.n_bytes[row]), int(self.index.crc32[row])
@@ -227,166 +378,24 @@ class TiledMap:
         return found
 
     def _query(self, row: int) -> Query:
-        """The query of a tile. If too many are open, the least recently used one is dropped."""
-        if row not in self._open:
+        """The query of a tile. If the open ones need too much memory, the least recently used are dropped."""
+        name = self._name(row)
+        if name not in self._open:
             components = self.components(row).to(self.device)
             share = float(self.index.support[row] / self.index.support.sum().clamp_min(1e-300))
             n_samples = max(1, round(share * self.query_options.n_samples))
-            self._open[row] = Query(components, replace(self.query_options, n_samples=n_samples))
-        self._open.move_to_end(row)
-        while len(self._open) > self.most_open:
+            made = Query(components, replace(self.query_options, n_samples=n_samples))
+            self._open[name] = made, len(components) * _BYTES_EACH
+        self._open.move_to_end(name)
+        while len(self._open) > 1 and sum(n_bytes for _, n_bytes in self._open.values()) > self.memory:
             self._open.popitem(last=False)
-        return self._open[row]
+        return self._open[name][0]
 
 
-INDEX = "index.safetensors"
-"""Name of the index file in the folder of a tiled map."""
+def _recent_name(crc32: int) -> str:
+    """Name of the file with the recent components of a map that grows."""
+    return f"recent_{crc32:08x}.safetensors"
 
-_KIND, _VERSION = "gmmtorch.tiles", 1
-_FARTHEST_TILE = 1 << 40
-_LARGEST_COUNT = 1 << 53  # sums of such counts stay exact
-
-
-@dataclass(frozen=True, eq=False)
-class TileIndex:
-    """T tiles of a tiled map.
-
-    tiles (T, 2): the tile contains the means with floor(x / side), floor(y / side). Distinct.
-    low, high (T, D): a box (m) around the components, to their cutoff, and their sensor origins.
-    distance (T,): longest distance (m) from a mean to its sensor origin.
-    support (T,): sum of the supports, points.
-    n_components, n_bytes, crc32 (T,): number of components, and length and CRC-32 of the file.
-    n_seen, n_many (T,): viewpoints with a count, and those with many points; they decide the cutoff.
-    """
-
-    tiles: Tensor
-    low: Tensor
-    high: Tensor
-    distance: Tensor
-    support: Tensor
-    n_components: Tensor
-    n_bytes: Tensor
-    crc32: Tensor
-    n_seen: Tensor
-    n_many: Tensor
-
-    def __len__(self) -> int:
-        return len(self.tiles)
-
-    @property
-    def dim(self) -> int:
-        return self.low.shape[1]
-
-    @property
-    def cutoff(self) -> float:
-        """The cutoff that follows from the support of all components."""
-        return cutoff_of(int(self.n_seen.sum()), int(self.n_many.sum()))
-
-    def boxes(self, side: float, cutoff: float) -> tuple[Tensor, Tensor]:
-        """`evidence_boxes` of the tiles."""
-        return evidence_boxes(self.low, self.high, self.distance, side, cutoff)
-
-    @classmethod
-    def joined(cls, rows: Sequence[dict[str, Any]], dim: int) -> TileIndex:
-        """The index of rows of `index_row`."""
-        columns = {}
-        for name, (shape, dtype) in _columns(dim).items():
-            values = [torch.as_tensor(row[name], dtype=dtype) for row in rows]
-            columns[name] = torch.stack(values) if values else torch.zeros(0, *shape, dtype=dtype)
-        return cls(**columns)
-
-    def to_bytes(self, **facts: Any) -> bytes:
-        """The index file; `facts` are JSON values."""
-        return pack_tensors(vars(self), _KIND, _VERSION, **facts)
-
-
-def _columns(dim: int) -> dict[str, tuple[tuple[int, ...], torch.dtype]]:
-    """Shape and type of a row of each column."""
-    shapes: dict[str, tuple[int, ...]] = {"tiles": (2,), "low": (dim,), "high": (dim,)}
-    real = ("low", "high", "distance", "support")
-    return {
-        f.name: (shapes.get(f.name, ()), torch.float64 if f.name in real else torch.int64)
-        for f in fields(TileIndex)
-    }
-
-
-def index_row(
-    tile: Sequence[int], components: Components, cutoff: float | None, n_bytes: int, crc32: int
-) -> dict[str, Any]:
-    """The row of a tile with these components; `cutoff` None: the one that follows from their support."""
-    cones = components.cones()
-    low, high = cone_bounds(cones, CUTOFF if cutoff is None else cutoff)
-    low, high = (torch.cat([corner, components.means]) for corner in (low, high))
-    distance = (cones.means - cones.origins).norm(dim=1)
-    n_seen, n_many = count_many(cones.counts)
-    return {
-        "tiles": list(tile),
-        "low": low.amin(0),
-        "high": high.amax(0),
-        "distance": distance.amax() if len(distance) else 0.0,
-        "support": components.support.sum(),
-        "n_components": len(components),
-        "n_bytes": n_bytes,
-        "crc32": crc32,
-        "n_seen": n_seen,
-        "n_many": n_many,
-    }
-
-
-def read_index(path: Path) -> tuple[TileIndex, dict[str, Any]]:
-    """The index and its facts; `side` (m) is checked, the others are not.
-
-    Raises `MissingDataError` if the file does not exist, and `DataError` if it is damaged.
-    """
-    tensors, facts = read_tensors(path, _KIND, _VERSION)
-    low = tensors.get("low")
-    dim = low.shape[1] if low is not None and low.ndim == 2 else 0
-    if dim not in (2, 3):
-        raise DataError(f"{path} has tiles of {dim} dimensions; a map has 2 or 3. The file is damaged.")
-    n_tiles = len(tensors["low"])
-    index = TileIndex(
-        **{
-            name: require(tensors, name, (n_tiles, *shape), dtype, path)
-            for name, (shape, dtype) in _columns(dim).items()
-        }
-    )
-    try:
-        check_number("side", facts.get("side"), above=True)
-    except GmmTorchError as error:
-        raise DataError(f"{path}: {error} The file is damaged.") from error
-    _check(index, path)
-    return index, facts
-
-
-def _check(index: TileIndex, path: Path) -> None:
-    """Raises `DataError` for values that no index has."""
-    limits = {
-        "tiles": (-_FARTHEST_TILE, _FARTHEST_TILE),
-        "low": (-2 * FARTHEST, 2 * FARTHEST),
-        "high": (-2 * FARTHEST, 2 * FARTHEST),
-        "distance": (0, 4 * FARTHEST),
-        "support": (0, float(_LARGEST_COUNT) ** 2),
-        "n_bytes": (1, MAX_FILE_BYTES),
-        "crc32": (0, (1 << 32) - 1),
-        **dict.fromkeys(("n_components", "n_seen", "n_many"), (0, _LARGEST_COUNT)),
-    }
-    for name, (least, most) in limits.items():
-        values = getattr(index, name)
-        if bool(((values < least) | (values > most)).any()):
-            raise DataError(f"{path}: {name} has values outside {least} to {most}; the file is damaged.")
-    if bool((index.low > index.high).any()):
-        raise DataError(f"{path}: a box has its lowest corner above its highest; the file is damaged.")
-    if len(torch.unique(index.tiles, dim=0)) != len(index):
-        raise DataError(f"{path} lists a tile twice; the file is damaged.")
-
-
-def tile_name(tile: Sequence[int]) -> str:
-    """Name of the file of a tile (2,)."""
-    return f"tile_{tile[0]}_{tile[1]}.safetensors"
-
-
-SIDE = 100.0
-"""Side (m) of the tiles if none is given."""
 
 _RULE = IncrementalRule()  # in the files of tiles; a map that continues from one adapts it to its scans
 
@@ -401,15 +410,20 @@ def tile_files(components: Components, settings: MapSettings, side: float = SIDE
     """
     check_number("tile", side, above=True)
     settings = _calibrated(replace(settings, robot=0), components)
-    place = (components.means[:, :2].detach() / side).floor().long()
-    tiles, which = torch.unique(place, dim=0, return_inverse=True)
     files, rows = {}, []
-    for number, tile in enumerate(tiles.tolist()):
-        own = (which == number).nonzero().squeeze(1)
-        files[tile_name(tile)], row = _tile(tile, components.selected(own), settings, None)
+    for tile, part in _by_tile(components, side):
+        files[tile_name(tile)], row = _tile(tile, part, settings, None)
         rows.append(row)
     files[INDEX] = _index(rows, components.dim, settings, side)
     return files
+
+
+def _by_tile(components: Components, side: float) -> Iterator[tuple[list[int], Components]]:
+    """Each tile (2,) that contains means, and its components."""
+    place = (components.means[:, :2].detach() / side).floor().long()
+    tiles, which = torch.unique(place, dim=0, return_inverse=True)
+    for number, tile in enumerate(tiles.tolist()):
+        yield tile, components.selected((which == number).nonzero().squeeze(1))
 
 
 def merge(

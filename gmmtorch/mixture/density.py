@@ -6,6 +6,7 @@ import inspect
 import math
 from collections.abc import Iterator
 from typing import Any, TypeVar, cast
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -24,6 +25,12 @@ from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.exact import Parameters, compact, count_free_entries, expand
 from gmmtorch.mixture.validation import Array, RandomState, as_generator, checked_tensor
 
+_JOINTS: WeakKeyDictionary[MixtureDensity, tuple[list[tuple[Tensor, int]], by_type.Joint]] = (
+    WeakKeyDictionary()
+)
+"""The log-densities of mixtures, with the parameters that they are of and the versions of these tensors.
+
+They are apart from the mixtures, because queries may not change an estimator's attributes."""
 _FAR = 1e4  # distance from the centre (m) beyond which products of features lose digits
 
 
@@ -73,7 +80,7 @@ class MixtureDensity(DensityMixin, BaseEstimator, DeviceModule):
     def score_samples(self, X: Array) -> Array:
         """log p(x) of each point, (N,), nats."""
         points = self._as_points(X)
-        return self._as_kind_of(X, torch.cat([torch.logsumexp(part, 0) for part in self._joint(points)]))
+        return self._as_kind_of(X, torch.cat([_log_sum(part) for part in self._joint(points)]))
 
     def forward(self, X: Tensor) -> Tensor:
         """log p(x) of each point, (N,), nats: `score_samples` for use inside a network."""
@@ -97,20 +104,32 @@ class MixtureDensity(DensityMixin, BaseEstimator, DeviceModule):
     def _joint(self, points: Tensor) -> Iterator[Tensor]:
         """log π_k + log N(x|k), in chunks (K, n)."""
         (k, dim), kind = self.means.shape, self._fitted_type
-        center = (self.weights[:, None] * self.means).sum(0)
-        parameters = Parameters(self.weights, self.means - center, self._typed_covariances())
-        if dim > 3:
-            joint = by_type.log_joint(parameters, kind)
+        if dim > 3 or kind in ("diag", "spherical"):
+            joint = self._typed_joint()
             parts = points.split(by_type.rows_of_chunk(k, dim, kind, points.device))
-            yield from (joint(part - center) for part in parts)
+            yield from (joint(part) for part in parts)
             return
-        full = parameters._replace(covariances=self.covariances)
+        center = (self.weights[:, None] * self.means).sum(0)
+        full = Parameters(self.weights, self.means - center, self.covariances)
         parts = points.split(max(64, chunk_elements(points.device) // k))
         if em.is_ill_conditioned(full) or bool(((points - center).abs() > _FAR).any()):
             yield from (em.log_joint(part - center, full).T for part in parts)
             return
         natural = em.natural_parameters(full)
         yield from (natural @ em.quadratic_features(part - center).T for part in parts)
+
+    def _typed_joint(self) -> by_type.Joint:
+        """`by_type.log_joint` of the parameters, which is made anew if they change."""
+        parameters = Parameters(self.weights, self.means, self._typed_covariances())
+        if any(value.requires_grad or value.is_inference() for value in parameters):
+            return by_type.log_joint(parameters, self._fitted_type)
+        known = _JOINTS.get(self)
+        if known is None or any(
+            a is not b or a._version != v for a, (b, v) in zip(parameters, known[0], strict=True)
+        ):
+            of = [(value, value._version) for value in parameters]
+            known = _JOINTS[self] = of, by_type.log_joint(parameters, self._fitted_type)
+        return known[1]
 
     def n_parameters(self) -> int:
         """Number of free parameters: for full covariances K(1 + D + D(D+1)/2) − 1."""
@@ -254,6 +273,12 @@ class MixtureDensity(DensityMixin, BaseEstimator, DeviceModule):
 
     def __sklearn_is_fitted__(self) -> bool:
         return "means" in self._buffers
+
+
+def _log_sum(joint: Tensor) -> Tensor:
+    """log Σ_k exp (n,) of joint (K, n); it is faster than `torch.logsumexp`."""
+    peak = joint.detach().amax(0).clamp_min(torch.finfo(joint.dtype).min)
+    return (joint - peak).exp_().sum(0).log() + peak
 
 
 def _short(value: object) -> str:

@@ -257,9 +257,8 @@ def _stream_step(run: _Run, e_step: EStep, n_points: int) -> loop.Step[Parameter
     dtype = torch.float64 if typed is None else em.SOFTMAX_DTYPES[typed.dtype]
     kind = run.mixture.covariance_type
 
-    def typed_step(given: Parameters) -> tuple[Parameters, Tensor]:
+    def typed_step(parameters: Parameters) -> tuple[Parameters, Tensor]:
         """A step with the arithmetic of the covariance type, direct if the linear form loses digits."""
-        parameters, (k, dim) = by_type.compacted(given, kind), given.means.shape
         factors = by_type.Factors(parameters, kind)
 
         def gather_typed(linear: bool, about: Tensor | None) -> tuple[by_type.Sums, Tensor]:
@@ -271,17 +270,21 @@ def _stream_step(run: _Run, e_step: EStep, n_points: int) -> loop.Step[Parameter
                     yield *sums.tensors(), value
 
             *parts, value = summed(terms())
-            whole = by_type.Sums(k, center[None], kind, about)
+            whole = by_type.Sums(parameters.means.shape[0], center[None], kind, about)
             for own, part in zip(whole.tensors(), parts, strict=True):
                 own += part
             return whole, value
 
         found = by_type.exact_step(gather_typed, factors, reg_covar, parameters, typed is not None)
-        covariances = expand(found.parameters.covariances, kind, k, dim)
-        return found.parameters._replace(covariances=covariances), found.value
+        return found.parameters, found.value
+
+    def direct(parameters: Parameters) -> tuple[Parameters, Tensor]:
+        new, value = typed_step(by_type.compacted(parameters, kind))
+        return new._replace(covariances=expand(new.covariances, kind, *new.means.shape)), value
 
     if typed is None:
-        return loop.guarded_step(gather, typed_step, reg_covar, float(n_points), kind)
+        guarded = loop.guarded_step(gather, direct, reg_covar, float(n_points), kind)
+        return loop.in_shape_of_type(guarded, kind)
 
     def step(parameters: Parameters) -> tuple[Parameters, float]:
         new, value = typed_step(parameters)
@@ -332,11 +335,10 @@ def first_state(
             points = survey.points - center
             rows = Rows(points, points.new_ones(points.shape[0]))
             parameters, _ = mixture._start(rows, center, generator)
-            covariances = expand(parameters.covariances, mixture.covariance_type, *parameters.means.shape)
-            parameters = parameters._replace(covariances=covariances)
             state = State(parameters, center, [])
         packed = state.pack()
-    return State.unpack(processes.broadcast(packed), cast(int, mixture.n_components), survey.low.shape[0])
+    k, dim = cast(int, mixture.n_components), survey.low.shape[0]
+    return State.unpack(processes.broadcast(packed), k, dim, mixture.covariance_type)
 
 
 def run_facts(mixture: GaussianMixture, survey: Survey, e_step: str) -> RunFacts:
@@ -370,7 +372,9 @@ def run_facts(mixture: GaussianMixture, survey: Survey, e_step: str) -> RunFacts
 
 
 class State(NamedTuple):
-    """Parameters relative to `center` (D,), and the lower bounds (nats) of the iterations so far."""
+    """Parameters relative to `center` (D,), with covariances in the shape of their type, and the lower bounds
+    (nats) of the iterations so far.
+    """
 
     parameters: Parameters
     center: Tensor
@@ -382,12 +386,12 @@ class State(NamedTuple):
         return torch.cat([part.flatten() for part in (*self.parameters, self.center, bounds)])
 
     @staticmethod
-    def unpack(vector: Tensor, n_components: int, dim: int) -> State:
+    def unpack(vector: Tensor, n_components: int, dim: int, covariance_type: str) -> State:
         """The inverse of `pack`."""
-        k = n_components
-        sizes = [k, k * dim, k * dim * dim, dim]
+        k, shape = n_components, em.type_shape(covariance_type, n_components, dim)
+        sizes = [k, k * dim, math.prod(shape), dim]
         weights, means, covariances, center, bounds = vector.split([*sizes, vector.numel() - sum(sizes)])
-        parameters = Parameters(weights, means.view(k, dim), covariances.view(k, dim, dim))
+        parameters = Parameters(weights, means.view(k, dim), covariances.view(shape))
         return State(parameters, center, bounds.tolist())
 
 
@@ -472,10 +476,14 @@ def read_state(path: Path) -> tuple[State, dict[str, Any]]:
     means = require(tensors, "means", (None, None), torch.float64, path)
     k, dim = means.shape
     weights = require(tensors, "weights", (k,), torch.float64, path)
-    covariances = require(tensors, "covariances", (k, dim, dim), torch.float64, path)
     center = require(tensors, "center", (dim,), torch.float64, path)
     bounds = require(tensors, "lower_bounds", (None,), torch.float64, path)
     run = facts.get("run")
-    if not isinstance(run, dict):
+    kind = run.get("covariance_type") if isinstance(run, dict) else None
+    if not isinstance(run, dict) or kind not in em.COVARIANCE_TYPES:
         raise DataError(f"{path} lacks the description of its run; the file is damaged.")
+    is_full = tensors["covariances"].ndim == 3 if "covariances" in tensors else False  # as in 1.0
+    shape = (k, dim, dim) if is_full else em.type_shape(kind, k, dim)
+    covariances = require(tensors, "covariances", shape, torch.float64, path)
+    covariances = em.compact(covariances, kind) if is_full else covariances
     return State(Parameters(weights, means, covariances), center, bounds.tolist()), run

@@ -3,6 +3,7 @@ from .accuracy_figures import comparison_figure as comparison_figure
 from .accuracy_figures import convergence_figure as convergence_figure
 from .accuracy_figures import reliability_figure as reliability_figure
 from .accuracy_figures import roc_figure as roc_figure
+from .accuracy_figures import trajectory_figure as trajectory_figure
 from .ellipsoids import checked_components as checked_components
 from .ellipsoids import cut_away as cut_away
 from .ellipsoids import ellipse_outlines as ellipse_outlines
@@ -61,6 +62,7 @@ from .style import line_style as line_style
 from .style import log_axis as log_axis
 from .style import metres as metres
 from .style import new_figure as new_figure
+from .style import picture as picture
 from .style import place_labels as place_labels
 from .style import save_figure as save_figure
 from .style import stacked_bars as stacked_bars

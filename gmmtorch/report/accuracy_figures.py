@@ -1,4 +1,6 @@
-"""Figures of accuracy: ROC, reliability and AUC of maps; convergence and likelihood of fitted mixtures."""
+"""Figures of accuracy: ROC, reliability and AUC of maps; trajectories; convergence and likelihood of fitted
+mixtures.
+"""
 
 from __future__ import annotations
 
@@ -163,6 +165,35 @@ def _draw_auc(axes: Axes, rows: style.Rows, methods: Sequence[str], heading: str
     style.log_axis(axes, "x", shares)
     axes.set_xlim(1.3 * max(shares), min(shares) / 1.3)
     style.draw_grid(axes)
+
+
+def trajectory_figure(
+    estimate: np.ndarray, truth: np.ndarray, found: np.ndarray, title: str = "Estimated poses"
+) -> Figure:
+    """Draws two paths from above, and below them the distance between them at each scan.
+
+    Args:
+        estimate, truth: positions (N, D) in one frame, metres. found: (N,) bool; lost scans are marked.
+    """
+    figure = style.new_figure(7.4, 8.6)
+    upper, lower = figure.subplots(2, 1, height_ratios=(3, 1))
+    upper.plot(truth[:, 0], truth[:, 1], color=_NOTE, linewidth=2.4, label="poses of the data set")
+    upper.plot(estimate[:, 0], estimate[:, 1], color=style.colour(0), linewidth=1.2, label="estimated")
+    scans, gaps = np.arange(len(truth)), np.linalg.norm(estimate - truth, axis=1)
+    lower.plot(scans, gaps, color=style.colour(0), linewidth=1.2)
+    if not found.all():
+        look: dict[str, Any] = {"color": style.colour(1), "markersize": 4, "linestyle": "none"}
+        upper.plot(*estimate[~found, :2].T, marker="x", label="lost", **look)
+        lower.plot(scans[~found], gaps[~found], marker="x", **look)
+    upper.set_aspect("equal", adjustable="datalim")
+    style.label_axes(upper, "", "x [m]", "y [m]")
+    style.label_axes(lower, "", "scan", "distance [m]")
+    lower.set_ylim(bottom=0)
+    for axes in (upper, lower):
+        style.draw_grid(axes)
+    upper.legend(loc="best", fontsize=style.LABEL_SIZE - 1, framealpha=0.95, edgecolor="none")
+    style.figure_title(figure, title)
+    return figure
 
 
 def convergence_figure(lower_bounds_by_name: Mapping[str, Sequence[float]]) -> Figure:

@@ -26,7 +26,7 @@ from matplotlib.transforms import Bbox
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.files import write_atomically
+from gmmtorch.files import write_atomically, write_bytes
 from gmmtorch.scan import ArrayLike
 
 Rows = Sequence[Mapping[str, Any]]
@@ -63,9 +63,7 @@ class _ShownFigure(Figure):
     """A figure that notebooks show as a picture, also before pyplot has made a figure."""
 
     def _repr_png_(self) -> bytes:
-        content = BytesIO()
-        self.savefig(content, format="png")
-        return content.getvalue()
+        return picture(self, self.dpi)
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -77,6 +75,15 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
+def picture(figure: Figure, dpi: float = SAVED_DPI) -> bytes:
+    """Returns the figure as a PNG file. `Figure.savefig` would draw it twice, with the same result."""
+    content, before = BytesIO(), figure.dpi
+    figure.dpi = dpi
+    FigureCanvasAgg(figure).print_png(content)
+    figure.dpi = before
+    return content.getvalue()
+
+
 def save_figure(figure: Figure, path: str | Path, dpi: float = SAVED_DPI) -> Path:
     """Writes the figure atomically as .png, with `dpi` pixels per inch, .pdf or .svg, and returns the path.
 
@@ -85,6 +92,8 @@ def save_figure(figure: Figure, path: str | Path, dpi: float = SAVED_DPI) -> Pat
     path = Path(path)
     if path.suffix.lower() not in _SUFFIXES:
         raise InvalidArgumentError(f"path={path} must end in one of {', '.join(_SUFFIXES)}.")
+    if path.suffix.lower() == ".png":
+        return write_bytes(path, picture(figure, dpi))
     return write_atomically(path, lambda temporary: figure.savefig(temporary, dpi=dpi))
 
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 import os
 import socket
+import struct
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,12 +19,9 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, OutputError
 from gmmtorch.report.ellipsoids import checked_components, ellipsoid_mesh
-from gmmtorch.report.style import as_array, colour, even_sample
+from gmmtorch.report.style import as_array, colour, even_sample, picture
 from gmmtorch.report.text import format_value
 from gmmtorch.scan import ArrayLike
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _MAX_POINTS = 50_000
 """Limit of points per cloud and vertices per mesh: browsers still turn these smoothly. More are thinned."""
@@ -103,17 +101,16 @@ class Board:
         false_rate, true_rate, _ = roc_curve(truth, theta)
         name = tag.rsplit("/", 1)[-1]
         curves = {name: (false_rate, true_rate, float(roc_auc_score(truth, theta)))}
-        self.figure(f"{tag}/roc", roc_figure(curves))
+        self.figure(f"{tag}/roc", picture(roc_figure(curves)))
 
-    def figure(self, tag: str, figure: Figure) -> None:
-        """Writes a figure as an image."""
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
+    def figure(self, tag: str, png: bytes) -> None:
+        """Writes an image: a PNG file, as `picture` makes it."""
+        from tensorboard.compat.proto.summary_pb2 import Summary
 
-        # SummaryWriter.add_figure would import pyplot, only to close a figure that pyplot never opened.
-        canvas = FigureCanvasAgg(figure)
-        canvas.draw()
-        pixels = np.asarray(canvas.buffer_rgba())[..., :3].copy()
-        self._events.add("image", tag, pixels, dataformats="HWC", step=0)
+        # summary.image would need the pixels, only to make such a file of them.
+        width, height = struct.unpack_from(">II", png, 16)
+        image = Summary.Image(height=height, width=width, colorspace=4, encoded_image_string=png)
+        self._events.write(Summary(value=[Summary.Value(tag=tag, image=image)]))
 
     def cloud(self, tag: str, points: ArrayLike, colors: ArrayLike | None = None, step: int = 0) -> None:
         """Writes points (N, D), metres, with colours (N, 3) from 0 to 255; writes nothing for no points."""

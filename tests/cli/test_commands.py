@@ -389,7 +389,7 @@ def test_a_damaged_file_is_named(monkeypatch, tmp_path):
 def test_a_process_with_an_error_prints_one_line_and_exits_with_one(tmp_path):
     done = run_script("occupancy", tmp_path / "run", "method=[octree]")
     assert "octree" in refused(done)
-    assert done.stdout == ""
+    assert done.stdout == f"gmmtorch-occupancy writes to {done.folder}\n"
 
 
 @pytest.mark.slow

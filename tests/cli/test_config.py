@@ -398,6 +398,48 @@ def test_inputs_that_do_not_exist_are_refused_without_heavy_imports(tmp_path):
         assert line.startswith(f"gmmtorch: error: {option}=")
 
 
+_RUN = """
+import importlib, io, sys
+
+class Output(io.StringIO):
+    def write(self, text):
+        if not self.getvalue():
+            loaded.append(set(sys.modules))
+        return super().write(text)
+
+loaded, out = [], sys.stdout
+sys.stdout = Output()
+sys.argv = ["gmmtorch"] + {arguments}
+importlib.import_module({module!r}).main()
+print(sys.stdout.getvalue(), *loaded[0], file=out)
+print(*sys.modules, file=sys.stderr)
+"""
+_UNUSED = {
+    "fit": {"gmmtorch.team", "gmmtorch.localization.odometry", "sklearn.mixture"},
+    "map": {"gmmtorch.team", "gmmtorch.localization.odometry", "sklearn", "scipy.stats"},
+}
+"""Modules that a plain run of a command does not need, besides those of pictures, TensorBoard and Open3D."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", _UNUSED)
+def test_a_command_prints_a_line_before_heavy_imports_and_loads_what_it_uses(command, tmp_path):
+    options = ["dataset=synthetic_building_2d", "dataset.n_scans=5", f"hydra.run.dir={tmp_path / 'run'}"]
+    options += ["mixture.n_components=3"] * (command == "fit")
+    quiet = [f"report.{name}=false" for name in ("progress", "figures", "tensorboard")]
+    for more, pictures in (([], True), (quiet, False)):
+        code = _RUN.format(arguments=options + more, module=COMMANDS[command].__name__)
+        done = run_python(["-c", code], cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        line, *_, first = done.stdout.splitlines()
+        assert line == f"gmmtorch-{command} writes to {tmp_path / 'run'}"
+        assert not _HEAVY & set(first.split())
+        loaded = set(done.stderr.splitlines()[-1].split())
+        assert not (_UNUSED[command] | {"open3d", "matplotlib.pyplot"}) & loaded
+        assert bool({"matplotlib", "tensorboard"} & loaded) == pictures
+        assert "torch" in loaded
+
+
 @pytest.mark.parametrize(
     "commands", [["export"], pytest.param(["occupancy", "explore", "robot"], marks=pytest.mark.slow)]
 )

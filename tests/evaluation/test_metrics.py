@@ -23,7 +23,6 @@ from gmmtorch.experiments.evaluation.metrics import (
     auc_interval,
     brier_score,
     log_loss_bits,
-    prior_and_dead_band,
     psnr2,
     psnr_terms,
     reliability,
@@ -34,7 +33,6 @@ from gmmtorch.experiments.evaluation.metrics import (
 )
 from gmmtorch.experiments.evaluation.queries import hit_and_free
 from gmmtorch.occupancy.calibrator import N_BINS, Calibrator, reliability_of, scores_of
-from gmmtorch.occupancy.evidence import occupancy_probability
 from gmmtorch.scan import Scan
 
 eighths = st.lists(st.integers(0, 8).map(lambda n: n / 8), min_size=1, max_size=12)
@@ -125,17 +123,17 @@ def test_auc_gain_matches_scikit_learn_and_a_bootstrap(levels):
     before = probabilities(400, 0.8, 0, levels), probabilities(600, -0.2, 1, levels)
     changes = (torch.from_numpy(rng.normal(0.05, 0.2, len(x))) for x in before)
     occupied, free = ((x + change).clamp(0, 1) for x, change in zip(before, changes, strict=True))
-    found = auc_gain(before, (occupied, free))
+    mean, low, high = auc_gain(before, (occupied, free))
 
     def area(occupied: Tensor, free: Tensor) -> float:
         return float(roc_auc_score(*labelled(occupied, free)))
 
-    assert found.mean == pytest.approx(area(occupied, free) - area(*before), abs=1e-12)
+    assert mean == pytest.approx(area(occupied, free) - area(*before), abs=1e-12)
     gains = []
     for _ in range(300):
         rows, columns = rng.integers(0, 400, 400), rng.integers(0, 600, 600)
         gains.append(area(occupied[rows], free[columns]) - area(before[0][rows], before[1][columns]))
-    assert found.high - found.low == pytest.approx(2 * 1.96 * np.std(gains), rel=0.15)
+    assert high - low == pytest.approx(2 * 1.96 * np.std(gains), rel=0.15)
 
 
 def test_auc_gain_of_equal_answers_is_exactly_zero():
@@ -316,37 +314,6 @@ def test_bins_of_a_tally_with_few_predictions_are_pooled():
     assert curve.n_points.tolist() == [21, 4]
     assert curve.predicted == pytest.approx([5.5 / 21, 3.9 / 4])
     assert curve.observed == pytest.approx([6 / 21, 1])
-
-
-def test_prior_and_dead_band_match_counting():
-    generator = torch.Generator().manual_seed(0)
-    labels = torch.randint(2, (400,), generator=generator)
-    hits = labels * torch.randint(0, 9, (400,), generator=generator).double()
-    misses = torch.randint(0, 9, (400,), generator=generator).double()
-    rows = prior_and_dead_band(
-        lambda prior: occupancy_probability(hits, misses, prior), labels, (0.5, 1.0), (0.25, 0.1)
-    )
-    assert [(row["prior"], row["variance_threshold"]) for row in rows] == [
-        (0.5, 0.25), (0.5, 0.1), (1.0, 0.25), (1.0, 0.1),
-    ]  # fmt: skip
-    for row in rows:
-        theta = (hits + row["prior"]) / (hits + misses + 2 * row["prior"])
-        decided = [i for i in range(400) if theta[i] * (1 - theta[i]) < row["variance_threshold"] - 1e-15]
-        right = [i for i in decided if (theta[i] > 0.5) == (labels[i] == 1)]
-        assert row["decided"] == pytest.approx(len(decided) / 400)
-        assert row["accuracy_decided"] == pytest.approx(len(right) / len(decided))
-        assert row["brier"] == pytest.approx(float(((theta - labels) ** 2).mean()))
-        assert row["ece"] == pytest.approx(reliability(theta, labels).expected_error)
-    # A larger prior and a wider dead band both decide fewer points.
-    assert rows[0]["decided"] > rows[1]["decided"] > rows[3]["decided"]
-
-
-def test_accuracy_decided_is_none_if_nothing_is_decided():
-    theta, labels = torch.full((4,), 0.5), torch.tensor([0, 1, 0, 1])
-    (row,) = prior_and_dead_band(lambda prior: theta, labels, (1.0,), (0.25,))
-    assert row["decided"] == 0
-    assert row["accuracy_decided"] is None
-    assert row["accuracy"] == 0.5
 
 
 @pytest.mark.parametrize(

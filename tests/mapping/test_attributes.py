@@ -210,6 +210,13 @@ def test_a_component_without_values_does_not_change_those_of_the_other_in_a_merg
     torch.testing.assert_close(made.share, (c.support[:1] / c.support.sum()))
 
 
+def test_parts_of_components_have_their_own_attributes():
+    c = coloured_components(k=5)
+    for part, rows in zip(c.split([2, 5]), (slice(0, 2), slice(2, 5)), strict=True):
+        part.checked()
+        assert torch.equal(part.attributes.channels["heat"].mean, c.attributes.channels["heat"].mean[rows])
+
+
 def test_predictions_move_with_the_components():
     made, motion = painted_map(dim=3, codec="float"), some_motion(3)
     points = drive(6, 3)[0].points.double()[:50]

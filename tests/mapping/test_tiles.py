@@ -9,17 +9,21 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mapping.map_cases import FINE, open_drive
 from mapping.random_components import random_components
 
-from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, MissingDataError
+from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, MissingDataError, OutputError
 from gmmtorch.files import pack_tensors, read_tensors
+from gmmtorch.mapping import tiles
 from gmmtorch.mapping.codec.component_batch import MapSettings
 from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.query_options import QueryOptions
-from gmmtorch.mapping.tiles import INDEX, TiledMap, canonical, merge, tile_files
+from gmmtorch.mapping.tile_index import INDEX
+from gmmtorch.mapping.tiles import TiledMap, canonical, merge, tile_files
 from gmmtorch.occupancy.calibrator import Calibration
+from gmmtorch.scan import Scan
 
 SIDE = 10.0
 KNOWN = Calibration.prior(8.0)
@@ -124,7 +128,7 @@ def test_a_query_opens_only_the_tiles_that_give_evidence(tmp_path, generator):
     before = tiled.n_read
     tiled.occupancy(points)
     assert tiled.n_read == before  # they are still open
-    one = TiledMap(tmp_path / "all", most_open=1)
+    one = TiledMap(tmp_path / "all", memory=1)
     torch.testing.assert_close(one.occupancy(points), answer)
     assert len(one._open) == 1
     assert float(tiled.occupancy(torch.tensor([[1e5, 0.0], [torch.inf, 0.0]])).sub(0.5).abs().max()) == 0
@@ -259,6 +263,145 @@ def test_a_map_without_components_has_no_tiles(tmp_path):
     assert (len(tiled.index), tiled.n_components) == (0, 0)
     assert torch.equal(torch.as_tensor(tiled.occupancy(torch.zeros(4, 3))), torch.full((4,), 0.5).double())
     assert tiled.open().n_components == 0
+
+
+# -- a map that grows ----------------------------------------------------------------------------------
+
+RULE = replace(FINE, window=3, mean_origins=None)
+
+
+def street(n: int, dim: int) -> list[Scan]:
+    """Scans of rooms, each 15 m after the one before."""
+    found = []
+    for number, scan in enumerate(open_drive(3, dim) * -(-n // 3)):
+        shift = torch.eye(dim, dtype=torch.float64)[0] * (number // 3 * 15.0)
+        found.append(Scan(scan.points + shift, scan.origin + shift, scan.no_return + shift))
+    return found[:n]
+
+
+def around(scans: list[Scan]) -> torch.Tensor:
+    ends = torch.cat([scan.points[::7] for scan in scans])
+    return torch.cat([ends, ends + 0.3, torch.full_like(ends[:1], torch.inf), ends[:1] + 1e6])
+
+
+def grown(folder: Path, scans: list[Scan], **options: object) -> TiledMap:
+    made = TiledMap.create(folder, GaussianMap(RULE, **options), scans[0].dim, SIDE, memory=100_000)
+    for scan in scans:
+        made.insert(scan)
+    return made
+
+
+@pytest.mark.parametrize("codec", ["quantized", "float"])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_map_that_grows_in_tiles_answers_as_one_in_memory(dim, codec, tmp_path, monkeypatch):
+    monkeypatch.setattr(tiles, "_RECENT", 40)
+    scans = street(14, dim)
+    built, tiled, asked = GaussianMap(RULE, codec=codec), None, around(scans)
+    tiled = TiledMap.create(tmp_path / "map", GaussianMap(RULE, codec=codec), dim, SIDE, memory=100_000)
+    for number, scan in enumerate(scans):
+        built.insert(scan)
+        tiled.insert(scan)
+        if number % 4 == 0:
+            assert torch.isfinite(tiled.occupancy(asked)).all()
+    assert len(tiled.index) > 2
+    assert tiled.n_pending == 2
+    assert (tiled.occupancy(asked) != 0.5).any()
+    tiled.finish()
+    built.finish()
+    assert tiled.n_components == built.n_components
+    # Calibrations differ, because the tiled one predicts with its recent components only.
+    whole = built.snapshot(calibration=tiled.query_options.calibration, cutoff=tiled.query_options.cutoff)
+    expected = whole.occupancy(asked)
+    torch.testing.assert_close(tiled.occupancy(asked), expected, rtol=0, atol=1e-9)
+    opened = TiledMap(tmp_path / "map", memory=1)
+    torch.testing.assert_close(opened.occupancy(asked), expected, rtol=0, atol=1e-9)
+    torch.testing.assert_close(opened.open().occupancy(asked), expected, rtol=0, atol=1e-9)
+    assert len(opened._open) == 1
+    more = moved(recording(dim, 0), 200.0)
+    opened.add(more)
+    assert TiledMap(tmp_path / "map").n_components == tiled.n_components + len(more)
+    found = TiledMap(tmp_path / "map").occupancy(torch.cat([asked, more.means]))
+    torch.testing.assert_close(found[: len(asked)], expected, rtol=0, atol=1e-9)
+    assert (found[len(asked) :] != 0.5).any()
+
+
+def test_a_map_that_is_stopped_at_any_write_opens_with_all_finished_windows(tmp_path, monkeypatch):
+    monkeypatch.setattr(tiles, "_RECENT", 40)
+    scans, write = street(15, 2), tiles.write_bytes
+    asked = around(scans)
+    for stop in range(1, 40):
+        folder, n_written = tmp_path / str(stop), 0
+
+        def full(path: Path, data: bytes, stop: int = stop) -> None:
+            nonlocal n_written
+            n_written += 1
+            if n_written == stop:
+                raise OutputError(f"{path} cannot be written: No space left on device")
+            write(path, data)
+
+        monkeypatch.setattr(tiles, "write_bytes", full)
+        if stop == 1:
+            with pytest.raises(OutputError):
+                grown(folder, scans)
+            continue
+        made = TiledMap.create(folder, GaussianMap(RULE), 2, SIDE) if stop > 2 else None
+        if made is None:
+            continue
+        n_final, before = 0, None
+        try:
+            for scan in scans:
+                before = TiledMap(folder).occupancy(asked)
+                n_final = made.n_components
+                made.insert(scan)
+        except OutputError:
+            monkeypatch.setattr(tiles, "write_bytes", write)
+            opened = TiledMap(folder)
+            assert opened.n_components == n_final
+            assert torch.equal(opened.occupancy(asked), before)
+            made.finish()  # the disk has room again: nothing is lost
+            assert TiledMap(folder).n_components == made.n_components > n_final
+            opened_again = TiledMap(folder)
+            torch.testing.assert_close(
+                opened_again.occupancy(asked), made.occupancy(asked), rtol=0, atol=1e-9
+            )
+            opened_again.insert(scans[-1])
+            opened_again.finish()
+            assert opened_again.n_components > made.n_components
+        else:
+            break
+    assert stop > 12
+
+
+def test_a_damaged_tile_is_named_and_the_rest_answers(tmp_path, monkeypatch):
+    monkeypatch.setattr(tiles, "_RECENT", 10)
+    scans = street(30, 2)
+    folder = grown(tmp_path / "map", scans).folder
+    expected = TiledMap(folder).occupancy(around(scans[-3:])[:-2])
+    first = TiledMap(folder)
+    tile = folder / first._name(first.near(*[scans[0].origin] * 2)[0])
+    tile.write_bytes(tile.read_bytes()[:-1])
+    damaged = TiledMap(folder)
+    with pytest.raises(DataError, match=tile.name):
+        damaged.occupancy(scans[0].origin[None])
+    assert torch.equal(damaged.occupancy(around(scans[-3:])[:-2]), expected)
+    recent = next(folder.glob("recent_*"))
+    recent.write_bytes(recent.read_bytes()[:-1])
+    with pytest.raises(DataError, match=recent.name):
+        TiledMap(folder)
+    recent.unlink()
+    with pytest.raises(MissingDataError, match=recent.name):
+        TiledMap(folder)
+
+
+def test_maps_that_cannot_grow_in_tiles_say_why(tmp_path):
+    for rule in (replace(RULE, n_components=5), replace(RULE, forget="contradiction")):
+        with pytest.raises(InvalidArgumentError, match="budget"):
+            TiledMap.create(tmp_path / "a", GaussianMap(rule), 2)
+    merged = written(tmp_path / "b", recording(2, 0))
+    with pytest.raises(InvalidArgumentError, match="do not grow"):
+        merged.insert(street(1, 2)[0])
+    with pytest.raises(InvalidArgumentError, match="has a map"):
+        TiledMap.create(tmp_path / "b", GaussianMap(), 2)
 
 
 # -- damaged and hostile files -------------------------------------------------------------------------

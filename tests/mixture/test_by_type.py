@@ -231,9 +231,9 @@ def test_variational_moments_of_a_type_are_those_of_features(kind, dim):
     log_weight = torch.tensor([-1.0, -3.0, -0.5], dtype=torch.float64)
     given = (points, points.new_ones(200), log_weight, full, 1e-3, torch.float64)
     expected, value = variational._expected_moments(em.quadratic_features(points), *given)
-    found, same = variational._typed_moments(*given, kind)
-    weights = expected.weights / expected.weights.sum()
-    projected = constrain(expected.covariances, kind, weights)
+    factors = by_type.Factors(parameters._replace(weights=full.weights), kind)
+    found, same = variational._typed_moments(*given[:3], factors, 1e-3, torch.float64)
+    projected = by_type.compacted(expected, kind).covariances
     torch.testing.assert_close(tuple(found), (*expected[:2], projected), rtol=1e-7, atol=1e-8)
     torch.testing.assert_close(same, value)
 

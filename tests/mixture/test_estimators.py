@@ -95,6 +95,9 @@ EXCEPTED = {
         "test_gaussian_mixture_log_probabilities": PRIVATE,
         "test_gaussian_mixture_precisions_init": PRIVATE,
         "test_gaussian_mixture_all_init_does_not_estimate_gaussian_parameters": PRIVATE,
+        "test_gaussian_mixture_precisions_init_diag": (
+            "expects the clusters of scikit-learn's k-means with the same seed, in their order"
+        ),
         "test_check_weights": "expects a message that exchanges the largest and the smallest weight",
         "test_gaussian_mixture_raises_where_array_api_not_implemented": (
             "expects an error for tensors, which are accepted"
@@ -187,4 +190,4 @@ def global_random_seed() -> int:
 def test_exceptions_are_existing_tests():
     for name, module in MODULES.items():
         assert EXCEPTED[name].keys() <= {key for key, _ in functions(name, module)}
-    assert sum(len(names) for names in EXCEPTED.values()) == 13
+    assert sum(len(names) for names in EXCEPTED.values()) == 14

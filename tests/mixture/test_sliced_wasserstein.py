@@ -274,21 +274,23 @@ def rings(n: int = 600) -> np.ndarray:
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 @pytest.mark.parametrize("init_params", ["kmeans", "random_points"])
-def test_result_is_closer_than_the_start_and_than_em(init_params):
+def test_result_is_closer_than_the_start_and_on_average_than_em(init_params):
     points = rings()
-    fit = SlicedWassersteinGaussianMixture(
-        8, n_projections=32, init_params=init_params, random_state=0, max_iter=40
-    ).fit(points)
     center = torch.from_numpy(points.mean(0))
-    first = initialize(
-        init_params, torch.from_numpy(points) - center, torch.ones(len(points)).double(), 8, 1e-6,
-        torch.Generator().manual_seed(0),
-    )  # fmt: skip
-    em_fit = GaussianMixture(8, init_params=init_params, random_state=0, tol=1e-6, max_iter=500).fit(points)
-    reached = distance(points, parameters_of(fit))
-    assert reached < 0.95 * distance(points, first._replace(means=first.means + center))
-    assert reached < distance(points, parameters_of(em_fit))
-    assert -fit.lower_bound_ == pytest.approx(reached, rel=0.5)
+    reached, of_em = [], []
+    for seed in range(3):
+        options = {"init_params": init_params, "random_state": seed}
+        fit = SlicedWassersteinGaussianMixture(8, n_projections=32, max_iter=40, **options).fit(points)
+        first = initialize(
+            init_params, torch.from_numpy(points) - center, torch.ones(len(points)).double(), 8, 1e-6,
+            torch.Generator().manual_seed(seed),
+        )  # fmt: skip
+        em_fit = GaussianMixture(8, tol=1e-6, max_iter=500, **options).fit(points)
+        reached.append(distance(points, parameters_of(fit)))
+        of_em.append(distance(points, parameters_of(em_fit)))
+        assert reached[-1] < 0.95 * distance(points, first._replace(means=first.means + center))
+        assert -fit.lower_bound_ == pytest.approx(reached[-1], rel=0.5)
+    assert np.mean(reached) < np.mean(of_em)
 
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")

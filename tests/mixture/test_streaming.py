@@ -19,7 +19,7 @@ from torch import Tensor
 from gmmtorch.datasets.point_files.point_chunks import PointChunks, in_memory, open_points
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mixture.em.distributed import SINGLE_PROCESS, LostProcessError, Processes, is_launched, joined
-from gmmtorch.mixture.em.exact import Parameters
+from gmmtorch.mixture.em.exact import COVARIANCE_TYPES, Parameters, expand, type_shape
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 from gmmtorch.mixture.streaming import (
     Accumulate,
@@ -302,6 +302,25 @@ def test_damaged_checkpoint_is_named(tmp_path):
     write_state(path, State(fewer, state.center, state.lower_bounds), run)
     with pytest.raises(DataError, match="does not match its own description"):
         fit_stream(exact(2), source_of(), checkpoint=Checkpoint(path, resume=True))
+
+
+@pytest.mark.parametrize("dim", [2, 5])
+@pytest.mark.parametrize("kind", COVARIANCE_TYPES)
+@pytest.mark.parametrize("old", [False, True])
+def test_fit_continues_from_a_checkpoint_in_the_shape_of_the_type(tmp_path, dim, kind, old):
+    points, path = np.random.default_rng(0).normal(size=(300, dim)), tmp_path / "state.safetensors"
+    options = {"covariance_type": kind, "tol": 0, "dtype": "float64"}
+    checkpoint = Checkpoint(path, resume=True)
+    fit_stream(exact(3, max_iter=2, **options), points, checkpoint=checkpoint)
+    state, run = read_state(path)
+    assert state.parameters.covariances.shape == type_shape(kind, 3, dim)
+    if old:  # versions up to 1.0 stored matrices
+        matrices = expand(state.parameters.covariances, kind, 3, dim)
+        write_state(path, state._replace(parameters=state.parameters._replace(covariances=matrices)), run)
+    continued = fit_stream(exact(3, max_iter=5, **options), points, checkpoint=checkpoint)
+    whole = fit_stream(exact(3, max_iter=5, **options), points)
+    assert continued.lower_bounds_ == pytest.approx(whole.lower_bounds_, rel=1e-12)
+    torch.testing.assert_close(continued.covariances, whole.covariances, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("options", [{"every": 0}, {"seconds": 0.0}, {"seconds": math.inf}])

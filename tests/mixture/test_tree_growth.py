@@ -14,6 +14,8 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 from torch import Tensor
 
+from gmmtorch.mixture.estimators import tree_growth
+from gmmtorch.mixture.estimators.hierarchical import HierarchicalGaussianMixture
 from gmmtorch.mixture.estimators.tree_growth import (
     Children,
     Members,
@@ -190,3 +192,14 @@ def test_nodes_of_a_batch_are_fitted_independently():
     rises = torch.stack(values).diff(dim=0)
     assert bool((rises > -1e-3).all())
     assert int((rises[-1] == 0).sum()) >= 3  # the nodes converge independently
+
+
+def test_features_that_are_made_again_give_the_same_tree(monkeypatch):
+    x = torch.randn(700, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    options = {"dtype": "float64", "max_levels": 2, "min_gain": 0, "branching": 3}
+    stored = HierarchicalGaussianMixture(**options).fit(x)
+    monkeypatch.setattr(tree_growth, "_MOST_FEATURES", 0)
+    made = HierarchicalGaussianMixture(**options).fit(x)
+    assert stored.means.shape[0] > 3
+    torch.testing.assert_close(made.means, stored.means, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(made.covariances, stored.covariances, rtol=1e-9, atol=1e-12)

@@ -68,9 +68,12 @@ class GivenStart(BayesianGaussianMixture):
             self.n_components,
             self.reg_covar,
             torch.Generator().manual_seed(0),
+            self.covariance_type,
         )
         order = found.weights.argsort(descending=True, stable=True)
-        count, means, covariances = (value[order].numpy() for value in found)
+        count, means = (value[order].numpy() for value in found[:2])
+        covariances = found.covariances if self.covariance_type == "tied" else found.covariances[order]
+        covariances = covariances.numpy()
         self._estimate_weights(count * len(X))
         self._estimate_means(count * len(X), means + center)
         self._estimate_precisions(count * len(X), means + center, covariances)
@@ -108,6 +111,18 @@ def test_equal_start_gives_the_posterior_of_scikit_learn(prior_type, dim, own_pr
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-8, atol=1e-8)
     apart = len(x) * np.array(found.lower_bounds_) - np.array(expected.lower_bounds_)
     np.testing.assert_allclose(apart, apart[0], atol=1e-7)  # the constants that scikit-learn omits
+
+
+@types
+@pytest.mark.parametrize("kind", ["tied", "diag", "spherical"])
+@pytest.mark.parametrize("dim", [2, 5])
+def test_posterior_of_a_type_is_that_of_scikit_learn(prior_type, kind, dim):
+    x, options = blobs(dim), {"covariance_type": kind, "tol": 0, "max_iter": 20, "reg_covar": 1e-3}
+    found = variational(5, prior_type, **options).fit(x)
+    expected = GivenStart(n_components=5, weight_concentration_prior_type=prior_type, **options).fit(x)
+    for name in ("weights_", "means_", "covariances_", "degrees_of_freedom_", "covariance_prior_"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-8, atol=1e-8)
+    assert bool((np.diff(found.lower_bounds_) > -1e-6).all())
 
 
 @types
@@ -391,7 +406,8 @@ def test_bound_is_close_below_the_enumerated_evidence(spread):
         weight += (special.gammaln(gamma + count) - special.gammaln(gamma)).sum()
         terms.append(weight + sum(log_marginal(x[label == j], prior) for j in range(3)))
     evidence = special.logsumexp(terms)
-    mixture = variational(3, DISTRIBUTION, reg_covar=0, n_init=5, tol=1e-9, max_iter=500, **prior).fit(x)
+    options = {"reg_covar": 0, "n_init": 5, "init_params": "random", "tol": 1e-9, "max_iter": 500}
+    mixture = variational(3, DISTRIBUTION, **options, **prior).fit(x)
     bound = mixture.lower_bound_ * 6
     # The bound covers one of the 3! orders of the components, and only part of it.
     assert evidence - math.log(6) - 3 < bound < evidence

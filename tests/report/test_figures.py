@@ -16,6 +16,7 @@ from gmmtorch.report.accuracy_figures import (
     convergence_figure,
     reliability_figure,
     roc_figure,
+    trajectory_figure,
 )
 from gmmtorch.report.mixture_figures import mixture_figure
 from gmmtorch.report.style import save_figure
@@ -79,6 +80,17 @@ def test_convergence_draws_each_fit():
     convergence_figure({}).canvas.draw()
 
 
+def test_a_trajectory_is_drawn_beside_the_truth_with_the_distances():
+    truth = np.stack([np.arange(5.0), np.zeros(5)], 1)
+    estimate = truth + np.array([0.0, 0.3])
+    figure = trajectory_figure(estimate, truth, np.array([True, True, False, True, True]))
+    upper, lower = figure.axes
+    assert np.array_equal(upper.lines[0].get_xydata(), truth)
+    assert np.array_equal(upper.lines[2].get_xydata(), estimate[2:3])
+    assert np.allclose(lower.lines[0].get_ydata(), 0.3)
+    assert len(trajectory_figure(estimate, truth, np.ones(5, dtype=bool)).axes[0].lines) == 2
+
+
 def row(method: str, resolution: float, kept: float, auc: float | None, **more: object) -> dict[str, object]:
     facts = {"dataset": "lab", "method": method, "resolution": resolution, "removal": "beams"}
     return {**facts, "kept": kept, "auc": auc, **more}
@@ -127,11 +139,12 @@ from gmmtorch.report.accuracy_figures import roc_figure
 from gmmtorch.report.map_figures import map_figure
 from gmmtorch.report.map_images import MapPanel
 from gmmtorch.report.mixture_figures import mixture_figure
-from gmmtorch.report.style import save_figure
+from gmmtorch.report.style import picture, save_figure
 eye, panel = torch.eye(2)[None], MapPanel("m", lambda x: x[:, 0] * 0 + 0.2, 0.5, (0, 0, 0), (1, 1, 1))
 with Board(sys.argv[1]) as board:
-    board.figure("map", map_figure([panel], [torch.zeros(2, 3)]))
-    board.figure("mixture", mixture_figure(torch.zeros(1, 2), torch.zeros(1, 2), eye, torch.ones(1)))
+    board.figure("map", picture(map_figure([panel], [torch.zeros(2, 3)])))
+    mixture = mixture_figure(torch.zeros(1, 2), torch.zeros(1, 2), eye, torch.ones(1))
+    board.figure("mixture", picture(mixture))
     board.curve("c", torch.tensor([0, 1]), torch.tensor([0.1, 0.9]))
 save_figure(roc_figure({}), sys.argv[1] + "/roc.png")
 assert "matplotlib.pyplot" not in sys.modules

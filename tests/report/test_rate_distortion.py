@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import math
+import runpy
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.experiments.report.rate_distortion_figures import bytes_for, figures, leads
+
+MODULE = runpy.run_path(
+    str(Path(__file__).resolve().parents[2] / "benchmarks" / "rate_distortion_figures.py")
+)
+bytes_for, figures, leads = (MODULE[name] for name in ("bytes_for", "figures", "leads"))
 
 
 def rows_of(curves: dict[str, list[tuple[float, float]]], dataset: str = "room") -> list[dict[str, Any]]:

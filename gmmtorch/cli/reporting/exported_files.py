@@ -9,6 +9,7 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
+from gmmtorch import mixture as mixtures  # whose estimators wait a second for scikit-learn
 from gmmtorch.cli import inputs
 from gmmtorch.datasets import read_trajectory
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
@@ -36,7 +37,6 @@ from gmmtorch.export import (
     write_splats,
 )
 from gmmtorch.mapping import GaussianMap
-from gmmtorch.mixture import GaussianMixture
 from gmmtorch.occupancy import OccupancyGrid, Thresholds, VoxelGrid, check_resolution, rasterize
 from gmmtorch.report import Event
 from gmmtorch.scan import COLOUR
@@ -69,7 +69,7 @@ def write_components(config: DictConfig) -> str:
     elif config.format == "npz":
         write_npz(output, mixture)
     else:
-        GaussianMixture.from_parameters(*mixture[:3]).save(output)
+        mixtures.GaussianMixture.from_parameters(*mixture[:3]).save(output)
     k, dim = mixture.means.shape
     return f"{_size(output)}: {k:,} components in {dim}D"
 
@@ -90,7 +90,7 @@ def _components(config: DictConfig) -> PlainMixture:
     except DataError as error:
         no_map = error
     try:
-        mixture = GaussianMixture.load(path)
+        mixture = mixtures.GaussianMixture.load(path)
     except DataError as error:
         raise DataError(f"{path} contains no components to export. {no_map} {error}") from error
     support = None if n_points is None else mixture.weights * n_points

@@ -12,13 +12,12 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 import gmmtorch
-from gmmtorch import report  # its parts load when they are used
+from gmmtorch import localization, report  # whose parts load when they are used
 from gmmtorch.cli import common, schema
 from gmmtorch.cli.export import ExportOptions
-from gmmtorch.datasets import Dataset, read_trajectory
+from gmmtorch.datasets import Dataset, Reposed, read_trajectory
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError, MissingDataError, check_number
 from gmmtorch.export import write_pose_table, write_tum
-from gmmtorch.localization import Trajectory, scan_times
 from gmmtorch.mapping import Components, GaussianMap, MapBuilder
 from gmmtorch.occupancy import reliability_of, scores_of
 from gmmtorch.optional_packages import load_pyoctomap
@@ -113,7 +112,7 @@ def write_trajectory(builder: MapBuilder, folder: Path) -> Tensor:
     return builder.poses[:, :-1, -1]
 
 
-def write_estimated_poses(dataset: Dataset, estimated: Trajectory, folder: Path) -> None:
+def write_estimated_poses(dataset: Dataset, estimated: localization.Trajectory, folder: Path) -> None:
     """Write the estimated poses of all scans with their covariances, if the method gives some."""
     if bool(estimated.covariances.isnan().any()):
         return
@@ -126,7 +125,7 @@ def write_estimated_poses(dataset: Dataset, estimated: Trajectory, folder: Path)
         "doubts": estimated.doubts,
     }
     spread = axes @ estimated.covariances @ axes.mT  # of the sensor's axes, in those of the world
-    write_pose_table(folder / POSE_TABLE, scan_times(dataset), estimated.poses, spread, columns)
+    write_pose_table(folder / POSE_TABLE, localization.scan_times(dataset), estimated.poses, spread, columns)
 
 
 def trajectories(run: Path, given: str | None, dim: int) -> list[Tensor]:
@@ -159,10 +158,10 @@ def write_exports(
     config: DictConfig, source: GaussianMap, folder: Path, on_event: Event
 ) -> tuple[list[str], list[str]]:
     """Write the exports that the options name; returns messages, and the errors of those that failed."""
-    from gmmtorch.cli.reporting import exported_files  # takes a second, for exports only
-
     messages, errors = [], []
     for name in config.export:
+        from gmmtorch.cli.reporting import exported_files
+
         form, file = EXPORTS[name]
         options = {
             "format": form,
@@ -222,11 +221,17 @@ def bytes_per_metre(nbytes: int, metres: float) -> float | None:
 
 
 def draw(
-    config: DictConfig, built: GaussianMap, trajectories: Sequence[Tensor], row: Row, folder: Path
+    config: DictConfig,
+    built: GaussianMap,
+    trajectories: Sequence[Tensor],
+    row: Row,
+    folder: Path,
+    odometry: Any = None,
 ) -> None:
     """Write the figures as PNG, and figures and numbers to TensorBoard.
 
-    trajectories: sensor positions (S, D) of each recording. row: of results.json.
+    trajectories: sensor positions (S, D) of each recording. row: of results.json. odometry: of
+    `odometry_figure`.
     """
 
     def write(board: report.Board) -> None:
@@ -237,7 +242,22 @@ def draw(
         board.paths("trajectory", trajectories)
         board.hparams(common.chosen_options(config), {key: row[key] for key in ("n_components", "nbytes")})
 
-    common.show(config, folder, lambda: _figures(built, trajectories, row), write)
+    def figures() -> dict[str, Any]:
+        return _figures(built, trajectories, row) | ({} if odometry is None else {"odometry": odometry})
+
+    common.show(config, folder, figures, write)
+
+
+def odometry_figure(dataset: Dataset, estimated: localization.Trajectory | None, row: Row) -> Any:
+    """A figure of the estimated path beside that of the data set; None if one of them is missing."""
+    facts = row.get("odometry")
+    if estimated is None or facts is None or facts["ate"] is None or not isinstance(dataset, Reposed):
+        return None
+    true = torch.stack([dataset.own_pose(index) for index in range(len(dataset))])
+    moved = localization.aligned(estimated.poses, true, facts["align"])
+    path, true_path = (poses[:, :-1, -1].numpy() for poses in (moved, true))
+    title = f"{row['dataset']}: ATE {facts['ate']:.3g} m, RPE {facts['rpe']:.3g} m, {facts['n_lost']} lost"
+    return report.trajectory_figure(path, true_path, estimated.found.numpy(), title)
 
 
 def map_panel(built: GaussianMap, trajectories: Sequence[Tensor]) -> report.MapPanel:

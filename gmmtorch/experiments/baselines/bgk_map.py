@@ -11,17 +11,11 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, MemoryLimitError, check_number, check_whole
-from gmmtorch.experiments.baselines.cell_table import CellTable
+from gmmtorch.experiments.baselines.cell_table import CellMap, CellTable
 from gmmtorch.experiments.baselines.samples import thinned_samples
 from gmmtorch.files import require
 from gmmtorch.linalg import ragged_index
-from gmmtorch.occupancy import (
-    MEMORY_LIMIT,
-    TensorFileMap,
-    check_length,
-    check_resolution,
-    optional_length,
-)
+from gmmtorch.occupancy import MEMORY_LIMIT, check_length, check_resolution, optional_length
 from gmmtorch.scan import Scan
 
 _CHUNK_PAIRS = 1 << 21
@@ -60,7 +54,7 @@ def kernel_offsets(length: float, resolution: float, dim: int) -> Tensor:
     return offsets[nearest < length]
 
 
-class BGKMap(TensorFileMap):
+class BGKMap(CellMap):
     """Cells with a Beta posterior over kernel-weighted counts of hit and free samples.
 
     Doherty, Wang & Englot 2017, 2019 (la3dm): α = α₀ + Σ k(x, xᵢ) over hits, β likewise over free samples,
@@ -81,6 +75,7 @@ class BGKMap(TensorFileMap):
     """
 
     file_kind = "gmmtorch.bgk_map"
+    _content = "sums"  # of the weights of hits, and of free samples
 
     def __init__(
         self,
@@ -112,13 +107,6 @@ class BGKMap(TensorFileMap):
         """Thinned samples (S, D) of a scan, and whether each (S,) is a hit."""
         return thinned_samples(scan, self.free_resolution, self.ds_resolution, self.max_range)
 
-    @property
-    def device(self) -> torch.device:
-        return self._table.keys.device
-
-    def _start(self, dim: int, device: torch.device) -> None:
-        self._table = CellTable(self.resolution, dim, 2, device, self.memory_limit)
-
     def _learn(self, scan: Scan) -> None:
         samples, is_hit = self._samples(scan)
         offsets = kernel_offsets(self.length, self.resolution, scan.dim).to(samples.device)
@@ -138,22 +126,8 @@ class BGKMap(TensorFileMap):
         self._table.values.view(-1).index_add_(0, 2 * rows + column, weight[sample, offset].float())
 
     def _answer(self, query: Tensor) -> Tensor:
-        rows, known = self._table.find(query)
-        if self._table.keys.shape[0] == 0:
-            return query.new_full((query.shape[0],), 0.5)
-        hits, misses = self._table.values[rows].double().unbind(1)
-        return torch.where(known, beta_mean(hits, misses, self.prior), 0.5)
-
-    def _tensors(self) -> dict[str, Tensor]:
-        """The cells, and their two sums as float32."""
-        return {**self._table.packed(), "sums": self._table.values}
-
-    def _restore(self, tensors: dict[str, Tensor], path: str | Path) -> None:
-        self._table.fill(tensors, path)
-        sums = require(tensors, "sums", (self._table.keys.shape[0], 2), torch.float32, path)
-        if bool((sums < 0).any()):
-            raise DataError(f"{path}: sums contains negative numbers; the file is damaged.")
-        self._table.values = sums
+        hits, misses = self._table.at(query).unbind(1)
+        return beta_mean(hits, misses, self.prior)
 
 
 _GROWTH_STEP = 2**0.125

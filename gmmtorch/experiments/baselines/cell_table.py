@@ -1,9 +1,10 @@
-"""CellTable: numbers of single cells, on an unbounded lattice."""
+"""CellTable: numbers of single cells, on an unbounded lattice; and the base of maps that have one."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, MemoryLimitError
 from gmmtorch.files import require
-from gmmtorch.occupancy import MEMORY_LIMIT, SparseLattice
+from gmmtorch.occupancy import MEMORY_LIMIT, SparseLattice, TensorFileMap
 
 _AXIS_BITS = {2: 27, 3: 17}
 
@@ -86,6 +87,13 @@ class CellTable(SparseLattice):
         """
         return self.find_cells(self.cells_of(points))
 
+    def at(self, points: Tensor) -> Tensor:
+        """The numbers (M, width) of the cell of each point (M, D), float64; zeros if it has none."""
+        if self.keys.shape[0] == 0:
+            return points.new_zeros(points.shape[0], self.values.shape[1])
+        rows, known = self.find(points)
+        return torch.where(known[:, None], self.values[rows].double(), 0.0)
+
     def find_cells(self, cells: Tensor) -> tuple[Tensor, Tensor]:
         """Row (M,) of each cell (M, D), and whether it has one; row 0 if not."""
         columns = self.columns(cells)
@@ -127,3 +135,32 @@ class CellTable(SparseLattice):
         self.anchor = anchor if blocks.numel() else None
         self.keys = (blocks[block] << bits) | cell
         self.values = torch.zeros(self.keys.shape[0], self.values.shape[1])
+
+
+class CellMap(TensorFileMap):
+    """A map with two numbers in each cell, of which those from `_first_positive` on are not negative."""
+
+    _content: ClassVar[str]
+    """Name of the numbers in files."""
+    _first_positive: ClassVar[int] = 0
+    resolution: float
+    memory_limit: int
+    _table: CellTable
+
+    @property
+    def device(self) -> torch.device:
+        return self._table.keys.device
+
+    def _start(self, dim: int, device: torch.device) -> None:
+        self._table = CellTable(self.resolution, dim, 2, device, self.memory_limit)
+
+    def _tensors(self) -> dict[str, Tensor]:
+        """The cells, and their numbers as float32."""
+        return {**self._table.packed(), self._content: self._table.values}
+
+    def _restore(self, tensors: dict[str, Tensor], path: str | Path) -> None:
+        self._table.fill(tensors, path)
+        values = require(tensors, self._content, (self._table.keys.shape[0], 2), torch.float32, path)
+        if bool((values[:, self._first_positive :] < 0).any()):
+            raise DataError(f"{path}: {self._content} contains negative numbers; the file is damaged.")
+        self._table.values = values

@@ -4,23 +4,15 @@ from __future__ import annotations
 
 import itertools
 import math
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import DataError, InvalidArgumentError, check_number, check_whole
-from gmmtorch.experiments.baselines.cell_table import CellTable
+from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
+from gmmtorch.experiments.baselines.cell_table import CellMap
 from gmmtorch.experiments.baselines.samples import thinned_samples
-from gmmtorch.files import require
 from gmmtorch.linalg import safe_cholesky
-from gmmtorch.occupancy import (
-    MEMORY_LIMIT,
-    TensorFileMap,
-    check_length,
-    check_resolution,
-    optional_length,
-)
+from gmmtorch.occupancy import MEMORY_LIMIT, check_length, check_resolution, optional_length
 from gmmtorch.scan import Scan
 
 _CHUNK_NUMBERS = 1 << 23
@@ -64,7 +56,7 @@ def gp_regression(
     return (cross * target).sum(1), variance - cross.square().sum(1)
 
 
-class GPMap(TensorFileMap):
+class GPMap(CellMap):
     """Cells that fuse the predictions of one Gaussian process per block of cells and scan.
 
     Occupancy by least-squares classification of samples labelled ±1 (O'Callaghan & Ramos 2012), made
@@ -94,6 +86,8 @@ class GPMap(TensorFileMap):
     """
 
     file_kind = "gmmtorch.gp_map"
+    _content = "fused"  # mean over variance, and precision
+    _first_positive = 1
 
     def __init__(
         self,
@@ -128,13 +122,6 @@ class GPMap(TensorFileMap):
         self.max_range = optional_length("max_range", max_range)
         self.memory_limit = memory_limit
         self._start(2, torch.device("cpu"))
-
-    @property
-    def device(self) -> torch.device:
-        return self._table.keys.device
-
-    def _start(self, dim: int, device: torch.device) -> None:
-        self._table = CellTable(self.resolution, dim, 2, device, self.memory_limit)
 
     # -- learning ---------------------------------------------------------------------------------
 
@@ -209,22 +196,6 @@ class GPMap(TensorFileMap):
     # -- queries ----------------------------------------------------------------------------------
 
     def _answer(self, query: Tensor) -> Tensor:
-        if self._table.keys.shape[0] == 0:
-            return query.new_full((query.shape[0],), 0.5)
-        rows, stored = self._table.find(query)
-        weighted, precision = self._table.values[rows].double().unbind(1)
-        known = stored & (precision + 1 / self.max_variance >= 1 / self.known_variance)
+        weighted, precision = self._table.at(query).unbind(1)
+        known = precision + 1 / self.max_variance >= 1 / self.known_variance
         return torch.where(known, torch.sigmoid(self.gain * self.min_variance * weighted), 0.5)
-
-    # -- files ------------------------------------------------------------------------------------
-
-    def _tensors(self) -> dict[str, Tensor]:
-        """The cells, and their fused mean over variance and precision as float32."""
-        return {**self._table.packed(), "fused": self._table.values}
-
-    def _restore(self, tensors: dict[str, Tensor], path: str | Path) -> None:
-        self._table.fill(tensors, path)
-        fused = require(tensors, "fused", (self._table.keys.shape[0], 2), torch.float32, path)
-        if bool((fused[:, 1] < 0).any()):
-            raise DataError(f"{path}: fused contains negative precisions; the file is damaged.")
-        self._table.values = fused

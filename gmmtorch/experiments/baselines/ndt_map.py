@@ -9,18 +9,12 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, check_whole
-from gmmtorch.experiments.baselines.cell_table import CellTable
+from gmmtorch.experiments.baselines.cell_table import CellMap, CellTable
 from gmmtorch.experiments.baselines.samples import cut_beams
 from gmmtorch.files import require
 from gmmtorch.kernels import traverse
 from gmmtorch.linalg import pack_symmetric, unpack_symmetric
-from gmmtorch.occupancy import (
-    MEMORY_LIMIT,
-    TensorFileMap,
-    check_length,
-    check_resolution,
-    optional_length,
-)
+from gmmtorch.occupancy import MEMORY_LIMIT, check_length, check_resolution, optional_length
 from gmmtorch.scan import Scan
 
 _LOG_ODDS_HIT = math.log(0.6 / 0.4)  # per return, as in perception_oru
@@ -66,7 +60,7 @@ def closest_on_line(
     return share, point, torch.exp(-0.5 * squared)
 
 
-class NDTMap(TensorFileMap):
+class NDTMap(CellMap):
     """NDT occupancy map (Saarinen, Andreasson, Stoyanov & Lilienthal 2013).
 
     Each cell stores the mean and covariance of its returns, updated recursively, and its log-odds of
@@ -132,10 +126,6 @@ class NDTMap(TensorFileMap):
         self.max_range = optional_length("max_range", max_range)
         self.memory_limit = memory_limit
         self._start(2, torch.device("cpu"))
-
-    @property
-    def device(self) -> torch.device:
-        return self._table.keys.device
 
     def _start(self, dim: int, device: torch.device) -> None:
         # Row: log-odds, count, mean relative to the cell's centre (m), packed scatter (m²).

@@ -21,7 +21,6 @@ from .mapping_methods import choose as choose
 from .mapping_methods import methods as methods
 from .metrics import auc_gain as auc_gain
 from .metrics import auc_interval as auc_interval
-from .metrics import prior_and_dead_band as prior_and_dead_band
 from .metrics import reliability as reliability
 from .metrics import roc as roc
 from .metrics import separating_threshold as separating_threshold

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from gmmtorch import mixture as ours
 from gmmtorch.datasets import PointChunks, in_memory
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.evaluation.metrics import psnr2, psnr_terms
@@ -24,14 +25,10 @@ from gmmtorch.mixture import (
     SINGLE_PROCESS,
     Checkpoint,
     GaussianMixture,
-    HierarchicalGaussianMixture,
     MixtureEstimator,
     Processes,
     PruneOptions,
-    RiemannianGaussianMixture,
     SensorModel,
-    SlicedWassersteinGaussianMixture,
-    VariationalGaussianMixture,
     fit_stream,
     measured_sensor,
     prune,
@@ -95,12 +92,12 @@ def _known(views: Views | None) -> Views:
     return views
 
 
-_OURS: dict[str, type] = {
-    "em": GaussianMixture,
-    "hierarchical": HierarchicalGaussianMixture,
-    "variational": VariationalGaussianMixture,
-    "riemannian": RiemannianGaussianMixture,
-    "sliced_wasserstein": SlicedWassersteinGaussianMixture,
+_OURS = {
+    "em": "GaussianMixture",
+    "hierarchical": "HierarchicalGaussianMixture",
+    "variational": "VariationalGaussianMixture",
+    "riemannian": "RiemannianGaussianMixture",
+    "sliced_wasserstein": "SlicedWassersteinGaussianMixture",
 }
 _SCIKIT_LEARN = {"scikit_learn": "GaussianMixture", "scikit_learn_bayesian": "BayesianGaussianMixture"}
 ESTIMATORS = (*_OURS, *_SCIKIT_LEARN)
@@ -115,7 +112,7 @@ def _estimator(method: str) -> Any:
         from sklearn import mixture  # takes half a second, which only a comparison waits for
 
         return getattr(mixture, _SCIKIT_LEARN[method])
-    return _OURS[method]
+    return getattr(ours, _OURS[method])
 
 
 def _fit_ours(
@@ -333,14 +330,6 @@ class Split(NamedTuple):
     sample_points: int | None
 
 
-class Streamed(NamedTuple):
-    """The row of results.json, the mixture, and the points sampled from the sources."""
-
-    row: Row
-    mixture: GaussianMixture
-    sample: FitData
-
-
 def split_source(source: PointChunks, test_share: float, seed: int, sample_points: int | None) -> Split:
     """Hold out a random share of the rows. Raises `InvalidArgumentError` for a share outside [0, 1)."""
     if not 0 <= test_share < 1:
@@ -369,8 +358,10 @@ def fit_streamed(
     processes: Processes = SINGLE_PROCESS,
     checkpoint: Checkpoint | None = None,
     on_event: Event = lambda stage, done, total: None,
-) -> Streamed:
+) -> tuple[Row, GaussianMixture, FitData]:
     """Fit the training source by EM, and score the mixture on both sources. Only rank 0 returns a row.
+
+    Also returns the mixture, and the points sampled from the sources.
 
     Likelihoods are means over all points. PSNR2 and `n_components_used` are computed from the samples.
     """
@@ -410,4 +401,4 @@ def fit_streamed(
         row["n_points"] = n_points
         row["log_likelihood"] = log_likelihood
         row["held_out_log_likelihood"] = held_out_log_likelihood if n_test else None
-    return Streamed(row, mixture, sample)
+    return row, mixture, sample

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from statistics import NormalDist
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.evaluation import queries
 from gmmtorch.experiments.evaluation.queries import OCCUPIED
-from gmmtorch.occupancy import N_BINS, Calibrator, CellClass, Prediction, Reliability, classify
+from gmmtorch.occupancy import N_BINS, Calibrator, Prediction, Reliability
 from gmmtorch.scan import Scan
-from gmmtorch.team.exploration import Interval
 
 _BINS = 4096
 _N_RESAMPLES = 1000
@@ -86,8 +84,8 @@ def auc_interval(occupied: Tensor, free: Tensor, auc: float, seed: int) -> tuple
     return max(0.0, float(low)), min(1.0, float(high))
 
 
-def auc_gain(before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> Interval:
-    """Difference of the AUCs of two classifiers of the same points, with its 95 % interval.
+def auc_gain(before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> tuple[float, float, float]:
+    """Difference of the AUCs of two classifiers of the same points, and the limits of its 95 % interval.
 
     Each argument has the probabilities of occupied (P,) and free (Q,) points. The variance is that of
     DeLong, DeLong & Clarke-Pearson (1988): of the differences of the points' shares of the AUC.
@@ -97,7 +95,7 @@ def auc_gain(before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> Int
     mean = float(up.mean())
     variance = float(up.var() / len(up) + down.var() / len(down))
     half = NormalDist().inv_cdf(0.975) * math.sqrt(variance)
-    return Interval(mean, mean - half, mean + half)
+    return mean, mean - half, mean + half
 
 
 def _shares_of_auc(occupied: Tensor, free: Tensor) -> tuple[Tensor, Tensor]:
@@ -127,26 +125,18 @@ def unknown_scores(unknown: Tensor, free: Tensor) -> dict[str, float | None]:
     }
 
 
-class Psnr(NamedTuple):
-    """The two terms of PSNR2 (dB).
-
-    forward: from each point to the nearest sample; low if the model misses part of the cloud.
-    backward: from each sample to the nearest point; low if the model has samples outside the cloud.
-    """
-
-    forward: float
-    backward: float
-
-
-def psnr_terms(points: Tensor, sampled: Tensor) -> Psnr:
+def psnr_terms(points: Tensor, sampled: Tensor) -> tuple[float, float]:
     """20 log₁₀(B/RMSE(X, X̂)) and 20 log₁₀(B/RMSE(X̂, X)) in dB, for points X (N, D) and samples X̂ (M, D).
 
-    B is the diagonal of the bounding box of X; RMSE is taken over nearest-neighbour distances. A term is
-    infinite if all these distances are zero.
+    The first term, forward, is low if the model misses part of the cloud, the second, backward, if it has
+    samples outside the cloud. B is the diagonal of the bounding box of X, and RMSE that of nearest-neighbour
+    distances. A term is infinite if all these distances are zero.
     """
+    from scipy.spatial import cKDTree
+
     x, y = points.cpu().numpy(), sampled.cpu().numpy()
     diagonal = float(np.linalg.norm(x.max(0) - x.min(0)))
-    return Psnr(_psnr(cKDTree(y).query(x)[0], diagonal), _psnr(cKDTree(x).query(y)[0], diagonal))
+    return _psnr(cKDTree(y).query(x)[0], diagonal), _psnr(cKDTree(x).query(y)[0], diagonal)
 
 
 def _psnr(distances: np.ndarray, diagonal: float) -> float:
@@ -165,10 +155,8 @@ def psnr2(points: Tensor, sampled: Tensor) -> float:
     return math.inf if math.inf in terms else sum(terms)
 
 
-PRIORS = (0.1, 0.5, 1.0, 2.0, 5.0)
 _BEAMS = 100  # of a scan whose prediction calibrates a map
 _RAYS = 1e4  # that stand for a probability
-VARIANCE_THRESHOLDS = (0.25, 0.2, 0.15, 0.1, 0.06, 0.03)
 
 
 def reliability(theta: Tensor, labels: Tensor) -> Reliability:
@@ -250,50 +238,6 @@ def _counts(theta: Tensor) -> tuple[Tensor, Tensor]:
     """Hits and misses that stand for a probability; none for ½ exactly."""
     n = _RAYS * (theta != 0.5)
     return n * theta, n * (1 - theta)
-
-
-def prior_and_dead_band(
-    theta_of: Callable[[float], Tensor],
-    labels: Tensor,
-    priors: Sequence[float] = PRIORS,
-    variance_thresholds: Sequence[float] = VARIANCE_THRESHOLDS,
-) -> list[dict[str, Any]]:
-    """Effect of the prior count N_p and of the dead band (3.10): one row for each pair of both.
-
-    Args:
-        theta_of: returns the probabilities (M,) of one test for a prior count.
-        labels: (M,), 1 occupied and 0 free.
-        priors: counts N_p.
-        variance_thresholds: v of the dead band; with 0.25 only θ = ½ is unknown.
-
-    Rows have `prior, variance_threshold`; `ece, mce, brier, log_loss_bits, accuracy`, which do not depend on
-    the dead band; `decided`, the share of the points classified as occupied or free; and
-    `accuracy_decided`, the share of the decided points that are correct (None if no point is decided).
-    """
-    rows: list[dict[str, Any]] = []
-    occupied = labels == OCCUPIED
-    for prior in priors:
-        theta = theta_of(prior).cpu()
-        of_prior = {
-            "prior": float(prior),
-            **scores(theta, labels),
-            "mce": reliability(theta, labels).maximum_error,
-        }
-        for threshold in variance_thresholds:
-            called = classify(theta, threshold)
-            decided = called != CellClass.UNKNOWN
-            right = (called == CellClass.OCCUPIED) == occupied.cpu()
-            rows.append(
-                {
-                    **of_prior,
-                    "variance_threshold": float(threshold),
-                    "decided": float(decided.double().mean()),
-                    "accuracy_decided": float(right[decided].double().mean())
-                    if bool(decided.any())
-                    else None,
-                }
-            )
-    return rows
 
 
 def _checked(theta: Tensor, labels: Tensor) -> tuple[np.ndarray, np.ndarray]:

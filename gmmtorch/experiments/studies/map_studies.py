@@ -105,15 +105,15 @@ def run_map_variants(
         for built in outcome.shown:
             assert isinstance(built.map, GaussianMap)
             base = first.setdefault(built.row["resolution"], built)
-            gain = auc_gain(base.asked.split(base.theta), built.asked.split(built.theta))
+            gain, low, high = auc_gain(base.asked.split(base.theta), built.asked.split(built.theta))
             rows.append(
                 {
                     **built.row,
                     "variant": variant,
                     "n_free_components": int(built.map.max_range.sum()),
-                    "auc_gain": gain.mean,
-                    "auc_gain_low": gain.low,
-                    "auc_gain_high": gain.high,
+                    "auc_gain": gain,
+                    "auc_gain_low": low,
+                    "auc_gain_high": high,
                     "held_out_log_likelihood": surface_score(built.map, ends),
                 }
             )

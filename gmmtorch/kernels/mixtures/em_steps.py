@@ -1,4 +1,4 @@
-"""Steps of EM: the E-step of exact and of truncated EM, the M-step, and natural parameters.
+"""Steps of EM: the E-step of exact and of truncated EM, the M-step, natural parameters; steps of k-means.
 
 The fused kernels compute in float64 and skip responsibilities below e⁻³⁷ of the row's largest term: a far
 component costs its log-density and nothing more. Statistics differ from the twin's with float64 exponentials
@@ -37,6 +37,7 @@ _EXPECTATION = {dim: FusedKernel(_E_STEP, f"e_step<{dim}>") for dim in _WIDTHS}
 _MOST_LIKELY = {dim: FusedKernel(_E_STEP, f"most_likely<{dim}>") for dim in _WIDTHS}
 _NORMS = {dim: FusedKernel(_E_STEP, f"row_norms<{dim}>") for dim in _WIDTHS}
 _SHARES = {dim: FusedKernel(_E_STEP, f"component_sums<{dim}>") for dim in _WIDTHS}
+_NEAREST = FusedKernel(_E_STEP, "nearest_centers")
 _DIMENSIONS = {width: dim for dim, width in _WIDTHS.items()}
 
 
@@ -159,6 +160,48 @@ def _batched_expectation(
         statistics += sums
         total += value
     return statistics, total
+
+
+def nearest_centers(points: Tensor, weight: Tensor, centers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """A step of R runs of k-means: the nearest center (R, N) of each point (N, D), the squared distance
+    (R, N) to it, and the weight and the weighted sum of the points of each center, (R, K, 1 + D).
+
+    Args:
+        weight: (N,). centers: (R, K, D).
+    """
+    given = points, weight, centers
+    if points.device.type == "cpu" and all(t.dtype == torch.float64 for t in given) and is_fused(*given):
+        return _fused_nearest_centers(*given)
+    (n_runs, k, dim), n = centers.shape, points.shape[0]
+    flat = centers.reshape(-1, dim)
+    bias, offset = -0.5 * flat.square().sum(1, keepdim=True), k * torch.arange(n_runs, device=points.device)
+    # A mask, because argmax along a dimension other than the last is slow.
+    place = torch.arange(k, dtype=points.dtype, device=points.device)[:, None]
+
+    def step(part: slice) -> tuple[Tensor, Tensor, Tensor]:
+        some, p = points[part], weight[part, None]
+        products = torch.addmm(bias, flat, some.T).view(n_runs, k, -1)
+        peak = products.amax(1)
+        nearest = torch.where(products == peak[:, None], place, 0).amax(1).long()
+        rows = torch.cat([p, p * some], 1).expand(n_runs, -1, -1).reshape(-1, 1 + dim)
+        sums = rows.new_zeros(n_runs * k, 1 + dim).index_add_(0, (nearest + offset[:, None]).flatten(), rows)
+        return nearest, (some.square().sum(1) - 2 * peak).clamp_min_(0), sums
+
+    size = max(64, chunk_elements(points.device) // max(flat.shape))
+    nearest, distance, sums = zip(*chunked(n, size, step), strict=True)
+    return torch.cat(nearest, 1), torch.cat(distance, 1), torch.stack(sums).sum(0).view(n_runs, k, -1)
+
+
+def _fused_nearest_centers(points: Tensor, weight: Tensor, centers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    (n_runs, k, dim), n, n_parts = centers.shape, points.shape[0], _n_parts(points)
+    padded = torch.nn.functional.pad(centers, (0, 0, 0, -k % 4))
+    bias = torch.nn.functional.pad(-0.5 * centers.square().sum(2), (0, -k % 4), value=-1e300)
+    nearest = torch.empty(n_runs, n, dtype=torch.int64)
+    distance, scratch = points.new_empty(n_runs, n), points.new_empty(n_runs * n_parts * dim * CPU_LANES)
+    sums = points.new_zeros(n_runs, n_parts, padded.shape[1], 1 + dim)
+    given = points.contiguous(), weight.contiguous(), n, dim, padded, bias, padded.shape[1], n_parts
+    _NEAREST(n_runs * n_parts, *given, scratch, nearest, distance, sums, device=points.device)
+    return nearest, distance, sums.sum(1)[:, :k]
 
 
 def softmax(logits: Tensor, sample_weight: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:

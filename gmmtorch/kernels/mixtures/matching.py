@@ -1,4 +1,5 @@
-"""Components matched with components or points: near pairs, overlaps, alignment of a scan, explained points.
+"""Components matched with components or points: near pairs, overlaps, alignment of a scan, explained points;
+and a scan laid over a raster.
 
 The twins of `near_pairs` and `overlap_sums` are in `localization.registration.overlap`, and that of
 `explained_points` in `mapping.learning.novelty`. The kernel of pairs tests all of them, which is faster
@@ -95,6 +96,29 @@ _LEAST_POINTS = 256  # of a part on a CPU
 _ALIGNMENTS = {dim: FusedKernel("mixtures/point_alignment.h", f"point_alignment<{dim}>") for dim in (2, 3)}
 
 
+class NearLists(NamedTuple):
+    """Components near each cell of a lattice.
+
+    low: (D,) corner of the lattice, metres. side: of a cell. shape: (D,) int64, cells along each axis.
+    starts: (cells + 1,) int64, row-major, of each cell's part of the entries (E,), int32.
+    """
+
+    low: Tensor
+    side: float
+    shape: Tensor
+    starts: Tensor
+    entries: Tensor
+
+    def cells(self, places: Tensor) -> Tensor:
+        """The cells (M,) of places (M, D); −1 outside the lattice."""
+        at = ((places - self.low) / self.side).floor()
+        inside = ((at >= 0) & (at < self.shape)).all(1)
+        cell = torch.zeros_like(at[:, 0], dtype=torch.int64)
+        for axis, column in enumerate(torch.where(inside[:, None], at, 0.0).long().unbind(1)):
+            cell = cell * self.shape[axis] + column
+        return torch.where(inside, cell, -1)
+
+
 class AlignmentSums(NamedTuple):
     """Of each of B motions, with q_n = Σ_k exp(−½ d_nk²) over the components listed for point n:
 
@@ -114,7 +138,7 @@ class AlignmentSums(NamedTuple):
 def alignment_sums(
     points: Tensor,
     motions: tuple[Tensor, Tensor],
-    lists: tuple[Tensor, Tensor, Tensor],
+    lists: NearLists,
     target: tuple[Tensor, Tensor, Tensor],
     limits: tuple[float, float, float, float],
 ) -> AlignmentSums:
@@ -122,7 +146,7 @@ def alignment_sums(
 
     Args:
         points: (N, D), float64. motions: rotations (B, D, D) and translations (B, D).
-        lists: the bucket of each moved point (B N,), or −1; starts and entries of the buckets' lists.
+        lists: of the components near each cell.
         target: means (K, D), precisions (K, D, D) and normals (K, D) of the components, zero for those that
             are seen from all sides.
         limits: metres behind a component's face from which on the sensor does not see it; d² beyond which a
@@ -130,7 +154,7 @@ def alignment_sums(
     """
     n, dim = motions[1].shape
     behind, farthest, outliers, height = limits
-    if not is_fused(points, *motions, *lists, *target):
+    if not is_fused(points, *motions, lists.entries, *target):
         return _batched_alignment(points, motions, lists, target, limits)
     free = dim + dim * (dim - 1) // 2
     on_cpu = points.device.type == "cpu"
@@ -139,10 +163,12 @@ def alignment_sums(
     )
     n_triangle = free * (free + 1) // 2
     sums = points.new_empty(n, n_parts, 2 + free + 2 * n_triangle)
-    given = [part.contiguous() for part in (*motions, *lists, *target)]
-    counts = len(points), n_parts
+    given = [part.contiguous() for part in (points, *motions, *target)]
     bounds = behind, farthest, outliers, outliers + height
-    _ALIGNMENTS[dim](n * n_parts, points.contiguous(), *counts, *given, *bounds, sums, device=points.device)
+    sizes, moved = (len(points), n_parts), given[1:3]
+    _ALIGNMENTS[dim](
+        n * n_parts, given[0], *sizes, *moved, *lists, *given[3:], *bounds, sums, device=points.device
+    )
     score, n_explained, gradient, *triangles = sums.sum(1).split([1, 1, free, n_triangle, n_triangle], 1)
     rows, columns = torch.triu_indices(free, free, device=points.device)
     full = points.new_zeros(2, n, free, free)
@@ -150,10 +176,35 @@ def alignment_sums(
     return AlignmentSums(score[:, 0], n_explained[:, 0], gradient, full[0], full[1])
 
 
+_RASTER = FusedKernel("mixtures/point_alignment.h", "raster_sums")
+
+
+def raster_sums(cells: Tensor, heading: Tensor, shift: Tensor, raster: Tensor, outside: float) -> Tensor:
+    """Sums (C,), float64, of a raster's values at the cells of a scan under C placements.
+
+    Args:
+        cells: (H, N, 3) int64, of N points under each of H headings. heading: (C,) int64, and shift: (C, 3)
+            int64, of each placement. raster: (nx, ny, nz) float32. outside: value of cells outside it.
+
+    The fused kernel differs from its twin by rounding.
+    """
+    if not is_fused(cells, heading, shift, raster):
+        at = cells[heading] + shift[:, None]
+        size = torch.tensor(raster.shape, device=at.device)
+        is_inside = ((at >= 0) & (at < size)).all(2)
+        x, y, z = at.clamp_min(0).minimum(size - 1).unbind(2)
+        return torch.where(is_inside, raster[x, y, z].double(), outside).sum(1)
+    sums = torch.empty(len(heading), dtype=torch.float64, device=cells.device)
+    given = [part.contiguous() for part in (heading, shift, raster)]
+    counts = *raster.shape, outside
+    _RASTER(len(heading), cells.contiguous(), cells.shape[1], *given, *counts, sums, device=cells.device)
+    return sums
+
+
 def _batched_alignment(
     points: Tensor,
     motions: tuple[Tensor, Tensor],
-    lists: tuple[Tensor, Tensor, Tensor],
+    lists: NearLists,
     target: tuple[Tensor, Tensor, Tensor],
     limits: tuple[float, float, float, float],
 ) -> AlignmentSums:
@@ -163,7 +214,7 @@ def _batched_alignment(
     n, (count, dim) = len(translations), points.shape
     lever = (points @ rotations.mT).flatten(0, 1)
     moved = lever + translations.repeat_interleave(count, 0)
-    row, component = _listed(*lists)
+    row, component = _listed(lists.cells(moved), lists.starts, lists.entries)
     offset = moved[row] - means[component]
     precision = precisions[component]
     pulls = (precision @ offset[:, :, None])[:, :, 0]

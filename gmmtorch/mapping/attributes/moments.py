@@ -80,7 +80,11 @@ class Attributes:
         """The attributes with `change` applied to each tensor."""
         return Attributes({name: type(c)(*map(change, c)) for name, c in self.channels.items()})
 
-    def selected(self, rows: Tensor) -> Attributes:
+    def on_cpu(self) -> Attributes:
+        """The attributes on the CPU, without gradients."""
+        return self.changed(lambda value: value.detach().cpu())
+
+    def selected(self, rows: Tensor | slice) -> Attributes:
         """Those of some components (J,), in that order."""
         return self._of_rows(lambda value: value[rows])
 
@@ -111,16 +115,14 @@ class Attributes:
             }
         )
 
-    def where(self, chosen: Tensor, other: Attributes) -> Attributes:
-        """These attributes where `chosen` (K,), else others with the same channels."""
-
-        def either(one: Tensor, two: Tensor) -> Tensor:
-            return torch.where(chosen.view(-1, *[1] * (one.ndim - 1)), one, two)
-
+    def replaced(self, rows: Tensor, other: Attributes) -> Attributes:
+        """These attributes with those of other components in some rows (J,)."""
         found: dict[str, Channel] = {}
         for name, c in self.channels.items():
             both = zip(c._fields, c, other.channels[name], strict=True)
-            found[name] = type(c)(*(a if part == _LABELS else either(a, b) for part, a, b in both))
+            found[name] = type(c)(
+                *(a if part == _LABELS else a.index_copy(0, rows, b) for part, a, b in both)
+            )
         return Attributes(found)
 
     def checked(self, k: int, dim: int) -> Attributes:
@@ -213,7 +215,7 @@ def learned(
     found: dict[str, Channel] = {}
     for name, values in channels.items():
         if values.is_floating_point():
-            sums = _cell_sums(values.double(), cells).index_select(0, kept)
+            sums = _cell_sums(values, cells).index_select(0, kept)
             places = cells.features.index_select(0, kept)
             found[name] = _regression(sums, values.shape[1], places, owner, means, covariances, total)
         else:
@@ -230,13 +232,12 @@ def _cell_sums(values: Tensor, cells: Cells) -> Tensor:
     """Of the values (N, A), NaN where unknown, in each of C cells: their number, sums, and sums of products,
     (C, 1 + A + A(A+1)/2)."""
     member, n = cells.member, len(cells.weight)
-    known = torch.isfinite(values.sum(1))
-    if not bool(known.all()):
-        values, member = values[known], member[known]
-    columns = [column.contiguous() for column in values.T]
+    columns = list(values.T.double().contiguous())
+    known = torch.isfinite(sum(columns))
+    columns = [torch.where(known, column, 0.0) for column in columns]
     rows, others = triangle_indices(len(columns))
     products = [columns[i] * columns[j] for i, j in zip(rows.tolist(), others.tolist(), strict=True)]
-    count = torch.bincount(member, minlength=n).double()
+    count = _sums(member, n, known.double())
     return torch.stack([count, *(_sums(member, n, column) for column in [*columns, *products])], 1)
 
 

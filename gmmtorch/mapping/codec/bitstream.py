@@ -77,11 +77,6 @@ def _path_length(values: Ints) -> float:
     return abs(float(values[0])) + float(np.abs(np.diff(values).astype(np.float64)).sum())
 
 
-def fewest_bits(rows: Ints) -> NDArray[np.float64]:
-    """The size in bits (T,) of each row of (T, N) in its shortest code."""
-    return np.minimum.reduce([n_bits for _, n_bits in _codings(rows).values()])
-
-
 def _codings(rows: Ints) -> dict[Code, tuple[Ints, NDArray[np.float64]]]:
     """Parameters (T,) of each code for rows (T, N), N > 0, and the sizes in bits (T,)."""
     base = rows.min(1)
@@ -163,35 +158,6 @@ class BitWriter:
         low = int(_rice_codes(values[None])[0][0])
         self.one(low, 6)
         self.rice(values, low)
-
-    def scaled(self, values: Ints, scales: Ints) -> None:
-        """Writes whole numbers of the order of 2^scale, or of a common fraction of it.
-
-        A Rice code whose low bits are each number's scale minus t; t is written first.
-        """
-        codes = zigzag(values)
-        low = np.maximum(scales - np.arange(16)[:, None], 0)
-        t = int(np.argmin(_sums(codes >> low) + _sums(low + 1)))
-        self.one(t, 4)
-        self.rice(codes, low[t])
-
-
-class BitCounter(BitWriter):
-    """Counts the bits that a `BitWriter` would write."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.n_bits = 0
-
-    def fixed(self, values: Ints, widths: Ints | int) -> None:
-        self.n_bits += len(values) * widths if isinstance(widths, int) else int(widths.sum())
-
-    def one(self, value: int, width: int) -> None:
-        self.n_bits += width
-
-    def rice(self, values: Ints, low: Ints | int) -> None:
-        self.n_bits += int((values >> low).sum()) + len(values)
-        self.fixed(values, low)
 
 
 class BitReader:

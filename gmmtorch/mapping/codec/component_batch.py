@@ -1,13 +1,12 @@
 """Batches: components as bytes, any number of them; and map files, which hold one. See docs/formats.md.
 
-A component takes about 10 bytes in 3D and 7 in 2D. Its rounding error is bounded in its own standard
+A component takes 6 to 8 bytes in 3D and 6 in 2D. Its rounding error is bounded in its own standard
 deviations (see `lattice`), and its covariance stays positive definite. A component decodes to the same values
 in every batch: `decode(encode(c))` is `quantized(c)`, and encoding decoded components again, in any grouping,
 changes nothing.
 
-A batch is a bit stream: columns of whole numbers for components, origins and viewpoints. A mean is written as
-the number of a cell of a common grid, and its place in the cell. The side of the cells is the one that takes
-the fewest bits.
+A batch is its sizes, and one code of all values (`context_model`), in which neighbours predict one another.
+Components in `spatial_order` take the fewest bytes.
 
 A map file is a safetensors container, about 200 bytes, with a batch and the settings of the map that differ
 from the defaults of the file format. No pickle.
@@ -15,48 +14,33 @@ from the defaults of the file format. No pickle.
 
 from __future__ import annotations
 
-import math
 import zlib
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError, check_choice, check_resolution, check_whole
 from gmmtorch.files import pack_tensors, read_tensors, require, unpack_tensors
+from gmmtorch.kernels import CodedBatch
 from gmmtorch.mapping.attributes.moments import Attributes
-from gmmtorch.mapping.codec.attribute_block import decode_attributes, encode_attributes
-from gmmtorch.mapping.codec.bitstream import BitCounter, BitReader, BitWriter, Ints
-from gmmtorch.mapping.codec.lattice import (
-    AXIS_ORDERS,
-    LARGEST_DEVIATION,
-    LARGEST_RATIO,
-    LEAST_DEVIATION,
-    Lattice,
-    shear_exponents,
-)
+from gmmtorch.mapping.codec.attribute_block import decode_attributes, encode_attributes, rounded
+from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter
+from gmmtorch.mapping.codec.context_model import read_batch, write_batch
+from gmmtorch.mapping.codec.first_version import read_first
+from gmmtorch.mapping.codec.lattice import Lattice
 from gmmtorch.mapping.codec.quantization import (
-    LARGEST_COUNT,
     LARGEST_SIDE,
-    LEAST_SHARE,
-    NO_COUNT,
+    LEAST_SIDE,
     ORIGIN_STEP,
-    RASTER_BITS,
     Quantized,
-    box_of,
     cell_exponent,
     cells_of,
-    ints,
     number_after,
-    numbered,
     quantize,
     quantize_numbered,
-    quantized,
-    raster,
 )
 from gmmtorch.mapping.components import TENSORS, Components
 from gmmtorch.mapping.learning.rules import LearningRule, changed_options, rule_facts
@@ -64,9 +48,10 @@ from gmmtorch.mapping.query_options import QueryOptions, check_method
 from gmmtorch.occupancy import Calibration
 from gmmtorch.scan import FARTHEST
 
-BATCH_VERSION = 1
+FIRST_VERSION, BATCH_VERSION = 1, 2
 _VERSION_BYTES, _CHECKSUM_BYTES = 1, 4
-_ORDER_BITS = {2: 1, 3: 3}
+_SIDE_BITS = 5
+_LONGEST_SIZES = 32  # bytes
 
 
 def encode(components: Components) -> bytes:
@@ -76,205 +61,108 @@ def encode(components: Components) -> bytes:
 
 def encode_quantized(values: Quantized) -> bytes:
     """A batch of components that `quantize` has rounded. The values are not checked again."""
+    k, e, side = len(values), len(values.seen_from), cell_exponent(values.places)
     writer = BitWriter()
-    _write_values(writer, values)
-    body = bytes([BATCH_VERSION]) + writer.to_bytes()
+    writer.one(values.places.dim - 2, 1)
+    writer.one(side - LEAST_SIDE, _SIDE_BITS)
+    for size in (k, len(values.origins), e - k):
+        writer.number(size)
+    stream = write_batch(coded(values, side)).ljust(_least_bytes(k, len(values.origins), e), b"\0")
+    body = bytes([BATCH_VERSION]) + writer.to_bytes() + stream
     return body + zlib.crc32(body).to_bytes(_CHECKSUM_BYTES, "little")
 
 
-def batch_bytes(values: Quantized) -> int:
-    """The length of `encode_quantized(values)`, without writing it."""
-    counter = BitCounter()
-    _write_values(counter, values)
-    return _VERSION_BYTES + -(-counter.n_bits // 8) + _CHECKSUM_BYTES
-
-
-def decode(data: bytes) -> Components:
-    """The components of a batch, on the CPU.
+def decode(data: bytes, most: int | None = None) -> Components:
+    """The components of a batch, on the CPU. most: largest number of components, and of viewpoints.
 
     Raises `DataError`, with the reason, for data that `encode` did not write. Memory is bounded in proportion
     to the length of the data, for any numbers in them.
     """
-    body, checksum = data[:-_CHECKSUM_BYTES], data[-_CHECKSUM_BYTES:]
-    if len(data) <= _CHECKSUM_BYTES:
-        raise DataError(f"{len(data)} bytes are too few for a batch of components: it is truncated.")
-    if body[0] != BATCH_VERSION:
-        raise DataError(
-            f"The batch of components is version {body[0]}; this gmmtorch reads version {BATCH_VERSION}. "
-            "It is foreign or damaged, or gmmtorch needs an update."
-        )
-    if zlib.crc32(body) != int.from_bytes(checksum, "little"):
-        raise DataError("The batch of components does not match its checksum: it is truncated or damaged.")
     try:
-        return _read_values(BitReader(body[1:])).restored().checked()
+        return _values(data, most).restored().checked()
     except DataError:
         raise
     except GmmTorchError as error:
         raise DataError(f"The batch of components is damaged: {error}") from error
 
 
-# -- writing ---------------------------------------------------------------------------------------------
+def ids_of_batch(data: bytes) -> Tensor:
+    """The ids (K, 2) of the components of a batch. Raises as `decode` does, but does not check the rest."""
+    return _values(data).ids
 
 
-def _write_values(writer: BitWriter, values: Quantized) -> None:
-    """Writes a batch without its version and checksum."""
-    dim, k = values.places.dim, len(values)
-    writer.number(dim)
-    writer.number(k)
-    writer.number(len(values.origins))
-    writer.fixed(ints(values.places.axis_order), _ORDER_BITS[dim])
-    writer.column(ints(values.ids[:, 0]))
-    # Consecutive ids become equal numbers, which take no bits.
-    writer.column(ints(values.ids[:, 1]) - np.arange(k))
-    _write_covariances(writer, values.places)
-    _write_means(writer, values.places)
-    writer.column(ints(values.count))
-    writer.column(ints(values.max_range))
-    _write_viewpoints(writer, ints(values.n_viewpoints), ints(values.seen_from), ints(values.share))
-    for axis in range(dim):
-        writer.column(ints(values.origins[:, axis]))
+def _values(data: bytes, most: int | None = None) -> Quantized:
+    body, checksum = data[:-_CHECKSUM_BYTES], data[-_CHECKSUM_BYTES:]
+    if len(data) <= _CHECKSUM_BYTES:
+        raise DataError(f"{len(data)} bytes are too few for a batch of components: it is truncated.")
+    if body[0] not in (FIRST_VERSION, BATCH_VERSION):
+        raise DataError(
+            f"The batch of components is version {body[0]}; this gmmtorch reads versions {FIRST_VERSION} and "
+            f"{BATCH_VERSION}. It is foreign or damaged, or gmmtorch needs an update."
+        )
+    if zlib.crc32(body) != int.from_bytes(checksum, "little"):
+        raise DataError("The batch of components does not match its checksum: it is truncated or damaged.")
+    rest = body[_VERSION_BYTES:]
+    return read_first(rest) if body[0] == FIRST_VERSION else _read(rest, most)
 
 
-def _write_covariances(writer: BitWriter, places: Lattice) -> None:
-    writer.column(ints(places.deviation[:, 0]))
-    for axis in range(1, places.dim):
-        writer.column(ints(places.deviation[:, axis - 1] - places.deviation[:, axis]))
-    exponents = ints(shear_exponents(places.deviation))
-    for pair in range(exponents.shape[1]):
-        writer.scaled(ints(places.shear[:, pair]), -exponents[:, pair])
-
-
-def _write_means(writer: BitWriter, places: Lattice) -> None:
-    """Writes the cells of a common grid that contain the means, then the place of each mean in its cell."""
-    exponent = cell_exponent(places, in_order=True)
-    cells = cells_of(places, np.array([exponent]))[0]
-    least, extent = box_of(cells)
-    writer.number(exponent)
-    for axis in range(places.dim):
-        writer.number(int(least[axis]))
-        writer.number(int(extent[axis]))
-    writer.column(raster(cells, least, extent))
-    width = np.maximum(exponent - ints(places.world_exponents()), 0)
-    within = ints(places.by_world_axis(places.mean)) & ((np.int64(1) << width) - 1)
-    for axis in range(places.dim):
-        writer.fixed(within[:, axis], width[:, axis])
-
-
-def _write_viewpoints(writer: BitWriter, n_viewpoints: Ints, seen_from: Ints, share: Ints) -> None:
-    """Writes the number of viewpoints of each component, the origin of its first one, the steps from one
-    origin to the next, and the shares."""
-    writer.column(n_viewpoints)
-    is_first = _firsts(n_viewpoints)
-    writer.column(seen_from[is_first])
-    writer.column(np.diff(seen_from, prepend=0)[~is_first])
-    writer.rice_column(share[np.repeat(n_viewpoints, n_viewpoints) > 1])
-
-
-def _firsts(n_viewpoints: Ints) -> NDArray[np.bool_]:
-    """Which viewpoints (E,) are the first of their component."""
-    first = np.zeros(int(n_viewpoints.sum()), np.bool_)
-    first[(np.cumsum(n_viewpoints) - n_viewpoints)[n_viewpoints > 0]] = True
-    return first
-
-
-# -- reading ---------------------------------------------------------------------------------------------
-
-
-def _read_values(reader: BitReader) -> Quantized:
-    """Reads a batch. Raises `DataError` for one that `_write_values` did not write."""
-    dim, k, n_origins = reader.number(), reader.number(), reader.number()
-    if dim not in (2, 3):
-        raise DataError(f"The components are {dim}-dimensional; a map has 2 or 3 dimensions.")
-    if min(k, n_origins) < 0:
-        raise DataError(f"{k} components and {n_origins} origins are announced.")
-    reader.require(max(k * _ORDER_BITS[dim], n_origins))
-    axis_order = _within(reader.fixed(k, _ORDER_BITS[dim]), "axis orders", 0, len(AXIS_ORDERS[dim]) - 1)
-    ids = np.stack([reader.column(k), reader.column(k) + np.arange(k)], 1)
-    places = _read_means(reader, *_read_covariances(reader, axis_order, dim))
-    if not bool(places.is_valid().all()):
-        raise DataError("A mean or a covariance is out of range: it is damaged.")
-    count = _within(reader.column(k), "counts", NO_COUNT, LARGEST_COUNT)
-    max_range = _within(reader.column(k), "max_range flags", 0, 1)
-    n_viewpoints, seen_from, share = _read_viewpoints(reader, k, n_origins)
+def _read(data: bytes, most: int | None) -> Quantized:
+    """The components of a batch without version and checksum."""
+    reader = BitReader(data[:_LONGEST_SIZES])
+    n_bits = reader.left
+    dim, side = 2 + reader.one(1), LEAST_SIDE + reader.one(_SIDE_BITS)
+    k, n_origins, more = reader.number(), reader.number(), reader.number()
+    e, begin = k + more, -((reader.left - n_bits) // 8)
+    least = _least_bytes(k, n_origins, e)
+    stream = data[begin:]
+    is_whole = len(stream) == max(len(stream.rstrip(b"\0")), least)
+    if most is not None and max(k, e) > most:
+        raise DataError(f"{k} components and {e} viewpoints; {most} of each are the most.")
+    if min(k, n_origins, e) < 0 or n_origins > e or side > LARGEST_SIDE or not is_whole:
+        raise DataError(
+            f"{k} components, {n_origins} origins and {e} viewpoints in {len(stream)} bytes: it is damaged."
+        )
+    rows: dict[str, tuple[int, ...]] = {
+        "axis_order": (k,),
+        "deviation": (k, dim),
+        "shear": (k, dim * (dim - 1) // 2),
+        "mean": (k, dim),
+        "count": (k,),
+        "max_range": (k,),
+        "ids": (k, 2),
+        "origins": (n_origins, dim),
+        "n_viewpoints": (k,),
+        "seen_from": (e,),
+        "share": (e,),
+        "cells": (k, dim),
+    }
+    b = CodedBatch(side, **{name: torch.zeros(shape, dtype=torch.int64) for name, shape in rows.items()})
+    read_batch(b, stream)
+    places = Lattice(b.axis_order, b.deviation, b.shear, b.mean)
     farthest = int(FARTHEST / ORIGIN_STEP)
-    origins = [_within(reader.column(n_origins), "origins", -farthest, farthest) for _ in range(dim)]
-    reader.finish()
+    if not bool(places.is_valid().all()) or bool((b.origins.abs() > farthest).any()):
+        raise DataError("A mean, a covariance or an origin is out of range: it is damaged.")
     return Quantized(
-        places=places,
-        count=torch.from_numpy(count),
-        max_range=torch.from_numpy(max_range).bool(),
-        ids=torch.from_numpy(ids),
-        origins=torch.from_numpy(np.stack(origins, 1)),
-        n_viewpoints=torch.from_numpy(n_viewpoints),
-        seen_from=torch.from_numpy(seen_from),
-        share=torch.from_numpy(share),
+        places, b.count, b.max_range.bool(), b.ids, b.origins, b.n_viewpoints, b.seen_from, b.share
     )
 
 
-def _read_covariances(reader: BitReader, axis_order: Ints, dim: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Reads axis orders, deviations and shears."""
-    k = len(axis_order)
-    deviation = [_within(reader.column(k), "deviations", LEAST_DEVIATION, LARGEST_DEVIATION)]
-    for _ in range(1, dim):
-        deviation.append(deviation[-1] - _within(reader.column(k), "deviations", 0, LARGEST_RATIO))
-    steps = torch.from_numpy(np.stack(deviation, 1))
-    exponents = ints(shear_exponents(steps))
-    shear = [reader.scaled(-exponents[:, pair]) for pair in range(exponents.shape[1])]
-    return torch.from_numpy(axis_order), steps, torch.from_numpy(np.stack(shear, 1))
+def coded(values: Quantized, side: int) -> CodedBatch:
+    """The values as the coder takes them."""
+    arrays = {**vars(values), **vars(values.places), "cells": torch.from_numpy(cells_of(values.places, side))}
+    del arrays["places"]
+    return CodedBatch(side, **{name: array.long().contiguous() for name, array in arrays.items()})
 
 
-def _read_means(reader: BitReader, axis_order: Tensor, deviation: Tensor, shear: Tensor) -> Lattice:
-    k, dim = deviation.shape
-    exponent = reader.number()
-    least, extent = zip(*((reader.number(), reader.number()) for _ in range(dim)), strict=True)
-    # A box of cells may exceed the largest possible map by one cell on each side.
-    reach = 2 * FARTHEST / 2.0**exponent + 2 if abs(exponent) <= LARGEST_SIDE else 0.0
-    if max(map(abs, least + extent)) > reach or min(extent) < 1 or math.prod(extent) >> RASTER_BITS:
-        raise DataError(f"Cells of side 2^{exponent} m, {extent} of them from {least} on: out of range.")
-    number = _within(reader.column(k), "cells", 0, math.prod(extent) - 1)
-    cells = np.empty((k, dim), np.int64)
-    for axis in reversed(range(dim)):
-        number, cells[:, axis] = np.divmod(number, extent[axis])
-    blank = Lattice(axis_order, deviation, shear, torch.zeros_like(deviation))
-    finer = exponent - ints(blank.world_exponents())
-    width, coarser = np.maximum(finer, 0), np.maximum(-finer, 0)
-    mean = (cells + np.array(least)) << width
-    if (mean & ((np.int64(1) << coarser) - 1)).any():
-        raise DataError("A mean lies between the steps of its lattice: it is damaged.")
-    mean >>= coarser
-    for axis in range(dim):
-        mean[:, axis] |= reader.fixed(k, width[:, axis])
-    return replace(blank, mean=torch.from_numpy(mean).gather(1, blank.axes()))
-
-
-def _read_viewpoints(reader: BitReader, k: int, n_origins: int) -> tuple[Ints, Ints, Ints]:
-    n_viewpoints = _within(reader.column(k), "viewpoints", 0, n_origins)
-    reader.require(int(n_viewpoints.sum(dtype=np.float64)) - k)  # shares take at least a bit each
-    is_first = _firsts(n_viewpoints)
-    first = reader.column(int(is_first.sum()))
-    step = np.zeros(len(is_first), np.int64)
-    step[~is_first] = _within(reader.column(int((~is_first).sum())), "steps", -n_origins, n_origins)
-    total = np.cumsum(step)
-    start = first - total[is_first]  # the steps of a component begin at its own first origin
-    seen_from = total + np.repeat(start, n_viewpoints[n_viewpoints > 0])
-    _within(seen_from, "origins seen from", 0, n_origins - 1)
-    several = np.repeat(n_viewpoints, n_viewpoints) > 1
-    share = np.zeros(len(seen_from), np.int64)
-    share[several] = _within(reader.rice_column(int(several.sum())), "shares", 0, LEAST_SHARE)
-    return n_viewpoints, seen_from, share
-
-
-def _within(values: Ints, name: str, least: int, largest: int) -> Ints:
-    """The values, if all are from `least` to `largest`; otherwise raises `DataError`."""
-    if len(values) and not (int(values.min()) >= least and int(values.max()) <= largest):
-        raise DataError(f"The {name} reach from {values.min()} to {values.max()}, not {least} to {largest}.")
-    return values
+def _least_bytes(k: int, n_origins: int, e: int) -> int:
+    """Shorter streams are filled with zeros, so that their length bounds the memory of a reader."""
+    return max(k, n_origins, e) // 8
 
 
 FILE_KIND, FILE_VERSION = "gmmtorch.map", 2
 
 CODECS = ("quantized", "float")
-"""About 10 bytes a component, rounded within bounds; or every number as it is, about 150 bytes."""
+"""About 8 bytes a component, rounded within bounds; or every number as it is, about 150 bytes."""
 
 FILE_OPTIONS = QueryOptions(prior=1.0, cutoff=5.0)
 """The query options of a file that contains none; they are not those of `GaussianMap()`."""
@@ -319,13 +207,14 @@ def file_size(components: Components, rule: LearningRule, settings: MapSettings,
     facts = _facts(rule, settings, number_after(components.ids, next_number + n_new))
     if settings.codec == "float":
         data = _exact_file(components, facts)
-    elif components.attributes:
-        data = map_bytes(
-            quantized(numbered(components, settings.robot, next_number)[0]), rule, settings, next_number
-        )
     else:
-        values = quantize_numbered(components, settings.robot, next_number)
-        data = _container(bytes(batch_bytes(values)), b"", facts)
+        values, order = quantize_numbered(components, settings.robot, next_number)
+        block = b""
+        if components.attributes:
+            found, given = values.restored(), components.attributes.on_cpu().selected(order)
+            moved = rounded(given, components.means.detach().cpu()[order], found.means, found.covariances)
+            block = encode_attributes(moved, found.covariances)
+        data = _container(encode_quantized(values), block, facts)
     return len(data) + _ROOM_FOR_SETTINGS
 
 

@@ -7,7 +7,6 @@ multiples of 2⁻⁸ m. Every number is rounded by itself, so components can be 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +16,7 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.linalg import all_equal, on_cpu
 from gmmtorch.mapping.codec import attribute_block, lattice
-from gmmtorch.mapping.codec.bitstream import Ints, fewest_bits
+from gmmtorch.mapping.codec.bitstream import Ints
 from gmmtorch.mapping.codec.lattice import PER_OCTAVE, Lattice
 from gmmtorch.mapping.components import Components
 from gmmtorch.scan import FARTHEST
@@ -34,12 +33,10 @@ NO_COUNT = LEAST_COUNT - 1
 """The number that encodes a count of zero."""
 COUNT_ERROR = lattice.DEVIATION_ERROR
 """Largest relative error of a count."""
-RASTER_BITS = 60
-"""Largest number of bits of a cell's number in a batch."""
-LARGEST_SIDE = 30
-"""Largest log2 of a cell's side (m); few such cells cover the largest possible map."""
-_SIDES_TRIED = 10
-_WORSE_IN_A_ROW = 2
+LEAST_SIDE, LARGEST_SIDE = -20, 6
+"""log2 of the side (m) of the cells of a batch."""
+_FINEST = -10  # log2 of the side (m) of the cells that are ordered
+_KEY_BITS = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +47,8 @@ class Quantized:
     count (K,): log2 of the support in steps, or `NO_COUNT`. max_range (K,) bool. ids (K, 2).
     origins (S, D): in steps; distinct, all used.
     n_viewpoints (K,): number of viewpoints of each component. For each viewpoint, sorted by component:
-    seen_from (E,), its origin; share (E,), −log2 of its share of the component's largest, in steps.
+    seen_from (E,), its origin, by rising coordinates; share (E,), −log2 of its share of the component's
+    largest, in steps.
     """
 
     places: Lattice
@@ -69,7 +67,9 @@ class Quantized:
         """The components of distinct rows (J,), in that order, with the origins that they use, sorted."""
         chosen = self.reordered(rows)
         origins, seen_from = torch.unique(self.origins[chosen.seen_from], dim=0, return_inverse=True)
-        return replace(chosen, origins=origins, seen_from=seen_from)
+        by = torch.repeat_interleave(torch.arange(len(chosen)), chosen.n_viewpoints)
+        order = torch.argsort(by * len(origins) + seen_from)
+        return replace(chosen, origins=origins, seen_from=seen_from[order], share=chosen.share[order])
 
     def reordered(self, rows: Tensor) -> Quantized:
         """The components of distinct rows (J,), in that order; all origins stay as they are."""
@@ -110,9 +110,9 @@ class Quantized:
 def quantize(components: Components) -> Quantized:
     """The components rounded to whole numbers.
 
-    Viewpoints are sorted by component. Origins that round to the same place become one; origins without a
-    viewpoint are dropped. Raises `InvalidArgumentError` for values that are too large to be stored, see
-    `lattice` and `LARGEST_COUNT`.
+    Viewpoints are sorted by component, then by the coordinates of the origin. Origins that round to the same
+    place become one; origins without a viewpoint are dropped. Raises `InvalidArgumentError` for values that
+    are too large to be stored, see `lattice` and `LARGEST_COUNT`.
     """
     c = components.on_cpu()
     places = lattice.nearest(c.means.double(), c.covariances.double())
@@ -129,7 +129,8 @@ def quantize(components: Components) -> Quantized:
     used, seen = np.unique(place[seen], return_inverse=True)
     origins = steps[distinct[used]]
     # Two origins of a component that round to the same place are one viewpoint.
-    kept, pair = _first_uses(by * len(origins) + seen)
+    rank = _ranks(origins)
+    _, kept, pair = np.unique(by * len(origins) + rank[seen], return_index=True, return_inverse=True)
     seen_count = torch.from_numpy(np.bincount(pair, counts, len(kept)))
     seen_by, seen_from = torch.from_numpy(by[kept]), torch.from_numpy(seen[kept])
     return Quantized(
@@ -210,6 +211,13 @@ def _first_uses(rows: Ints) -> tuple[Ints, Ints]:
     return first[order], rank[which.reshape(-1)]
 
 
+def _ranks(rows: np.ndarray) -> Ints:
+    """The rank (N,) of each of distinct rows (N, D) in lexicographic order."""
+    ranks = np.empty(len(rows), np.int64)
+    ranks[np.lexsort(rows.T[::-1])] = np.arange(len(rows))
+    return ranks
+
+
 def quantized_after(known: Components, rounded: Components, components: Components) -> Components:
     """`quantized(components)`, which rounds only those after `known`, whose `rounded` values are given.
 
@@ -228,7 +236,16 @@ def quantized_after(known: Components, rounded: Components, components: Componen
     both = Components.concatenate([rounded, quantized(components.selected(rows))])
     origins = both.origins.cpu().numpy()
     distinct, place = (torch.from_numpy(v).to(both.means.device) for v in _first_uses(origins))
-    return replace(both, origins=both.origins[distinct], seen_from=place[both.seen_from])
+    seen_from = place[both.seen_from]
+    rank = torch.from_numpy(_ranks(origins[distinct.cpu().numpy()])).to(seen_from.device)
+    order = torch.argsort(both.seen_by * len(distinct) + rank[seen_from])
+    return replace(
+        both,
+        origins=both.origins[distinct],
+        seen_by=both.seen_by[order],
+        seen_from=seen_from[order],
+        seen_count=both.seen_count[order],
+    )
 
 
 # -- order and numbers -----------------------------------------------------------------------------------
@@ -266,12 +283,13 @@ def number_after(ids: Tensor, next_number: int) -> int:
     return max(next_number, int(ids[:, 1].max()) + 1 if len(ids) else 0)
 
 
-def quantize_numbered(components: Components, robot: int, first: int) -> Quantized:
-    """The same as `quantize(numbered(components, robot, first)[0])`, rounding every component once."""
+def quantize_numbered(components: Components, robot: int, first: int) -> tuple[Quantized, Tensor]:
+    """The same as `quantize(numbered(components, robot, first)[0])`, rounding every component once; and the
+    rows (K,) of the components in that order."""
     values = quantize(components)
     new = (values.ids[:, 1] < 0).nonzero().squeeze(1)
     ids, order = _numbering(values.ids, order_of(values.places.taken(new)), robot, first)
-    return replace(values.reordered(order), ids=ids)
+    return replace(values.reordered(order), ids=ids), order
 
 
 def _numbering(ids: Tensor, by_place: Tensor, robot: int, first: int) -> tuple[Tensor, Tensor]:
@@ -290,64 +308,36 @@ def _numbering(ids: Tensor, by_place: Tensor, robot: int, first: int) -> tuple[T
 
 
 def order_of(places: Lattice) -> Tensor:
-    """The `spatial_order` (K,) of components on the lattice."""
-    cells = cells_of(places, np.array([cell_exponent(places, in_order=False)]))[0]
-    return torch.from_numpy(np.lexsort(cells.T[::-1]))
+    """The `spatial_order` (K,) of components on the lattice: that of a Morton curve."""
+    cells = cells_of(places, _FINEST) + offset_of(_FINEST)
+    k, dim = cells.shape
+    keys = np.zeros((2, k), np.int64)  # the lower and the higher bits of the coordinates, interleaved
+    for bit in range(_KEY_BITS):
+        for axis in range(dim):
+            place = bit * dim + dim - 1 - axis
+            keys[0] |= (cells[:, axis] >> bit & 1) << place
+            keys[1] |= (cells[:, axis] >> (bit + _KEY_BITS) & 1) << place
+    return torch.from_numpy(np.lexsort(keys))
 
 
-def cells_of(places: Lattice, exponents: Ints) -> Ints:
-    """The cells (T, K, D) that contain the means, for cells of side 2^exponent m with exponents (T,)."""
+def cells_of(places: Lattice, exponent: int) -> Ints:
+    """The cells (K, D) of side 2^exponent m that contain the means."""
     mean, step = ints(places.by_world_axis(places.mean)), ints(places.world_exponents())
-    finer = exponents[:, None, None] - step
+    finer = exponent - step
     return np.where(finer >= 0, mean >> np.maximum(finer, 0), mean << np.maximum(-finer, 0))
 
 
-def cell_exponent(places: Lattice, in_order: bool) -> int:
-    """log2 of the side (m) of the cells with which means take the fewest bits, in this order or sorted."""
-    exponents = ints(places.world_exponents())
-    if not len(exponents):
-        return 0
-    rising = np.sort(exponents, axis=None)
-    first = int((rising[(len(rising) - 1) // 2] + rising[len(rising) // 2]) / 2)
-    while True:
-        tried = np.arange(first, min(first + _SIDES_TRIED, LARGEST_SIDE + 1))
-        cells = cells_of(places, tried)
-        least, extent = box_of(cells)
-        if first == LARGEST_SIDE or not _too_many(extent[0]):
-            break
-        first += 1
-    rasters = raster(cells, least, extent)
-    within = np.maximum(tried[:, None, None] - exponents, 0).sum((1, 2))
-    sizes = fewest_bits(rasters if in_order else np.sort(rasters, axis=1)) + within
-    best = 0
-    for row in range(len(tried)):
-        if sizes[row] < sizes[best]:
-            best = row
-        if row - best >= _WORSE_IN_A_ROW:
-            break
-    return int(tried[best])
+def offset_of(exponent: int) -> int:
+    """What is added to cells, so that they are positive, and the places around the origin of the world are in
+    few blocks of the curve."""
+    return sum(1 << (power - exponent) for power in range(6, 30, 2))
 
 
-def box_of(cells: Ints) -> tuple[Ints, Ints]:
-    """The lowest cell (…, D) of (…, K, D), and the number of cells on each axis."""
-    if not cells.shape[-2]:
-        shape = (*cells.shape[:-2], cells.shape[-1])
-        return np.zeros(shape, np.int64), np.ones(shape, np.int64)
-    least = cells.min(-2)
-    return least, cells.max(-2) - least + 1
-
-
-def _too_many(extent: Ints) -> bool:
-    """Whether a box (D,) has more cells than `RASTER_BITS` can number."""
-    return bool(math.prod(extent.tolist()) >> RASTER_BITS)
-
-
-def raster(cells: Ints, least: Ints, extent: Ints) -> Ints:
-    """Row-major numbers (…, K) of cells in their box."""
-    number = cells[..., 0] - least[..., None, 0]
-    for axis in range(1, cells.shape[-1]):
-        number = number * extent[..., None, axis] + (cells[..., axis] - least[..., None, axis])
-    return number
+def cell_exponent(places: Lattice) -> int:
+    """log2 of the side (m) of the cells of a batch: about the median of the largest deviations."""
+    largest = ints(places.deviation[:, 0])
+    middle = int(np.median(largest) // PER_OCTAVE) if len(largest) else 0
+    return min(max(middle, LEAST_SIDE), LARGEST_SIDE)
 
 
 def ints(values: Tensor) -> Ints:

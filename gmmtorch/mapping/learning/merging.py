@@ -164,9 +164,6 @@ def _kept_viewpoints(
 Size = Callable[[Components], int]
 """Number of bytes of the file of given components."""
 
-_GROWTH = 1.08
-"""A share s of the bytes holds about s^_GROWTH of the components, because merged ones take more bytes."""
-
 
 def estimated_bytes(components: Components) -> int:
     """Estimate of the file size: 16 bytes a component, 2 a viewpoint beyond the first, 7 an origin, 300 in
@@ -191,10 +188,14 @@ def merged(components: Components, labels: Tensor) -> Components:
     seen_by, seen_from, seen_count = union_of_viewpoints(components, labels)
     attributes = components.attributes
     if attributes:
-        both = (components.means, components.covariances), (joined.means, joined.covariances)
-        attributes = attributes.selected(first).where(
-            single, moments.merged(attributes, labels, components.support, *both)
+        rows, groups = (~single[labels]).nonzero().squeeze(1), (~single).nonzero().squeeze(1)
+        number = ((~single).cumsum(0) - 1)[labels[rows]]
+        before, after = (
+            (components.means[rows], components.covariances[rows]),
+            (joined.means[groups], joined.covariances[groups]),
         )
+        made = moments.merged(attributes.selected(rows), number, components.support[rows], before, after)
+        attributes = attributes.selected(first).replaced(groups, made)
     return replace(
         components,
         means=torch.where(single[:, None], components.means[first], joined.means),
@@ -291,6 +292,9 @@ def compact_to_bytes(
 ) -> Components:
     """Merges components until their `size` is at most `max_bytes`; origins are limited as by `limit_origins`.
 
+    Beyond that size, components lose their numbers: numbered anew, in the order of space, each takes a byte
+    less.
+
     Raises `InvalidArgumentError` if a single component with one origin is too large.
     """
     components = limit_origins(components, max_origins, mean_origins)
@@ -305,7 +309,12 @@ def compact_to_bytes(
             continue
         if fixed is None:
             fixed = size(Components.empty(components.dim, components.means.device))
+            robots = components.ids[:, 0]
+            components = replace(
+                components, ids=torch.stack([robots, torch.full_like(robots, UNNUMBERED)], 1)
+            )
+            continue
         room = max(0, max_bytes - fixed) / max(1, taken - fixed)
-        wanted = max(1, min(len(components) - 1, int(len(components) * room**_GROWTH)))
+        wanted = max(1, min(len(components) - 1, int(len(components) * room)))
         components = limit_origins(compact(components, wanted), max_origins, mean_origins)
     return components

@@ -178,17 +178,22 @@ def _invert(lower: Tensor) -> Tensor:
 def squares(points: Tensor, kind: str) -> Tensor:
     """The quadratic features of a type: |x|² (n, 1), x² (n, D), or x_i x_j (i ≤ j)."""
     if kind == "spherical":
-        return (points * points).sum(1, keepdim=True)
+        return torch.linalg.vector_norm(points, dim=1, keepdim=True).square()
     return points * points if kind == "diag" else em.products(points, points)
 
 
 def log_joint(parameters: Parameters, kind: str) -> Joint:
-    """The fastest form with enough digits, of parameters about their own centre."""
+    """The fastest form with enough digits: linear about the origin, linear about the centre, or direct."""
     factors = Factors(parameters, kind)
     k, dim = parameters.means.shape
-    if has_linear_form(k, dim, kind) and not bool(factors.lost_digits()):
+    linear = has_linear_form(k, dim, kind)
+    if linear and not bool(factors.lost_digits()):
         return factors.linear()
-    return factors.direct()
+    center = parameters.weights @ parameters.means
+    factors.means = parameters.means - center
+    linear = linear and not bool(factors.lost_digits())
+    joint = factors.linear() if linear else factors.direct()
+    return lambda points, square=None: joint(points - center)
 
 
 def rows_of_chunk(n_components: int, dim: int, kind: str, device: torch.device) -> int:

@@ -150,9 +150,9 @@ def is_ill_conditioned(parameters: Parameters) -> bool:
     φ·W sums terms as large as μᵀΣ⁻¹μ to a few nats. For a component 1 mm thick this fails 10 km from the
     centre of the cloud.
     """
-    whiten = inverse_factor(safe_cholesky(parameters.covariances))
-    size = (parameters.means[:, None, :] @ whiten).square().sum((1, 2))
-    return bool((size * parameters.weights.sign()).max() * torch.finfo(whiten.dtype).eps > 1e-6)
+    weights, means, _ = parameters
+    size = (natural_parameters(parameters)[:, 1 : 1 + means.shape[1]] * means).sum(1)
+    return bool((size * weights.sign()).max() * torch.finfo(size.dtype).eps > 1e-6)
 
 
 def has_cancelled(statistics: Tensor, parameters: Parameters) -> bool:

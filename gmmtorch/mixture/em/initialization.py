@@ -7,137 +7,154 @@ and the same point given twice therefore give exactly the same start.
 from __future__ import annotations
 
 import functools
-import warnings
 from collections.abc import Callable
+from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from gmmtorch.kernels import chunk_elements
 from gmmtorch.linalg import argsort
 from gmmtorch.mixture.em import by_type
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.exact import Parameters
+from gmmtorch.mixture.em.kmeans import kmeans, spread_out
 from gmmtorch.mixture.em.partition import FlatnessRule, partition, pool, pool_into_cells, surface_rule
 
 _FEWEST_CELLS, _CELLS_OF_A_COMPONENT = 4096, 8  # lower limits of the cells for flat pieces
 _FINEST_CELLS = 1 << 14  # along the longest side
 _SURFACE_CELLS = 1 << 17  # `surface_pieces` partitions cells from twice this number of points on
 
-Initialization = Callable[[Tensor, Tensor, int, float, torch.Generator, str], Parameters]
-"""(points (N, D), weight (N,), K, reg_covar, generator, covariance type) → parameters, with covariances in
-the shape of the type. Points centred, float64.
+Initialization = Callable[["Distinct", int, float, torch.Generator, str], Parameters]
+"""(points, K, reg_covar, generator, covariance type) → parameters, with covariances in the shape of the
+type. Points centred, float64.
 """
 
 
-def distinct_points(points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Distinct rows in lexicographic order, and the sum of the weights of each."""
-    order = argsort(points[:, 0].contiguous())
-    column = points[order, 0]
-    same = column[1:] == column[:-1]
-    if points.shape[1] > 1 and bool(same.any()):
+class Distinct(NamedTuple):
+    """Points (N, D) with weights (N,), and which of them are distinct.
+
+    rows: (M,) one point of each place, in an order that depends on the values only: by the first column,
+    then by a hash of the others. mass: (M,) the summed weights of the points there.
+    """
+
+    points: Tensor
+    weight: Tensor
+    rows: Tensor
+    mass: Tensor
+
+    @staticmethod
+    def of(points: Tensor, weight: Tensor) -> Distinct:
+        order = argsort(points[:, 0].contiguous())
+        column = points[order, 0]
+        same = column[1:] == column[:-1]
+        if not bool(same.any()):
+            return Distinct(points, weight, order, weight[order])
         # Only rows that are equal in the first column need the other columns.
         tied = torch.cat([same.new_zeros(1), same]) | torch.cat([same, same.new_zeros(1)])
         among = order[tied]
-        for axis in reversed(range(points.shape[1])):
-            among = among[argsort(points[among, axis])]
-        order[tied] = among
-    rows = points[order]
-    is_new = torch.ones_like(order, dtype=torch.bool)
-    is_new[1:] = (rows[1:] != rows[:-1]).any(1)
-    number = is_new.cumsum(0) - 1
-    rows = rows if bool(is_new.all()) else rows[is_new]
-    return rows, weight.new_zeros(len(rows)).index_add_(0, number, weight[order])
+        among = among[argsort(_hash(points, among))]
+        order[tied] = among[argsort(points[among, 0])]
+        for some in same.nonzero().squeeze(1).split(chunk_rows(points)):
+            same[some] = (points[order[some + 1]] == points[order[some]]).all(1)
+        is_new = torch.cat([~same.new_zeros(1), ~same])
+        mass = weight.new_zeros(int(is_new.sum())).index_add_(0, is_new.cumsum(0) - 1, weight[order])
+        return Distinct(points, weight, order[is_new], mass)
+
+    def drawn(self, n: int, generator: torch.Generator) -> Tensor:
+        """A draw (n, D) without replacement, by weight: the n smallest of E/w, E exponential."""
+        race = torch.empty(self.mass.shape, dtype=torch.float64).exponential_(generator=generator)
+        return self.points[self.rows[(race.to(self.mass.device) / self.mass).argsort()[:n]]]
+
+
+def _hash(points: Tensor, rows: Tensor) -> Tensor:
+    """A whole number (n,) for each of some rows; equal rows have equal ones."""
+    odd = torch.randint(2**62, (points.shape[1],), generator=torch.Generator().manual_seed(0)) * 2 + 1
+    odd, found = odd.to(points.device), []
+    for some in rows.split(chunk_rows(points)):
+        bits = (points[some] + 0.0).view(torch.int64)  # + 0, because −0 equals 0
+        found.append(((bits ^ (bits >> 32)) * odd).sum(1))
+    return torch.cat(found)
+
+
+def chunk_rows(points: Tensor) -> int:
+    """Rows of a chunk of points (N, D)."""
+    return max(64, chunk_elements(points.device) // points.shape[1])
 
 
 def from_kmeans(
-    points: Tensor,
-    weight: Tensor,
+    cloud: Distinct,
     n_components: int,
     reg_covar: float,
     generator: torch.Generator,
     kind: str,
     n_init: int = 1,
 ) -> Parameters:
-    """The moments of scikit-learn's k-means clusters; of `n_init` runs, the clustering with least scatter."""
-    from sklearn.cluster import KMeans
-    from sklearn.exceptions import ConvergenceWarning
-
-    seed = int(torch.randint(2**31 - 1, (), generator=generator))
-    kmeans = KMeans(n_components, n_init=n_init, random_state=seed, copy_x=False)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)  # raised for empty clusters
-        labels = kmeans.fit(points.cpu().numpy(), sample_weight=weight.cpu().numpy()).labels_
-    labels = torch.from_numpy(labels.astype(np.int64)).to(points.device)
+    """The moments of k-means clusters; of `n_init` runs, the clustering with least scatter."""
+    points, weight = cloud.points, cloud.weight
+    labels, scatter = kmeans(*cloud, n_components, generator, n_init)
+    best = labels[scatter.argmin()]
     if points.shape[1] > 3:
-        found = by_type.moments_of_labels(points, weight, labels, n_components, kind)
+        found = by_type.moments_of_labels(points, weight, best, n_components, kind)
         return by_type.maximized(found, reg_covar, None, kind)
-    found = moments_of(em.quadratic_features(points), weight, labels, n_components, reg_covar, points)
+    found = moments_of(em.quadratic_features(points), weight, best, n_components, reg_covar, points)
     return by_type.compacted(found, kind)
 
 
 def from_random_points(
-    points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator, kind: str
+    cloud: Distinct, n_components: int, reg_covar: float, generator: torch.Generator, kind: str
 ) -> Parameters:
     """Means at distinct random points, drawn by weight; isotropic covariance, uniform weights."""
-    return _tiling(points[_draw(weight, n_components, generator)], points, weight, reg_covar, kind)
-
-
-def _draw(weight: Tensor, n: int, generator: torch.Generator) -> Tensor:
-    """Indices (n,) of a draw without replacement, by weight: the n smallest of E/w, E exponential."""
-    race = torch.empty(weight.shape, dtype=torch.float64).exponential_(generator=generator)
-    return (race.to(weight.device) / weight).argsort()[:n]
+    return _tiling(cloud.drawn(n_components, generator), cloud, reg_covar, kind)
 
 
 def from_single_points(
-    points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator, kind: str
+    cloud: Distinct, n_components: int, reg_covar: float, generator: torch.Generator, kind: str
 ) -> Parameters:
     """Components of one random point each, with variance `reg_covar`: scikit-learn's "random_from_data"."""
-    return _isotropic(points[_draw(weight, n_components, generator)], reg_covar, kind)
+    return _isotropic(cloud.drawn(n_components, generator), reg_covar, kind)
 
 
 def from_kmeans_plus_plus(
-    points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator, kind: str
+    cloud: Distinct, n_components: int, reg_covar: float, generator: torch.Generator, kind: str
 ) -> Parameters:
     """Components of one point each, chosen far apart as k-means++ does, with variance `reg_covar`."""
-    from sklearn.cluster import kmeans_plusplus
-
-    seed = int(torch.randint(2**31 - 1, (), generator=generator))
-    means, _ = kmeans_plusplus(
-        points.cpu().numpy(), n_components, sample_weight=weight.cpu().numpy(), random_state=seed
-    )
-    return _isotropic(torch.from_numpy(means).to(points.device), reg_covar, kind)
+    chosen = spread_out(*cloud, n_components, generator)[0]
+    return _isotropic(cloud.points[chosen], reg_covar, kind)
 
 
 def from_random_responsibilities(
-    points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator, kind: str
+    cloud: Distinct, n_components: int, reg_covar: float, generator: torch.Generator, kind: str
 ) -> Parameters:
     """The moments of uniformly random responsibilities: scikit-learn's "random"."""
-    linear = by_type.has_linear_form(n_components, points.shape[1], kind)
-    about = None if linear else points.new_zeros(n_components, points.shape[1])
-    sums = by_type.Sums(n_components, points, kind, about)
-    rows = by_type.rows_of_chunk(n_components, points.shape[1], kind, points.device)
-    for some, p in zip(points.split(rows), weight.split(rows), strict=True):
+    dim, device = cloud.points.shape[1], cloud.points.device
+    linear = by_type.has_linear_form(n_components, dim, kind)
+    about = None if linear else cloud.points.new_zeros(n_components, dim)
+    sums = by_type.Sums(n_components, cloud.points, kind, about)
+    size = by_type.rows_of_chunk(n_components, dim, kind, device)
+    for some, p in zip(cloud.rows.split(size), cloud.mass.split(size), strict=True):
         share = torch.rand(some.shape[0], n_components, generator=generator, dtype=torch.float64)
-        share = share.to(points.device).T
-        sums.add(some, share * (p / share.sum(0)))
+        share = share.to(device).T
+        sums.add(cloud.points[some], share * (p / share.sum(0)))
     return by_type.maximized(sums.moments()[0], reg_covar, None, kind)
 
 
 def from_bounding_box(
-    points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator, kind: str
+    cloud: Distinct, n_components: int, reg_covar: float, generator: torch.Generator, kind: str
 ) -> Parameters:
     """Means uniform in the bounding box; isotropic covariance, uniform weights."""
-    low, high = points.amin(0), points.amax(0)
-    uniform = torch.rand(n_components, points.shape[1], generator=generator, dtype=torch.float64)
-    return _tiling(low + (high - low) * uniform.to(points.device), points, weight, reg_covar, kind)
+    low, high = cloud.points.amin(0), cloud.points.amax(0)
+    uniform = torch.rand(n_components, len(low), generator=generator, dtype=torch.float64)
+    return _tiling(low + (high - low) * uniform.to(low.device), cloud, reg_covar, kind)
 
 
-def _tiling(means: Tensor, points: Tensor, weight: Tensor, reg_covar: float, kind: str) -> Parameters:
+def _tiling(means: Tensor, cloud: Distinct, reg_covar: float, kind: str) -> Parameters:
     """Components with the cloud's mean variance, reduced as if they tile the cloud: σ² K^(−2/D)."""
-    n_components, dim = means.shape
-    center = (weight[:, None] * points).sum(0) / weight.sum()
-    spread = (weight[:, None] * (points - center) ** 2).sum() / weight.sum() / dim
+    (n_components, dim), (points, weight, *_) = means.shape, cloud
+    center, total = weight @ points / weight.sum(), weight.sum()
+    spread = weight.new_zeros(())
+    for some, p in zip(points.split(chunk_rows(points)), weight.split(chunk_rows(points)), strict=True):
+        spread = spread + (p @ (some - center).square_()).sum() / total / dim
     return _isotropic(means, spread * n_components ** (-2 / dim) + reg_covar, kind)
 
 
@@ -152,10 +169,10 @@ def _isotropic(means: Tensor, variance: Tensor | float, kind: str) -> Parameters
 
 
 def from_flat_pieces(
-    points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator, kind: str
+    cloud: Distinct, n_components: int, reg_covar: float, generator: torch.Generator, kind: str
 ) -> Parameters:
     """One component for each of the cloud's flat pieces: deterministic, and fast for any K."""
-    found, _ = flat_pieces(points, weight, n_components, reg_covar)
+    found, _ = flat_pieces(cloud.points[cloud.rows], cloud.mass, n_components, reg_covar)
     return by_type.compacted(replicated(found, n_components)[0], kind)
 
 
@@ -266,9 +283,9 @@ def initialize(
     If there are fewer distinct points than components, each distinct point gives one component, and the
     other components are copies that share its weight. The density is then that of the distinct points.
     """
-    points, weight = distinct_points(points, weight)
-    n = min(n_components, points.shape[0])
-    found = INITIALIZATIONS[method](points, weight, n, reg_covar, generator, covariance_type)
+    cloud = Distinct.of(points, weight)
+    n = min(n_components, cloud.rows.shape[0])
+    found = INITIALIZATIONS[method](cloud, n, reg_covar, generator, covariance_type)
     return replicated(found, n_components, covariance_type)[0]
 
 

@@ -86,6 +86,11 @@ def em_step(
     if points is not None and points.shape[1] > 3:
         return _typed_step(points, rows.weight, reg_covar, softmax_dtype, covariance_type)
     natural = natural_step(rows.features(), rows.weight, reg_covar, softmax_dtype, points, covariance_type)
+    return in_shape_of_type(natural, covariance_type)
+
+
+def in_shape_of_type(natural: Step[Parameters], covariance_type: str) -> Step[Parameters]:
+    """The steps `natural`, whose covariances are (K, D, D), for covariances in the shape of their type."""
     if covariance_type == "full":
         return natural
     known: list[tuple[Parameters, Parameters]] = []  # the last result, in both shapes

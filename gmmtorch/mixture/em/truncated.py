@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gmmtorch.kernels import (
@@ -317,9 +316,14 @@ class Groups(NamedTuple):
         )
 
 
-def group_rows(rows: Rows, owner: Tensor, centers: Tensor, dtype: torch.dtype) -> Groups:
-    """Group rows by owner (N,), relative to the owner's center (K, D), in `dtype`."""
-    n, k = owner.shape[0], centers.shape[0]
+def group_rows(
+    rows: Rows, owner: Tensor, centers: Tensor, dtype: torch.dtype, as_points: bool = False
+) -> Groups:
+    """Group rows by owner (N,), relative to the owner's center (K, D), in `dtype`.
+
+    With `as_points`, for points: the groups have points (b, B, D) in place of their features.
+    """
+    n, (k, dim) = owner.shape[0], centers.shape
     # Small blocks need little padding; large blocks multiply faster.
     block = 16 if n < 48 * k else 32 if n < 200 * k else 64
     row = argsort(owner)
@@ -327,7 +331,7 @@ def group_rows(rows: Rows, owner: Tensor, centers: Tensor, dtype: torch.dtype) -
     n_blocks = (count + block - 1) // block
     gap = (torch.cumsum(n_blocks, 0) - n_blocks) * block - (torch.cumsum(count, 0) - count)
     n_slots = int(n_blocks.sum()) * block
-    n_features = em.quadratic_features(centers[:1]).shape[1]
+    n_features = dim if as_points else em.quadratic_features(centers[:1]).shape[1]
     features = torch.zeros(n_slots, n_features, dtype=dtype, device=owner.device)
     weight = torch.zeros(n_slots, dtype=dtype, device=owner.device)
     slot = torch.empty_like(row)
@@ -336,14 +340,12 @@ def group_rows(rows: Rows, owner: Tensor, centers: Tensor, dtype: torch.dtype) -
         group = owner.index_select(0, row[part])
         slot[part] = torch.arange(part.start, part.stop, device=owner.device) + gap.index_select(0, group)
         values, own = rows.values.index_select(0, row[part]), centers.index_select(0, group)
-        if rows.are_points:
-            local = em.quadratic_features((values - own).to(dtype))
-        else:
-            local = em.shift_features(values, -own).to(dtype)
+        local = (values - own if rows.are_points else em.shift_features(values, -own)).to(dtype)
+        local = em.quadratic_features(local) if rows.are_points and not as_points else local
         features.index_copy_(0, slot[part], local)
         weight.index_copy_(0, slot[part], rows.weight.index_select(0, row[part]).to(dtype))
-    trace = pack_symmetric(torch.eye(centers.shape[1], dtype=dtype, device=owner.device))
-    squared = features[:, -trace.shape[0] :] @ trace
+    trace = pack_symmetric(torch.eye(dim, dtype=dtype, device=owner.device))
+    squared = features.square().sum(1) if as_points else features[:, -trace.shape[0] :] @ trace
     sums = torch.stack([weight, weight * squared]).view(2, -1, block).sum(2).double()
     owner_of_block = torch.repeat_interleave(torch.arange(k, device=owner.device), n_blocks)
     mass, spread = sums.new_zeros(2, k).index_add_(1, owner_of_block, sums)
@@ -360,6 +362,8 @@ def owners_of(groups: Groups) -> Tensor:
 
 def nearest(points: Tensor, means: Tensor) -> Tensor:
     """The component (N,) whose mean (K, D) is nearest to each point (N, D)."""
+    from scipy.spatial import cKDTree
+
     tree = cKDTree(means.detach().cpu().numpy())
     return torch.from_numpy(tree.query(points.detach().cpu().numpy())[1]).to(points.device)
 

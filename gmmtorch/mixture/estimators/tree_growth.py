@@ -36,6 +36,7 @@ _WORST_ROUNDING = 0.02  # nats per point of float32 error above which float64 is
 _SHORTLIST = 3  # nodes that are fully fitted, per node that the limit of leaves allows to split
 _TRIAL_ITERATIONS = 2
 _LEAST_SHARE = 1e-30  # smaller shares of the largest responsibility are treated as zero
+_MOST_FEATURES = 1 << 23  # numbers; above, features are made again in each pass
 _ROUNDINGS = 10.0  # variances below this number of roundings of squared distances are noise
 
 
@@ -284,38 +285,58 @@ class Members(NamedTuple):
 class Packed(NamedTuple):
     """Members in blocks of B of one node. Members of weight 0 fill incomplete blocks.
 
-    features: (b, F, B) relative to the node's centre. weight: (b, B). node: (b,) of each block. member:
-    (b, B) index of the member in each place, −1 if the place is empty.
+    values: (b, F, B) features relative to the node's centre; the points (b, D, B) if their features
+    would need much memory. weight: (b, B). node: (b,) of each block. member: (b, B) index of the
+    member in each place, −1 if the place is empty. dim: D.
     """
 
-    features: Tensor
+    values: Tensor
     weight: Tensor
     node: Tensor
     member: Tensor
+    dim: int
 
     def select(self, kept: Tensor) -> Packed:
         """The blocks of the nodes in the mask `kept` (G,), which are renumbered from 0."""
         blocks = kept[self.node].nonzero().squeeze(1)
-        features, weight, node, member = (value.index_select(0, blocks) for value in self)
-        return Packed(features, weight, (torch.cumsum(kept.long(), 0) - 1)[node], member)
+        values, weight, node, member = (value.index_select(0, blocks) for value in self[:4])
+        return Packed(values, weight, (torch.cumsum(kept.long(), 0) - 1)[node], member, self.dim)
 
     def chunks(self, n_children: int) -> Iterator[tuple[slice, Tensor, Tensor, Tensor]]:
         """Slices of blocks, and their features, weight and node, small enough for the cache."""
-        step = max(1, chunk_elements(self.weight.device) // (self.weight.shape[1] * n_children))
+        are_points = self.values.shape[1] == self.dim
+        width = max(n_children, self.dim**2 // 8 if are_points else 0)
+        step = max(1, chunk_elements(self.weight.device) // (self.weight.shape[1] * width))
         for begin in range(0, self.node.shape[0], step):
             part = slice(begin, begin + step)
-            yield part, self.features[part], self.weight[part], self.node[part]
+            x = self.values[part]
+            if are_points:
+                x = _features_of_columns(x)
+            yield part, x, self.weight[part], self.node[part]
+
+
+def _features_of_columns(x: Tensor) -> Tensor:
+    """Features (b, F, B) of points (b, D, B): `exact.quadratic_features` in another layout."""
+    dim = x.shape[1]
+    found = x.new_empty(x.shape[0], 1 + dim + dim * (dim + 1) // 2, x.shape[2])
+    found[:, 0], found[:, 1 : 1 + dim], begin = 1.0, x, 1 + dim
+    for i in range(dim):
+        torch.mul(x[:, i : i + 1], x[:, i:], out=found[:, begin : begin + dim - i])
+        begin += dim - i
+    return found
 
 
 def pack(points: Tensor, members: Members, centers: Tensor, dtype: torch.dtype) -> Packed:
     """Pack members of points (N, D) relative to the centres (G, D) of their nodes, in `dtype`."""
     rows = Rows(points.index_select(0, members.point), members.weight, are_points=True)
-    groups = group_rows(rows, members.node, centers, dtype)
+    dim = points.shape[1]
+    many = dim > 3 and members.weight.shape[0] * dim * (dim + 1) // 2 > _MOST_FEATURES
+    groups = group_rows(rows, members.node, centers, dtype, as_points=many)
     member = torch.full((groups.weight.numel(),), -1, dtype=torch.int64, device=points.device)
     member[groups.slot] = groups.row
     # With members along the rows, the products run twice as fast.
-    features = groups.features.transpose(1, 2).contiguous()
-    return Packed(features, groups.weight, groups.owner, member.view_as(groups.weight))
+    values = groups.features.transpose(1, 2).contiguous()
+    return Packed(values, groups.weight, groups.owner, member.view_as(groups.weight), dim)
 
 
 class Children(NamedTuple):
@@ -341,8 +362,8 @@ class Children(NamedTuple):
 def expectation(packed: Packed, children: Children) -> tuple[Tensor, Tensor]:
     """The E-step in all nodes: statistics (G, m, F) and Σ p log Σ_children (G,), float64."""
     n_nodes, m = children.weights.shape
-    dtype, n_features = packed.features.dtype, packed.features.shape[1]
-    natural, floor = children.natural(dtype), em.exponent_floor(dtype)
+    natural = children.natural(packed.values.dtype)
+    n_features, floor = natural.shape[2], em.exponent_floor(natural.dtype)
     sums = natural.new_zeros(n_nodes, m * n_features, dtype=torch.float64)
     value = natural.new_zeros(n_nodes, dtype=torch.float64)
     for _, features, weight, node in packed.chunks(m):
@@ -397,8 +418,7 @@ def principal_axes_start(packed: Packed, n_nodes: int, n_children: int, reg_cova
     """
     label = torch.zeros_like(packed.member)
     n_pieces = 1
-    dtype = packed.features.dtype
-    dim = feature_dimension(packed.features.shape[1])
+    dtype, dim = packed.values.dtype, packed.dim
     while n_pieces < n_children:
         statistics = _pool(packed, label, n_nodes, n_pieces)
         count = statistics[..., 0]
@@ -423,7 +443,7 @@ def principal_axes_start(packed: Packed, n_nodes: int, n_children: int, reg_cova
 
 def _pool(packed: Packed, label: Tensor, n_nodes: int, n_pieces: int) -> Tensor:
     """Statistics (G, n, F) of the pieces that the labels (b, B) of members define in each node."""
-    n_features = packed.features.shape[1]
+    n_features = 1 + packed.dim + packed.dim * (packed.dim + 1) // 2
     sums = packed.weight.new_zeros(n_nodes, n_pieces * n_features, dtype=torch.float64)
     piece = torch.arange(n_pieces, device=label.device)[:, None]
     for part, features, weight, node in packed.chunks(n_pieces):
@@ -501,7 +521,7 @@ def assign_members(packed: Packed, children: Children, members: Members, soft_th
     to γ (2.8).
     """
     m = children.weights.shape[1]
-    natural = children.natural(packed.features.dtype)
+    natural = children.natural(packed.values.dtype)
     log_weight = children.weights.log().flatten()
     floor = em.exponent_floor(natural.dtype)
     value = torch.zeros_like(children.weights[:, 0])

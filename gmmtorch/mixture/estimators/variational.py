@@ -11,6 +11,7 @@ uses the E-step of EM, see `variational_step` (Bishop, 2006, section 10.2; Blei 
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
 from collections.abc import Mapping
@@ -24,7 +25,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import chunk_elements
-from gmmtorch.linalg import check_symmetric, inverse_factor, safe_cholesky
+from gmmtorch.linalg import check_symmetric, safe_cholesky
 from gmmtorch.mixture.density import NotFittedError
 from gmmtorch.mixture.em import by_type, loop
 from gmmtorch.mixture.em import exact as em
@@ -60,7 +61,8 @@ class Posterior(NamedTuple):
 
     concentration: (2, K) the Beta parameters of the sticks, or (1, K) the Dirichlet parameters.
     mean_precision: β (K,), the number of points that determine each mean. means: m (K, D).
-    degrees_of_freedom: ν (K,). covariances: W⁻¹/ν (K, D, D), the inverse of the expected precision.
+    degrees_of_freedom: ν (K,). covariances: W⁻¹/ν, the inverse of the expected precision, in the shape of the
+    covariance type.
     """
 
     concentration: Tensor
@@ -217,16 +219,15 @@ class VariationalGaussianMixture(MixtureEstimator):
         if self._continues():
             last = Posterior(*(value.to(cloud.points.device) for value in self._posterior()))
             self._check_continues(cloud.points)
-            covariances = constrain(last.covariances, self.covariance_type)
-            return last._replace(means=last.means - cloud.center, covariances=covariances)
+            return last._replace(means=last.means - cloud.center)
         k, kind, reg = self.n_components, self.covariance_type, float(self.reg_covar)
         first = initialize(self.init_params, cloud.points, cloud.weight, k, reg, generator, kind)
-        first = first._replace(covariances=expand(first.covariances, kind, *first.means.shape))
         # Stick-breaking depends on the order of components. With the largest component first the bound is
         # best and does not depend on the frame.
         order = first.weights.argsort(descending=True, stable=True)
         count = first.weights[order] * cloud.weight.sum()
-        moments = Parameters(count, first.means[order], first.covariances[order])
+        covariances = first.covariances if kind == "tied" else first.covariances[order]
+        moments = Parameters(count, first.means[order], covariances)
         process = self.weight_concentration_prior_type == "dirichlet_process"
         return update(prior, moments, process, self.covariance_type)
 
@@ -245,8 +246,7 @@ class VariationalGaussianMixture(MixtureEstimator):
             mean = checked_parameter(self.mean_prior, (dim,), "mean_prior", points.device) - center
         kind = self.covariance_type
         if self.covariance_prior is None:
-            spread = unbiased_covariance(points, weight, thickness=float(self.reg_covar))
-            spread = constrain(spread[None], kind)[0]
+            spread = unbiased_covariance(points, weight, float(self.reg_covar), kind)
         else:
             shape = (dim, dim) if kind == "full" else type_shape(kind, 1, dim)
             given = torch.as_tensor(self.covariance_prior)
@@ -272,7 +272,7 @@ class VariationalGaussianMixture(MixtureEstimator):
         with few points.
         """
         points = self._as_points(X)
-        return self._as_kind_of(X, log_predictive(points, self._posterior()))
+        return self._as_kind_of(X, log_predictive(points, self._posterior(), self._fitted_type))
 
     def _posterior(self) -> Posterior:
         self._fitted()
@@ -280,9 +280,8 @@ class VariationalGaussianMixture(MixtureEstimator):
             raise NotFittedError(
                 f"This {type(self).__name__} has given parameters and no posterior; fit it to points first."
             )
-        return Posterior(
-            self.concentration, self.mean_precision, self.means, self.degrees_of_freedom, self.covariances
-        )
+        dof, covariances = self.degrees_of_freedom, self._typed_covariances()
+        return Posterior(self.concentration, self.mean_precision, self.means, dof, covariances)
 
     @property
     def support_(self) -> Array:
@@ -350,14 +349,24 @@ class VariationalGaussianMixture(MixtureEstimator):
 # -- the posterior, given moments -----------------------------------------------------------------
 
 
-def unbiased_covariance(points: Tensor, weight: Tensor, thickness: float) -> Tensor:
-    """Covariance (D, D) of points whose mean is the origin.
+def unbiased_covariance(
+    points: Tensor, weight: Tensor, thickness: float, covariance_type: str = "full"
+) -> Tensor:
+    """Covariance (D, D), of the type, of points whose mean is the origin.
 
     In directions in which the points are flat, the variance is `thickness` (m²) instead of zero.
     """
     total = float(weight.sum())
     # No unbiased estimate exists below two points; W/2 continues W − 1 continuously.
-    covariance = (points * weight[:, None]).T @ points / max(total - 1, total / 2)
+    count = max(total - 1, total / 2)
+    if covariance_type in ("diag", "spherical"):
+        rows = max(64, chunk_elements(points.device) // points.shape[1])
+        parts = zip(points.split(rows), weight.split(rows), strict=True)
+        variances = torch.stack([p @ x.square() for x, p in parts]).sum(0) / count
+        flat = ~(variances > 1e-14 * variances.amax())
+        variances = torch.where(flat, variances.clamp_min(thickness), variances)
+        return constrain(torch.diag(variances)[None], covariance_type)[0]
+    covariance = (points * weight[:, None]).T @ points / count
     variances, directions = torch.linalg.eigh(covariance)
     if float(variances[0]) > 1e-14 * float(variances[-1]):
         return covariance
@@ -367,7 +376,8 @@ def unbiased_covariance(points: Tensor, weight: Tensor, thickness: float) -> Ten
 def update(prior: Prior, moments: Parameters, process: bool, covariance_type: str = "full") -> Posterior:
     """The posterior given the points N_k (K,) of each component, their means and their covariances.
 
-    `moments` has N_k in place of weights. process: whether the weights have a Dirichlet process prior.
+    `moments` has N_k in place of weights, and covariances in the shape of the type. process: whether the
+    weights have a Dirichlet process prior.
     Bishop (10.58)–(10.63); Blei & Jordan (18)–(19). For other types than full covariances, the Wishart
     factors are the best ones whose scale matrix is of the type: tied ones are equal.
     """
@@ -376,11 +386,17 @@ def update(prior: Prior, moments: Parameters, process: bool, covariance_type: st
     degrees_of_freedom = prior.degrees_of_freedom + count
     offset = mean - prior.mean
     pull = count * prior.mean_precision / mean_precision
-    scatter = prior.covariance + count[:, None, None] * covariance
-    scatter = scatter + pull[:, None, None] * offset[:, :, None] * offset[:, None, :]
-    scatter = constrain(scatter, covariance_type)
-    if covariance_type == "tied":
+    scatter = compact(prior.covariance[None], covariance_type)
+    if covariance_type == "full":
+        outer = offset[:, :, None] * offset[:, None, :]
+        scatter = scatter + count[:, None, None] * covariance + pull[:, None, None] * outer
+    elif covariance_type == "tied":
+        scatter = scatter + (count.sum() * covariance + (pull[:, None] * offset).T @ offset) / len(count)
         degrees_of_freedom = degrees_of_freedom.mean().expand_as(degrees_of_freedom).clone()
+    elif covariance_type == "diag":
+        scatter = scatter + count[:, None] * covariance + pull[:, None] * offset.square()
+    else:
+        scatter = scatter + count * covariance + pull * offset.square().mean(1)
     if process:  # 1 + N_k for taking stick k, and γ₀ + Σ_{j>k} N_j for passing it
         later = torch.cat([count.flip(0).cumsum(0).flip(0)[1:], count.new_zeros(1)])
         concentration = torch.stack([1 + count, prior.concentration + later])
@@ -391,8 +407,13 @@ def update(prior: Prior, moments: Parameters, process: bool, covariance_type: st
         mean_precision,
         (prior.mean_precision * prior.mean + count[:, None] * mean) / mean_precision[:, None],
         degrees_of_freedom,
-        scatter / degrees_of_freedom[:, None, None],
+        scatter / _of_each(degrees_of_freedom, scatter, covariance_type),
     )
+
+
+def _of_each(value: Tensor, covariances: Tensor, covariance_type: str) -> Tensor:
+    """A value (K,) of each component, in a shape that broadcasts with covariances; tied: that of all."""
+    return value[0] if covariance_type == "tied" else value.view(-1, *[1] * (covariances.ndim - 1))
 
 
 def expected_weights(concentration: Tensor) -> Tensor:
@@ -429,19 +450,27 @@ def expected_log_density(posterior: Posterior) -> tuple[Tensor, Parameters]:
     return weight, Parameters(torch.ones_like(weight), posterior.means, posterior.covariances)
 
 
-def assigned_log_density(moments: Parameters, log_weight: Tensor, gaussians: Parameters) -> Tensor:
-    """Σ_n Σ_k γ_nk (ω_k + log N(x_n | m_k, Σ_k)), a scalar, of points with moments (N_k, x̄_k, S_k)."""
+def assigned_log_density(moments: Parameters, log_weight: Tensor, factors: by_type.Factors) -> Tensor:
+    """Σ_n Σ_k γ_nk (ω_k + log N(x_n | m_k, Σ_k)), a scalar, of points with moments (N_k, x̄_k, S_k).
+
+    Covariances have the shape of their type. factors: of weights 1, m and Σ.
+    """
     count, mean, covariance = moments
-    factors = safe_cholesky(gaussians.covariances)
-    whiten = inverse_factor(factors)
-    offset = mean - gaussians.means
-    second = covariance + offset[:, :, None] * offset[:, None, :]
-    squared = (whiten @ whiten.transpose(-2, -1) * second).sum((1, 2))
-    half_log_det = torch.log(factors.diagonal(dim1=-2, dim2=-1)).sum(1)
-    return (count * (log_weight - half_log_det - 0.5 * (mean.shape[1] * LOG_2PI + squared))).sum()
+    whiten, offset = factors.whiten, mean - factors.means
+    if factors.kind in ("full", "tied"):
+        trace = (whiten.mT @ whiten * covariance).sum((-2, -1))
+        shift = whiten @ offset[:, :, None]
+    else:
+        n_equal = factors.dim if factors.kind == "spherical" else 1
+        trace = (whiten.square() * covariance).view(len(count), -1).sum(1) * n_equal
+        shift = offset * whiten.view(len(count), -1)
+    squared = trace + shift.square().flatten(1).sum(1)
+    return (count * (log_weight + factors.constant - 0.5 * squared)).sum()
 
 
-def log_evidence(prior: Prior, posterior: Posterior, n_points: float) -> Tensor:
+def log_evidence(
+    prior: Prior, posterior: Posterior, n_points: float, covariance_type: str = "full"
+) -> Tensor:
     """log p(X | assignments) + log p(assignments), nats, of the points that `posterior` includes.
 
     The ratio of the normalisers of posterior and prior, times (2π)^(−ND/2). Plus the entropy of the
@@ -449,9 +478,11 @@ def log_evidence(prior: Prior, posterior: Posterior, n_points: float) -> Tensor:
     of the whole process: components beyond the K-th have no points and equal the prior.
     """
     dim = prior.mean.shape[0]
-    scatter = posterior.covariances * posterior.degrees_of_freedom[:, None, None]
-    components = _log_wishart(posterior.degrees_of_freedom, scatter)
-    components = components - _log_wishart(prior.degrees_of_freedom[None], prior.covariance[None])
+    dof = posterior.degrees_of_freedom
+    log_det = _log_det(posterior.covariances, covariance_type, dim) + dim * dof.log()
+    components = _log_wishart(dof, log_det, dim)
+    first = _log_det(compact(prior.covariance[None], covariance_type), covariance_type, dim)
+    components = components - _log_wishart(prior.degrees_of_freedom[None], first, dim)
     components = components + 0.5 * dim * torch.log(prior.mean_precision / posterior.mean_precision)
     sticks = posterior.concentration
     if sticks.shape[0] == 2:
@@ -462,10 +493,17 @@ def log_evidence(prior: Prior, posterior: Posterior, n_points: float) -> Tensor:
     return components.sum() + weights - 0.5 * n_points * dim * LOG_2PI
 
 
-def _log_wishart(degrees_of_freedom: Tensor, scatter: Tensor) -> Tensor:
-    """log ∫ |Λ|^((ν−D−1)/2) exp(−½ tr W⁻¹Λ) dΛ (K,), with scatter W⁻¹ (K, D, D). Bishop (B.79)."""
-    dim = scatter.shape[-1]
-    log_det = 2 * torch.log(safe_cholesky(scatter).diagonal(dim1=-2, dim2=-1)).sum(1)
+def _log_det(covariances: Tensor, kind: str, dim: int) -> Tensor:
+    """log |Σ| of covariances in the shape of their type: (K,), tied (1,)."""
+    if kind in ("full", "tied"):
+        factors = safe_cholesky(covariances.view(-1, dim, dim))
+        return 2 * torch.log(factors.diagonal(dim1=-2, dim2=-1)).sum(1)
+    log = covariances.log()
+    return log.sum(1) if kind == "diag" else dim * log
+
+
+def _log_wishart(degrees_of_freedom: Tensor, log_det: Tensor, dim: int) -> Tensor:
+    """log ∫ |Λ|^((ν−D−1)/2) exp(−½ tr W⁻¹Λ) dΛ (K,), with log |W⁻¹| (K,). Bishop (B.79)."""
     half = 0.5 * degrees_of_freedom
     return half * (dim * math.log(2) - log_det) + torch.mvlgamma(half, dim)
 
@@ -475,7 +513,7 @@ def _log_dirichlet(concentration: Tensor) -> Tensor:
     return torch.lgamma(concentration).sum(0) - torch.lgamma(concentration.sum(0))
 
 
-def log_predictive(points: Tensor, posterior: Posterior) -> Tensor:
+def log_predictive(points: Tensor, posterior: Posterior, covariance_type: str = "full") -> Tensor:
     """log p(x | X) (N,) of new points (N, D): Σ_k E[π_k] Student-t(x | m_k, L_k⁻¹, ν_k + 1 − D).
 
     The scale L_k⁻¹ is W_k⁻¹ (1 + β_k) / (β_k (ν_k + 1 − D)). Bishop (10.81)–(10.82).
@@ -483,21 +521,19 @@ def log_predictive(points: Tensor, posterior: Posterior) -> Tensor:
     k, dim = posterior.means.shape
     dof = posterior.degrees_of_freedom + 1 - dim
     ratio = posterior.degrees_of_freedom / dof * (1 + 1 / posterior.mean_precision)
-    factors = safe_cholesky(posterior.covariances * ratio[:, None, None])
-    whiten = inverse_factor(factors)
-    constant = (
-        torch.lgamma(0.5 * (dof + dim)) - torch.lgamma(0.5 * dof) - 0.5 * dim * torch.log(math.pi * dof)
-    )
-    constant = constant - torch.log(factors.diagonal(dim1=-2, dim2=-1)).sum(1)
-    constant = constant + torch.log(expected_weights(posterior.concentration))
+    weights = expected_weights(posterior.concentration)
+    factors = by_type.Factors(Parameters(weights, posterior.means, posterior.covariances), covariance_type)
+    constant = torch.lgamma(0.5 * (dof + dim)) - torch.lgamma(0.5 * dof) + factors.constant
+    constant = constant - 0.5 * dim * torch.log(0.5 * dof * ratio)
+    joint = factors.direct()
 
-    def joint(part: Tensor) -> Tensor:
-        offset = part[:, None, :] - posterior.means
-        squared = torch.einsum("nkd,kde->nke", offset, whiten).square().sum(-1)
-        return constant - 0.5 * (dof + dim) * torch.log1p(squared / dof)
+    def log_sum(part: Tensor) -> Tensor:
+        squared = 2 * (factors.constant[:, None] - joint(part))
+        term = torch.log1p(squared / (ratio * dof)[:, None])
+        return torch.logsumexp(constant[:, None] - 0.5 * (dof + dim)[:, None] * term, 0)
 
-    rows = max(1, chunk_elements(points.device) // k)
-    return torch.cat([torch.logsumexp(joint(part), 1) for part in points.split(rows)])
+    rows = by_type.rows_of_chunk(k, dim, covariance_type, points.device)
+    return torch.cat([log_sum(part) for part in points.split(rows)])
 
 
 def variational_step(
@@ -516,19 +552,26 @@ def variational_step(
     """
     features = em.quadratic_features(points) if points.shape[1] <= 3 else None
     total = float(sample_weight.sum())
-    eye = torch.eye(points.shape[1], dtype=points.dtype, device=points.device)
+    kind = covariance_type
 
     def step(posterior: Posterior) -> tuple[Posterior, float]:
         log_weight, gaussians = expected_log_density(posterior)
-        given = (points, sample_weight, log_weight, gaussians, reg_covar, softmax_dtype)
+        factors = by_type.Factors(gaussians, kind)
         if features is None:
-            found, value = _typed_moments(*given, covariance_type)
+            found, value = _typed_moments(
+                points, sample_weight, log_weight, factors, reg_covar, softmax_dtype
+            )
         else:
-            found, value = _expected_moments(features, *given)
-        new = update(prior, found, process, covariance_type)
-        plain = found._replace(covariances=found.covariances - reg_covar * eye)
-        entropy = value - assigned_log_density(plain, log_weight, gaussians)
-        return new, float(entropy + log_evidence(prior, new, total)) / total
+            matrices = expand(gaussians.covariances, kind, *gaussians.means.shape)
+            given = log_weight, gaussians._replace(covariances=matrices), reg_covar, softmax_dtype
+            found, value = _expected_moments(features, points, sample_weight, *given)
+            found = by_type.compacted(found, kind)
+        new = update(prior, found, process, kind)
+        plain = found.covariances.clone()
+        diagonal = plain.diagonal(dim1=-2, dim2=-1) if kind in ("full", "tied") else plain
+        diagonal.sub_(reg_covar)
+        entropy = value - assigned_log_density(found._replace(covariances=plain), log_weight, factors)
+        return new, float(entropy + log_evidence(prior, new, total, kind)) / total
 
     return step
 
@@ -564,16 +607,13 @@ def _typed_moments(
     points: Tensor,
     sample_weight: Tensor,
     log_weight: Tensor,
-    gaussians: Parameters,
+    factors: by_type.Factors,
     reg_covar: float,
     softmax_dtype: torch.dtype,
-    kind: str,
 ) -> tuple[Parameters, Tensor]:
     """The same with the arithmetic of the covariance type, for many dimensions."""
-    k, dim = gaussians.means.shape
-    factors = by_type.Factors(by_type.compacted(gaussians, kind), kind)
-    factors.constant = factors.constant + log_weight
-    gather = functools.partial(by_type.expected_moments, points, sample_weight, factors, softmax_dtype)
-    found = by_type.exact_step(gather, factors, reg_covar, None, linear=True)
-    covariances = expand(found.parameters.covariances, kind, k, dim)
-    return Parameters(found.points, found.parameters.means, covariances), found.value
+    weighted = copy.copy(factors)
+    weighted.constant = factors.constant + log_weight
+    gather = functools.partial(by_type.expected_moments, points, sample_weight, weighted, softmax_dtype)
+    found = by_type.exact_step(gather, weighted, reg_covar, None, linear=True)
+    return found.parameters._replace(weights=found.points), found.value

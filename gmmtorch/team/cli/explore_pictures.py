@@ -10,7 +10,7 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from gmmtorch.cli import chosen_options, save_figures, show, surfaces_of
+from gmmtorch.cli import chosen_options, show, show_figures, surfaces_of
 from gmmtorch.files import write_bytes
 from gmmtorch.mapping import Components, GaussianMap
 from gmmtorch.occupancy import Box
@@ -84,7 +84,7 @@ class MissionRecorder:
             made = GaussianMap.of(components, resolution=self._world.resolution, codec="quantized")
             made.save(self._folder / "map.safetensors")
         figures = self._figures(mission, row, paths, components)
-        save_figures(self._config, figures, self._folder)
+        show_figures(self._config, figures, self._folder, self._board)
         if self._board is not None:
             for snapshot in self.snapshots.chosen():
                 seconds = int(snapshot.tick * mission.tick_seconds)
@@ -95,8 +95,6 @@ class MissionRecorder:
             # The curves are there already; numbers of a curve's name are its last values.
             numbers = {k: v for k, v in row.items() if k not in mission.score.samples}
             self._board.scalars(numbers, "result", step=int(row["times"][-1]))
-            for name, figure in figures.items():
-                self._board.figure(f"figures/{name}", figure)
             numbers = {name: row[name] for name in ("entropy_reduction_bits", "auc", "bytes_sent")}
             self._board.hparams(chosen_options(self._config), numbers)
             self._board.close()

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
 
@@ -27,18 +27,6 @@ _CURVES = {"entropy_bits": "entropy_bits", "records": "records_over_time", "byte
 _COMPARE_KEYS = "; compare link.key_file, or $GMMTORCH_TEAM_KEY, of all robots"
 
 
-class _Display(Protocol):
-    """Shows scalars. Both methods may raise `OSError`.
-
-    option: the option that switches it on.
-    """
-
-    option: str
-
-    def show(self, now: float, scalars: dict[str, float]) -> None: ...
-    def close(self) -> None: ...
-
-
 class RobotReport:
     """Shows a robot as the options `report.*` say. Call it with the robot's time (s) as often as you like.
 
@@ -52,7 +40,7 @@ class RobotReport:
         self._view, self._sample_every = view, config.evaluation.every
         self._next_show = self._next_sample = 0.0
         self.series: dict[str, list[float]] = {"times": []}
-        self._displays: list[_Display] = []
+        self._displays: list[_StatusLine | _BoardDisplay] = []
         if config.report.progress and sys.stderr is not None:  # it is None if the process has closed it
             self._displays.append(_StatusLine(view))
         if config.report.tensorboard:

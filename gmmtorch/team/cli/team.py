@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import json
 import os
 import signal
@@ -267,17 +266,18 @@ def _show(config: DictConfig, rows: list[dict[str, Any]], outputs: Outputs) -> N
     """Writes the figure of the run, as a file and for TensorBoard."""
     if not (config.report.figures or config.report.tensorboard):
         return
-    from gmmtorch.report import Board, save_figure
+    from gmmtorch.files import write_bytes
+    from gmmtorch.report import Board, picture
     from gmmtorch.team.report import team_run_figure
 
-    figure = team_run_figure(rows)
+    png = picture(team_run_figure(rows))
 
     def write_board(folder: Path) -> None:
         with Board(folder) as board:
-            board.figure("figures/run", figure)
+            board.figure("figures/run", png)
 
     if config.report.figures:
-        outputs.written("run.png", functools.partial(save_figure, figure))
+        outputs.written("run.png", lambda path: write_bytes(path, png))
     if config.report.tensorboard:
         outputs.written("team", write_board)
 

@@ -247,7 +247,7 @@ class TeamOptions(LinkConditions):
     planning_prior: float = 0.125
     rest: StoppingRule = group(StoppingRule, "planner")
     codec: str = option(
-        _CODEC, "code of components: quantized (about 8.7 bytes each), float, or thesis (57 bytes)"
+        _CODEC, "code of components: quantized (about 6 bytes each), float, or thesis (57 bytes)"
     )
     announce_every: float = option(
         5.0, "seconds between announcements of a robot's records, while these change", "network.announce"

@@ -300,10 +300,10 @@ class Agent:
         """Sends what is due of the map, and announcements if they are due."""
         if not self.options.shares:
             return
-        shared, library = self.robot.mapper.shared, self.robot.library
+        shared = self.robot.mapper.shared
         datagrams = self.radio.within_budget(lambda budget: shared.datagrams(budget=budget), now)
         urgent = bool(shared.missing)
-        if self.radio.announcements.due(now, (shared.version, library.version), urgent):
+        if self.radio.announcements.due(now, (shared.version,), urgent):
             datagrams += shared.announcements()
         self.radio.send(datagrams, now)
 

@@ -354,12 +354,6 @@ _REACH = 3.0  # deviations around the means that belong to the box
 _MOST_TILES = 4096  # a batch in more tiles is tested in every search
 
 
-class _Batch(NamedTuple):
-    components: Components
-    low: list[float]  # corners of the box around its rays, metres
-    high: list[float]
-
-
 class MixtureTiles:
     """Batches of components, each of one message or frame, hashed into cubes by the box around their rays.
 
@@ -373,7 +367,8 @@ class MixtureTiles:
         if not 0 < tile < math.inf:
             raise InvalidArgumentError(f"tile={tile} must be finite metres above zero.")
         self.tile = tile
-        self._batches: list[_Batch] = []
+        self._batches: list[tuple[Components, list[float], list[float]]] = []
+        """With the corners of the box around their rays, metres."""
         self._tiles: dict[tuple[int, ...], list[int]] = {}  # rows of the batches in each cube
         self._everywhere: list[int] = []
 
@@ -394,7 +389,7 @@ class MixtureTiles:
         else:
             for place in itertools.product(*spans):
                 self._tiles.setdefault(place, []).append(len(self._batches))
-        self._batches.append(_Batch(components, low, high))
+        self._batches.append((components, low, high))
 
     def near(self, box: Box, resolution: float) -> list[Components]:
         """Batches whose rays may reach a box of cells of side `resolution` (m), in the order of `add`.
@@ -414,9 +409,9 @@ class MixtureTiles:
                     found.update(numbers)
         batches = [self._batches[number] for number in sorted(found)]
         return [
-            batch.components
-            for batch in batches
-            if all(a <= d and c <= b for a, b, c, d in zip(batch.low, batch.high, low, high, strict=True))
+            components
+            for components, first, last in batches
+            if all(a <= d and c <= b for a, b, c, d in zip(first, last, low, high, strict=True))
         ]
 
     def _spans(self, low: list[float], high: list[float]) -> list[range]:

@@ -234,6 +234,6 @@ class GmmMapper(Mapper):
 def _key(batch: Components) -> bytes:
     """A hash of all values of a batch: corrected components keep their ids and support."""
     digest = hashlib.blake2b(digest_size=16)
-    for value in vars(batch).values():
+    for value in batch.tensors().values():
         digest.update(value.contiguous().numpy().tobytes())
     return digest.digest()

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from sklearn.metrics import roc_auc_score
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
@@ -106,6 +105,8 @@ class BeliefMap:
 
 def accuracy(belief: BeliefMap, cells: Tensor, occupied: Tensor) -> dict[str, float | None]:
     """Return AUC and mean cross-entropy (bits a cell) of a map against the truth, over given cells (C, 3)."""
+    from sklearn.metrics import roc_auc_score
+
     p = belief.probability(cells).double()
     right = torch.where(occupied, p, 1 - p).clamp_min(torch.finfo(torch.float64).tiny)
     both = bool(occupied.any()) and not bool(occupied.all())

@@ -55,7 +55,7 @@ from gmmtorch.team.sharing.messages.datagrams import (
 
 MOST_COMPONENTS_SENT = 1024
 """Components, and viewpoints of them, in a datagram, as a receiver may cast hundreds of rays for each. A
-map's datagrams have about 170."""
+map's datagrams have about 200."""
 
 _SIZES = struct.Struct("<BIII")  # dimensions, components, origins, viewpoints
 _FIRST_GUESS = 128  # components that are likely to fit into a datagram
@@ -72,7 +72,7 @@ class ComponentsMessage:
 def encode_components(components: Components, codec: str = "quantized") -> list[bytes]:
     """Datagrams of components in order, each with the sensor origins that it needs; empty without components.
 
-    codec: "quantized": 8 to 10 bytes per component, rounded as `mapping.codec.quantized` does. "float":
+    codec: "quantized": 5 to 8 bytes per component, rounded as `mapping.codec.quantized` does. "float":
     float64, unchanged. "thesis": 57 bytes for each component and sensor origin.
 
     Raises `InvalidArgumentError` for values that the codec cannot store, positions beyond
@@ -127,12 +127,13 @@ def _quantized(components: Components) -> bytes:
 
 
 def read_quantized(body: bytes) -> ComponentsMessage:
-    return _message(read_batch(body))
+    return _message(read_batch(body, MOST_COMPONENTS_SENT))
 
 
-def read_batch(data: bytes) -> Components:
-    """The components of a codec batch of any size. Raises `DataError` if they are damaged or out of range."""
-    components = decode(data)
+def read_batch(data: bytes, most: int | None = None) -> Components:
+    """The components of a codec batch of any size, or of `most` components and viewpoints. Raises `DataError`
+    if they are damaged or out of range."""
+    components = decode(data, most)
     try:
         _check_range(components.means, components.origins, components.ids)
     except InvalidArgumentError as error:

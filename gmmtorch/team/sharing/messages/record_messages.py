@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
-from gmmtorch.mapping import AXIS_ORDERS, LARGEST_COUNT, NO_COUNT, BitReader, BitWriter, count_steps
+from gmmtorch.mapping import LARGEST_COUNT, NO_COUNT, BitReader, BitWriter, count_steps, ids_of_batch
 from gmmtorch.occupancy import N_BYTES, Calibration
 from gmmtorch.team.sharing.messages.component_messages import counts_of
 from gmmtorch.team.sharing.messages.datagrams import (
@@ -339,24 +339,12 @@ def _check_sender(sender: int, incarnation: int) -> None:
 
 
 def keys_in(datagram: bytes) -> Intervals:
-    """The keys of the records in a datagram that a replica has sent or merged, without decoding the rest.
-    Raises `DataError` if it is no datagram of `RECORD_KINDS`."""
+    """The keys of the records in a datagram that a replica has sent or merged. Raises
+    `DataError` if it is no datagram of `RECORD_KINDS`."""
     kind, body = parse_datagram(datagram)
     if kind is Kind.COMPONENTS:
-        return Intervals.of(_component_keys(BitReader(body[1:])))
+        return Intervals.of(keys_of(ids_of_batch(body)))
     if kind not in RECORD_KINDS:
         raise DataError(f"A datagram of kind {int(kind)} has no records.")
     key = BitReader(body).number()
     return Intervals.span(key, key + 1)
-
-
-def _component_keys(batch: BitReader) -> Ints:
-    """The keys of a codec batch (docs/formats.md): three numbers and the axis orders precede its ids."""
-    dim, k, _ = batch.number(), batch.number(), batch.number()
-    if dim not in AXIS_ORDERS or k < 0:
-        raise DataError(f"{k} components in {dim}D: it is damaged.")
-    n_bits = (len(AXIS_ORDERS[dim]) - 1).bit_length()
-    batch.require(k * n_bits)
-    batch.fixed(k, n_bits)
-    robots, numbers = batch.column(k), batch.column(k) + np.arange(k)
-    return keys_of(torch.from_numpy(np.stack([robots, numbers], 1)))

@@ -96,7 +96,7 @@ class Backlog:
         return Intervals.union(self._theirs.values()) - held
 
 
-_RUN = 96  # components with consecutive keys that are sent together: about one datagram
+_RUN = 160  # components with consecutive keys that are sent together: about one datagram
 
 
 def packets(

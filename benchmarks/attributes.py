@@ -1,0 +1,212 @@
+"""Colour, intensity and classes at held-out points, beside grids of mean values.
+
+    python benchmarks/attributes.py --data FOLDER
+
+FOLDER holds kinect/ and courtyard/; building is simulated. Every 5th scan is held out. kinect: PSNR of sRGB
+colours at points of held-out frames, from every 4th pixel of every 4th row. The colour camera was calibrated
+on the other frames. building: share of points with the right class of floor, ceiling, wall and furniture.
+courtyard: correlation of the reflectivity, and its RMS error. A cell of a grid takes 6 bytes for its place,
+and 3 for a colour or 1 for an intensity or a class.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import open3d as o3d
+import torch
+from sklearn.metrics import roc_auc_score
+from torch import Tensor
+
+from gmmtorch import GaussianMap, IncrementalRule, Scan
+from gmmtorch.datasets import load
+from gmmtorch.experiments.harness import Case, Row, run
+from gmmtorch.scan import display_colours
+from gmmtorch.simulation import building_3d, poses_3d, simulate_scan, spinning_lidar
+
+EVERY, N_POINTS = 5, 60_000
+COLOUR_INTRINSICS = "522.6 0 320\n0 522.6 240\n0 0 1\n"
+COLOUR_POSE = "1 0 0 -0.0275\n0 1 0 -0.004\n0 0 1 0\n0 0 0 1\n"
+PLACE_BYTES = 6
+CELL = {"kinect": 0.05, "building": 0.1, "courtyard": 0.2}
+BUDGETS = {"kinect": (8000, 16_000, 32_000, None), "building": (8000, 16_000), "courtyard": (16_000, 32_000)}
+VALUE_BYTES = {"colour": 3, "class": 1, "intensity": 1}
+
+
+def kinect(data: Path) -> list[Scan]:
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made)
+        for file in (data / "kinect").iterdir():
+            (folder / file.name).symlink_to(file)
+        (folder / "color-intrinsics.txt").write_text(COLOUR_INTRINSICS)
+        (folder / "color-pose.txt").write_text(COLOUR_POSE)
+        return list(load("depth_frames", folder, pixel_stride=4, up="-y", attributes=["colour"]))
+
+
+def courtyard(data: Path) -> list[Scan]:
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made)
+        (folder / "scans").symlink_to(data / "courtyard" / "scans_intensity")
+        (folder / "poses.txt").symlink_to(data / "courtyard" / "poses.txt")
+        return list(load("scan_folder", folder, attributes=["intensity"]))
+
+
+def building(_: Path) -> list[Scan]:
+    """Lidar scans of the simulated building; a point has the class of the nearest triangle."""
+    generator = torch.Generator().manual_seed(0)
+    world, sensor = building_3d(generator), spinning_lidar()
+    triangles = world.triangles.float().reshape(-1, 3).numpy()
+    scene: Any = o3d.t.geometry.RaycastingScene()
+    faces = np.arange(len(triangles), dtype=np.uint32).reshape(-1, 3)
+    scene.add_triangles(o3d.core.Tensor(triangles), o3d.core.Tensor(faces))
+    classes, scans = triangle_classes(world.triangles), []
+    for pose in poses_3d(world.path, 60, 1.2):
+        scan = simulate_scan(sensor, pose, world, generator)
+        nearest = scene.compute_closest_points(o3d.core.Tensor(scan.points.float().numpy()))
+        label = classes[torch.from_numpy(nearest["primitive_ids"].numpy().astype(np.int64))]
+        scans.append(Scan(scan.points, scan.origin, attributes={"class": label}))
+    return scans
+
+
+def triangle_classes(triangles: Tensor) -> Tensor:
+    """0: floor, 1: ceiling, 2: wall, 3: furniture. Boxes of floors, ceilings and walls come first."""
+    from gmmtorch.simulation import buildings
+
+    n_flat, n_walls = (
+        sum(len(part) for part in parts)
+        for parts in (buildings._floors_and_ceilings(), buildings._hall_walls())
+    )
+    label = torch.full((len(triangles),), 3)
+    label[: n_flat + n_walls] = 2
+    label[:n_flat] = (triangles[:n_flat, :, 2].mean(1) > 1.0).long()
+    return label
+
+
+SOURCES = {"kinect": kinect, "building": building, "courtyard": courtyard}
+
+
+def built(scans: Sequence[Scan], max_bytes: int | None, with_channels: bool) -> tuple[GaussianMap, float]:
+    """A map and the CPU seconds of learning."""
+    begin = time.process_time()
+    made = GaussianMap(IncrementalRule(max_bytes=max_bytes))
+    for scan in scans:
+        made.insert(scan if with_channels else Scan(scan.points, scan.origin))
+    made.finish()
+    return made, time.process_time() - begin
+
+
+def known_points(scans: Sequence[Scan], channel: str) -> tuple[Tensor, Tensor]:
+    points = torch.cat([scan.points for scan in scans]).double()
+    values = torch.cat([scan.attributes[channel] for scan in scans])
+    known = torch.isfinite(values).all(1) if values.is_floating_point() else values >= 0
+    return points[known], values[known]
+
+
+def grid(points: Tensor, values: Tensor, side: float, asked: Tensor) -> tuple[Tensor, Tensor, int]:
+    """Mean value, or most frequent label, of the cell of each point; that of all where no point fell. Which
+    points are known, and the number of cells."""
+    target = values.double() if values.is_floating_point() else torch.nn.functional.one_hot(values).double()
+    both = (torch.cat([points, asked]) / side).floor().long()
+    cells, cell = torch.unique(both, dim=0, return_inverse=True)
+    own, of_asked = cell[: len(points)], cell[len(points) :]
+    count = torch.bincount(own, minlength=len(cells)).double()
+    mean = target.new_zeros(len(cells), target.shape[1]).index_add_(0, own, target)
+    mean /= count.clamp_min(1)[:, None]
+    known = count[of_asked] > 0
+    found = torch.where(known[:, None], mean[of_asked], target.mean(0))
+    return found if values.is_floating_point() else found.argmax(1), known, int((count > 0).sum())
+
+
+def score(channel: str, found: Tensor, true: Tensor) -> str:
+    if channel == "colour":
+        error = (display_colours(found.clamp(0, 1)) - display_colours(true.double())).square().mean()
+        return f"{-10 * float(error.log10()):.2f} dB"
+    if channel == "class":
+        return f"{100 * float((found == true).double().mean()):.1f} %"
+    found, true = found[:, 0].double(), true[:, 0].double()
+    together = float(torch.corrcoef(torch.stack([found, true]))[0, 1])
+    return f"{together:.3f}, {float((found - true).square().mean().sqrt()):.1f}"
+
+
+def auc(made: GaussianMap, scans: Sequence[Scan], side: float) -> float:
+    """Of the occupancy of ends of held-out beams and of a random point on each."""
+    generator = torch.Generator().manual_seed(1)
+    points, labels = [], []
+    for scan in scans:
+        rows = torch.randperm(len(scan.points), generator=generator)[:1500]
+        ends = scan.points[rows].double()
+        share = torch.rand(len(ends), 1, generator=generator, dtype=torch.float64)
+        points += [ends, scan.origin + share * (ends - scan.origin)]
+        labels += [torch.ones(len(ends)), torch.zeros(len(ends))]
+    return float(roc_auc_score(torch.cat(labels), made.occupancy(torch.cat(points), side)))
+
+
+def measure(options: Any) -> Iterator[Row]:
+    for name in options.names:
+        scans = SOURCES[name](options.data)
+        channel = next(iter(scans[0].attributes))
+        test = scans[::EVERY]
+        train = [scan for number, scan in enumerate(scans) if number % EVERY]
+        points, values = known_points(test, channel)
+        rows = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:N_POINTS]
+        points, values = points[rows], values[rows]
+        for budget in BUDGETS[name]:
+            plain = min(built(train, budget, False)[1] for _ in range(3))
+            made, seconds = min((built(train, budget, True) for _ in range(3)), key=lambda pair: pair[1])
+            found = made.attributes(points)[channel]
+            value = found.most_likely if channel == "class" else found.mean
+            size = f"map, {len(made.components()):,} components"
+            yield (
+                name,
+                size,
+                made.nbytes / 1e3,
+                score(channel, value, values),
+                float(100 * found.known.double().mean()),
+                auc(made, test, CELL[name]),
+                f"{seconds:.1f} ({plain:.1f})",
+            )
+            if budget is not None:
+                yield grid_row(name, channel, train, made.nbytes, points, values)
+        given = known_points(train, channel)
+        value, known, n = grid(*given, CELL[name], points)
+        n_bytes = n * (PLACE_BYTES + VALUE_BYTES[channel])
+        about = f"grid of {CELL[name]:g} m, {n:,} cells"
+        yield name, about, n_bytes / 1e3, score(channel, value, values), share(known), None, None
+
+
+def share(known: Tensor) -> float:
+    return 100 * float(known.double().mean())
+
+
+def grid_row(
+    name: str, channel: str, train: Sequence[Scan], n_bytes: int, points: Tensor, values: Tensor
+) -> Row:
+    """The finest grid that takes at most so many bytes."""
+    side, given = CELL[name], known_points(train, channel)
+    while True:
+        value, known, n = grid(*given, side, points)
+        taken = n * (PLACE_BYTES + VALUE_BYTES[channel])
+        if taken <= n_bytes:
+            about = f"grid of {side:.3f} m, {n:,} cells"
+            return name, about, taken / 1e3, score(channel, value, values), share(known), None, None
+        side *= max(1.01, (taken / n_bytes) ** 0.4)
+
+
+COLUMNS = {"data": "", "from": "", "kB": ",.1f", "result": "", "known (%)": ".1f", "AUC": ".4f", "CPU s": ""}
+CASE = Case(
+    "attributes",
+    measure,
+    "Result: PSNR of colours; share of right classes; correlation and RMS error of the intensity. CPU s of "
+    "learning, and in brackets without attributes.",
+    COLUMNS,
+    ("kinect", "building", "courtyard"),
+    key=2,
+)
+
+if __name__ == "__main__":
+    run(__doc__, CASE)

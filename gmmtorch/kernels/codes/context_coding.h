@@ -1,0 +1,592 @@
+// Components in an adaptive binary range coder, written or read. An item is a batch. The twin, with the
+// meaning of every context, is mapping/codec/context_model.py: both do the same operations in the same order.
+#pragma once
+
+#include "../mixtures/lattice.h"
+
+namespace gmm {
+
+// The K components, S origins and E viewpoints of a batch, as in `Quantized`. cells: side 2^side m.
+struct Batch {
+    int64_t k;
+    int64_t n_origins;
+    int64_t n_seen;
+    int64_t side;
+    int64_t* axis_order;
+    int64_t* deviation;
+    int64_t* shear;
+    int64_t* mean;
+    int64_t* count;
+    int64_t* max_range;
+    int64_t* ids;
+    int64_t* origins;
+    int64_t* n_viewpoints;
+    int64_t* seen_from;
+    int64_t* share;
+};
+
+// chances: probability of a 0 in 1/65536, by slot; n_seen: bits that a slot has coded, up to `most_seen`.
+// distance (S,), rank (S,), place (K, D), normal (K, D), cell (K, D): scratch.
+struct Scratch {
+    int32_t* chances;
+    int32_t* n_coded;
+    const int64_t* rates;
+    int64_t most_coded;
+    const int64_t* first_slot;
+    double* distance;
+    int64_t* rank;
+    double* place;
+    double* normal;
+    int64_t* cell;
+};
+
+// bytes: room for `size` bytes; those written, or read. result: bytes used; −1: damaged, or no room.
+struct Stream {
+    uint8_t* bytes;
+    int64_t size;
+    int64_t* result;
+};
+
+struct Field {
+    enum {
+        FLAG,
+        LEVEL,
+        DIGIT,
+        LOWER,
+        ORDER,
+        WIDE,
+        RATIO,
+        THIN,
+        TURN,
+        TILT,
+        SLOPE,
+        ACROSS,
+        COUNT,
+        VIEWS,
+        RANK,
+        SHARE,
+        ORIGIN,
+        ROBOT,
+        NUMBER
+    };
+};
+
+template <bool WRITES>
+struct RangeCoder {
+    Scratch s;
+    Stream out;
+    uint64_t low;
+    uint32_t range, code;
+    int64_t at, pending;
+    uint8_t cache;
+    bool started, good;
+
+    GMM_INLINE void begin() {
+        low = 0, range = 0xFFFFFFFFu, code = 0, at = 0, pending = 0, cache = 0, started = false, good = true;
+        if (!WRITES)
+            for (int i = 0; i < 4; ++i) code = code << 8 | next();
+    }
+
+    // Zeros follow the stream: those at its end are not written.
+    GMM_INLINE uint8_t next() {
+        const uint8_t byte = at < out.size ? out.bytes[at] : 0;
+        ++at;
+        return byte;
+    }
+
+    GMM_INLINE void put(uint8_t byte) {
+        if (at < out.size) out.bytes[at] = byte;
+        good = good && at < out.size;
+        ++at;
+    }
+
+    // Moves the highest byte of `low` out. A byte waits until no carry can change it; so do 0xFF after it.
+    GMM_INLINE void shift() {
+        if (low < 0xFF000000ull || low > 0xFFFFFFFFull) {
+            const uint8_t carry = (uint8_t)(low >> 32);
+            if (started) put((uint8_t)(cache + carry));
+            for (; pending > 0; --pending) put((uint8_t)(0xFF + carry));
+            started = true;
+            cache = (uint8_t)(low >> 24);
+        } else {
+            ++pending;
+        }
+        low = (low & 0x00FFFFFFull) << 8;
+    }
+
+    GMM_INLINE void renew() {
+        while (range < 1u << 24) {
+            range <<= 8;
+            if (WRITES)
+                shift();
+            else
+                code = code << 8 | next();
+        }
+    }
+
+    GMM_INLINE int64_t end() {
+        if (WRITES) {
+            uint64_t last = low;  // of the numbers that say the same, the one with most zeros at its end
+            for (int n = 1; n < 32; ++n) {
+                const uint64_t rounder = (low + (1ull << n) - 1) >> n << n;
+                if (rounder < low + range) last = rounder;
+            }
+            low = last;
+            for (int i = 0; i < 5; ++i) shift();
+        }
+        return good ? at : -1;
+    }
+
+    // One bit in a slot; `value` is it, or unused.
+    GMM_INLINE int64_t bit(int64_t slot, int64_t value) {
+        const uint32_t chance = (uint32_t)s.chances[slot], bound = (range >> 16) * chance;
+        if (WRITES) {
+            if (value) low += bound;
+        } else {
+            value = code >= bound;
+            if (value) code -= bound;
+        }
+        range = value ? range - bound : bound;
+        const int64_t n = s.n_coded[slot], step = ((value ? 0 : 65536) - (int64_t)chance) * s.rates[n];
+        s.chances[slot] =
+            (int32_t)(minimum(maximum((int64_t)chance + (step >> 16), (int64_t)64), (int64_t)65472));
+        if (n < s.most_coded) s.n_coded[slot] = (int32_t)(n + 1);
+        renew();
+        return value;
+    }
+
+    // n bits without a model, highest first.
+    GMM_INLINE int64_t raw(int64_t n, int64_t value) {
+        int64_t found = 0;
+        while (n > 0) {
+            const int64_t width = minimum(n, (int64_t)8);
+            n -= width;
+            range >>= width;
+            int64_t part = (value >> n) & ((1 << width) - 1);
+            if (WRITES) {
+                low += (uint64_t)range * (uint64_t)part;
+            } else {
+                part = minimum((int64_t)(code / range), (int64_t)(1 << width) - 1);
+                code -= (uint32_t)part * range;
+            }
+            found = found << width | part;
+            renew();
+        }
+        return found;
+    }
+
+    // n bits as a tree of 2^n slots, highest first.
+    GMM_INLINE int64_t tree(int64_t first, int64_t n, int64_t value) {
+        int64_t node = 1;
+        for (int64_t i = n - 1; i >= 0; --i) node = node << 1 | bit(first + node, (value >> i) & 1);
+        return node - (1 << n);
+    }
+
+    // A number ≥ 0 below 2^60: the length of value + 1 in unary, then its other bits; the two highest of
+    // these have slots.
+    GMM_INLINE int64_t number(int64_t first, int64_t value) {
+        int64_t length = 0;
+        const int64_t whole = value + 1;
+        while (good && bit(first + 4 + minimum(length, (int64_t)11), (whole >> (length + 1)) != 0)) {
+            if (++length > 60) good = false;
+        }
+        if (!good) return 0;
+        int64_t found = 1;
+        if (length > 0)
+            found = 2 | bit(first + 15 + minimum(length, (int64_t)8), (whole >> (length - 1)) & 1);
+        if (length > 1) {
+            const int64_t slot = length < 5 ? 24 + 2 * (length - 2) + (found & 1) : 30;
+            found = found << 1 | bit(first + slot, (whole >> (length - 2)) & 1);
+        }
+        if (length > 2) found = found << (length - 2) | raw(length - 2, whole & ((1ll << (length - 2)) - 1));
+        return found - 1;
+    }
+
+    // Any whole number. side: 0, 1 or 2, the slot of its sign.
+    GMM_INLINE int64_t whole(int64_t first, int64_t value, int64_t side) {
+        if (!bit(first, value != 0)) return 0;
+        const int64_t negative = bit(first + 1 + side, value < 0);
+        const int64_t size = number(first, (value < 0 ? -value : value) - 1) + 1;
+        return negative ? -size : size;
+    }
+};
+
+// Walks through the components of a batch, each value in place: written, or read into arrays of zeros.
+template <int DIM, bool WRITES>
+struct Walk {
+    Batch b;
+    Scratch s;
+    RangeCoder<WRITES> c;
+    int64_t offset, nearest;
+
+    GMM_INLINE int64_t slots(int field, int64_t context, int64_t size = 32) const {
+        return s.first_slot[field] + context * size;
+    }
+
+    GMM_INLINE void check(bool valid) { c.good = c.good && valid; }
+
+    GMM_INLINE void id(int64_t i) {
+        int64_t* own = b.ids + 2 * i;
+        bool same = false;
+        if (i > 0) same = c.bit(slots(Field::ROBOT, 1), own[0] == own[-2]);
+        own[0] = same ? own[-2] : c.whole(slots(Field::ROBOT, 0), own[0], 0);
+        const int64_t next = same ? own[-1] + 1 : 0;
+        own[1] = next + c.whole(slots(Field::NUMBER, same), own[1] - next, 0);
+        for (int a = 0; a < 2; ++a) check(own[a] <= 1ll << 61 && own[a] >= -(1ll << 61));
+    }
+
+    GMM_INLINE void origin(int64_t i) {
+        for (int a = 0; a < DIM; ++a) {
+            int64_t* own = b.origins + i * DIM + a;
+            const int64_t before = i > 0 ? own[-DIM] : 0;
+            *own = before + c.whole(slots(Field::ORIGIN, a + 3 * (i > 0)), *own - before, 0);
+            check(*own <= 1ll << 36 && *own >= -(1ll << 36));
+        }
+    }
+
+    // The bit that halves a block along axis a: which half is nearer to the plane of the component before?
+    GMM_INLINE int64_t halving(int64_t i, const int64_t* corner, const int64_t* width, int a) const {
+        if (i == 0) return 5;
+        const double *n = s.normal + (i - 1) * DIM, *m = s.place + (i - 1) * DIM;
+        const int64_t* d = b.deviation + (i - 1) * DIM;
+        if (d[DIM - 2] - d[DIM - 1] < 4 || fabs(n[a]) < 0.25) return 5;
+        const double side = two_to(b.side);
+        double apart = 0.0;
+        for (int x = 0; x < DIM; ++x)
+            apart = apart + n[x] * (((double)corner[x] + 0.5 * (double)width[x]) * side - m[x]);
+        const double quarter = n[a] * (0.25 * (double)width[a] * side);
+        const double nearer = fabs(apart - quarter) - fabs(apart + quarter), most = 2.0 * fabs(quarter);
+        return nearer < -0.75 * most   ? 0
+               : nearer < -0.25 * most ? 1
+               : nearer <= 0.25 * most ? 2
+               : nearer <= 0.75 * most ? 3
+                                       : 4;
+    }
+
+    // The cell of a mean: the highest level at which it leaves the block of the cell before, then its place
+    // there.
+    GMM_INLINE void cell(int64_t i, int64_t flag) {
+        uint64_t before[DIM], now[DIM], differs = 0;
+        for (int a = 0; a < DIM; ++a) {
+            int64_t old = 0;
+            if (i > 0)
+                old = s.cell[(i - 1) * DIM + a];
+            else if (b.n_origins > 0)
+                old = b.side >= -8 ? b.origins[a] >> (b.side + 8) : b.origins[a] * (1ll << (-8 - b.side));
+            before[a] = (uint64_t)(old + offset);
+            now[a] = WRITES ? (uint64_t)(s.cell[i * DIM + a] + offset) : 0;
+            differs |= before[a] ^ now[a];
+        }
+        int64_t level = 0;
+        if (WRITES)
+            while (differs >> level) ++level;
+        level = c.number(slots(Field::LEVEL, i > 0 ? flag : 2), level);
+        check(level <= 52);
+        if (!c.good) return;
+        int64_t corner[DIM], width[DIM];
+        for (int a = 0; a < DIM; ++a)
+            corner[a] = (int64_t)((before[a] >> level) << level), width[a] = 1ll << level;
+        if (level > 0) {
+            int64_t old = 0, digit = 0;
+            for (int a = 0; a < DIM; ++a) {
+                old = old << 1 | ((before[a] >> (level - 1)) & 1);
+                digit = digit << 1 | ((now[a] >> (level - 1)) & 1);
+            }
+            digit = c.tree(slots(Field::DIGIT, old, 8), DIM, digit);
+            check(digit != old);
+            for (int a = 0; a < DIM; ++a) {
+                width[a] >>= 1;
+                corner[a] += ((digit >> (DIM - 1 - a)) & 1) * width[a];
+            }
+        }
+        for (int a = 0; a < DIM; ++a) corner[a] -= offset;
+        for (int64_t l = level - 2; l >= 0; --l)
+            for (int a = 0; a < DIM; ++a) {
+                const int64_t context = halving(i, corner, width, a) + 6 * (level >= 4);
+                width[a] >>= 1;
+                corner[a] += c.bit(slots(Field::LOWER, context, 1), (now[a] >> l) & 1) * width[a];
+            }
+        const double reach = 2.0 * 134217728.0 * two_to(-b.side);
+        for (int a = 0; a < DIM; ++a) {
+            s.cell[i * DIM + a] = corner[a];
+            check(fabs((double)corner[a]) <= reach);
+        }
+    }
+
+    // The two nearest of the last 64 components before i, and the squared distance (m²) of the nearest.
+    GMM_INLINE double neighbours(int64_t i, int64_t& first, int64_t& second) const {
+        double least = HUGE_VAL, next = HUGE_VAL;
+        first = second = i > 64 ? i - 64 : 0;
+        const double side = two_to(b.side);
+        for (int64_t t = first; t < i; ++t) {
+            double apart = 0.0;
+            for (int a = 0; a < DIM; ++a) {
+                const double x = s.place[t * DIM + a] - ((double)s.cell[i * DIM + a] + 0.5) * side;
+                apart = apart + x * x;
+            }
+            if (apart < least)
+                next = least, second = first, least = apart, first = t;
+            else if (apart < next)
+                next = apart, second = t;
+        }
+        if (next == HUGE_VAL) second = first;
+        return least;
+    }
+
+    GMM_INLINE void deviations(int64_t i, int64_t j, int64_t k, int64_t flag) {
+        const int64_t *x = b.deviation + j * DIM, *y = b.deviation + k * DIM;
+        int64_t* d = b.deviation + i * DIM;
+        if (i == 0) {
+            d[0] = c.whole(slots(Field::WIDE, 2 + flag), d[0], 0);
+            if (DIM == 3) d[1] = d[0] - c.number(slots(Field::RATIO, 10 + flag), d[0] - d[1]);
+            d[DIM - 1] = d[DIM - 2] - c.number(slots(Field::THIN, 6 + flag), d[DIM - 2] - d[DIM - 1]);
+        } else {
+            const int64_t wide = (x[0] + y[0]) >> 1;
+            d[0] = wide + c.whole(slots(Field::WIDE, flag), d[0] - wide, 0);
+            if (DIM == 3) {
+                const int64_t ratio = (x[0] - x[1] + y[0] - y[1]) >> 2;
+                d[1] =
+                    d[0] - c.number(slots(Field::RATIO, flag * 5 + minimum(ratio, (int64_t)4)), d[0] - d[1]);
+            }
+            const int64_t thin = minimum((x[DIM - 1] + y[DIM - 1]) >> 1, d[DIM - 2]);
+            const int64_t apart = x[DIM - 1] > y[DIM - 1] ? x[DIM - 1] - y[DIM - 1] : y[DIM - 1] - x[DIM - 1];
+            const int64_t context = flag * 3 + minimum(apart / 3, (int64_t)2);
+            d[DIM - 1] = thin + c.whole(slots(Field::THIN, context), d[DIM - 1] - thin, thin == d[DIM - 2]);
+        }
+        for (int a = 0; a < DIM; ++a) check(d[a] <= 80 && d[a] >= -80 && (a == 0 || d[a] <= d[a - 1]));
+        check(d[0] - d[DIM - 1] <= 80);
+    }
+
+    GMM_INLINE double slope_of(int64_t i, int pair, int row, int column) {
+        const int64_t* d = b.deviation + i * DIM;
+        const double value =
+            (double)b.shear[i * PAIRS<DIM> + pair] * two_to(floor_of(d[row] - d[column], 4) - 2);
+        check(fabs(value) <= 2.0);
+        return value;
+    }
+
+    GMM_INLINE void component(int64_t i) {
+        int64_t flag = b.max_range[i], k;
+        int64_t& j = nearest;
+        const int64_t last = i > 0 ? b.max_range[i - 1] : 0;
+        flag = c.bit(slots(Field::FLAG, 2 * last + (i > 1 ? b.max_range[i - 2] : 0), 1), flag);
+        b.max_range[i] = flag;
+        cell(i, flag);
+        if (!c.good) return;
+        const double apart = neighbours(i, j, k);
+        const int64_t near =
+            i > 0 ? (flag * 2 + (b.axis_order[j] == b.axis_order[k])) * 6 + b.axis_order[j] : 24 + flag;
+        const int64_t order = c.tree(slots(Field::ORDER, near, 8), DIM == 3 ? 3 : 1, b.axis_order[i]);
+        b.axis_order[i] = order;
+        check(order < (DIM == 3 ? 6 : 2));
+        deviations(i, j, k, flag);
+        if (!c.good) return;
+        const int64_t* d = b.deviation + i * DIM;
+        // The lexicographic permutations of the axes.
+        int axis[DIM];
+        axis[0] = (int)(DIM == 3 ? order / 2 : order);
+        axis[DIM - 1] = DIM == 2 ? 1 - axis[0] : order % 2 ? (axis[0] == 0 ? 1 : 0) : (axis[0] == 2 ? 1 : 2);
+        if (DIM == 3) axis[1] = 3 - axis[0] - axis[DIM - 1];
+
+        // The plane of the nearest component.
+        const double size = two_to(2 * floor_of(d[0], 4));
+        const double* n = s.normal + j * DIM;
+        const int64_t* e = b.deviation + j * DIM;
+        bool flat =
+            i > 0 && e[DIM - 2] - e[DIM - 1] >= 4 && d[DIM - 2] - d[DIM - 1] >= 2 && apart < 64.0 * size;
+        double given[DIM], own[DIM];  // slopes of the last axis along the others
+        for (int a = 0; a < DIM; ++a) given[a] = own[a] = 0.0;
+        if (flat) {
+            double most = 0.0;
+            for (int a = 0; a < DIM; ++a) most = maximum(most, fabs(n[a]));
+            flat = fabs(n[axis[DIM - 1]]) > 0.25 * most;
+            for (int a = 0; a < DIM - 1 && flat; ++a) given[a] = -n[axis[a]] / n[axis[DIM - 1]];
+            for (int a = 0; a < DIM - 1; ++a) flat = flat && fabs(given[a]) <= 2.0;
+            for (int a = 0; a < DIM - 1; ++a) given[a] = flat ? given[a] : 0.0;
+        }
+        int64_t* l = b.shear + i * PAIRS<DIM>;
+        int64_t off = 0;
+        double turn = 0.0;
+        if (DIM == 3) {
+            const int64_t finer = -floor_of(d[1] - d[0], 4);
+            l[0] = c.whole(slots(Field::TURN, flag * 8 + minimum(finer, (int64_t)7)), l[0], 0);
+            turn = slope_of(i, 0, 1, 0);
+            const int64_t step = floor_of(d[DIM - 1] - d[1], 4) - 2, fine = minimum(-step / 2, (int64_t)6);
+            const int64_t about = (int64_t)floor(given[1] * two_to(-step) + 0.5);
+            const int64_t context = flat ? 7 + fine * 3 + minimum((e[1] - e[DIM - 1]) / 6, (int64_t)2) : fine;
+            off = c.whole(slots(Field::TILT, flag * 28 + context), l[PAIRS<DIM> - 1] - about,
+                          (about > 0) + 2 * (about < 0));
+            l[PAIRS<DIM> - 1] = about + off;
+            own[1] = slope_of(i, PAIRS<DIM> - 1, DIM - 1, 1);
+            if (!c.good) return;
+        }
+        const int64_t step = floor_of(d[DIM - 1] - d[0], 4) - 2, fine = minimum(-step / 2, (int64_t)6);
+        const int64_t about = (int64_t)floor((given[0] + own[1] * turn) * two_to(-step) + 0.5);
+        const int64_t context =
+            flag * 42 + flat * 21 + fine * 3 + minimum((off < 0 ? -off : off) / 2, (int64_t)2);
+        const int64_t rest =
+            c.whole(slots(Field::SLOPE, context), l[PAIRS<DIM> / 2] - about, (about > 0) + 2 * (about < 0));
+        l[PAIRS<DIM> / 2] = about + rest;
+        own[0] = slope_of(i, PAIRS<DIM> / 2, DIM - 1, 0) - own[1] * turn;
+        if (!c.good) return;
+        if (DIM == 2) off = rest;
+        s.normal[i * DIM + axis[DIM - 1]] = 1.0;
+        for (int a = 0; a < DIM - 1; ++a) s.normal[i * DIM + axis[a]] = -own[a];
+
+        // The mean in its cell: freely along the component, near the plane across it.
+        double across = flat ? s.place[j * DIM + axis[DIM - 1]] : 0.0;
+        for (int a = 0; a < DIM; ++a) {
+            const int64_t exponent = floor_of(d[a], 4) - 2, where = s.cell[i * DIM + axis[a]];
+            const int64_t width = maximum(b.side - exponent, (int64_t)0),
+                          coarser = maximum(exponent - b.side, (int64_t)0);
+            check((where & ((1ll << coarser) - 1)) == 0);
+            const int64_t base = coarser > 0 ? where >> coarser : where * (1ll << width);
+            int64_t inside = WRITES ? b.mean[i * DIM + a] - base : 0;
+            if (a == DIM - 1 && flat && width > 0) {
+                const double top = (double)((1ll << width) - 1);
+                const double wanted =
+                    floor((across - (double)where * two_to(b.side)) * two_to(-exponent) + 0.5);
+                const int64_t guess = (int64_t)minimum(maximum(wanted, 0.0), top);
+                const int64_t rise = guess, fall = (int64_t)top - guess;
+                const int64_t far = apart < size ? 0 : apart < 4.0 * size ? 1 : apart < 9.0 * size ? 2 : 3;
+                const int64_t turned = minimum((off < 0 ? -off : off) / 3, (int64_t)3);
+                const int64_t there = ((flag * 2 + (wanted >= 0.0 && wanted <= top)) * 4 + far) * 4 + turned;
+                const int64_t edge = minimum(rise, fall) > 7 ? 0 : rise < fall ? 1 : 2;
+                inside = guess + c.whole(slots(Field::ACROSS, there), inside - guess, edge);
+                check(inside >= 0 && inside <= (int64_t)top);
+            } else {
+                inside = c.raw(width, inside);
+            }
+            b.mean[i * DIM + a] = base + inside;
+            const double place = (double)(base + inside) * two_to(exponent);
+            s.place[i * DIM + axis[a]] = place;
+            if (a < DIM - 1 && flat)
+                across = across + 0.5 * (given[a] + own[a]) * (place - s.place[j * DIM + axis[a]]);
+        }
+        points(i, j, k, flag);
+    }
+
+    GMM_INLINE void points(int64_t i, int64_t j, int64_t k, int64_t flag) {
+        auto area = [&](int64_t t) {
+            return b.deviation[t * DIM] + (DIM == 3 ? b.deviation[t * DIM + 1] : 0);
+        };
+        int64_t about = 0;
+        if (i > 0) {
+            const int64_t both = b.count[j] + b.count[k];
+            about = (((both - area(j) - area(k)) >> 1) + area(i) + (both >> 1)) >> 1;
+        }
+        b.count[i] = about + c.whole(slots(Field::COUNT, flag + 2 * (i == 0)), b.count[i] - about, 0);
+        check(b.count[i] >= -41 && b.count[i] <= 160);
+    }
+
+    GMM_INLINE bool before(int64_t x, int64_t y) const {
+        return s.distance[x] < s.distance[y] || (s.distance[x] == s.distance[y] && x < y);
+    }
+
+    // Whether the coordinates of origin x come after those of y.
+    GMM_INLINE bool follows(int64_t x, int64_t y) const {
+        for (int a = 0; a < DIM; ++a) {
+            const int64_t one = b.origins[x * DIM + a], other = b.origins[y * DIM + a];
+            if (one != other) return one > other;
+        }
+        return x > y;
+    }
+
+    // The origin after `rank` others among the first n of s.rank, by distance.
+    GMM_INLINE int64_t selected(int64_t n, int64_t rank) const {
+        int64_t low = 0, high = n - 1;
+        while (low < high) {
+            const int64_t pivot = s.rank[(low + high) / 2];
+            int64_t x = low, y = high;
+            while (x <= y) {
+                while (before(s.rank[x], pivot)) ++x;
+                while (before(pivot, s.rank[y])) --y;
+                if (x <= y) {
+                    const int64_t kept = s.rank[x];
+                    s.rank[x++] = s.rank[y], s.rank[y--] = kept;
+                }
+            }
+            if (rank <= y)
+                high = y;
+            else if (rank >= x)
+                low = x;
+            else
+                break;
+        }
+        return s.rank[rank];
+    }
+
+    // The viewpoints of component i, which begin at `begin`; returns where they end.
+    GMM_INLINE int64_t viewpoints(int64_t i, int64_t j, int64_t begin) {
+        const int64_t known = i > 0 ? minimum(b.n_viewpoints[j], (int64_t)3) : 0;
+        const int64_t n = c.number(slots(Field::VIEWS, b.max_range[i] * 4 + known), b.n_viewpoints[i]);
+        b.n_viewpoints[i] = n;
+        check(n <= b.n_origins && begin + n <= b.n_seen);
+        if (!c.good || n == 0) return begin;
+        for (int64_t o = 0; o < b.n_origins; ++o) {
+            double apart = 0.0;
+            for (int a = 0; a < DIM; ++a) {
+                const double x = (double)b.origins[o * DIM + a] * 0.00390625 - s.place[i * DIM + a];
+                apart = apart + x * x;
+            }
+            s.distance[o] = apart;
+        }
+        int64_t* seen = b.seen_from + begin;
+        int64_t* share = b.share + begin;
+        int64_t passed = -1;
+        bool is_largest = false;  // whether a share of the largest was among them
+        for (int64_t q = 0; q < n; ++q) {
+            int64_t left = 0, found = -1, at = q, rank = 0;
+            for (int64_t o = 0; o < b.n_origins; ++o)
+                if (passed < 0 || before(passed, o)) s.rank[left++] = o;
+            check(left >= n - q);
+            if (!c.good) return begin;
+            if (WRITES) {
+                for (int64_t x = 0; x < n; ++x)
+                    if ((passed < 0 || before(passed, seen[x])) && (found < 0 || before(seen[x], found)))
+                        found = seen[x], at = x;
+                for (int64_t x = 0; x < left; ++x) rank += before(s.rank[x], found);
+            }
+            if (left > n - q) rank = c.number(slots(Field::RANK, minimum(n - q, (int64_t)4) - 1), rank);
+            check(rank < left);
+            if (!c.good) return begin;
+            if (!WRITES) found = selected(left, rank);
+            int64_t part = WRITES ? share[at] : 0;
+            if (n > 1 && (q < n - 1 || is_largest))
+                part = c.number(slots(Field::SHARE, 2 * (n > 2) + is_largest), part);
+            check(part <= 15);
+            is_largest = is_largest || part == 0;
+            passed = found;
+            if (!WRITES) {  // in the order of `Quantized`
+                int64_t x = q;
+                for (; x > 0 && follows(seen[x - 1], found); --x)
+                    seen[x] = seen[x - 1], share[x] = share[x - 1];
+                seen[x] = found, share[x] = part;
+            }
+        }
+        return begin + n;
+    }
+
+    GMM_INLINE int64_t run() {
+        offset = 0;
+        for (int64_t x = 6; x <= 28; x += 2) offset += 1ll << (x - b.side);
+        c.begin();
+        for (int64_t i = 0; i < b.k && c.good; ++i) id(i);
+        for (int64_t i = 0; i < b.n_origins && c.good; ++i) origin(i);
+        int64_t seen = 0;
+        for (int64_t i = 0; i < b.k && c.good; ++i) {
+            component(i);
+            if (c.good) seen = viewpoints(i, nearest, seen);
+        }
+        check(seen == b.n_seen);
+        return c.end();
+    }
+};
+
+template <int DIM, bool WRITES>
+GMM_KERNEL context_coding(int64_t, Batch batch, Scratch scratch, Stream stream) {
+    Walk<DIM, WRITES> walk{batch, scratch, {scratch, stream, 0, 0, 0, 0, 0, 0, false, true}, 0, 0};
+    *stream.result = walk.run();
+}
+
+}  // namespace gmm

@@ -1,0 +1,76 @@
+"""Components as an adaptive binary code, written and read; the twin is `mapping.codec.context_model`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gmmtorch.kernels.compiler import FusedKernel
+
+_CODINGS = {
+    (dim, writes): FusedKernel(
+        "codes/context_coding.h", f"context_coding<{dim}, {str(writes).lower()}>", rounds_each=True
+    )
+    for dim in (2, 3)
+    for writes in (True, False)
+}
+
+
+@dataclass(frozen=True, eq=False)
+class CodedBatch:
+    """K components, S origins and E viewpoints as whole numbers, int64; read into arrays of zeros.
+
+    side: log2 of the side (m) of the cells (K, D) that contain the means. The others: as in `Quantized`.
+    """
+
+    side: int
+    axis_order: Tensor
+    deviation: Tensor
+    shear: Tensor
+    mean: Tensor
+    count: Tensor
+    max_range: Tensor
+    ids: Tensor
+    origins: Tensor
+    n_viewpoints: Tensor
+    seen_from: Tensor
+    share: Tensor
+    cells: Tensor
+
+    @property
+    def dim(self) -> int:
+        return self.mean.shape[1]
+
+    def arrays(self) -> dict[str, Tensor]:
+        """All but the side."""
+        return {field.name: getattr(self, field.name) for field in fields(self)[1:]}
+
+
+class ChanceTables(NamedTuple):
+    """chances, n_coded (N,), int32: of each slot, the probability of a 0 in 1/65536, and how many bits it has
+    coded; both change. rates (M + 1,): in 1/65536, how far a bit moves a slot that has coded 0 … M bits.
+    first_slot (F,): of the fields."""
+
+    chances: Tensor
+    n_coded: Tensor
+    rates: Tensor
+    first_slot: Tensor
+
+
+def context_coding(batch: CodedBatch, tables: ChanceTables, stream: Tensor, writes: bool) -> int:
+    """Write a batch to the stream (B,), uint8, or read it; returns the number of bytes used, or −1 if the
+    stream is damaged or too short. All tensors are on the CPU."""
+    k, n_origins = len(batch.count), len(batch.origins)
+    result = torch.zeros(1, dtype=torch.int64)
+    near = torch.empty(n_origins, dtype=torch.float64)
+    place, normal = (torch.zeros(k, batch.dim, dtype=torch.float64) for _ in range(2))
+    rank = torch.empty(n_origins, dtype=torch.int64)
+    sizes = k, n_origins, len(batch.seen_from), batch.side
+    scratch = (*tables[:3], len(tables.rates) - 1, tables.first_slot, near, rank, place, normal, batch.cells)
+    values = list(batch.arrays().values())[:-1]  # cells are scratch
+    kernel = _CODINGS[batch.dim, writes]
+    kernel(1, *sizes, *values, *scratch, stream, len(stream), result, device=result.device)
+    return int(result)

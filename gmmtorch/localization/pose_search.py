@@ -1,0 +1,248 @@
+"""PoseSearch: the poses in which a scan may lie in a map, among all within a reach, by branch and bound.
+
+A raster of the map gives each cell the log-likelihood of a return: high at surfaces, low in free space, and
+between where nothing was seen. The score of a pose is the sum over the scan's points. Of a square of poses
+with one heading, 2ˡ cells wide, the sum over a raster of maxima, each of the 2ˡ × 2ˡ cells from its own on,
+is an upper bound (Olson 2009; Hess et al. 2016). Squares that may hold a pose as good as the best one so far,
+less a margin, are divided. All squares of a level are scored in one launch.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gmmtorch.kernels import count_in_grid, raster_sums
+from gmmtorch.localization.alignment import distinct
+from gmmtorch.pose import Pose
+
+CORRELATED = 10.0
+"""Points that share one error, that of their component (measured on a hall and an office)."""
+
+HIT, UNKNOWN, FREE = 8.0, 4.0, -8.0
+"""Nats of a point on a surface, where nothing was seen, and in free space."""
+
+_CELLS = 1 << 18  # of a raster at most
+_FINEST = {2: 0.1, 3: 0.4}  # metres of a cell
+_BLUR = 1.5  # cells of standard deviation of a surface
+_TAIL = 2.0  # nats: beyond, the prior falls as a power of the deviation
+NEVER = 1e4
+"""Nats against a pose that is farther from the expected poses than the sensor moves."""
+_NEAR = 3  # cells from a surface: neither free nor unknown
+_LEVELS = 5  # the largest squares are 16 cells wide
+_MOST_SQUARES = 150  # of one heading
+_TURNS = math.radians(0.7), math.radians(4)  # least and largest step between headings
+_FAR = 0.8  # quantile of the ranges that a step between headings moves by a cell
+_POINTS = 128  # of the scan
+_KEPT = 3000  # squares of a level at most
+_FIRST = 50  # best squares, which are divided first, for a score to compare with
+_MARGIN = 12.0  # nats below the best score that are kept: refinement may turn the order
+_PLACES = 6  # times as many poses of different places, from which those that differ are chosen
+_TOLD_APART = 0.3, math.radians(8)  # metres and radians between poses that are returned
+
+
+class Expectation(NamedTuple):
+    """Where a scan is expected: poses (B), world ← sensor; the standard deviations of the first one
+    (m, rad); the share of its points that is usually explained; and the largest shift (m) and turn (rad) from
+    the nearest of the poses.
+    """
+
+    poses: Pose
+    distance: float
+    angle: float
+    explained: float
+    max_step: float = 8.0
+    max_turn: float = math.pi
+
+    def unlikely(self, poses: Pose) -> Tensor:
+        """Nats (N,) against poses, by their deviation from the nearest expected one."""
+        turned = self._turned(poses.rotation)
+        return self._against(torch.cdist(poses.translation, self.poses.translation), turned)
+
+    def _turned(self, rotation: Tensor) -> Tensor:
+        chord = torch.cdist(rotation.flatten(1), self.poses.rotation.flatten(1)) / math.sqrt(2)
+        return 2 * (chord / 2).clamp_max(1).asin()
+
+    def _against(self, shift: Tensor, turned: Tensor) -> Tensor:
+        """By shifts (N, B) and turns (N, B). Far from an expected pose the nats grow with the logarithm of
+        the deviation: a robot that stops or turns does not follow any prediction.
+        """
+        is_near = (shift <= self.max_step) & (turned <= self.max_turn + 1e-6)
+        square = (shift / self.distance).square() + (turned / self.angle).square()
+        nats = _TAIL * torch.log1p(square.amin(1) / (2 * _TAIL))
+        return nats + torch.where(is_near.any(1), 0.0, NEVER)
+
+
+class Found(NamedTuple):
+    """Poses (B), world ← sensor, best first, and their scores (B,), nats."""
+
+    poses: Pose
+    scores: Tensor
+
+
+class PoseSearch:
+    """A raster of a map, with its maxima.
+
+    Args:
+        points: (N, D) on the surfaces, world frame, metres; at least one.
+        free: (M, 2, D) segments through free space; none: cells away from surfaces are unknown.
+        cell: side (m) of a cell; it is larger where the raster would have too many cells.
+    """
+
+    def __init__(self, points: Tensor, free: Tensor | None = None, cell: float | None = None) -> None:
+        self.dim = points.shape[1]
+        low, high = points.amin(0), points.amax(0)
+        side = _FINEST[self.dim] if cell is None else cell
+        while (volume := math.prod(((high - low) / side + 1).tolist())) > _CELLS:
+            side *= 1.01 * (volume / _CELLS) ** (1 / self.dim)
+        self.cell = side
+        margin = 1 << _LEVELS
+        pad = torch.tensor([margin, margin, _NEAR][: self.dim]).to(points)
+        self._low = (low / side).floor() - pad
+        shape = ((high / side).floor() + pad + 1 - self._low).long().tolist()
+        hits = points.new_zeros(shape, dtype=torch.float32)
+        hits[((points / side).floor() - self._low).long().unbind(1)] = 1.0
+        weights = [math.exp(-0.5 * (shift / _BLUR) ** 2) for shift in range(_NEAR + 1)]
+        shade, near = hits, hits
+        for axis in range(self.dim):
+            shade, near = _spread(shade, weights, axis), _spread(near, [1.0] * (_NEAR + 1), axis)
+        raster = torch.where(near > 0, HIT * shade, UNKNOWN)
+        if free is not None and len(free):
+            misses = torch.zeros(math.prod(shape), dtype=torch.float64, device=points.device)
+            starts, ends = (free.double() / side).unbind(1)
+            count_in_grid(misses, starts, ends, tuple(shape), low=self._low)
+            crossed = (misses > 0).view(shape)
+            raster = torch.where(crossed & (near == 0), FREE, raster)
+        while raster.ndim < 3:
+            raster = raster[..., None]
+        self._levels = [raster]
+        for level in range(_LEVELS - 1):
+            wider = self._levels[-1]
+            for axis in (0, 1):
+                wider = torch.maximum(wider, _shifted(wider, 1 << level, axis, UNKNOWN))
+            self._levels.append(wider)
+
+    def best(
+        self,
+        points: Tensor,
+        expected: Expectation,
+        n: int,
+    ) -> Found:
+        """The best poses that differ, at most `n`, as far from the last expected pose as a scan can be.
+
+        In 3D the poses have the height of that one, and its rotation but for a turn about the vertical.
+
+        Args:
+            points: (N, D) of the scan, sensor frame, in random order; the first ones are used.
+        """
+        center, reach, turn = expected.poses[-1], expected.max_step, expected.max_turn
+        rows = self._spread_out(points.double())[:_POINTS]
+        share = len(points) / len(rows) / CORRELATED
+        ranges = rows.norm(dim=1).quantile(_FAR).clamp_min(1e-3)
+        step = min(max(self.cell / float(ranges), _TURNS[0]), _TURNS[1])
+        n_turns = min(math.ceil(turn / step), round(math.pi / step))
+        angles = torch.arange(-n_turns, n_turns + 1).to(rows) * step
+        turned = Pose.from_yaw(angles, rows.new_zeros(self.dim)).rotation @ center.rotation
+        placed = (rows @ turned.mT + center.translation) / self.cell
+        cells = (placed.floor() - self._low).long()
+        cells = torch.nn.functional.pad(cells, (0, 3 - self.dim))
+        level = self._first_level(reach)
+        width = 1 << level
+        side = torch.arange(-math.ceil(reach / self.cell / width), math.ceil(reach / self.cell / width) + 1)
+        flat = torch.nn.functional.pad(torch.cartesian_prod(side, side) * width, (0, 1)).to(cells)
+        heading = torch.arange(len(angles), device=rows.device).repeat_interleave(len(flat))
+        shift = flat.repeat(len(angles), 1)
+
+        off = expected._turned(turned)
+
+        def middle(shift: Tensor, width: int) -> Tensor:
+            cells = shift[:, : self.dim].double()
+            cells[:, :2] += (width - 1) / 2
+            return cells * self.cell
+
+        def scored(heading: Tensor, shift: Tensor, level: int) -> Tensor:
+            width = 1 << level
+            sums = raster_sums(cells, heading, shift, self._levels[level], UNKNOWN)
+            away = (width - 1) * self.cell / math.sqrt(2)
+            middles = center.translation + middle(shift, width)
+            gap = (torch.cdist(middles, expected.poses.translation) - away).clamp_min(0)
+            return share * sums - expected._against(gap, off[heading])
+
+        bound = scored(heading, shift, level)
+        first = bound.topk(min(_FIRST, len(bound))).indices
+        some, at, least = heading[first], shift[first], -math.inf
+        for finer in range(level - 1, -1, -1):
+            some, at = _divided(some, at, 1 << finer)
+            score = scored(some, at, finer)
+            best = score.topk(min(_FIRST, len(score))).indices
+            some, at, least = some[best], at[best], float(score[best[0]])
+        for finer in range(level - 1, -1, -1):
+            kept = _most(bound, least - _MARGIN)
+            heading, shift = _divided(heading[kept], shift[kept], 1 << finer)
+            bound = scored(heading, shift, finer)
+        order = _most(bound, max(least, float(bound.max())) - _MARGIN)
+        order = order[bound[order].argsort(descending=True, stable=True)]
+        # Of neighbours the first one, in two passes: comparing all pairs would take longer than the search.
+        places = torch.cat([angles[heading[order], None] / _TOLD_APART[1],
+                            shift[order] * (self.cell / _TOLD_APART[0])], 1)  # fmt: skip
+        order = order[_firsts(places.floor())][: _PLACES * n]
+        found = Pose(turned[heading[order]], center.translation + middle(shift[order], 1))
+        chosen = distinct(found, *_TOLD_APART)[:n]
+        return Found(found[chosen], bound[order[chosen]])
+
+    def _spread_out(self, points: Tensor) -> Tensor:
+        """The first point of each cell, in their order: near the sensor, points are dense and tell little."""
+        return points[_firsts((points / self.cell).floor())]
+
+    def _first_level(self, reach: float) -> int:
+        """The level whose squares are few."""
+        for level in range(_LEVELS - 1):
+            if (2 * math.ceil(reach / self.cell / (1 << level)) + 1) ** 2 <= _MOST_SQUARES:
+                return level
+        return _LEVELS - 1
+
+
+def _firsts(rows: Tensor) -> Tensor:
+    """Numbers of the rows (N, D) of whole numbers that are the first of their kind, in rising order."""
+    keys = rows.new_zeros(len(rows))
+    for column in rows.unbind(1):
+        low, high = column.aminmax()
+        keys = keys * (high - low + 1) + column - low
+    kinds, kind = torch.unique(keys, return_inverse=True)
+    number = torch.arange(len(rows), device=rows.device)
+    first = number.new_full((len(kinds),), len(rows))
+    return first.scatter_reduce(0, kind, number, "amin").sort().values
+
+
+def _most(bound: Tensor, least: float) -> Tensor:
+    """Rows of the bounds above `least`, but of the largest `_KEPT` only."""
+    kept = (bound >= least).nonzero()[:, 0]
+    return kept if len(kept) <= _KEPT else kept[bound[kept].topk(_KEPT).indices]
+
+
+def _divided(heading: Tensor, shift: Tensor, width: int) -> tuple[Tensor, Tensor]:
+    """The four squares of `width` cells of each larger one."""
+    parts = torch.tensor([[0, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0]], device=shift.device) * width
+    return heading.repeat_interleave(4), (shift[:, None] + parts).flatten(0, 1)
+
+
+def _spread(values: Tensor, weights: list[float], axis: int) -> Tensor:
+    """The largest of the neighbours along an axis, times the weight of their distance in cells."""
+    found = weights[0] * values
+    for shift, weight in enumerate(weights[1:], 1):
+        for way in (shift, -shift):
+            found = torch.maximum(found, weight * _shifted(values, way, axis, 0.0))
+    return found
+
+
+def _shifted(values: Tensor, shift: int, axis: int, outside: float) -> Tensor:
+    """values[i + shift] along an axis."""
+    n = values.shape[axis]
+    if abs(shift) >= n:
+        return torch.full_like(values, outside)
+    rest = values.new_full((*values.shape[:axis], abs(shift), *values.shape[axis + 1 :]), outside)
+    kept = values.narrow(axis, max(shift, 0), n - abs(shift))
+    return torch.cat([kept, rest] if shift > 0 else [rest, kept], axis)

@@ -1,0 +1,534 @@
+"""Batches as an adaptive binary code: each value is predicted from the components before it; docs/formats.md.
+
+A range coder (Martin 1979) writes bits, each with the chance of a 0 that its *slot* has learned from the bits
+that it coded before. A slot is one bit of one field in one context, such as "the smallest deviation differs
+from that of the neighbours". The model uses whole numbers, and sums, products and quotients of doubles, which
+every machine rounds equally: a batch is read with the chances with which it was written.
+
+The fused kernel does the work. This twin defines it, and takes about 100 times as long.
+"""
+
+from __future__ import annotations
+
+import base64
+import functools
+import math
+import zlib
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.kernels import ChanceTables, CodedBatch, context_coding, is_fused
+from gmmtorch.mapping.codec.context_chances import CHANCES
+from gmmtorch.mapping.codec.lattice import (
+    AXIS_ORDERS,
+    LARGEST_DEVIATION,
+    LARGEST_RATIO,
+    LEAST_DEVIATION,
+    STEEPEST,
+)
+from gmmtorch.mapping.codec.quantization import LARGEST_COUNT, LEAST_SHARE, NO_COUNT, ORIGIN_STEP, offset_of
+
+_NEIGHBOURS = 64  # components before a component among which its neighbours are searched
+_MOST_LEVELS = 52
+_NUMBER = 32  # slots of a number
+_MOST_CODED, _MOST_TRAINED = 120, 12  # bits of a slot that count; of those from which its first chance comes
+_LEAST_CHANCE = 64
+_ONE = 1 << 16
+
+FIELDS = {
+    "FLAG": (4, 1),
+    "LEVEL": (3, _NUMBER),
+    "DIGIT": (8, 8),
+    "LOWER": (12, 1),
+    "ORDER": (26, 8),
+    "WIDE": (4, _NUMBER),
+    "RATIO": (12, _NUMBER),
+    "THIN": (8, _NUMBER),
+    "TURN": (16, _NUMBER),
+    "TILT": (56, _NUMBER),
+    "SLOPE": (84, _NUMBER),
+    "ACROSS": (64, _NUMBER),
+    "COUNT": (4, _NUMBER),
+    "VIEWS": (8, _NUMBER),
+    "RANK": (4, _NUMBER),
+    "SHARE": (4, _NUMBER),
+    "ORIGIN": (6, _NUMBER),
+    "ROBOT": (2, _NUMBER),
+    "NUMBER": (2, _NUMBER),
+}
+"""Contexts of each field, and slots of each context."""
+N_SLOTS = sum(contexts * slots for contexts, slots in FIELDS.values())
+
+
+def write_batch(batch: CodedBatch) -> bytes:
+    """The batch as bytes, without zeros at their end. Raises `InvalidArgumentError` for ids beyond 2^60."""
+    size = 256 + 96 * len(batch.count) + 24 * (len(batch.origins) + len(batch.seen_from))
+    stream = torch.zeros(size, dtype=torch.uint8)
+    try:
+        if is_fused(batch.mean):
+            n = context_coding(batch, _tables(), stream, writes=True)
+            _require(n >= 0)
+            return stream[:n].numpy().tobytes().rstrip(b"\0")
+        writer = _Writer()
+        _Walk(writer, batch).run()
+        return writer.to_bytes().rstrip(b"\0")
+    except DataError as error:
+        low, high = int(batch.ids.min()), int(batch.ids.max())
+        raise InvalidArgumentError(
+            f"ids reach from {low} to {high}; numbers up to 2^60 are stored."
+        ) from error
+
+
+def read_batch(batch: CodedBatch, data: bytes) -> None:
+    """Read what `write_batch` wrote into a batch of zeros of the same sizes. Raises `DataError` for other
+    bytes: a batch has one form."""
+    if is_fused(batch.mean):
+        stream = torch.frombuffer(bytearray(data or b"\0"), dtype=torch.uint8)
+        _require(context_coding(batch, _tables(), stream, writes=False) >= 0)
+    else:
+        _Walk(_Reader(data), batch).run()
+    _require(write_batch(batch) == data.rstrip(b"\0"))
+
+
+def _tables() -> ChanceTables:
+    chances, n_coded, rates, first_slot = first_tables()
+    return ChanceTables(chances.clone(), n_coded.clone(), rates, first_slot)
+
+
+@functools.cache
+def first_tables() -> ChanceTables:
+    """The tables before the first bit."""
+    sizes = [contexts * slots for contexts, slots in FIELDS.values()]
+    packed = base64.b85decode("".join(CHANCES.split()))
+    known = zlib.decompress(packed) if packed else bytes(N_SLOTS)
+    chances = torch.tensor(list(known))
+    return ChanceTables(
+        chances=torch.where(chances == 0, _ONE // 2, chances << 8).int(),
+        n_coded=torch.where(chances == 0, 0, _MOST_TRAINED).int(),
+        rates=torch.tensor([10 * _ONE // (10 * n + 16) for n in range(_MOST_CODED + 1)]),
+        first_slot=torch.tensor([0, *np.cumsum(sizes[:-1]).tolist()]),
+    )
+
+
+# -- the twin: the range coder ---------------------------------------------------------------------------
+
+
+class _RangeCoder:
+    """What a writer and a reader have in common: numbers as bits in slots."""
+
+    def __init__(self) -> None:
+        tables = first_tables()
+        self.chances, self.n_coded = tables.chances.tolist(), tables.n_coded.tolist()
+        self._rates, first = tables.rates.tolist(), tables.first_slot.tolist()
+        self.first = dict(zip(FIELDS, first, strict=True))
+        self.range = (1 << 32) - 1
+
+    def bit(self, slot: int, value: int) -> int:
+        """A bit; `value` is what a writer writes."""
+        chance, n = self.chances[slot], self.n_coded[slot]
+        value = self._split((self.range >> 16) * chance, value)
+        moved = chance + (((0 if value else _ONE) - chance) * self._rates[n] >> 16)
+        self.chances[slot] = min(max(moved, _LEAST_CHANCE), _ONE - _LEAST_CHANCE)
+        self.n_coded[slot] = min(n + 1, _MOST_CODED)
+        self._renew()
+        return value
+
+    def raw(self, n: int, value: int) -> int:
+        """n bits without slots, highest first, eight at a time."""
+        found = 0
+        while n > 0:
+            width = min(n, 8)
+            n -= width
+            self.range >>= width
+            found = found << width | self._part(value >> n & (1 << width) - 1, width)
+            self._renew()
+        return found
+
+    def tree(self, first: int, n: int, value: int) -> int:
+        """n bits, each with a slot for every choice of the bits before it."""
+        node = 1
+        for i in range(n - 1, -1, -1):
+            node = node << 1 | self.bit(first + node, value >> i & 1)
+        return node - (1 << n)
+
+    def number(self, first: int, value: int) -> int:
+        """A number ≥ 0 below 2^60: the length of value + 1 in unary, then its other bits; the two highest of
+        these have slots."""
+        whole, length = value + 1, 0
+        while self.bit(first + 4 + min(length, 11), int(whole >> (length + 1) != 0)):
+            length += 1
+            if length > 60:
+                raise DataError("A number is too large: it is damaged.")
+        found = 1
+        if length > 0:
+            found = 2 | self.bit(first + 15 + min(length, 8), whole >> (length - 1) & 1)
+        if length > 1:
+            slot = 24 + 2 * (length - 2) + (found & 1) if length < 5 else 30
+            found = found << 1 | self.bit(first + slot, whole >> (length - 2) & 1)
+        if length > 2:
+            found = found << (length - 2) | self.raw(length - 2, whole & (1 << (length - 2)) - 1)
+        return found - 1
+
+    def whole(self, first: int, value: int, side: int = 0) -> int:
+        """Any whole number. side: 0, 1 or 2, the slot of its sign."""
+        if not self.bit(first, int(value != 0)):
+            return 0
+        negative = self.bit(first + 1 + side, int(value < 0))
+        size = self.number(first, abs(value) - 1) + 1
+        return -size if negative else size
+
+    def _split(self, bound: int, value: int) -> int:
+        raise NotImplementedError
+
+    def _part(self, value: int, width: int) -> int:
+        raise NotImplementedError
+
+    def _renew(self) -> None:
+        raise NotImplementedError
+
+
+class _Writer(_RangeCoder):
+    writes = True
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._low = self._n = 0  # of all bytes so far: the number, and their count
+
+    def _split(self, bound: int, value: int) -> int:
+        self._low += bound if value else 0
+        self.range = self.range - bound if value else bound
+        return value
+
+    def _part(self, value: int, width: int) -> int:
+        self._low += self.range * value
+        return value
+
+    def _renew(self) -> None:
+        while self.range < 1 << 24:
+            self.range <<= 8
+            self._low <<= 8
+            self._n += 1
+
+    def to_bytes(self) -> bytes:
+        """Of the numbers that say the same, the one with most zeros at its end."""
+        last = self._low
+        for n in range(1, 32):
+            rounder = (self._low + (1 << n) - 1) >> n << n
+            last = rounder if rounder < self._low + self.range else last
+        return last.to_bytes(self._n + 4, "big")
+
+
+class _Reader(_RangeCoder):
+    writes = False
+
+    def __init__(self, data: bytes) -> None:
+        super().__init__()
+        self._data, self._at = data, 4
+        self._code = int.from_bytes(data[:4].ljust(4, b"\0"), "big")
+
+    def _split(self, bound: int, value: int) -> int:
+        value = int(self._code >= bound)
+        self._code -= bound if value else 0
+        self.range = self.range - bound if value else bound
+        return value
+
+    def _part(self, value: int, width: int) -> int:
+        found = min(self._code // self.range, (1 << width) - 1)
+        self._code -= found * self.range
+        return found
+
+    def _renew(self) -> None:
+        while self.range < 1 << 24:
+            self.range <<= 8
+            byte = self._data[self._at] if self._at < len(self._data) else 0  # zeros are not written
+            self._code = (self._code << 8 | byte) & 0xFFFFFFFF
+            self._at += 1
+
+
+# -- the twin: the model ---------------------------------------------------------------------------------
+
+
+class _Walk:
+    """Walks through the components of a batch, each value in place: written, or read into arrays of zeros.
+
+    Contexts and predictions are stated in docs/formats.md.
+    """
+
+    def __init__(self, coder: _Writer | _Reader, batch: CodedBatch) -> None:
+        self.c, self.b, self.dim, self.side = coder, batch, batch.dim, batch.side
+        self.places, self.normals = np.zeros(batch.mean.shape), np.zeros(batch.mean.shape)
+        self.offset = offset_of(self.side)
+        # Lists of Python numbers, which are faster one by one than arrays.
+        self.v = {name: array.tolist() for name, array in batch.arrays().items()}
+        self.last = self.dim - 1
+
+    def run(self) -> None:
+        v = self.v
+        for i in range(len(v["count"])):
+            self._id(i)
+        for i in range(len(v["origins"])):
+            self._origin(i)
+        self._origins = np.array(v["origins"], np.float64).reshape(-1, self.dim) * ORIGIN_STEP
+        begin = 0
+        for i in range(len(v["count"])):
+            near = self._component(i)
+            begin = self._viewpoints(i, near, begin)
+        _require(begin == len(v["seen_from"]))
+        if isinstance(self.c, _Reader):
+            for name, values in v.items():
+                found = getattr(self.b, name)
+                found.copy_(torch.tensor(values, dtype=torch.int64).reshape(found.shape))
+
+    def _slots(self, field: str, context: int, size: int = _NUMBER) -> int:
+        return self.c.first[field] + context * size
+
+    def _id(self, i: int) -> None:
+        ids = self.v["ids"]
+        same = i > 0 and bool(self.c.bit(self._slots("ROBOT", 1), int(ids[i][0] == ids[i - 1][0])))
+        ids[i][0] = ids[i - 1][0] if same else self.c.whole(self._slots("ROBOT", 0), ids[i][0])
+        after = ids[i - 1][1] + 1 if same else 0
+        ids[i][1] = after + self.c.whole(self._slots("NUMBER", int(same)), ids[i][1] - after)
+        _require(max(map(abs, ids[i])) <= 1 << 61)
+
+    def _origin(self, i: int) -> None:
+        own = self.v["origins"][i]
+        for a in range(self.dim):
+            before = self.v["origins"][i - 1][a] if i > 0 else 0
+            own[a] = before + self.c.whole(self._slots("ORIGIN", a + 3 * (i > 0)), own[a] - before)
+            _require(abs(own[a]) <= 1 << 36)
+
+    def _cell(self, i: int, flag: int) -> None:
+        """The cell of a mean: the level at which it leaves the block of the cell before, then its place."""
+        c, v, dims = self.c, self.v, range(self.dim)
+        if i > 0:
+            before = [x + self.offset for x in v["cells"][i - 1]]
+        elif v["origins"]:
+            shift = self.side + 8
+            before = [(x >> shift if shift >= 0 else x << -shift) + self.offset for x in v["origins"][0]]
+        else:
+            before = [self.offset] * self.dim
+        now = [x + self.offset for x in v["cells"][i]]
+        apart = max((x ^ y).bit_length() for x, y in zip(before, now, strict=True)) if c.writes else 0
+        level = c.number(self._slots("LEVEL", flag if i > 0 else 2), apart)
+        _require(level <= _MOST_LEVELS)
+        corner, width = [x >> level << level for x in before], [1 << level] * self.dim
+        if level > 0:
+            old, digit = 0, 0
+            for a in dims:
+                old = old << 1 | before[a] >> (level - 1) & 1
+                digit = digit << 1 | now[a] >> (level - 1) & 1
+            digit = c.tree(self._slots("DIGIT", old, 8), self.dim, digit)
+            _require(digit != old)
+            width = [1 << (level - 1)] * self.dim
+            corner = [x + (digit >> (self.last - a) & 1) * width[a] for a, x in enumerate(corner)]
+        corner = [x - self.offset for x in corner]
+        for at in range(level - 2, -1, -1):
+            for a in dims:
+                context = self._halving(i - 1, corner, width, a) + 6 * (level >= 4)
+                width[a] >>= 1
+                corner[a] += c.bit(self._slots("LOWER", context, 1), now[a] >> at & 1) * width[a]
+        v["cells"][i] = corner
+        _require(max(map(abs, corner)) <= 2.0 * 134217728.0 * math.ldexp(1, -self.side))
+
+    def _halving(self, j: int, corner: Sequence[int], width: Sequence[int], a: int) -> int:
+        """Which half of a block along axis a is nearer to the plane of component j: 0, the lower one, to 4;
+        5: it has no plane."""
+        if j < 0 or self.v["deviation"][j][-2] - self.v["deviation"][j][-1] < 4:
+            return 5
+        n, m, side = self.normals[j].tolist(), self.places[j].tolist(), math.ldexp(1, self.side)
+        if abs(n[a]) < 0.25:
+            return 5
+        apart = 0.0
+        for x in range(self.dim):
+            apart = apart + n[x] * ((corner[x] + 0.5 * width[x]) * side - m[x])
+        quarter = n[a] * (0.25 * width[a] * side)
+        nearer, most = abs(apart - quarter) - abs(apart + quarter), 2.0 * abs(quarter)
+        if nearer < -0.25 * most:
+            return int(nearer >= -0.75 * most)
+        return 2 if nearer <= 0.25 * most else 3 if nearer <= 0.75 * most else 4
+
+    def _neighbours(self, i: int) -> tuple[int, int, float]:
+        """Of the components before i, the two nearest to its cell, and the squared distance (m²) of one."""
+        first = max(i - _NEIGHBOURS, 0)
+        if i == 0:
+            return 0, 0, math.inf
+        apart = np.zeros(i - first)
+        for a in range(self.dim):
+            x = self.places[first:i, a] - (self.v["cells"][i][a] + 0.5) * math.ldexp(1, self.side)
+            apart = apart + x * x
+        order = np.argsort(apart, kind="stable")[:2].tolist()
+        return first + order[0], first + order[-1], float(apart[order[0]])
+
+    def _deviations(self, i: int, j: int, k: int, flag: int) -> None:
+        c, last = self.c, self.last
+        x, y, d = (self.v["deviation"][t] for t in (j, k, i))
+        if i == 0:
+            d[0] = c.whole(self._slots("WIDE", 2 + flag), d[0])
+            if self.dim == 3:
+                d[1] = d[0] - c.number(self._slots("RATIO", 10 + flag), d[0] - d[1])
+            d[last] = d[last - 1] - c.number(self._slots("THIN", 6 + flag), d[last - 1] - d[last])
+        else:
+            wide = (x[0] + y[0]) >> 1
+            d[0] = wide + c.whole(self._slots("WIDE", flag), d[0] - wide)
+            if self.dim == 3:
+                ratio = (x[0] - x[1] + y[0] - y[1]) >> 2
+                d[1] = d[0] - c.number(self._slots("RATIO", flag * 5 + min(ratio, 4)), d[0] - d[1])
+            thin = min((x[last] + y[last]) >> 1, d[last - 1])
+            slots = self._slots("THIN", flag * 3 + min(abs(x[last] - y[last]) // 3, 2))
+            d[last] = thin + c.whole(slots, d[last] - thin, int(thin == d[last - 1]))
+        _require(max(d) <= LARGEST_DEVIATION and min(d) >= LEAST_DEVIATION and d == sorted(d, reverse=True))
+        _require(d[0] - d[last] <= LARGEST_RATIO)
+
+    def _component(self, i: int) -> int:
+        """Code a component; returns its nearest neighbour."""
+        c, v, last = self.c, self.v, self.last
+        flags, orders = v["max_range"], v["axis_order"]
+        before = 2 * (flags[i - 1] if i > 0 else 0) + (flags[i - 2] if i > 1 else 0)
+        flag = flags[i] = c.bit(self._slots("FLAG", before, 1), flags[i])
+        self._cell(i, flag)
+        j, k, apart = self._neighbours(i)
+        context = (flag * 2 + (orders[j] == orders[k])) * 6 + orders[j] if i > 0 else 24 + flag
+        orders[i] = c.tree(self._slots("ORDER", context, 8), 3 if self.dim == 3 else 1, orders[i])
+        _require(orders[i] < len(AXIS_ORDERS[self.dim]))
+        axis = AXIS_ORDERS[self.dim][orders[i]].tolist()
+        self._deviations(i, j, k, flag)
+        d = v["deviation"][i]
+        size = math.ldexp(1, 2 * (d[0] // 4))
+        given = self._plane(i, j, axis) if apart < 64.0 * size else None
+        own, off = self._shears(i, j, flag, given)
+        self.normals[i, axis[last]] = 1.0
+        for a in range(last):
+            self.normals[i, axis[a]] = -own[a]
+
+        # The mean in its cell: freely along the component, near the plane across it.
+        across = float(self.places[j, axis[last]])
+        for a in range(self.dim):
+            exponent, where = d[a] // 4 - 2, v["cells"][i][axis[a]]
+            width, coarser = max(self.side - exponent, 0), max(exponent - self.side, 0)
+            _require(where & (1 << coarser) - 1 == 0)
+            base = where >> coarser << width
+            inside = v["mean"][i][a] - base if c.writes else 0
+            if a == last and given is not None and width > 0:
+                top = (1 << width) - 1
+                wanted = math.floor(
+                    (across - where * math.ldexp(1, self.side)) * math.ldexp(1, -exponent) + 0.5
+                )
+                guess = min(max(wanted, 0), top)
+                far = sum(apart >= bound * size for bound in (1.0, 4.0, 9.0))
+                context = ((flag * 2 + (0 <= wanted <= top)) * 4 + far) * 4 + min(abs(off) // 3, 3)
+                edge = 0 if min(guess, top - guess) > 7 else 1 if guess < top - guess else 2
+                inside = guess + c.whole(self._slots("ACROSS", context), inside - guess, edge)
+                _require(0 <= inside <= top)
+            else:
+                inside = c.raw(width, inside)
+            v["mean"][i][a] = base + inside
+            place = (base + inside) * math.ldexp(1, exponent)
+            self.places[i, axis[a]] = place
+            if a < last and given is not None:
+                across = across + 0.5 * (given[a] + own[a]) * (place - float(self.places[j, axis[a]]))
+        self._count(i, j, k, flag)
+        return j
+
+    def _plane(self, i: int, j: int, axis: Sequence[int]) -> list[float] | None:
+        """The slopes of the plane of component j: of the last axis of i along its others; None if it has none
+        or is too steep."""
+        d, e, n = self.v["deviation"][i], self.v["deviation"][j], self.normals[j].tolist()
+        if i == 0 or e[-2] - e[-1] < 4 or d[-2] - d[-1] < 2:
+            return None
+        upright = n[axis[self.last]]
+        if not abs(upright) > 0.25 * max(map(abs, n)):
+            return None
+        slopes = [-n[a] / upright for a in axis[: self.last]]
+        return slopes if max(map(abs, slopes)) <= 2.0 else None
+
+    def _shears(self, i: int, j: int, flag: int, given: list[float] | None) -> tuple[list[float], int]:
+        """Code the shears; returns the slopes of the last axis, and how far they are from those given, in
+        steps."""
+        c, last = self.c, self.last
+        d, e, shear = self.v["deviation"][i], self.v["deviation"][j], self.v["shear"][i]
+        slopes, own, turn, off = given or [0.0, 0.0], [0.0, 0.0], 0.0, 0
+
+        def value(pair: int, row: int, column: int) -> float:
+            found = shear[pair] * math.ldexp(1, (d[row] - d[column]) // 4 - 2)
+            _require(abs(found) <= STEEPEST)
+            return found
+
+        if self.dim == 3:
+            finer = -((d[1] - d[0]) // 4)
+            shear[0] = c.whole(self._slots("TURN", flag * 8 + min(finer, 7)), shear[0])
+            turn = value(0, 1, 0)
+            step = (d[2] - d[1]) // 4 - 2
+            fine, about = min(-step // 2, 6), math.floor(slopes[1] * math.ldexp(1, -step) + 0.5)
+            context = fine if given is None else 7 + fine * 3 + min((e[1] - e[2]) // 6, 2)
+            off = c.whole(self._slots("TILT", flag * 28 + context), shear[2] - about, _side(about))
+            shear[2] = about + off
+            own[1] = value(2, 2, 1)
+        step = (d[last] - d[0]) // 4 - 2
+        about = math.floor((slopes[0] + own[1] * turn) * math.ldexp(1, -step) + 0.5)
+        context = flag * 42 + (given is not None) * 21 + min(-step // 2, 6) * 3 + min(abs(off) // 2, 2)
+        pair = last - 1
+        rest = c.whole(self._slots("SLOPE", context), shear[pair] - about, _side(about))
+        shear[pair] = about + rest
+        own[0] = value(pair, last, 0) - own[1] * turn
+        return own, off if self.dim == 3 else rest
+
+    def _count(self, i: int, j: int, k: int, flag: int) -> None:
+        count, deviation = self.v["count"], self.v["deviation"]
+        about = 0
+        if i > 0:
+            area = [sum(deviation[t][: self.last]) for t in (i, j, k)]
+            both = count[j] + count[k]
+            about = ((both - area[1] - area[2] >> 1) + area[0] + (both >> 1)) >> 1
+        count[i] = about + self.c.whole(self._slots("COUNT", flag + 2 * (i == 0)), count[i] - about)
+        _require(NO_COUNT <= count[i] <= LARGEST_COUNT)
+
+    def _viewpoints(self, i: int, j: int, begin: int) -> int:
+        """Code the origins of component i by their rank among those left, by distance, and their shares."""
+        c, v, n_origins = self.c, self.v, len(self.v["origins"])
+        known = min(v["n_viewpoints"][j], 3) if i > 0 else 0
+        n = v["n_viewpoints"][i] = c.number(
+            self._slots("VIEWS", v["max_range"][i] * 4 + known), v["n_viewpoints"][i]
+        )
+        _require(n <= n_origins and begin + n <= len(v["seen_from"]))
+        if n == 0:
+            return begin
+        distance = np.zeros(n_origins)
+        for a in range(self.dim):
+            x = self._origins[:, a] - self.places[i, a]
+            distance = distance + x * x
+        order = np.argsort(distance, kind="stable").tolist()
+        place = {origin: rank for rank, origin in enumerate(order)}
+        end, passed, is_largest = begin + n, -1, False
+        rows = list(zip(v["seen_from"][begin:end], v["share"][begin:end], strict=True))
+        rows.sort(key=lambda row: place[row[0]])
+        found = []
+        for q, (origin, share) in enumerate(rows):
+            left, wanted = n_origins - 1 - passed, place[origin] - passed - 1
+            _require(left >= n - q)
+            rank = c.number(self._slots("RANK", min(n - q, 4) - 1), max(wanted, 0)) if left > n - q else 0
+            _require(rank < left)
+            if n > 1 and (q < n - 1 or is_largest):
+                share = c.number(self._slots("SHARE", 2 * (n > 2) + is_largest), share)
+            else:
+                share = 0
+            _require(share <= LEAST_SHARE)
+            is_largest = is_largest or share == 0
+            passed += 1 + rank
+            found.append((order[passed], share))
+        if not c.writes:
+            found.sort(key=lambda row: (v["origins"][row[0]], row[0]))
+            v["seen_from"][begin:end], v["share"][begin:end] = map(list, zip(*found, strict=True))
+        return end
+
+
+def _side(about: int) -> int:
+    """The slot of the sign of what is coded relative to a guess."""
+    return 0 if about == 0 else 1 if about > 0 else 2
+
+
+def _require(valid: bool) -> None:
+    if not valid:
+        raise DataError("A value of a batch is out of range: it is damaged.")

@@ -1,0 +1,101 @@
+"""The search of poses against enumeration, and in a room whose shape is known."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from gmmtorch.kernels import kernels, raster_sums
+from gmmtorch.localization.pose_search import CORRELATED, FREE, UNKNOWN, Expectation, PoseSearch
+from gmmtorch.pose import Pose
+
+
+def room(n: int, seed: int) -> Tensor:
+    """Points (N, 2) on the walls of an L-shaped room with a pillar."""
+    corners = torch.tensor([[0, 0], [9, 0], [9, 4], [5, 4], [5, 7], [0, 7], [0, 0]]).double()
+    pillar = torch.tensor([[2, 2], [2.6, 2], [2.6, 3], [2, 2]]).double()
+    sides = torch.cat([torch.stack([c[:-1], c[1:]], 1) for c in (corners, pillar)])
+    draw = torch.Generator().manual_seed(seed)
+    lengths = (sides[:, 1] - sides[:, 0]).norm(dim=1)
+    which = torch.multinomial(lengths, n, replacement=True, generator=draw)
+    part = torch.rand(n, 1, generator=draw).double()
+    return sides[which, 0] + part * (sides[which, 1] - sides[which, 0])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_best_pose_is_that_of_all_placements(seed):
+    search = PoseSearch(room(600, 0), cell=0.25)
+    draw = torch.Generator().manual_seed(seed)
+    pose = Pose.from_yaw(6 * torch.rand((), generator=draw), 2 + 2 * torch.rand(2, generator=draw).double())
+    points = pose.inverse().apply(room(120, seed + 1))
+    expected = Expectation(
+        Pose.stack([pose.moved(torch.tensor([0.7, -0.4, 0.5]).double())]), 0.5, 0.3, 0.9, 1.0, 0.7
+    )
+    found = search.best(points, expected, 5)
+    # The same raster, at every shift of a cell and every heading that the search tries.
+    rows = search._spread_out(points)[:128]
+    step = 0.25 / float(rows.norm(dim=1).quantile(0.8))
+    center, scores = expected.poses[-1], []
+    for turn in range(-math.ceil(0.7 / step), math.ceil(0.7 / step) + 1):
+        turned = Pose.from_yaw(turn * step, torch.zeros(2)).rotation @ center.rotation
+        placed = ((rows @ turned.T + center.translation) / 0.25).floor() - search._low
+        for x in range(-5, 6):
+            for y in range(-5, 6):
+                at = (placed + torch.tensor([x, y])).long()
+                sums = float(search._levels[0][at[:, 0], at[:, 1], 0].double().sum())
+                there = Pose(turned, center.translation + 0.25 * torch.tensor([x, y]).double())
+                score = sums * len(points) / len(rows) / CORRELATED
+                scores.append(score - float(expected.unlikely(there[None])))
+    assert float(found.scores[0]) == pytest.approx(max(scores), abs=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_scan_is_found_anywhere_in_a_room(seed):
+    draw = torch.Generator().manual_seed(seed)
+    surfaces = room(2000, 0)
+    origin = torch.tensor([3.5, 1.5]).double()
+    free = torch.stack([origin.expand_as(surfaces), origin + 0.9 * (surfaces - origin)], 1)
+    search = PoseSearch(surfaces, free)
+    pose = Pose.from_yaw(6 * torch.rand((), generator=draw), 1 + 2 * torch.rand(2, generator=draw).double())
+    expected = Expectation(Pose.from_yaw([0.0], [3.0, 2.0]), 3.0, 3.0, 0.9, 4.0)
+    found = search.best(pose.inverse().apply(room(180, seed + 1)), expected, 5)
+    off = found.poses[0].inverse() @ pose
+    assert float(off.translation.norm()) < 0.3
+    assert float(off.angle()) < math.radians(4)
+
+
+def test_cells_that_beams_cross_are_free_and_others_are_unknown():
+    points = torch.tensor([[2.0, 0.0], [2.0, 3.0]]).double()
+    search = PoseSearch(points, torch.tensor([[[0.0, 0.0], [1.5, 0.0]]]).double(), cell=0.1)
+    asked = torch.tensor([[1.0, 0.0], [1.0, 2.0], [2.0, 3.0]]).double()
+    cells = ((asked / 0.1).floor() - search._low).long()
+    value = search._levels[0][cells[:, 0], cells[:, 1], 0].tolist()
+    assert value[:2] == [FREE, UNKNOWN]
+    assert value[2] > UNKNOWN
+
+
+@pytest.mark.parametrize("shape", [(7, 9, 1), (5, 6, 4)])
+def test_fused_sums_over_a_raster_equal_the_twin(shape):
+    draw = torch.Generator().manual_seed(0)
+    cells = torch.randint(-3, 8, (3, 20, 3), generator=draw)
+    heading, shift = torch.randint(3, (50,), generator=draw), torch.randint(-4, 5, (50, 3), generator=draw)
+    raster = torch.randn(shape, generator=draw)
+    sums = []
+    for choice in ("torch", "fused"):
+        with kernels(choice):
+            sums.append(raster_sums(cells, heading, shift, raster, 0.5))
+    torch.testing.assert_close(*sums)
+
+
+def test_the_prior_falls_slowly_and_ends_at_the_largest_motion():
+    expected = Expectation(Pose.from_yaw([0.0], [0.0, 0.0]), 0.5, 0.3, 0.9, 4.0, 1.0)
+    places = Pose.from_yaw(torch.tensor([0.0, 0.0, 0.0, 0.0, 0.9, 1.1]), torch.zeros(6, 2).double())
+    places.translation[:, 0] = torch.tensor([0.0, 0.5, 3.9, 4.1, 0.0, 0.0])
+    nats = expected.unlikely(places).tolist()
+    assert nats[0] == 0
+    assert nats[1] == pytest.approx(0.5, abs=0.1)  # as of a Gaussian
+    assert nats[2] < 7  # which would be 30
+    assert nats[3] > 1000
+    assert nats[4] < 7
+    assert nats[5] > 1000
