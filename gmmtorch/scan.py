@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike as ArrayLike
-from gmmtorch.arrays import as_tensor, naming_device
+from gmmtorch.arrays import as_tensor, is_floating, naming_device
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.pose import Pose
 
@@ -83,6 +84,61 @@ def extent(rows: Tensor) -> str:
     return ", " + ", ".join(f"{axis} {a:.4g} to {b:.4g}" for axis, a, b in sides) + " m"
 
 
+COLOUR = "colour"
+"""Name of the channel with linear RGB from 0 to 1."""
+LARGEST_LABEL = 65535
+_MOST_COLUMNS = 8
+
+
+def linear_colours(values: Tensor) -> Tensor:
+    """Linear RGB of sRGB values, both from 0 to 1 (IEC 61966-2-1)."""
+    return torch.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055).clamp_min(0) ** 2.4)
+
+
+def display_colours(values: Tensor) -> Tensor:
+    """sRGB of linear RGB values, both from 0 to 1: the inverse of `linear_colours`."""
+    return torch.where(
+        values <= 0.0031308, values * 12.92, 1.055 * values.clamp_min(0.0031308) ** (1 / 2.4) - 0.055
+    )
+
+
+def _as_channel(name: str, given: ArrayLike, points: Tensor) -> Tensor:
+    """A channel of points (N, D), on their device: floating numbers (N, A), or labels (N,) int64."""
+    n, where = points.shape[0], f"attributes[{name!r}]"
+    value = as_tensor(given, where, device=points.device)
+    is_colour = name == COLOUR
+    if value.shape[:1] != (n,) or value.ndim > 2 or (is_colour and value.shape[1:] != (3,)):
+        raise InvalidArgumentError(
+            f"{where} has shape {tuple(value.shape)}; expected {(n, 3) if is_colour else (n,)}, one row for "
+            "each point."
+        )
+    if is_colour and str(getattr(given, "dtype", "")).endswith("uint8"):
+        return linear_colours(value.float() / 255)
+    if not is_floating(given):
+        if is_colour:
+            raise InvalidArgumentError(
+                f"{where} are whole numbers; give linear RGB from 0 to 1, or sRGB from 0 to 255 as uint8."
+            )
+        value = value.long()
+        if value.ndim != 1 or bool(((value < -1) | (value > LARGEST_LABEL)).any()):
+            raise InvalidArgumentError(
+                f"{where} are whole numbers, so they are labels: expected (N,) from 0 to {LARGEST_LABEL}, or "
+                "−1 where unknown. Give measured values in a floating type."
+            )
+        return value
+    value = value[:, None] if value.ndim == 1 else value
+    if not 1 <= value.shape[1] <= _MOST_COLUMNS or bool(value.isinf().any()):
+        raise InvalidArgumentError(
+            f"{where} has {value.shape[1]} columns, or infinite values; give 1 to {_MOST_COLUMNS} columns of "
+            "finite numbers, and NaN where unknown."
+        )
+    if is_colour and bool(((value < 0) | (value > 1)).any()):
+        raise InvalidArgumentError(
+            f"{where} has values outside 0 to 1; give linear RGB, or sRGB from 0 to 255 as uint8."
+        )
+    return value
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Scan:
     """Measured surface points and the sensor position that measured them. World frame, metres.
@@ -93,6 +149,9 @@ class Scan:
         no_return: (M, D) one row for each beam without return: the point up to which the beam is
             assumed to cross free space. It is never a surface point.
         time: of the measurement in seconds, on any clock that all scans share; None: not known.
+        attributes: channels beside the points, by name. Numbers in a floating type (N,) or (N, A), NaN where
+            unknown, such as "intensity"; or labels (N,), whole numbers, −1 where unknown, such as "class".
+            "colour" (N, 3) is linear RGB from 0 to 1; uint8 is taken as sRGB.
 
     Accepts arrays, lists and tensors. Raises `InvalidArgumentError` for inconsistent shapes, for NaN and
     infinite coordinates, and for coordinates beyond 2²⁷ m. Warns if float32 coordinates are too far from
@@ -103,6 +162,7 @@ class Scan:
     origin: Tensor
     no_return: Tensor = None  # type: ignore[assignment]  # None becomes an empty (0, D) tensor
     time: float | None = None
+    attributes: Mapping[str, Tensor] = None  # type: ignore[assignment]  # None becomes no channel
 
     def __post_init__(self) -> None:
         origin = as_tensor(self.origin, "origin")
@@ -116,12 +176,16 @@ class Scan:
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "origin", origin.to(points.device))
         object.__setattr__(self, "no_return", no_return.to(points.device, points.dtype))
+        channels = {name: _as_channel(name, x, points) for name, x in (self.attributes or {}).items()}
+        object.__setattr__(self, "attributes", channels)
 
     def __repr__(self) -> str:
         origin = ", ".join(f"{x:.6g}" for x in self.origin.tolist())
+        channels = f" with {', '.join(self.attributes)}" if self.attributes else ""
         return (
-            f"Scan({self.points.shape[0]} points and {self.no_return.shape[0]} no-return beams in {self.dim}D"
-            f" from ({origin}) m{extent(self.points)}, {self.points.dtype}, {self.points.device})"
+            f"Scan({self.points.shape[0]} points{channels} and {self.no_return.shape[0]} no-return beams "
+            f"in {self.dim}D from ({origin}) m{extent(self.points)}, {self.points.dtype}, "
+            f"{self.points.device})"
         )
 
     @property
@@ -143,14 +207,16 @@ class Scan:
     def select(self, keep: Tensor) -> Scan:
         """The scan with only the beams that `keep` (N + M,) marks, in the order of `ends`."""
         n = self.points.shape[0]
-        return replace(self, points=self.points[keep[:n]], no_return=self.no_return[keep[n:]])
+        channels = {name: value[keep[:n]] for name, value in self.attributes.items()}
+        return replace(
+            self, points=self.points[keep[:n]], no_return=self.no_return[keep[n:]], attributes=channels
+        )
 
     def transformed(self, transform: ArrayLike) -> Scan:
         """The scan moved by a rigid motion (D+1, D+1): x → R x + t."""
         pose = Pose.checked(transform, self.dim, device=self.points.device)
-        return Scan(
-            pose.apply(self.points), pose.apply(self.origin[None])[0], pose.apply(self.no_return), self.time
-        )
+        points, no_return = pose.apply(self.points), pose.apply(self.no_return)
+        return Scan(points, pose.apply(self.origin[None])[0], no_return, self.time, self.attributes)
 
     def copied(self, device: torch.device | str | None = None) -> Scan:
         """A deep copy, on `device` if given. A reader that reuses its arrays for the next scan needs it."""
@@ -158,18 +224,24 @@ class Scan:
         def copy(x: Tensor) -> Tensor:
             return x.detach().to(device or x.device, copy=True)
 
-        return self._with(copy(self.points), copy(self.origin), copy(self.no_return))
+        channels = {name: copy(value) for name, value in self.attributes.items()}
+        return self._with(copy(self.points), copy(self.origin), copy(self.no_return), channels)
 
     def to(self, device: torch.device | str | None) -> Scan:
         """The scan on another device. None: where it is."""
         with naming_device(device):
-            return self._with(*(x.to(device) for x in (self.points, self.origin, self.no_return)))
+            channels = {name: value.to(device) for name, value in self.attributes.items()}
+            parts = self.points.to(device), self.origin.to(device), self.no_return.to(device)
+            return self._with(*parts, channels)
 
-    def _with(self, points: Tensor, origin: Tensor, no_return: Tensor) -> Scan:
+    def _with(
+        self, points: Tensor, origin: Tensor, no_return: Tensor, attributes: Mapping[str, Tensor]
+    ) -> Scan:
         """The scan with the same numbers in other tensors, which are not checked again."""
         made = object.__new__(Scan)
         for name, value in vars(self).items():
             object.__setattr__(made, name, value)
         for name, value in (("points", points), ("origin", origin), ("no_return", no_return)):
             object.__setattr__(made, name, value)
+        object.__setattr__(made, "attributes", attributes)
         return made

@@ -27,7 +27,7 @@ from omegaconf import DictConfig
 
 from gmmtorch.cli import common, options_help, schema
 from gmmtorch.cli.sweep_table import ERROR_FILE
-from gmmtorch.errors import GmmTorchError
+from gmmtorch.errors import GmmTorchError, OutputError
 from gmmtorch.processes import end_with_parent
 
 _FULL_ERROR = "HYDRA_FULL_ERROR"
@@ -210,12 +210,21 @@ def _result_of(run: Callable[[DictConfig], Any], config: DictConfig) -> Any:
         raise
 
 
+def _saved() -> str:
+    """A sentence on the files of a run that a full disk or the like has ended; each is complete."""
+    files = sorted(file for file in common.run_dir().glob("*.*") if file.suffix != ".log" and file.is_file())
+    names = [file.name for file in files if not file.name.startswith(".")]
+    return f" Saved in {common.run_dir()}: {', '.join(names)}." if names else ""
+
+
 def _guarded(run: Callable[[DictConfig], Any], config: DictConfig) -> Any:
     """The result of a command; an error ends the command, or only its job of a sweep."""
     end_with_parent()  # a job of a sweep in its own process ends if the sweep's process ends
     if not common.is_job_of_sweep():
         try:
             return _result_of(run, config)
+        except OutputError as error:
+            sys.exit(f"gmmtorch: error: {error.told(schema.option_names(config))}{_saved()}")
         except GmmTorchError as error:
             sys.exit(f"gmmtorch: error: {error.told(schema.option_names(config))}")
     note = common.run_dir() / ERROR_FILE

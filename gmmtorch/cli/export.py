@@ -15,7 +15,7 @@ from gmmtorch.optional_packages import load_pyoctomap
 from gmmtorch.report import ProgressBars
 
 _OF_SPACE = ("map_server", "octomap", "ply", "pcd", "mesh", "distance_field")
-_OF_COMPONENTS = ("csv", "npz", "mixture")
+_OF_COMPONENTS = ("csv", "npz", "mixture", "splats")
 _OF_POSES = "kitti"
 _OF_ENDINGS = {
     **dict.fromkeys((".yaml", ".pgm"), "map_server"),
@@ -26,6 +26,7 @@ _OF_ENDINGS = {
     ".csv": "csv",
     ".npz": "npz",
     ".safetensors": "mixture",
+    ".spz": "splats",
 }
 """Formats by the endings of the output, if none is given."""
 
@@ -42,8 +43,8 @@ class ExportOptions:
     output: str | None = option(None, "file to write; for octomap its ending selects the format, .bt or .ot")
     format: str | None = option(
         None,
-        "map_server, octomap, ply, pcd, mesh, distance_field, csv, npz, mixture, kitti; null: by the ending "
-        "of the output",
+        "map_server, octomap, ply, pcd, mesh, distance_field, csv, npz, mixture, splats (.spz, .ply, .glb), "
+        "kitti; null: by the ending of the output",
     )
     method: str | None = option(None, "form of evidence: point, flux, cone, monte_carlo; null: the map's own")
     resolution: float | None = option(None, "side (m) of the cells; null: the map's own")

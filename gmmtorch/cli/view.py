@@ -28,6 +28,8 @@ _FLAGS_WITH_A_VALUE |= {"--config-name", "-cn", "--config-dir", "-cd"}
 
 BOUNDS = "of a map in tiles: the box [x0,y0,z0,x1,y1,z1] (m), in 2D without z, that is opened; null: all"
 
+ORIGINS = "list of addresses at which browsers find the page behind a proxy, such as https://map.example.org"
+
 
 @dataclass
 class ViewOptions:
@@ -36,6 +38,7 @@ class ViewOptions:
     view: bool = option(False, "show the work in the browser while it runs, and until Ctrl-C")
     view_host: str = option("127.0.0.1", "address of the view; 0.0.0.0: other machines can open it, too")
     view_port: int = option(8080, "port of the view; the next free one if it is in use")
+    view_origins: list[str] = option([], ORIGINS)
 
 
 @dataclass
@@ -49,9 +52,14 @@ class PageOptions:
     bounds: list[float] | None = option(None, BOUNDS)
     html: str | None = option(None, "file to write, .html, instead of serving a page")
     shape: str = option("ellipsoids", "ellipsoids (2σ), splats, surfaces (the mesh, in 3D) or none")
-    colour: str = option("height", "height, support, or age: the order in which components were learned")
+    colour: str = option(
+        "height",
+        "height, support, age (the order in which components were learned), uncertainty (deviation across "
+        "the surface), or a channel of the map, such as colour",
+    )
     host: str = option("127.0.0.1", "address of the page; 0.0.0.0: other machines can open it, too")
     port: int = option(8080, "port of the page; the next free one if it is in use")
+    origins: list[str] = option([], ORIGINS)
     runtime: common.Memory = group(common.Memory)
 
 
@@ -107,7 +115,8 @@ def run(config: DictConfig) -> None:
         written = write_page(config.html, shown, trajectories, **look)
         print(f"{written}  {written.stat().st_size:,} bytes: open it in a browser")
         return
-    serve(MapViewer(shown, trajectories, **look, host=config.host, port=config.port))
+    place = {"host": config.host, "port": config.port, "origins": config.origins}
+    serve(MapViewer(shown, trajectories, **look, **place))
 
 
 def open_live_view(config: DictConfig) -> LiveView | None:
@@ -117,8 +126,8 @@ def open_live_view(config: DictConfig) -> LiveView | None:
     from gmmtorch.live import LiveView
 
     logging.getLogger("websockets").setLevel(logging.WARNING)  # it reports every connection
-    with schema.naming({"host": "view_host", "port": "view_port"}):
-        view = LiveView(config.view_host, config.view_port)
+    with schema.naming({name: f"view_{name}" for name in ("host", "port", "origins")}):
+        view = LiveView(config.view_host, config.view_port, config.view_origins)
     atexit.register(view.stop)  # a thread that computes while Python ends would abort the process
     print(f"The map is at {view.url}", flush=True)
     return view

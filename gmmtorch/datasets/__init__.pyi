@@ -5,6 +5,9 @@ from .base import shard_indices as shard_indices
 from .base import start_frame as start_frame
 from .dataset_options import OPTIONS as OPTIONS
 from .dataset_options import point_path as point_path
+from .point_files.channels import read_channels as read_channels
+from .point_files.mesh_files import ply_fields as ply_fields
+from .point_files.mesh_files import ply_rows as ply_rows
 from .point_files.mesh_files import read_triangles as read_triangles
 from .point_files.point_chunks import PointChunks as PointChunks
 from .point_files.point_chunks import Survey as Survey

@@ -8,7 +8,7 @@ import math
 import re
 import zlib
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import overload
@@ -57,12 +57,19 @@ class Ranges:
                 "or a distance in metres."
             )
 
-    def scan(self, ends: ArrayLike, origin: ArrayLike, no_return: ArrayLike | None = None) -> Scan:
+    def scan(
+        self,
+        ends: ArrayLike,
+        origin: ArrayLike,
+        no_return: ArrayLike | None = None,
+        attributes: Mapping[str, Tensor] | None = None,
+    ) -> Scan:
         """A scan from beam ends (N, D) and the sensor origin (D,), world frame, metres.
 
         Ends at or beyond `max_range`, and those marked in `no_return` (N,), become beams without return.
         Their free part is `no_return_range` metres long, or as long as the beam if that is shorter. Ends
-        that are not finite or equal the sensor origin are invalid and dropped.
+        that are not finite or equal the sensor origin are invalid and dropped. `attributes`: channels of the
+        ends, see `Scan`.
         """
         ends = as_tensor(ends, "ends")
         origin = as_tensor(origin, "origin", device=ends.device)
@@ -75,16 +82,18 @@ class Ranges:
         if self.max_range is not None:
             empty |= is_beyond(distance, self.max_range)
         hit, empty = valid & ~empty, valid & empty
+        channels = {name: value[hit] for name, value in (attributes or {}).items()}
         if self.no_return_range == 0:
-            return Scan(ends[hit], origin)
+            return Scan(ends[hit], origin, attributes=channels)
         free_length = distance[empty].clamp_max(self.no_return_range)
         if self.max_range is not None:
             free_length = free_length.clamp_max(self.max_range)
-        return Scan(ends[hit], origin, origin + offset[empty] * (free_length / distance[empty])[:, None])
+        free = origin + offset[empty] * (free_length / distance[empty])[:, None]
+        return Scan(ends[hit], origin, free, attributes=channels)
 
-    def posed(self, points: Tensor, pose: Tensor) -> Scan:
+    def posed(self, points: Tensor, pose: Tensor, attributes: Mapping[str, Tensor] | None = None) -> Scan:
         """A scan from points (N, 3) in the sensor frame and the pose (4, 4), world ← sensor; see `scan`."""
-        return self.scan(Pose.from_matrix(pose).apply(points), pose[:3, 3])
+        return self.scan(Pose.from_matrix(pose).apply(points), pose[:3, 3], None, attributes)
 
 
 class Dataset(Sequence[Scan]):
@@ -164,6 +173,11 @@ class Dataset(Sequence[Scan]):
         final after the last scan.
         """
         return {reason: len(scans) for reason, scans in self._skipped.items()}
+
+    def _without(self, channels: Iterable[str], index: int) -> None:
+        """Counts a scan that lacks some of the channels that it should have."""
+        for name in channels:
+            self._skip(f"read without {name}, which they lack", index)
 
     def can_continue(self, n_read: int) -> bool:
         """Whether reading can go on after `n_read` scans that were read in an earlier run."""

@@ -51,6 +51,15 @@ class FileOptions(DatasetOptions):
 
 
 @dataclass(kw_only=True)
+class ChannelOptions(FileOptions):
+    """A data set whose points can have channels."""
+
+    attributes: list[str] = option(
+        [], "channels that the map learns beside the points, such as [colour,intensity,class]"
+    )
+
+
+@dataclass(kw_only=True)
 class CarmenOptions(FileOptions):
     """A CARMEN log."""
 
@@ -59,7 +68,7 @@ class CarmenOptions(FileOptions):
 
 
 @dataclass(kw_only=True)
-class DepthFramesOptions(FileOptions):
+class DepthFramesOptions(ChannelOptions):
     """Depth images."""
 
     pixel_stride: int = option(1, "every n-th pixel of every n-th row of depth images")
@@ -75,7 +84,7 @@ class DepthFramesOptions(FileOptions):
 
 
 @dataclass(kw_only=True)
-class TumOptions(FileOptions):
+class TumOptions(ChannelOptions):
     """A sequence of the TUM RGB-D benchmark."""
 
     pixel_stride: int = repeated(DepthFramesOptions, "pixel_stride", 1)
@@ -89,7 +98,7 @@ class TumOptions(FileOptions):
 
 
 @dataclass(kw_only=True)
-class KittiOptions(FileOptions):
+class KittiOptions(ChannelOptions):
     """A sequence of the KITTI benchmark."""
 
     max_gap: float = repeated(TumOptions, "max_gap", 2.0)
@@ -116,6 +125,7 @@ class RosbagOptions(TumOptions):
         None, "topic of the camera parameters of depth images; null: the nearest by name"
     )
     imu_topic: str | None = option(None, "topic of the IMU of motion=imu; null: the only one")
+    damaged: str = option("read", "read: the intact part of a damaged bag; refuse: a damaged bag is an error")
 
 
 @dataclass(kw_only=True)
@@ -155,8 +165,8 @@ class MeshScansOptions(FileOptions):
 
 OPTIONS: dict[str, type[DatasetOptions]] = {
     "carmen": CarmenOptions,
-    "scan_folder": FileOptions,
-    "pcd_viewpoint": FileOptions,
+    "scan_folder": ChannelOptions,
+    "pcd_viewpoint": ChannelOptions,
     "depth_frames": DepthFramesOptions,
     "octomap_log": FileOptions,
     "rosbag": RosbagOptions,

@@ -2,15 +2,17 @@
 
 `frame-*.depth.png`: 16 bit, millimetres along the optical axis, or another unit, see `depth_scale`.
 `frame-*.pose.txt`: 4×4 matrix camera-to-world, metres. `camera-intrinsics.txt`: 3×3 pinhole matrix in
-pixels.
+pixels. Colours, if wanted: `frame-*.color.jpg` or `.png`, and if the images are not registered to
+the depth images, `color-intrinsics.txt`, 3×3, and `color-pose.txt`, 4×4, colour camera ← depth camera.
 
 `depth.txt`: rows `time file`. `groundtruth.txt`: rows `time x y z qx qy qz qw`. Depth images are PNG with 16
-bits, in 1/5000 m; 0 is invalid.
+bits, in 1/5000 m; 0 is invalid. `rgb.txt`: rows `time file` of images that are registered to the depth.
 """
 
 from __future__ import annotations
 
 import io
+from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 from typing import IO
 
@@ -19,6 +21,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset, Ranges, check_poses, natural_key, require_path
+from gmmtorch.datasets.colour_images import ColourCamera, check_colour
 from gmmtorch.datasets.trajectory import (
     NANOSECONDS,
     order_of_rows,
@@ -28,7 +31,7 @@ from gmmtorch.datasets.trajectory import (
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_number, check_whole
 from gmmtorch.pinhole import back_project, check_intrinsics, is_centered, pinhole_matrix
 from gmmtorch.pose import Pose
-from gmmtorch.scan import Scan
+from gmmtorch.scan import COLOUR, Scan
 
 _INVALID = (0, 65535)
 MAX_PIXELS = 1 << 23
@@ -45,7 +48,27 @@ _UPRIGHT = {
 """The rotation that turns an axis into z."""
 
 
-class DepthFrames(Dataset):
+_COLOUR_INTRINSICS, _COLOUR_POSE = "color-intrinsics.txt", "color-pose.txt"
+
+
+class _DepthDataset(Dataset):
+    """Depth images, whose points have colours if `attributes` names them."""
+
+    attributes: tuple[str, ...]
+
+    def _colours(
+        self, points: Tensor, path: Path | None, camera: ColourCamera, depth: Tensor, index: int
+    ) -> dict[str, Tensor]:
+        """The channels of the points of a depth image, from the colour image in a file, if there is one."""
+        if not self.attributes:
+            return {}
+        if path is None:
+            self._without(self.attributes, index)
+            return {}
+        return {COLOUR: camera.colours(points, path, (depth.shape[0], depth.shape[1]))}
+
+
+class DepthFrames(_DepthDataset):
     """Depth images as scans, in the natural order of their names (frame-2 before frame-10).
 
     Pixels at a distance of `max_range` metres or beyond have no return. Depths 0 and 65535 are invalid
@@ -53,7 +76,7 @@ class DepthFrames(Dataset):
     metres per unit of the images. `intrinsics` is the pinhole matrix (3, 3) in pixels. `image` returns the
     full depth image of a scan. An image whose middle is far from the principal point is refused: it has
     another size than the intrinsics. `up` is the axis of the world frame of the pose files that points up;
-    the frame is turned so that it becomes z.
+    the frame is turned so that it becomes z. `attributes` can be ["colour"].
     """
 
     def __init__(
@@ -64,7 +87,9 @@ class DepthFrames(Dataset):
         pixel_stride: int = 1,
         depth_scale: float = 0.001,
         up: str = "z",
+        attributes: Iterable[str] = (),
     ) -> None:
+        self.attributes = check_colour(tuple(attributes))
         path = require_path(
             path,
             "folder",
@@ -88,6 +113,11 @@ class DepthFrames(Dataset):
         file = path / "camera-intrinsics.txt"
         try:
             self.intrinsics = check_intrinsics(_matrix(file, 3))
+            self._camera = ColourCamera(self.intrinsics)
+            if self.attributes and (path / _COLOUR_INTRINSICS).exists():
+                file = path / _COLOUR_INTRINSICS
+                pose = check_poses(_matrix(path / _COLOUR_POSE, 4), str(path / _COLOUR_POSE))
+                self._camera = ColourCamera(check_intrinsics(_matrix(file, 3)), pose)
         except InvalidArgumentError as error:
             raise DataError(f"{file}: {error}") from error
 
@@ -95,8 +125,12 @@ class DepthFrames(Dataset):
         return len(self._files)
 
     def _read(self, index: int) -> Scan:
-        points = back_project(self._depth(index), self.intrinsics, self.pixel_stride)
-        return self.ranges.posed(points, self._known_pose(index))
+        depth = self._depth(index)
+        points = back_project(depth, self.intrinsics, self.pixel_stride)
+        stem = self._files[index].name.removesuffix(".depth.png")
+        files = [self._files[index].with_name(f"{stem}.color.{ending}") for ending in ("jpg", "png")]
+        channels = self._colours(points, next(filter(Path.is_file, files), None), self._camera, depth, index)
+        return self.ranges.posed(points, self._known_pose(index), channels)
 
     def image(self, index: int) -> tuple[Tensor, Tensor]:
         """Depth (H, W) in metres, 0 for invalid pixels, and pose (4, 4), world ← camera, of a scan.
@@ -178,7 +212,7 @@ _INTRINSICS = (525.0, 525.0, 319.5, 239.5)
 """The values that the benchmark recommends: its depth images are registered with these."""
 
 
-class TumRgbd(Dataset):
+class TumRgbd(_DepthDataset):
     """Depth images as scans, in the order of their times, with poses interpolated at their times.
 
     Images without a pose are left out and counted. `intrinsics` is the pinhole matrix (3, 3) in pixels;
@@ -192,6 +226,7 @@ class TumRgbd(Dataset):
         depth_scale: metres per unit of the images.
         max_gap: longest time (s) between two poses that are interpolated.
         pixel_stride: every n-th pixel of every n-th row is used.
+        attributes: can be ["colour"]: of the image in rgb.txt that is nearest in time, within 20 ms.
     """
 
     _poses: Tensor
@@ -206,7 +241,9 @@ class TumRgbd(Dataset):
         depth_scale: float = 0.0002,
         max_gap: float = 0.5,
         pixel_stride: int = 1,
+        attributes: Iterable[str] = (),
     ) -> None:
+        self.attributes = check_colour(tuple(attributes))
         path = require_path(
             path,
             "folder",
@@ -235,13 +272,17 @@ class TumRgbd(Dataset):
         self._files = [files[index] for index in np.flatnonzero(found.known)]
         self._poses = found.poses[found.known].matrix
         self._times = torch.from_numpy(times[found.known] / NANOSECONDS)
+        self._images = _nearest(path / "rgb.txt", times[found.known]) if self.attributes else []
 
     def _count(self) -> int:
         return len(self._files)
 
     def _read(self, index: int) -> Scan:
-        points = back_project(self._depth(index), self.intrinsics, self.pixel_stride)
-        return self.ranges.posed(points, self._poses[index])
+        depth = self._depth(index)
+        points = back_project(depth, self.intrinsics, self.pixel_stride)
+        image = self._images[index] if self._images else None
+        channels = self._colours(points, image, ColourCamera(self.intrinsics), depth, index)
+        return self.ranges.posed(points, self._poses[index], channels)
 
     def image(self, index: int) -> tuple[Tensor, Tensor]:
         """Depth (H, W) in metres, 0 for invalid pixels, and pose (4, 4), world ← camera, of a scan."""
@@ -251,6 +292,19 @@ class TumRgbd(Dataset):
     def _depth(self, index: int) -> Tensor:
         path = self._files[index]
         return torch.from_numpy(read_png(path, str(path)) * self._scale)
+
+
+_MOST_APART = 20_000_000  # ns between a depth image and its colour image
+
+
+def _nearest(path: Path, times: np.ndarray) -> list[Path | None]:
+    """The listed image that is nearest to each time (ns); None if none is near."""
+    stamps, files = _listed(path)
+    after = np.searchsorted(stamps, times).clip(1, max(1, len(stamps) - 1))
+    choices = np.stack([after - 1, after.clip(max=len(stamps) - 1)])
+    gaps = np.abs(stamps[choices] - times)
+    best = np.where(gaps[0] <= gaps[1], choices[0], choices[1])
+    return [files[i] if gap <= _MOST_APART else None for i, gap in zip(best, gaps.min(0), strict=True)]
 
 
 def _listed(path: Path) -> tuple[np.ndarray, list[Path]]:

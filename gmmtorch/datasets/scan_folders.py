@@ -4,12 +4,14 @@
 12 numbers, the upper 3×4 part of world ← sensor, row by row; metres. `PcdViewpoint` has PCD files with points
 in the world frame and the sensor origin in VIEWPOINT.
 
-`Kitti` has `velodyne/*.bin`, float32 x, y, z, reflectance; `poses.txt` with a row of the left camera for each
-scan; `calib.txt` with the row `Tr`, camera ← Velodyne; and, optional, `times.txt` in seconds.
+`Kitti` has `velodyne/*.bin`, float32 x, y, z, reflectance; optional `labels/*.label` of SemanticKITTI;
+`poses.txt` with a row of the left camera for each scan;
+`calib.txt` with the row `Tr`, camera ← Velodyne; and, optional, `times.txt` in seconds.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +19,11 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset, Ranges, check_poses, natural_key, number_rows, require_path
+from gmmtorch.datasets.point_files.channels import CLASS, INTENSITY, check_channels, read_channels
 from gmmtorch.datasets.point_files.pcd_files import pcd_header
 from gmmtorch.datasets.point_files.point_chunks import read_cloud
 from gmmtorch.datasets.trajectory import Trajectory, kitti_poses, read_rows, read_trajectory, to_nanoseconds
-from gmmtorch.errors import DataError
+from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 
@@ -30,12 +33,21 @@ class ScanFolder(Dataset):
 
     Points at or beyond `max_range` have no return. NaN, infinite points and points at the sensor origin are
     invalid and dropped; scans with infinite points, or NaN in a PLY file, are counted. With `standing`,
-    poses.txt is not read, and every scan is in the frame of the sensor.
+    poses.txt is not read, and every scan is in the frame of the sensor. `attributes`: names of the channels
+    that are read, see `read_channels`.
     """
 
     _poses: torch.Tensor
 
-    def __init__(self, path: str | Path, ranges: Ranges, stride: int = 1, standing: bool = False) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        ranges: Ranges,
+        stride: int = 1,
+        standing: bool = False,
+        attributes: Iterable[str] = (),
+    ) -> None:
+        self.attributes = check_channels(attributes)
         path = require_path(
             path,
             "folder",
@@ -63,7 +75,9 @@ class ScanFolder(Dataset):
     def _read(self, index: int) -> Scan:
         points = read_cloud(self._files[index])
         self._count_invalid(points, index)
-        return self.ranges.posed(points, self._poses[index])
+        channels = read_channels(self._files[index], self.attributes) if self.attributes else {}
+        self._without(set(self.attributes) - channels.keys(), index)
+        return self.ranges.posed(points, self._poses[index], channels)
 
     def _count_invalid(self, points: torch.Tensor, index: int) -> None:
         """Counts a scan with points that are not finite. NaN in a PCD file is a beam without return."""
@@ -91,10 +105,14 @@ class PcdViewpoint(Dataset):
     """Scans in the natural order of their file names (scan_2 before scan_10).
 
     Points at or beyond `max_range` from the viewpoint have no return. NaN, infinite points and points at the
-    sensor origin are invalid and dropped. The orientation in VIEWPOINT is not used.
+    sensor origin are invalid and dropped. The orientation in VIEWPOINT is not used. `attributes`: names of
+    the channels that are read, see `read_channels`.
     """
 
-    def __init__(self, path: str | Path, ranges: Ranges, stride: int = 1) -> None:
+    def __init__(
+        self, path: str | Path, ranges: Ranges, stride: int = 1, attributes: Iterable[str] = ()
+    ) -> None:
+        self.attributes = check_channels(attributes)
         path = require_path(
             path,
             "folder",
@@ -115,7 +133,9 @@ class PcdViewpoint(Dataset):
 
     def _read(self, index: int) -> Scan:
         path = self._files[index]
-        return self.ranges.scan(read_cloud(path), _viewpoint(path))
+        channels = read_channels(path, self.attributes) if self.attributes else {}
+        self._without(set(self.attributes) - channels.keys(), index)
+        return self.ranges.scan(read_cloud(path), _viewpoint(path), None, channels)
 
 
 def _viewpoint(path: Path) -> torch.Tensor:
@@ -152,6 +172,8 @@ class Kitti(Dataset):
         poses: another trajectory: KITTI rows of the camera as in poses.txt, or TUM rows of the Velodyne,
             which need times.txt.
         max_gap: longest time (s) between two poses of a TUM trajectory that are interpolated.
+        attributes: channels that are read: "intensity", the reflectance; "class", the label of SemanticKITTI
+            (the lower 16 bits; 0, unlabeled, is unknown).
     """
 
     _poses: Tensor
@@ -163,7 +185,13 @@ class Kitti(Dataset):
         stride: int = 1,
         poses: str | None = None,
         max_gap: float = 2.0,
+        attributes: Iterable[str] = (),
     ) -> None:
+        self.attributes = check_channels(attributes)
+        if not set(self.attributes) <= {INTENSITY, CLASS}:
+            raise InvalidArgumentError(
+                f"attributes={list(self.attributes)}: scans of KITTI have {INTENSITY} and {CLASS}."
+            )
         path = require_path(
             path,
             "folder",
@@ -205,9 +233,31 @@ class Kitti(Dataset):
             raise DataError(
                 f"{path} is not a whole number of points of {_POINT_BYTES} bytes; it is truncated."
             )
-        points = np.fromfile(path, "<f4").reshape(-1, 4)[:, :3].astype(np.float64)
+        table = np.fromfile(path, "<f4").reshape(-1, 4)
+        points = table[:, :3].astype(np.float64)
         valid = np.isfinite(points).all(1) & (points != 0).any(1)
-        return self.ranges.posed(torch.from_numpy(points[valid]), self._poses[index])
+        channels = {}
+        if INTENSITY in self.attributes:
+            channels[INTENSITY] = torch.from_numpy(
+                np.where(np.isfinite(table[:, 3]), table[:, 3], np.nan)[valid]
+            )
+        if CLASS in self.attributes:
+            channels[CLASS] = torch.from_numpy(_kitti_labels(path, len(table))[valid])
+        return self.ranges.posed(torch.from_numpy(points[valid]), self._poses[index], channels)
+
+
+def _kitti_labels(scan: Path, n_points: int) -> np.ndarray:
+    """The labels (N,) of a scan of SemanticKITTI, −1 where unlabeled."""
+    path = scan.parent.parent / "labels" / f"{scan.stem}.label"
+    if not path.is_file():
+        raise DataError(f"{path} is missing; SemanticKITTI publishes the labels of each scan there.")
+    if path.stat().st_size != 4 * n_points:
+        raise DataError(
+            f"{path} has {path.stat().st_size:,} bytes, not 4 for each of {n_points:,} points; it is damaged,"
+            " or of another scan."
+        )
+    labels = np.fromfile(path, "<u4").astype(np.int64) & 0xFFFF
+    return np.where(labels == 0, -1, labels)
 
 
 def _find_poses(path: Path) -> Path:

@@ -23,6 +23,10 @@ from .point_cloud import CellCloud as CellCloud
 from .point_cloud import write_octomap as write_octomap
 from .point_cloud import write_pcd as write_pcd
 from .point_cloud import write_ply as write_ply
+from .splats import Splats as Splats
+from .splats import map_of_splats as map_of_splats
+from .splats import read_splats as read_splats
+from .splats import write_splats as write_splats
 from .trajectory_files import write_kitti as write_kitti
 from .trajectory_files import write_pose_table as write_pose_table
 from .trajectory_files import write_tum as write_tum

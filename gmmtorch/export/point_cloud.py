@@ -20,7 +20,9 @@ from gmmtorch.occupancy import (
     occupancy_probability,
 )
 from gmmtorch.optional_packages import load_pyoctomap
+from gmmtorch.scan import display_colours
 
+_RGB = ("red", "green", "blue")
 _MIN_STEPS = 16  # least number of float32 values per cell side; with fewer, centres would be too inexact
 
 
@@ -82,15 +84,27 @@ class CellCloud:
         return np.pad(array, ((0, 0), (0, 3 - array.shape[1])))
 
 
-def write_ply(path: str | Path, cells: CellCloud) -> Path:
-    """Writes the cells, atomically, as binary PLY: vertices x, y, z (double) and intensity = θ (float)."""
+def write_ply(path: str | Path, cells: CellCloud, colours: Tensor | None = None) -> Path:
+    """Writes the cells, atomically, as binary PLY: vertices x, y, z (double) and intensity = θ (float).
+
+    `colours`: linear RGB (M, 3) from 0 to 1, written as sRGB: red, green, blue (uchar).
+    """
     comment = f"centres of cells of {cells.resolution!r} m; intensity is the probability of occupancy"
-    return write_bytes(path, ply_bytes(_records(cells, "<f8"), comment))
+    rows = _records(cells, "<f8")
+    if colours is not None:
+        coloured = np.empty(len(rows), [*rows.dtype.descr, *((name, "u1") for name in _RGB)])
+        for name in rows.dtype.names or ():
+            coloured[name] = rows[name]
+        shades = (255 * display_colours(colours.detach().cpu().clamp(0, 1))).round().numpy()
+        for name, column in zip(_RGB, shades.T, strict=True):
+            coloured[name] = column
+        rows = coloured
+    return write_bytes(path, ply_bytes(rows, comment))
 
 
 def ply_bytes(vertices: np.ndarray, comment: str = "", faces: np.ndarray | None = None) -> bytes:
-    """Binary PLY of vertices, a structured array (V,) of float32 and float64, and of triangles (F, 3)."""
-    names = {"<f8": "double", "<f4": "float"}
+    """Binary PLY of vertices, a structured array (V,) of floating numbers and bytes, and triangles (F, 3)."""
+    names = {"<f8": "double", "<f4": "float", "|u1": "uchar"}
     header = ["ply", "format binary_little_endian 1.0"] + [f"comment {comment}"] * bool(comment)
     header += [f"element vertex {len(vertices)}"]
     header += [f"property {names[vertices.dtype[name].str]} {name}" for name in vertices.dtype.names or ()]

@@ -79,14 +79,14 @@ class LiveView:
     nothing.
 
     Args:
-        host, port: where the page is served; another port is taken if this one is in use.
+        host, port, origins: where the page is served, see `MapViewer`.
 
     Raises `GmmTorchError` if viser is not installed, and `InvalidArgumentError` for a host that is not of
     this machine.
     """
 
-    def __init__(self, host: str = "127.0.0.1", port: int = 8080) -> None:
-        self.viewer = MapViewer(GaussianMap(), host=host, port=port)
+    def __init__(self, host: str = "127.0.0.1", port: int = 8080, origins: Sequence[str] = ()) -> None:
+        self.viewer = MapViewer(GaussianMap(), host=host, port=port, origins=origins)
         self._robots: dict[int, RobotNodes] = {}
         self._plots: dict[str, Any] = {}
         self._changed = threading.Condition()

@@ -44,16 +44,16 @@ def write_page(
         trajectories: (S, 2) or (S, 3) sensor positions of each recording, world metres.
         shape: one of `viewer_scene.SHAPES`, shown first. The mesh of the surfaces, which is large, is in the
             file only with "surfaces".
-        colour: one of `viewer_scene.COLOURS`, shown first.
+        colour: one of `viewer_scene.colour_choices`, shown first.
 
     Raises `InvalidArgumentError` for another ending or choice, and for a map without surfaces.
     """
     check_choice("shape", shape, viewer_scene.SHAPES)
-    check_choice("colour", colour, viewer_scene.COLOURS)
     path = Path(path)
     if path.suffix not in (".html", ".htm"):
         raise InvalidArgumentError(f"html={path} must end in .html.")
     components = shown.components() if shown.dim else Components.empty(3)
+    check_choice("colour", colour, viewer_scene.colour_choices(components))
     solid = viewer_scene.surfaces(components)
     if len(solid.rows) == 0:
         raise InvalidArgumentError(f"html={path}: the map has no surface to show; insert scans with returns.")
@@ -98,9 +98,9 @@ def _ellipsoids(components: Components, solid: Solid, frame: Frame) -> dict[str,
     places[:, 2, :3] = balls.scales / viewer_scene.N_SIGMA
     vertices, faces = viewer_scene.sphere(len(solid.means))
     colours = {}
-    for by in viewer_scene.COLOURS:
+    for by in viewer_scene.colour_choices(components):
         found = viewer_scene.colours(components, solid, by)
-        colours[by] = {"rgb": _encoded(found.rgb, "u1"), "ends": found.ends}
+        colours[by] = {"rgb": _encoded(found.rgb, "u1"), "ends": found.ends, "legend": found.legend}
     return {
         "places": _encoded(places, "<f4"),
         "sphere": {"vertices": _encoded(vertices, "<f4"), "faces": _encoded(faces, "<u2")},

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import contextlib
 import io
+import ipaddress
 import math
 import socket
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_choice, check_whole
+from gmmtorch.errors import GmmTorchError, InvalidArgumentError, check_choice, check_whole
 from gmmtorch.export import surface_mesh
 from gmmtorch.live import viewer_scene
 from gmmtorch.live.map_page import write_page
@@ -39,8 +41,9 @@ class MapViewer:
     Args:
         shown: the map; an empty map is shown once `update` gives another one.
         trajectories: (S, D) sensor positions of each recording, world metres.
-        shape: one of `viewer_scene.SHAPES`. colour: one of `viewer_scene.COLOURS`.
+        shape: one of `viewer_scene.SHAPES`. colour: one of `viewer_scene.colour_choices`.
         host, port: where the page is served; another port is taken if this one is in use.
+        origins: of the page at a proxy, such as https://map.example.org; others are refused, see `admits`.
 
     The page has controls for the shape, the colour, the height above which components are hidden, the paths,
     and the height and resolution of the slice. A click shows occupancy, hits and misses at a place.
@@ -50,7 +53,7 @@ class MapViewer:
         shift: (3,) origin of the scene's frame in the world frame, metres.
 
     Raises `GmmTorchError` if viser is not installed, and `InvalidArgumentError` for a host that is not of
-    this machine.
+    this machine, or an origin that is none.
     """
 
     def __init__(
@@ -62,13 +65,17 @@ class MapViewer:
         colour: str = "height",
         host: str = "127.0.0.1",
         port: int = 8080,
+        origins: Sequence[str] = (),
     ) -> None:
         check_choice("shape", shape, viewer_scene.SHAPES)
-        check_choice("colour", colour, viewer_scene.COLOURS)
+        known = shown.components() if shown.dim else Components.empty(3)
+        check_choice("colour", colour, viewer_scene.colour_choices(known))
         with needs_extra("The browser viewer needs", "viser", "viewer"):
             import viser
         _check_address(host, port)
-        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a box with the address
+        _check_origins(origins)
+        # viser prints a box with the address
+        with contextlib.redirect_stdout(io.StringIO()), _refusing(host, origins):
             self.server: Any = viser.ViserServer(host, port, label="gmmtorch", verbose=False)
         self._lock = threading.RLock()
         self._nodes: dict[str, Any] = {}
@@ -112,6 +119,9 @@ class MapViewer:
             if shown.dim is None:
                 return
             self._map, self._components = shown, shown.components()
+            choices = viewer_scene.colour_choices(self._components)
+            if choices != self._colour.options:  # a channel of an earlier map may be gone
+                self._colour.options = choices
             self._paths, self._path_colours = viewer_scene.in_space(trajectories), colours
             self._show(viewer_scene.frame(self._components, self._paths))
             self._draw_components()
@@ -242,7 +252,7 @@ class MapViewer:
         components, occupancy, place = self._folders
         with components:
             self._shape = gui.add_dropdown("shape", viewer_scene.SHAPES, initial_value=shape)
-            self._colour = gui.add_dropdown("colour", viewer_scene.COLOURS, initial_value=colour)
+            self._colour = gui.add_dropdown("colour", (*viewer_scene.COLOURS, colour), initial_value=colour)
             self._cut = gui.add_slider("hide above [m]", 0.0, 1.0, 0.05, 1.0)
             self._with_paths = gui.add_checkbox("trajectory", True)
         with occupancy:
@@ -303,6 +313,92 @@ def _check_address(host: str, port: int) -> None:
         raise InvalidArgumentError(
             f"host={host} is not an address of this machine ({error}); use 127.0.0.1, or 0.0.0.0 for all."
         ) from error
+
+
+# -- who may see the page ----------------------------------------------------------------------------
+
+
+def admits(host: str, origin: str | None, served: str, origins: Sequence[str] = ()) -> bool:
+    """Whether a request may see the map: the headers Host and Origin are those of our own page.
+
+    Without this, every page that is open in the user's browser could read the map: it connects from its own
+    Origin, or lets the name of its own machine point to this one, which Host then shows.
+
+    Args:
+        host, origin: the headers. Only browsers send an Origin.
+        served: the address that the page is served at.
+        origins: further ones that are allowed, such as https://map.example.org.
+    """
+    allowed = {name.rstrip("/").lower() for name in origins}
+    place = host.lower()
+    names = {served.lower(), "localhost", (own := socket.gethostname().lower()), f"{own}.local"}
+    is_ours = _host_name(place) in names or _is_address(_host_name(place))
+    if not is_ours and place not in {urlsplit(name).netloc for name in allowed}:
+        return False
+    return origin is None or origin.lower() in {*allowed, f"http://{place}", f"https://{place}"}
+
+
+def _host_name(place: str) -> str:
+    """The name or address of name:port."""
+    try:
+        return urlsplit(f"//{place}").hostname or ""
+    except ValueError:
+        return ""
+
+
+def _is_address(name: str) -> bool:
+    """Whether a name is an IP address, which no other page can let point to this machine."""
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+def _check_origins(origins: Sequence[str]) -> None:
+    for origin in origins:
+        parts = urlsplit(origin.rstrip("/"))
+        if parts.scheme not in ("http", "https") or parts.geturl() != f"{parts.scheme}://{parts.netloc}":
+            raise InvalidArgumentError(
+                f"origins={list(origins)}: {origin} is not the origin of a page; give one such as "
+                "https://map.example.org or http://robot:8080."
+            )
+
+
+_serving = threading.Lock()
+
+
+@contextlib.contextmanager
+def _refusing(host: str, origins: Sequence[str]) -> Iterator[None]:
+    """A server that viser starts inside answers 403 to requests that `admits` does not admit.
+
+    viser has no place for such a check, so it gets another `serve` of websockets while it starts.
+    """
+    from websockets.asyncio import server
+
+    plain, n_started = server.serve, 0
+
+    def serve(*arguments: Any, process_request: Callable[..., Any], **options: Any) -> Any:
+        nonlocal n_started
+        n_started += 1
+
+        def checked(connection: Any, request: Any) -> Any:
+            hosts, pages = request.headers.get_all("Host"), request.headers.get_all("Origin")
+            is_clear = len(hosts) == 1 and len(pages) <= 1
+            if is_clear and admits(hosts[0], pages[0] if pages else None, host, origins):
+                return process_request(connection, request)
+            return connection.respond(403, "This page is refused: its address is not one of the map's.\n")
+
+        return plain(*arguments, process_request=checked, **options)
+
+    with _serving:
+        server.serve = serve  # type: ignore[assignment, misc]
+        try:
+            yield
+        finally:
+            server.serve = plain  # type: ignore[misc]
+    if not n_started:
+        raise GmmTorchError("This version of viser cannot be kept from showing the map to foreign pages.")
 
 
 def _assign(control: Any, **values: Any) -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gmmtorch.errors import check_choice
 from gmmtorch.export import TriangleMesh
-from gmmtorch.mapping import Components, GaussianMap
+from gmmtorch.mapping import Attributes, Components, GaussianMap, Labels
 from gmmtorch.occupancy import VoxelGrid
 from gmmtorch.pose import Pose
 from gmmtorch.report import (
@@ -29,12 +29,17 @@ from gmmtorch.report import (
     slice_image,
     unit_sphere,
 )
+from gmmtorch.scan import COLOUR, display_colours
 
 SHAPES = ("ellipsoids", "splats", "surfaces", "none")
 """How components are drawn: 2σ ellipsoids, Gaussian splats, or the triangle mesh of the surfaces."""
 
-COLOURS = ("height", "support", "age")
-"""What colours the components: z of the mean; log of the support; order in which they were learned."""
+COLOURS = ("height", "support", "age", "uncertainty")
+"""What colours the components of every map: z of the mean; log of the support; order in which they were
+learned; log of the deviation across the surface. Channels of the map, such as colour, come after these."""
+
+_UNKNOWN = 160  # grey of components without a value of a channel
+_HUES = 12  # colours of classes, which repeat after so many
 
 _SPHERES = ((1500, 162), (math.inf, 42))  # number of components, at most, and vertices of each ellipsoid
 _FLATNESS = 0.01  # m, thickness of a 2D component
@@ -96,25 +101,69 @@ def instances(solid: Solid) -> Instances:
 
 
 class Colours(NamedTuple):
-    """Colours of components, rgb (K, 3) uint8, and what the first and the last colour of the scale mean."""
+    """Colours of components, rgb (K, 3) uint8, and what the first and the last colour of the scale mean;
+    None: they are not of the scale. legend: names and CSS colours of classes."""
 
     rgb: np.ndarray
-    ends: tuple[str, str]
+    ends: tuple[str, str] | None = None
+    legend: Sequence[tuple[str, str]] = ()
+
+
+def colour_choices(components: Components) -> tuple[str, ...]:
+    """What can colour these components: `COLOURS`, and the channels of the map."""
+    return (*COLOURS, *(name for name in components.attributes.channels if name not in COLOURS))
 
 
 def colours(components: Components, solid: Solid, by: str) -> Colours:
-    """The colours of the components by one of `COLOURS`."""
-    check_choice("colour", by, COLOURS)
+    """The colours of the components by one of `colour_choices`."""
+    check_choice("colour", by, colour_choices(components))
     if by == "height":
         scale = height_scale(solid.means[:, 2])
         return Colours(height_shades(solid.means), (f"{scale.vmin:.2f} m", f"{scale.vmax:.2f} m"))
-    chosen = components.support if by == "support" else components.ids[:, 1]
-    value = chosen.cpu()[solid.rows].double()
-    low, high = (float(value.min()), float(value.max())) if len(value) else (0.0, 1.0)
-    ends = (f"{low:.3g} points", f"{high:.3g} points") if by == "support" else ("oldest", "newest")
-    if by == "support":
-        value, low, high = value.clamp_min(1e-9).log(), *np.log(np.maximum([low, high], 1e-9))
-    return Colours(_shades(((value - low) / max(high - low, 1e-9)).numpy()), ends)
+    if by == "age":
+        value = components.ids[:, 1].cpu()[solid.rows].double()
+        return Colours(_spread(value, *_range(value)), ("oldest", "newest"))
+    if by in COLOURS:
+        value = components.support.cpu()[solid.rows].double()
+        if by == "uncertainty":
+            value = 1e3 * torch.linalg.eigvalsh(solid.covariances)[:, 0].clamp_min(0).sqrt()
+        low, high = _range(value)
+        unit = "points" if by == "support" else "mm across"
+        ends = (f"{low:.3g} {unit}", f"{high:.3g} {unit}")
+        low, high = math.log(max(low, 1e-9)), math.log(max(high, 1e-9))
+        return Colours(_spread(value.clamp_min(1e-9).log(), low, high), ends)
+    return _channel_colours(by, components.attributes.selected(solid.rows.to(components.means.device)))
+
+
+def _channel_colours(name: str, attributes: Attributes) -> Colours:
+    """The colours of a channel; grey where it is unknown."""
+    channel, legend, ends = attributes.channels[name], [], None
+    if isinstance(channel, Labels):
+        hues = _shades((np.arange(_HUES) + 0.5) / _HUES)[np.arange(len(channel.labels)) * 5 % _HUES]
+        known, rgb = channel.share.sum(1) > 0, hues[channel.share.cpu().argmax(1).numpy()]
+        names = map(str, channel.labels.tolist())
+        legend = [(label, _css(hue)) for label, hue in zip(names, hues.tolist(), strict=True)]
+    elif name == COLOUR:
+        known, seen = channel.share > 0, display_colours(channel.mean.clamp(0, 1))
+        rgb = (255 * seen).round().cpu().numpy().astype(np.uint8)
+    else:
+        known, value = channel.share > 0, channel.mean[:, 0].cpu()
+        some = value[known.cpu()]
+        low, high = some.quantile(torch.tensor([0.02, 0.98]).double()).tolist() if len(some) else (0.0, 1.0)
+        rgb, ends = _spread(value, low, high), (f"{low:.3g}", f"{high:.3g}")
+    rgb = np.where(known.cpu().numpy()[:, None], rgb, _UNKNOWN).astype(np.uint8)
+    return Colours(rgb, ends, legend)
+
+
+def _range(value: Tensor) -> tuple[float, float]:
+    """The least and the largest of some values (K,); 0 and 1 if there are none."""
+    return (float(value.min()), float(value.max())) if len(value) else (0.0, 1.0)
+
+
+def _spread(value: Tensor, low: float, high: float) -> np.ndarray:
+    """Colours (K, 3) uint8 of values (K,) on a scale from `low` to `high`."""
+    share = (value - low) / max(high - low, 1e-9)
+    return _shades(share.clamp(0, 1).numpy())
 
 
 def height_shades(places: Tensor) -> np.ndarray:
@@ -124,7 +173,11 @@ def height_shades(places: Tensor) -> np.ndarray:
 
 def colour_scale(n_colours: int) -> list[str]:
     """The scale of the colours as CSS colours, from the first to the last."""
-    return ["rgb({}, {}, {})".format(*shade) for shade in _shades(np.linspace(0, 1, n_colours)).tolist()]
+    return [_css(shade) for shade in _shades(np.linspace(0, 1, n_colours)).tolist()]
+
+
+def _css(shade: Sequence[int]) -> str:
+    return "rgb({}, {}, {})".format(*shade)
 
 
 def _shades(share: np.ndarray) -> np.ndarray:

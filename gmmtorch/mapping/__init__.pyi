@@ -1,3 +1,7 @@
+from .attributes.answers import Prediction as Prediction
+from .attributes.moments import Attributes as Attributes
+from .attributes.moments import Labels as Labels
+from .attributes.moments import Numbers as Numbers
 from .codec.bitstream import BitReader as BitReader
 from .codec.bitstream import BitWriter as BitWriter
 from .codec.bitstream import Ints as Ints

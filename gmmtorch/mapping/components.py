@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike, as_tensor, naming_device
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.linalg import argsort, check_symmetric, on_cpu, safe_cholesky
+from gmmtorch.mapping.attributes.moments import Attributes
 from gmmtorch.occupancy import Cones
 from gmmtorch.scan import check_positions, extent
 
@@ -37,6 +38,7 @@ class Components:
     origins (S, D): sensor positions.
     seen_by, seen_from, seen_count (E,): `seen_count[e]` points of component `seen_by[e]` were observed from
         `origins[seen_from[e]]`. The counts of a component add up to its support.
+    attributes: channels such as colour; none in most maps.
 
     Fields can be arrays, lists or tensors; they become float64, int64 and bool tensors.
     """
@@ -50,17 +52,25 @@ class Components:
     seen_by: Tensor
     seen_from: Tensor
     seen_count: Tensor
+    attributes: Attributes = field(default_factory=Attributes, kw_only=True)
 
     def __post_init__(self) -> None:
-        for name, given in list(vars(self).items()):
+        for name, given in self.tensors().items():
             value = as_tensor(given, name, _DTYPES.get(name, torch.float64))
             if value is not given:
                 object.__setattr__(self, name, value)
 
+    def tensors(self) -> dict[str, Tensor]:
+        """The fields by name, without attributes."""
+        return {name: value for name, value in vars(self).items() if name != "attributes"}
+
     def __repr__(self) -> str:
-        n_bytes = sum(getattr(self, field.name).nbytes for field in fields(self))
+        n_bytes = sum(
+            value.nbytes for value in (*self.tensors().values(), *self.attributes.tensors().values())
+        )
+        channels = f" with {', '.join(self.attributes.channels)}" if self.attributes else ""
         return (
-            f"Components({len(self)} in {self.dim}D seen from {self.origins.shape[0]} origins"
+            f"Components({len(self)} in {self.dim}D{channels} seen from {self.origins.shape[0]} origins"
             f"{extent(self.means)}, {float(self.support.sum()):.6g} points, {n_bytes} bytes in memory, "
             f"{self.means.device})"
         )
@@ -129,8 +139,12 @@ class Components:
             seen_from.append(part.seen_from + n_origins)
             n_components += len(part)
             n_origins += part.origins.shape[0]
-        joined = {f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(cls)}
-        return cls(**{**joined, "seen_by": torch.cat(seen_by), "seen_from": torch.cat(seen_from)})
+        joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in TENSORS}
+        attributes = Attributes.concatenate(
+            [part.attributes for part in parts], [len(part) for part in parts]
+        )
+        whole = {**joined, "seen_by": torch.cat(seen_by), "seen_from": torch.cat(seen_from)}
+        return cls(**whole, attributes=attributes)
 
     def to(self, device: torch.device | str) -> Components:
         """The components on a device."""
@@ -139,11 +153,13 @@ class Components:
                 return self
             if torch.device(device).type == "cpu":
                 return self.on_cpu()
-            return Components(**{name: value.to(device) for name, value in vars(self).items()})
+            moved = {name: value.to(device) for name, value in self.tensors().items()}
+            return Components(**moved, attributes=self.attributes.changed(lambda value: value.to(device)))
 
     def on_cpu(self) -> Components:
         """The components on the CPU, without gradients."""
-        return Components(*on_cpu(*vars(self).values()))
+        attributes = self.attributes.changed(lambda value: value.detach().cpu())
+        return Components(*on_cpu(*self.tensors().values()), attributes=attributes)
 
     def cones(self) -> Cones:
         """One cone for each viewpoint: the argument of the evidence functions."""
@@ -160,7 +176,7 @@ class Components:
         rank = torch.empty_like(order)
         rank[order] = torch.arange(len(order), device=order.device)
         moved = {name: getattr(self, name)[order] for name in _PER_COMPONENT}
-        return replace(self, **moved, seen_by=rank[self.seen_by])
+        return replace(self, **moved, seen_by=rank[self.seen_by], attributes=self.attributes.selected(order))
 
     def selected(self, rows: Tensor) -> Components:
         """The components of distinct rows (J,), in that order, with all origins."""
@@ -175,7 +191,25 @@ class Components:
             seen_by=place[self.seen_by[kept]],
             seen_from=self.seen_from[kept],
             seen_count=self.seen_count[kept],
+            attributes=self.attributes.selected(rows),
         )
+
+    def split(self, ends: Sequence[int]) -> list[Components]:
+        """The components up to each of the rising rows `ends`, from the one before, with all origins. Parts
+        share memory with this, if its viewpoints are sorted by component."""
+        by, each = self.seen_by, self
+        if not bool((by[1:] >= by[:-1]).all()):
+            order = argsort(by)
+            each = replace(
+                self, seen_by=by[order], seen_from=self.seen_from[order], seen_count=self.seen_count[order]
+            )
+        begins, found = [0, *ends[:-1]], []
+        places = torch.searchsorted(each.seen_by, by.new_tensor([begins, list(ends)])).tolist()
+        for begin, end, first, last in zip(begins, ends, *places, strict=True):
+            part = {name: getattr(each, name)[begin:end] for name in _PER_COMPONENT}
+            part |= {name: getattr(each, name)[first:last] for name in ("seen_from", "seen_count")}
+            found.append(replace(each, **part, seen_by=each.seen_by[first:last] - begin))
+        return found
 
     def with_used_origins(self) -> Components:
         """The components without the origins that have no viewpoint."""
@@ -210,6 +244,7 @@ class Components:
             ),
             origins=origins,
             seen_from=seen_from,
+            attributes=self.attributes.turned(rotation).where(chosen, self.attributes),
         )
         return moved.with_used_origins()
 
@@ -250,7 +285,12 @@ class Components:
             raise InvalidArgumentError("support and counts must not be negative.")
         if k:
             safe_cholesky(check_symmetric(self.covariances, "covariances"))
+        self.attributes.checked(k, dim)
         return self
+
+
+TENSORS = tuple(part.name for part in fields(Components) if part.name != "attributes")
+"""Names of the fields of `Components` that are tensors."""
 
 
 def _viewpoints(

@@ -15,6 +15,7 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_whole
 from gmmtorch.files import write_bytes
+from gmmtorch.mapping.attributes.answers import Prediction, predictions
 from gmmtorch.mapping.codec.component_batch import CODECS, MapSettings, map_bytes, read_map
 from gmmtorch.mapping.codec.quantization import quantized_after
 from gmmtorch.mapping.components import Components
@@ -66,8 +67,10 @@ class GaussianMap(MapState):
             model, for the ranges of the map's beams.
 
     Queries do not change the map: the scans of an unfinished window are learned for the answer, and learned
-    again when the window is full. Lists of the components near the points that were asked about are kept
-    while the map grows; method "monte_carlo" draws its rays anew (about a second for a million). `save` and
+    again when the window is full. If they are large, a query learns from them scan by scan, in less time than
+    together. `finish`, `components` and `save` learn from them together, and until the next scan queries
+    answer from that. Lists of the components near the points that were asked about are kept while the map
+    grows; method "monte_carlo" draws its rays anew (about a second for a million). `save` and
     `load` keep a map with its settings. `state_dict` holds everything that learning continues from, and loads
     into any map.
     """
@@ -225,23 +228,32 @@ class GaussianMap(MapState):
         self._commit(*learned)
 
     def finish(self) -> None:
-        """Learns from the scans of the unfinished window now instead of at the first query. Changes no
-        answer."""
+        """Learns from the scans of the unfinished window together, as from those of a full one."""
         if self.dim is not None:
             self.components()
 
     def components(self) -> Components:
         """All components as the codec rounds them, with those of the unfinished window."""
         if self._rounded is None:
-            learned, final = self._with_pending(), self._final()
-            if self.codec == "float":
-                return learned
-            none = Components.empty(final.dim, final.means.device)
-            known, rounded = self._final_rounded or (none, none)
-            if any(value is not getattr(final, name) for name, value in vars(known).items()):
-                known, rounded = self._final_rounded = final, quantized_after(known, rounded, final)
-            self._rounded = quantized_after(known, rounded, learned) if self.n_pending else rounded
+            learned, known, rounded = self.unrounded(), *self._rounded_final()
+            is_known = self.codec == "float" or not self.n_pending
+            self._rounded = (
+                (learned if self.codec == "float" else rounded)
+                if is_known
+                else quantized_after(known, rounded, learned)
+            )
         return self._rounded
+
+    def _rounded_final(self) -> tuple[Components, Components]:
+        """The final components, and as the codec rounds them."""
+        final = self._final()
+        if self.codec == "float":
+            return final, final
+        none = Components.empty(final.dim, final.means.device)
+        known, rounded = self._final_rounded or (none, none)
+        if any(value is not getattr(final, name) for name, value in known.tensors().items()):
+            self._final_rounded = final, quantized_after(known, rounded, final)
+        return self._final_rounded or (final, rounded)
 
     def transform(self, transform: ArrayLike, ids: ArrayLike | None = None) -> None:
         """Moves components and their sensor origins by a rigid motion (D+1, D+1), as a pose correction does.
@@ -259,7 +271,7 @@ class GaussianMap(MapState):
     def revise(self, change: Callable[[Components], Components]) -> None:
         """Replaces all components by the result of `change` for them, not rounded. An unfinished window is
         learned first."""
-        self._commit(change(self._with_pending()))
+        self._commit(change(self.unrounded()))
 
     @property
     def n_components(self) -> int:
@@ -303,11 +315,23 @@ class GaussianMap(MapState):
             )
         return self._answers().evidence(grid, method)
 
+    def attributes(self, points: ArrayLike) -> dict[str, Prediction]:
+        """Each channel of the map, such as "colour", at points (M, D) in metres; see `Prediction`.
+
+        Unknown where no component is near, and without channels while no scan had any. Differentiable in the
+        points; tensors are on their device.
+        """
+        query = check_queries(points, self.dim)
+        if self.dim is None:
+            return {}
+        found = predictions(self.components(), query.to(self._device))
+        return {name: prediction.to(query.device) for name, prediction in found.items()}
+
     def _answers(self) -> Query:
         if self._query is None or self._is_stale:
-            found = self.components()
-            is_final = (found.ids[:, 0] != self.robot) | (found.ids[:, 1] < self._next_number)
-            asked = found.cones(), self.query_options, is_final[found.seen_by]
+            parts = self._window_parts()
+            found = self.components() if parts is None else self._rounded_final()[1]
+            asked = found, self.query_options, parts or ()
             self._query = Query(*asked) if self._query is None else self._query.replaced(*asked)
             self._is_stale = False
         return self._query

@@ -13,7 +13,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -353,7 +353,7 @@ class WindowMotions:
     def as_inserted(self, target: GaussianMap) -> tuple[Components, Tensor]:
         """The components of a map, not rounded, where they would be if no window had moved, and the window
         (K,) of each; −1 for those that no scan here has seen."""
-        components = Components(**{field.name: getattr(target, field.name) for field in fields(Components)})
+        components = target.unrounded()
         identity = torch.eye(components.dim + 1, dtype=torch.float64)
         back = [one if _is_identity(one) else _motion(one, identity) for one in self.motions]
         windows, of_origins = _members(components, self._finder())
@@ -441,6 +441,7 @@ def _moved(components: Components, motions: Tensor, windows: Tensor, of_origins:
             stays[:, None, None], components.covariances, (covariances + covariances.mT) / 2
         ),
         origins=torch.where(stay[of_origins].to(device)[:, None], components.origins, origins),
+        attributes=components.attributes.turned(turn),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, Self, cast
 
@@ -12,9 +12,10 @@ from torch import Tensor
 
 from gmmtorch.arrays import DeviceModule
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
+from gmmtorch.mapping.attributes.moments import Attributes
 from gmmtorch.mapping.codec.component_batch import MapSettings, file_size
 from gmmtorch.mapping.codec.quantization import number_after, numbered
-from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.components import TENSORS, Components
 from gmmtorch.mapping.learning.fitting import DepthFrame, as_scans
 from gmmtorch.mapping.learning.rules import LearningRule, WindowedRule, read_rule, rule_facts
 from gmmtorch.mapping.learning.windows import (
@@ -23,7 +24,9 @@ from gmmtorch.mapping.learning.windows import (
     Doubts,
     absorb,
     joined,
+    learn_part,
     learn_window,
+    learns_in_parts,
     predicted,
 )
 from gmmtorch.mapping.query import Query
@@ -31,8 +34,8 @@ from gmmtorch.mapping.query_options import QueryOptions
 from gmmtorch.occupancy import Calibrator
 from gmmtorch.scan import Scan
 
+_PART = 5_000  # beams of a part of an unfinished window, at least
 _LONGEST_WINDOW = 40  # scans, if no scan yet shows how many points it holds
-_BUFFERS = tuple(f.name for f in fields(Components))
 _STATE = "_extra_state"  # torch's name of it in a state dict
 
 
@@ -42,7 +45,7 @@ def _field(name: str, about: str) -> Any:
     def read(self: MapState) -> Tensor:
         if self.dim is None:
             raise AttributeError(name)  # `__getattr__` explains it
-        return cast(Tensor, getattr(self._with_pending(), name))
+        return cast(Tensor, getattr(self.unrounded(), name))
 
     return property(read, doc=f"{about} Not rounded; with the components of the unfinished window.")
 
@@ -78,18 +81,20 @@ class MapState(DeviceModule):
         self._calibrator = None if known is None else Calibrator.continued(known, len(SIDES))
         self.learning = learning
         self._random_state = random_state
+        self._attributes = Attributes()  # of the final components
         self._pending: list[Scan] = []
         self._n_windows = 0
         self._next_number = 0  # of the next new component
         self._doubts = self._next_doubts = Doubts.none()  # of the final components; after the pending scans
         self._learned: tuple[Components, int] | None = None  # what follows from buffers and pending scans
+        self._parts: dict[tuple[int, int], Components] = {}  # learned from these pending scans
         self._rounded: Components | None = None
         self._final_rounded: tuple[Components, Components] | None = None  # final components, and rounded
         self._query: Query | None = None
         self._is_stale = False  # the query is of earlier components
 
     def __getattr__(self, name: str) -> Any:
-        if name in _BUFFERS:
+        if name in TENSORS:
             raise AttributeError(f"{name}: the map is empty; insert a scan first.")
         return super().__getattr__(name)
 
@@ -145,10 +150,11 @@ class MapState(DeviceModule):
         """The components without those of the unfinished window, not rounded."""
         if self.dim is None:
             raise InvalidArgumentError("The map is empty; insert a scan first.")
-        buffers = {name: self._buffers[name] for name in _BUFFERS}
-        return Components(**{name: value for name, value in buffers.items() if value is not None})
+        buffers = {name: self._buffers[name] for name in TENSORS}
+        known = {name: value for name, value in buffers.items() if value is not None}
+        return Components(**known, attributes=self._attributes)
 
-    def _with_pending(self) -> Components:
+    def unrounded(self) -> Components:
         """All components, not rounded."""
         return self._upcoming()[0]
 
@@ -158,7 +164,32 @@ class MapState(DeviceModule):
             return self._final(), self._next_number
         if self._learned is None:
             self._learned = self._absorbed(self._pending, self.learning.fitted(self._pending))
+            self._is_stale = True  # the query may be of parts of the window
         return self._learned
+
+    def _window_parts(self) -> list[Components] | None:
+        """The components of the unfinished window for a query, learned from some scans at a time, so that a
+        scan makes the next query learn from few beams. None: the window is learned as a whole, if it is small
+        or already learned."""
+        sizes = [scan.n_beams for scan in self._pending]
+        if self._learned is not None or sum(sizes) <= _PART or not learns_in_parts(self.learning):
+            return None
+        found, begin, size = {}, 0, 0
+        for end, n_beams in enumerate(sizes, 1):
+            size += n_beams
+            if size >= _PART or end == len(sizes):
+                found[begin, end] = self._parts.get((begin, end)) or self._part(begin, end)
+                begin, size = end, 0
+        self._parts = found
+        return list(found.values())
+
+    def _part(self, begin: int, end: int) -> Components:
+        rule = self.learning.fitted(self._pending[:end])
+        return learn_part(self._pending[begin:end], rule, self._generator())
+
+    def _generator(self) -> torch.Generator:
+        """Random numbers for the unfinished window."""
+        return torch.Generator().manual_seed(hash((self._random_state, self._n_windows)) % 2**63)
 
     def _absorbed(
         self,
@@ -173,9 +204,8 @@ class MapState(DeviceModule):
         """
         known = self._final()
         if isinstance(rule, WindowedRule):
-            generator = torch.Generator().manual_seed(hash((self._random_state, self._n_windows)) % 2**63)
             window = as_scans(scans)
-            new = learn_window(window, rule, generator)
+            new = learn_window(window, rule, self._generator())
             learned, self._next_doubts = joined(known, new, window, rule, self._doubts)
         else:
             size = partial(file_size, rule=rule, settings=self.settings, next_number=self._next_number)
@@ -226,13 +256,14 @@ class MapState(DeviceModule):
         self.learning = self.learning.fitted(self._pending)
         self._doubts = self._next_doubts
         self._n_windows += bool(self._pending)
-        self._pending = []
+        self._pending, self._parts = [], {}
         self._next_number = next_number or number_after(components.ids, self._next_number)
         self._set(components)
 
     def _set(self, components: Components) -> None:
-        for name in _BUFFERS:
+        for name in TENSORS:
             self._buffers[name] = getattr(components, name)  # properties have the names of the buffers
+        self._attributes = components.attributes
         self._forget()
 
     def _forget(self) -> None:
@@ -246,6 +277,8 @@ class MapState(DeviceModule):
         super()._apply(fn, recurse)
         if self.dim is not None:
             self._pending = [scan.to(self._device) for scan in self._pending]
+            self._attributes = self._attributes.changed(lambda value: value.to(self._device))
+        self._parts = {}
         self._query = self._final_rounded = None  # are on the former device
         self._forget()
         return self
@@ -255,6 +288,7 @@ class MapState(DeviceModule):
         return {
             "learning": rule_facts(self.learning),
             "pending": [dict(vars(scan)) for scan in self._pending],
+            "attributes": self._attributes.tensors(),
             "n_windows": self._n_windows,
             "n_numbered": self._next_number,
             "doubts": dict(vars(self._doubts)),
@@ -275,27 +309,32 @@ class MapState(DeviceModule):
         map whose components are all final. Raises `DataError` for a damaged state, and changes nothing."""
         own = {key.removeprefix(prefix): v for key, v in state_dict.items() if key.startswith(prefix)}
         state = own.pop(_STATE, None)
-        missing = [name for name in _BUFFERS if name not in own]
+        missing = [name for name in TENSORS if name not in own]
         if strict:
-            unexpected_keys += [prefix + name for name in own if name not in _BUFFERS]
-        if missing and (state is None or len(missing) < len(_BUFFERS)):
+            unexpected_keys += [prefix + name for name in own if name not in TENSORS]
+        if missing and (state is None or len(missing) < len(TENSORS)):
             missing_keys += [prefix + name for name in missing]
             return
         try:
             extra = None if state is None else _read_extra(state)
-            components = None if missing else Components(**{name: own[name] for name in _BUFFERS}).checked()
+            components = None
+            if not missing:
+                known = Attributes.of((state or {}).get("attributes", {}))
+                components = Components(**{name: own[name] for name in TENSORS}, attributes=known).checked()
         except (GmmTorchError, KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise DataError(f"The state of the map is damaged ({error}).") from error
         device = self._device
-        for name in _BUFFERS:
+        for name in TENSORS:
             self._buffers.pop(name, None)
-        self._pending = []
+        self._pending, self._parts = [], {}
         if extra is not None:
             self.learning, self._pending, self._n_windows, self._next_number, self._doubts = extra[:5]
             self._calibrator = extra[5]
             self._next_doubts = self._doubts
         if components is not None:
-            self._set(Components(**{n: v.detach().clone().to(device) for n, v in vars(components).items()}))
+            tensors = {n: v.detach().clone().to(device) for n, v in components.tensors().items()}
+            known = components.attributes.changed(lambda value: value.detach().clone().to(device))
+            self._set(Components(**tensors, attributes=known))
             self._next_number = number_after(components.ids, self._next_number)
         self._forget()
 

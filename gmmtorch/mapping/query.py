@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Iterable, Iterator
+import copy
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from gmmtorch.linalg import all_equal
+from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.query_options import QueryOptions, check_method
 from gmmtorch.occupancy import (
     CUTOFF,
@@ -17,7 +19,6 @@ from gmmtorch.occupancy import (
     ConeIndex,
     Cones,
     Evidence,
-    Pairs,
     PointEvidence,
     PointForm,
     Rule,
@@ -34,95 +35,226 @@ from gmmtorch.occupancy import (
 _RAYS_AT_ONCE = 1 << 20
 _CELLS_AT_ONCE = 1 << 20
 _SHARP_CUTOFF = 3.0
-_MANY_ASKED = 1 << 18
-"""Points after which a map probably does not change soon, so that all its cones get one index."""
 MANY_POINTS = 50
 """A viewpoint with this count shows where a surface ends."""
 
 
-def cutoff_by_support(cones: Cones) -> float:
-    """The cutoff if none is given: 3 if the median count is at least 50 points, otherwise `CUTOFF`."""
-    return cutoff_of(*count_many(cones))
-
-
-def count_many(cones: Cones) -> tuple[int, int]:
-    """Number of cones with a count, and number of cones with a count of at least 50 points."""
-    return int((cones.counts > 0).sum()), int((cones.counts >= MANY_POINTS).sum())
+def count_many(counts: Tensor) -> tuple[int, int]:
+    """How many of the counts of viewpoints are above zero, and how many are at least 50 points."""
+    n_seen, n_many = torch.stack([(counts > 0).sum(), (counts >= MANY_POINTS).sum()]).tolist()
+    return n_seen, n_many
 
 
 def cutoff_of(n_seen: int, n_many: int) -> float:
-    """`cutoff_by_support` of `n_seen` cones with a count, `n_many` of them with at least 50 points."""
+    """The cutoff if none is given, of `n_seen` viewpoints with a count, `n_many` of them with at least 50
+    points: 3 if the median is at least 50 points, otherwise `CUTOFF`."""
     return _SHARP_CUTOFF if n_seen - n_many <= (n_seen - 1) // 2 else CUTOFF
 
 
-def mean_range(parts: Iterable[Cones]) -> float:
+def mean_range(parts: Iterable[Components]) -> float:
     """Mean range (m) of the beams with a return, to their components' means; 1 if there are none."""
     total = count = 0.0
-    for cones in parts:
-        weight = cones.counts * ~cones.max_range
-        ranges = (cones.means - cones.origins).norm(dim=1)
+    for c in parts:
+        weight = c.seen_count * ~c.max_range[c.seen_by]
+        ranges = (c.means[c.seen_by] - c.origins[c.seen_from]).norm(dim=1)
         found = torch.stack([(weight * ranges).sum(), weight.sum()]).tolist()
         total, count = total + found[0], count + found[1]
     return total / count if total > 0 else 1.0
 
 
-def rule_of(options: QueryOptions, parts: Iterable[Cones]) -> Rule:
-    """How probabilities follow from evidence; without a prior or a calibration, from the ranges of cones."""
+def rule_of(options: QueryOptions, parts: Iterable[Components]) -> Rule:
+    """How probabilities follow from evidence; without a prior or a calibration, from the ranges of beams."""
     if options.prior is not None:
         return float(options.prior)
     return options.calibration or Calibration.prior(mean_range(parts))
 
 
-class _Part(NamedTuple):
-    """Some of the cones, and the forms and indices of them for each resolution that was asked for."""
+def evidence_boxes(
+    low: Tensor, high: Tensor, distance: Tensor, side: float, cutoff: float
+) -> tuple[Tensor, Tensor]:
+    """Lowest and highest corners (T, D), m, of boxes outside which a set of cones gives no evidence.
 
-    cones: Cones
-    forms: dict[float, PointForm]
-    indices: dict[float, ConeIndex]
+    Args:
+        low, high: (T, D) a box around the cones of each set, see `cone_bounds`.
+        distance: (T,) longest distance (m) from a mean to its sensor origin.
+        side: of the cube around a point, or of the cell that contains it. A cube widens a cone as in
+            `Hulls`, here by a bound for all cones of a set. The centre of the cell that contains a point is
+            within one side of it.
+    """
+    widest = side * max(0.5 * low.shape[1] ** 0.5, cutoff / 12**0.5)
+    pad = (widest * distance).sqrt().clamp_min(widest)[:, None] + side
+    return low - pad, high + pad
 
-    def replaced(self, cones: Cones, former: Tensor) -> _Part:
-        """The part with other cones, which keeps what it can; `former` as for `ConeIndex.replaced`."""
-        forms = {side: form.replaced(cones, former) for side, form in self.forms.items()}
-        return _Part(cones, forms, {s: index.replaced(cones, former) for s, index in self.indices.items()})
+
+_BLOCK = 8192  # components
+
+
+class _Block:
+    """Components of a map that answer together: the forms and indices of their cones for each resolution that
+    was asked for. Both are made when a query needs the block.
+
+    low, high (D,), distance (): see `evidence_boxes`.
+    """
+
+    def __init__(self, components: Components, cutoff: float) -> None:
+        self.components, self.cutoff = components, cutoff
+        self.forms: dict[float, PointForm] = {}
+        self.indices: dict[float, ConeIndex] = {}
+        c = components
+        means, origins = c.means.detach().double(), c.origins.detach().double()[c.seen_from]
+        extent = cutoff * c.covariances.detach().double().diagonal(dim1=1, dim2=2).sqrt()
+        self.low = torch.minimum((means - extent).amin(0), origins.amin(0))
+        self.high = torch.maximum((means + extent).amax(0), origins.amax(0))
+        self.distance = (means[c.seen_by] - origins).norm(dim=1).amax()
+
+    def form(self, resolution: float, share: float) -> PointForm:
+        if resolution not in self.forms:
+            self.forms[resolution] = PointForm(self.components.cones(), resolution, self.cutoff, share)
+        return self.forms[resolution]
+
+    def index(self, resolution: float) -> ConeIndex:
+        if resolution not in self.indices:
+            self.indices[resolution] = ConeIndex(self.components.cones(), resolution, self.cutoff)
+        return self.indices[resolution]
+
+    def replaced(self, components: Components) -> _Block:
+        """The block of other components, which keeps the lists that it can."""
+        if _same(self.components, components):
+            made = copy.copy(self)
+            made.components = components  # else this would keep all earlier components in memory
+            return made
+        made, cones = _Block(components, self.cutoff), components.cones()
+        former = former_rows(self.components.cones(), cones)
+        if 2 * int((former < 0).sum()) <= len(former):
+            made.forms = {side: form.replaced(cones, former) for side, form in self.forms.items()}
+            made.indices = {side: index.replaced(cones, former) for side, index in self.indices.items()}
+        return made
+
+
+def _same(one: Components, other: Components) -> bool:
+    """Whether all cones are equal. Origins may have other numbers."""
+    if one is other:
+        return True
+    parts = ("means", "covariances", "max_range", "seen_by", "seen_count")
+    pairs = ((getattr(one, name), getattr(other, name)) for name in parts)
+    origins = ((c.origins, c.seen_from) for c in (one, other))
+    return all_equal(pairs) and torch.equal(*(places[number] for places, number in origins))
+
+
+def _identities(parts: Iterable[Components]) -> Cones:
+    """What tells components apart, as the argument of `former_rows`."""
+    each = [(c.means, c.covariances, c.means, c.support, c.max_range) for c in parts]
+    return Cones(*map(torch.cat, zip(*each, strict=True)))
+
+
+def _blocks(components: Components, cutoff: float) -> list[_Block]:
+    if len(components) <= _BLOCK:
+        return [_Block(components, cutoff)] if len(components.seen_by) else []
+    ends = [*range(_BLOCK, len(components), _BLOCK), len(components)]
+    return [_Block(part, cutoff) for part in components.split(ends) if len(part.seen_by)]
 
 
 class Query:
-    """Answers queries about fixed cones. Indices and Monte Carlo rays are made at the first query.
+    """Answers queries about fixed components. Indices and Monte Carlo rays are made at the first query.
+
+    Components that follow each other form blocks, so a query needs only the blocks near its points, and a
+    change only the blocks that it touches.
 
     Args:
-        cones: of components.
+        components: of the map.
         options: how queries are answered.
-        settled: (C,) False for cones that the next change will probably replace, such as those of an
-            unfinished window. They have an index of their own. None: all are settled.
+        recent: more components, such as those of an unfinished window, in parts of which some stay.
     """
 
-    def __init__(self, cones: Cones, options: QueryOptions, settled: Tensor | None = None) -> None:
-        self.cones = cones
-        self.options, self.rule = options, rule_of(options, [cones])
-        self.cutoff = cutoff_by_support(cones) if options.cutoff is None else options.cutoff
-        self._lattices: dict[float, SparseEvidence] = {}
-        if settled is None or bool(settled.all()):
-            self._parts = [_Part(cones, {}, {})]
-        else:
-            self._parts = [_Part(cones.taken(rows), {}, {}) for rows in (settled, ~settled)]
-        self._n_asked = 0
+    def __init__(
+        self, components: Components, options: QueryOptions, recent: Sequence[Components] = ()
+    ) -> None:
+        self._set(components, options, recent)
+        self._blocks = _blocks(components, self.cutoff)
+        self._recent = [_Block(part, self.cutoff) for part in recent if len(part.seen_by)]
 
-    def replaced(self, cones: Cones, options: QueryOptions, settled: Tensor | None = None) -> Query:
-        """The answers about other cones; arguments as for `Query`. Lists of settled cones stay."""
-        made, old = Query(cones, options, settled), self._parts[0]
-        if made.cutoff != self.cutoff or cones.dim != self.cones.dim or not len(old.cones.counts):
-            return made
-        first, *rest = made._parts
-        former = former_rows(old.cones, first.cones)
-        if 2 * int((former < 0).sum()) > len(former):
-            return made
-        if len(former) != len(old.cones.counts) or bool((former < 0).any()):
-            old = old.replaced(first.cones, former)
-        made._parts = [old._replace(cones=first.cones)]
-        for part in rest:
-            none = torch.full_like(part.cones.max_range, -1, dtype=torch.int64)
-            made._parts.append(old.replaced(part.cones, none))
+    def _set(self, components: Components, options: QueryOptions, recent: Sequence[Components]) -> None:
+        self.components, self.options, self.dim = components, options, components.dim
+        parts = [components, *recent]
+        self.rule = rule_of(options, parts)
+        self.cutoff = options.cutoff or cutoff_of(*count_many(torch.cat([part.seen_count for part in parts])))
+        self._lattices: dict[float, SparseEvidence] = {}
+        self._bounds: tuple[Tensor, Tensor, Tensor] | None = None
+
+    def replaced(
+        self, components: Components, options: QueryOptions, recent: Sequence[Components] = ()
+    ) -> Query:
+        """The answers about other components; arguments as for `Query`. Blocks that did not change stay."""
+        made = copy.copy(self)
+        made._set(components, options, recent)
+        if made.cutoff != self.cutoff or components.dim != self.dim or not self._blocks:
+            return Query(components, options, recent)
+        if components is not self.components:
+            made._blocks = self._following(components)
+        known = {id(block.components): block for block in self._recent}
+        made._recent = [known.get(id(c)) or _Block(c, self.cutoff) for c in recent if len(c.seen_by)]
         return made
+
+    def _following(self, components: Components) -> list[_Block]:
+        """The blocks of other components. Those before the first change stay as they are; of the others, each
+        has those of its components that stay."""
+        ends = list(itertools.accumulate(len(block.components) for block in self._blocks))
+        *parts, rest = components.split(
+            [*(end for end in ends[:-1] if end <= len(components)), len(components)]
+        )
+        kept: list[_Block] = []
+        for block, part in zip(self._blocks, parts, strict=False):
+            if not _same(block.components, part):
+                break
+            kept.append(block.replaced(part))
+        old, n = self._blocks[len(kept) :], len(kept)
+        begin = ends[n - 1] if n else 0
+        rest = components.split([begin, len(components)])[1]
+        former = former_rows(_identities(block.components for block in old), _identities([rest]))
+        if not len(former) or int(former.amax()) < 0:
+            return kept + _blocks(rest, self.cutoff)
+        latest = former.cummax(0).values
+        bounds = torch.tensor([end - begin for end in ends[n:]], device=latest.device)
+        n_old = int((latest < latest[-1]).sum()) + 1  # rows up to the last component that stays
+        owner = torch.bucketize(latest[:n_old], bounds, right=True)
+        counts, n_new = torch.bincount(owner, minlength=len(old)).tolist(), len(rest) - n_old
+        if counts[-1] < _BLOCK and counts[-1] + n_new <= 2 * _BLOCK:
+            counts[-1], n_new = counts[-1] + n_new, 0
+        *parts, new = rest.split(list(itertools.accumulate([*counts, n_new])))
+        kept += [b.replaced(part) for b, part in zip(old, parts, strict=True) if len(part.seen_by)]
+        return kept + _blocks(new, self.cutoff)
+
+    @property
+    def cones(self) -> Cones:
+        """The cones of all components."""
+        every = [block.components.cones() for block in [*self._blocks, *self._recent]]
+        return Cones(*map(torch.cat, zip(*every, strict=True))) if every else self.components.cones()
+
+    def _near(self, points: Tensor, side: float) -> Iterator[tuple[_Block, Tensor | None]]:
+        """The blocks that can give evidence at points (M, D), and the points (R,) of each; None: all."""
+        blocks = [*self._blocks, *self._recent]
+        if len(blocks) <= 1:
+            yield from ((block, None) for block in blocks)
+            return
+        if self._bounds is None:
+            bounds = zip(*((b.low, b.high, b.distance) for b in blocks), strict=True)
+            low, high, distance = (torch.stack(values) for values in bounds)
+            self._bounds = low, high, distance
+        low, high = evidence_boxes(*self._bounds, side, self.cutoff)
+        fixed = points.detach().to(low)
+        finite = torch.where(torch.isfinite(fixed), fixed, torch.nan)
+        if not len(points):
+            return
+        ends = [torch.nan_to_num(finite, nan=far) for far in (torch.inf, -torch.inf)]
+        met = (ends[0].amin(0) <= high).all(1) & (ends[1].amax(0) >= low).all(1)
+        columns = fixed.T.contiguous()
+        for number in met.nonzero().squeeze(1).tolist():
+            inside = torch.ones_like(columns[0], dtype=torch.bool)
+            for column, first, last in zip(columns, low[number], high[number], strict=True):
+                inside &= (column >= first) & (column <= last)
+            rows = inside.nonzero().squeeze(1)
+            if len(rows):
+                yield blocks[number], rows
 
     def occupancy(self, points: Tensor, resolution: float, method: str) -> Tensor:
         """Probability (M,) that the cube of side `resolution` (m) of each point (M, D) is occupied.
@@ -131,13 +263,13 @@ class Query:
         [i·resolution, (i+1)·resolution) that contains the point. Points at infinity are unknown (½).
         """
         found = self.evidence_at(points, resolution, method)
-        return probability(found.hits, found.misses, resolution, self.cones.dim, self.rule)
+        return probability(found.hits, found.misses, resolution, self.dim, self.rule)
 
     def evidence_at(self, points: Tensor, resolution: float, method: str) -> PointEvidence:
         """Hits and misses (M,) of the cubes of `occupancy`. Those of disjoint sets of cones add up."""
         check_method(method)
         zeros = torch.zeros_like(points[:, 0])
-        if len(self.cones.counts) == 0:
+        if not self._blocks and not self._recent:
             return PointEvidence(zeros, zeros.clone())
         if method == "point":
             return self._at_points(points, resolution)
@@ -146,13 +278,7 @@ class Query:
         finite = torch.isfinite(points).all(1)
         cells, cell = torch.unique(torch.floor(points[finite] / resolution), dim=0, return_inverse=True)
         low, high = cells * resolution, (cells + 1) * resolution
-        if method == "flux":
-            found = _sum(
-                PointEvidence(*cell_flux(part.cones, cells, resolution, pairs, self.cutoff))
-                for part, pairs in self._candidates(low, high, resolution)
-            )
-        else:
-            found = self._in_boxes(low, high, resolution)
+        found = self._in_boxes(low, high, resolution, cells if method == "flux" else None)
         place = finite.nonzero().squeeze(1)
         return PointEvidence(*(zeros.index_copy(0, place, values[cell]) for values in found))
 
@@ -163,8 +289,8 @@ class Query:
         """
         check_method(method)
         grid.check_memory(self.options.memory_limit)
-        evidence = replace(Evidence.empty(grid, self.cones.means.device), rule=self.rule)
-        if len(self.cones.counts) == 0:
+        evidence = replace(Evidence.empty(grid, self.components.means.device), rule=self.rule)
+        if not self._blocks and not self._recent:
             return evidence
         if method == "monte_carlo":
             self._cast(evidence)
@@ -173,7 +299,7 @@ class Query:
             return replace(flux_evidence(self.cones, grid, self.cutoff), rule=self.rule)
         half, parts = 0.5 * grid.resolution, []
         for first in range(0, grid.n_cells, _CELLS_AT_ONCE):  # centres of all cells take more than evidence
-            centers = grid.centers(self.cones.means.device, range(first, first + _CELLS_AT_ONCE))
+            centers = grid.centers(self.components.means.device, range(first, first + _CELLS_AT_ONCE))
             if method == "point":
                 parts.append(self._at_points(centers, grid.resolution))
             else:
@@ -182,32 +308,34 @@ class Query:
         return Evidence(grid, hits, misses, self.rule)
 
     def _at_points(self, points: Tensor, resolution: float) -> PointEvidence:
-        """Evidence of the point form. The sum over all cones has one order, however they are kept."""
-        if len(self._parts) > 1 and self._n_asked > _MANY_ASKED:  # one index is faster for more points
-            self._parts = [_Part(self.cones, {}, {})]
-        self._n_asked += len(points)
-        found = None
-        for part in self._parts:
-            if resolution not in part.forms:
-                part.forms[resolution] = PointForm(part.cones, resolution, self.cutoff)
-            found = part.forms[resolution](points, found)
-        assert found is not None
+        """Evidence of the point form. The sum over all cones has one order, in whichever blocks they are."""
+        found = PointEvidence(*torch.zeros(2, len(points), dtype=points.dtype, device=points.device))
+        for block, rows in self._near(points, resolution):
+            form = block.form(resolution, 1 / max(1, len(self._blocks)))
+            if rows is None:
+                found = form(points, found)
+            else:
+                part = form(points[rows], PointEvidence(*(values[rows] for values in found)))
+                found = PointEvidence(
+                    *(old.index_copy(0, rows, new) for old, new in zip(found, part, strict=True))
+                )
         return found
 
-    def _candidates(
-        self, low: Tensor, high: Tensor, resolution: float
-    ) -> Iterator[tuple[_Part, Iterator[Pairs]]]:
-        for part in self._parts:
-            if resolution not in part.indices:
-                part.indices[resolution] = ConeIndex(part.cones, resolution, self.cutoff)
-            yield part, part.indices[resolution].candidates(low, high)
-
-    def _in_boxes(self, low: Tensor, high: Tensor, resolution: float) -> PointEvidence:
-        """Evidence of the thesis's cones."""
-        return _sum(
-            PointEvidence(*cone_evidence(part.cones, low, high, pairs, cutoff=self.cutoff))
-            for part, pairs in self._candidates(low, high, resolution)
-        )
+    def _in_boxes(self, low: Tensor, high: Tensor, side: float, cells: Tensor | None = None) -> PointEvidence:
+        """Evidence of boxes [low, high], (M, D) each: of the thesis's cones, or of the flux through the faces
+        of `cells` (M, D)."""
+        hits, misses = torch.zeros(2, len(low), dtype=low.dtype, device=low.device)
+        every = torch.arange(len(low), device=low.device)
+        for block, chosen in self._near(0.5 * (low + high), side):
+            rows, cones = every if chosen is None else chosen, block.components.cones()
+            boxes = low[rows], high[rows]
+            pairs = block.index(side).candidates(*boxes)
+            if cells is None:
+                found = cone_evidence(cones, *boxes, pairs, cutoff=self.cutoff)
+            else:
+                found = cell_flux(cones, cells[rows], side, pairs, self.cutoff)
+            hits, misses = hits.index_add(0, rows, found[0]), misses.index_add(0, rows, found[1])
+        return PointEvidence(hits, misses)
 
     def _lattice(self, resolution: float) -> SparseEvidence:
         """Monte Carlo evidence of the whole map on the world's lattice of this resolution."""
@@ -226,9 +354,3 @@ class Query:
         parts = zip(*(field.split(_RAYS_AT_ONCE) for field in rays), strict=True)
         for origins, ends, weights, is_hit in parts:
             evidence.add_rays(origins, ends, weights, is_hit)
-
-
-def _sum(parts: Iterable[PointEvidence]) -> PointEvidence:
-    """The evidence of disjoint sets of cones, which adds up."""
-    hits, misses = (functools.reduce(torch.add, values) for values in zip(*parts, strict=True))
-    return PointEvidence(hits, misses)

@@ -47,7 +47,7 @@ from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.merging import compact_to_bytes
 from gmmtorch.mapping.learning.rules import IncrementalRule
-from gmmtorch.mapping.query import Query, count_many, cutoff_of, mean_range, rule_of
+from gmmtorch.mapping.query import Query, count_many, cutoff_of, evidence_boxes, mean_range, rule_of
 from gmmtorch.mapping.query_options import check_method
 from gmmtorch.occupancy import (
     CUTOFF,
@@ -120,8 +120,7 @@ class TiledMap:
         those of version 1.0 all are read once, for the ranges of the sensor model."""
         options = self.query_options
         if options.prior is None and options.calibration is None:
-            cones = (self.components(row).cones() for row in range(len(self.index)))
-            known = Calibration.prior(mean_range(cones))
+            known = Calibration.prior(mean_range(map(self.components, range(len(self.index)))))
             self.query_options = replace(options, calibration=known)
         return rule_of(self.query_options, ())
 
@@ -230,10 +229,10 @@ class TiledMap:
     def _query(self, row: int) -> Query:
         """The query of a tile. If too many are open, the least recently used one is dropped."""
         if row not in self._open:
-            cones = self.components(row).to(self.device).cones()
+            components = self.components(row).to(self.device)
             share = float(self.index.support[row] / self.index.support.sum().clamp_min(1e-300))
             n_samples = max(1, round(share * self.query_options.n_samples))
-            self._open[row] = Query(cones, replace(self.query_options, n_samples=n_samples))
+            self._open[row] = Query(components, replace(self.query_options, n_samples=n_samples))
         self._open.move_to_end(row)
         while len(self._open) > self.most_open:
             self._open.popitem(last=False)
@@ -284,15 +283,8 @@ class TileIndex:
         return cutoff_of(int(self.n_seen.sum()), int(self.n_many.sum()))
 
     def boxes(self, side: float, cutoff: float) -> tuple[Tensor, Tensor]:
-        """Lowest and highest corners (T, D), m, of boxes outside which a point gets no evidence of the tile.
-
-        `side`: of the cube around a point, or of the cell that contains it. A cube widens a cone as in
-        `Hulls.bounds`, here by a bound for all cones of a tile. The centre of the cell that contains a point
-        is within one side of it.
-        """
-        widest = side * max(0.5 * self.dim**0.5, cutoff / 12**0.5)
-        pad = (widest * self.distance).sqrt().clamp_min(widest)[:, None] + side
-        return self.low - pad, self.high + pad
+        """`evidence_boxes` of the tiles."""
+        return evidence_boxes(self.low, self.high, self.distance, side, cutoff)
 
     @classmethod
     def joined(cls, rows: Sequence[dict[str, Any]], dim: int) -> TileIndex:
@@ -326,7 +318,7 @@ def index_row(
     low, high = cone_bounds(cones, CUTOFF if cutoff is None else cutoff)
     low, high = (torch.cat([corner, components.means]) for corner in (low, high))
     distance = (cones.means - cones.origins).norm(dim=1)
-    n_seen, n_many = count_many(cones)
+    n_seen, n_many = count_many(cones.counts)
     return {
         "tiles": list(tile),
         "low": low.amin(0),
@@ -482,7 +474,7 @@ def _calibrated(settings: MapSettings, components: Components) -> MapSettings:
     none. A tile alone does not show these ranges."""
     if settings.query.calibration is not None or settings.query.prior is not None:
         return settings
-    return _with(settings, Calibration.prior(mean_range([components.cones()])))
+    return _with(settings, Calibration.prior(mean_range([components])))
 
 
 def _with(settings: MapSettings, calibration: Calibration | None) -> MapSettings:

@@ -21,14 +21,20 @@ from gmmtorch.linalg import argsort, dense_ranks
 from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.grid import check_resolution
 
-Spectrum = tuple[Tensor, Tensor]
-"""Variances (C, D), ascending, and axes V (C, D, D) of components."""
 
-
-def spectrum_of(covariances: Tensor) -> Spectrum:
-    """The spectrum of components with covariances (C, D, D), without gradients, float64."""
+def spectrum_of(covariances: Tensor) -> tuple[Tensor, Tensor]:
+    """Variances (C, D), ascending, and axes V (C, D, D) of components with covariances (C, D, D), without
+    gradients, float64."""
     variances, axes = torch.linalg.eigh(covariances.detach().double())
     return variances, axes
+
+
+def hull_rows(cones: Cones) -> Tensor:
+    """(C, n) the first columns of `PointTable.rows`, up to the variances, without gradients."""
+    means, origins = cones.means.detach().double(), cones.origins.detach().double()
+    variances, axes = spectrum_of(cones.covariances)
+    seen = (axes.transpose(1, 2) @ (means - origins)[:, :, None]).squeeze(2)
+    return torch.cat([axes.flatten(1), means, origins, seen, variances], 1)
 
 
 class Hulls:
@@ -37,23 +43,24 @@ class Hulls:
     A cone can give evidence to a cube of side `extent` (m) if its hull meets the cube. With `smoothed`, as
     in the point form, the cone is widened instead by a Gaussian with the variance of the cube.
 
+    Args:
+        cones: the cones, or their `PointTable.rows`, which are then kept instead of a copy.
+
     Attributes:
         table: (C, n), see `near_lists`.
         low, high: (C, D) corners of the box outside which a cone gives no evidence.
     """
 
-    def __init__(
-        self, cones: Cones, extent: float, cutoff: float, smoothed: bool, spectrum: Spectrum | None = None
-    ) -> None:
-        dim = self.dim = cones.dim
-        means, origins = cones.means.detach().double(), cones.origins.detach().double()
-        variances, axes = spectrum or spectrum_of(cones.covariances)
+    def __init__(self, cones: Cones | Tensor, extent: float, cutoff: float, smoothed: bool) -> None:
+        self.table = rows = cones.detach() if isinstance(cones, Tensor) else hull_rows(cones)
+        dim = self.dim = _dim_of(rows)
+        self.cutoff = cutoff
+        axes = rows[:, : dim * dim].view(-1, dim, dim)
+        means, origins, _, variances = (rows[:, dim * dim + i * dim :][:, :dim] for i in range(4))
         squares = cutoff**2 * variances.clamp_min(0)  # (C, D) squared half axes, ascending
         distance = (means - origins).norm(dim=1, keepdim=True)
-        far = distance + squares[:, -1:].sqrt()
         self.reach = 0.5 * extent * dim**0.5  # from the centre of the cube to its corners
         self.spread = cutoff * extent / 12**0.5 if smoothed else 0.0  # cutoff radius of the cube's Gaussian
-        self.table = torch.cat([axes.flatten(1), means, origins, squares, distance, far], 1)
         # The spread as seen from the sensor origin at range r is spread · distance / r, and at most r.
         widest = max(self.reach, self.spread)
         pad = (widest * distance).sqrt().clamp_min(widest)
@@ -67,10 +74,11 @@ class Hulls:
         made.table, made.low, made.high = self.table[rows], self.low[rows], self.high[rows]
         return made
 
-    def replaced(self, former: Tensor, new: Hulls) -> Hulls:
-        """The hulls with numbers `former` (C,), and the `new` ones, in order, where it is −1."""
+    def replaced(self, former: Tensor, new: Hulls, table: Tensor | None) -> Hulls:
+        """The hulls with numbers `former` (C,), and the `new` ones, in order, where it is −1. `table`: of all
+        of them, if it is known."""
         made = copy.copy(self)
-        made.table = replaced_rows(self.table, former, new.table)
+        made.table = replaced_rows(self.table, former, new.table) if table is None else table
         made.low, made.high = (
             replaced_rows(*rows) for rows in ((self.low, former, new.low), (self.high, former, new.high))
         )
@@ -81,13 +89,20 @@ class Hulls:
         arguments as for `near_lists`."""
         chunks = chunks_of(given.lengths()[lists], _TESTS_AT_ONCE)
         parts = [
-            near_lists(self.table, given, lists[t], centers[t], radii[t], self.reach, self.spread)
+            near_lists(
+                self.table, given, lists[t], centers[t], radii[t], self.reach, self.spread, self.cutoff
+            )
             for t in chunks
         ]
         if len(parts) == 1:
             return parts[0]
         lengths = [part.lengths() for part in parts] or [lists]
         return Lists.of(torch.cat(lengths), torch.cat([given.entries[:0], *(part.entries for part in parts)]))
+
+
+def _dim_of(rows: Tensor) -> int:
+    """2 or 3, of rows of `hull_rows` or `PointTable.rows`."""
+    return 2 if rows.shape[1] < 21 else 3
 
 
 def replaced_rows(rows: Tensor, former: Tensor, new: Tensor) -> Tensor:
@@ -98,7 +113,7 @@ def replaced_rows(rows: Tensor, former: Tensor, new: Tensor) -> Tensor:
 
 
 _ENTRIES_PER_CONE = {2: 64, 3: 512}  # of all buckets, which decides their side
-_KEPT_PER_CONE, _KEPT = 64, 1 << 22  # entries of the lists that are kept, for each cone, and at least
+_KEPT_PER_CONE, _KEPT = 48, 1 << 22  # entries of the lists that are kept, for each cone, and at least
 _KEY_BITS = {2: 31, 3: 21}  # bits of one bucket coordinate in a packed key
 _SAMPLE = 64  # cones, and places around each, by which the side is chosen
 _SHIFT = 2  # buckets of the next level are 2^_SHIFT times as large
@@ -122,7 +137,8 @@ class ConeIndex:
     lists are kept like the others, are compared with the boxes of all cones.
 
     Args:
-        cones: must not change afterwards; gradients do not pass through the index.
+        cones: or the `PointTable.rows` of them, which are not copied. They must not change afterwards;
+            gradients do not pass through the index.
         extent: side (m) of the largest box that is queried.
         cutoff: Mahalanobis distance beyond which a component gives no evidence.
         smoothed: True for the point form, which widens cones by the spread of the cube (see `PointForm`);
@@ -131,7 +147,7 @@ class ConeIndex:
             them.
         smallest: the lists of the smallest buckets serve always, which pays for many queries about the same
             places. False: a larger bucket's list serves its points if there are few.
-        spectrum: of the components of the cones, if it is known.
+        share: of the least number of entries that are kept, if other indices need memory, too.
 
     Attributes:
         lists: the kept lists; queries append to them, or drop the oldest.
@@ -140,20 +156,20 @@ class ConeIndex:
 
     def __init__(
         self,
-        cones: Cones,
+        cones: Cones | Tensor,
         extent: float,
         cutoff: float = CUTOFF,
         smoothed: bool = False,
         entries_per_cone: int | None = None,
         smallest: bool = False,
-        spectrum: Spectrum | None = None,
+        share: float = 1.0,
     ) -> None:
         self.extent = check_resolution(extent)
-        cones = cones.checked()
-        self.dim = cones.dim
         self._options = self.extent, cutoff, smoothed, entries_per_cone
-        self._smallest = smallest
-        self.hulls = Hulls(cones, self.extent, cutoff, smoothed, spectrum)
+        self._smallest, self._share = smallest, share
+        cones = cones if isinstance(cones, Tensor) else cones.checked()
+        self.hulls = Hulls(cones, self.extent, cutoff, smoothed)
+        self.dim = self.hulls.dim
         self._set_lattice()
 
     def _set_lattice(self) -> None:
@@ -170,20 +186,20 @@ class ConeIndex:
         self._set_box()
         self._drop_all()
 
-    def replaced(self, cones: Cones, former: Tensor, spectrum: Spectrum | None = None) -> ConeIndex:
+    def replaced(self, cones: Cones | Tensor, former: Tensor) -> ConeIndex:
         """The index of other cones. It keeps the lists of buckets that no new cone, and none that is gone,
         can reach; none if there are too many new cones for the size of the buckets.
 
         Args:
-            cones: C cones; must not change afterwards.
+            cones: C cones, or their rows, as for `ConeIndex`; must not change afterwards.
             former: (C,) the number of each cone in this index, −1 for a new one. The other numbers ascend.
-            spectrum: of the components of the new cones, if it is known.
         """
-        cones, made = cones.checked(), copy.copy(self)
+        made, table = copy.copy(self), cones.detach() if isinstance(cones, Tensor) else None
         is_new, stays = former < 0, torch.zeros_like(self.hulls.low[:, 0], dtype=torch.bool)
         stays[former[~is_new]] = True
-        new = Hulls(cones.taken(is_new), *self._options[:3], spectrum)
-        made.hulls = self.hulls.replaced(former, new)
+        given = cones[is_new] if isinstance(cones, Tensor) else cones.checked().taken(is_new)
+        new = Hulls(given, *self._options[:3])
+        made.hulls = self.hulls.replaced(former, new, table)
         corners = (torch.cat([new.low, new.high]) - self.origin) / self.side
         is_far = bool((corners.abs() > self._limit).any())
         if is_far or len(former) > 2 * self._n_chosen:
@@ -226,6 +242,7 @@ class ConeIndex:
         self._buckets = [(none, none)] * self._n_levels  # of each level, sorted keys and the buckets' lists
         self._used, self._now = none, 0  # when each list was used last
         self._levels = none  # of the bucket of each list
+        self._asked = none  # points that each list served
         self._buffer = none.int()  # begins with the entries of the lists
         self._table: Tensor | None = None  # of the smallest buckets of the box: the list of each
         self.lists = Lists.of(none, self._buffer)
@@ -235,7 +252,7 @@ class ConeIndex:
         lengths = self.lists.lengths()
         self._buffer = self.lists.entries[torch.repeat_interleave(kept, lengths)]
         self.lists = Lists.of(lengths[kept], self._buffer)
-        self._used, self._levels = self._used[kept], self._levels[kept]
+        self._used, self._levels, self._asked = (v[kept] for v in (self._used, self._levels, self._asked))
         rank, buckets = kept.cumsum(0) - 1, []
         for keys, numbers in self._buckets:
             stays = kept[numbers]
@@ -244,7 +261,7 @@ class ConeIndex:
 
     def _make_room(self) -> None:
         """Drops lists that were not used for the longest time, if there are more than the bound."""
-        most = max(_KEPT, _KEPT_PER_CONE * len(self.hulls.table))
+        most = max(int(_KEPT * self._share), _KEPT_PER_CONE * len(self.hulls.table))
         sizes = self.lists.lengths() + _PER_LIST
         if int(sizes.sum()) <= most:
             return
@@ -263,6 +280,7 @@ class ConeIndex:
         self.lists = Lists(starts, self._buffer[: n_entries + n_added])
         self._used = torch.cat([self._used, torch.full_like(cells[:, 0], self._now)])
         self._levels = torch.cat([self._levels, torch.full_like(cells[:, 0], level)])
+        self._asked = torch.cat([self._asked, torch.zeros_like(cells[:, 0])])
         added = torch.arange(n_lists, n_lists + len(cells), device=cells.device)
         keys, numbers = self._buckets[level]
         keys, numbers = torch.cat([keys, self._pack(cells)]), torch.cat([numbers, added])
@@ -402,7 +420,8 @@ class ConeIndex:
     def _serving(self, cells: Tensor, rank: Tensor) -> Tensor:
         """The list (R,) that serves each point, in the bucket with number `rank` (R,) among `cells` (B, D).
 
-        Lists are made from those of the largest buckets on, as long as there are enough points.
+        Lists are made from those of the largest buckets on, as long as there are enough points: with those of
+        earlier queries, so that places that are asked again and again get small buckets.
         """
         if self._smallest:  # with their neighbours, where the next points will be
             parents = torch.unique(cells >> _SHIFT, dim=0) << _SHIFT
@@ -411,28 +430,28 @@ class ConeIndex:
             return self._numbered(0, cells)[rank]
         groups, owners = [cells], []
         n_points = [torch.bincount(rank, minlength=len(cells))]
-        enough = [torch.zeros_like(cells[:, 0], dtype=torch.bool)]  # points to divide the bucket
+        n_children = [torch.zeros_like(cells[:, 0])]
         for _ in range(1, self._n_levels):
             cell = groups[-1] >> _SHIFT
             owner, n_groups = dense_ranks(self._pack(cell))
             groups.append(cell.new_zeros(n_groups, self.dim).index_copy_(0, owner, cell))
             owners.append(owner)
             n_points.append(torch.zeros_like(groups[-1][:, 0]).index_add_(0, owner, n_points[-1]))
-            n_children = torch.bincount(owner, minlength=n_groups)
-            enough.append(n_points[-1] >= _POINTS_PER_LIST * n_children)
+            n_children.append(torch.bincount(owner, minlength=n_groups))
         number = self._numbered(self._n_levels - 1, groups[-1])
         divided = torch.ones_like(number, dtype=torch.bool)
         for level in reversed(range(self._n_levels - 1)):
-            n_pairs = self.lists.lengths()[number] * n_points[level + 1]
-            if int((n_pairs * divided).sum()) <= _FEW_PAIRS:
+            weight = n_points[level + 1] + self._asked[number]
+            if int((self.lists.lengths()[number] * weight * divided).sum()) <= _FEW_PAIRS * self._share:
                 for owner in reversed(owners[: level + 1]):
                     number = number[owner]
                 break
             owner = owners[level]
-            divided = (divided & enough[level + 1])[owner]
+            divided = (divided & (weight >= _POINTS_PER_LIST * n_children[level + 1]))[owner]
             number = number[owner]
             asked = divided.nonzero().squeeze(1)
             number[asked] = self._numbered(level, groups[level][asked])
+        self._asked.index_add_(0, number, n_points[0])
         return number[rank]
 
     def buckets(self, points: Tensor) -> Tensor:

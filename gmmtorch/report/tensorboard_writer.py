@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+import os
+import socket
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +16,7 @@ import torch
 from matplotlib.colors import to_rgb
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import InvalidArgumentError, OutputError
 from gmmtorch.report.ellipsoids import checked_components, ellipsoid_mesh
 from gmmtorch.report.style import as_array, colour, even_sample
 from gmmtorch.report.text import format_value
@@ -36,13 +39,13 @@ class Board:
 
     Args:
         directory: folder of the event file; created if missing.
+
+    Raises `OutputError` if an event cannot be written; later events are then dropped.
     """
 
     def __init__(self, directory: str | Path) -> None:
-        from torch.utils.tensorboard import SummaryWriter
-
         self.directory = Path(directory)
-        self._writer = SummaryWriter(str(self.directory))
+        self._events = _EventFile(self.directory)
         self._first: dict[tuple[str, str], tuple[float, int, float] | None] = {}
         """Value, step and time of a tag's first value; None once the tag is a curve."""
 
@@ -64,7 +67,7 @@ class Board:
                 self._first[tag] = now
                 continue
             for number, at, moment in (first, now) if first is not None else (now,):
-                self._writer.add_scalar("/".join(filter(None, tag)), number, at, walltime=moment)
+                self._events.add("scalar", "/".join(filter(None, tag)), number, step=at, moment=moment)
             self._first[tag] = None
 
     def _write_results(self) -> None:
@@ -77,7 +80,7 @@ class Board:
         for name in dict.fromkeys(name for _, name in single):
             values = (single.get((prefix, name)) for prefix in prefixes)
             lines.append([name, *("" if value is None else format_value(name, value) for value in values)])
-        self._writer.add_text("results", "\n".join(f"| {' | '.join(line)} |" for line in lines))
+        self._events.add("text", "results", "\n".join(f"| {' | '.join(line)} |" for line in lines))
         self._first = {}
 
     def curve(self, tag: str, labels: ArrayLike, probabilities: ArrayLike) -> None:
@@ -90,7 +93,7 @@ class Board:
             )
         if len(truth) == 0:
             return
-        self._writer.add_pr_curve(tag, truth, theta, 0)
+        self._events.add("pr_curve", tag, truth, theta, step=0)
         if truth.all() or not truth.any():
             return
         from sklearn.metrics import roc_auc_score, roc_curve
@@ -110,7 +113,7 @@ class Board:
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
         pixels = np.asarray(canvas.buffer_rgba())[..., :3].copy()
-        self._writer.add_image(tag, pixels, 0, dataformats="HWC")
+        self._events.add("image", tag, pixels, dataformats="HWC", step=0)
 
     def cloud(self, tag: str, points: ArrayLike, colors: ArrayLike | None = None, step: int = 0) -> None:
         """Writes points (N, D), metres, with colours (N, 3) from 0 to 255; writes nothing for no points."""
@@ -161,15 +164,15 @@ class Board:
             k: v if isinstance(v, bool | int | float | str) else str(v) for k, v in config_flat.items()
         }
         results = {key: float(value) for key, value in metrics.items() if _is_number(value)}
-        # SummaryWriter.add_hparams would create another run, named after the time.
-        file_writer = self._writer._get_file_writer()
         for summary in hparams({**settings, **results}, {}):
-            file_writer.add_summary(summary)
+            self._events.write(summary)
 
     def close(self) -> None:
         """Writes pending events and closes the file."""
-        self._write_results()
-        self._writer.close()
+        try:
+            self._write_results()
+        finally:
+            self._events.close()
 
     def __enter__(self) -> Board:
         return self
@@ -180,13 +183,67 @@ class Board:
     def _add_mesh(
         self, tag: str, vertices: Tensor, colors: Tensor | None, faces: Tensor | None, step: int
     ) -> None:
-        self._writer.add_mesh(
+        self._events.add(
+            "mesh",
             tag,
             vertices.float()[None],
             None if colors is None else colors.clamp(0, 255).to(torch.uint8)[None],
             None if faces is None else faces.int()[None],
-            global_step=step,
+            None,
+            step=step,
         )
+
+
+class _EventFile:
+    """The event file of a run. It is written in the thread of the caller, to whom a full disk is an error;
+    torch's SummaryWriter has a thread whose errors nobody can catch."""
+
+    def __init__(self, directory: Path) -> None:
+        from tensorboard.compat.proto.event_pb2 import Event
+        from tensorboard.summary.writer.record_writer import RecordWriter
+
+        self._directory, self._is_full, self._event = directory, False, Event
+        name = f"events.out.tfevents.{time.time():017.6f}.{socket.gethostname()}.{os.getpid()}"
+        with self._errors():
+            directory.mkdir(parents=True, exist_ok=True)
+            self._file = (directory / name).open("xb")
+            self._records = RecordWriter(self._file)
+        self._append(Event(wall_time=time.time(), file_version="brain.Event:2"))
+
+    def add(
+        self, kind: str, *content: Any, step: int = 0, moment: float | None = None, **options: Any
+    ) -> None:
+        """Adds what the function `kind` of torch.utils.tensorboard.summary makes of a tag and its content."""
+        from torch.utils.tensorboard import summary
+
+        self.write(getattr(summary, kind)(*content, **options), step, moment)
+
+    def write(self, summary: Any, step: int = 0, moment: float | None = None) -> None:
+        """Adds a summary."""
+        self._append(self._event(summary=summary, step=int(step), wall_time=moment or time.time()))
+
+    def close(self) -> None:
+        """Closes the file."""
+        with suppress(OSError) if self._is_full else self._errors():  # of a full disk the caller knows
+            self._file.close()
+
+    def _append(self, event: Any) -> None:
+        if self._is_full:
+            return
+        with self._errors():
+            self._records.write(event.SerializeToString())
+            self._file.flush()
+
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            self._is_full = True
+            raise OutputError(
+                f"{self._directory} cannot be written: {error.strerror or error}; the events of TensorBoard "
+                "are incomplete."
+            ) from error
 
 
 def _is_number(value: object) -> bool:

@@ -7,14 +7,16 @@ import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from command_runs import QUIET, Finished, refused, run_here, succeeded
+from command_runs import QUIET, Disk, Finished, refused, run_here, succeeded
 
 from gmmtorch.datasets import load
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.map_builder import MapBuilder
+from gmmtorch.report import Board
 
 Run = Callable[..., Finished]
 SMALL = ["dataset=synthetic_building_2d", "dataset.n_scans=10", "map.window=4", "resolution=0.2"]
@@ -193,3 +195,22 @@ def test_odometry_auto_keeps_given_poses_and_mixture_is_scored_by_them(monkeypat
     text = refused(run_here(monkeypatch, "map", tmp_path / "imu", *options, *imu))
     assert "dataset.motion=imu cannot be used: it needs the IMU of a ROS bag" in text
     assert "Predict with dataset.motion=constant or dataset.motion=dataset." in text
+
+
+def test_a_disk_that_fills_up_ends_in_one_line_with_what_was_saved(monkeypatch, tmp_path):
+    options = [*SMALL, "report.progress=false"]
+    with Disk() as disk:
+        plain = Board.scalars
+
+        def fill(*arguments: Any, **row: Any) -> None:
+            disk.fill()
+            plain(*arguments, **row)
+
+        monkeypatch.setattr(Board, "scalars", fill)
+        done = run_here(monkeypatch, "map", tmp_path / "run", *options)
+    assert done.status == 1
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f"gmmtorch: error: {done.folder / 'tensorboard'} cannot be written: ")
+    assert f" Saved in {done.folder}: above.png, " in line
+    assert "map.safetensors" in line
+    assert GaussianMap.load(done.folder / "map.safetensors").n_components

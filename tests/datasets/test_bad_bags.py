@@ -28,7 +28,7 @@ def test_truncated_bags_are_refused_with_a_repair(tmp_path, suffix, share):
     data = path.read_bytes()
     path.write_bytes(data[: int(share * len(data))])
     with pytest.raises(DataError, match=r"a\.(mcap|db3|bag) cannot be read.*(recover|reindex)"):
-        load("rosbag", path)
+        load("rosbag", path, damaged="refuse")
 
 
 @FORMATS

@@ -254,7 +254,7 @@ def test_a_folder_with_several_files_asks_for_one(tmp_path):
 def test_a_bag_that_misses_a_file_is_refused(tmp_path, files):
     path = folder_of("a 0.mcap", metadata=metadata(files=files))(tmp_path)
     with pytest.raises(GmmTorchError, match=r"files are missing.*a 1\.mcap"):
-        load("rosbag", path)
+        load("rosbag", path, damaged="refuse")
 
 
 def test_remedies_of_kitti_are_applied(tmp_path):

@@ -170,7 +170,7 @@ def test_losses_are_repaired_to_the_bit(world: World) -> None:
     for other in others:
         second = other.components()
         assert isinstance(second, Components)
-        for name, value in vars(first).items():
+        for name, value in first.tensors().items():
             assert torch.equal(value, getattr(second, name)), name
         found = other.belief.grid.dense(world.box)
         torch.testing.assert_close(found[0], hits, rtol=1e-4, atol=1e-3)

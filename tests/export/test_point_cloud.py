@@ -9,6 +9,7 @@ import pytest
 import torch
 from export.map_examples import example_grid, random_probabilities
 
+from gmmtorch.datasets import read_channels
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.export.point_cloud import CellCloud, write_pcd, write_ply
 from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
@@ -84,3 +85,14 @@ def test_far_from_the_origin_ply_is_exact_and_pcd_is_rejected(tmp_path):
     with pytest.raises(InvalidArgumentError, match="write PLY, which has doubles"):
         write_pcd(tmp_path / "far.pcd", cells)
     assert not (tmp_path / "far.pcd").exists()
+
+
+def test_ply_clouds_have_colours_as_srgb_bytes(tmp_path):
+    cells = CellCloud(torch.eye(3).double(), torch.ones(3).double(), 0.1)
+    linear = torch.tensor([[1.0, 0, 0], [0, 0.2158605, 0], [0, 0, 2.0]]).double()  # sRGB 128; clamped
+    path = write_ply(tmp_path / "cells.ply", cells, linear)
+    torch.testing.assert_close(read_channels(path, ["colour"])["colour"][0], torch.tensor([1.0, 0, 0]))
+    body = path.read_bytes().split(b"end_header\n", 1)[1]
+    table = np.frombuffer(body, [("p", "<f8", 3), ("intensity", "<f4"), ("rgb", "u1", 3)])
+    assert table["rgb"].tolist() == [[255, 0, 0], [0, 128, 0], [0, 0, 255]]
+    np.testing.assert_array_equal(table["p"], np.eye(3))

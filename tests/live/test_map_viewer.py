@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import math
 import re
+import socket
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from gmmtorch.datasets import load
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.live import viewer_scene
+from gmmtorch.mapping import Attributes, Labels, Numbers
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.query import Query
 from gmmtorch.report.ellipsoids import unit_sphere
+from gmmtorch.scan import display_colours
 
 pytest.importorskip("viser")
+from viser_client import Client
 
 
 @pytest.fixture(scope="module")
@@ -82,12 +87,50 @@ def test_colours_follow_the_order_of_their_quantity(by, maps):
     components = maps[3][0].components()
     solid = viewer_scene.surfaces(components)
     colours = viewer_scene.colours(components, solid, by).rgb.astype(int)
-    quantity = {"height": solid.means[:, 2], "support": components.support, "age": components.ids[:, 1]}[by]
-    quantity = quantity if by == "height" else quantity[solid.rows]
+    quantity = {
+        "height": solid.means[:, 2],
+        "support": components.support[solid.rows],
+        "age": components.ids[solid.rows, 1],
+        "uncertainty": torch.linalg.eigvalsh(solid.covariances)[:, 0],
+    }[by]
     low, high = int(quantity.argmin()), int(quantity.argmax())
     assert colours[high, 1] > colours[low, 1] + 100  # viridis: from violet to yellow, with rising green
     with pytest.raises(InvalidArgumentError, match="colour"):
         viewer_scene.colours(components, solid, "taste")
+
+
+def test_channels_of_the_map_colour_its_components(maps):
+    components = maps[3][0].components()
+    solid, k = viewer_scene.surfaces(components), len(components)
+    none = torch.zeros(k, 3, 3).double()
+    colour = torch.rand(k, 3, generator=torch.Generator().manual_seed(0)).double()
+    share = torch.ones(k).double()
+    share[solid.rows[0]] = 0
+    heat = torch.arange(k).double()[:, None]
+    labels = torch.nn.functional.one_hot(torch.arange(k) % 2, 2).double()
+    attributes = Attributes(
+        {
+            "colour": Numbers(share, colour, none, none),
+            "heat": Numbers(share, heat, none[:, :1], none[:, :1, :1]),
+            "class": Labels(labels, torch.tensor([4, 9])),
+        }
+    )
+    known = replace(components, attributes=attributes)
+    assert viewer_scene.colour_choices(known) == (*viewer_scene.COLOURS, "colour", "heat", "class")
+    found = viewer_scene.colours(known, solid, "colour")
+    expected = (255 * display_colours(colour[solid.rows])).round().numpy()
+    np.testing.assert_array_equal(found.rgb[1:], expected[1:])
+    assert found.rgb[0].tolist() == [160, 160, 160]  # unknown
+    assert found.ends is None
+    shades = viewer_scene.colours(known, solid, "heat")
+    assert int(shades.rgb[-1, 1]) > int(shades.rgb[1, 1]) + 100
+    classes = viewer_scene.colours(known, solid, "class")
+    assert [name for name, _ in classes.legend] == ["4", "9"]
+    of_rows = {tuple(rgb) for rgb in classes.rgb[(solid.rows % 2 == 0).numpy()].tolist()}
+    assert len(of_rows) == 1
+    assert classes.legend[0][1] == "rgb({}, {}, {})".format(*of_rows.pop())
+    with pytest.raises(InvalidArgumentError, match="colour='heat'"):
+        viewer_scene.colours(components, solid, "heat")
 
 
 def test_slice_has_the_occupancy_of_the_map_with_the_highest_y_first(maps):
@@ -129,7 +172,7 @@ def test_a_place_has_the_evidence_from_which_its_occupancy_follows(dim, maps):
     position = built.components().means[3]
     theta, hits, misses = viewer_scene.place_at(built, position, 0.1)
     given = (torch.tensor(value).double() for value in (hits, misses))
-    expected = Query(built.components().cones(), built.query_options).rule.probability(*given, 0.1, dim)
+    expected = Query(built.components(), built.query_options).rule.probability(*given, 0.1, dim)
     assert hits > 0
     assert theta == pytest.approx(float(expected))
 
@@ -180,3 +223,101 @@ def test_a_growing_map_is_shown_from_its_first_components(maps):
         assert not made._height.visible
     finally:
         made.stop()
+
+
+# -- who may see the page -------------------------------------------------------------------------
+
+
+PORT = 8394
+OWN, PROXY = f"127.0.0.1:{PORT}", "https://map.example.org"
+
+
+@pytest.fixture(scope="module")
+def guarded(maps) -> Iterator:
+    from gmmtorch.live.map_viewer import MapViewer
+
+    made = MapViewer(*maps[2], port=PORT, origins=[PROXY])
+    yield made
+    made.stop()
+
+
+def status_of(viewer, *headers: str) -> int:
+    """The status of a request for the page with these headers, sent without a library that would add some."""
+    with socket.create_connection(("127.0.0.1", viewer.server.get_port()), timeout=10) as connection:
+        connection.sendall("\r\n".join(["GET / HTTP/1.1", *headers, "", ""]).encode())
+        return int(connection.recv(64).split()[1])
+
+
+@pytest.mark.parametrize(
+    ("headers", "is_admitted"),
+    [
+        ([f"Host: {OWN}"], True),
+        ([f"Host: localhost:{PORT}", f"Origin: http://localhost:{PORT}"], True),
+        (["Host: localhost:9000", "Origin: http://localhost:9000"], True),  # through a tunnel of ssh
+        (["Host: 192.168.1.7:8080"], True),
+        (["Host: [::1]:8080", "Origin: http://[::1]:8080"], True),
+        ([f"Host: {socket.gethostname()}:{PORT}"], True),
+        (["Host: map.example.org", f"Origin: {PROXY}"], True),
+        ([f"Host: {OWN}", f"Origin: {PROXY}"], True),
+        (["Host: evil.example"], False),
+        (["Host: evil.example", f"Origin: http://{OWN}"], False),
+        (["Host: 127.0.0.1.evil.example:8080"], False),
+        ([f"Host: {OWN}", "Origin: http://evil.example"], False),
+        ([f"Host: {OWN}", f"Origin: {PROXY}.evil.example"], False),
+        ([f"Host: {OWN}", "Origin: null"], False),
+        ([f"Host: {OWN}", "Origin: http://127.0.0.1:1"], False),
+        ([f"Host: {OWN}", "Host: evil.example"], False),
+        ([f"Host: {OWN}", f"Origin: http://{OWN}", "Origin: http://evil.example"], False),
+        (["Host: ]["], False),
+        (["Host:"], False),
+        ([], False),
+    ],
+)
+def test_only_the_pages_own_addresses_are_answered(guarded, headers, is_admitted):
+    assert status_of(guarded, *headers) == (200 if is_admitted else 403)
+
+
+def test_a_foreign_page_gets_no_connection(guarded):
+    """What each page in the user's browser could open, and the same from the map's own page."""
+    from websockets.exceptions import InvalidStatus
+
+    with Client(guarded.url, origin=guarded.url) as client:
+        client.received(b"GuiFolderMessage")
+    with Client(guarded.url) as client:  # a program
+        client.received(b"GuiFolderMessage")
+    for headers in ({"origin": "http://evil.example"}, {"additional_headers": {"Origin": "null"}}):
+        with pytest.raises(InvalidStatus, match="403"):
+            Client(guarded.url, **headers)
+
+
+def test_origins_are_checked(maps):
+    from gmmtorch.live.map_viewer import MapViewer
+
+    for origin in ("map.example.org", "ftp://map.example.org", "https://map.example.org/page"):
+        with pytest.raises(InvalidArgumentError, match=r"origins=.* is not the origin of a page"):
+            MapViewer(GaussianMap(), port=8395, origins=[origin])
+
+
+def test_a_server_that_cannot_be_guarded_is_not_used(monkeypatch):
+    import viser
+
+    from gmmtorch.live.map_viewer import MapViewer
+
+    monkeypatch.setattr(viser, "ViserServer", lambda *_, **__: None)
+    with pytest.raises(GmmTorchError, match="foreign pages"):
+        MapViewer(GaussianMap(), port=8396)
+
+
+def test_the_viewer_survives_a_thousand_connections(guarded):
+    """They send nothing, or a part of a request; the page is served beside them, and after them."""
+    kept = []
+    try:
+        for number in range(1000):
+            kept.append(socket.create_connection(("127.0.0.1", PORT), timeout=10))
+            if number % 2:
+                kept[-1].sendall(b"GET / HTTP/1.1\r\nHost: ")
+        assert status_of(guarded, f"Host: {OWN}") == 200
+    finally:
+        for connection in kept:
+            connection.close()
+    assert status_of(guarded, f"Host: {OWN}") == 200

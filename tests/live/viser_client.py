@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from typing import Any
 
 import msgspec.msgpack
 import viser
@@ -27,13 +28,14 @@ _CAMERA = ViewerCameraMessage(
 class Client:
     """Connects as a page does; use it in a `with` statement. Leaving without `close` cuts the connection."""
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, **headers: Any) -> None:
         self._connection: ClientConnection = connect(
             url.replace("http", "ws"),
             subprotocols=[f"viser-v{viser.__version__}"],  # type: ignore[list-item]
             max_size=None,
             max_queue=None,  # reads even while nobody takes what it received
             ping_interval=None,
+            **headers,
         )
         self._decompress = zstandard.ZstdDecompressor().decompress
         self._connection.send(msgspec.msgpack.encode(_CAMERA.as_serializable_dict()))

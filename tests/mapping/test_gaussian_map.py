@@ -90,7 +90,7 @@ def test_attributes_show_the_unfinished_window(finish):
     assert made.n_pending == 1
     known = made.components()
     assert len(made.means) == len(made.support) == len(known) > 0
-    for name in vars(known):
+    for name in known.tensors():
         assert torch.equal(getattr(made, name), getattr(known, name)), name
     made.insert(drive(2)[1])  # the window of two is full
     assert made.n_pending == 0
@@ -332,7 +332,7 @@ def test_a_restored_map_continues_bit_by_bit(rule, n, tmp_path):
     assert (again.dim, again.learning) == (first.dim, first.learning)
     for scan in SCANS[n:]:
         again.insert(scan)
-    for name, value in vars(whole_map(rule).components()).items():
+    for name, value in whole_map(rule).components().tensors().items():
         assert torch.equal(value, getattr(again.components(), name)), name
 
 

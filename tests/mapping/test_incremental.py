@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from torch import Tensor
 import gmmtorch
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.evaluation import metrics, queries
-from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.components import TENSORS, Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.fitting import DepthFrame
 from gmmtorch.mapping.learning.merging import UNNUMBERED, estimated_bytes
@@ -51,7 +51,7 @@ def occupancy(components: Components, x: Tensor, resolution: float = 0.125) -> T
 
 
 def equal(a: Components, b: Components) -> bool:
-    return all(torch.equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(Components))
+    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in TENSORS)
 
 
 @given(

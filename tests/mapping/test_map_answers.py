@@ -12,9 +12,11 @@ from mapping.map_cases import FINE, built, drive, given_parts, open_drive
 from occupancy.protocol_contract import RESOLUTION, SENSOR, WALL, dims, lattice, points, shifted, wall_scan
 
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
+from gmmtorch.mapping import map_state
+from gmmtorch.mapping import query as map_query
 from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.query import Query, cutoff_by_support
+from gmmtorch.mapping.query import Query, count_many, cutoff_of
 from gmmtorch.mapping.query_options import METHODS, QueryOptions
 from gmmtorch.occupancy import cone_index
 from gmmtorch.occupancy.calibrator import Calibration
@@ -195,19 +197,17 @@ def test_lists_are_read_in_double_precision():
 
 
 def test_the_default_cutoff_follows_the_support_of_the_components():
-    def cones(*counts: float) -> Cones:
-        k = len(counts)
-        eye = torch.eye(2, dtype=torch.float64).repeat(k, 1, 1)
-        place = torch.zeros(k, 2, dtype=torch.float64)
-        weight = torch.tensor(counts, dtype=torch.float64)
-        return Cones(place, eye, place + 5, weight, torch.zeros(k, dtype=torch.bool))
+    def cutoff(*counts: float) -> float:
+        return cutoff_of(*count_many(torch.tensor(counts, dtype=torch.float64)))
 
-    assert cutoff_by_support(cones(1000.0, 60.0, 50.0)) == 3
-    assert cutoff_by_support(cones(1000.0, 40.0, 3.0)) == CUTOFF
-    assert cutoff_by_support(cones(0.0, 0.0, 70.0)) == 3
-    assert cutoff_by_support(cones()) == CUTOFF
-    fixed = Query(cones(1000.0), QueryOptions(cutoff=4.0))
-    assert (fixed.cutoff, Query(cones(1000.0), QueryOptions(cutoff=None)).cutoff) == (4, 3)
+    assert cutoff(1000.0, 60.0, 50.0) == 3
+    assert cutoff(1000.0, 40.0, 3.0) == CUTOFF
+    assert cutoff(0.0, 0.0, 70.0) == 3
+    assert cutoff() == CUTOFF
+    components = built(open_drive(2, 2), FINE).components()
+    counts = torch.full_like(components.seen_count, 1000.0)
+    many = replace(components, seen_count=counts)
+    assert [Query(many, QueryOptions(cutoff=given)).cutoff for given in (4.0, None)] == [4, 3]
 
 
 # -- a map that is asked while it grows ------------------------------------------------------------------
@@ -228,10 +228,11 @@ def corridor(n: int, dim: int) -> list[Scan]:
 
 @dims
 @pytest.mark.parametrize("method", ["point", "flux", "cone"])
-@pytest.mark.parametrize("codec", ["quantized", "float"])
-def test_a_map_asked_after_each_scan_answers_like_a_new_one(dim, method, codec, monkeypatch):
+@pytest.mark.parametrize(("codec", "block"), [("quantized", 8192), ("float", 8192), ("quantized", 5)])
+def test_a_map_asked_after_each_scan_answers_like_a_new_one(dim, method, codec, block, monkeypatch):
     for module in (point_form, cone_index):
         monkeypatch.setattr(module, "_FEW_PAIRS", 0)
+    monkeypatch.setattr(map_query, "_BLOCK", block)
     grown = GaussianMap(replace(FINE, window=3), codec=codec, method=method)
     grid = VoxelGrid.covering([-1.0] * dim, [10.0] + [2.0] * (dim - 1), 0.5)
     for number, scan in enumerate(corridor(8, dim)):
@@ -246,15 +247,67 @@ def test_a_map_asked_after_each_scan_answers_like_a_new_one(dim, method, codec, 
                 torch.testing.assert_close(
                     getattr(found, name), getattr(expected, name), rtol=1e-9, atol=1e-9
                 )
-    expected = quantized(grown._with_pending()) if codec == "quantized" else grown._with_pending()
-    for name, values in vars(grown.components()).items():
+    expected = quantized(grown.unrounded()) if codec == "quantized" else grown.unrounded()
+    for name, values in grown.components().tensors().items():
         assert torch.equal(values, getattr(expected, name)), name
 
 
 @dims
-def test_components_that_are_replaced_give_no_evidence(dim, monkeypatch):
+@pytest.mark.parametrize("few_pairs", [0, 1 << 19])
+def test_blocks_answer_as_one_form_of_all_cones_however_the_components_change(dim, few_pairs, monkeypatch):
+    for module in (point_form, cone_index):
+        monkeypatch.setattr(module, "_FEW_PAIRS", few_pairs)
+    monkeypatch.setattr(map_query, "_BLOCK", 7)
+    every = built(corridor(9, dim), FINE).components()
+    asked = torch.cat([lattice(dim), lattice(dim) + torch.tensor([4.0, 0, 0][:dim])])
+    asked = torch.cat([asked, torch.full_like(asked[:1], torch.inf), 1e7 + asked[:1]])
+    generator = torch.Generator().manual_seed(0)
+    options = QueryOptions(cutoff=4.0)
+    answers = Query(every.selected(torch.arange(10)), options)
+    for step in range(12):
+        kept = torch.rand(len(every), generator=generator) < (step / 8 if step < 8 else 0.9)
+        changed = every.selected(kept.nonzero().squeeze(1))
+        if step % 3 == 1 and len(changed):
+            changed.seen_count[: 1 + len(changed) // 3] *= 2  # `selected` copies
+        recent = [every.selected(torch.arange(step, step + 2))] if step % 2 else []
+        answers = answers.replaced(changed, options, recent)
+        cones = Cones(*map(torch.cat, zip(*(c.cones() for c in (changed, *recent)), strict=True)))
+        expected = point_form.PointForm(cones, 0.1, 4.0)(asked)
+        found = answers.evidence_at(asked, 0.1, "point")
+        for one, other in zip(found, expected, strict=True):
+            assert torch.equal(one, other)
+
+
+@dims
+def test_a_large_unfinished_window_answers_from_its_parts_until_it_is_learned(dim, monkeypatch):
+    monkeypatch.setattr(map_state, "_PART", 1)
+    grown = GaussianMap(replace(FINE, window=4))
+    asked = torch.cat([scan.points[::5] for scan in corridor(7, dim)]) + 0.02
+    for scan in corridor(7, dim):
+        grown.insert(scan)
+    theta = grown.occupancy(asked)
+    assert len(grown._parts) == 3
+    whole = built(corridor(4, dim), replace(FINE, window=4), codec="quantized").components().cones()
+    parts = [c.cones() for c in grown._parts.values()]
+    cones = Cones(*map(torch.cat, zip(whole, *parts, strict=True)))
+    query = Query(grown.components(), grown.query_options)
+    evidence = point_form.PointForm(cones, grown.resolution, query.cutoff)(asked)
+    expected = grown.query_options.calibration.probability(*evidence, grown.resolution, dim)
+    torch.testing.assert_close(theta, expected, rtol=1e-12, atol=1e-12)
+    learned = grown.occupancy(asked)  # `components` has learned the window
+    assert not torch.equal(learned, theta)
+    torch.testing.assert_close(learned, grown.snapshot().occupancy(asked), rtol=1e-9, atol=1e-9)
+    restored = GaussianMap(replace(FINE, window=4))
+    restored.load_state_dict(grown.state_dict())
+    assert torch.equal(restored.occupancy(asked), theta)
+
+
+@dims
+@pytest.mark.parametrize("block", [8192, 5])
+def test_components_that_are_replaced_give_no_evidence(dim, block, monkeypatch):
     for module in (point_form, cone_index):
         monkeypatch.setattr(module, "_FEW_PAIRS", 0)
+    monkeypatch.setattr(map_query, "_BLOCK", block)
     made = built(corridor(6, dim), FINE, codec="quantized")
     query = torch.cat([lattice(dim), lattice(dim) + torch.tensor([4.0, 0, 0][:dim])])
     before = made.occupancy(query)

@@ -99,13 +99,13 @@ def test_the_builder_inserts_its_scans_and_counts_them():
 def test_progress_learns_no_unfinished_window(monkeypatch):
     """A preview of the window for each scan would cost more than the map itself."""
     previews: list[int] = []
-    learned = GaussianMap._with_pending
+    learned = GaussianMap.unrounded
 
     def counted(self):
         previews.append(self.n_pending)
         return learned(self)
 
-    monkeypatch.setattr(GaussianMap, "_with_pending", counted)
+    monkeypatch.setattr(GaussianMap, "unrounded", counted)
     one = builder()
     shown = [now.n_components for now in one.insert_all()]
     assert shown[-1] > 0

@@ -244,6 +244,19 @@ def test_lists_that_are_kept_are_bounded(monkeypatch, smallest):
     assert most > 1 << 10
 
 
+def test_places_that_are_asked_again_get_shorter_lists_and_the_same_answers(monkeypatch):
+    monkeypatch.setattr(cone_index, "_FEW_PAIRS", 1500)
+    monkeypatch.setattr(point_form, "_FEW_PAIRS", 0)
+    cones = random_cones(3, 200, 2, room=True)
+    places, _ = places_on_rays(cones, 40, CUTOFF, 0)
+    form, n_listed = PointForm(cones, 0.1), []
+    for _ in range(8):
+        same_evidence(form(places), brute(cones, places, 0.1))
+        number = form.index.buckets(places).clamp_min(0)
+        n_listed.append(int(form.index.lists.lengths()[number].sum()))
+    assert n_listed[-1] < 0.7 * n_listed[0]
+
+
 @pytest.mark.parametrize("case", ["clusters", "hundred metres", "needles", "one component", "one place"])
 def test_strange_cones_give_the_evidence_of_all(case, monkeypatch):
     monkeypatch.setattr(point_form, "_FEW_PAIRS", 0)

@@ -256,6 +256,18 @@ def test_evidence_is_zero_beyond_the_cutoff():
         assert occupancy_probability(*evidence).tolist() == [0.5] * len(places)
 
 
+def test_points_at_infinity_do_not_change_the_evidence_of_others():
+    cones = random_cones(3, 6, 0)
+    points = near_rays(cones, 40, 1)
+    expected = point_evidence(cones, points, 0.1)
+    mixed = torch.full((80, 3), torch.inf, dtype=torch.float64)
+    mixed[::2] = points
+    for one, other in zip(point_evidence(cones, mixed, 0.1), expected, strict=True):
+        assert float(other.sum()) > 0
+        assert torch.equal(one[::2], other)
+        assert not bool(one[1::2].any())
+
+
 def test_evidence_is_continuous_at_the_cutoff():
     cones = one_cone((3.0, 0.0), (0.01, 0.01), count=1e6)
     across = torch.linspace(0, 0.8, 200_001, dtype=torch.float64)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import resource
+import threading
+
 import numpy as np
 import pytest
 import torch
@@ -10,7 +13,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.plugins.hparams import plugin_data_pb2
 from tensorboard.util.tensor_util import make_ndarray
 
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import InvalidArgumentError, OutputError
 from gmmtorch.report import tensorboard_writer
 from gmmtorch.report.accuracy_figures import roc_figure
 from gmmtorch.report.tensorboard_writer import Board
@@ -110,3 +113,20 @@ def test_board_errors_name_the_argument(tmp_path):
             board.cloud("bad", torch.zeros(3))
         with pytest.raises(InvalidArgumentError, match="colors has shape"):
             board.cloud("bad", torch.zeros(3, 3), torch.zeros(2, 3))
+
+
+def test_a_full_disk_is_one_error_of_the_caller(tmp_path):
+    """A limit of the file's size stands for the end of the disk. No thread has an error of its own."""
+    unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
+    board, n_threads = Board(tmp_path), threading.active_count()
+    resource.setrlimit(resource.RLIMIT_FSIZE, (5_000, unlimited[1]))
+    try:
+        with pytest.raises(OutputError, match=f"{tmp_path} cannot be written: .*TensorBoard") as found, board:
+            board.cloud("scan", torch.zeros(10_000, 3))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
+    assert "\n" not in str(found.value)
+    assert threading.active_count() == n_threads
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="cannot be written"):
+        Board(tmp_path / "file")

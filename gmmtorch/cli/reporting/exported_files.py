@@ -15,6 +15,7 @@ from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
 from gmmtorch.export import (
     CellCloud,
     PlainMixture,
+    Splats,
     checked,
     distance_field,
     highest_in_band,
@@ -32,11 +33,13 @@ from gmmtorch.export import (
     write_octomap,
     write_pcd,
     write_ply,
+    write_splats,
 )
 from gmmtorch.mapping import GaussianMap
 from gmmtorch.mixture import GaussianMixture
 from gmmtorch.occupancy import OccupancyGrid, Thresholds, VoxelGrid, check_resolution, rasterize
 from gmmtorch.report import Event
+from gmmtorch.scan import COLOUR
 
 _EXTENT = 3.0  # standard deviations around each component that the cells cover
 
@@ -54,9 +57,13 @@ def write_poses(path: Path, output: Path) -> str:
 
 
 def write_components(config: DictConfig) -> str:
-    """Write weights, means and covariances; returns a message."""
-    mixture = checked(_components(config))
+    """Write weights, means and covariances, or splats; returns a message."""
     output = Path(config.output)
+    if config.format == "splats":
+        splats = Splats.of(inputs.open_map(Path(config.path), config.runtime, config.bounds).components())
+        write_splats(output, splats)
+        return f"{_size(output)}: {len(splats.means):,} splats"
+    mixture = checked(_components(config))
     if config.format == "csv":
         write_gira_csv(output, mixture)
     elif config.format == "npz":
@@ -141,8 +148,11 @@ def write_space(config: DictConfig, source: Source, on_event: Event) -> str:
         write_octomap(output, cells, rule)
     else:
         cells = cells.above(rule.occupied)
-        write = write_ply if config.format == "ply" else write_pcd
-        write(output, cells)
+        if config.format == "ply":
+            found = source.attributes(cells.centers) if isinstance(source, GaussianMap) else {}
+            write_ply(output, cells, found[COLOUR].mean if COLOUR in found else None)
+        else:
+            write_pcd(output, cells)
     return f"{_size(output)}: {len(cells):,} cells of {cells.resolution:g} m"
 
 

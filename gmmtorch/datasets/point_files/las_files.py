@@ -6,14 +6,14 @@ Offsets are those of the LAS specification 1.4 (ASPRS) and of the LASzip specifi
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
-from gmmtorch.datasets.point_files.point_rows import check_count
+from gmmtorch.datasets.point_files.point_rows import AXES, check_count
 from gmmtorch.errors import DataError, GmmTorchError
 from gmmtorch.optional_packages import needs_extra
 
@@ -138,22 +138,26 @@ def _damaged(path: Path, reason: str) -> DataError:
 
 
 class LasRows:
-    """The points of a LAS or LAZ file, in the file's frame, float64, with scale and offset applied."""
+    """The points of a LAS or LAZ file, in the file's frame, float64, with scale and offset applied; or its
+    dimensions of these names.
 
-    dim = 3
+    Attributes:
+        fields: the types of all dimensions.
+    """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, names: Sequence[str] = AXES) -> None:
         with needs_extra(f"{path}: LAS and LAZ files need", "laspy", "formats"):
             import laspy
             import lazrs  # noqa: F401  used by laspy
         self._laspy: Any = laspy
-        self._path = path
+        self._path, self._names, self.dim = path, names, len(names)
         self.name = path.stem
         with _las_errors(path):
             self.n_rows, self._point_bytes = read_las_header(path)
         with _las_errors(path), self._open() as reader:
             if int(reader.header.point_count) != self.n_rows:
                 raise DataError(f"{path} announces two numbers of points; it is damaged. Write it again.")
+            self.fields = {d.name: np.dtype(d.dtype or "<u1") for d in reader.header.point_format}
             scales, offsets = (
                 np.asarray(of, np.float64) for of in (reader.header.scales, reader.header.offsets)
             )
@@ -174,7 +178,7 @@ class LasRows:
             for first in range(begin, end, size):
                 wanted = min(size, end - first)
                 points = reader.read_points(wanted)
-                block = np.stack([points.x, points.y, points.z], 1)
+                block = np.stack([np.asarray(getattr(points, name)) for name in self._names], 1)
                 check_count(self._path, first, block.shape[0], wanted, self.n_rows)
                 yield block
 

@@ -100,8 +100,15 @@ def _read_header(path: Path) -> _Header:
     return _Header(_ORDERS[form], form == "ascii", counts, properties, len(lines), n_bytes)
 
 
-def ply_rows(path: Path) -> Rows:
-    """The points (element vertex) of a PLY file. Raises `DataError` if it is damaged.
+def ply_fields(path: Path) -> dict[str, np.dtype]:
+    """The types of the properties of the points of a PLY file that are one number."""
+    return {p.name: np.dtype(p.code) for p in _read_header(path).properties["vertex"] if not p.count_code}
+
+
+def ply_rows(path: Path, fields: Sequence[str] = AXES) -> Rows:
+    """The points (element vertex) of a PLY file, or their properties of these names.
+
+    Raises `DataError` if it is damaged.
 
     Points with lists, and records after lists, are read as a whole.
     """
@@ -109,22 +116,22 @@ def ply_rows(path: Path) -> Rows:
     names = list(header.counts)
     place = names.index("vertex")
     before, n_points = names[:place], header.counts["vertex"]
-    fields = header.properties["vertex"]
+    known = [p.name for p in header.properties["vertex"]]
     if header.is_text and not _has_lists(header, ["vertex"]):
         check_text(path, sum(header.counts.values()))
         n_before, n_after = (sum(header.counts[name] for name in of) for of in (before, names[place + 1 :]))
-        columns = [[p.name for p in fields].index(axis) for axis in AXES]
-        return TextRows(path, n_points, header.n_lines, len(fields), columns, n_before, n_after)
+        columns = [known.index(name) for name in fields]
+        return TextRows(path, n_points, header.n_lines, len(known), columns, n_before, n_after)
     if header.is_text or _has_lists(header, [*before, "vertex"]):
         vertices = ply_elements(path)["vertex"]
-        return ArrayRows(np.stack([vertices[axis] for axis in AXES], 1).astype(np.float64), path.stem)
+        return ArrayRows(np.stack([vertices[name] for name in fields], 1).astype(np.float64), path.stem)
     if _has_lists(header, names):
         ply_elements(path)  # reads the lists, because only their lengths tell whether the file is complete
     else:
         n_bytes = sum(header.counts[name] * _record(header, name).itemsize for name in names)
         check_size(path, header.n_bytes + n_bytes, f"{n_points} points")
     start = header.n_bytes + sum(header.counts[name] * _record(header, name).itemsize for name in before)
-    return RecordRows(path, n_points, start, _record(header, "vertex")[list(AXES)])
+    return RecordRows(path, n_points, start, _record(header, "vertex")[list(fields)])
 
 
 def _has_lists(header: _Header, names: Sequence[str]) -> bool:

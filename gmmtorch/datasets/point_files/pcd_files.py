@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from gmmtorch.datasets.point_files.point_rows import (
     AXES,
+    PACKED,
     ArrayRows,
     RecordRows,
     Rows,
@@ -39,8 +41,21 @@ def _entries(lines: list[list[str]]) -> dict[str, list[str]]:
     return {words[0]: words[1:] for words in lines if words and not words[0].startswith("#")}
 
 
-def pcd_rows(path: Path) -> Rows:
-    """The points of a PCD file. Raises `DataError` if its header is damaged or its size another one."""
+def pcd_fields(path: Path) -> dict[str, np.dtype]:
+    """The types of the fields of a PCD file with one number each."""
+    header = pcd_header(path)
+    with damaged(path, "has a damaged header"):
+        columns = zip(header["FIELDS"], header["TYPE"], header["SIZE"], strict=True)
+        counts = header.get("COUNT", ["1"] * len(header["FIELDS"]))
+        both = zip(columns, counts, strict=True)
+        return {name: np.dtype(_CODES[f"{kind}{size}"]) for (name, kind, size), n in both if n == "1"}
+
+
+def pcd_rows(path: Path, names: Sequence[str] = AXES) -> Rows:
+    """The points of a PCD file, or its fields of these names. A field with packed colours is its 32 bits.
+
+    Raises `DataError` if its header is damaged or its size another one.
+    """
     lines, n_bytes = header_lines(path, "DATA")
     with damaged(path, "has a damaged header"):
         header = _entries(lines)
@@ -55,12 +70,12 @@ def pcd_rows(path: Path) -> Rows:
             raise ValueError("the sizes of the fields")
         if "WIDTH" in header and sides[0] * sides[1] != n_points:
             raise ValueError(f"POINTS {n_points} is not WIDTH times HEIGHT")
-        columns = [fields.index(axis) for axis in AXES]
+        columns = [fields.index(name) for name in names]
         offsets = [sum(widths[:column]) for column in columns]
         record = np.dtype(
             {
-                "names": AXES,
-                "formats": [_CODES[codes[column]] for column in columns],
+                "names": list(names),
+                "formats": ["<u4" if fields[c] in PACKED else _CODES[codes[c]] for c in columns],
                 "offsets": offsets,
                 "itemsize": sum(widths),
             }
@@ -75,8 +90,8 @@ def pcd_rows(path: Path) -> Rows:
     if form == "binary_compressed":
         data = _unpacked(path, n_bytes, n_points * record.itemsize)
         axes = [
-            np.ndarray(n_points, record[axis], data, n_points * offset, (widths[column],))
-            for axis, offset, column in zip(AXES, offsets, columns, strict=True)
+            np.ndarray(n_points, record[name], data, n_points * offset, (widths[column],))
+            for name, offset, column in zip(names, offsets, columns, strict=True)
         ]  # one field of all points follows the other
         with np.errstate(invalid="ignore"):  # a signalling NaN of a damaged file
             return ArrayRows(np.stack([axis.astype(np.float64) for axis in axes], 1), path.stem)

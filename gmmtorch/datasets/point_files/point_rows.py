@@ -79,12 +79,11 @@ class NpyRows:
 
 
 class RecordRows:
-    """The points of a binary file, mapped into memory: records with the fields x, y and z from a byte on."""
-
-    dim = 3
+    """The fields of a record in a binary file, mapped into memory, such as x, y and z, from a byte on."""
 
     def __init__(self, path: Path, n_points: int, start: int, record: np.dtype) -> None:
         self._path, self._start, self._record = path, start, record
+        self.dim = len(record.names or ())
         self.name, self.n_rows = path.stem, n_points
 
     def blocks(self, begin: int, end: int, size: int) -> Iterator[np.ndarray]:
@@ -93,7 +92,7 @@ class RecordRows:
             offset = self._start + first * self._record.itemsize
             records = np.memmap(self._path, self._record, "r", offset, (n,))
             with np.errstate(invalid="ignore"):  # a signalling NaN of a damaged file
-                block = np.stack([records[axis].astype(np.float64) for axis in AXES], 1)
+                block = np.stack([records[name].astype(np.float64) for name in self._record.names or ()], 1)
             yield block
 
 
@@ -103,11 +102,9 @@ class TextRows:
     Args:
         n_lines: lines of the header.
         width: numbers in the line of a point.
-        columns: those of x, y and z.
+        columns: those that are read, such as x, y and z.
         n_before, n_after: lines that are not blank, before and after the points.
     """
-
-    dim = 3
 
     def __init__(
         self,
@@ -120,7 +117,7 @@ class TextRows:
         n_after: int = 0,
     ) -> None:
         self._path, self._n_lines, self._width, self._columns = path, n_lines, width, columns
-        self._n_before, self._n_after = n_before, n_after
+        self._n_before, self._n_after, self.dim = n_before, n_after, len(columns)
         self.name, self.n_rows = path.stem, n_points
 
     def blocks(self, begin: int, end: int, size: int) -> Iterator[np.ndarray]:
@@ -162,6 +159,8 @@ def check_count(path: Path, first: int, found: int, wanted: int, announced: int)
 
 
 AXES = ("x", "y", "z")
+PACKED = ("rgb", "rgba")
+"""Fields of 32 bits, 0xAARRGGBB, which PCL also calls floating numbers."""
 _HEADER_BYTES = 1 << 16
 _MAX_PADDING = 1 << 16
 

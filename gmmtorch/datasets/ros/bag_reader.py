@@ -21,6 +21,7 @@ from types import SimpleNamespace
 from typing import Any, BinaryIO, NamedTuple
 
 from gmmtorch.datasets.ros.message_decoder import BASE, NAME, SEQUENCE, MessageDecoder
+from gmmtorch.datasets.ros.salvage import Salvage
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
 from gmmtorch.optional_packages import needs_extra
 
@@ -52,22 +53,26 @@ class RawMessage(NamedTuple):
     data: bytes
 
 
+class DamagedBagError(DataError):
+    """A bag cannot be read as a whole."""
+
+
 class BagReader:
     """The topics and messages of one bag.
 
     Args:
         path: a .bag, .mcap or .db3 file, or the folder of a ROS 2 bag.
+        is_salvaged: whether the intact part of a damaged bag is read.
 
-    Raises `DataError`, which states a repair, if the bag is damaged, and `GmmTorchError` without rosbags.
+    Raises `DamagedBagError`, which states a repair, if the bag is damaged, and `GmmTorchError` without
+    rosbags.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, is_salvaged: bool = False) -> None:
         self.path = _bag_file(path)
         self._is_ros1 = self.path.suffix == ".bag"
         with self._errors():
-            for file in sorted(self.path.glob("*.db3")) if self.path.is_dir() else [self.path]:
-                _check_length(file)
-            self._reader: Any = self._opened()
+            self._reader: Any = self._salvaged() if is_salvaged else self._opened()
             self._connections = [
                 c for c in self._reader.connections if isinstance(c.topic, str) and isinstance(c.msgtype, str)
             ]  # columns of a damaged database can be empty
@@ -114,8 +119,43 @@ class BagReader:
                 f"{self.path}, topic {message.topic}, recorded at {message.time / 1e9:.3f} s: {error}."
             ) from error
 
+    @property
+    def damage(self) -> str:
+        """What is missing in a damaged bag whose intact part is read; "" if nothing is."""
+        if not isinstance(self._reader, Salvage):
+            return ""
+        found, first = self._reader, self._reader.first
+        n_stated, end = _stated(self.path)
+        of_all = f" of {n_stated:,}" if n_stated else ""
+        text = f"{found.n_messages:,}{of_all} messages in {(found.last - first) / 1e9:.1f} s are intact"
+        if found.gaps:
+            longest = max(found.gaps, key=lambda gap: gap[1] - gap[0])
+            text += (
+                f"; {found.missing_seconds:.1f} s in {len(found.gaps)} gaps are missing, the longest from "
+                f"{(longest[0] - first) / 1e9:.1f} to {(longest[1] - first) / 1e9:.1f} s"
+            )
+        if end:
+            return f"{text}; {max(0, end - found.last) / 1e9:.1f} s at the end are missing"
+        return (
+            f"{text}; the file is cut off there, and does not state how much is missing"
+            if found.is_cut
+            else text
+        )
+
+    def _salvaged(self) -> Salvage:
+        reader_class(self._is_ros1)  # puts limits on rosbags
+        files = sorted(self.path.iterdir()) if self.path.is_dir() else [self.path]
+        try:
+            return Salvage(
+                [file for file in files if file.suffix in _SUFFIXES], _unpack_chunk, MAX_CHUNK_BYTES
+            )
+        except DataError as error:
+            raise DamagedBagError(str(error)) from error
+
     def _opened(self) -> Any:
         """The opened reader of rosbags: of the folder, or of its only file if metadata.yaml is unusable."""
+        for file in sorted(self.path.glob("*.db3")) if self.path.is_dir() else [self.path]:
+            _check_length(file)
         *tried, last = self.path, *_only_file(self.path)
         for path in tried:
             reader = reader_class(self._is_ros1)(_bounded(path))
@@ -149,7 +189,7 @@ class BagReader:
             if "index" in reason and self._is_ros1:
                 reason = f"{reason} (it was not closed)"
             repair = _REPAIRS.get(self.path.suffix, "'ros2 bag reindex' writes metadata.yaml again")
-            raise DataError(
+            raise DamagedBagError(
                 f"{self.path} cannot be read as a ROS bag: {reason}. It is truncated, damaged, or uses an "
                 f"unknown compression; {repair}."
             ) from error
@@ -181,6 +221,15 @@ def _only_file(path: Path) -> list[Path]:
     text = metadata.read_text("utf-8", errors="replace")
     named = {name.split(": ")[-1].strip(" -") for name in re.findall(r"[^\n/,'\"[]+\.(?:mcap|db3)\b", text)}
     return files if len(files) == 1 and named <= {files[0].name} else []
+
+
+def _stated(path: Path) -> tuple[int, int]:
+    """The number of messages and the time (ns) of the last one by metadata.yaml, or 0."""
+    metadata = path / "metadata.yaml"
+    text = metadata.read_text("utf-8", errors="replace") if metadata.is_file() else ""
+    patterns = (r"message_count: (\d{1,12})\b", r"_since_epoch: (\d{1,19})\b", r"nanoseconds: (\d{1,19})\b")
+    n_messages, begin, duration = (int(found[1]) if (found := re.search(p, text)) else 0 for p in patterns)
+    return n_messages, begin + duration
 
 
 def _check_length(path: Path) -> None:
@@ -443,6 +492,19 @@ def _unpack_lz4(data: bytes, limit: int = MAX_CHUNK_BYTES) -> bytes:
     import lz4.frame
 
     return _within(lz4.frame.LZ4FrameDecompressor().decompress(data, _more(limit)))
+
+
+def _unpack_chunk(data: bytes, compression: str, size: int) -> bytes:
+    """A chunk of a damaged bag, unpacked to at most a byte more than it announces."""
+    if compression in ("", "none"):
+        return data
+    codecs = {"bz2": _unpack_bz2, "lz4": _unpack_lz4, "zstd": unpack_zstd}
+    if compression not in codecs:
+        raise DataError(f"the compression {compression!r} is not known")
+    try:
+        return codecs[compression](data, size)
+    except Exception as error:  # each codec has errors of its own
+        raise DataError(f"a chunk cannot be unpacked: {error}") from error
 
 
 def _more(limit: int) -> int:

@@ -5,20 +5,22 @@ from __future__ import annotations
 import logging
 from array import array
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset, Ranges, require_path
+from gmmtorch.datasets.point_files.channels import check_channels
 from gmmtorch.datasets.ros.bag_poses import BagSurvey, Record, RegisteredPoses
 from gmmtorch.datasets.ros.bag_reader import (
     IMU_TYPE,
     BagReader,
+    DamagedBagError,
     RawMessage,
     Sensor,
     choose_camera_info,
@@ -37,6 +39,7 @@ from gmmtorch.scan import FARTHEST, Scan
 
 HEADER = "std_msgs/msg/Header"
 _SHORT_SKIP = 16
+T = TypeVar("T")
 
 
 def open_rosbag(
@@ -56,6 +59,8 @@ def open_rosbag(
     depth_scale: float | None = None,
     intrinsics: list[float] | None = None,
     imu_topic: str | None = None,
+    damaged: str = "read",
+    attributes: Iterable[str] = (),
 ) -> RosBag:
     """The scans of one topic of a bag; see docs/recordings.md.
 
@@ -75,23 +80,48 @@ def open_rosbag(
         depth_scale: metres per unit of depth images; None: 0.001 for whole numbers, 1 for floating ones.
         intrinsics: fx, fy, cx, cy in pixels of depth images without distortion; None: of `camera_info`.
         imu_topic: of the IMU of `RosBag.turns`; None: the only one.
+        damaged: "read" reads the intact part of a damaged bag; "refuse" raises an error.
+        attributes: channels of point clouds that are read, such as "intensity" and "colour".
     """
     source = "A bag of ROS 1 is a file; one of ROS 2 is a file or its folder."
     file = require_path(path, "file or folder", "a ROS bag (.bag, .mcap, .db3)", source)
     check_choice("clock", clock, ("header", "received"))
     if not max_gap > 0:
         raise InvalidArgumentError(f"‹max_gap›={max_gap} must be a time above zero seconds.")
-    reader = BagReader(file)
-    sensor = choose_sensor(reader, topic)
-    info = None
-    if sensor.is_camera and intrinsics is None:
-        info = choose_camera_info(reader, sensor.topic.name, camera_info)
-    survey = BagSurvey(reader, sensor, info, poses, frame, extrinsic, max_gap)
-    camera = ImageCamera(sensor, survey.camera_info(), pixel_stride, depth_scale, intrinsics)
-    options = sensor_frame, clock, deskew, imu_topic
-    if sensor.is_camera:
-        return DepthBag(reader, sensor, survey, ranges, stride, *options, camera)
-    return RosBag(reader, sensor, survey, ranges, stride, *options)
+    check_choice("damaged", damaged, ("read", "refuse"))
+
+    def opened(is_salvaged: bool) -> RosBag:
+        reader = BagReader(file, is_salvaged)
+        if reader.damage:
+            _log.warning("%s is damaged: %s. damaged=refuse makes this an error.", file, reader.damage)
+        sensor = choose_sensor(reader, topic)
+        info = None
+        if sensor.is_camera and intrinsics is None:
+            info = choose_camera_info(reader, sensor.topic.name, camera_info)
+        survey = BagSurvey(reader, sensor, info, poses, frame, extrinsic, max_gap)
+        camera = ImageCamera(sensor, survey.camera_info(), pixel_stride, depth_scale, intrinsics)
+        options = sensor_frame, clock, deskew, imu_topic, check_channels(attributes)
+        if sensor.is_camera:
+            return DepthBag(reader, sensor, survey, ranges, stride, *options, camera)
+        return RosBag(reader, sensor, survey, ranges, stride, *options)
+
+    return whole_or_intact(opened, damaged == "read")
+
+
+def whole_or_intact(read: Callable[[bool], T], may_salvage: bool = True) -> T:
+    """What a function reads of a whole bag (False), or else of the intact part of a damaged one (True).
+
+    Raises `DamagedBagError` if the bag is damaged, and no part of it is intact or may be read.
+    """
+    try:
+        return read(False)
+    except DamagedBagError as error:
+        try:
+            if may_salvage:
+                return read(True)
+        except DamagedBagError:
+            pass
+        raise error
 
 
 class RosBag(Dataset):
@@ -116,6 +146,7 @@ class RosBag(Dataset):
         clock: str,
         deskew: bool,
         imu_topic: str | None,
+        attributes: tuple[str, ...],
         camera: ImageCamera | None = None,
     ) -> None:
         super().__init__(reader.path.stem, ranges, stride)
@@ -134,7 +165,7 @@ class RosBag(Dataset):
             records = kept
         records = self._ordered(records)
         self._source = survey.source(records, self._where, sensor_frame)
-        self._conversion = ScanConversion(sensor, ranges, self._source, deskew, camera)
+        self._conversion = ScanConversion(sensor, ranges, self._source, deskew, camera, attributes)
         self._records, self._in_space = self._posed(records)
         self._samples = self._first_readings()
         rate = Rate.of(records, clock)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -39,6 +39,7 @@ class ScanConversion:
         source: poses of the sensor.
         deskew: whether points with times get the pose of their own time, if the source has one.
         camera: of depth images.
+        attributes: channels of point clouds that are read.
     """
 
     def __init__(
@@ -48,7 +49,9 @@ class ScanConversion:
         source: PoseSource,
         deskew: bool = True,
         camera: ImageCamera | None = None,
+        attributes: Sequence[str] = (),
     ) -> None:
+        self._attributes = attributes
         self.source, self._camera = source, camera
         self._sensor, self._ranges = sensor, ranges
         self._times = PointTimes(sensor.kind == bag_reader.LASER) if deskew and source.can_deskew else None
@@ -57,7 +60,7 @@ class ScanConversion:
         """The points of a decoded message, in the sensor's frame."""
         kind = self._sensor.kind
         if kind == bag_reader.CLOUD:
-            return sensor_messages.cloud_points(message)
+            return sensor_messages.cloud_points(message, self._attributes)
         if kind == bag_reader.LIST:
             return sensor_messages.listed_points(message, self._sensor.field)
         if kind == bag_reader.LASER:
@@ -114,12 +117,15 @@ class ScanConversion:
         elif is_flat and not is_planar(found):
             skip("points of several heights among planar scans")
             return Scan(origin.new_empty(0, dim), origin)
+        for name in set(self._attributes) - found.channels.keys():
+            skip(f"read without {name}, which they lack")
         found, offsets = self._timed(found, stamp, skip)
         if isinstance(self.source, RegisteredPoses):
             pose = self.source.of_points(stamp, frame)
         ends = self._in_world(found.points, offsets, stamp, frame, pose, skip)
         ends[(ends.abs() > FARTHEST).any(1)] = torch.nan  # no sensor measures them
-        return self._ranges.scan(ends[:, :dim].contiguous(), origin, torch.from_numpy(found.no_return))
+        ends, no_return = ends[:, :dim].contiguous(), torch.from_numpy(found.no_return)
+        return self._ranges.scan(ends, origin, no_return, found.channels)
 
     def times(self, found: Reading, stamp: int) -> tuple[int, int]:
         """The first and last times (ns) at which poses are needed."""

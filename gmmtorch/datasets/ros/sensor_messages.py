@@ -6,7 +6,9 @@ Input are messages as `MessageDecoder` returns them. Every size in them is check
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -14,6 +16,8 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.depth_images import MAX_PIXELS, metric, read_png
+from gmmtorch.datasets.point_files.channels import channel_of, fields_of
+from gmmtorch.datasets.point_files.point_rows import PACKED
 from gmmtorch.errors import DataError
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -34,28 +38,37 @@ class Reading(NamedTuple):
 
     points: (N, 3) float64, sensor frame, metres; finite and not at the sensor. no_return: (N,) whether the
     beam met nothing. times: (N,) as the message states them, see `PointTimes`; None without times of points.
-    doubt: why the times that the message states cannot be used, if so.
+    doubt: why the times that the message states cannot be used, if so. channels: of the points, see `Scan`.
     """
 
     points: np.ndarray
     no_return: np.ndarray
     times: np.ndarray | None
     doubt: str = ""
+    channels: Mapping[str, Tensor] = MappingProxyType({})
 
     def where(self, kept: np.ndarray) -> Reading:
         """The points of a mask (N,)."""
         times = None if self.times is None else self.times[kept]
-        return Reading(self.points[kept], self.no_return[kept], times, self.doubt)
+        channels = {name: values[torch.from_numpy(kept)] for name, values in self.channels.items()}
+        return Reading(self.points[kept], self.no_return[kept], times, self.doubt, channels)
 
 
-def reading(points: np.ndarray, no_return: np.ndarray | None, times: np.ndarray | None) -> Reading:
+def reading(
+    points: np.ndarray,
+    no_return: np.ndarray | None,
+    times: np.ndarray | None,
+    channels: Mapping[str, Tensor] = MappingProxyType({}),
+) -> Reading:
     """The valid ones of some points: finite, and not at the sensor."""
     empty = np.zeros(len(points), bool) if no_return is None else no_return
-    return Reading(points, empty, times).where(np.isfinite(points).all(1) & (points != 0).any(1))
+    found = Reading(points, empty, times, channels=channels)
+    return found.where(np.isfinite(points).all(1) & (points != 0).any(1))
 
 
-def cloud_points(message: dict[str, Any]) -> Reading:
-    """The points of a PointCloud2 with any layout of fields and either byte order."""
+def cloud_points(message: dict[str, Any], wanted: Sequence[str] = ()) -> Reading:
+    """The points of a PointCloud2 with any layout of fields and either byte order, with the wanted channels
+    that it has."""
     width, height, step = int(message["width"]), int(message["height"]), int(message["point_step"])
     data = message["data"]
     if width * height == 0:
@@ -68,27 +81,35 @@ def cloud_points(message: dict[str, Any]) -> Reading:
     if missing:
         raise DataError(f"the cloud has no field {missing[0]}, only {', '.join(fields) or 'none'}")
     time = _time_field(fields)
-    names = [*"xyz", *([time] if time else [])]
+    of_channels = {name: fields_of(name, fields) for name in wanted}
+    names = list(dict.fromkeys([*"xyz", *([time] if time else []), *itertools.chain(*of_channels.values())]))
     layout: dict[str, Any] = {"names": names, "formats": [], "offsets": [], "itemsize": step}
     for name in names:
         offset, kind = int(fields[name]["offset"]), _TYPES.get(int(fields[name]["datatype"]))
         if kind is None or offset + np.dtype(kind).itemsize > step:
             raise DataError(f"field {name} does not fit into a point of {step} bytes")
-        layout["formats"].append(order + kind)
+        layout["formats"].append(order + ("u4" if name in PACKED else kind))
         layout["offsets"].append(offset)
     table = np.ndarray((height, width), np.dtype(cast(Any, layout)), bytes(data), 0, (row, step)).ravel()
-    return _table_points(table, time)
+    channels = {}
+    for name, chosen in of_channels.items():
+        if chosen:
+            columns = [table[field] for field in chosen]
+            channels[name] = channel_of(name, columns, [column.dtype for column in columns], "the cloud")
+    return _table_points(table, time, channels)
 
 
 def _time_field(names: Iterable[str]) -> str | None:
     return next((name for name in names if name.lower().replace("_", "") in _TIME_FIELDS), None)
 
 
-def _table_points(table: np.ndarray, time: str | None) -> Reading:
+def _table_points(
+    table: np.ndarray, time: str | None, channels: Mapping[str, Tensor] = MappingProxyType({})
+) -> Reading:
     times = None if time is None else table[time].astype(table[time].dtype.newbyteorder("="), copy=False)
     with np.errstate(invalid="ignore"):  # signalling NaNs, which random bytes contain
         points = np.stack([table[axis].astype(np.float64) for axis in "xyz"], 1)
-    return reading(points, None, times)
+    return reading(points, None, times, channels)
 
 
 def _row_bytes(shape: tuple[int, int], item: int, step: int, most_padding: int, n_bytes: int) -> int:

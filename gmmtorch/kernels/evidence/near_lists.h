@@ -9,9 +9,9 @@ namespace gmm {
 template <int DIM>
 GMM_KERNEL near_lists(int64_t item, const double* rows, const int64_t* starts, const int32_t* entries,
                       const int64_t* lists, const int64_t* firsts, const double* centers, const double* radii,
-                      int64_t n_balls, double cube_reach, double spread, int64_t parts, bool* near,
-                      double* counts) {
-    constexpr int WIDTH = DIM * DIM + 3 * DIM + 2, AHEAD = 6;
+                      int64_t n_balls, double cube_reach, double spread, int64_t width, double cutoff,
+                      int64_t parts, bool* near, double* counts) {
+    constexpr int READ = DIM * DIM + 4 * DIM, AHEAD = 6;
     const int64_t begin = item / parts * LANES, stop = minimum(begin + LANES, n_balls), part = item % parts;
     vec x[DIM], ball, number = (vec)(-1.0);
     double n_near[LANES];
@@ -31,9 +31,16 @@ GMM_KERNEL near_lists(int64_t item, const double* rows, const int64_t* starts, c
         while (last + 1 < LANES && get(number, last + 1) == mine) ++last;
         const int64_t list = (int64_t)mine, from = starts[list];
         for (int64_t at = from + part; at < starts[list + 1]; at += parts) {
-            const double* row = rows + entries[at] * WIDTH;
-            fetch(rows + entries[minimum(at + AHEAD * parts, starts[list + 1] - 1)] * WIDTH, WIDTH);
-            const double *mean = row + DIM * DIM, *origin = mean + DIM, *squares = origin + DIM;
+            const double* row = rows + entries[at] * width;
+            fetch(rows + entries[minimum(at + AHEAD * parts, starts[list + 1] - 1)] * width, READ);
+            const double *mean = row + DIM * DIM, *origin = mean + DIM, *variance = origin + 2 * DIM;
+            double squares[DIM], mm = 0.0;
+            for (int j = 0; j < DIM; ++j) {
+                const double seen = mean[j] - origin[j];
+                mm += seen * seen;
+                squares[j] = cutoff * cutoff * maximum(variance[j], 0.0);
+            }
+            const double whole = root(mm), longest = root(squares[DIM - 1]);
             vec ray[DIM], y[DIM], z[DIM], distance = (vec)(0.0);
             for (int j = 0; j < DIM; ++j) {
                 ray[j] = x[j] - origin[j];
@@ -43,18 +50,13 @@ GMM_KERNEL near_lists(int64_t item, const double* rows, const int64_t* starts, c
             vec clear = distance - reach;
             clear = clear < 1e-12 ? (vec)(1e-12) : clear;
             const vec closeness = 1.0 / clear;
-            vec widened = squares[DIM] * closeness;
+            vec widened = whole * closeness;
             widened = spread * (widened < 1.0 ? (vec)(1.0) : widened);
-            const vec far = squares[DIM + 1] + widened, beta = far * reach * closeness;
+            const vec far = whole + longest + widened, beta = far * reach * closeness;
             // All of the ellipsoid lies within its longest half axis of the mean: a quick test.
-            double mm = 0.0;
             vec along = (vec)(0.0);
-            for (int j = 0; j < DIM; ++j) {
-                const double seen = mean[j] - origin[j];
-                mm += seen * seen;
-                along += seen * ray[j];
-            }
-            const vec within = squares[DIM + 1] - squares[DIM] + widened + beta, square = distance * distance;
+            for (int j = 0; j < DIM; ++j) along += (mean[j] - origin[j]) * ray[j];
+            const vec within = longest + widened + beta, square = distance * distance;
             mask close = distance <= far + reach;
             close &= (mm * (1.0 - 1e-14) - within * within) * square <= along * along;
             widened *= widened;

@@ -187,15 +187,16 @@ def near_lists(
     radii: Tensor,
     cube_reach: float,
     spread: float,
+    cutoff: float,
 ) -> Lists:
     """For each ball (T,), those cones of its list that can give evidence to a cube centred in the ball.
 
     Args:
-        table: (C, n) float64, a row for each cone: its axes (D²), mean, sensor origin and squared half axes
-            at the cutoff (D each), the distance between mean and origin, and that to the farthest point.
+        table: (C, n) float64, a row for each cone, which begins as `PointTable.rows` up to the variances.
         lists: (T,) a list of `given` for each ball. Balls of one list that follow each other share its cost.
         centers, radii: (T, D), (T,) of the balls, float64.
         cube_reach: from the centre of a cube to its corners; spread: see `Hulls`; metres.
+        cutoff: Mahalanobis distance at which a component ends.
     """
     lengths = given.lengths()[lists]
     if is_fused(table, given.entries, lists, centers):
@@ -204,19 +205,25 @@ def near_lists(
         near = torch.empty(int(ends[-1]) if len(ends) else 0, dtype=torch.bool, device=table.device)
         lanes, parts = (CPU_LANES, 1) if table.device.type == "cpu" else (1, _PARTS_OF_LISTS)
         arguments = (table, *given, lists, firsts, centers.contiguous(), radii.contiguous(), len(lists))
-        sizes = (cube_reach, spread, parts)
+        sizes = (cube_reach, spread, table.shape[1], cutoff, parts)
         n_items = (len(lists) + lanes - 1) // lanes * parts
         _NEAR[centers.shape[1]](n_items, *arguments, *sizes, near, counts, device=table.device)
         counts = counts.long()
         shift = torch.repeat_interleave(given.starts[lists] - firsts, counts)
         return Lists.of(counts, given.entries[near.nonzero().squeeze(1) + shift])
     ball, cone = given.taken(lists)
-    near = _near_cone(table.T, cone, centers[ball], radii[ball], cube_reach, spread)
+    near = _near_cone(table.T, cone, centers[ball], radii[ball], cube_reach, spread, cutoff)
     return Lists.of(torch.bincount(ball[near], minlength=len(lists)), cone[near].int())
 
 
 def _near_cone(
-    table: Tensor, cone: Tensor, centers: Tensor, radius: Tensor, cube_reach: float, spread: float
+    table: Tensor,
+    cone: Tensor,
+    centers: Tensor,
+    radius: Tensor,
+    cube_reach: float,
+    spread: float,
+    cutoff: float,
 ) -> Tensor:
     """Whether each cone (P,) meets its ball; the twin. The cones are columns of the table.
 
@@ -227,9 +234,11 @@ def _near_cone(
     along the two longest axes. In the smoothed case E is widened first.
     """
     dim = centers.shape[1]
-    columns = [column[cone] for column in table]
-    mean, origin, squares = (columns[dim * dim + i * dim :][:dim] for i in range(3))
-    whole, far = columns[-2:]
+    columns = [column[cone] for column in table[: dim * dim + 4 * dim]]
+    mean, origin, _, variances = (columns[dim * dim + i * dim :][:dim] for i in range(4))
+    squares = [cutoff**2 * variance.clamp_min(0) for variance in variances]
+    whole = sum_of((m - s).square() for m, s in zip(mean, origin, strict=True)).sqrt()
+    far = whole + squares[-1].sqrt()
     axes = [columns[i * dim : (i + 1) * dim] for i in range(dim)]  # axes[i][j]: entry i of axis j
     x = centers.unbind(1)
     ray = [a - s for a, s in zip(x, origin, strict=True)]

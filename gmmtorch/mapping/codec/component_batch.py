@@ -28,6 +28,8 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError, check_choice, check_resolution, check_whole
 from gmmtorch.files import pack_tensors, read_tensors, require, unpack_tensors
+from gmmtorch.mapping.attributes.moments import Attributes
+from gmmtorch.mapping.codec.attribute_block import decode_attributes, encode_attributes
 from gmmtorch.mapping.codec.bitstream import BitCounter, BitReader, BitWriter, Ints
 from gmmtorch.mapping.codec.lattice import (
     AXIS_ORDERS,
@@ -50,11 +52,13 @@ from gmmtorch.mapping.codec.quantization import (
     cells_of,
     ints,
     number_after,
+    numbered,
     quantize,
     quantize_numbered,
+    quantized,
     raster,
 )
-from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.components import TENSORS, Components
 from gmmtorch.mapping.learning.rules import LearningRule, changed_options, rule_facts
 from gmmtorch.mapping.query_options import QueryOptions, check_method
 from gmmtorch.occupancy import Calibration
@@ -275,6 +279,7 @@ CODECS = ("quantized", "float")
 FILE_OPTIONS = QueryOptions(prior=1.0, cutoff=5.0)
 """The query options of a file that contains none; they are not those of `GaussianMap()`."""
 
+_ATTRIBUTES = "attributes"
 _MACHINE_OPTIONS = ("memory_limit", "compiled")  # query options that a file does not contain
 _WEIGHTED = "hit_length"  # in files of 1.0, which weighted hits by a length; their answers are calibrated now
 _ROOM_FOR_SETTINGS = 48  # bytes by which settings may grow while a map is built; part of its byte budget
@@ -299,8 +304,9 @@ def map_bytes(components: Components, rule: LearningRule, settings: MapSettings,
     """A map file. `next_number`: sequence number of the next new component."""
     facts = _facts(rule, settings, number_after(components.ids, next_number))
     if settings.codec == "float":
-        return pack_tensors(vars(components), FILE_KIND, FILE_VERSION, **facts)
-    return _container(torch.frombuffer(bytearray(encode(components)), dtype=torch.uint8), facts)
+        return _exact_file(components, facts)
+    block = encode_attributes(components.attributes, components.covariances) if components.attributes else b""
+    return _container(encode(components), block, facts)
 
 
 def file_size(components: Components, rule: LearningRule, settings: MapSettings, next_number: int) -> int:
@@ -312,10 +318,14 @@ def file_size(components: Components, rule: LearningRule, settings: MapSettings,
         settings = replace(settings, query=replace(settings.query, calibration=known))
     facts = _facts(rule, settings, number_after(components.ids, next_number + n_new))
     if settings.codec == "float":
-        data = pack_tensors(vars(components), FILE_KIND, FILE_VERSION, **facts)
+        data = _exact_file(components, facts)
+    elif components.attributes:
+        data = map_bytes(
+            quantized(numbered(components, settings.robot, next_number)[0]), rule, settings, next_number
+        )
     else:
         values = quantize_numbered(components, settings.robot, next_number)
-        data = _container(torch.zeros(batch_bytes(values), dtype=torch.uint8), facts)
+        data = _container(bytes(batch_bytes(values)), b"", facts)
     return len(data) + _ROOM_FOR_SETTINGS
 
 
@@ -333,11 +343,15 @@ def _content(
     tensors: dict[str, Tensor], facts: dict[str, Any], path: str | Path
 ) -> tuple[Components, dict[str, Any]]:
     facts = {"cutoff": FILE_OPTIONS.cutoff, **_with_calibration(facts, path)}
-    if tensors.keys() == {f.name for f in fields(Components)}:
+    if tensors.keys() >= {*TENSORS}:
         return _exact(tensors, path), facts
     batch = require(tensors, "components", (None,), torch.uint8, path)
     try:
-        return decode(batch.numpy().tobytes()), facts
+        found = decode(batch.numpy().tobytes())
+        if _ATTRIBUTES in tensors:
+            block = require(tensors, _ATTRIBUTES, (None,), torch.uint8, path).numpy().tobytes()
+            found = replace(found, attributes=decode_attributes(block, found.covariances))
+        return found, facts
     except DataError as error:
         raise DataError(f"{path}: {error}") from error
 
@@ -391,12 +405,26 @@ def read_settings(facts: dict[str, Any], path: str | Path) -> MapSettings:
     return MapSettings(resolution, facts["method"], facts["codec"], robot, query)
 
 
-def _container(batch: Tensor, facts: dict[str, Any]) -> bytes:
-    return pack_tensors({"components": batch}, FILE_KIND, FILE_VERSION, **facts)
+def _container(batch: bytes, attributes: bytes, facts: dict[str, Any]) -> bytes:
+    blocks = {"components": batch, **({_ATTRIBUTES: attributes} if attributes else {})}
+    tensors = {name: torch.frombuffer(bytearray(data), dtype=torch.uint8) for name, data in blocks.items()}
+    return pack_tensors(tensors, FILE_KIND, FILE_VERSION, **facts)
+
+
+def _exact_file(components: Components, facts: dict[str, Any]) -> bytes:
+    """The file of components with every number as it is."""
+    known = {f"{_ATTRIBUTES}.{key}": value for key, value in components.attributes.tensors().items()}
+    return pack_tensors({**components.tensors(), **known}, FILE_KIND, FILE_VERSION, **facts)
 
 
 def _exact(tensors: dict[str, Tensor], path: str | Path) -> Components:
     """Components of a file with codec "float"."""
+    known = {
+        name.removeprefix(f"{_ATTRIBUTES}."): tensors[name]
+        for name in tensors.keys() - {*TENSORS}
+        if name.startswith(f"{_ATTRIBUTES}.")
+    }
+    tensors = {name: tensors[name] for name in TENSORS}
     whole = dict.fromkeys(("ids", "seen_by", "seen_from"), torch.int64) | {"max_range": torch.bool}
     for name, tensor in tensors.items():
         require(tensors, name, (None,) * tensor.ndim, whole.get(name, torch.float64), path)
@@ -405,6 +433,6 @@ def _exact(tensors: dict[str, Tensor], path: str | Path) -> Components:
             f"{path}: means has shape {tuple(tensors['means'].shape)}; expected (K, 2) or (K, 3)."
         )
     try:
-        return Components(**tensors).checked()
+        return Components(**tensors, attributes=Attributes.of(known)).checked()
     except GmmTorchError as error:
         raise DataError(f"{path}: {error}") from error

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.linalg import all_equal, on_cpu
-from gmmtorch.mapping.codec import lattice
+from gmmtorch.mapping.codec import attribute_block, lattice
 from gmmtorch.mapping.codec.bitstream import Ints, fewest_bits
 from gmmtorch.mapping.codec.lattice import PER_OCTAVE, Lattice
 from gmmtorch.mapping.components import Components
@@ -145,8 +145,13 @@ def quantize(components: Components) -> Quantized:
 
 
 def quantized(components: Components) -> Components:
-    """The result of `decode(encode(components))`, on the components' device, without writing bits."""
-    return quantize(components).restored().to(components.means.device)
+    """The components after writing and reading them, on their device, without writing bits."""
+    found = quantize(components).restored()
+    if components.attributes:
+        given = components.on_cpu()
+        known = attribute_block.rounded(given.attributes, given.means, found.means, found.covariances)
+        found = replace(found, attributes=known)
+    return found.to(components.means.device)
 
 
 def _support_steps(support: Tensor) -> Tensor:
@@ -214,8 +219,8 @@ def quantized_after(known: Components, rounded: Components, components: Componen
         return components
     k, e, s = len(known), len(known.seen_by), len(known.origins)
     sizes = {"origins": s, "seen_by": e, "seen_from": e, "seen_count": e}
-    old = {name: values[: sizes.get(name, k)] for name, values in vars(components).items()}
-    if not k or not all_equal((old[name], values) for name, values in vars(known).items()):
+    old = {name: values[: sizes.get(name, k)] for name, values in components.tensors().items()}
+    if not k or not all_equal((old[name], values) for name, values in known.tensors().items()):
         return quantized(components)
     if len(components) == k:
         return rounded

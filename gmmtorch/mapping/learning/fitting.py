@@ -8,7 +8,7 @@ component; the points of each scan in a component give the component's viewpoint
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -18,6 +18,7 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import DepthCells, DepthView, depth_cells
+from gmmtorch.mapping.attributes.moments import Attributes, learned, of_scans
 from gmmtorch.mapping.components import UNNUMBERED, Components
 from gmmtorch.mapping.learning.merging import AssignedViewpoints, AssignViewpoints
 from gmmtorch.mapping.learning.rules import MixtureRule
@@ -219,7 +220,8 @@ def fit_window(
     other beam are treated as ends of no-return beams. Components are not numbered.
     """
     origins = torch.stack([scan.origin.double() for scan in scans])
-    returns = fit_points([scan.points for scan in scans], origins, fit, viewpoints)
+    channels = [scan.attributes for scan in scans]
+    returns = fit_points([scan.points for scan in scans], origins, fit, viewpoints, channels)
     n_free = fit.rule.free_points
     ends = [scan.no_return for scan in scans]
     if n_free:
@@ -235,12 +237,14 @@ def fit_points(
     origins: Tensor,
     fit: SurfaceFit,
     viewpoints: AssignViewpoints,
+    attributes: Sequence[Mapping[str, Tensor]] = (),
     *,
     max_range: bool = False,
 ) -> Components:
     """Components of S clouds of points (N_s, D), each observed from its sensor origin (S, D), in metres.
 
-    `max_range`: the points are ends of no-return beams. Components are not numbered.
+    `attributes`: the channels of the points of each cloud. `max_range`: the points are ends of no-return
+    beams. Components are not numbered.
     """
     sizes = [cloud.shape[0] for cloud in clouds]
     n_points, dim = sum(sizes), origins.shape[1]
@@ -253,9 +257,12 @@ def fit_points(
     sensor = _measured_sensor(clouds, origins) if rule.prune == "density" else None
     window = _Window(points.sub_(center), scan, origins.double() - center, sensor)
     learn = _LEARNERS[rule.learner]
-    found, counts, n_learned = learn(window, replace(fit, rule=rule))
+    found, counts, n_learned, cells, owner = learn(window, replace(fit, rule=rule))
+    known = None
+    if any(attributes):
+        known = learned(of_scans(attributes, sizes), cells, owner, found.means, found.covariances)
     found = found._replace(means=found.means + center)
-    return _components(found, viewpoints(counts, found.weights, n_learned), origins, max_range)
+    return _components(found, viewpoints(counts, found.weights, n_learned), origins, max_range, known)
 
 
 def fit_frames(frames: Sequence[DepthFrame], fit: SurfaceFit, viewpoints: AssignViewpoints) -> Components:
@@ -280,7 +287,11 @@ def fit_frames(frames: Sequence[DepthFrame], fit: SurfaceFit, viewpoints: Assign
 
 
 def _components(
-    found: Parameters, assigned: AssignedViewpoints, origins: Tensor, max_range: bool
+    found: Parameters,
+    assigned: AssignedViewpoints,
+    origins: Tensor,
+    max_range: bool,
+    attributes: Attributes | None = None,
 ) -> Components:
     """The components that keep a viewpoint; not numbered."""
     kept, support, seen_by, seen_from, seen_count = (part.to(origins.device) for part in assigned)
@@ -296,6 +307,7 @@ def _components(
         seen_by=seen_by,
         seen_from=seen_from,
         seen_count=seen_count,
+        attributes=Attributes() if attributes is None else attributes.selected(kept),
     )
 
 
@@ -340,12 +352,15 @@ class _Window(NamedTuple):
 
 class _Learned(NamedTuple):
     """mixture; counts (K, S): its points in each scan, of which each belongs to its most likely component;
-    n_points: number of points that pruning leaves.
+    n_points: number of points that pruning leaves. cells: of the points; owner: their component (C,), −1 if
+    it is pruned.
     """
 
     mixture: Parameters
     counts: Tensor
     n_points: float
+    cells: Cells
+    owner: Tensor
 
 
 def _from_flat_pieces(window: _Window, fit: SurfaceFit) -> _Learned:
@@ -356,7 +371,7 @@ def _from_flat_pieces(window: _Window, fit: SurfaceFit) -> _Learned:
     counts = window.counts(owner[cells.member], mixture.weights.shape[0])
     n_points, rule = len(window.points), fit.rule
     if rule.prune == "none":
-        return _Learned(mixture, counts, n_points)
+        return _Learned(mixture, counts, n_points, cells, owner)
     support = mixture.weights * n_points
     if window.sensor is None:
         kept = support >= rule.min_support
@@ -367,7 +382,8 @@ def _from_flat_pieces(window: _Window, fit: SurfaceFit) -> _Learned:
         kept = share >= rule.min_density_share
     weights = mixture.weights[kept]
     left = Parameters(weights / weights.sum(), mixture.means[kept], mixture.covariances[kept])
-    return _Learned(left, counts[kept], float(support[kept].sum()))
+    number = torch.where(kept, kept.cumsum(0) - 1, -1)
+    return _Learned(left, counts[kept], float(support[kept].sum()), cells, number[owner])
 
 
 def _from_tree(window: _Window, fit: SurfaceFit) -> _Learned:
@@ -394,7 +410,8 @@ def _from_tree(window: _Window, fit: SurfaceFit) -> _Learned:
     leaves = grown.leaves()
     mixture = Parameters(grown.weights[leaves], grown.means[leaves], grown.covariances[leaves])
     owner = most_likely_component(cells.features, mixture)
-    return _Learned(mixture, window.counts(owner[cells.member], len(leaves)), len(window.points))
+    counts = window.counts(owner[cells.member], len(leaves))
+    return _Learned(mixture, counts, len(window.points), cells, owner)
 
 
 _LEARNERS: dict[str, Callable[[_Window, SurfaceFit], _Learned]] = {

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.linalg import on_cpu
+from gmmtorch.mapping.attributes import moments
 from gmmtorch.mapping.components import UNNUMBERED, Components
 from gmmtorch.mixture import Parameters, merge_components, simplify
 
@@ -188,10 +189,17 @@ def merged(components: Components, labels: Tensor) -> Components:
     ids = components.ids[first]
     ids[~single, 1] = UNNUMBERED
     seen_by, seen_from, seen_count = union_of_viewpoints(components, labels)
+    attributes = components.attributes
+    if attributes:
+        both = (components.means, components.covariances), (joined.means, joined.covariances)
+        attributes = attributes.selected(first).where(
+            single, moments.merged(attributes, labels, components.support, *both)
+        )
     return replace(
         components,
         means=torch.where(single[:, None], components.means[first], joined.means),
         covariances=torch.where(single[:, None, None], components.covariances[first], joined.covariances),
+        attributes=attributes,
         support=torch.where(single, components.support[first], joined.weights),
         max_range=components.max_range[first],
         ids=ids,
@@ -238,6 +246,9 @@ def _merged_by_kind(components: Components, limit: int | None, max_cost: float |
             surfaces = (~components.max_range).nonzero().squeeze(1)
             return _merged_by_kind(components.selected(surfaces), limit, max_cost)
         given = Parameters(components.support[rows], components.means[rows], components.covariances[rows])
+        if components.attributes and not flag:
+            joint = moments.joint_moments(components.attributes.selected(rows), *given)
+            given = Parameters(given.weights, *joint)
         cost = "hellinger" if limit is None else "kullback_leibler"
         found = simplify(given, share, max_cost, cost, most_exact=0)
         labels[rows] = found.labels + n_labels

@@ -240,7 +240,7 @@ def _shared_out(
     gained = means.new_zeros(len(components))
     found = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     reach = None if frees is None else box_around(components, limit)
-    for part, some in _portions(points, len(components), reach):
+    for part, some in portions(points, len(components), reach):
         offset = points[part, None].double() - means[some]
         squared = torch.einsum("kij,nkj->nki", inverse[some], offset).square().sum(-1)
         explains = squared < limit
@@ -286,7 +286,7 @@ def summed(components: Components) -> Components:
     return replace(kept, support=support, seen_count=support[kept.seen_by])
 
 
-def _portions(points: Tensor, k: int, boxes: tuple[Tensor, Tensor] | None) -> Iterator[tuple[Tensor, Tensor]]:
+def portions(points: Tensor, k: int, boxes: tuple[Tensor, Tensor] | None) -> Iterator[tuple[Tensor, Tensor]]:
     """Portions of points (N, D), as indices, and the indices of the components that may explain them.
 
     boxes: lowest and highest corners (K, D) of what the components explain. Portions are then neighbouring

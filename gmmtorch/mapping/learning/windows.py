@@ -53,7 +53,7 @@ from gmmtorch.mapping.learning.rules import (
     NoveltyRule,
     WindowedRule,
 )
-from gmmtorch.mapping.query import MANY_POINTS, cutoff_of
+from gmmtorch.mapping.query import count_many, cutoff_of
 from gmmtorch.mixture import SOFTMAX_DTYPES, FlatnessRule, surface_rule
 from gmmtorch.occupancy import (
     Calibrator,
@@ -128,14 +128,19 @@ def _absorb_window(
     return _within_budget(components, rule, size) if len(learned) else components, doubts
 
 
-def _learned(scans: Sequence[Scan], rule: IncrementalRule, weight: float) -> Components:
-    """The components of a window of scans; none if no scan has a beam."""
+def _learned(
+    scans: Sequence[Scan], rule: IncrementalRule, weight: float, iterations: int | None = None
+) -> Components:
+    """The components of a window of scans; none if no scan has a beam. `iterations`: not the rule's."""
     if not any(scan.n_beams for scan in scans):
         return Components.empty(scans[0].dim, scans[0].points.device)
     if rule.noise is None or rule.length is None or rule.cell is None:
         # Scans without a return still show the scale of the sensor by the ends of their beams.
         rule = rule.fitted([Scan(scan.no_return, scan.origin) for scan in scans])
-    return fit_window(scans, surface_fit(rule, scans[0].dim), all_origins(weight))
+    fit = surface_fit(rule, scans[0].dim)
+    return fit_window(
+        scans, fit if iterations is None else replace(fit, iterations=iterations), all_origins(weight)
+    )
 
 
 def _explain(
@@ -191,6 +196,22 @@ def cell_fit(
         outlier_gap=10 * length,
     )
     return SurfaceFit(noise, cell, flatness, iterations)
+
+
+def learn_part(scans: Sequence[Scan], rule: LearningRule, generator: torch.Generator) -> Components:
+    """Components of a part of an unfinished window, with which it answers until all of it is learned.
+
+    Those of an `IncrementalRule` are its flat pieces, at most half as many as of a window, without EM.
+    """
+    if isinstance(rule, WindowedRule):
+        return learn_window(scans, replace(rule, iterations=1), generator)
+    quick = replace(rule, window_components=max(1, rule.window_components // 2))
+    return limit_origins(_learned(scans, quick, 1.0, 0), rule.max_origins, rule.mean_origins)
+
+
+def learns_in_parts(rule: LearningRule) -> bool:
+    """Whether the components of a window do not depend on those of the map, which it leaves as they are."""
+    return rule.forget == FORGET_OFF and (isinstance(rule, WindowedRule) or rule.novelty is None)
 
 
 # -- a WindowedRule -------------------------------------------------------------------------------------
@@ -439,7 +460,7 @@ def _beams(window: Sequence[Scan | DepthFrame], generator: torch.Generator) -> t
 def few_points(known: Components, points: Tensor, sides: Sequence[float]) -> tuple[list[PointEvidence], int]:
     """Evidence (M,) of cubes of several sides (m) at a few points (M, D), without an index; and the number of
     pairs of a point and a cone that it takes."""
-    cutoff = cutoff_of(len(known.seen_count), int((known.seen_count >= MANY_POINTS).sum()))
+    cutoff = cutoff_of(*count_many(known.seen_count))
     point, view = _near(known, points, max(sides), cutoff)
     used, cone = torch.unique(view, return_inverse=True)
     by = known.seen_by[used]

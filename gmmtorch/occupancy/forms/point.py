@@ -149,6 +149,7 @@ class PointForm:
         cones: must not change afterwards.
         resolution: h (m).
         cutoff: Mahalanobis distance beyond which a component gives no evidence.
+        share: see `ConeIndex`.
     """
 
     def __init__(
@@ -156,6 +157,7 @@ class PointForm:
         cones: Cones,
         resolution: float,
         cutoff: float = CUTOFF,
+        share: float = 1.0,
     ) -> None:
         self.resolution = check_resolution(resolution)
         cones = cones.checked()
@@ -163,12 +165,12 @@ class PointForm:
             raise InvalidArgumentError(f"cutoff={cutoff} must be finite and above zero.")
         self.dim, self.cutoff = cones.dim, float(cutoff)
         safe_cholesky(cones.covariances.double().detach())  # raises if one is not positive definite
-        spectrum = spectrum_of(cones.covariances)
-        self._table = _table_of(cones, spectrum[1], self.resolution)
-        self._index: ConeIndex | Callable[[], ConeIndex]
-        self._index = functools.partial(
-            ConeIndex, cones, self.resolution, cutoff, smoothed=True, spectrum=spectrum
-        )
+        self._table = _table_of(cones, spectrum_of(cones.covariances)[1], self.resolution)
+        self._share = share
+        self._index: ConeIndex | Callable[[], ConeIndex] = self._new_index
+
+    def _new_index(self) -> ConeIndex:
+        return ConeIndex(self.rows, self.resolution, self.cutoff, smoothed=True, share=self._share)
 
     @property
     def index(self) -> ConeIndex:
@@ -187,15 +189,14 @@ class PointForm:
         made, is_new, cones = copy.copy(self), former < 0, cones.checked()
         new = cones.taken(is_new)
         safe_cholesky(new.covariances.double().detach())
-        spectrum = spectrum_of(new.covariances)
-        table = _table_of(new, spectrum[1], self.resolution)
+        table = _table_of(new, spectrum_of(new.covariances)[1], self.resolution)
         made._table = PointTable(
             *(replaced_rows(rows, former, rest) for rows, rest in zip(self._table, table, strict=True))
         )
         if isinstance(self._index, ConeIndex):
-            made._index = functools.partial(self._index.replaced, cones, former, spectrum)
+            made._index = functools.partial(self._index.replaced, made.rows, former)
         else:
-            made._index = functools.partial(ConeIndex, cones, self.resolution, self.cutoff, smoothed=True)
+            made._index = made._new_index
         return made
 
     def __call__(self, points: ArrayLike, before: PointEvidence | None = None) -> PointEvidence:
@@ -234,8 +235,8 @@ class PointForm:
         if len(points) * len(self.rows) <= _FEW_PAIRS:
             bucket = torch.zeros_like(points[:, 0], dtype=torch.int64)
             every = torch.arange(len(self.rows), dtype=torch.int32, device=points.device)
-            order = torch.arange(len(points), device=points.device)
-            bucket[(points.abs() > _FARTHEST).any(1)] = -1
+            # Lanes of the kernel take each list once where its points follow each other.
+            order = (points.abs() <= _FARTHEST).all(1).nonzero().squeeze(1)
             listed_evidence(points, order, bucket, Lists.of(order.new_tensor([len(every)]), every), *settings)
             return found
         for rows, number in self.index.parts(points):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -160,7 +161,7 @@ def _float(components: Components) -> bytes:
     c = _checked(components)
     sizes = (c.dim, len(c), len(c.origins), len(c.seen_by))  # indices beyond 16 bits do not fit anyway
     row = np.zeros((), _float_layout(*sizes))
-    for name, value in {**vars(c), "covariances": pack_symmetric(c.covariances)}.items():
+    for name, value in {**c.tensors(), "covariances": pack_symmetric(c.covariances)}.items():
         row[name] = value.detach().cpu().numpy()
     return make_datagram(Kind.FLOAT_COMPONENTS, _SIZES.pack(*sizes) + row.tobytes())
 
@@ -179,7 +180,7 @@ def read_float(body: bytes) -> ComponentsMessage:
     row = np.frombuffer(body, layout, offset=_SIZES.size)[0]
     if (row["max_range"] > 1).any() or (row["ids"] < 0).any():
         raise DataError("A max_range flag or an id is out of range: it is damaged.")
-    values = {
+    values: dict[str, Any] = {
         name: torch.from_numpy(row[name].astype(np.float64 if layout[name].base.kind == "f" else np.int64))
         for name in layout.names or ()
     }

@@ -1,0 +1,572 @@
+"""The intact part of a damaged ROS bag: chunks that are whole, or rows of a database, wherever they are.
+
+A ROS 1 bag and an MCAP file are sequences of records, most of them chunks of messages. After a damaged record
+the next chunk is searched by its header. The index of a file is not needed, so a recording may be cut off.
+"""
+
+from __future__ import annotations
+
+import mmap
+import re
+import struct
+import zlib
+from array import array
+from collections.abc import Callable, Collection, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gmmtorch.errors import DataError
+
+Unpack = Callable[[bytes, str, int], bytes]
+"""Unpacks a chunk: its data, its compression, and the number of bytes that it announces."""
+
+_MOST_FIELD_BYTES = 1 << 24  # of a record's header in a ROS 1 bag, or of its definition of a message
+_MOST_RATIO = 1000  # bytes of all unpacked chunks for each byte of the file
+_KEPT_CHUNKS = 4  # unpacked, while messages of several are read in turn
+_MCAP_CHUNK = struct.Struct("<QQQII")  # first and last time, unpacked bytes, CRC-32, length of a name
+_NANOSECONDS = 1_000_000_000
+
+
+_Found = tuple[int, int, int, int]
+"""A message: its time (ns), its connection, and two numbers by which its source finds it."""
+
+
+class _Place(NamedTuple):
+    """Where messages are: bytes of the file, packed. CRC-32 of the unpacked bytes; 0: not known."""
+
+    begin: int
+    end: int
+    compression: str = ""
+    size: int = 0
+    crc: int = 0
+
+
+class Salvage:
+    """The messages that a damaged bag still has, in the order of recording.
+
+    Args:
+        files: .bag, .mcap or .db3 files of one recording.
+        unpack: unpacks a chunk within limits. limit: bytes of a chunk or message, at most.
+
+    Attributes:
+        connections: as those of a reader of rosbags.
+        n_messages: that can be read.
+        gaps: (first, last) time (ns) of each interval between intact messages whose messages are lost.
+        first, last: times (ns) of the first and the last one.
+        is_cut: whether a file ends before its end, so that later messages may be missing, too.
+
+    Raises `DataError` if no message can be read.
+    """
+
+    def __init__(self, files: Collection[Path], unpack: Unpack, limit: int) -> None:
+        self._unpack, self._limit = unpack, limit
+        self._sources: list[_Chunked | _Database] = []
+        self._times, self._where = array("q"), array("q")  # of each message: source, connection, two numbers
+        self.connections: list[Any] = []
+        self.gaps: list[tuple[int, int]] = []
+        self.is_cut = False
+        for file in files:
+            self._add(file)
+        self.n_messages = len(self._times)
+        if not self.n_messages:
+            raise DataError(f"{', '.join(map(str, files))}: no message can be read.")
+        rows = np.array(self._where).reshape(-1, 4)
+        order = np.argsort(np.array(self._times), kind="stable")
+        self._rows, self._sorted = rows[order], np.array(self._times)[order]
+        self.first, self.last = (int(time) for time in self._sorted[[0, -1]])
+        del self._times, self._where
+
+    def _add(self, file: Path) -> None:
+        kinds: dict[str, type[_Chunked | _Database]] = {".bag": _Ros1Bag, ".mcap": _Mcap, ".db3": _Database}
+        source = kinds[file.suffix](file, self._unpack, self._limit)
+        number, numbers = len(self._sources), dict[int, int]()
+        self._sources.append(source)
+        last = None
+        found = array("q")
+        for time, connection, one, two in source.messages():
+            found.extend((time, connection, one, two))
+        rows = np.array(found, np.int64).reshape(-1, 4)
+        counts = dict(
+            zip(*(part.tolist() for part in np.unique(rows[:, 1], return_counts=True)), strict=True)
+        )
+        for key, connection in source.connections().items():
+            numbers[key] = len(self.connections)
+            self.connections.append(connection._replace(id=numbers[key], msgcount=counts.get(key, 0)))
+        known = np.isin(rows[:, 1], list(numbers))
+        rows = rows[known]
+        self._times.frombytes(rows[:, 0].tobytes())
+        ids = np.array([numbers[key] for key in rows[:, 1].tolist()], np.int64)
+        where = np.column_stack([np.full_like(ids, number), ids, rows[:, 2:]]) if len(ids) else rows
+        self._where.frombytes(np.ascontiguousarray(where, np.int64).tobytes())
+        for last, following in source.lost:
+            if following is None:
+                self.is_cut = True
+            elif last is not None and following > last:
+                self.gaps.append((last, following))
+
+    @property
+    def missing_seconds(self) -> float:
+        """Seconds between intact messages whose messages are lost."""
+        return sum(end - begin for begin, end in self.gaps) / _NANOSECONDS
+
+    def messages(
+        self, connections: Collection[Any], start: int | None = None
+    ) -> Iterator[tuple[Any, int, bytes]]:
+        """(connection, time in ns, content) of messages of some connections, from a time on."""
+        wanted = np.isin(self._rows[:, 1], [connection.id for connection in connections])
+        if start is not None:
+            wanted &= self._sorted >= start
+        for row in np.flatnonzero(wanted):
+            source, connection, one, two = self._rows[row].tolist()
+            data = self._sources[source].content(one, two)
+            if data is not None:
+                yield self.connections[connection], int(self._sorted[row]), data
+
+
+def _connection(topic: str, kind: str, form: str, definition: str) -> Any:
+    from rosbags.interfaces import (
+        Connection,
+        ConnectionExtRosbag2,
+        MessageDefinition,
+        MessageDefinitionFormat,
+    )
+
+    package, _, name = kind.rpartition("/")
+    kind = kind if "/msg/" in kind else f"{package}/msg/{name}"
+    text = MessageDefinition(MessageDefinitionFormat[form], definition)
+    return Connection(0, topic, kind, text, "", 0, ConnectionExtRosbag2("cdr", []), None)
+
+
+_ERRORS = (DataError, ValueError, KeyError, IndexError, struct.error, OverflowError, OSError, RuntimeError)
+"""What damaged records and the codecs of their chunks raise."""
+
+
+class _Chunked:
+    """A file of records. `lost`: for each part that cannot be read, the time (ns) of the last message before,
+    and of the first one after; None without one."""
+
+    def __init__(self, path: Path, unpack: Unpack, limit: int) -> None:
+        self._unpack, self._places = unpack, list[_Place]()
+        self._left = limit + _MOST_RATIO * path.stat().st_size
+        with path.open("rb") as file:
+            self._data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        self._kept: dict[int, bytes] = {}
+        self._connections: dict[int, Any] = {}
+        self.lost: list[tuple[int | None, int | None]] = []
+
+    def connections(self) -> dict[int, Any]:
+        """The connections by the numbers that messages have."""
+        return self._connections
+
+    def messages(self) -> Iterator[_Found]:
+        """(time in ns, connection, chunk, byte) of each message."""
+        at: int | None = self._first()
+        following: int | None
+        end, last, is_after_loss = len(self._data), None, False
+        while at is not None and at < end:
+            try:
+                following, found, is_whole = self._record(at)
+            except _ERRORS:
+                following, found, is_whole = self._next(at + 1), self._cut_off(at), False
+            if found:
+                if is_after_loss:
+                    self.lost.append((last, min(time for time, *_ in found)))
+                    is_after_loss = False
+                last = max(last or 0, *(time for time, *_ in found))
+                yield from found
+            is_after_loss |= not is_whole
+            at = following
+        if is_after_loss or not self._is_complete():
+            self.lost.append((last, None))
+
+    def content(self, chunk: int, byte: int) -> bytes | None:
+        """The content of a message."""
+        if chunk not in self._kept:
+            while len(self._kept) >= _KEPT_CHUNKS:
+                del self._kept[next(iter(self._kept))]
+            self._kept[chunk] = self._unpacked(self._places[chunk])
+        return self._message(self._kept[chunk], byte)
+
+    def _unpacked(self, place: _Place) -> bytes:
+        data = self._data[place.begin : place.end]
+        found = self._unpack(data, place.compression, place.size)
+        if len(found) != place.size or (place.crc and zlib.crc32(found) != place.crc):
+            raise DataError("a chunk is damaged")
+        return found
+
+    def _chunk(self, place: _Place) -> tuple[list[_Found], bool]:
+        """The messages of a chunk up to a damaged one, and whether all are intact."""
+        if (left := self._left - place.size) < 0:
+            raise DataError("chunks that overlap unpack to too many bytes")
+        data, number, self._left = self._unpacked(place), len(self._places), left
+        self._places.append(place)
+        found = list[_Found]()
+        with suppress(*_ERRORS):
+            for time, key, byte in self._inner(data):
+                found.append((time, key, number, byte))
+            return found, True
+        return found, False
+
+    def _cut_off(self, at: int) -> list[_Found]:
+        """The messages of a chunk that the end of the file cuts off, up to there."""
+        with suppress(*_ERRORS):
+            place = self._cut_chunk(at)
+            data = self._unpack(self._data[place.begin :], place.compression, place.size)
+            return self._chunk(_Place(place.begin, len(self._data), place.compression, len(data)))[0]
+        return []
+
+    def _cut_chunk(self, at: int) -> _Place:
+        """The place of a chunk that ends after the file. Raises an error if there is no such chunk."""
+        raise NotImplementedError
+
+    def _first(self) -> int | None:
+        """The place of the first record. Raises `DataError` if the file is of another kind."""
+        raise NotImplementedError
+
+    def _record(self, at: int) -> tuple[int, list[_Found], bool]:
+        """The place after a record, its messages, and whether it is intact. Raises an error if it is not."""
+        raise NotImplementedError
+
+    def _next(self, at: int) -> int | None:
+        """The place of the next chunk from a byte on."""
+        raise NotImplementedError
+
+    def _inner(self, data: bytes) -> Iterator[tuple[int, int, int]]:
+        """(time, connection, byte) of the messages of a chunk."""
+        raise NotImplementedError
+
+    def _message(self, data: bytes, byte: int) -> bytes:
+        raise NotImplementedError
+
+    def _is_complete(self) -> bool:
+        """Whether the file has the end that a closed one has."""
+        raise NotImplementedError
+
+
+# -- ROS 1 (wiki.ros.org/Bags/Format/2.0) ------------------------------------------------------------
+
+
+_BAG_MAGIC = b"#ROSBAG V2.0\n"
+_CONNECTION, _CHUNK, _MESSAGE, _CHUNK_INFO = 7, 5, 2, 6
+_CHUNK_HEADER = 128  # bytes before the field op in the header of a chunk, at most
+
+
+class _Ros1Bag(_Chunked):
+    """A bag of ROS 1, format 2.0."""
+
+    _has_index = False
+
+    def _first(self) -> int:
+        if self._data[: len(_BAG_MAGIC)] != _BAG_MAGIC:
+            raise DataError("it does not begin as a ROS 1 bag of format 2.0")
+        return len(_BAG_MAGIC)
+
+    def _record(self, at: int) -> tuple[int, list[_Found], bool]:
+        fields, begin, end = _ros1_record(self._data, at)
+        kind = fields[b"op"][0]
+        if kind == _CHUNK:
+            return end, *self._chunk(_ros1_chunk(fields, begin, end))
+        if kind == _CONNECTION:
+            self._note(fields, self._data[begin:end])
+        self._has_index |= kind == _CHUNK_INFO
+        return end, [], True
+
+    def _cut_chunk(self, at: int) -> _Place:
+        fields, begin, end = _ros1_record(self._data, at, is_cut=True)
+        return _ros1_chunk(fields, begin, end)
+
+    def _next(self, at: int) -> int | None:
+        while (found := self._data.find(b"\4\0\0\0op=\5", at)) >= 0:
+            for start in range(max(at, found - _CHUNK_HEADER), found - 3):
+                with suppress(DataError, struct.error):
+                    fields, _, _ = _ros1_record(self._data, start)
+                    if fields.get(b"op") == b"\5" and {b"size", b"compression"} <= fields.keys():
+                        return start
+            at = found + 1
+        return None
+
+    def _inner(self, data: bytes) -> Iterator[tuple[int, int, int]]:
+        at = 0
+        while at < len(data):
+            fields, begin, end = _ros1_record(data, at)
+            if fields[b"op"][0] == _CONNECTION:
+                self._note(fields, data[begin:end])
+            elif fields[b"op"][0] == _MESSAGE:
+                seconds, nanoseconds = struct.unpack("<II", fields[b"time"])
+                yield seconds * _NANOSECONDS + nanoseconds, *struct.unpack("<I", fields[b"conn"]), at
+            at = end
+
+    def _message(self, data: bytes, byte: int) -> bytes:
+        _, begin, end = _ros1_record(data, byte)
+        return data[begin:end]
+
+    def _note(self, fields: dict[bytes, bytes], content: bytes) -> None:
+        (key,) = struct.unpack("<I", fields[b"conn"])
+        about = _ros1_fields(content)
+        text = [about.get(name, b"").decode(errors="replace") for name in (b"type", b"message_definition")]
+        topic = fields[b"topic"].decode(errors="replace")
+        topic = ("/" if topic.startswith("/") else "") + "/".join(filter(None, topic.split("/")))
+        self._connections[key] = _connection(topic, text[0], "MSG", text[1])
+
+    def _is_complete(self) -> bool:
+        return self._has_index
+
+
+def _ros1_chunk(fields: dict[bytes, bytes], begin: int, end: int) -> _Place:
+    (size,) = struct.unpack("<I", fields[b"size"])
+    return _Place(begin, end, fields[b"compression"].decode(), size)
+
+
+def _ros1_record(data: Any, at: int, is_cut: bool = False) -> tuple[dict[bytes, bytes], int, int]:
+    """The fields of a record's header, and where its content begins and ends; only after the file if it
+    `is_cut`."""
+    (length,) = struct.unpack("<I", data[at : at + 4])
+    begin = at + 8 + length
+    if length > _MOST_FIELD_BYTES or begin > len(data):
+        raise DataError("a header is too long")
+    (size,) = struct.unpack("<I", data[begin - 4 : begin])
+    if (begin + size > len(data)) != is_cut:
+        raise DataError("a record is cut off")
+    return _ros1_fields(data[at + 4 : begin - 4]), begin, begin + size
+
+
+def _ros1_fields(header: bytes) -> dict[bytes, bytes]:
+    fields, at = {}, 0
+    while at < len(header):
+        (length,) = struct.unpack("<I", header[at : at + 4])
+        name, sign, value = header[at + 4 : at + 4 + length].partition(b"=")
+        at += 4 + length
+        if not sign or at > len(header):
+            raise DataError("a header is damaged")
+        fields[name] = value
+    return fields
+
+
+# -- MCAP (mcap.dev/spec) ----------------------------------------------------------------------------
+
+
+_MCAP_MAGIC = b"\x89MCAP0\r\n"
+_MCAP_SCHEMA, _MCAP_CHANNEL, _MCAP_MESSAGE, _MCAP_CHUNK_OP = 3, 4, 5, 6
+_LAST_KIND = 0x0F
+_CHUNK_BEGIN = re.compile(b"\6(?=.{5}\0\0\0)", re.DOTALL)  # a chunk is smaller than 2⁴⁰ bytes
+_MCAP_FORMS = {"ros2msg": "MSG", "ros2idl": "IDL", "omgidl": "IDL"}
+
+
+class _Mcap(_Chunked):
+    """An MCAP file of ROS 2."""
+
+    def __init__(self, path: Path, unpack: Unpack, limit: int) -> None:
+        super().__init__(path, unpack, limit)
+        self._schemas: dict[int, tuple[str, str, str]] = {}
+        self._channels: dict[int, tuple[int, str]] = {}
+        self._places.append(_Place(0, 0))  # of messages outside of chunks
+
+    def connections(self) -> dict[int, Any]:
+        found = {}
+        for key, (schema, topic) in self._channels.items():
+            if schema in self._schemas:
+                kind, encoding, text = self._schemas[schema]
+                found[key] = _connection(topic, kind, _MCAP_FORMS.get(encoding, "NONE"), text)
+        return found
+
+    def _first(self) -> int:
+        if self._data[: len(_MCAP_MAGIC)] != _MCAP_MAGIC:
+            raise DataError("it does not begin as an MCAP file")
+        begin, end = _mcap_record(self._data, len(_MCAP_MAGIC))
+        profile, _ = _mcap_text(self._data[begin:end], 0)
+        if profile != "ros2":
+            raise DataError(f"its profile is {profile!r}, not ros2")
+        return end
+
+    def _record(self, at: int) -> tuple[int, list[_Found], bool]:
+        begin, end = _mcap_record(self._data, at)
+        kind = self._data[at]
+        if kind == _MCAP_CHUNK_OP:
+            return end, *self._chunk(self._place(begin, end))
+        if kind == _MCAP_MESSAGE:
+            key, _, time = struct.unpack_from("<HIQ", self._data, begin)
+            return end, [(_within(time), key, 0, at)], True
+        if not 0 < kind <= _LAST_KIND:
+            raise DataError("a record of an unknown kind")
+        if kind in (_MCAP_SCHEMA, _MCAP_CHANNEL):
+            self._note(kind, self._data[begin:end])
+        return (len(self._data) if kind == 2 else end), [], True  # the footer is the last record
+
+    def _cut_chunk(self, at: int) -> _Place:
+        if self._data[at] != _MCAP_CHUNK_OP:
+            raise DataError("it is no chunk")
+        return self._place(*_mcap_record(self._data, at, is_cut=True))
+
+    def _place(self, begin: int, end: int) -> _Place:
+        _, _, size, crc, length = _MCAP_CHUNK.unpack_from(self._data, begin)
+        at = begin + _MCAP_CHUNK.size
+        (n_bytes,) = struct.unpack_from("<Q", self._data, at + length)
+        if length > 16 or at + length + 8 + n_bytes != end:
+            raise DataError("a chunk is damaged")
+        return _Place(at + length + 8, end, self._data[at : at + length].decode(), size, crc)
+
+    def _next(self, at: int) -> int | None:
+        for found in _CHUNK_BEGIN.finditer(self._data, at):
+            with suppress(DataError, struct.error, ValueError):
+                begin, end = _mcap_record(self._data, found.start())
+                if self._place(begin, end).compression in ("", "lz4", "zstd"):
+                    return found.start()
+        return None
+
+    def _inner(self, data: bytes) -> Iterator[tuple[int, int, int]]:
+        at = 0
+        while at < len(data):
+            begin, end = _mcap_record(data, at)
+            if data[at] == _MCAP_MESSAGE:
+                key, _, time = struct.unpack_from("<HIQ", data, begin)
+                yield _within(time), key, at
+            elif data[at] in (_MCAP_SCHEMA, _MCAP_CHANNEL):
+                self._note(data[at], data[begin:end])
+            elif not 0 < data[at] <= _LAST_KIND:
+                raise DataError("a record of an unknown kind")
+            at = end
+
+    def content(self, chunk: int, byte: int) -> bytes | None:
+        return self._message(self._data, byte) if chunk == 0 else super().content(chunk, byte)
+
+    def _message(self, data: Any, byte: int) -> bytes:
+        begin, end = _mcap_record(data, byte)
+        return bytes(data[begin + 22 : end])
+
+    def _note(self, kind: int, content: bytes) -> None:
+        (key,) = struct.unpack_from("<H", content)
+        if kind == _MCAP_SCHEMA:
+            name, at = _mcap_text(content, 2)
+            encoding, at = _mcap_text(content, at)
+            self._schemas[key] = name, encoding, _mcap_text(content, at)[0]
+        else:
+            topic, at = _mcap_text(content, 4)
+            if _mcap_text(content, at)[0] == "cdr":
+                self._channels[key] = struct.unpack_from("<H", content, 2)[0], topic
+
+    def _is_complete(self) -> bool:
+        return self._data[-len(_MCAP_MAGIC) :] == _MCAP_MAGIC
+
+
+def _mcap_record(data: Any, at: int, is_cut: bool = False) -> tuple[int, int]:
+    """Where the content of a record begins and ends; only after the file if it `is_cut`."""
+    (length,) = struct.unpack("<Q", data[at + 1 : at + 9])
+    if (at + 9 + length > len(data)) != is_cut:
+        raise DataError("a record is cut off")
+    return at + 9, at + 9 + length
+
+
+def _mcap_text(content: bytes, at: int) -> tuple[str, int]:
+    (length,) = struct.unpack_from("<I", content, at)
+    if at + 4 + length > len(content):
+        raise DataError("a text is cut off")
+    return content[at + 4 : at + 4 + length].decode(errors="replace"), at + 4 + length
+
+
+def _within(time: int) -> int:
+    """A time that fits into 63 bits. Raises `DataError`."""
+    if time >= 1 << 63:
+        raise DataError("a time is damaged")
+    return time
+
+
+# -- SQLite ------------------------------------------------------------------------------------------
+
+
+_MOST_LOST_ROWS = 1 << 40
+_NEXT_ROW = "SELECT rowid, timestamp, topic_id FROM messages WHERE rowid > ? ORDER BY rowid LIMIT 1"
+
+
+class _Database:
+    """A database of ROS 2, whose rows are read one after the other; rows in damaged pages are passed over."""
+
+    def __init__(self, path: Path, unpack: Unpack, limit: int) -> None:
+        import sqlite3
+
+        self._error = sqlite3.Error
+        self.lost: list[tuple[int | None, int | None]] = []
+        self._database = sqlite3.connect(f"{path.resolve().as_uri()}?immutable=1", uri=True)
+        self._database.text_factory = lambda data: data.decode(errors="replace")
+        self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, limit)
+        self._database.execute("PRAGMA trusted_schema=OFF")
+        self._database.execute("PRAGMA writable_schema=ON")  # opens a file that is shorter than it states
+        query = "SELECT count(*) FROM sqlite_master WHERE type='table' AND name IN ('messages', 'topics')"
+        with suppress(self._error):
+            if self._database.execute(query).fetchone() == (2,):
+                return
+        raise DataError("it has no readable tables of messages and topics")
+
+    def connections(self) -> dict[int, Any]:
+        """The topics by their numbers."""
+        texts: dict[str, tuple[str, str]] = {}
+        with suppress(self._error):  # older recordings have no definitions
+            query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+            texts = {kind: (_MCAP_FORMS.get(form, "NONE"), text) for kind, form, text in self._rows(query)}
+        found = {}
+        for key, topic, kind in self._rows("SELECT id, name, type FROM topics"):
+            if isinstance(topic, str) and isinstance(kind, str):
+                found[key] = _connection(topic, kind, *texts.get(kind, ("NONE", "")))
+        return found
+
+    def _rows(self, query: str) -> Iterator[Any]:
+        yield from self._database.execute(query)
+
+    def messages(self) -> Iterator[_Found]:
+        """(time in ns, topic, row, 0) of each message."""
+        row: int | None = -1
+        last, is_after_loss = None, False
+        while row is not None:
+            try:
+                found = self._row_after(row)
+            except (self._error, OverflowError):
+                is_after_loss, row = True, self._next(row)
+                continue
+            if found is None:
+                break
+            row, time, topic = found
+            if isinstance(time, int) and isinstance(topic, int):
+                if is_after_loss:
+                    self.lost.append((last, time))
+                    is_after_loss = False
+                last = max(last or 0, time)
+                yield time, topic, row, 0
+        if is_after_loss:
+            self.lost.append((last, None))
+
+    def _next(self, row: int) -> int | None:
+        """The row before the next one that is intact; None without one."""
+        low, high = row, row + 1
+        while not self._is_intact_after(high):
+            low, high = high, high + 2 * (high - row)
+            if high - row > _MOST_LOST_ROWS:
+                return None
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (low, middle) if self._is_intact_after(middle) else (middle, high)
+        return high
+
+    def _is_intact_after(self, row: int) -> bool:
+        """Whether the row after `row` is intact, or there is none."""
+        try:
+            self._row_after(row)
+        except (self._error, OverflowError):
+            return False
+        return True
+
+    def _row_after(self, row: int) -> Any:
+        """(row, time, topic) of the next row; None at the end. Raises an error if its page is damaged."""
+        found = self._database.execute(_NEXT_ROW, (row,)).fetchone()
+        if found is not None and found[0] <= row:  # in a page that is another one
+            raise self._error("rows are out of order")
+        return found
+
+    def content(self, row: int, _: int) -> bytes | None:
+        """The content of a message; None if it is damaged."""
+        try:
+            found = self._database.execute("SELECT data FROM messages WHERE rowid = ?", (row,)).fetchone()
+        except self._error:
+            return None
+        return found[0] if found and isinstance(found[0], bytes) else None

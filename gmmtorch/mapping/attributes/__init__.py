@@ -1,0 +1,1 @@
+"""What components know besides geometry: colour, intensity, classes."""

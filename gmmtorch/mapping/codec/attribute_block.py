@@ -1,0 +1,276 @@
+"""Attributes of components as bytes, a block beside the batch of their geometry; see docs/formats.md.
+
+Errors are measured in a component's own deviations, as in `lattice`. Of a channel of numbers: the deviation
+from its plane, a power of √2; the mean and the slopes along the component's axes, except the shortest, as
+multiples of a part of the deviation. Colours are written as lightness and two differences, whose deviations
+are independent. Of a channel of classes: the most likely label, the next one, and their shares in eighths.
+Every component is rounded by itself, and rounding again changes nothing.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
+from gmmtorch.mapping.attributes.moments import Attributes, Channel, Labels, Numbers
+from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Ints
+from gmmtorch.scan import COLOUR, LARGEST_LABEL
+
+BLOCK_VERSION = 1
+_MEAN_STEPS, _SLOPE_STEPS = 2.0, 1.0  # in a deviation
+_SHARES = 8
+_MOST_REST = 3  # eighths of the second label
+_DEVIATIONS = -80, 80  # least and largest, in powers of √2
+_LEAST_COLOUR = 2.0**-8  # deviation
+_LEAST_RELATIVE = 2.0**-8  # deviation of other numbers, relative to the mean
+_MOST_CHANNELS, _MOST_COLUMNS, _LONGEST_NAME = 16, 8, 64
+_MOST_STEPS = 1 << 40
+_LIGHTNESS = torch.tensor([[1.0, 1.0, 1.0], [1.0, 0.0, -1.0], [1.0, -2.0, 1.0]], dtype=torch.float64)
+_LIGHTNESS = _LIGHTNESS / _LIGHTNESS.norm(dim=1, keepdim=True)
+
+
+class _NumberSteps(NamedTuple):
+    """Of the components with values: share (K,) in eighths of all; then deviation, mean (J, A), and slope
+    (J, A, D−1)."""
+
+    share: Tensor
+    deviation: Tensor
+    mean: Tensor
+    slope: Tensor
+
+
+class _LabelSteps(NamedTuple):
+    """share (K,) in eighths; of the components with labels, the rows of the first and the second label (J,),
+    and the share of the second in eighths; labels (C,)."""
+
+    share: Tensor
+    first: Tensor
+    second: Tensor
+    rest: Tensor
+    labels: Tensor
+
+
+def rounded(
+    attributes: Attributes, means: Tensor, rounded_means: Tensor, rounded_covariances: Tensor
+) -> Attributes:
+    """The attributes after writing and reading them, for components whose geometry is rounded, on the CPU.
+
+    means, rounded_means: (K, D), from which the means of numbers move along their slopes.
+    """
+    return Attributes(
+        {
+            name: _restored(
+                name, _steps(name, _at(c, rounded_means - means), rounded_covariances), rounded_covariances
+            )
+            for name, c in attributes.channels.items()
+        }
+    )
+
+
+def encode_attributes(attributes: Attributes, covariances: Tensor) -> bytes:
+    """The block of the attributes of components with these rounded covariances (K, D, D)."""
+    writer = BitWriter()
+    writer.number(len(attributes.channels))
+    for name, channel in attributes.channels.items():
+        _write_name(writer, name)
+        steps = _steps(name, channel, covariances)
+        if isinstance(steps, _NumberSteps):
+            writer.number(steps.mean.shape[1])
+            writer.column(steps.share.numpy())
+            for values in (steps.deviation, steps.mean, steps.slope.flatten(1)):
+                for column in values.T:
+                    writer.column(column.contiguous().numpy())
+        else:
+            writer.number(0)
+            writer.number(len(steps.labels))
+            writer.column(steps.labels.numpy())
+            writer.column(steps.share.numpy())
+            writer.column(steps.first.numpy())
+            writer.column(steps.rest.numpy())
+            writer.column(steps.second[steps.rest > 0].numpy())
+    return bytes([BLOCK_VERSION]) + writer.to_bytes()
+
+
+def decode_attributes(data: bytes, covariances: Tensor) -> Attributes:
+    """The attributes of components with these covariances (K, D, D). Raises `DataError` for data that
+    `encode_attributes` did not write for K components."""
+    if not data or data[0] != BLOCK_VERSION:
+        raise DataError(
+            f"The attributes are version {data[0] if data else 'none'}; this gmmtorch reads {BLOCK_VERSION}."
+        )
+    reader = BitReader(data[1:])
+    k, dim = covariances.shape[:2]
+    found: dict[str, Channel] = {}
+    for _ in range(_bounded(reader.number(), "channels", 0, _MOST_CHANNELS)):
+        name = _read_name(reader)
+        width = _bounded(reader.number(), "columns", 0, _MOST_COLUMNS)
+        steps = _read_numbers(reader, k, width, dim) if width else _read_labels(reader, k)
+        found[name] = _restored(name, steps, covariances)
+    reader.finish()
+    try:
+        return Attributes(found).checked(k, dim)
+    except GmmTorchError as error:
+        raise DataError(f"The attributes are damaged: {error}") from error
+
+
+def _write_name(writer: BitWriter, name: str) -> None:
+    letters = np.frombuffer(name.encode(), np.uint8).astype(np.int64)
+    if not 0 < len(letters) <= _LONGEST_NAME:
+        raise InvalidArgumentError(f"attributes[{name!r}]: a name has 1 to {_LONGEST_NAME} bytes.")
+    writer.number(len(letters))
+    writer.fixed(letters, 8)
+
+
+def _read_name(reader: BitReader) -> str:
+    letters = reader.fixed(_bounded(reader.number(), "letters", 1, _LONGEST_NAME), 8)
+    return letters.astype(np.uint8).tobytes().decode("utf-8", errors="replace")
+
+
+def _read_numbers(reader: BitReader, k: int, width: int, dim: int) -> _NumberSteps:
+    share = _column(reader, k, "shares", 0, _SHARES)
+    n = int((share > 0).sum())
+
+    def table(columns: int, name: str, least: int, largest: int) -> Tensor:
+        found = [_column(reader, n, name, least, largest) for _ in range(columns)]
+        return torch.stack(found, 1) if found else torch.zeros(n, 0, dtype=torch.int64)
+
+    deviation = table(width, "deviations", *_DEVIATIONS)
+    mean = table(width, "means", -_MOST_STEPS, _MOST_STEPS)
+    slope = table(width * (dim - 1), "slopes", -_MOST_STEPS, _MOST_STEPS).view(n, width, dim - 1)
+    return _NumberSteps(share, deviation, mean, slope)
+
+
+def _read_labels(reader: BitReader, k: int) -> _LabelSteps:
+    n_labels = _bounded(reader.number(), "labels", 0, LARGEST_LABEL + 1)
+    labels = _column(reader, n_labels, "labels", 0, LARGEST_LABEL)
+    share = _column(reader, k, "shares", 0, _SHARES)
+    n = int((share > 0).sum())
+    if n and not n_labels:
+        raise DataError("Components have labels, but there are none: the attributes are damaged.")
+    first = _column(reader, n, "labels", 0, n_labels - 1)
+    rest = _column(reader, n, "shares", 0, _MOST_REST)
+    second = torch.zeros_like(first)
+    second[rest > 0] = _column(reader, int((rest > 0).sum()), "labels", 0, n_labels - 1)
+    if n * n_labels > 1 << 28:
+        raise DataError(f"{n} components with {n_labels} labels are too many to read.")
+    return _LabelSteps(share, first, second, rest, labels)
+
+
+def _column(reader: BitReader, n: int, name: str, least: int, largest: int) -> Tensor:
+    values: Ints = reader.column(n)
+    if n:
+        _bounded(int(values.min()), name, least, largest)
+        _bounded(int(values.max()), name, least, largest)
+    return torch.from_numpy(values)
+
+
+def _bounded(value: int, name: str, least: int, largest: int) -> int:
+    if not least <= value <= largest:
+        raise DataError(f"The {name} of the attributes reach {value}, not {least} to {largest}: damaged.")
+    return value
+
+
+# -- rounding --------------------------------------------------------------------------------------------
+
+
+def _at(channel: Channel, shift: Tensor) -> Channel:
+    """The channel with the mean at another place of each component, `shift` (K, D) away."""
+    if isinstance(channel, Labels):
+        return channel
+    return channel._replace(mean=channel.mean + (channel.slope @ shift[:, :, None])[:, :, 0])
+
+
+def _steps(name: str, channel: Channel, covariances: Tensor) -> _NumberSteps | _LabelSteps:
+    if isinstance(channel, Labels):
+        return _label_steps(channel)
+    share = (channel.share * _SHARES).round().long().clamp(0, _SHARES)
+    share = torch.where((channel.share > 0) & (share == 0), 1, share)
+    rows = share > 0
+    basis = _basis(name, channel.mean)
+    given = channel.mean[rows] @ basis.T
+    noise = (basis @ channel.covariance[rows] @ basis.T).diagonal(dim1=1, dim2=2).clamp_min(1e-30).sqrt()
+    deviation, mean = _log(noise), given
+    for _ in range(3):  # the second time for the rounded mean, so that rounding again changes nothing
+        least = torch.full_like(mean, _LEAST_COLOUR) if name == COLOUR else _LEAST_RELATIVE * mean.abs()
+        deviation = torch.where(deviation < _log(least) - 2, _log(least), deviation).clamp_min(_DEVIATIONS[0])
+        mean = (given / _power(deviation) * _MEAN_STEPS).round() * _power(deviation) / _MEAN_STEPS
+    if bool((deviation > _DEVIATIONS[1]).any()):
+        raise InvalidArgumentError(
+            f"attributes {name!r} reach {float(given.abs().max()):g}, too large to be stored."
+        )
+    unit = _power(deviation)
+    along = (basis @ channel.slope[rows]) @ _factors(covariances[rows])[:, :, :-1]
+    steps = (given / unit * _MEAN_STEPS).round(), (along / unit[:, :, None] * _SLOPE_STEPS).round()
+    return _NumberSteps(
+        share, deviation, *(values.clamp(-_MOST_STEPS, _MOST_STEPS).long() for values in steps)
+    )
+
+
+def _log(noise: Tensor) -> Tensor:
+    """Deviations as whole powers of √2."""
+    return (2 * noise.clamp_min(1e-30).log2()).round().long()
+
+
+def _label_steps(channel: Labels) -> _LabelSteps:
+    total = channel.share.sum(1)
+    share = (total * _SHARES).round().long().clamp(0, _SHARES)
+    share = torch.where((total > 0) & (share == 0), 1, share)
+    rows = share > 0
+    own = channel.share[rows]
+    own = own / own.sum(1, keepdim=True).clamp_min(torch.finfo(own.dtype).tiny)
+    if own.shape[1] < 2:
+        first = second = own.new_zeros(len(own), dtype=torch.int64)
+        return _LabelSteps(share, first, second, torch.zeros_like(first), channel.labels)
+    (largest, next_one), (first, second) = (part.unbind(1) for part in own.topk(2, 1))
+    pair = next_one / (largest + next_one)
+    rest = (pair * _SHARES).round().long().clamp(0, _MOST_REST)
+    return _LabelSteps(share, first, second, rest, channel.labels)
+
+
+def _restored(name: str, steps: _NumberSteps | _LabelSteps, covariances: Tensor) -> Channel:
+    k, dim = covariances.shape[:2]
+    share, rows = steps.share.double() / _SHARES, (steps.share > 0).nonzero().squeeze(1)
+    if isinstance(steps, _LabelSteps):
+        rest = steps.rest.double() / _SHARES
+        table = share.new_zeros(k, len(steps.labels))
+        table.index_put_((rows, steps.second), share[rows] * rest, accumulate=True)
+        table.index_put_((rows, steps.first), share[rows] * (1 - rest), accumulate=True)
+        return Labels(table, steps.labels)
+    width = steps.mean.shape[1]
+    unit = _power(steps.deviation)
+    along = torch.zeros(len(rows), width, dim, dtype=torch.float64)
+    along[:, :, :-1] = steps.slope * (unit / _SLOPE_STEPS)[:, :, None]
+    basis = _basis(name, unit)
+    slope = basis.T @ torch.linalg.solve(_factors(covariances[rows]), along, left=False)
+    mean = (steps.mean * unit / _MEAN_STEPS) @ basis
+    noise = basis.T @ torch.diag_embed(unit.square()) @ basis
+    found = Numbers(share, *(share.new_zeros(k, *v.shape[1:]) for v in (mean, slope, noise)))
+    for whole, own in zip(found[1:], (mean, slope, noise), strict=True):
+        whole[rows] = own
+    return found
+
+
+def _power(deviation: Tensor) -> Tensor:
+    """√2 to the power of whole numbers."""
+    return torch.exp2(deviation.double() / 2)
+
+
+def _basis(name: str, like: Tensor) -> Tensor:
+    """The directions (A, A), orthonormal, in which a channel is written."""
+    return _LIGHTNESS if name == COLOUR else torch.eye(like.shape[1], dtype=torch.float64)
+
+
+def _factors(covariances: Tensor) -> Tensor:
+    """F (K, D, D) with Σ = F Fᵀ, whose columns are axes of falling length (Cholesky with pivoting)."""
+    left, columns = covariances, []
+    for _ in range(covariances.shape[1]):
+        variance, pivot = left.diagonal(dim1=1, dim2=2).max(1)
+        column = left.gather(2, pivot.view(-1, 1, 1).expand(-1, left.shape[1], 1))[:, :, 0]
+        column = column / variance.clamp_min(1e-300).sqrt()[:, None]
+        left = left - column[:, :, None] * column[:, None]
+        columns.append(column)
+    return torch.stack(columns, 2)

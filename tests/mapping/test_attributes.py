@@ -1,0 +1,411 @@
+"""Attributes of components: learning, merging, prediction, motion, and their block in map files."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from mapping.map_cases import FINE, assert_same_components, drive, some_motion
+from scipy.stats import multivariate_normal
+from torch import Tensor
+
+import gmmtorch as gt
+from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.files import read_tensors
+from gmmtorch.mapping.attributes import moments
+from gmmtorch.mapping.attributes.answers import predictions
+from gmmtorch.mapping.attributes.moments import Attributes, Labels, Numbers
+from gmmtorch.mapping.codec.attribute_block import decode_attributes, encode_attributes
+from gmmtorch.mapping.codec.quantization import quantized
+from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.learning.merging import compact, merged
+from gmmtorch.mapping.tiles import TiledMap, tile_files
+from gmmtorch.mixture import Cells, merge_components, quadratic_features
+from gmmtorch.scan import Scan, display_colours, linear_colours
+
+
+def seeded(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def normal(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=seeded(seed), dtype=torch.float64)
+
+
+def painted(scan: Scan, seed: int = 0) -> Scan:
+    """The scan with a colour that follows the place, intensity, and two classes at y = 0."""
+    y = scan.points[:, 1].double()
+    colour = torch.stack([0.5 + 0.2 * torch.tanh(y), 0.5 - 0.2 * torch.tanh(y), torch.full_like(y, 0.25)], 1)
+    colour = (colour + 0.02 * normal(len(y), 3, seed=seed)).clamp(0, 1)
+    channels = {"colour": colour, "intensity": 40 + 3 * y, "class": (y > 0).long() * 7}
+    return replace(scan, attributes=channels)
+
+
+def painted_map(n: int = 6, dim: int = 2, **options: Any) -> gt.GaussianMap:
+    made = gt.GaussianMap(FINE, **options)
+    for seed, scan in enumerate(drive(n, dim)):
+        made.insert(painted(scan, seed))
+    return made
+
+
+def coloured_components(dim: int = 3, k: int = 5, width: int = 2) -> Components:
+    root, both = 0.3 * normal(k, dim, dim, seed=1), normal(k, width, dim, seed=2)
+    noise = 0.2 * normal(k, width, width, seed=3)
+    share = torch.linspace(0.2, 1, k, dtype=torch.float64)
+    own = Numbers(share, normal(k, width, seed=4), both, noise @ noise.mT + 0.01 * torch.eye(width).double())
+    labels = Labels(torch.softmax(normal(k, 3, seed=6), 1) * share[:, None], torch.tensor([2, 5, 9]))
+    made = Components.given(
+        normal(k, dim, seed=5), root @ root.mT + 0.01 * torch.eye(dim).double(),
+        torch.arange(1.0, k + 1), normal(k, dim, seed=7), None, 0,
+    )  # fmt: skip
+    return replace(made, attributes=Attributes({"heat": own, "class": labels}))
+
+
+def joint(c: Components, name: str = "heat") -> tuple[Tensor, Tensor]:
+    """Means and covariances of (position, attribute)."""
+    own = c.attributes.channels[name]
+    assert isinstance(own, Numbers)
+    both = own.slope @ c.covariances
+    top, bottom = (
+        torch.cat([c.covariances, both.mT], 2),
+        torch.cat([both, own.covariance + both @ own.slope.mT], 2),
+    )
+    return torch.cat([c.means, own.mean], 1), torch.cat([top, bottom], 1)
+
+
+# -- learning --------------------------------------------------------------------------------------------
+
+
+def cells_of(points: Tensor) -> Cells:
+    """Every point in a cell of its own, in a random order."""
+    order = torch.randperm(len(points), generator=seeded(3))
+    return Cells(quadratic_features(points[order]), torch.ones(len(points)).double(), order.argsort())
+
+
+def test_a_slope_is_that_of_least_squares_with_points_without_slope():
+    points, owner = normal(400, 3), torch.arange(400) % 2
+    values = 1000 + points @ normal(3, 2, seed=1) + 0.1 * normal(400, 2, seed=2)
+    means = torch.stack([points[owner == i].mean(0) for i in (0, 1)])
+    covariances = torch.eye(3, dtype=torch.float64).repeat(2, 1, 1)
+    cells = cells_of(points)
+    of_cells = owner[cells.member.argsort()]
+    found = moments.learned({"heat": values}, cells, of_cells, means, covariances).channels["heat"]
+    for i in (0, 1):
+        offset, own = (points[owner == i] - means[i]).numpy(), values[owner == i].numpy()
+        rows = np.vstack([offset, np.sqrt(3.0) * np.eye(3)])  # three points, spread like the component
+        slope, *_ = np.linalg.lstsq(rows, np.vstack([own - own.mean(0), np.zeros((3, 2))]), None)
+        np.testing.assert_allclose(found.slope[i].numpy(), slope.T, rtol=1e-8)
+        np.testing.assert_allclose(found.mean[i].numpy(), own.mean(0), rtol=1e-9)
+        left = own - own.mean(0) - offset @ slope
+        np.testing.assert_allclose(found.covariance[i].numpy(), left.T @ left / 200, atol=1e-4)
+    assert found.share.tolist() == [1.0, 1.0]
+
+
+def test_points_without_a_value_and_components_without_points_do_not_count():
+    values = torch.tensor([[1.0], [torch.nan], [3.0]], dtype=torch.float64)
+    cells = cells_of(torch.zeros(3, 3).double())
+    owner = torch.tensor([0, 0, -1])[cells.member.argsort()]
+    means, covariances = torch.zeros(2, 3).double(), torch.eye(3).double().repeat(2, 1, 1)
+    channels = {"heat": values, "class": torch.tensor([4, -1, 4])}
+    found = moments.learned(channels, cells, owner, means, covariances).channels
+    assert found["heat"].share.tolist() == [0.5, 0.0]
+    assert found["heat"].mean.tolist() == [[1.0], [0.0]]
+    assert found["class"].share.tolist() == [[0.5], [0.0]]
+    assert found["class"].labels.tolist() == [4]
+
+
+def test_merges_of_neighbours_with_different_colours_cost_more():
+    """Two pairs of equal geometry; the one of one colour is merged."""
+    means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [10, 0, 0], [11, 0, 0]]).double()
+    c = Components.given(means, torch.eye(3).double().repeat(4, 1, 1), torch.ones(4), means + 5, None, 0)
+    for rows, merged_pair in (([0.2, 0.8, 0.2, 0.2], 10.5), ([0.2, 0.2, 0.2, 0.8], 0.5)):
+        mean = torch.tensor(rows).double()[:, None].expand(4, 3)
+        own = Numbers(
+            torch.ones(4).double(),
+            mean,
+            torch.zeros(4, 3, 3).double(),
+            1e-4 * torch.eye(3).double().repeat(4, 1, 1),
+        )
+        found = compact(replace(c, attributes=Attributes({"colour": own})), 3)
+        assert merged_pair in found.means[:, 0].tolist()
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_attributes_change_neither_the_geometry_nor_its_bytes(dim):
+    plain, coloured = gt.GaussianMap(FINE), painted_map(dim=dim)
+    for scan in drive(6, dim):
+        plain.insert(scan)
+    assert_same_components(plain.components(), coloured.components())
+    assert not plain.components().attributes
+    assert plain.attributes(torch.zeros(1, dim)) == {}
+
+
+def test_a_map_without_attributes_has_no_byte_for_them(tmp_path):
+    plain = gt.GaussianMap(FINE)
+    for scan in drive(4):
+        plain.insert(scan)
+    plain.save(tmp_path / "plain.safetensors")
+    tensors, _ = read_tensors(tmp_path / "plain.safetensors", "gmmtorch.map", 2)
+    assert list(tensors) == ["components"]
+
+
+def test_scans_with_and_without_colour_make_one_map():
+    made = gt.GaussianMap(FINE)
+    for i, scan in enumerate(drive(6)):
+        made.insert(painted(scan) if i % 2 else scan)
+    own = made.components().attributes.channels["colour"]
+    assert 0 < float(own.share.mean()) < 1
+    found = made.attributes(drive(6)[0].points)["colour"]
+    assert bool(found.known.all())
+    assert bool(torch.isfinite(found.mean).all())
+
+
+def test_one_channel_cannot_be_numbers_and_labels():
+    one, other = drive(2)
+    one = replace(one, attributes={"heat": torch.zeros(len(one.points))})
+    other = replace(other, attributes={"heat": torch.zeros(len(other.points), dtype=torch.int64)})
+    made = gt.GaussianMap(FINE)
+    made.insert(one)
+    with pytest.raises(InvalidArgumentError, match="'heat' are numbers in some scans and labels in others"):
+        made.insert(other)
+
+
+# -- merging and moving ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_merging_preserves_the_moments_of_position_and_attribute(dim):
+    c = coloured_components(dim)
+    own = c.attributes.channels["heat"]
+    c = replace(
+        c,
+        attributes=Attributes({**c.attributes.channels, "heat": own._replace(share=torch.ones(5).double())}),
+    )
+    labels = torch.tensor([0, 1, 0, 1, 2])
+    found = merged(c, labels)
+    expected = merge_components(c.support, *joint(c), labels, 3)
+    for value, wanted in zip(joint(found), (expected.means, expected.covariances), strict=True):
+        torch.testing.assert_close(value, wanted, rtol=1e-9, atol=1e-12)
+    counts = c.support[:, None] * c.attributes.channels["class"].share
+    summed = torch.zeros(3, 3).double().index_add_(0, labels, counts)
+    torch.testing.assert_close(found.support[:, None] * found.attributes.channels["class"].share, summed)
+    alone = found.attributes.channels["heat"]
+    assert torch.equal(alone.slope[2], own.slope[4])
+    assert torch.equal(alone.covariance[2], own.covariance[4])
+
+
+def test_a_component_without_values_does_not_change_those_of_the_other_in_a_merge():
+    c = coloured_components(k=2)
+    own = c.attributes.channels["heat"]
+    none = own._replace(share=torch.tensor([1.0, 0.0]).double())
+    found = merged(replace(c, attributes=Attributes({"heat": none})), torch.tensor([0, 0]))
+    made, at = found.attributes.channels["heat"], c.means[0] - found.means[0]
+    torch.testing.assert_close(made.slope[0], own.slope[0])
+    torch.testing.assert_close(made.mean[0] + made.slope[0] @ at, own.mean[0])
+    torch.testing.assert_close(made.share, (c.support[:1] / c.support.sum()))
+
+
+def test_predictions_move_with_the_components():
+    made, motion = painted_map(dim=3, codec="float"), some_motion(3)
+    points = drive(6, 3)[0].points.double()[:50]
+    before = made.attributes(points)
+    made.transform(motion)
+    after = made.attributes(points @ motion[:3, :3].T + motion[:3, 3])
+    for name, found in before.items():
+        torch.testing.assert_close(after[name].mean, found.mean, rtol=1e-7, atol=1e-9)
+        assert torch.equal(after[name].known, found.known)
+
+
+# -- prediction ------------------------------------------------------------------------------------------
+
+
+def test_predictions_are_those_of_the_joint_mixture():
+    c = coloured_components()
+    c = replace(c, attributes=Attributes({"heat": c.attributes.channels["heat"]}))
+    points = c.means + 0.05 * normal(5, 3, seed=9)
+    found = predictions(c, points, cutoff=40.0)["heat"]
+    means, covariances = joint(c)
+    share = c.attributes.channels["heat"].share
+    for row, point in enumerate(points):
+        weight, mean, square = [], [], []
+        for k in range(5):
+            own = covariances[k]
+            gain = own[3:, :3] @ torch.linalg.inv(own[:3, :3])
+            offset = point - means[k, :3]
+            far = float((offset @ torch.linalg.inv(own[:3, :3]) @ offset).sqrt())
+            offset = offset * min(1, 2.5 / far)  # slopes are followed up to 2.5 deviations
+            value = means[k, 3:] + gain @ offset
+            density = multivariate_normal(means[k, :3].numpy(), own[:3, :3].numpy()).pdf(point.numpy())
+            weight.append(float(c.support[k] * share[k]) * density)
+            mean.append(value)
+            square.append((own[3:, 3:] - gain @ own[:3, 3:]).diagonal() + value**2)
+        shares = torch.tensor(weight).double() / sum(weight)
+        wanted = (shares[:, None] * torch.stack(mean)).sum(0)
+        torch.testing.assert_close(found.mean[row], wanted, rtol=1e-8, atol=1e-10)
+        variance = (shares[:, None] * torch.stack(square)).sum(0) - wanted**2
+        torch.testing.assert_close(found.variance[row], variance, rtol=1e-7, atol=1e-9)
+
+
+def test_predictions_are_differentiable_and_unknown_far_away():
+    c = coloured_components()
+    points = (c.means + 0.02).requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: predictions(c, x)["heat"].mean, points)
+    far = torch.tensor([[1e3, 0.0, 0.0], [torch.inf, 0.0, 0.0]]).double()
+    found = predictions(c, far)
+    assert not bool(found["heat"].known.any())
+    assert bool(torch.isfinite(found["heat"].mean).all())
+    assert found["class"].most_likely.tolist() == [-1, -1]
+    torch.testing.assert_close(found["class"].mean.sum(1), torch.ones(2).double())
+
+
+def test_a_painted_wall_has_a_gradient_and_two_classes():
+    made = painted_map(dim=3)
+    scan = painted(drive(6, 3)[0])
+    found = made.attributes(scan.points)
+    assert bool(found["colour"].known.all())
+    off = (found["colour"].mean - scan.attributes["colour"]).square().mean().sqrt()
+    assert float(off) < 0.04
+    assert float((found["intensity"].mean[:, 0] - scan.attributes["intensity"][:, 0]).abs().mean()) < 1.0
+    right = found["class"].most_likely == scan.attributes["class"]
+    assert float(right.double().mean()) > 0.95
+    with pytest.raises(InvalidArgumentError, match="numbers, not labels"):
+        _ = found["colour"].most_likely
+
+
+# -- files -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("codec", ["quantized", "float"])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_saved_map_gives_the_same_attributes(tmp_path, codec, dim):
+    made, path = painted_map(dim=dim, codec=codec), tmp_path / "map.safetensors"
+    made.save(path)
+    loaded = gt.GaussianMap.load(path)
+    for name, value in made.components().attributes.tensors().items():
+        torch.testing.assert_close(
+            loaded.components().attributes.tensors()[name], value, rtol=1e-12, atol=1e-14
+        )
+    loaded.save(tmp_path / "again.safetensors")
+    assert (tmp_path / "again.safetensors").read_bytes() == path.read_bytes()
+    for row in map(int, torch.randperm(len(made.components()), generator=seeded(0))[:3]):
+        alone = made.components().selected(torch.tensor([row]))  # each component is rounded by itself
+        torch.testing.assert_close(
+            quantized(alone).attributes.channels["colour"].mean if codec == "quantized" else
+            alone.attributes.channels["colour"].mean,
+            made.components().attributes.channels["colour"].mean[row, None],
+        )  # fmt: skip
+
+
+def test_rounding_is_bounded_in_deviations_and_changes_nothing_twice():
+    c = coloured_components(k=40)
+    once = quantized(c)
+    twice = quantized(once)
+    for name, value in once.attributes.tensors().items():
+        torch.testing.assert_close(twice.attributes.tensors()[name], value, rtol=1e-10, atol=1e-12)
+    own, found = c.attributes.channels["heat"], once.attributes.channels["heat"]
+    noise = found.covariance.diagonal(dim1=1, dim2=2).sqrt()
+    moved = own.mean + (own.slope @ (once.means - c.means)[:, :, None])[:, :, 0]
+    assert bool(((moved - found.mean).abs() <= 0.25 * noise * (1 + 1e-9)).all())
+    ratio = noise / own.covariance.diagonal(dim1=1, dim2=2).sqrt()
+    assert float(ratio.min()) > 2**-0.26
+    assert float(ratio.max()) < 2**0.26
+
+
+@given(st.integers(0, 2**32), st.floats(-12, 12), st.floats(-12, 12))
+def test_rounding_again_changes_nothing_at_any_scale(seed, mean, noise):
+    c = coloured_components(k=8)
+    own = Numbers(
+        torch.ones(8).double(),
+        10.0**mean * normal(8, 2, seed=seed),
+        10.0**noise * normal(8, 2, 3, seed=seed),
+        10.0 ** (2 * noise) * torch.diag_embed(normal(8, 2, seed=seed).square()),
+    )
+    once = quantized(replace(c, attributes=Attributes({"heat": own})))
+    for name, value in once.attributes.tensors().items():
+        torch.testing.assert_close(quantized(once).attributes.tensors()[name], value, rtol=1e-9, atol=1e-300)
+
+
+def test_colour_takes_four_bytes_and_a_class_one():
+    made = painted_map(12, 3)
+    c = made.components()
+    for name, most in (("colour", 4.0), ("class", 1.0)):
+        alone = Attributes({name: c.attributes.channels[name]})
+        assert len(encode_attributes(alone, c.covariances)) - 40 <= most * len(c)
+
+
+@given(st.integers(0, 2**32), st.integers(0, 255))
+def test_damaged_blocks_raise_a_data_error(place, value):
+    c = quantized(coloured_components())
+    data = bytearray(encode_attributes(c.attributes, c.covariances))
+    data[place % len(data)] ^= value
+    for damaged in (bytes(data), bytes(data[: place % len(data)])):
+        try:
+            found = decode_attributes(damaged, c.covariances)
+        except DataError:
+            continue
+        found.checked(len(c), 3)
+
+
+def test_a_budget_holds_with_attributes(tmp_path):
+    made = gt.GaussianMap(replace(FINE, max_bytes=1500))
+    for seed, scan in enumerate(drive(8, 3)):
+        made.insert(painted(scan, seed))
+    assert made.nbytes <= 1500
+    assert set(made.components().attributes.channels) == {"colour", "intensity", "class"}
+
+
+def test_state_and_tiles_keep_attributes(tmp_path):
+    made = painted_map(5, 3)  # one scan is pending
+    again = gt.GaussianMap(FINE)
+    again.load_state_dict(made.state_dict())
+    points = drive(5, 3)[0].points
+    wanted = made.attributes(points)["colour"].mean
+    torch.testing.assert_close(again.attributes(points)["colour"].mean, wanted)
+    for name, data in tile_files(made.components(), made.settings, 0.5).items():
+        (tmp_path / name).write_bytes(data)
+    whole = TiledMap(tmp_path).open()
+    torch.testing.assert_close(whole.attributes(points)["colour"].mean, wanted, rtol=1e-6, atol=1e-9)
+
+
+# -- scans -----------------------------------------------------------------------------------------------
+
+
+def scan_of(**channels: Any) -> Scan:
+    return Scan(torch.ones(2, 3), torch.zeros(3), attributes=channels)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "reason"),
+    [
+        ("colour", torch.tensor([[0.0, 0.5, 200.0]] * 2), "outside 0 to 1"),
+        ("colour", torch.zeros(2, 3, dtype=torch.int64), "as uint8"),
+        ("colour", torch.zeros(2), r"expected \(2, 3\)"),
+        ("intensity", torch.zeros(3), r"expected \(2,\)"),
+        ("intensity", torch.tensor([torch.inf, 0.0]), "infinite"),
+        ("intensity", torch.zeros(2, 9), "9 columns"),
+        ("class", torch.tensor([0, 65536]), "from 0 to 65535"),
+        ("class", torch.tensor([0, -2]), "from 0 to 65535"),
+    ],
+)
+def test_bad_channels_are_refused_with_the_remedy(name, value, reason):
+    with pytest.raises(InvalidArgumentError, match=reason):
+        scan_of(**{name: value})
+
+
+def test_channels_follow_their_points():
+    scan = scan_of(colour=np.array([[0, 128, 255], [255, 0, 0]], np.uint8), heat=[1.0, torch.nan])
+    torch.testing.assert_close(scan.attributes["colour"][0], torch.tensor([0.0, 0.2158605, 1.0]))
+    kept = scan.select(torch.tensor([False, True])).copied().transformed(torch.eye(4))
+    assert kept.attributes["colour"].tolist() == [[1.0, 0.0, 0.0]]
+    assert kept.attributes["heat"].isnan().all()
+
+
+@given(st.floats(0, 1))
+def test_display_colours_invert_linear_ones(value):
+    given = torch.tensor([value], dtype=torch.float64)
+    torch.testing.assert_close(linear_colours(display_colours(given)), given, rtol=1e-6, atol=1e-6)
