@@ -23,7 +23,7 @@ from gmmtorch.mixture.density import NotFittedError
 from gmmtorch.mixture.em import by_type
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.initialization import initialize
-from gmmtorch.mixture.estimators.variational import (
+from gmmtorch.mixture.em.variational_bayes import (
     expected_log_weights,
     expected_weights,
     unbiased_covariance,
