@@ -132,7 +132,7 @@ class BagReader:
         if found.gaps:
             longest = max(found.gaps, key=lambda gap: gap[1] - gap[0])
             text += (
-                f"; {found.missing_seconds:.1f} s in {len(found.gaps)} gap(s) are missing, the longest from "
+                f"; {found.missing_seconds:.1f} s are missing, the longest gap from "
                 f"{(longest[0] - first) / 1e9:.1f} to {(longest[1] - first) / 1e9:.1f} s"
             )
         if end:
