@@ -69,9 +69,9 @@ class Odometry:
     bound (`localization.pose_search`), and the mixture is climbed from the best ones; in 3D it is climbed
     from the best of a lattice of starts. The prediction continues the last motion. `trajectory`
     finds the places that were seen twice and corrects all poses by a pose graph
-    (`localization.pose_graph`). A scan that is not found never enters the local map, and is searched for
-    again when a later one is found. The fourth of them in a row begins a new map, whose poses are found if a
-    closure joins them with the first.
+    (`localization.pose_graph`). A scan that is not found never enters the local map. If the
+    next one is found, it is searched for again. The fourth in a row begins a new map, whose poses are found
+    if a closure joins them with the first.
 
     Args:
         n_keyframes: in the local map. None: 10, or 80 for a sensor with a narrow field of view, such as a
@@ -292,25 +292,23 @@ class Odometry:
                 is_narrow = float(directions.mean(0).norm()) > _NARROW
                 self.n_keyframes = _MANY_KEYFRAMES if is_narrow else _KEYFRAMES
             self._set_local_map(self.n_keyframes)
-        if location.found:
-            self._search_again(lost)
+        if location.found and len(lost) == 1:
+            self._search_again(lost[0])
 
-    def _search_again(self, lost: list[Keyframe]) -> None:
-        """Scans that were lost until the last one was found, between the poses on both sides of them."""
-        after, last = len(self._poses) - 1, self._last_frame
-        before = after - len(lost) - 1
-        for number, scan in enumerate(lost, before + 1):
-            if self._local is None or len(scan.points) < _FEWEST:
-                continue
-            first, share = self._poses[before], (number - before) / (after - before)
-            way = Pose.stack([first.towards(self._poses[after], share), first])
-            limits = self.max_step, self.max_turn
-            location = self._local.locate(scan, Expectation(way, *self._surprise, self._explained, *limits))
-            if location.found:
-                pose = Pose.from_matrix(location.pose)
-                motion = self._poses[last].inverse() @ pose
-                self._edges[number - 1] = (last, motion, information_of(location))
-                self._poses[number], self._locations[number] = pose, location
+    def _search_again(self, scan: Keyframe) -> None:
+        """The last scan but one, which was lost, between the poses on both sides of it. Of several lost scans
+        in a row none is searched for: the pose that ends them is less sure.
+        """
+        if self._local is None or len(scan.points) < _FEWEST:
+            return
+        number, last = len(self._poses) - 2, self._last_frame
+        before, after = self._poses[number - 1], self._poses[-1]
+        way, limits = Pose.stack([before.towards(after, 0.5), before]), (self.max_step, self.max_turn)
+        location = self._local.locate(scan, Expectation(way, *self._surprise, self._explained, *limits))
+        if location.found:
+            pose = Pose.from_matrix(location.pose)
+            self._edges[number - 1] = (last, self._poses[last].inverse() @ pose, information_of(location))
+            self._poses[number], self._locations[number] = pose, location
 
     def _set_local_map(self, n: int) -> None:
         """Of the last n keyframes at most, and not of those before the sensor was lost."""
