@@ -31,19 +31,19 @@ from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 
 _BLURS = {2: (0.2, 0.08, 0.03), 3: (0.25, 0.1, 0.04)}  # metres
-_STEPS = 6, 10, 15  # of the last level, and of those before it
+_STEPS = 15  # of a level; with six on the last one, headings stay 2° off
 _EACH, _LAST = 3, 5  # a third of the poses go on to the next level, but at least five
 _SLIDE = 1.0  # metres that the best pose is moved at most along its loosest direction, to
 _SLIDES = 16  # places, each of which climbs by
 _SLIDE_STEPS = 3
 _DECISIVE = 4.0  # nats by which such a place must be better: smaller gains do not make poses more exact
-_SPACING = 0.5  # metres between the starts of the first search in 3D
-_COARSE = 1.0  # metres of blur, and between the starts, of the last one
-_TURNED = 0.2  # radians between the headings of neighbours, for each metre between their places
+_SPACING = {2: 0.25, 3: 0.5}  # metres between the starts near the expected poses
+_COARSE = 1.0  # metres of blur, and between the starts, of the wide search in 3D
+_TURNED = {2: 0.5, 3: 0.2}  # radians between the headings of neighbours, for each metre between their places
 _NEAR = 0.5  # metres, and half as many radians, of the deviations of the first search
 _FARTHEST = 3.0  # metres of a search
 _AT_ONCE = 256  # starts
-_SORTED = 64  # best starts, of which
+_SORTED = {2: 400, 3: 64}  # best starts, of which
 _CLIMBED = 24  # different ones are climbed
 _SPREAD = 0.75  # spacings between them
 _COARSE_POINTS = 300  # of the scan on all levels but the last one
@@ -140,14 +140,15 @@ class LocalMap:
         self, scan: Keyframe, expected: Expectation
     ) -> Iterator[tuple[Pose, list[AlignmentTarget]]]:
         """Starts, and the levels they climb; the cheapest search first."""
-        if self.dim == 2:
-            yield self._best(scan, expected), self._targets
-            return
         near = expected._replace(distance=min(expected.distance, _NEAR), angle=min(expected.angle, _NEAR / 2))
+        starts = self._lattice(scan, near, self._targets[0], _SPACING[self.dim])
+        if self.dim == 2:
+            # Along a wall most climbs end in one wrong place: the best pose of the raster is not enough.
+            yield Pose.cat([starts, self._search.best(scan.points, expected, _STARTS).poses]), self._targets
+            return
         still = Scan(scan.points, torch.zeros(self.dim))
         mixture = learn_window([still], self._rule, torch.Generator().manual_seed(0))
         registered = register(mixture, self._components, expected.poses.matrix).transform
-        starts = self._lattice(scan, near, self._targets[0], _SPACING)
         yield Pose.cat([Pose.from_matrix(registered[None]), starts]), self._targets
         coarse = self._target(_COARSE)
         wide = expected._replace(distance=_FARTHEST / 2, angle=math.pi / 2)
@@ -156,11 +157,6 @@ class LocalMap:
         found = register(mixture, self._components, starts.matrix, coarsest=coarse.blur)
         yield Pose.from_matrix(found.transform[None]), self._targets
 
-    def _best(self, scan: Keyframe, expected: Expectation) -> Pose:
-        """The expected poses, and the best ones that the sensor can have reached."""
-        found = self._search.best(scan.points, expected, _STARTS)
-        return Pose.cat([expected.poses, found.poses])
-
     def _lattice(
         self, scan: Keyframe, expected: Expectation, target: AlignmentTarget, spacing: float
     ) -> Pose:
@@ -168,7 +164,7 @@ class LocalMap:
         reach = math.ceil(min(2 * expected.distance, _FARTHEST) / spacing)
         side = torch.arange(-reach, reach + 1).double() * spacing
         shifts = torch.nn.functional.pad(torch.cartesian_prod(side, side), (0, self.dim - 2))
-        turn = _TURNED * spacing
+        turn = _TURNED[self.dim] * spacing
         n_turns = math.ceil(min(2 * expected.angle, math.pi) / turn)
         angles = torch.arange(-n_turns, n_turns + 1).double() * turn
         turns = Pose.from_yaw(angles, torch.zeros(self.dim).double()).rotation
@@ -179,7 +175,7 @@ class LocalMap:
         parts = torch.arange(len(starts)).split(_AT_ONCE)
         score = torch.cat([target.sums(points, starts[part].shifted(-self._center)).score for part in parts])
         total = score / CORRELATED - expected.unlikely(starts)
-        best = total.argsort(descending=True, stable=True)[:_SORTED]
+        best = total.argsort(descending=True, stable=True)[: _SORTED[self.dim]]
         view = self._space.view(points, starts[best])
         against = _CONTRADICTED * (view.in_free_space + view.looked_through) - _UNKNOWN * view.unknown
         total = total[best] - against * len(points) / CORRELATED
@@ -191,9 +187,9 @@ class LocalMap:
         self, scan: Keyframe, expected: Expectation, starts: Pose, targets: list[AlignmentTarget]
     ) -> _Found:
         motions, kept = starts.shifted(-self._center), len(starts)
-        for number, target in enumerate(targets):
+        for target in targets:
             points = scan.points[: self.n_points if target is targets[-1] else _COARSE_POINTS]
-            found = align(points, target, motions, _STEPS[max(number - len(targets), -len(_STEPS))])
+            found = align(points, target, motions, _STEPS)
             kept = max(kept // _EACH, _LAST)
             total, view = self._total(found, points, expected)
             order = total.argsort(descending=True, stable=True)

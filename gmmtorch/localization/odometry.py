@@ -69,8 +69,9 @@ class Odometry:
     bound (`localization.pose_search`), and the mixture is climbed from the best ones; in 3D it is climbed
     from the best of a lattice of starts. The prediction continues the last motion. `trajectory`
     finds the places that were seen twice and corrects all poses by a pose graph
-    (`localization.pose_graph`). A scan that is not found never enters the local map. The
-    fourth of them in a row begins a new one, whose poses are found if a closure joins them with the first.
+    (`localization.pose_graph`). A scan that is not found never enters the local map. If the
+    next one is found, it is searched for again. The fourth in a row begins a new map, whose poses are found
+    if a closure joins them with the first.
 
     Args:
         n_keyframes: in the local map. None: 10, or 80 for a sensor with a narrow field of view, such as a
@@ -111,7 +112,7 @@ class Odometry:
         self._locations: list[Location] = []
         self._frames: list[int] = []  # scans that are keyframes
         self._last_frame = self._last_found = 0
-        self._n_lost = 0
+        self._lost: list[Keyframe] = []  # the last scans, if they were not found
         self._parts: list[int] = []  # keyframes that begin a map of their own, because the sensor was lost
         self._edges: list[tuple[int, Pose, Tensor]] = []  # from which scan, motion, information
         self._motion: Pose | None = None
@@ -234,7 +235,7 @@ class Odometry:
         elif self._motion is not None:
             step = self._motion if ratio == 1.0 else rest.towards(self._motion, ratio)
         guess = self._poses[-1] @ step  # of a scan that was lost, too
-        reach = self.max_step * min(self._n_lost + 1, _LONGEST_GAP)
+        reach = self.max_step * min(len(self._lost) + 1, _LONGEST_GAP)
         expected = Expectation(
             Pose.stack([guess, last @ rest]), *self._surprise, self._explained, reach, self.max_turn
         )
@@ -266,19 +267,23 @@ class Odometry:
             since = self._poses[self._last_frame].inverse() @ pose
             self._edges.append((self._last_frame, since, information_of(location)))
             if location.found:
-                self._motion = self._poses[-1].inverse() @ pose if not self._n_lost else None
+                self._motion = self._poses[-1].inverse() @ pose if not self._lost else None
                 self._last_found = number
-            elif self._n_lost >= _GIVEN_UP:
+            elif len(self._lost) >= _GIVEN_UP:
                 self._motion = None  # a sensor that is covered for long may have stopped
         self._poses.append(pose)
         self._locations.append(location)
-        self._n_lost = 0 if location.found else self._n_lost + 1
-        begins = self._local is None or self._n_lost > _GIVEN_UP
+        lost = self._lost
+        if location.found:
+            self._lost = []
+        else:
+            lost.append(scan)
+        begins = self._local is None or len(self._lost) > _GIVEN_UP
         is_new = begins or (location.found and self._is_new(pose))
         if is_new and len(scan.points) >= _FEWEST:
             if begins:
                 self._parts.append(len(self.keyframes))
-                self._n_lost, self._last_found = 0, number
+                self._lost, self._last_found = [], number
             self._last_frame = number
             self._frames.append(number)
             self.keyframes.append(scan._replace(pose=pose))
@@ -287,6 +292,23 @@ class Odometry:
                 is_narrow = float(directions.mean(0).norm()) > _NARROW
                 self.n_keyframes = _MANY_KEYFRAMES if is_narrow else _KEYFRAMES
             self._set_local_map(self.n_keyframes)
+        if location.found and len(lost) == 1:
+            self._search_again(lost[0])
+
+    def _search_again(self, scan: Keyframe) -> None:
+        """The last scan but one, which was lost, between the poses on both sides of it. Of several lost scans
+        in a row none is searched for: the pose that ends them is less sure.
+        """
+        if self._local is None or len(scan.points) < _FEWEST:
+            return
+        number, last = len(self._poses) - 2, self._last_frame
+        before, after = self._poses[number - 1], self._poses[-1]
+        way, limits = Pose.stack([before.towards(after, 0.5), before]), (self.max_step, self.max_turn)
+        location = self._local.locate(scan, Expectation(way, *self._surprise, self._explained, *limits))
+        if location.found:
+            pose = Pose.from_matrix(location.pose)
+            self._edges[number - 1] = (last, self._poses[last].inverse() @ pose, information_of(location))
+            self._poses[number], self._locations[number] = pose, location
 
     def _set_local_map(self, n: int) -> None:
         """Of the last n keyframes at most, and not of those before the sensor was lost."""

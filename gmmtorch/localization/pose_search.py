@@ -59,16 +59,17 @@ class Expectation(NamedTuple):
 
     def unlikely(self, poses: Pose) -> Tensor:
         """Nats (N,) against poses, by their deviation from the nearest expected one."""
-        turned = self._turned(poses.rotation)
-        return self._against(torch.cdist(poses.translation, self.poses.translation), turned)
+        turned = self.turned(poses.rotation)
+        return self.against(torch.cdist(poses.translation, self.poses.translation), turned)
 
-    def _turned(self, rotation: Tensor) -> Tensor:
+    def turned(self, rotation: Tensor) -> Tensor:
+        """Turns (N, B), rad, from the expected poses."""
         chord = torch.cdist(rotation.flatten(1), self.poses.rotation.flatten(1)) / math.sqrt(2)
         return 2 * (chord / 2).clamp_max(1).asin()
 
-    def _against(self, shift: Tensor, turned: Tensor) -> Tensor:
-        """By shifts (N, B) and turns (N, B). Far from an expected pose the nats grow with the logarithm of
-        the deviation: a robot that stops or turns does not follow any prediction.
+    def against(self, shift: Tensor, turned: Tensor) -> Tensor:
+        """Nats (N,) by shifts (N, B) and turns (N, B). Far from an expected pose the nats grow with the
+        logarithm of the deviation: a robot that stops or turns does not follow any prediction.
         """
         is_near = (shift <= self.max_step) & (turned <= self.max_turn + 1e-6)
         square = (shift / self.distance).square() + (turned / self.angle).square()
@@ -81,6 +82,19 @@ class Found(NamedTuple):
 
     poses: Pose
     scores: Tensor
+
+
+class _Tried(NamedTuple):
+    """Of H headings: the turns (H,) from the last expected pose, the rotations (H, D, D), the cells (H, N, 3)
+    of the points, and the turns (H, B) from the expected poses; and how many observations a point stands for.
+    """
+
+    expected: Expectation
+    angles: Tensor
+    turned: Tensor
+    cells: Tensor
+    off: Tensor
+    share: float
 
 
 class PoseSearch:
@@ -125,73 +139,78 @@ class PoseSearch:
                 wider = torch.maximum(wider, _shifted(wider, 1 << level, axis, UNKNOWN))
             self._levels.append(wider)
 
-    def best(
-        self,
-        points: Tensor,
-        expected: Expectation,
-        n: int,
-    ) -> Found:
-        """The best poses that differ, at most `n`, as far from the last expected pose as a scan can be.
+    def best(self, points: Tensor, expected: Expectation, most: int) -> Found:
+        """The best poses that differ, at most `most`, as far from the last expected pose as a scan can be.
 
         In 3D the poses have the height of that one, and its rotation but for a turn about the vertical.
 
         Args:
             points: (N, D) of the scan, sensor frame, in random order; the first ones are used.
         """
-        center, reach, turn = expected.poses[-1], expected.max_step, expected.max_turn
-        rows = self._spread_out(points.double())[:_POINTS]
-        share = len(points) / len(rows) / CORRELATED
-        ranges = rows.norm(dim=1).quantile(_FAR).clamp_min(1e-3)
-        step = min(max(self.cell / float(ranges), _TURNS[0]), _TURNS[1])
-        n_turns = min(math.ceil(turn / step), round(math.pi / step))
-        angles = torch.arange(-n_turns, n_turns + 1).to(rows) * step
-        turned = Pose.from_yaw(angles, rows.new_zeros(self.dim)).rotation @ center.rotation
-        placed = (rows @ turned.mT + center.translation) / self.cell
-        cells = (placed.floor() - self._low).long()
-        cells = torch.nn.functional.pad(cells, (0, 3 - self.dim))
-        level = self._first_level(reach)
+        tried = self._tried(points.double(), expected)
+        level = self._first_level(expected.max_step)
         width = 1 << level
-        side = torch.arange(-math.ceil(reach / self.cell / width), math.ceil(reach / self.cell / width) + 1)
-        flat = torch.nn.functional.pad(torch.cartesian_prod(side, side) * width, (0, 1)).to(cells)
-        heading = torch.arange(len(angles), device=rows.device).repeat_interleave(len(flat))
-        shift = flat.repeat(len(angles), 1)
-
-        off = expected._turned(turned)
-
-        def middle(shift: Tensor, width: int) -> Tensor:
-            cells = shift[:, : self.dim].double()
-            cells[:, :2] += (width - 1) / 2
-            return cells * self.cell
-
-        def scored(heading: Tensor, shift: Tensor, level: int) -> Tensor:
-            width = 1 << level
-            sums = raster_sums(cells, heading, shift, self._levels[level], UNKNOWN)
-            away = (width - 1) * self.cell / math.sqrt(2)
-            middles = center.translation + middle(shift, width)
-            gap = (torch.cdist(middles, expected.poses.translation) - away).clamp_min(0)
-            return share * sums - expected._against(gap, off[heading])
-
-        bound = scored(heading, shift, level)
+        n = math.ceil(expected.max_step / self.cell / width)
+        side = torch.arange(-n, n + 1)
+        flat = torch.nn.functional.pad(torch.cartesian_prod(side, side) * width, (0, 1)).to(tried.cells)
+        n_turns = len(tried.angles)
+        heading = torch.arange(n_turns, device=flat.device).repeat_interleave(len(flat))
+        shift = flat.repeat(n_turns, 1)
+        bound = self._scored(tried, heading, shift, level)
         first = bound.topk(min(_FIRST, len(bound))).indices
         some, at, least = heading[first], shift[first], -math.inf
         for finer in range(level - 1, -1, -1):
             some, at = _divided(some, at, 1 << finer)
-            score = scored(some, at, finer)
+            score = self._scored(tried, some, at, finer)
             best = score.topk(min(_FIRST, len(score))).indices
             some, at, least = some[best], at[best], float(score[best[0]])
         for finer in range(level - 1, -1, -1):
             kept = _most(bound, least - _MARGIN)
             heading, shift = _divided(heading[kept], shift[kept], 1 << finer)
-            bound = scored(heading, shift, finer)
-        order = _most(bound, max(least, float(bound.max())) - _MARGIN)
-        order = order[bound[order].argsort(descending=True, stable=True)]
+            bound = self._scored(tried, heading, shift, finer)
+        kept = _most(bound, max(least, float(bound.max())) - _MARGIN)
+        return self._told_apart(tried, heading[kept], shift[kept], bound[kept], most)
+
+    def _tried(self, points: Tensor, expected: Expectation) -> _Tried:
+        """The headings of a search, with a step that moves most of the points by a cell."""
+        rows = self._spread_out(points)[:_POINTS]
+        ranges = rows.norm(dim=1).quantile(_FAR).clamp_min(1e-3)
+        step = min(max(self.cell / float(ranges), _TURNS[0]), _TURNS[1])
+        n_turns = min(math.ceil(expected.max_turn / step), round(math.pi / step))
+        angles = torch.arange(-n_turns, n_turns + 1).to(rows) * step
+        center = expected.poses[-1]
+        turned = Pose.from_yaw(angles, rows.new_zeros(self.dim)).rotation @ center.rotation
+        placed = (rows @ turned.mT + center.translation) / self.cell
+        cells = (placed.floor() - self._low).long()
+        cells = torch.nn.functional.pad(cells, (0, 3 - self.dim))
+        off = expected.turned(turned)
+        return _Tried(expected, angles, turned, cells, off, len(points) / len(rows) / CORRELATED)
+
+    def _scored(self, tried: _Tried, heading: Tensor, shift: Tensor, level: int) -> Tensor:
+        """Upper bounds (S,) of the scores in squares of poses, nats; the scores themselves on level 0."""
+        width = 1 << level
+        sums = raster_sums(tried.cells, heading, shift, self._levels[level], UNKNOWN)
+        away = (width - 1) * self.cell / math.sqrt(2)
+        middles = self._middle(tried, shift, width)
+        gap = (torch.cdist(middles, tried.expected.poses.translation) - away).clamp_min(0)
+        return tried.share * sums - tried.expected.against(gap, tried.off[heading])
+
+    def _middle(self, tried: _Tried, shift: Tensor, width: int) -> Tensor:
+        """The middle (S, D) of squares, metres."""
+        cells = shift[:, : self.dim].double()
+        cells[:, :2] += (width - 1) / 2
+        return tried.expected.poses[-1].translation + cells * self.cell
+
+    def _told_apart(self, tried: _Tried, heading: Tensor, shift: Tensor, score: Tensor, most: int) -> Found:
+        """The best poses that differ, at most `most`."""
+        order = score.argsort(descending=True, stable=True)
         # Of neighbours the first one, in two passes: comparing all pairs would take longer than the search.
-        places = torch.cat([angles[heading[order], None] / _TOLD_APART[1],
+        places = torch.cat([tried.angles[heading[order], None] / _TOLD_APART[1],
                             shift[order] * (self.cell / _TOLD_APART[0])], 1)  # fmt: skip
-        order = order[_firsts(places.floor())][: _PLACES * n]
-        found = Pose(turned[heading[order]], center.translation + middle(shift[order], 1))
-        chosen = distinct(found, *_TOLD_APART)[:n]
-        return Found(found[chosen], bound[order[chosen]])
+        order = order[_firsts(places.floor())][: _PLACES * most]
+        found = Pose(tried.turned[heading[order]], self._middle(tried, shift[order], 1))
+        chosen = distinct(found, *_TOLD_APART)[:most]
+        return Found(found[chosen], score[order[chosen]])
 
     def _spread_out(self, points: Tensor) -> Tensor:
         """The first point of each cell, in their order: near the sensor, points are dense and tell little."""

@@ -105,7 +105,7 @@ def write_room(path: Path, poses: Tensor, monkeypatch: pytest.MonkeyPatch) -> Pa
 
 
 @pytest.mark.slow
-def test_fast_turns_are_followed_with_an_imu_and_lost_without(turning, tmp_path, monkeypatch):
+def test_fast_turns_are_followed_with_an_imu_and_without(turning, tmp_path, monkeypatch):
     pytest.importorskip("rosbags")
     bag = load("rosbag", write_room(tmp_path / "a.mcap", turning, monkeypatch), poses="standing")
 
@@ -114,10 +114,9 @@ def test_fast_turns_are_followed_with_an_imu_and_lost_without(turning, tmp_path,
         return found.rmse, math.degrees(float(found.angles.max()))
 
     guessed, turned = (errors(with_odometry(bag, motion=motion).trajectory) for motion in ("constant", "imu"))
-    assert guessed[0] > 0.5
-    assert guessed[1] > 80  # the room looks nearly the same from four sides
-    assert turned[0] < 0.02
-    assert turned[1] < 0.5
+    for shift, turn in (guessed, turned):  # the room looks nearly the same from four sides
+        assert shift < 0.02
+        assert turn < 0.5
 
 
 class Turning(Dataset):

@@ -1,6 +1,7 @@
 """Odometry in simulated worlds whose poses are known, and on bad input."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -114,6 +115,27 @@ def test_a_lost_scan_lies_on_the_way_between_those_that_were_found():
     bridged = _bridged(poses, found).matrix
     assert torch.allclose(bridged[2:4], poses[[1, 1]].towards(poses[[4, 4]], torch.tensor([1, 2]) / 3).matrix)
     assert torch.equal(bridged[[0, 1, 4, 5, 6]], poses[[0, 1, 4, 5, 6]].matrix)
+
+
+def test_a_lost_scan_is_searched_for_again_when_the_next_one_is_found(monkeypatch):
+    scans, true = sensor_scans("synthetic_building_2d", 8)
+    locate, n_calls = LocalMap.locate, 0
+
+    def missed(local, scan, expected):
+        nonlocal n_calls
+        n_calls += 1
+        location = locate(local, scan, expected)
+        return (
+            replace(location, pose=expected.poses[0].matrix, doubts=("missed",)) if n_calls == 4 else location
+        )
+
+    monkeypatch.setattr(LocalMap, "locate", missed)
+    odometry = Odometry()
+    assert [odometry.add(points).found for points in scans] == [number != 4 for number in range(8)]
+    back = odometry.trajectory()
+    assert back.found.all()
+    errors = absolute_trajectory_error(back.poses, true, align="first").distances
+    assert float(errors.max()) < 0.05
 
 
 def test_a_room_with_equal_sides_leaves_the_heading_in_doubt():
