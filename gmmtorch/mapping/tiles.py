@@ -182,10 +182,8 @@ class TiledMap:
             self._open.clear()
         self._cutoff = cutoff
         self.query_options = replace(self.settings.query, cutoff=cutoff, memory_limit=self._memory_limit)
-        if (
-            self._recent is not None
-        ):  # without tiles its components decide, with those of its unfinished window
-            own = cutoff if len(self.index) else given
+        if self._recent is not None:
+            own = cutoff if len(self.index) else given  # without tiles the unfinished window counts, too
             self._recent._query_options = replace(self._recent._query_options, cutoff=own)
 
     # -- learning -------------------------------------------------------------------------------------
