@@ -14,6 +14,7 @@ stopped at any moment opens with all finished windows. The next write removes wh
 from __future__ import annotations
 
 import math
+import os
 import re
 import zlib
 from collections import OrderedDict
@@ -260,7 +261,9 @@ class TiledMap:
         if n_old:
             recent.revise(lambda components: components.selected(left).with_used_origins())
         self._update()
-        _remove_others(self.folder, {_recent_name(crc32), *map(self._name, range(len(index)))})
+        _remove_others(
+            self.folder, {_recent_name(crc32), *map(tile_name, index.tiles.tolist(), index.crc32.tolist())}
+        )
 
     def _name(self, row: int) -> str:
         crc32 = None if self._recent is None else int(self.index.crc32[row])
@@ -412,9 +415,9 @@ class TiledMap:
 
 def _remove_others(folder: Path, names: set[str]) -> None:
     """Removes the files that a map of this folder has written, except its index and those of some names."""
-    for path in folder.glob("*.safetensors"):  # with those that begin with a dot
-        if path.name not in {INDEX, *names} and _WRITTEN.fullmatch(path.name):
-            path.unlink(missing_ok=True)
+    for name in {*os.listdir(folder)} - {INDEX, *names} if folder.exists() else ():
+        if _WRITTEN.fullmatch(name):
+            (folder / name).unlink(missing_ok=True)
 
 
 def _recent_name(crc32: int) -> str:
