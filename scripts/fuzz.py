@@ -6,7 +6,7 @@
 
 Inputs are sound ones that were changed where it hurts: sizes, counts, names, numbers; checksums fit again.
 A reader may return or raise a `GmmTorchError`. Anything else is a fault: another error, more than 10 s, more
-than 512 MiB above what the process had, a file outside of its folder, the death of the process. The inputs of
+than 512 MiB above what the process had, a new file beside the input, the death of the process. The inputs of
 faults are kept in the folder. The exit status is 1 if there is one.
 """
 
@@ -45,6 +45,7 @@ import torch  # noqa: E402
 import gmmtorch as gt  # noqa: E402
 from gmmtorch import datasets  # noqa: E402
 from gmmtorch.errors import GmmTorchError  # noqa: E402
+from gmmtorch.mapping import TiledMap, tile_files  # noqa: E402
 
 SECONDS, MEMORY, BATCH, SILENCE = 10, 512 << 20, 500, 40
 HOSTILE = (
@@ -81,6 +82,12 @@ def targets(folder: Path) -> dict[str, Target]:
     built.finish()
     built.save(folder / "a.safetensors")
     found["map"] = Target(taken(folder, "a.safetensors"), lambda path: gt.GaussianMap.load(path), mended_map)
+    tiles = tile_files(built.components(), built.settings)
+    found["tiles"] = Target(
+        {"index.safetensors": tiles["index.safetensors"]},
+        lambda path: TiledMap(path.parent).near([0, 0, 0], [1, 1, 1]),
+        mended_map,
+    )
     return found
 
 
@@ -399,8 +406,12 @@ def main() -> int:
     (folder / "seeds").mkdir(parents=True, exist_ok=True)
     chosen = targets(folder / "seeds")
     if options.targets:
-        chosen = {name: chosen[name] for name in options.targets.split(",")}
+        names = options.targets.split(",")
+        if unknown := set(names) - chosen.keys():
+            parser.error(f"no targets {', '.join(sorted(unknown))}; there are {', '.join(chosen)}")
+        chosen = {name: chosen[name] for name in names}
     counts = {name: collections.Counter[str]() for name in chosen}
+    seconds = collections.Counter[str]()
     end = time.monotonic() + 60 * (options.minutes or 1e9)
     seed = options.seed * 1_000_000
     n_inputs = options.inputs or (10**12 if options.minutes else 20_000)
@@ -416,8 +427,8 @@ def main() -> int:
                 if outcome.startswith("fault") and outcome not in counts[name]:
                     print(f"{name}: {outcome} (in {place})", flush=True)
             counts[name] += outcomes
-            counts[name]["seconds"] += round(time.monotonic() - start)
-        (folder / "counts.json").write_text(json.dumps(counts, indent=1))
+            seconds[name] += round(time.monotonic() - start)
+        (folder / "counts.json").write_text(json.dumps({"outcomes": counts, "seconds": seconds}, indent=1))
     n_faults = 0
     print(f"\n{'reader':16}{'inputs':>10}{'read':>10}{'refused':>10}{'faults':>8}")
     for name, found in counts.items():

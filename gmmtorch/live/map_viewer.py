@@ -93,7 +93,8 @@ class MapViewer:
     @property
     def url(self) -> str:
         """The address of the page."""
-        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+        host = self.server.get_host()
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}"
 
     def stop(self) -> None:
         """Ends the server."""
@@ -329,7 +330,7 @@ def admits(host: str, origin: str | None, served: str, origins: Sequence[str] = 
         served: the address that the page is served at.
         origins: further ones that are allowed, such as https://map.example.org.
     """
-    allowed = {name.rstrip("/").lower() for name in origins}
+    allowed = {_as_sent(name) for name in origins}
     place = host.lower()
     names = {served.lower(), "localhost", (own := socket.gethostname().lower()), f"{own}.local"}
     is_ours = _host_name(place) in names or _is_address(_host_name(place))
@@ -355,10 +356,29 @@ def _is_address(name: str) -> bool:
     return True
 
 
+_DEFAULT_PORTS = {"http": ":80", "https": ":443"}
+
+
+def _as_sent(origin: str) -> str:
+    """An origin as browsers send it: in lower case, without the default port."""
+    origin = origin.rstrip("/").lower()
+    return origin.removesuffix(_DEFAULT_PORTS.get(origin.partition(":")[0], ""))
+
+
+def _is_origin(text: str) -> bool:
+    """Whether a text is http or https and the name of a machine, perhaps with a port."""
+    try:
+        parts = urlsplit(text.rstrip("/"))
+        _ = parts.port
+    except ValueError:
+        return False
+    is_whole = parts.geturl() == f"{parts.scheme}://{parts.netloc}" and "@" not in parts.netloc
+    return parts.scheme in _DEFAULT_PORTS and bool(parts.hostname) and is_whole
+
+
 def _check_origins(origins: Sequence[str]) -> None:
     for origin in origins:
-        parts = urlsplit(origin.rstrip("/"))
-        if parts.scheme not in ("http", "https") or parts.geturl() != f"{parts.scheme}://{parts.netloc}":
+        if not _is_origin(origin):
             raise InvalidArgumentError(
                 f"origins={list(origins)}: {origin} is not the origin of a page; give one such as "
                 "https://map.example.org or http://robot:8080."

@@ -336,6 +336,7 @@ class MapState(DeviceModule):
             known = components.attributes.changed(lambda value: value.detach().clone().to(device))
             self._set(Components(**tensors, attributes=known))
             self._next_number = number_after(components.ids, self._next_number)
+            self._pending = [scan.to(self._device) for scan in self._pending]
         self._forget()
 
 

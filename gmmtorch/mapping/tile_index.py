@@ -22,6 +22,7 @@ INDEX = "index.safetensors"
 
 _KIND, _VERSION, _GROWN = "gmmtorch.tiles", 1, 2  # tiles of a map that grows have their CRC-32 in their name
 _FARTHEST_TILE = 1 << 40
+_LEAST_SIDE = FARTHEST / _FARTHEST_TILE  # m
 _LARGEST_COUNT = 1 << 53  # sums of such counts stay exact
 
 
@@ -135,7 +136,7 @@ def read_index(path: Path) -> tuple[TileIndex, dict[str, Any]]:
         }
     )
     try:
-        check_number("side", facts.get("side"), above=True)
+        check_side("side", facts.get("side"))
         if "recent" in facts:
             check_whole("recent", facts["recent"], 0)
     except GmmTorchError as error:
@@ -164,6 +165,11 @@ def _check(index: TileIndex, path: Path) -> None:
         raise DataError(f"{path}: a box has its lowest corner above its highest; the file is damaged.")
     if len(torch.unique(index.tiles, dim=0)) != len(index):
         raise DataError(f"{path} lists a tile twice; the file is damaged.")
+
+
+def check_side(name: str, side: Any) -> None:
+    """Raises `InvalidArgumentError` for a side (m) with which numbers of tiles would be too large."""
+    check_number(name, side, least=_LEAST_SIDE)
 
 
 def tile_name(tile: Sequence[int], crc32: int | None = None) -> str:

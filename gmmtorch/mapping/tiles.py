@@ -8,12 +8,14 @@ the answers are those of the whole map, up to the rounding of sums.
 `tile_files` makes the files from components; `merge` merges the tiles of several recordings.
 `TiledMap.create` makes a map that grows in its folder: one more file has the components of recent windows.
 Files are never changed: new ones have other names, and count once the index names them. So a map that is
-stopped at any moment opens with all finished windows.
+stopped at any moment opens with all finished windows. The next write removes what an interrupted one left.
 """
 
 from __future__ import annotations
 
 import math
+import os
+import re
 import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
@@ -32,7 +34,7 @@ from gmmtorch.errors import (
     InvalidArgumentError,
     MemoryLimitError,
     MissingDataError,
-    check_number,
+    OutputError,
     check_whole,
 )
 from gmmtorch.files import write_bytes
@@ -52,7 +54,7 @@ from gmmtorch.mapping.learning.rules import IncrementalRule
 from gmmtorch.mapping.learning.windows import learns_in_parts
 from gmmtorch.mapping.query import Query, count_many, cutoff_of, mean_range, rule_of
 from gmmtorch.mapping.query_options import check_method
-from gmmtorch.mapping.tile_index import INDEX, TileIndex, index_row, read_index, tile_name
+from gmmtorch.mapping.tile_index import INDEX, TileIndex, check_side, index_row, read_index, tile_name
 from gmmtorch.occupancy import (
     CUTOFF,
     Calibration,
@@ -68,7 +70,12 @@ SIDE = 100.0
 """Side (m) of the tiles if none is given."""
 _BYTES_EACH = 1536  # memory of a component that answers queries, with its part of the spatial index
 _RECENT = 4096  # components in memory before the older half goes into tiles
-_REMEDY = "copy the folder again from where it was written, or merge the recordings again"
+_REMEDY = (
+    "open the map again if another process changes it; otherwise copy the folder again from where it was "
+    "written, or merge the recordings again"
+)
+_WRITTEN = re.compile(r"\.?(tile_-?\d+_-?\d+|recent|index)(_[0-9a-f]{8})?(\.[0-9a-f]{16})?\.safetensors")
+"""Names of files that a map writes; with a dot before an interrupted write has renamed them."""
 
 
 class TiledMap:
@@ -142,7 +149,7 @@ class TiledMap:
                 "The learning rule has novelty, forgetting or a budget, which need all of the map; give a "
                 "rule without them."
             )
-        check_number("side", side, above=True)
+        check_side("side", side)
         target._prepare(dim, torch.device("cpu"), "dim is")
         index = TileIndex.joined([], dim)
         settings = replace(target.settings, robot=0)
@@ -158,7 +165,12 @@ class TiledMap:
         path = self.folder / _recent_name(self._crc32)
         if path.is_file() and zlib.crc32(path.read_bytes()) != self._crc32:
             raise DataError(f"{path} is not the file that {INDEX} lists; {_REMEDY}.")
-        return GaussianMap.load(path).to(self.device)
+        recent = GaussianMap.load(path)
+        if recent.dim != self.dim:
+            raise DataError(
+                f"{path} is a map in {recent.dim}D, but {INDEX} is of one in {self.dim}D; {_REMEDY}."
+            )
+        return recent.to(self.device)
 
     def _update(self) -> None:
         """Brings cutoff and calibration up to date with all components."""
@@ -172,7 +184,8 @@ class TiledMap:
         self._cutoff = cutoff
         self.query_options = replace(self.settings.query, cutoff=cutoff, memory_limit=self._memory_limit)
         if self._recent is not None:
-            self._recent._query_options = replace(self._recent._query_options, cutoff=cutoff)
+            own = cutoff if len(self.index) else given  # without tiles the unfinished window counts, too
+            self._recent._query_options = replace(self._recent._query_options, cutoff=own)
 
     # -- learning -------------------------------------------------------------------------------------
 
@@ -186,7 +199,7 @@ class TiledMap:
 
         The cost does not depend on the size of the map. Raises `InvalidArgumentError` if the map does not
         grow, and `OutputError` if a file cannot be written: the scan is then in memory, and the next full
-        window, or `finish`, writes it.
+        window, or `finish`, writes it. Only one process may write; another one gets an `OutputError`.
         """
         self._growing().insert(scan)
         if not self.n_pending:
@@ -200,7 +213,10 @@ class TiledMap:
         self._store()
 
     def add(self, components: Components) -> None:
-        """Adds components, such as those of another map, and writes them. An unfinished window ends."""
+        """Adds components, such as those of another map, and writes them. An unfinished window ends.
+
+        Until the first full window the calibration is that of the sensor model for the first components.
+        """
         recent = self._growing()
         numbers = recent._next_number + torch.arange(len(components), device=self.device)
         ids = torch.stack([torch.full_like(numbers, recent.robot), numbers], 1)
@@ -215,12 +231,17 @@ class TiledMap:
 
     def _store(self) -> None:
         """Writes the recent components; if there are more than `_RECENT`, the older ones into tiles."""
-        recent = self._growing()
-        found, cutoff = recent.components(), self.settings.query.cutoff
-        settings = replace(recent.settings, query=replace(recent.query_options, cutoff=cutoff), robot=0)
-        settings = _calibrated(settings, found)
+        recent, known = self._growing(), self.settings.query
+        if read_index(self.folder / INDEX)[1].get("recent") != self._crc32:
+            raise OutputError(
+                f"{self.folder} cannot be written: another process has changed the map since it was opened "
+                "here. Open it again by TiledMap, and insert again what it does not contain."
+            )
+        found, query = recent.components(), recent.query_options
+        query = replace(query, cutoff=known.cutoff, calibration=query.calibration or known.calibration)
+        settings = _calibrated(replace(recent.settings, query=query, robot=0), found)
         n_old = len(found) - _RECENT // 2 if len(found) > _RECENT else 0
-        rows, index, old = [], self.index, [_recent_name(self._crc32)]
+        rows, index = [], self.index
         number = {tuple(tile): row for row, tile in enumerate(index.tiles.tolist())} if n_old else {}
         for tile, part in _by_tile(found.selected(torch.arange(n_old, device=self.device)), self.side):
             row = number.get(tuple(tile))
@@ -228,7 +249,6 @@ class TiledMap:
             data, made = _tile(tile, Components.concatenate(parts), settings, None)
             write_bytes(self.folder / tile_name(tile, made["crc32"]), data)
             rows.append(made)
-            old += [] if row is None else [self._name(row)]
         if rows:
             index = index.replaced(rows)
         left = torch.arange(n_old, len(found), device=self.device)
@@ -241,8 +261,9 @@ class TiledMap:
         if n_old:
             recent.revise(lambda components: components.selected(left).with_used_origins())
         self._update()
-        for name in {*old} - {_recent_name(crc32), *(tile_name(row["tiles"], row["crc32"]) for row in rows)}:
-            (self.folder / name).unlink(missing_ok=True)
+        _remove_others(
+            self.folder, {_recent_name(crc32), *map(tile_name, index.tiles.tolist(), index.crc32.tolist())}
+        )
 
     def _name(self, row: int) -> str:
         crc32 = None if self._recent is None else int(self.index.crc32[row])
@@ -392,6 +413,13 @@ class TiledMap:
         return self._open[name][0]
 
 
+def _remove_others(folder: Path, names: set[str]) -> None:
+    """Removes the files that a map of this folder has written, except its index and those of some names."""
+    for name in {*os.listdir(folder)} - {INDEX, *names} if folder.exists() else ():
+        if _WRITTEN.fullmatch(name):
+            (folder / name).unlink(missing_ok=True)
+
+
 def _recent_name(crc32: int) -> str:
     """Name of the file with the recent components of a map that grows."""
     return f"recent_{crc32:08x}.safetensors"
@@ -408,7 +436,7 @@ def tile_files(components: Components, settings: MapSettings, side: float = SIDE
         settings: of the files. Components get new ids.
         side: of the tiles (m).
     """
-    check_number("tile", side, above=True)
+    check_side("tile", side)
     settings = _calibrated(replace(settings, robot=0), components)
     files, rows = {}, []
     for tile, part in _by_tile(components, side):
@@ -438,8 +466,8 @@ def merge(
     result is the sum of that of the parts, and merging is associative.
 
     Args:
-        folder: an earlier merge in it is replaced.
-        parts: at least one; with equal settings and sides.
+        folder: a map that is in it is replaced; it cannot be one of the parts.
+        parts: at least one; with equal settings and sides. Recent components of one that grows are included.
         tile_bytes: budget of each file: components are merged as under `max_bytes` of an `IncrementalRule`.
             None: no budget.
         on_event: called with ("merging tiles", done, total) after each tile.
@@ -448,6 +476,8 @@ def merge(
     """
     if not parts:
         raise InvalidArgumentError("parts is empty; give at least one tiled map.")
+    if Path(folder).resolve() in {part.folder.resolve() for part in parts}:
+        raise InvalidArgumentError(f"folder={folder} is that of a part; choose another folder.")
     if tile_bytes is not None:
         check_whole("tile_bytes", tile_bytes, 1)
     first, folder = parts[0], Path(folder)
@@ -464,16 +494,18 @@ def merge(
                     f"{part.folder} has {name}={found[0]}, but {first.folder} has {found[1]}; map all "
                     "recordings with the same options."
                 )
-    owners: dict[tuple[int, ...], list[tuple[TiledMap, int]]] = {}
+    owners: dict[tuple[int, ...], list[Callable[[], Components]]] = {}
     for part in parts:
         for number, tile in enumerate(part.index.tiles.tolist()):
-            owners.setdefault(tuple(tile), []).append((part, number))
+            owners.setdefault(tuple(tile), []).append(partial(part.components, number))
+        if part._recent is not None:
+            for tile, recent in _by_tile(part._recent.components(), first.side):
+                owners.setdefault(tuple(tile), []).append(recent.on_cpu)
     (folder / INDEX).unlink(missing_ok=True)  # a merge that is stopped leaves no index, not a wrong one
-    for path in {*folder.glob("tile_*.safetensors")} - {folder / tile_name(tile) for tile in owners}:
-        path.unlink()
+    _remove_others(folder, set(map(tile_name, owners)))
     rows = []
     for done, tile in enumerate(sorted(owners), 1):
-        joined = Components.concatenate([part.components(number) for part, number in owners[tile]])
+        joined = Components.concatenate([components() for components in owners[tile]])
         data, row = _tile(tile, joined, settings, tile_bytes)
         write_bytes(folder / tile_name(tile), data)
         rows.append(row)

@@ -148,3 +148,16 @@ def test_names_cannot_control_the_terminal(check, tmp_path):
     log = (done.folder / "map.log").read_text()
     assert "points are in the fixed frame" in log
     assert "\x1b" not in log
+
+
+def test_options_that_read_only_empty_scans_are_no_advice(check, tmp_path):
+    with BagWriter(tmp_path / "a.mcap") as writer:
+        for i in range(3):
+            writer.cloud("/points", i * 0.1, "lidar", np.zeros((0, 3)))
+    done = check(tmp_path / "a.mcap", "dataset=rosbag")
+    assert done.status == 1
+    assert "no option that was tried helps" in words(done)
+    done = check(tmp_path / "a.mcap", "dataset=rosbag", "dataset.poses=standing")
+    assert done.status == 1
+    assert "1. no points in 3 scans: the map would be empty" in words(done)
+    assert "problem" not in words(done)

@@ -194,3 +194,70 @@ def test_a_database_whose_messages_never_end_is_refused(tmp_path):
     database.close()
     with pytest.raises(DataError, match="no readable tables"):
         BagReader(tmp_path / "a.db3", True)
+
+
+@pytest.mark.parametrize("kind", ["mcap", "db3"])
+def test_a_file_of_several_that_cannot_be_read_is_named(bags, tmp_path, kind):
+    (tmp_path / f"a_0.{kind}").write_bytes(bags[kind].read_bytes())
+    (tmp_path / f"a_1.{kind}").write_bytes(b"")  # of a recorder that was killed
+    (tmp_path / "metadata.yaml").write_text("")
+    found = BagReader(tmp_path, True)
+    assert f"nothing can be read of a_1.{kind}" in found.damage
+    assert messages(tmp_path, True) == messages(bags[kind], True)
+
+
+def mcap_of_chunks(path: Path, n_chunks: int, data: bytes, crc: int = 0) -> Path:
+    """An MCAP file with a topic and equal compressed chunks."""
+    from rosbags.rosbag2.storage_mcap import zstd
+
+    def text(value: bytes) -> bytes:
+        return struct.pack("<I", len(value)) + value
+
+    def record(kind: int, content: bytes) -> bytes:
+        return struct.pack("<BQ", kind, len(content)) + content
+
+    packed, key = zstd.compress(data), struct.pack("<H", 1)
+    chunk = struct.pack("<QQQI", 0, 0, len(data), crc) + text(b"zstd") + struct.pack("<Q", len(packed))
+    schema = record(3, key + text(b"std_msgs/msg/String") + text(b"ros2msg") + text(b""))
+    channel = record(4, key + key + text(b"/a") + text(b"cdr") + text(b""))
+    head = b"\x89MCAP0\r\n" + record(1, text(b"ros2") + text(b""))
+    path.write_bytes(head + schema + channel + record(6, chunk + packed) * n_chunks)
+    return path
+
+
+def test_chunks_with_wrong_checksums_are_unpacked_up_to_a_limit(tmp_path, monkeypatch):
+    from gmmtorch.datasets.ros import bag_reader
+
+    unpacked, plain = [], bag_reader._unpack_chunk
+
+    def counted(*arguments: object) -> bytes:
+        unpacked.append(len(plain(*arguments)))
+        return bytes(unpacked[-1])
+
+    monkeypatch.setattr(bag_reader, "_unpack_chunk", counted)
+    with pytest.raises(DamagedBagError):
+        BagReader(mcap_of_chunks(tmp_path / "a.mcap", 60, bytes(1 << 24), crc=1), True)
+    assert 0 < sum(unpacked) < 2 * (1 << 28)
+
+
+def test_a_small_file_has_a_limited_number_of_messages(tmp_path):
+    message = struct.pack("<BQHIQQ", 5, 22, 1, 0, 5, 5)
+    found = BagReader(mcap_of_chunks(tmp_path / "a.mcap", 2, message * 1_200_000), True)
+    assert found.topics[0].n_messages < 1.1 * (1 << 20)
+
+
+def test_headers_that_overlap_take_no_quadratic_time(tmp_path, monkeypatch):
+    from gmmtorch.datasets.ros import salvage
+
+    sizes, plain = [], salvage._ros1_fields
+
+    def counted(header: bytes) -> dict[bytes, bytes]:
+        sizes.append(len(header))
+        return plain(header)
+
+    monkeypatch.setattr(salvage, "_ros1_fields", counted)
+    path = tmp_path / "a.bag"
+    path.write_bytes(b"#ROSBAG V2.0\n" + (struct.pack("<I", 10_000) + b"\4\0\0\0op=\5") * 4_000)
+    with pytest.raises(DamagedBagError):
+        BagReader(path, True)
+    assert sum(sizes) < 100 * path.stat().st_size

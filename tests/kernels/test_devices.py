@@ -186,6 +186,27 @@ def test_a_gpu_waits_nine_times_for_the_first_scan():
         torch.testing.assert_close(getattr(found, name).held, values)
 
 
+@pytest.mark.parametrize("devices", [("cuda", "cpu"), ("cpu", "cuda")])
+def test_a_state_goes_to_the_device_of_the_map_that_loads_it(devices):
+    scan = gt.Scan(cloud(500).double(), torch.tensor([2.0, 2.0, 1.0], dtype=torch.float64))
+
+    def built(device):
+        made = gt.GaussianMap(gt.IncrementalRule(noise=0.01, length=0.5, cell=0.05, window=3))
+        made.insert(scan.to(device))
+        return made
+
+    with kernels("torch"):
+        expected = built("cpu")
+        expected.insert(scan)
+    with pretended_gpu():
+        saved, loaded = map(built, devices)
+        loaded.load_state_dict(saved.state_dict())
+        loaded.insert(scan.to(devices[1]))
+        found = loaded.components().on_cpu()
+    for name, values in expected.components().tensors().items():
+        torch.testing.assert_close(getattr(found, name), values)
+
+
 @pytest.mark.parametrize(
     ("work", "most_bytes"),
     [(list_visits, 20_000), (ask_points, 300_000), (exact_grid_flux, 20_000), (truncated_e_step, 400_000)],

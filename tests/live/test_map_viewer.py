@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import socket
+import urllib.request
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -169,7 +170,8 @@ def test_first_hit_is_where_a_dense_walk_along_the_ray_enters_an_ellipsoid(maps)
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_place_has_the_evidence_from_which_its_occupancy_follows(dim, maps):
     built, _ = maps[dim]
-    position = built.components().means[3]
+    known = built.components()
+    position = known.means[~known.max_range][0]  # beams without a return give no hits
     theta, hits, misses = viewer_scene.place_at(built, position, 0.1)
     given = (torch.tensor(value).double() for value in (hits, misses))
     expected = Query(built.components(), built.query_options).rule.probability(*given, 0.1, dim)
@@ -293,7 +295,8 @@ def test_a_foreign_page_gets_no_connection(guarded):
 def test_origins_are_checked(maps):
     from gmmtorch.live.map_viewer import MapViewer
 
-    for origin in ("map.example.org", "ftp://map.example.org", "https://map.example.org/page"):
+    wrong = ["map.example.org", "ftp://map.example.org", "https://map.example.org/page", "http://[map"]
+    for origin in [*wrong, "https://me@map.example.org", "http://map.example.org:99999", "https://:8080"]:
         with pytest.raises(InvalidArgumentError, match=r"origins=.* is not the origin of a page"):
             MapViewer(GaussianMap(), port=8395, origins=[origin])
 
@@ -321,3 +324,28 @@ def test_the_viewer_survives_a_thousand_connections(guarded):
         for connection in kept:
             connection.close()
     assert status_of(guarded, f"Host: {OWN}") == 200
+
+
+def test_an_origin_with_the_default_port_is_that_without():
+    from gmmtorch.live.map_viewer import admits
+
+    for scheme, port in (("https", 443), ("http", 80)):
+        sent, named = f"{scheme}://map.example.org", f"{scheme}://Map.example.org:{port}/"
+        for host in ("127.0.0.1:8080", "map.example.org"):  # a proxy may keep the name of the page or not
+            assert admits(host, sent, "127.0.0.1", [named])
+    assert not admits("127.0.0.1", "https://map.example.org", "127.0.0.1", ["https://map.example.org:80"])
+
+
+def test_the_address_of_an_ipv6_server_can_be_opened():
+    from gmmtorch.live.map_viewer import MapViewer
+
+    try:
+        socket.create_server(("::1", 0), family=socket.AF_INET6).close()
+    except OSError:
+        pytest.skip("this machine has no IPv6")
+    made = MapViewer(GaussianMap(), host="::1", port=8396)
+    try:
+        with urllib.request.urlopen(made.url, timeout=10) as page:
+            assert page.status == 200
+    finally:
+        made.stop()

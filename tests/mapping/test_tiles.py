@@ -393,6 +393,17 @@ def test_a_damaged_tile_is_named_and_the_rest_answers(tmp_path, monkeypatch):
         TiledMap(folder)
 
 
+def test_recent_components_of_another_dimension_are_refused(tmp_path):
+    flat, solid = (TiledMap.create(tmp_path / str(dim), GaussianMap(), dim) for dim in (2, 3))
+    (recent,) = flat.folder.glob("recent_*")
+    tensors, facts = read_tensors(solid.folder / INDEX, "gmmtorch.tiles", 2)
+    facts["recent"] = flat._crc32
+    (solid.folder / INDEX).write_bytes(pack_tensors(tensors, "gmmtorch.tiles", 2, **facts))
+    (solid.folder / recent.name).write_bytes(recent.read_bytes())
+    with pytest.raises(DataError, match="2D"):
+        TiledMap(solid.folder)
+
+
 def test_maps_that_cannot_grow_in_tiles_say_why(tmp_path):
     for rule in (replace(RULE, n_components=5), replace(RULE, forget="contradiction")):
         with pytest.raises(InvalidArgumentError, match="budget"):
@@ -402,6 +413,100 @@ def test_maps_that_cannot_grow_in_tiles_say_why(tmp_path):
         merged.insert(street(1, 2)[0])
     with pytest.raises(InvalidArgumentError, match="has a map"):
         TiledMap.create(tmp_path / "b", GaussianMap(), 2)
+
+
+@pytest.mark.parametrize("n_recent", [40, 10_000])
+def test_merged_maps_that_grow_have_all_their_components(n_recent, tmp_path, monkeypatch):
+    monkeypatch.setattr(tiles, "_RECENT", n_recent)
+    scans = street(8, 2)
+    one, two = grown(tmp_path / "1", scans[:4]), grown(tmp_path / "2", scans[4:])
+    parts = [one.open().components(), two.open().components()]
+    assert one.n_pending == two.n_pending == 1
+    merged = merge(tmp_path / "all", [one, two])
+    assert merged.n_components == sum(map(len, parts))
+    options = {**vars(merged.query_options), "resolution": merged.resolution}
+    expected = GaussianMap.of(Components.concatenate(parts), **options).occupancy(around(scans))
+    torch.testing.assert_close(merged.occupancy(around(scans)), expected, rtol=0, atol=1e-9)
+
+
+def test_a_map_is_not_merged_into_its_own_folder(tmp_path):
+    made = grown(tmp_path / "map", street(4, 2))
+    before = contents(made.folder)
+    with pytest.raises(InvalidArgumentError, match="another folder"):
+        merge(tmp_path / "other" / ".." / "map", [made])
+    assert contents(made.folder) == before
+
+
+def test_a_merge_replaces_a_map_that_grows(tmp_path):
+    grown(tmp_path / "map", street(4, 2))
+    merged = merge(tmp_path / "map", [written(tmp_path / "part", recording(2, 0))])
+    assert {*contents(merged.folder)} == {*contents(tmp_path / "part")}
+
+
+def test_the_next_write_removes_what_an_interrupted_one_left(tmp_path, monkeypatch):
+    monkeypatch.setattr(tiles, "_RECENT", 40)
+    scans = street(9, 2)
+    made = grown(tmp_path / "map", scans[:6])
+    others = ["notes.safetensors", "tile_map.safetensors", "recent.txt", "index_old.safetensors"]
+    ended = ["tile_0_-7_0123abcd", "recent_0123abcd", ".index.0123456789abcdef"]
+    ended = [f"{name}.safetensors" for name in [*ended, ".tile_0_0_0123abcd.0123456789abcdef"]]
+    for name in [*others, *ended]:
+        (made.folder / name).write_bytes(b"")
+    TiledMap(made.folder).occupancy(around(scans))
+    assert {*ended} <= {*contents(made.folder)}  # reading does not change files
+    for scan in scans[6:]:
+        made.insert(scan)
+    known = {INDEX, tiles._recent_name(made._crc32), *map(made._name, range(len(made.index)))}
+    assert {*contents(made.folder)} == known | {*others}
+
+
+def test_a_second_process_cannot_overwrite_a_map(tmp_path, monkeypatch):
+    monkeypatch.setattr(tiles, "_RECENT", 40)
+    scans = street(9, 2)
+    one = grown(tmp_path / "map", scans[:3])
+    two = TiledMap(one.folder)
+    for scan in scans[3:6]:
+        one.insert(scan)
+    before = contents(one.folder)
+    with pytest.raises(OutputError, match="Open it again"):
+        two.add(recording(2, 0))
+    assert contents(one.folder) == before
+    for scan in scans[6:]:
+        one.insert(scan)
+    assert TiledMap(one.folder).n_components == one.n_components
+
+
+def test_tiles_are_not_too_small_for_their_numbers(tmp_path):
+    with pytest.raises(InvalidArgumentError, match="side"):
+        TiledMap.create(tmp_path / "map", GaussianMap(), 2, side=1e-9)
+    with pytest.raises(InvalidArgumentError, match="tile"):
+        tile_files(recording(2, 0), SETTINGS, side=1e-9)
+
+
+@pytest.mark.parametrize("n_recent", [20, 10_000])
+def test_a_map_of_added_components_answers_the_same_once_reopened(n_recent, tmp_path, monkeypatch):
+    monkeypatch.setattr(tiles, "_RECENT", n_recent)
+    parts = [random_components(2, 60, 3, center=3.0, extent=extent) for extent in (10.0, 60.0, 90.0)]
+    made = TiledMap.create(tmp_path / "1", GaussianMap(), 2, SIDE)
+    other = TiledMap.create(tmp_path / "2", GaussianMap(), 2, SIDE)
+    for part in parts:
+        made.add(part)
+        TiledMap(other.folder).add(part)
+        assert contents(made.folder) == contents(other.folder)
+    assert made._rule == TiledMap(other.folder)._rule
+
+
+def test_the_first_unfinished_window_decides_the_cutoff(tmp_path):
+    sparse = street(1, 2)[0]
+    scan = Scan(sparse.points.repeat(100, 1), sparse.origin)  # components with many points
+    built, made = GaussianMap(RULE), TiledMap.create(tmp_path / "map", GaussianMap(RULE), 2, SIDE)
+    opened = TiledMap(made.folder)
+    for one in (built, made, opened):
+        one.insert(scan)
+    expected = built.occupancy(around([scan]))
+    assert built._answers().cutoff == 3
+    assert torch.equal(made.occupancy(around([scan])), expected)
+    assert torch.equal(opened.occupancy(around([scan])), expected)
 
 
 # -- damaged and hostile files -------------------------------------------------------------------------

@@ -19,6 +19,7 @@ from gmmtorch.report import Row, byte_text, count_text, format_table
 
 _N_SAMPLES = 40  # scans that are read
 _MOST_TRIALS = 12  # openings of the recording with other options
+_N_TRIED = 5  # scans of each, of which one must have beams
 _CLOCKS_DIFFER = 0.5  # s
 _NEAREST, _FARTHEST = 0.03, 300.0  # m, of a usual median range
 _FASTEST = 60.0  # m/s of a usual robot
@@ -143,6 +144,8 @@ def _print_scans(found: Dataset, advice: list[str]) -> float:
     print(text + (f", in {usable[0].dim}D" if usable else "") + _timing(found, advice))
     if usable:
         _print_ranges(usable, advice)
+    else:
+        advice.append(f"no points in {count_text(len(indices), 'scan')}: the map would be empty")
     _print_poses(found, advice)
     for reason, count in found.skipped.items():
         print(f"note       {count_text(count, 'scan')}: {printable(reason)}")
@@ -235,7 +238,8 @@ def _trials(options: DictConfig, facts: BagFacts, n_found: int) -> list[str]:
                 continue
             n_trials += 1
             try:
-                n_scans = len(datasets.load("rosbag", options.path, **{**given, **tried}))
+                found = datasets.load("rosbag", options.path, **{**given, **tried})
+                n_scans = len(found) if any(found[i].n_beams for i in range(min(len(found), _N_TRIED))) else 0
             except GmmTorchError:
                 continue
             if n_scans > n_found:

@@ -135,6 +135,8 @@ class BagReader:
                 f"; {found.missing_seconds:.1f} s are missing, the longest gap from "
                 f"{(longest[0] - first) / 1e9:.1f} to {(longest[1] - first) / 1e9:.1f} s"
             )
+        if found.unread:
+            text += f"; nothing can be read of {', '.join(found.unread)}"
         if end:
             return f"{text}; {max(0, end - found.last) / 1e9:.1f} s at the end are missing"
         return text + "; the file is cut off there, and does not state how much is missing" * found.is_cut

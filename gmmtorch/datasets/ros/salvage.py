@@ -24,7 +24,8 @@ Unpack = Callable[[bytes, str, int], bytes]
 """Unpacks a chunk: its data, its compression, and the number of bytes that it announces."""
 
 _MOST_FIELD_BYTES = 1 << 24  # of a record's header in a ROS 1 bag, or of its definition of a message
-_MOST_RATIO = 1000  # bytes of all unpacked chunks for each byte of the file
+_MOST_RATIO = 1000  # bytes of all chunks, packed and unpacked, for each byte of the file
+_LEAST_MESSAGES, _MESSAGE_BYTES = 1 << 20, 4  # of a file: messages, or fewer bytes of the file for each
 _KEPT_CHUNKS = 4  # unpacked, while messages of several are read in turn
 _MCAP_CHUNK = struct.Struct("<QQQII")  # first and last time, unpacked bytes, CRC-32, length of a name
 _NANOSECONDS = 1_000_000_000
@@ -57,6 +58,7 @@ class Salvage:
         gaps: (first, last) time (ns) of each interval between intact messages whose messages are lost.
         first, last: times (ns) of the first and the last one.
         is_cut: whether a file ends before its end, so that later messages may be missing, too.
+        unread: names of files, one of several, of which nothing can be read.
 
     Raises `DataError` if no message can be read.
     """
@@ -68,8 +70,14 @@ class Salvage:
         self.connections: list[Any] = []
         self.gaps: list[tuple[int, int]] = []
         self.is_cut = False
+        self.unread: list[str] = []
         for file in files:
-            self._add(file)
+            try:
+                self._add(file)
+            except _ERRORS:
+                if len(files) == 1:
+                    raise
+                self.unread.append(file.name)
         self.n_messages = len(self._times)
         if not self.n_messages:
             raise DataError(f"{', '.join(map(str, files))}: no message can be read.")
@@ -149,8 +157,10 @@ class _Chunked:
     and of the first one after; None without one."""
 
     def __init__(self, path: Path, unpack: Unpack, limit: int) -> None:
-        self._unpack, self._places = unpack, list[_Place]()
-        self._left = limit + _MOST_RATIO * path.stat().st_size
+        self._unpack, self._limit, self._places = unpack, limit, list[_Place]()
+        size = path.stat().st_size
+        self._left = limit + _MOST_RATIO * size
+        self._n_left = _LEAST_MESSAGES + size // _MESSAGE_BYTES
         with path.open("rb") as file:
             self._data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         self._kept: dict[int, bytes] = {}
@@ -191,6 +201,8 @@ class _Chunked:
         return self._message(self._kept[chunk], byte)
 
     def _unpacked(self, place: _Place) -> bytes:
+        if max(place.size, place.end - place.begin) > self._limit:
+            raise DataError("a chunk is too large")
         data = self._data[place.begin : place.end]
         found = self._unpack(data, place.compression, place.size)
         if len(found) != place.size or (place.crc and zlib.crc32(found) != place.crc):
@@ -199,23 +211,34 @@ class _Chunked:
 
     def _chunk(self, place: _Place) -> tuple[list[_Found], bool]:
         """The messages of a chunk up to a damaged one, and whether all are intact."""
-        if (left := self._left - place.size) < 0:
-            raise DataError("chunks that overlap unpack to too many bytes")
-        data, number, self._left = self._unpacked(place), len(self._places), left
+        self._spend(place)
+        data, number = self._unpacked(place), len(self._places)
         self._places.append(place)
-        found = list[_Found]()
+        found, is_whole = list[_Found](), False
         with suppress(*_ERRORS):
             for time, key, byte in self._inner(data):
+                if len(found) == self._n_left:
+                    raise DataError("a file of this size has fewer messages")
                 found.append((time, key, number, byte))
-            return found, True
-        return found, False
+            is_whole = True
+        self._n_left -= len(found)
+        return found, is_whole
+
+    def _spend(self, place: _Place) -> None:
+        """Counts the bytes of a chunk. Raises `DataError` if all chunks, which may overlap, have too many."""
+        left = self._left - place.size - (place.end - place.begin)
+        if left < 0:
+            raise DataError("chunks that overlap have too many bytes")
+        self._left = left
 
     def _cut_off(self, at: int) -> list[_Found]:
         """The messages of a chunk that the end of the file cuts off, up to there."""
         with suppress(*_ERRORS):
-            place = self._cut_chunk(at)
-            data = self._unpack(self._data[place.begin :], place.compression, place.size)
-            return self._chunk(_Place(place.begin, len(self._data), place.compression, len(data)))[0]
+            begin, _, compression, size, _ = self._cut_chunk(at)
+            end = min(len(self._data), begin + self._limit)
+            self._spend(_Place(begin, end, size=min(size, self._limit)))
+            data = self._unpack(self._data[begin:end], compression, size)
+            return self._chunk(_Place(begin, end, compression, len(data)))[0]
         return []
 
     def _cut_chunk(self, at: int) -> _Place:
@@ -282,7 +305,7 @@ class _Ros1Bag(_Chunked):
         while (found := self._data.find(b"\4\0\0\0op=\5", at)) >= 0:
             for start in range(max(at, found - _CHUNK_HEADER), found - 3):
                 with suppress(DataError, struct.error):
-                    fields, _, _ = _ros1_record(self._data, start)
+                    fields, _, _ = _ros1_record(self._data, start, most=2 * _CHUNK_HEADER)
                     if fields.get(b"op") == b"\5" and {b"size", b"compression"} <= fields.keys():
                         return start
             at = found + 1
@@ -320,12 +343,14 @@ def _ros1_chunk(fields: dict[bytes, bytes], begin: int, end: int) -> _Place:
     return _Place(begin, end, fields[b"compression"].decode(), size)
 
 
-def _ros1_record(data: Any, at: int, is_cut: bool = False) -> tuple[dict[bytes, bytes], int, int]:
-    """The fields of a record's header, and where its content begins and ends; only after the file if it
-    `is_cut`."""
+def _ros1_record(
+    data: Any, at: int, is_cut: bool = False, most: int = _MOST_FIELD_BYTES
+) -> tuple[dict[bytes, bytes], int, int]:
+    """The fields of a record's header, of at most `most` bytes, and where its content begins and ends; only
+    after the file if it `is_cut`."""
     (length,) = struct.unpack("<I", data[at : at + 4])
     begin = at + 8 + length
-    if length > _MOST_FIELD_BYTES or begin > len(data):
+    if length > most or begin > len(data):
         raise DataError("a header is too long")
     (size,) = struct.unpack("<I", data[begin - 4 : begin])
     if (begin + size > len(data)) != is_cut:
