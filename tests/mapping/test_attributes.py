@@ -393,7 +393,10 @@ def scan_of(**channels: Any) -> Scan:
         ("colour", torch.zeros(2, 3, dtype=torch.int64), "as uint8"),
         ("colour", torch.zeros(2), r"expected \(2, 3\)"),
         ("intensity", torch.zeros(3), r"expected \(2,\)"),
-        ("intensity", torch.tensor([torch.inf, 0.0]), "infinite"),
+        ("intensity", torch.tensor([torch.inf, 0.0]), "beyond 1e"),
+        ("intensity", torch.tensor([1e13, 0.0]), "beyond 1e"),
+        ("", torch.zeros(2), "1 to 64 bytes"),
+        ("é" * 33, torch.zeros(2), "1 to 64 bytes"),
         ("intensity", torch.zeros(2, 9), "9 columns"),
         ("class", torch.tensor([0, 65536]), "from 0 to 65535"),
         ("class", torch.tensor([0, -2]), "from 0 to 65535"),
@@ -402,6 +405,29 @@ def scan_of(**channels: Any) -> Scan:
 def test_bad_channels_are_refused_with_the_remedy(name, value, reason):
     with pytest.raises(InvalidArgumentError, match=reason):
         scan_of(**{name: value})
+
+
+def test_more_channels_than_a_file_has_room_for_are_refused(tmp_path):
+    with pytest.raises(InvalidArgumentError, match="17 channels"):
+        scan_of(**{f"c{i}": torch.zeros(2) for i in range(17)})
+    made = gt.GaussianMap(FINE)
+    for first in (0, 9):
+        points = drive(1, 3)[0].points
+        channels = {f"c{first + i}": points[:, 0] for i in range(9)}
+        made.insert(Scan(points, torch.zeros(3), attributes=channels))
+    with pytest.raises(InvalidArgumentError, match="18 channels"):
+        made.save(tmp_path / "map.gmm")
+
+
+@pytest.mark.parametrize("codec", ["quantized", "float"])
+def test_the_largest_values_and_most_channels_are_saved(tmp_path, codec):
+    made = gt.GaussianMap(FINE, codec=codec)
+    points = drive(1, 3)[0].points
+    channels = {f"c{i}": torch.linspace(-1e12, 1e12, len(points)) for i in range(16)}
+    made.insert(Scan(points, torch.zeros(3), attributes=channels))
+    made.save(tmp_path / "map.gmm")
+    again = gt.GaussianMap.load(tmp_path / "map.gmm")
+    assert torch.equal(again.attributes(points)["c15"].mean, made.attributes(points)["c15"].mean)
 
 
 def test_channels_follow_their_points():

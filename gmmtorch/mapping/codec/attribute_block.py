@@ -18,7 +18,7 @@ from torch import Tensor
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
 from gmmtorch.mapping.attributes.moments import Attributes, Channel, Labels, Numbers
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Ints
-from gmmtorch.scan import COLOUR, LARGEST_LABEL
+from gmmtorch.scan import COLOUR, LARGEST_LABEL, LONGEST_NAME, MOST_CHANNELS, MOST_COLUMNS
 
 BLOCK_VERSION = 1
 _MEAN_STEPS, _SLOPE_STEPS = 2.0, 1.0  # in a deviation
@@ -27,7 +27,6 @@ _MOST_REST = 3  # eighths of the second label
 _DEVIATIONS = -80, 80  # least and largest, in powers of √2
 _LEAST_COLOUR = 2.0**-8  # deviation
 _LEAST_RELATIVE = 2.0**-8  # deviation of other numbers, relative to the mean
-_MOST_CHANNELS, _MOST_COLUMNS, _LONGEST_NAME = 16, 8, 64
 _MOST_STEPS = 1 << 40
 _LIGHTNESS = torch.tensor([[1.0, 1.0, 1.0], [1.0, 0.0, -1.0], [1.0, -2.0, 1.0]], dtype=torch.float64)
 _LIGHTNESS = _LIGHTNESS / _LIGHTNESS.norm(dim=1, keepdim=True)
@@ -73,8 +72,13 @@ def rounded(
 
 def encode_attributes(attributes: Attributes, covariances: Tensor) -> bytes:
     """The block of the attributes of components with these rounded covariances (K, D, D)."""
+    n = len(attributes.channels)
+    if n > MOST_CHANNELS:
+        raise InvalidArgumentError(
+            f"The map has {n} channels of attributes; at most {MOST_CHANNELS} are stored."
+        )
     writer = BitWriter()
-    writer.number(len(attributes.channels))
+    writer.number(n)
     for name, channel in attributes.channels.items():
         _write_name(writer, name)
         steps = _steps(name, channel, covariances)
@@ -105,9 +109,9 @@ def decode_attributes(data: bytes, covariances: Tensor) -> Attributes:
     reader = BitReader(data[1:])
     k, dim = covariances.shape[:2]
     found: dict[str, Channel] = {}
-    for _ in range(_bounded(reader.number(), "channels", 0, _MOST_CHANNELS)):
+    for _ in range(_bounded(reader.number(), "channels", 0, MOST_CHANNELS)):
         name = _read_name(reader)
-        width = _bounded(reader.number(), "columns", 0, _MOST_COLUMNS)
+        width = _bounded(reader.number(), "columns", 0, MOST_COLUMNS)
         steps = _read_numbers(reader, k, width, dim) if width else _read_labels(reader, k)
         found[name] = _restored(name, steps, covariances)
     reader.finish()
@@ -119,14 +123,14 @@ def decode_attributes(data: bytes, covariances: Tensor) -> Attributes:
 
 def _write_name(writer: BitWriter, name: str) -> None:
     letters = np.frombuffer(name.encode(), np.uint8).astype(np.int64)
-    if not 0 < len(letters) <= _LONGEST_NAME:
-        raise InvalidArgumentError(f"attributes[{name!r}]: a name has 1 to {_LONGEST_NAME} bytes.")
+    if not 0 < len(letters) <= LONGEST_NAME:
+        raise InvalidArgumentError(f"attributes[{name!r}]: a name has 1 to {LONGEST_NAME} bytes.")
     writer.number(len(letters))
     writer.fixed(letters, 8)
 
 
 def _read_name(reader: BitReader) -> str:
-    letters = reader.fixed(_bounded(reader.number(), "letters", 1, _LONGEST_NAME), 8)
+    letters = reader.fixed(_bounded(reader.number(), "letters", 1, LONGEST_NAME), 8)
     return letters.astype(np.uint8).tobytes().decode("utf-8", errors="replace")
 
 
