@@ -28,6 +28,7 @@ _DEVIATIONS = -80, 80  # least and largest, in powers of √2
 _LEAST_COLOUR = 2.0**-8  # deviation
 _LEAST_RELATIVE = 2.0**-8  # deviation of other numbers, relative to the mean
 _MOST_STEPS = 1 << 40
+_MOST_SHARES = 1 << 28  # of labels in components, 2 GiB in memory
 _LIGHTNESS = torch.tensor([[1.0, 1.0, 1.0], [1.0, 0.0, -1.0], [1.0, -2.0, 1.0]], dtype=torch.float64)
 _LIGHTNESS = _LIGHTNESS / _LIGHTNESS.norm(dim=1, keepdim=True)
 
@@ -74,9 +75,7 @@ def encode_attributes(attributes: Attributes, covariances: Tensor) -> bytes:
     """The block of the attributes of components with these rounded covariances (K, D, D)."""
     n = len(attributes.channels)
     if n > MOST_CHANNELS:
-        raise InvalidArgumentError(
-            f"The map has {n} channels of attributes; at most {MOST_CHANNELS} are stored."
-        )
+        raise InvalidArgumentError(f"The map has {n} channels of attributes; {MOST_CHANNELS} can be stored.")
     writer = BitWriter()
     writer.number(n)
     for name, channel in attributes.channels.items():
@@ -89,6 +88,11 @@ def encode_attributes(attributes: Attributes, covariances: Tensor) -> bytes:
                 for column in values.T:
                     writer.column(column.contiguous().numpy())
         else:
+            if channel.share.numel() > _MOST_SHARES:
+                raise InvalidArgumentError(
+                    f"attributes[{name!r}]: {len(steps.share)} components with {len(steps.labels)} labels "
+                    "are too many to be stored; give fewer labels."
+                )
             writer.number(0)
             writer.number(len(steps.labels))
             writer.column(steps.labels.numpy())
@@ -150,6 +154,8 @@ def _read_numbers(reader: BitReader, k: int, width: int, dim: int) -> _NumberSte
 
 def _read_labels(reader: BitReader, k: int) -> _LabelSteps:
     n_labels = _bounded(reader.number(), "labels", 0, LARGEST_LABEL + 1)
+    if k * n_labels > _MOST_SHARES:
+        raise DataError(f"{k} components with {n_labels} labels are too many to read.")
     labels = _column(reader, n_labels, "labels", 0, LARGEST_LABEL)
     share = _column(reader, k, "shares", 0, _SHARES)
     n = int((share > 0).sum())
@@ -159,8 +165,6 @@ def _read_labels(reader: BitReader, k: int) -> _LabelSteps:
     rest = _column(reader, n, "shares", 0, _MOST_REST)
     second = torch.zeros_like(first)
     second[rest > 0] = _column(reader, int((rest > 0).sum()), "labels", 0, n_labels - 1)
-    if n * n_labels > 1 << 28:
-        raise DataError(f"{n} components with {n_labels} labels are too many to read.")
     return _LabelSteps(share, first, second, rest, labels)
 
 
