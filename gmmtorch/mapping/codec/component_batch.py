@@ -195,8 +195,9 @@ def map_bytes(components: Components, rule: LearningRule, settings: MapSettings,
     facts = _facts(rule, settings, number_after(components.ids, next_number))
     if settings.codec == "float":
         return _exact_file(components, facts)
-    block = encode_attributes(components.attributes, components.covariances) if components.attributes else b""
-    return _container(encode(components), block, facts)
+    c = components.on_cpu()
+    block = encode_attributes(c.attributes, c.covariances) if c.attributes else b""
+    return _container(encode(c), block, facts)
 
 
 def file_size(components: Components, rule: LearningRule, settings: MapSettings, next_number: int) -> int:
