@@ -258,7 +258,7 @@ class GaussianMap(MapState):
             return final, final
         none = Components.empty(final.dim, final.means.device)
         known, rounded = self._final_rounded or (none, none)
-        if any(value is not getattr(final, name) for name, value in known.tensors().items()):
+        if any(value is not getattr(final, name) for name, value in vars(known).items()):
             self._final_rounded = final, quantized_after(known, rounded, final)
         return self._final_rounded or (final, rounded)
 

@@ -426,6 +426,19 @@ def test_bad_channels_are_refused_with_the_remedy(name, value, reason):
         scan_of(**{name: value})
 
 
+def test_a_change_of_attributes_alone_counts():
+    made = painted_map(5, 3)
+    made.revise(lambda c: c)
+    assert set(made.components().attributes.channels) == {"colour", "intensity", "class"}
+    kept = {"intensity": made.unrounded().attributes.channels["intensity"]}
+    made.revise(lambda c: replace(c, attributes=Attributes(kept)))
+    assert set(made.components().attributes.channels) == {"intensity"}
+    made.insert(painted(drive(6, 3)[5]))
+    again = quantized(made.unrounded())
+    for name, value in made.components().attributes.tensors().items():
+        assert torch.equal(value, again.attributes.tensors()[name]), name
+
+
 def test_no_points_have_no_attributes():
     assert painted_map(2, 3).attributes(torch.zeros(0, 3))["colour"].mean.shape == (0, 3)
 

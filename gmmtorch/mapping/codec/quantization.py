@@ -228,7 +228,9 @@ def quantized_after(known: Components, rounded: Components, components: Componen
     k, e, s = len(known), len(known.seen_by), len(known.origins)
     sizes = {"origins": s, "seen_by": e, "seen_from": e, "seen_count": e}
     old = {name: values[: sizes.get(name, k)] for name, values in components.tensors().items()}
-    if not k or not all_equal((old[name], values) for name, values in known.tensors().items()):
+    old |= components.attributes.selected(slice(k)).tensors()
+    given = {**known.tensors(), **known.attributes.tensors()}
+    if not k or old.keys() != given.keys() or not all_equal((old[name], x) for name, x in given.items()):
         return quantized(components)
     if len(components) == k:
         return rounded
