@@ -87,7 +87,8 @@ def extent(rows: Tensor) -> str:
 COLOUR = "colour"
 """Name of the channel with linear RGB from 0 to 1."""
 LARGEST_LABEL = 65535
-_MOST_COLUMNS = 8
+MOST_CHANNELS, MOST_COLUMNS, LONGEST_NAME = 16, 8, 64
+LARGEST_VALUE = 1e12
 
 
 def linear_colours(values: Tensor) -> Tensor:
@@ -105,6 +106,8 @@ def display_colours(values: Tensor) -> Tensor:
 def _as_channel(name: str, given: ArrayLike, points: Tensor) -> Tensor:
     """A channel of points (N, D), on their device: floating numbers (N, A), or labels (N,) int64."""
     n, where = points.shape[0], f"attributes[{name!r}]"
+    if not isinstance(name, str) or not 0 < len(name.encode()) <= LONGEST_NAME:
+        raise InvalidArgumentError(f"{where}: the name of a channel is text of 1 to {LONGEST_NAME} bytes.")
     value = as_tensor(given, where, device=points.device)
     is_colour = name == COLOUR
     if value.shape[:1] != (n,) or value.ndim > 2 or (is_colour and value.shape[1:] != (3,)):
@@ -127,10 +130,10 @@ def _as_channel(name: str, given: ArrayLike, points: Tensor) -> Tensor:
             )
         return value
     value = value[:, None] if value.ndim == 1 else value
-    if not 1 <= value.shape[1] <= _MOST_COLUMNS or bool(value.isinf().any()):
+    if not 1 <= value.shape[1] <= MOST_COLUMNS or bool((value.abs() > LARGEST_VALUE).any()):
         raise InvalidArgumentError(
-            f"{where} has {value.shape[1]} columns, or infinite values; give 1 to {_MOST_COLUMNS} columns of "
-            "finite numbers, and NaN where unknown."
+            f"{where} has {value.shape[1]} columns, or values beyond {LARGEST_VALUE:g}; give 1 to "
+            f"{MOST_COLUMNS} columns of numbers in another unit, and NaN where unknown."
         )
     if is_colour and bool(((value < 0) | (value > 1)).any()):
         raise InvalidArgumentError(
@@ -151,7 +154,8 @@ class Scan:
         time: of the measurement in seconds, on any clock that all scans share; None: not known.
         attributes: channels beside the points, by name. Numbers in a floating type (N,) or (N, A), NaN where
             unknown, such as "intensity"; or labels (N,), whole numbers, −1 where unknown, such as "class".
-            "colour" (N, 3) is linear RGB from 0 to 1; uint8 is taken as sRGB.
+            "colour" (N, 3) is linear RGB from 0 to 1; uint8 is taken as sRGB. At most 16, of up to 8 columns
+            and values up to 10¹².
 
     Accepts arrays, lists and tensors. Raises `InvalidArgumentError` for inconsistent shapes, for NaN and
     infinite coordinates, and for coordinates beyond 2²⁷ m. Warns if float32 coordinates are too far from
@@ -177,6 +181,10 @@ class Scan:
         object.__setattr__(self, "origin", origin.to(points.device))
         object.__setattr__(self, "no_return", no_return.to(points.device, points.dtype))
         channels = {name: _as_channel(name, x, points) for name, x in (self.attributes or {}).items()}
+        if len(channels) > MOST_CHANNELS:
+            raise InvalidArgumentError(
+                f"attributes has {len(channels)} channels; give at most {MOST_CHANNELS}."
+            )
         object.__setattr__(self, "attributes", channels)
 
     def __repr__(self) -> str:

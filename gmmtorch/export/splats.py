@@ -146,6 +146,8 @@ def _packed_quaternions(quaternions: np.ndarray) -> np.ndarray:
 
 def _glb(splats: Splats) -> bytes:
     """Binary glTF 2.0: points, which viewers without the extension show in their colours."""
+    if not len(splats.means):
+        raise InvalidArgumentError("No surface: glTF has no empty tables; export the map as .ply or .spz.")
     splats = splats.turned(_Y_UP)
     name = "KHR_gaussian_splatting"
     opaque = torch.cat([linear_colours(splats.colours), splats.opacity[:, None]], 1)

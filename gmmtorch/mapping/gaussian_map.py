@@ -16,6 +16,7 @@ from gmmtorch.arrays import ArrayLike
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_whole
 from gmmtorch.files import write_bytes
 from gmmtorch.mapping.attributes.answers import Prediction, predictions
+from gmmtorch.mapping.attributes.moments import check_kinds
 from gmmtorch.mapping.codec.component_batch import CODECS, MapSettings, map_bytes, read_map
 from gmmtorch.mapping.codec.quantization import quantized_after
 from gmmtorch.mapping.components import Components
@@ -173,8 +174,14 @@ class GaussianMap(MapState):
     # -- learning -------------------------------------------------------------------------------------
 
     def insert(self, scan: Scan) -> None:
-        """Learns from a scan. Queries use it at once; its components are final when their window is full."""
+        """Learns from a scan. Queries use it at once; its components are final when their window is full.
+
+        Raises `InvalidArgumentError`, and keeps the map as it is, if the dimension or the kind of a channel
+        is not that of the map.
+        """
         check_scan(scan)
+        known = (one.attributes for one in self._pending)
+        check_kinds([self._attributes.channels, *known, scan.attributes])
         self._prepare(scan.dim, scan.points.device, "scan is")
         self._add(scan.copied(self._device))
 
@@ -251,7 +258,7 @@ class GaussianMap(MapState):
             return final, final
         none = Components.empty(final.dim, final.means.device)
         known, rounded = self._final_rounded or (none, none)
-        if any(value is not getattr(final, name) for name, value in known.tensors().items()):
+        if any(value is not getattr(final, name) for name, value in vars(known).items()):
             self._final_rounded = final, quantized_after(known, rounded, final)
         return self._final_rounded or (final, rounded)
 

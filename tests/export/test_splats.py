@@ -57,6 +57,14 @@ def test_splats_come_back_in_the_frame_of_the_map(tmp_path, suffix):
         assert bool((error < 0.08 * c.covariances.flatten(1).norm(dim=1)).all())
 
 
+def test_a_map_without_surfaces_is_written_where_the_format_allows_it(tmp_path):
+    nothing = Splats.of(Components.empty(3))
+    for suffix in (".ply", ".spz"):
+        assert len(read_splats(write_splats(tmp_path / f"none{suffix}", nothing)).means) == 0
+    with pytest.raises(InvalidArgumentError, match="No surface"):
+        write_splats(tmp_path / "none.glb", nothing)
+
+
 def test_a_ply_file_has_the_common_layout(tmp_path):
     """Read without our reader: float32 properties in the usual order, logits, logarithms, w first."""
     c = coloured(3)

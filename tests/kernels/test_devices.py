@@ -88,6 +88,20 @@ def build_and_ask_a_map(device):
     return built.means, built.occupancy(asked, 0.1), built.occupancy(asked, 0.2, method="monte_carlo")
 
 
+def colour_a_map(device):
+    """Learned, moved, measured in bytes and asked, with two channels."""
+    built = gt.GaussianMap(n_samples=300)
+    for shift in (0.0, 0.1):
+        points = cloud(300).to(device) + shift
+        channels = {"colour": (points / 5).clamp(0, 1), "class": (points[:, 0] > 2).long()}
+        origin = torch.tensor([2.0, 2.0, 1.0], device=device)
+        built.insert(gt.Scan(points, origin, attributes=channels))
+    built.transform(torch.eye(4))
+    found = built.attributes(cloud(60).to(device))
+    size = torch.tensor(built.nbytes, device=device)
+    return found["colour"].mean, found["class"].mean, found["class"].most_likely, size
+
+
 def list_visits(device):
     origins, ends = (5 * part.to(device) for part in rays())
     total = torch.zeros(4000, device=device)  # of the numbers of the rays in each voxel
@@ -115,6 +129,7 @@ WORK = [
     grid_flux,
     fit_mixture,
     pytest.param(build_and_ask_a_map, marks=pytest.mark.slow),
+    pytest.param(colour_a_map, marks=pytest.mark.slow),
 ]
 
 

@@ -21,6 +21,7 @@ from gmmtorch.mapping.attributes import moments
 from gmmtorch.mapping.attributes.answers import predictions
 from gmmtorch.mapping.attributes.moments import Attributes, Labels, Numbers
 from gmmtorch.mapping.codec.attribute_block import decode_attributes, encode_attributes
+from gmmtorch.mapping.codec.bitstream import BitWriter
 from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.merging import compact, merged
@@ -169,10 +170,13 @@ def test_one_channel_cannot_be_numbers_and_labels():
     one, other = drive(2)
     one = replace(one, attributes={"heat": torch.zeros(len(one.points))})
     other = replace(other, attributes={"heat": torch.zeros(len(other.points), dtype=torch.int64)})
-    made = gt.GaussianMap(FINE)
-    made.insert(one)
-    with pytest.raises(InvalidArgumentError, match="'heat' are numbers in some scans and labels in others"):
-        made.insert(other)
+    for made in (gt.GaussianMap(FINE), gt.GaussianMap(replace(FINE, window=5))):
+        made.insert(one)
+        with pytest.raises(
+            InvalidArgumentError, match="'heat' are numbers in some scans and labels in others"
+        ):
+            made.insert(other)
+        assert set(made.attributes(one.points)) == {"heat"}  # the map is as it was
 
 
 # -- merging and moving ----------------------------------------------------------------------------------
@@ -358,6 +362,21 @@ def test_damaged_blocks_raise_a_data_error(place, value):
         found.checked(len(c), 3)
 
 
+def test_many_components_with_many_labels_are_refused_before_memory_is_taken():
+    """The block has a bit for each label, and none for each component, as no component has a label."""
+    none, writer = np.zeros(0, np.int64), BitWriter()
+    writer.number(1)
+    writer.number(1)
+    writer.fixed(np.array([ord("c")]), 8)
+    writer.number(0)
+    writer.number(65536)
+    for column in (np.arange(65536), np.zeros(100_000, np.int64), none, none, none):
+        writer.column(column)
+    eye = torch.eye(3, dtype=torch.float64).expand(100_000, 3, 3)
+    with pytest.raises(DataError, match="too many to read"):
+        decode_attributes(b"\1" + writer.to_bytes(), eye)
+
+
 def test_a_budget_holds_with_attributes(tmp_path):
     made = gt.GaussianMap(replace(FINE, max_bytes=1500))
     for seed, scan in enumerate(drive(8, 3)):
@@ -393,7 +412,10 @@ def scan_of(**channels: Any) -> Scan:
         ("colour", torch.zeros(2, 3, dtype=torch.int64), "as uint8"),
         ("colour", torch.zeros(2), r"expected \(2, 3\)"),
         ("intensity", torch.zeros(3), r"expected \(2,\)"),
-        ("intensity", torch.tensor([torch.inf, 0.0]), "infinite"),
+        ("intensity", torch.tensor([torch.inf, 0.0]), "beyond 1e"),
+        ("intensity", torch.tensor([1e13, 0.0]), "beyond 1e"),
+        ("", torch.zeros(2), "1 to 64 bytes"),
+        ("é" * 33, torch.zeros(2), "1 to 64 bytes"),
         ("intensity", torch.zeros(2, 9), "9 columns"),
         ("class", torch.tensor([0, 65536]), "from 0 to 65535"),
         ("class", torch.tensor([0, -2]), "from 0 to 65535"),
@@ -402,6 +424,80 @@ def scan_of(**channels: Any) -> Scan:
 def test_bad_channels_are_refused_with_the_remedy(name, value, reason):
     with pytest.raises(InvalidArgumentError, match=reason):
         scan_of(**{name: value})
+
+
+def test_a_change_of_attributes_alone_counts():
+    made = painted_map(5, 3)
+    made.revise(lambda c: c)
+    assert set(made.components().attributes.channels) == {"colour", "intensity", "class"}
+    kept = {"intensity": made.unrounded().attributes.channels["intensity"]}
+    made.revise(lambda c: replace(c, attributes=Attributes(kept)))
+    assert set(made.components().attributes.channels) == {"intensity"}
+    made.insert(painted(drive(6, 3)[5]))
+    again = quantized(made.unrounded())
+    for name, value in made.components().attributes.tensors().items():
+        assert torch.equal(value, again.attributes.tensors()[name]), name
+
+
+def test_no_points_have_no_attributes():
+    assert painted_map(2, 3).attributes(torch.zeros(0, 3))["colour"].mean.shape == (0, 3)
+
+
+@pytest.mark.parametrize(
+    ("part", "change"),
+    [
+        ("mean", lambda value: value.sum()),
+        ("mean", lambda value: value[:-1]),
+        ("covariance", lambda value: -value),
+        ("covariance", lambda value: value.sum()),
+        ("share", lambda value: value + 5),
+        ("share", lambda value: value - 5),
+    ],
+)
+def test_a_state_with_damaged_attributes_is_refused(part, change):
+    made = painted_map(4, 3)
+    made.finish()
+    state = made.state_dict()
+    known = state["_extra_state"]["attributes"]
+    known[f"colour.{part}"] = change(known[f"colour.{part}"])
+    with pytest.raises(DataError, match="The state of the map is damaged"):
+        gt.GaussianMap(FINE).load_state_dict(state)
+
+
+def test_a_state_of_other_floating_types_is_read():
+    made = painted_map(4, 3)
+    made.finish()
+    state = made.state_dict()
+    known = state["_extra_state"]["attributes"]
+    known["colour.slope"] = known["colour.slope"].float()
+    again = gt.GaussianMap(FINE)
+    again.load_state_dict(state)
+    points = drive(4, 3)[0].points
+    wanted = made.attributes(points)["colour"].mean
+    torch.testing.assert_close(again.attributes(points)["colour"].mean, wanted, rtol=1e-4, atol=1e-4)
+
+
+def test_more_channels_than_a_file_has_room_for_are_refused(tmp_path):
+    with pytest.raises(InvalidArgumentError, match="17 channels"):
+        scan_of(**{f"c{i}": torch.zeros(2) for i in range(17)})
+    made = gt.GaussianMap(FINE)
+    for first in (0, 9):
+        points = drive(1, 3)[0].points
+        channels = {f"c{first + i}": points[:, 0] for i in range(9)}
+        made.insert(Scan(points, torch.zeros(3), attributes=channels))
+    with pytest.raises(InvalidArgumentError, match="18 channels"):
+        made.save(tmp_path / "map.gmm")
+
+
+@pytest.mark.parametrize("codec", ["quantized", "float"])
+def test_the_largest_values_and_most_channels_are_saved(tmp_path, codec):
+    made = gt.GaussianMap(FINE, codec=codec)
+    points = drive(1, 3)[0].points
+    channels = {f"c{i}": torch.linspace(-1e12, 1e12, len(points)) for i in range(16)}
+    made.insert(Scan(points, torch.zeros(3), attributes=channels))
+    made.save(tmp_path / "map.gmm")
+    again = gt.GaussianMap.load(tmp_path / "map.gmm")
+    assert torch.equal(again.attributes(points)["c15"].mean, made.attributes(points)["c15"].mean)
 
 
 def test_channels_follow_their_points():

@@ -22,6 +22,7 @@ from mapping.random_components import random_components, rotations
 from gmmtorch.datasets import load
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.experiments.evaluation import metrics, queries
+from gmmtorch.kernels.codes import context_coding
 from gmmtorch.mapping.codec import component_batch, context_model, lattice
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Code, best_code, zigzag
 from gmmtorch.mapping.codec.component_batch import decode, encode
@@ -426,6 +427,50 @@ def test_a_limit_on_components_is_kept_before_they_are_read(sound):
     assert len(decode(sound, most=40)) == 12
     with pytest.raises(DataError, match="12 components and"):
         decode(sound, most=11)
+
+
+def seen_from_afar(n: int, nearest: bool) -> Components:
+    """n components, each seen from an origin of its own beside it, or from a random one."""
+    generator = torch.Generator().manual_seed(0)
+    c = random_components(3, k=n, n_origins=n, max_sightings=1, extent=100.0)
+    every = torch.arange(n)
+    origins = c.means + 0.1 if nearest else c.means[torch.randperm(n, generator=generator)] + 0.1
+    return replace(c, origins=origins, seen_by=every, seen_from=every, seen_count=c.support)
+
+
+def test_steps_do_not_grow_with_components_times_origins(monkeypatch):
+    """Origins that are near cost few steps; a batch that takes many for each byte is neither written nor
+    read."""
+    near, far = seen_from_afar(4000, nearest=True), seen_from_afar(4000, nearest=False)
+    bytes_of_far = encode(far)
+    monkeypatch.setattr(context_coding, "MOST_STEPS", 32)
+    assert_same_components(decode(encode(near)), quantized(near))
+    with pytest.raises(InvalidArgumentError, match="4000 components have viewpoints"):
+        encode(far)
+    with pytest.raises(DataError, match="damaged"):
+        decode(bytes_of_far)
+
+
+@dims
+def test_origins_at_equal_distances_are_ranked_as_the_twin_ranks_them(dim):
+    """Components in the middle of a grid of origins, eight or more of which are equally far."""
+    axis = torch.arange(-3.0, 4.0, dtype=torch.float64)
+    origins = torch.cartesian_prod(*[axis] * dim)
+    n = len(origins)
+    c = random_components(dim, k=12, n_origins=n, max_sightings=1)
+    seen_from = torch.randint(n, (12, 40), generator=torch.Generator().manual_seed(1)).flatten()
+    c = replace(
+        c,
+        means=(c.means * 0.1).round(),
+        origins=origins[torch.randperm(n, generator=torch.Generator().manual_seed(2))],
+        seen_by=torch.arange(12).repeat_interleave(40),
+        seen_from=seen_from,
+        seen_count=(c.support / 40).repeat_interleave(40),
+    )
+    twin, fused = by_both(lambda: encode(c))
+    assert twin == fused
+    for found in by_both(lambda: decode(fused)):
+        assert_same_components(found, quantized(c))
 
 
 # -- earlier versions and the two coders -----------------------------------------------------------------

@@ -3,6 +3,7 @@
 #pragma once
 
 #include "../mixtures/lattice.h"
+#include "range_coder.h"
 
 namespace gmm {
 
@@ -25,26 +26,17 @@ struct Batch {
     int64_t* share;
 };
 
-// chances: probability of a 0 in 1/65536, by slot; n_seen: bits that a slot has coded, up to `most_seen`.
-// distance (S,), rank (S,), place (K, D), normal (K, D), cell (K, D): scratch.
+// Scratch: leaf (S,): the origins in the order of the tree; box (T, 2, D): of its T items; distance, item
+// (T,): of the heap; row (S,): zeros; place, normal, cell (K, D).
 struct Scratch {
-    int32_t* chances;
-    int32_t* n_coded;
-    const int64_t* rates;
-    int64_t most_coded;
-    const int64_t* first_slot;
+    int64_t* leaf;
+    int64_t* box;
     double* distance;
-    int64_t* rank;
+    int64_t* waiting;
+    int64_t* row;
     double* place;
     double* normal;
     int64_t* cell;
-};
-
-// bytes: room for `size` bytes; those written, or read. result: bytes used; −1: damaged, or no room.
-struct Stream {
-    uint8_t* bytes;
-    int64_t size;
-    int64_t* result;
 };
 
 struct Field {
@@ -71,146 +63,6 @@ struct Field {
     };
 };
 
-template <bool WRITES>
-struct RangeCoder {
-    Scratch s;
-    Stream out;
-    uint64_t low;
-    uint32_t range, code;
-    int64_t at, pending;
-    uint8_t cache;
-    bool started, good;
-
-    GMM_INLINE void begin() {
-        low = 0, range = 0xFFFFFFFFu, code = 0, at = 0, pending = 0, cache = 0, started = false, good = true;
-        if (!WRITES)
-            for (int i = 0; i < 4; ++i) code = code << 8 | next();
-    }
-
-    // Zeros follow the stream: those at its end are not written.
-    GMM_INLINE uint8_t next() {
-        const uint8_t byte = at < out.size ? out.bytes[at] : 0;
-        ++at;
-        return byte;
-    }
-
-    GMM_INLINE void put(uint8_t byte) {
-        if (at < out.size) out.bytes[at] = byte;
-        good = good && at < out.size;
-        ++at;
-    }
-
-    // Moves the highest byte of `low` out. A byte waits until no carry can change it; so do 0xFF after it.
-    GMM_INLINE void shift() {
-        if (low < 0xFF000000ull || low > 0xFFFFFFFFull) {
-            const uint8_t carry = (uint8_t)(low >> 32);
-            if (started) put((uint8_t)(cache + carry));
-            for (; pending > 0; --pending) put((uint8_t)(0xFF + carry));
-            started = true;
-            cache = (uint8_t)(low >> 24);
-        } else {
-            ++pending;
-        }
-        low = (low & 0x00FFFFFFull) << 8;
-    }
-
-    GMM_INLINE void renew() {
-        while (range < 1u << 24) {
-            range <<= 8;
-            if (WRITES)
-                shift();
-            else
-                code = code << 8 | next();
-        }
-    }
-
-    GMM_INLINE int64_t end() {
-        if (WRITES) {
-            uint64_t last = low;  // of the numbers that say the same, the one with most zeros at its end
-            for (int n = 1; n < 32; ++n) {
-                const uint64_t rounder = (low + (1ull << n) - 1) >> n << n;
-                if (rounder < low + range) last = rounder;
-            }
-            low = last;
-            for (int i = 0; i < 5; ++i) shift();
-        }
-        return good ? at : -1;
-    }
-
-    // One bit in a slot; `value` is it, or unused.
-    GMM_INLINE int64_t bit(int64_t slot, int64_t value) {
-        const uint32_t chance = (uint32_t)s.chances[slot], bound = (range >> 16) * chance;
-        if (WRITES) {
-            if (value) low += bound;
-        } else {
-            value = code >= bound;
-            if (value) code -= bound;
-        }
-        range = value ? range - bound : bound;
-        const int64_t n = s.n_coded[slot], step = ((value ? 0 : 65536) - (int64_t)chance) * s.rates[n];
-        s.chances[slot] =
-            (int32_t)(minimum(maximum((int64_t)chance + (step >> 16), (int64_t)64), (int64_t)65472));
-        if (n < s.most_coded) s.n_coded[slot] = (int32_t)(n + 1);
-        renew();
-        return value;
-    }
-
-    // n bits without a model, highest first.
-    GMM_INLINE int64_t raw(int64_t n, int64_t value) {
-        int64_t found = 0;
-        while (n > 0) {
-            const int64_t width = minimum(n, (int64_t)8);
-            n -= width;
-            range >>= width;
-            int64_t part = (value >> n) & ((1 << width) - 1);
-            if (WRITES) {
-                low += (uint64_t)range * (uint64_t)part;
-            } else {
-                part = minimum((int64_t)(code / range), (int64_t)(1 << width) - 1);
-                code -= (uint32_t)part * range;
-            }
-            found = found << width | part;
-            renew();
-        }
-        return found;
-    }
-
-    // n bits as a tree of 2^n slots, highest first.
-    GMM_INLINE int64_t tree(int64_t first, int64_t n, int64_t value) {
-        int64_t node = 1;
-        for (int64_t i = n - 1; i >= 0; --i) node = node << 1 | bit(first + node, (value >> i) & 1);
-        return node - (1 << n);
-    }
-
-    // A number ≥ 0 below 2^60: the length of value + 1 in unary, then its other bits; the two highest of
-    // these have slots.
-    GMM_INLINE int64_t number(int64_t first, int64_t value) {
-        int64_t length = 0;
-        const int64_t whole = value + 1;
-        while (good && bit(first + 4 + minimum(length, (int64_t)11), (whole >> (length + 1)) != 0)) {
-            if (++length > 60) good = false;
-        }
-        if (!good) return 0;
-        int64_t found = 1;
-        if (length > 0)
-            found = 2 | bit(first + 15 + minimum(length, (int64_t)8), (whole >> (length - 1)) & 1);
-        if (length > 1) {
-            const int64_t slot = length < 5 ? 24 + 2 * (length - 2) + (found & 1) : 30;
-            found = found << 1 | bit(first + slot, (whole >> (length - 2)) & 1);
-        }
-        if (length > 2) found = found << (length - 2) | raw(length - 2, whole & ((1ll << (length - 2)) - 1));
-        return found - 1;
-    }
-
-    // Any whole number. side: 0, 1 or 2, the slot of its sign.
-    GMM_INLINE int64_t whole(int64_t first, int64_t value, int64_t side) {
-        if (!bit(first, value != 0)) return 0;
-        const int64_t negative = bit(first + 1 + side, value < 0);
-        const int64_t size = number(first, (value < 0 ? -value : value) - 1) + 1;
-        return negative ? -size : size;
-    }
-};
-
 // Walks through the components of a batch, each value in place: written, or read into arrays of zeros.
 template <int DIM, bool WRITES>
 struct Walk {
@@ -218,9 +70,12 @@ struct Walk {
     Scratch s;
     RangeCoder<WRITES> c;
     int64_t offset, nearest;
+    int64_t level_begin[24], n_waiting, work;  // of the tree of origins and its heap; items taken from it
+    int levels;
+    bool is_slow;
 
     GMM_INLINE int64_t slots(int field, int64_t context, int64_t size = 32) const {
-        return s.first_slot[field] + context * size;
+        return c.s.first_slot[field] + context * size;
     }
 
     GMM_INLINE void check(bool valid) { c.good = c.good && valid; }
@@ -479,91 +334,145 @@ struct Walk {
         check(b.count[i] >= -41 && b.count[i] <= 160);
     }
 
+    // Whether slot x of the heap comes before slot y: boxes before the origins that may be in them.
     GMM_INLINE bool before(int64_t x, int64_t y) const {
-        return s.distance[x] < s.distance[y] || (s.distance[x] == s.distance[y] && x < y);
+        if (s.distance[x] != s.distance[y]) return s.distance[x] < s.distance[y];
+        const int64_t one = s.waiting[x], other = s.waiting[y], n = b.n_origins;
+        return one < n && other < n ? s.leaf[one] < s.leaf[other] : one > other;
     }
 
-    // Whether the coordinates of origin x come after those of y.
-    GMM_INLINE bool follows(int64_t x, int64_t y) const {
-        for (int a = 0; a < DIM; ++a) {
-            const int64_t one = b.origins[x * DIM + a], other = b.origins[y * DIM + a];
-            if (one != other) return one > other;
+    GMM_INLINE void swap_slots(int64_t x, int64_t y) {
+        const double distance = s.distance[x];
+        const int64_t item = s.waiting[x];
+        s.distance[x] = s.distance[y], s.waiting[x] = s.waiting[y];
+        s.distance[y] = distance, s.waiting[y] = item;
+    }
+
+    GMM_INLINE void push(double distance, int64_t item) {
+        int64_t at = n_waiting++;
+        s.distance[at] = distance, s.waiting[at] = item;
+        for (; at > 0 && before(at, (at - 1) / 2); at = (at - 1) / 2) swap_slots(at, (at - 1) / 2);
+    }
+
+    GMM_INLINE int64_t pop() {
+        const int64_t item = s.waiting[0];
+        swap_slots(0, --n_waiting);
+        for (int64_t at = 0, child = 1; child < n_waiting; at = child, child = 2 * at + 1) {
+            if (child + 1 < n_waiting && before(child + 1, child)) ++child;
+            if (!before(child, at)) break;
+            swap_slots(child, at);
         }
-        return x > y;
+        ++work;
+        return item;
     }
 
-    // The origin after `rank` others among the first n of s.rank, by distance.
-    GMM_INLINE int64_t selected(int64_t n, int64_t rank) const {
-        int64_t low = 0, high = n - 1;
-        while (low < high) {
-            const int64_t pivot = s.rank[(low + high) / 2];
-            int64_t x = low, y = high;
-            while (x <= y) {
-                while (before(s.rank[x], pivot)) ++x;
-                while (before(pivot, s.rank[y])) --y;
-                if (x <= y) {
-                    const int64_t kept = s.rank[x];
-                    s.rank[x++] = s.rank[y], s.rank[y--] = kept;
+    // The origins along a Morton curve of 2^16 cells an axis are the leaves of a tree; eight items after one
+    // another have a box around them in the next level.
+    GMM_INLINE void grow_tree() {
+        const int64_t n = b.n_origins;
+        int64_t low[DIM], extent = 1;
+        for (int a = 0; a < DIM && n > 0; ++a) {
+            int64_t high = low[a] = b.origins[a];
+            for (int64_t t = 1; t < n; ++t) {
+                low[a] = minimum(low[a], b.origins[t * DIM + a]);
+                high = maximum(high, b.origins[t * DIM + a]);
+            }
+            extent = maximum(extent, high - low[a]);
+        }
+        n_waiting = 0;
+        for (int64_t t = 0; t < n; ++t) {
+            int64_t key = 0;
+            for (int bit = 15; bit >= 0; --bit)
+                for (int a = 0; a < DIM; ++a)
+                    key = key << 1 | (((b.origins[t * DIM + a] - low[a]) * 65535 / extent >> bit) & 1);
+            s.leaf[t] = t;
+            push((double)key, t);
+        }
+        for (int64_t t = 0; t < n; ++t) s.row[t] = pop();
+        for (int64_t t = 0; t < n; ++t) {
+            s.leaf[t] = s.row[t], s.row[t] = 0;
+            for (int x = 0; x < 2 * DIM; ++x) s.box[t * 2 * DIM + x] = b.origins[s.leaf[t] * DIM + x % DIM];
+        }
+        levels = 1, level_begin[0] = 0, level_begin[1] = n, work = 0;
+        while (level_begin[levels] - level_begin[levels - 1] > 1) {
+            const int64_t begin = level_begin[levels - 1], end = level_begin[levels];
+            level_begin[++levels] = end + (end - begin + 7) / 8;
+            for (int64_t t = begin; t < end; ++t) {
+                int64_t *box = s.box + (end + (t - begin) / 8) * 2 * DIM, *own = s.box + t * 2 * DIM;
+                const bool is_first = (t - begin) % 8 == 0;
+                for (int a = 0; a < DIM; ++a) {
+                    box[a] = is_first ? own[a] : minimum(box[a], own[a]);
+                    box[DIM + a] = is_first ? own[DIM + a] : maximum(box[DIM + a], own[DIM + a]);
                 }
             }
-            if (rank <= y)
-                high = y;
-            else if (rank >= x)
-                low = x;
-            else
-                break;
         }
-        return s.rank[rank];
     }
 
-    // The viewpoints of component i, which begin at `begin`; returns where they end.
+    // An item of the tree waits for its turn, with its squared distance (m²) from component i. Rounding keeps
+    // the order of numbers, so no origin is nearer than its box.
+    GMM_INLINE void wait(int64_t i, int64_t item) {
+        const int64_t *low = s.box + item * 2 * DIM, *high = low + DIM;
+        double apart = 0.0;
+        for (int a = 0; a < DIM; ++a) {
+            const double place = s.place[i * DIM + a];
+            const double below = (double)low[a] * 0.00390625 - place;
+            const double above = place - (double)high[a] * 0.00390625;
+            const double x = maximum(maximum(below, above), 0.0);
+            apart = apart + x * x;
+        }
+        push(apart, item);
+    }
+
+    // The next origin by distance from component i, and index; −1 if none is left.
+    GMM_INLINE int64_t next_origin(int64_t i) {
+        while (n_waiting > 0) {
+            const int64_t item = pop();
+            if (item < b.n_origins) return s.leaf[item];
+            int level = 1;
+            while (item >= level_begin[level + 1]) ++level;
+            const int64_t begin = level_begin[level - 1] + 8 * (item - level_begin[level]);
+            for (int64_t t = begin; t < minimum(begin + 8, level_begin[level]); ++t) wait(i, t);
+        }
+        return -1;
+    }
+
+    // The viewpoints of component i, which begin at `begin`, nearest first; returns where they end.
     GMM_INLINE int64_t viewpoints(int64_t i, int64_t j, int64_t begin) {
         const int64_t known = i > 0 ? minimum(b.n_viewpoints[j], (int64_t)3) : 0;
         const int64_t n = c.number(slots(Field::VIEWS, b.max_range[i] * 4 + known), b.n_viewpoints[i]);
         b.n_viewpoints[i] = n;
         check(n <= b.n_origins && begin + n <= b.n_seen);
         if (!c.good || n == 0) return begin;
-        for (int64_t o = 0; o < b.n_origins; ++o) {
-            double apart = 0.0;
-            for (int a = 0; a < DIM; ++a) {
-                const double x = (double)b.origins[o * DIM + a] * 0.00390625 - s.place[i * DIM + a];
-                apart = apart + x * x;
-            }
-            s.distance[o] = apart;
-        }
         int64_t* seen = b.seen_from + begin;
         int64_t* share = b.share + begin;
-        int64_t passed = -1;
+        if (WRITES)
+            for (int64_t q = 0; q < n; ++q) s.row[seen[q]] = q + 1;
+        n_waiting = 0;
+        wait(i, level_begin[levels] - 1);
+        int64_t left = b.n_origins;
         bool is_largest = false;  // whether a share of the largest was among them
         for (int64_t q = 0; q < n; ++q) {
-            int64_t left = 0, found = -1, at = q, rank = 0;
-            for (int64_t o = 0; o < b.n_origins; ++o)
-                if (passed < 0 || before(passed, o)) s.rank[left++] = o;
+            int64_t rank = 0, found = 0;
             check(left >= n - q);
-            if (!c.good) return begin;
-            if (WRITES) {
-                for (int64_t x = 0; x < n; ++x)
-                    if ((passed < 0 || before(passed, seen[x])) && (found < 0 || before(seen[x], found)))
-                        found = seen[x], at = x;
-                for (int64_t x = 0; x < left; ++x) rank += before(s.rank[x], found);
-            }
+            if (WRITES)
+                while (c.good && (found = next_origin(i)) >= 0 && s.row[found] == 0) ++rank;
             if (left > n - q) rank = c.number(slots(Field::RANK, minimum(n - q, (int64_t)4) - 1), rank);
             check(rank < left);
+            is_slow = work > c.out.most_steps * (c.at + 4096);
+            check(!is_slow && found >= 0);
             if (!c.good) return begin;
-            if (!WRITES) found = selected(left, rank);
-            int64_t part = WRITES ? share[at] : 0;
+            if (!WRITES)
+                for (int64_t r = 0; r <= rank; ++r) found = next_origin(i);
+            left -= rank + 1;
+            int64_t part = WRITES ? share[s.row[found] - 1] : 0;
             if (n > 1 && (q < n - 1 || is_largest))
                 part = c.number(slots(Field::SHARE, 2 * (n > 2) + is_largest), part);
             check(part <= 15);
             is_largest = is_largest || part == 0;
-            passed = found;
-            if (!WRITES) {  // in the order of `Quantized`
-                int64_t x = q;
-                for (; x > 0 && follows(seen[x - 1], found); --x)
-                    seen[x] = seen[x - 1], share[x] = share[x - 1];
-                seen[x] = found, share[x] = part;
-            }
+            if (!WRITES) seen[q] = found, share[q] = part;
         }
+        if (WRITES)
+            for (int64_t q = 0; q < n; ++q) s.row[seen[q]] = 0;
         return begin + n;
     }
 
@@ -573,19 +482,20 @@ struct Walk {
         c.begin();
         for (int64_t i = 0; i < b.k && c.good; ++i) id(i);
         for (int64_t i = 0; i < b.n_origins && c.good; ++i) origin(i);
+        if (c.good) grow_tree();
         int64_t seen = 0;
         for (int64_t i = 0; i < b.k && c.good; ++i) {
             component(i);
             if (c.good) seen = viewpoints(i, nearest, seen);
         }
         check(seen == b.n_seen);
-        return c.end();
+        return is_slow ? -2 : c.end();
     }
 };
 
 template <int DIM, bool WRITES>
-GMM_KERNEL context_coding(int64_t, Batch batch, Scratch scratch, Stream stream) {
-    Walk<DIM, WRITES> walk{batch, scratch, {scratch, stream, 0, 0, 0, 0, 0, 0, false, true}, 0, 0};
+GMM_KERNEL context_coding(int64_t, Batch batch, Chances chances, Scratch scratch, Stream stream) {
+    Walk<DIM, WRITES> walk{batch, scratch, {chances, stream, 0, 0, 0, 0, 0, 0, false, true}};
     *stream.result = walk.run();
 }
 

@@ -62,7 +62,8 @@ def predictions(components: Components, points: Tensor, cutoff: float = CUTOFF) 
     height = solid.support.double().log() - log_norm
     channels, order = solid.attributes.channels, []
     found: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {name: [] for name in channels}
-    for part, some in portions(asked.detach(), max(1, len(solid)), box_around(solid, cutoff**2)):
+    boxes = box_around(solid, cutoff**2)
+    for part, some in portions(asked.detach(), max(1, len(solid)), boxes) if len(asked) else ():
         offset = asked[part, None] - solid.means[some]
         apart = torch.einsum("kij,nkj->nki", white[some], offset)
         squared = apart.square().sum(-1)

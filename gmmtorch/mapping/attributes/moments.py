@@ -10,7 +10,7 @@ its points have each label. Both are relative to the support of the component.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -20,6 +20,7 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.linalg import pack_symmetric, triangle_indices, unpack_symmetric
 from gmmtorch.mixture import Cells
+from gmmtorch.scan import LARGEST_LABEL
 
 _SLOPE_PRIOR = 3.0  # points, spread like the component, that show no slope
 _NOISE_PRIOR = 1.0  # points that deviate like those of all components
@@ -74,7 +75,8 @@ class Attributes:
         kinds = {frozenset(kind._fields): kind for kind in (Numbers, Labels)}
         if any(frozenset(found) not in kinds for found in parts.values()):
             raise InvalidArgumentError(f"attributes are {', '.join(tensors)}: not those of a channel.")
-        return cls({name: kinds[frozenset(found)](**found) for name, found in parts.items()})
+        made = cls({name: kinds[frozenset(found)](**found) for name, found in parts.items()})
+        return made._of_rows(lambda value: value.double())
 
     def changed(self, change: Callable[[Tensor], Tensor]) -> Attributes:
         """The attributes with `change` applied to each tensor."""
@@ -129,7 +131,7 @@ class Attributes:
         """These attributes, if their shapes and values are those of K components in D dimensions; otherwise
         raises `InvalidArgumentError`."""
         for name, c in self.channels.items():
-            width = c.mean.shape[-1] if isinstance(c, Numbers) else len(c.labels)
+            width = c.covariance.shape[-1:].numel() if isinstance(c, Numbers) else c.labels.numel()
             expected = (
                 {"share": (k,), "mean": (k, width), "slope": (k, width, dim), "covariance": (k, width, width)}
                 if isinstance(c, Numbers)
@@ -141,19 +143,41 @@ class Attributes:
                         f"attributes {name}.{part} have shape {tuple(value.shape)} or NaN; expected finite "
                         f"{expected[part]}."
                     )
-            if bool((c.share < 0).any()):
-                raise InvalidArgumentError(f"attributes {name}.share is negative.")
-            if isinstance(c, Labels) and bool((c.labels.diff() <= 0).any()):
-                raise InvalidArgumentError(f"attributes {name}.labels do not increase.")
+            total = c.share.sum(1) if isinstance(c, Labels) else c.share
+            if bool((c.share < 0).any()) or bool((total > 1 + 1e-6).any()):
+                raise InvalidArgumentError(f"attributes {name}.share is not from 0 to 1.")
+            if isinstance(c, Numbers) and bool((c.covariance.diagonal(dim1=1, dim2=2) < 0).any()):
+                raise InvalidArgumentError(f"attributes {name}.covariance has negative variances.")
+            if isinstance(c, Labels) and (
+                c.labels.is_floating_point()
+                or bool((c.labels.diff() <= 0).any())
+                or bool(((c.labels < 0) | (c.labels > LARGEST_LABEL)).any())
+            ):
+                raise InvalidArgumentError(
+                    f"attributes {name}.labels are not rising whole numbers from 0 to {LARGEST_LABEL}."
+                )
         return self
+
+
+def check_kinds(parts: Iterable[Mapping[str, Channel | Tensor]]) -> None:
+    """Raises `InvalidArgumentError` if a channel of scans or components is numbers in one part and labels in
+    another, or has different numbers of columns."""
+    kinds: dict[str, int] = {}
+    for name, c in ((name, c) for part in parts for name, c in part.items()):
+        values = c.mean if isinstance(c, Numbers) else c.labels if isinstance(c, Labels) else c
+        kind = values.shape[1] if values.is_floating_point() else 0
+        if kinds.setdefault(name, kind) != kind:
+            raise InvalidArgumentError(
+                f"attributes {name!r} are numbers in some scans and labels in others, or have different "
+                "numbers of columns; give one kind."
+            )
 
 
 def _joined(name: str, given: Sequence[Channel | None], sizes: Sequence[int]) -> Channel:
     """One channel of several parts."""
     known = [c for c in given if c is not None]
     first = known[0]
-    if any(type(c) is not type(first) for c in known):
-        raise InvalidArgumentError(f"attributes {name!r} are numbers in some scans and labels in others.")
+    check_kinds({name: c} for c in known)
     if isinstance(first, Labels):
         labels = torch.unique(torch.cat([c.labels for c in known if isinstance(c, Labels)]))
         shares = []
@@ -163,10 +187,6 @@ def _joined(name: str, given: Sequence[Channel | None], sizes: Sequence[int]) ->
                 share[:, torch.searchsorted(labels, c.labels)] = c.share
             shares.append(share)
         return Labels(torch.cat(shares), labels)
-    if len({c[1].shape[1] for c in known}) > 1:
-        raise InvalidArgumentError(
-            f"attributes {name!r} have different numbers of columns in different scans."
-        )
     parts = [
         c if c is not None else Numbers(*(v.new_zeros(n, *v.shape[1:]) for v in first))
         for c, n in zip(given, sizes, strict=True)
@@ -182,6 +202,7 @@ def of_scans(scans: Sequence[Mapping[str, Tensor]], sizes: Sequence[int]) -> dic
 
     Raises `InvalidArgumentError` if a channel has different kinds or columns in the scans.
     """
+    check_kinds(scans)
     found = {}
     for name in dict.fromkeys(name for scan in scans for name in scan):
         first = next(scan[name] for scan in scans if name in scan)
@@ -190,11 +211,6 @@ def of_scans(scans: Sequence[Mapping[str, Tensor]], sizes: Sequence[int]) -> dic
             scan[name] if name in scan else first.new_full((n, *first.shape[1:]), unknown)
             for scan, n in zip(scans, sizes, strict=True)
         ]
-        if len({(part.is_floating_point(), part.shape[1:]) for part in parts}) > 1:
-            raise InvalidArgumentError(
-                f"attributes {name!r} are numbers in some scans and labels in others, or have different "
-                "numbers of columns; give one kind."
-            )
         found[name] = torch.cat(parts)
     return found
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
 from gmmtorch.mapping.attributes.moments import Attributes, Channel, Labels, Numbers
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Ints
-from gmmtorch.scan import COLOUR, LARGEST_LABEL
+from gmmtorch.scan import COLOUR, LARGEST_LABEL, LONGEST_NAME, MOST_CHANNELS, MOST_COLUMNS
 
 BLOCK_VERSION = 1
 _MEAN_STEPS, _SLOPE_STEPS = 2.0, 1.0  # in a deviation
@@ -27,8 +27,8 @@ _MOST_REST = 3  # eighths of the second label
 _DEVIATIONS = -80, 80  # least and largest, in powers of √2
 _LEAST_COLOUR = 2.0**-8  # deviation
 _LEAST_RELATIVE = 2.0**-8  # deviation of other numbers, relative to the mean
-_MOST_CHANNELS, _MOST_COLUMNS, _LONGEST_NAME = 16, 8, 64
 _MOST_STEPS = 1 << 40
+_MOST_SHARES = 1 << 28  # of labels in components, 2 GiB in memory
 _LIGHTNESS = torch.tensor([[1.0, 1.0, 1.0], [1.0, 0.0, -1.0], [1.0, -2.0, 1.0]], dtype=torch.float64)
 _LIGHTNESS = _LIGHTNESS / _LIGHTNESS.norm(dim=1, keepdim=True)
 
@@ -73,8 +73,11 @@ def rounded(
 
 def encode_attributes(attributes: Attributes, covariances: Tensor) -> bytes:
     """The block of the attributes of components with these rounded covariances (K, D, D)."""
+    n = len(attributes.channels)
+    if n > MOST_CHANNELS:
+        raise InvalidArgumentError(f"The map has {n} channels of attributes; {MOST_CHANNELS} can be stored.")
     writer = BitWriter()
-    writer.number(len(attributes.channels))
+    writer.number(n)
     for name, channel in attributes.channels.items():
         _write_name(writer, name)
         steps = _steps(name, channel, covariances)
@@ -85,6 +88,11 @@ def encode_attributes(attributes: Attributes, covariances: Tensor) -> bytes:
                 for column in values.T:
                     writer.column(column.contiguous().numpy())
         else:
+            if channel.share.numel() > _MOST_SHARES:
+                raise InvalidArgumentError(
+                    f"attributes[{name!r}]: {len(steps.share)} components with {len(steps.labels)} labels "
+                    "are too many to be stored; give fewer labels."
+                )
             writer.number(0)
             writer.number(len(steps.labels))
             writer.column(steps.labels.numpy())
@@ -105,9 +113,9 @@ def decode_attributes(data: bytes, covariances: Tensor) -> Attributes:
     reader = BitReader(data[1:])
     k, dim = covariances.shape[:2]
     found: dict[str, Channel] = {}
-    for _ in range(_bounded(reader.number(), "channels", 0, _MOST_CHANNELS)):
+    for _ in range(_bounded(reader.number(), "channels", 0, MOST_CHANNELS)):
         name = _read_name(reader)
-        width = _bounded(reader.number(), "columns", 0, _MOST_COLUMNS)
+        width = _bounded(reader.number(), "columns", 0, MOST_COLUMNS)
         steps = _read_numbers(reader, k, width, dim) if width else _read_labels(reader, k)
         found[name] = _restored(name, steps, covariances)
     reader.finish()
@@ -119,14 +127,14 @@ def decode_attributes(data: bytes, covariances: Tensor) -> Attributes:
 
 def _write_name(writer: BitWriter, name: str) -> None:
     letters = np.frombuffer(name.encode(), np.uint8).astype(np.int64)
-    if not 0 < len(letters) <= _LONGEST_NAME:
-        raise InvalidArgumentError(f"attributes[{name!r}]: a name has 1 to {_LONGEST_NAME} bytes.")
+    if not 0 < len(letters) <= LONGEST_NAME:
+        raise InvalidArgumentError(f"attributes[{name!r}]: a name has 1 to {LONGEST_NAME} bytes.")
     writer.number(len(letters))
     writer.fixed(letters, 8)
 
 
 def _read_name(reader: BitReader) -> str:
-    letters = reader.fixed(_bounded(reader.number(), "letters", 1, _LONGEST_NAME), 8)
+    letters = reader.fixed(_bounded(reader.number(), "letters", 1, LONGEST_NAME), 8)
     return letters.astype(np.uint8).tobytes().decode("utf-8", errors="replace")
 
 
@@ -146,6 +154,8 @@ def _read_numbers(reader: BitReader, k: int, width: int, dim: int) -> _NumberSte
 
 def _read_labels(reader: BitReader, k: int) -> _LabelSteps:
     n_labels = _bounded(reader.number(), "labels", 0, LARGEST_LABEL + 1)
+    if k * n_labels > _MOST_SHARES:
+        raise DataError(f"{k} components with {n_labels} labels are too many to read.")
     labels = _column(reader, n_labels, "labels", 0, LARGEST_LABEL)
     share = _column(reader, k, "shares", 0, _SHARES)
     n = int((share > 0).sum())
@@ -155,8 +165,6 @@ def _read_labels(reader: BitReader, k: int) -> _LabelSteps:
     rest = _column(reader, n, "shares", 0, _MOST_REST)
     second = torch.zeros_like(first)
     second[rest > 0] = _column(reader, int((rest > 0).sum()), "labels", 0, n_labels - 1)
-    if n * n_labels > 1 << 28:
-        raise DataError(f"{n} components with {n_labels} labels are too many to read.")
     return _LabelSteps(share, first, second, rest, labels)
 
 

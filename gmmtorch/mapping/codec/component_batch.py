@@ -41,6 +41,7 @@ from gmmtorch.mapping.codec.quantization import (
     number_after,
     quantize,
     quantize_numbered,
+    ranks,
 )
 from gmmtorch.mapping.components import TENSORS, Components
 from gmmtorch.mapping.learning.rules import LearningRule, changed_options, rule_facts
@@ -142,9 +143,10 @@ def _read(data: bytes, most: int | None) -> Quantized:
     farthest = int(FARTHEST / ORIGIN_STEP)
     if not bool(places.is_valid().all()) or bool((b.origins.abs() > farthest).any()):
         raise DataError("A mean, a covariance or an origin is out of range: it is damaged.")
-    return Quantized(
-        places, b.count, b.max_range.bool(), b.ids, b.origins, b.n_viewpoints, b.seen_from, b.share
-    )
+    rank = torch.from_numpy(ranks(b.origins.numpy()))[b.seen_from]
+    order = torch.argsort(torch.arange(k).repeat_interleave(b.n_viewpoints) * n_origins + rank)
+    seen_from, share = b.seen_from[order], b.share[order]
+    return Quantized(places, b.count, b.max_range.bool(), b.ids, b.origins, b.n_viewpoints, seen_from, share)
 
 
 def coded(values: Quantized, side: int) -> CodedBatch:
@@ -193,8 +195,9 @@ def map_bytes(components: Components, rule: LearningRule, settings: MapSettings,
     facts = _facts(rule, settings, number_after(components.ids, next_number))
     if settings.codec == "float":
         return _exact_file(components, facts)
-    block = encode_attributes(components.attributes, components.covariances) if components.attributes else b""
-    return _container(encode(components), block, facts)
+    c = components.on_cpu()
+    block = encode_attributes(c.attributes, c.covariances) if c.attributes else b""
+    return _container(encode(c), block, facts)
 
 
 def file_size(components: Components, rule: LearningRule, settings: MapSettings, next_number: int) -> int:

@@ -34,6 +34,7 @@ from gmmtorch.mapping.codec.quantization import LARGEST_COUNT, LEAST_SHARE, NO_C
 _NEIGHBOURS = 64  # components before a component among which its neighbours are searched
 _MOST_LEVELS = 52
 _NUMBER = 32  # slots of a number
+_TOO_SLOW = -2  # of the fused kernel
 _MOST_CODED, _MOST_TRAINED = 120, 12  # bits of a slot that count; of those from which its first chance comes
 _LEAST_CHANCE = 64
 _ONE = 1 << 16
@@ -70,6 +71,12 @@ def write_batch(batch: CodedBatch) -> bytes:
     try:
         if is_fused(batch.mean):
             n = context_coding(batch, _tables(), stream, writes=True)
+            if n == _TOO_SLOW:
+                raise InvalidArgumentError(
+                    f"{len(batch.count)} components have viewpoints that are farther than thousands of the "
+                    f"{len(batch.origins)} origins, which takes too long to read; merge components, or write "
+                    'codec="float".'
+                )
             _require(n >= 0)
             return stream[:n].numpy().tobytes().rstrip(b"\0")
         writer = _Writer()
@@ -83,8 +90,9 @@ def write_batch(batch: CodedBatch) -> bytes:
 
 
 def read_batch(batch: CodedBatch, data: bytes) -> None:
-    """Read what `write_batch` wrote into a batch of zeros of the same sizes. Raises `DataError` for other
-    bytes: a batch has one form."""
+    """Read what `write_batch` wrote into a batch of zeros of the same sizes; the viewpoints of a component
+    are nearest first. Raises `DataError` for other bytes, as a batch has one form, and for those that take
+    more time than a batch of that length may; the twin does not bound its time."""
     if is_fused(batch.mean):
         stream = torch.frombuffer(bytearray(data or b"\0"), dtype=torch.uint8)
         _require(context_coding(batch, _tables(), stream, writes=False) >= 0)
@@ -519,7 +527,6 @@ class _Walk:
             passed += 1 + rank
             found.append((order[passed], share))
         if not c.writes:
-            found.sort(key=lambda row: (v["origins"][row[0]], row[0]))
             v["seen_from"][begin:end], v["share"][begin:end] = map(list, zip(*found, strict=True))
         return end
 

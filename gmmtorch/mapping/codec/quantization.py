@@ -129,7 +129,7 @@ def quantize(components: Components) -> Quantized:
     used, seen = np.unique(place[seen], return_inverse=True)
     origins = steps[distinct[used]]
     # Two origins of a component that round to the same place are one viewpoint.
-    rank = _ranks(origins)
+    rank = ranks(origins)
     _, kept, pair = np.unique(by * len(origins) + rank[seen], return_index=True, return_inverse=True)
     seen_count = torch.from_numpy(np.bincount(pair, counts, len(kept)))
     seen_by, seen_from = torch.from_numpy(by[kept]), torch.from_numpy(seen[kept])
@@ -211,11 +211,11 @@ def _first_uses(rows: Ints) -> tuple[Ints, Ints]:
     return first[order], rank[which.reshape(-1)]
 
 
-def _ranks(rows: np.ndarray) -> Ints:
-    """The rank (N,) of each of distinct rows (N, D) in lexicographic order."""
-    ranks = np.empty(len(rows), np.int64)
-    ranks[np.lexsort(rows.T[::-1])] = np.arange(len(rows))
-    return ranks
+def ranks(rows: np.ndarray) -> Ints:
+    """The rank (N,) of each of rows (N, D) in lexicographic order; of equal ones, in the given order."""
+    found = np.empty(len(rows), np.int64)
+    found[np.lexsort(rows.T[::-1])] = np.arange(len(rows))
+    return found
 
 
 def quantized_after(known: Components, rounded: Components, components: Components) -> Components:
@@ -228,7 +228,9 @@ def quantized_after(known: Components, rounded: Components, components: Componen
     k, e, s = len(known), len(known.seen_by), len(known.origins)
     sizes = {"origins": s, "seen_by": e, "seen_from": e, "seen_count": e}
     old = {name: values[: sizes.get(name, k)] for name, values in components.tensors().items()}
-    if not k or not all_equal((old[name], values) for name, values in known.tensors().items()):
+    old |= components.attributes.selected(slice(k)).tensors()
+    given = {**known.tensors(), **known.attributes.tensors()}
+    if not k or old.keys() != given.keys() or not all_equal((old[name], x) for name, x in given.items()):
         return quantized(components)
     if len(components) == k:
         return rounded
@@ -237,7 +239,7 @@ def quantized_after(known: Components, rounded: Components, components: Componen
     origins = both.origins.cpu().numpy()
     distinct, place = (torch.from_numpy(v).to(both.means.device) for v in _first_uses(origins))
     seen_from = place[both.seen_from]
-    rank = torch.from_numpy(_ranks(origins[distinct.cpu().numpy()])).to(seen_from.device)
+    rank = torch.from_numpy(ranks(origins[distinct.cpu().numpy()])).to(seen_from.device)
     order = torch.argsort(both.seen_by * len(distinct) + rank[seen_from])
     return replace(
         both,
