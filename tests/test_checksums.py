@@ -49,7 +49,9 @@ def written_baseline(kind: str, folder: Path) -> Written:
 
 def written_checkpoint(kind: str, folder: Path) -> Written:
     parameters = Parameters(torch.ones(1).double(), cloud()[:1], torch.eye(2).double()[None])
-    write_state(folder / "state.safetensors", State(parameters, cloud()[1], [1.0, 2.0]), {"seed": 1})
+    write_state(
+        folder / "state.safetensors", State(parameters, cloud()[1], [1.0, 2.0]), {"covariance_type": "full"}
+    )
     return folder / "state.safetensors", read_state
 
 

@@ -49,7 +49,7 @@ def _a_new_folder_without_a_screen(tmp_path, monkeypatch):
 
 def test_there_are_examples_and_tutorials():
     assert len(EXAMPLES) >= 6
-    assert sum(page.parent.name == "tutorials" for page in PAGES) == 7
+    assert sum(page.parent.name == "tutorials" for page in PAGES) == 8
 
 
 @pytest.mark.slow

@@ -222,9 +222,9 @@ def show(
 
     made = figures()
     with Board(folder / "tensorboard") if config.report.tensorboard else nullcontext() as board:
+        show_figures(config, made, folder, board)  # first: pictures are kept on a disk that fills up
         if board is not None:
             write(board)
-        show_figures(config, made, folder, board)
 
 
 def print_table(rows: Sequence[Row], columns: Sequence[str], title: str) -> None:

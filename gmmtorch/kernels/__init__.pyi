@@ -1,3 +1,4 @@
+from .choice import KERNELS as KERNELS
 from .choice import is_fused as is_fused
 from .choice import kernels as kernels
 from .choice import use_kernels as use_kernels

@@ -43,6 +43,7 @@ from .gaussian_mixture import GaussianMixture as GaussianMixture
 from .prune_options import PruneOptions as PruneOptions
 from .pruning import density_share as density_share
 from .pruning import prune as prune
+from .reduction import Reduction as Reduction
 from .reduction import merge as merge
 from .reduction import merge_components as merge_components
 from .reduction import simplify as simplify

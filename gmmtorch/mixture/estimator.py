@@ -213,8 +213,9 @@ class MixtureEstimator(MixtureDensity):
             check_weight_scale(weight)
         if reset:
             self._check_component_count(points.shape[0])
+        points = points.contiguous()  # sums round alike for every order in memory
         center = points.mT @ (weight / weight.sum())
-        return Cloud((points - center).contiguous(), weight, center)
+        return Cloud(points - center, weight, center)
 
     def _store_fit(
         self,

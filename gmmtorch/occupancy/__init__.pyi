@@ -32,9 +32,11 @@ from .forms.flux import region_flux as region_flux
 from .forms.monte_carlo import RayBundle as RayBundle
 from .forms.monte_carlo import Sampling as Sampling
 from .forms.monte_carlo import sample_rays as sample_rays
+from .forms.point import ExpectedRange as ExpectedRange
 from .forms.point import KeptEvidence as KeptEvidence
 from .forms.point import PointEvidence as PointEvidence
 from .forms.point import PointForm as PointForm
+from .forms.point import RayHits as RayHits
 from .forms.point import expected_range as expected_range
 from .forms.point import hit_probability as hit_probability
 from .forms.point import listed_points as listed_points

@@ -19,6 +19,7 @@ from .sensors import poses_2d as poses_2d
 from .sensors import poses_3d as poses_3d
 from .sensors import sense as sense
 from .sensors import simulate_scan as simulate_scan
+from .sensors import smooth_path as smooth_path
 from .sensors import spinning_lidar as spinning_lidar
 from .warehouses import warehouse as warehouse
 from .warehouses import warehouse_start as warehouse_start

@@ -5,7 +5,9 @@ from .mission.driver import drive as drive
 from .mission.driver import settle as settle
 from .mission.mission import Mission as Mission
 from .mission.options import THESIS as THESIS
+from .mission.options import Dynamics as Dynamics
 from .mission.options import FrameRule as FrameRule
+from .mission.options import StoppingRule as StoppingRule
 from .mission.options import TeamOptions as TeamOptions
 from .mission.options import WorldOptions as WorldOptions
 from .mission.replay import ReplayMission as ReplayMission
