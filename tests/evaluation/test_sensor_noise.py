@@ -182,6 +182,9 @@ def test_the_noise_model_improves_likelihood_on_real_scans(real_data: Path):
     if not path.is_file():
         pytest.skip(f"{path} is not there")
     study = SensorModelStudy("laser_2d", n_components=(200,), n_points=8000, max_beams=2000, max_iter=15)
-    plain, _, noise, _ = run_sensor_noise("intel", list(load("carmen", path, stride=4)), study)
-    assert noise["held_out_log_likelihood"] > plain["held_out_log_likelihood"]
-    assert noise["thickness"] < plain["thickness"]
+    scans, thinner = list(load("carmen", path, stride=4)), 0.0
+    for seed in range(3):
+        plain, _, noise, _ = run_sensor_noise("intel", scans, study, seed)
+        assert noise["held_out_log_likelihood"] > plain["held_out_log_likelihood"]
+        thinner += plain["thickness"] - noise["thickness"]
+    assert thinner > 0, "on average of the seeds; a single start can be thicker"
