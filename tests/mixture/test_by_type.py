@@ -15,7 +15,7 @@ from torch.utils._pytree import tree_leaves
 from gmmtorch.datasets.point_files.point_chunks import in_memory
 from gmmtorch.errors import GmmTorchError, NumericalError
 from gmmtorch.mixture import GaussianMixture
-from gmmtorch.mixture.em import by_type, loop, variational
+from gmmtorch.mixture.em import by_type, loop, variational_bayes
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.exact import COVARIANCE_TYPES, Parameters, constrain, expand, type_shape
 from gmmtorch.mixture.em.initialization import INITIALIZATIONS, initialize
@@ -229,9 +229,9 @@ def test_variational_moments_of_a_type_are_those_of_features(kind, dim):
     )
     log_weight = torch.tensor([-1.0, -3.0, -0.5], dtype=torch.float64)
     given = (points, points.new_ones(200), log_weight, full, 1e-3, torch.float64)
-    expected, value = variational._expected_moments(em.quadratic_features(points), *given)
+    expected, value = variational_bayes._expected_moments(em.quadratic_features(points), *given)
     factors = by_type.Factors(parameters._replace(weights=full.weights), kind)
-    found, same = variational._typed_moments(*given[:3], factors, 1e-3, torch.float64)
+    found, same = variational_bayes._typed_moments(*given[:3], factors, 1e-3, torch.float64)
     projected = by_type.compacted(expected, kind).covariances
     torch.testing.assert_close(tuple(found), (*expected[:2], projected), rtol=1e-7, atol=1e-8)
     torch.testing.assert_close(same, value)
