@@ -411,7 +411,7 @@ loaded, out = [], sys.stdout
 sys.stdout = Output()
 sys.argv = ["gmmtorch"] + {arguments}
 importlib.import_module({module!r}).main()
-print(sys.stdout.getvalue(), *loaded[0], file=out)
+print(sys.stdout.getvalue(), *loaded[0], file=out, flush=True)  # at exit only sys.stdout is flushed
 print(*sys.modules, file=sys.stderr)
 """
 _UNUSED = {
