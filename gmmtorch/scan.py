@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -228,28 +228,17 @@ class Scan:
 
     def copied(self, device: torch.device | str | None = None) -> Scan:
         """A deep copy, on `device` if given. A reader that reuses its arrays for the next scan needs it."""
-
-        def copy(x: Tensor) -> Tensor:
-            return x.detach().to(device or x.device, copy=True)
-
-        channels = {name: copy(value) for name, value in self.attributes.items()}
-        return self._with(copy(self.points), copy(self.origin), copy(self.no_return), channels)
+        return self._changed(lambda x: x.detach().to(device or x.device, copy=True))
 
     def to(self, device: torch.device | str | None) -> Scan:
         """The scan on another device. None: where it is."""
         with naming_device(device):
-            channels = {name: value.to(device) for name, value in self.attributes.items()}
-            parts = self.points.to(device), self.origin.to(device), self.no_return.to(device)
-            return self._with(*parts, channels)
+            return self._changed(lambda x: x.to(device))
 
-    def _with(
-        self, points: Tensor, origin: Tensor, no_return: Tensor, attributes: Mapping[str, Tensor]
-    ) -> Scan:
-        """The scan with the same numbers in other tensors, which are not checked again."""
+    def _changed(self, change: Callable[[Tensor], Tensor]) -> Scan:
+        """The scan with `change` applied to each tensor: the same numbers, which are not checked again."""
         made = object.__new__(Scan)
         for name, value in vars(self).items():
-            object.__setattr__(made, name, value)
-        for name, value in (("points", points), ("origin", origin), ("no_return", no_return)):
-            object.__setattr__(made, name, value)
-        object.__setattr__(made, "attributes", attributes)
+            object.__setattr__(made, name, change(value) if isinstance(value, Tensor) else value)
+        object.__setattr__(made, "attributes", {name: change(x) for name, x in self.attributes.items()})
         return made
