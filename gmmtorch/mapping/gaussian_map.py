@@ -242,13 +242,11 @@ class GaussianMap(MapState):
     def components(self) -> Components:
         """All components as the codec rounds them, with those of the unfinished window."""
         if self._rounded is None:
-            learned, known, rounded = self.unrounded(), *self._rounded_final()
-            is_known = self.codec == "float" or not self.n_pending
-            self._rounded = (
-                (learned if self.codec == "float" else rounded)
-                if is_known
-                else quantized_after(known, rounded, learned)
-            )
+            learned, (known, rounded) = self.unrounded(), self._rounded_final()
+            if self.codec == "float":
+                self._rounded = learned
+            else:
+                self._rounded = quantized_after(known, rounded, learned) if self.n_pending else rounded
         return self._rounded
 
     def _rounded_final(self) -> tuple[Components, Components]:
