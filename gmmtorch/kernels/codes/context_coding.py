@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -47,10 +47,6 @@ class CodedBatch:
     def dim(self) -> int:
         return self.mean.shape[1]
 
-    def arrays(self) -> dict[str, Tensor]:
-        """All but the side."""
-        return {field.name: getattr(self, field.name) for field in fields(self)[1:]}
-
 
 class ChanceTables(NamedTuple):
     """chances, n_coded (N,), int32: of each slot, the probability of a 0 in 1/65536, and how many bits it has
@@ -77,7 +73,7 @@ def context_coding(batch: CodedBatch, tables: ChanceTables, stream: Tensor, writ
     sizes = k, n_origins, len(batch.seen_from), batch.side
     slots = (*tables[:3], len(tables.rates) - 1, tables.first_slot)
     scratch = (*slots, leaf, box, distance, waiting, row, place, normal, batch.cells)
-    values = list(batch.arrays().values())[:-1]  # cells are scratch
+    values = list(vars(batch).values())[1:-1]  # without side and cells
     kernel = _CODINGS[batch.dim, writes]
     kernel(1, *sizes, *values, *scratch, stream, len(stream), MOST_STEPS, result, device=result.device)
     return int(result)

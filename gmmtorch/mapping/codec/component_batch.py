@@ -104,7 +104,11 @@ def _values(data: bytes, most: int | None = None) -> Quantized:
     if zlib.crc32(body) != int.from_bytes(checksum, "little"):
         raise DataError("The batch of components does not match its checksum: it is truncated or damaged.")
     rest = body[_VERSION_BYTES:]
-    return read_first(rest) if body[0] == FIRST_VERSION else _read(rest, most)
+    found = read_first(rest) if body[0] == FIRST_VERSION else _read(rest, most)
+    farthest = int(FARTHEST / ORIGIN_STEP)
+    if not bool(found.places.is_valid().all()) or bool((found.origins.abs() > farthest).any()):
+        raise DataError("A mean, a covariance or an origin is out of range: it is damaged.")
+    return found
 
 
 def _read(data: bytes, most: int | None) -> Quantized:
@@ -140,9 +144,6 @@ def _read(data: bytes, most: int | None) -> Quantized:
     b = CodedBatch(side, **{name: torch.zeros(shape, dtype=torch.int64) for name, shape in rows.items()})
     read_batch(b, stream)
     places = Lattice(b.axis_order, b.deviation, b.shear, b.mean)
-    farthest = int(FARTHEST / ORIGIN_STEP)
-    if not bool(places.is_valid().all()) or bool((b.origins.abs() > farthest).any()):
-        raise DataError("A mean, a covariance or an origin is out of range: it is damaged.")
     rank = torch.from_numpy(ranks(b.origins.numpy()))[b.seen_from]
     order = torch.argsort(torch.arange(k).repeat_interleave(b.n_viewpoints) * n_origins + rank)
     seen_from, share = b.seen_from[order], b.share[order]

@@ -79,7 +79,7 @@ def write_batch(batch: CodedBatch) -> bytes:
                 )
             _require(n >= 0)
             return stream[:n].numpy().tobytes().rstrip(b"\0")
-        writer = _Writer()
+        writer = _RangeCoder()
         _Walk(writer, batch).run()
         return writer.to_bytes().rstrip(b"\0")
     except DataError as error:
@@ -97,7 +97,7 @@ def read_batch(batch: CodedBatch, data: bytes) -> None:
         stream = torch.frombuffer(bytearray(data or b"\0"), dtype=torch.uint8)
         _require(context_coding(batch, _tables(), stream, writes=False) >= 0)
     else:
-        _Walk(_Reader(data), batch).run()
+        _Walk(_RangeCoder(data), batch).run()
     _require(write_batch(batch) == data.rstrip(b"\0"))
 
 
@@ -125,24 +125,50 @@ def first_tables() -> ChanceTables:
 
 
 class _RangeCoder:
-    """What a writer and a reader have in common: numbers as bits in slots."""
+    """Numbers as bits in slots: written, or read from `data`.
 
-    def __init__(self) -> None:
+    writes: whether a value that is given is written; otherwise it is unused.
+    """
+
+    def __init__(self, data: bytes | None = None) -> None:
         tables = first_tables()
         self.chances, self.n_coded = tables.chances.tolist(), tables.n_coded.tolist()
         self._rates, first = tables.rates.tolist(), tables.first_slot.tolist()
         self.first = dict(zip(FIELDS, first, strict=True))
-        self.range = (1 << 32) - 1
+        self.writes, self._range = data is None, (1 << 32) - 1
+        self._at = 4  # bytes written, with those of the range; or read
+        self._data = data or b""
+        # Where the range begins, of all bytes written; or how far above that the bytes read are.
+        self._place = int.from_bytes(self._data[:4].ljust(4, b"\0"), "big")
 
     def bit(self, slot: int, value: int) -> int:
         """A bit; `value` is what a writer writes."""
         chance, n = self.chances[slot], self.n_coded[slot]
-        value = self._split((self.range >> 16) * chance, value)
+        bound = (self._range >> 16) * chance
+        value = value if self.writes else int(self._place >= bound)
+        self._move(bound if value else 0, self._range - bound if value else bound)
         moved = chance + (((0 if value else _ONE) - chance) * self._rates[n] >> 16)
         self.chances[slot] = min(max(moved, _LEAST_CHANCE), _ONE - _LEAST_CHANCE)
         self.n_coded[slot] = min(n + 1, _MOST_CODED)
-        self._renew()
         return value
+
+    def _move(self, step: int, width: int) -> None:
+        """To the part of the range that begins after `step`, of this width; then to the next bytes."""
+        self._place, self._range = self._place + (step if self.writes else -step), width
+        while self._range < 1 << 24:
+            self._range <<= 8
+            following = self._data[self._at : self._at + 1]  # none at the end, where zeros are not written
+            self._place = self._place << 8 | int.from_bytes(following, "big")
+            self._place &= -1 if self.writes else 0xFFFFFFFF
+            self._at += 1
+
+    def to_bytes(self) -> bytes:
+        """Of the numbers that say the same, the one with most zeros at its end."""
+        last = self._place
+        for n in range(1, 32):
+            rounder = (self._place + (1 << n) - 1) >> n << n
+            last = rounder if rounder < self._place + self._range else last
+        return last.to_bytes(self._at, "big")
 
     def raw(self, n: int, value: int) -> int:
         """n bits without slots, highest first, eight at a time."""
@@ -150,9 +176,10 @@ class _RangeCoder:
         while n > 0:
             width = min(n, 8)
             n -= width
-            self.range >>= width
-            found = found << width | self._part(value >> n & (1 << width) - 1, width)
-            self._renew()
+            size, most = self._range >> width, (1 << width) - 1
+            part = value >> n & most if self.writes else min(self._place // size, most)
+            self._move(part * size, size)
+            found = found << width | part
         return found
 
     def tree(self, first: int, n: int, value: int) -> int:
@@ -188,73 +215,6 @@ class _RangeCoder:
         size = self.number(first, abs(value) - 1) + 1
         return -size if negative else size
 
-    def _split(self, bound: int, value: int) -> int:
-        raise NotImplementedError
-
-    def _part(self, value: int, width: int) -> int:
-        raise NotImplementedError
-
-    def _renew(self) -> None:
-        raise NotImplementedError
-
-
-class _Writer(_RangeCoder):
-    writes = True
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._low = self._n = 0  # of all bytes so far: the number, and their count
-
-    def _split(self, bound: int, value: int) -> int:
-        self._low += bound if value else 0
-        self.range = self.range - bound if value else bound
-        return value
-
-    def _part(self, value: int, width: int) -> int:
-        self._low += self.range * value
-        return value
-
-    def _renew(self) -> None:
-        while self.range < 1 << 24:
-            self.range <<= 8
-            self._low <<= 8
-            self._n += 1
-
-    def to_bytes(self) -> bytes:
-        """Of the numbers that say the same, the one with most zeros at its end."""
-        last = self._low
-        for n in range(1, 32):
-            rounder = (self._low + (1 << n) - 1) >> n << n
-            last = rounder if rounder < self._low + self.range else last
-        return last.to_bytes(self._n + 4, "big")
-
-
-class _Reader(_RangeCoder):
-    writes = False
-
-    def __init__(self, data: bytes) -> None:
-        super().__init__()
-        self._data, self._at = data, 4
-        self._code = int.from_bytes(data[:4].ljust(4, b"\0"), "big")
-
-    def _split(self, bound: int, value: int) -> int:
-        value = int(self._code >= bound)
-        self._code -= bound if value else 0
-        self.range = self.range - bound if value else bound
-        return value
-
-    def _part(self, value: int, width: int) -> int:
-        found = min(self._code // self.range, (1 << width) - 1)
-        self._code -= found * self.range
-        return found
-
-    def _renew(self) -> None:
-        while self.range < 1 << 24:
-            self.range <<= 8
-            byte = self._data[self._at] if self._at < len(self._data) else 0  # zeros are not written
-            self._code = (self._code << 8 | byte) & 0xFFFFFFFF
-            self._at += 1
-
 
 # -- the twin: the model ---------------------------------------------------------------------------------
 
@@ -265,12 +225,12 @@ class _Walk:
     Contexts and predictions are stated in docs/formats.md.
     """
 
-    def __init__(self, coder: _Writer | _Reader, batch: CodedBatch) -> None:
+    def __init__(self, coder: _RangeCoder, batch: CodedBatch) -> None:
         self.c, self.b, self.dim, self.side = coder, batch, batch.dim, batch.side
         self.places, self.normals = np.zeros(batch.mean.shape), np.zeros(batch.mean.shape)
         self.offset = offset_of(self.side)
         # Lists of Python numbers, which are faster one by one than arrays.
-        self.v = {name: array.tolist() for name, array in batch.arrays().items()}
+        self.v = {name: array.tolist() for name, array in vars(batch).items() if name != "side"}
         self.last = self.dim - 1
 
     def run(self) -> None:
@@ -285,7 +245,7 @@ class _Walk:
             near = self._component(i)
             begin = self._viewpoints(i, near, begin)
         _require(begin == len(v["seen_from"]))
-        if isinstance(self.c, _Reader):
+        if not self.c.writes:
             for name, values in v.items():
                 found = getattr(self.b, name)
                 found.copy_(torch.tensor(values, dtype=torch.int64).reshape(found.shape))

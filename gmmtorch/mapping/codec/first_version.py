@@ -28,7 +28,6 @@ from gmmtorch.mapping.codec.quantization import (
     LARGEST_COUNT,
     LEAST_SHARE,
     NO_COUNT,
-    ORIGIN_STEP,
     Quantized,
     ints,
 )
@@ -52,13 +51,10 @@ def read_first(data: bytes) -> Quantized:
     axis_order = _within(reader.fixed(k, _ORDER_BITS[dim]), "axis orders", 0, len(AXIS_ORDERS[dim]) - 1)
     ids = np.stack([reader.column(k), reader.column(k) + np.arange(k)], 1)
     places = _read_means(reader, *_read_covariances(reader, axis_order, dim))
-    if not bool(places.is_valid().all()):
-        raise DataError("A mean or a covariance is out of range: it is damaged.")
     count = _within(reader.column(k), "counts", NO_COUNT, LARGEST_COUNT)
     max_range = _within(reader.column(k), "max_range flags", 0, 1)
     n_viewpoints, seen_from, share = _read_viewpoints(reader, k, n_origins)
-    farthest = int(FARTHEST / ORIGIN_STEP)
-    origins = [_within(reader.column(n_origins), "origins", -farthest, farthest) for _ in range(dim)]
+    origins = [reader.column(n_origins) for _ in range(dim)]
     reader.finish()
     return Quantized(
         places=places,
