@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mapping.attributes.moments import Channel, Labels
+from gmmtorch.mapping.attributes.moments import Channel, Labels, overall
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.novelty import box_around, portions
 from gmmtorch.occupancy import whitening
@@ -128,11 +128,5 @@ def _overall(channel: Channel, support: Tensor) -> tuple[Tensor, Tensor]:
         total = support @ channel.share
         mean = (total / total.sum().clamp_min(torch.finfo(total.dtype).tiny))[None]
         return mean, mean * (1 - mean)
-    weight = support * channel.share
-    if not bool(weight.sum() > 0):
-        none = channel.mean.new_zeros(1, channel.mean.shape[1])
-        return none, none + 1
-    weight = weight / weight.sum()
-    mean = weight @ channel.mean
-    around = channel.covariance.diagonal(dim1=1, dim2=2) + (channel.mean - mean).square()
-    return mean[None], (weight @ around)[None]
+    mean, variance = overall(channel, support)
+    return mean[None], variance[None]

@@ -396,11 +396,8 @@ def joint_moments(
     for c in attributes.channels.values():
         if not isinstance(c, Numbers):
             continue
-        weight = weights * c.share
-        total = weight.sum().clamp_min(torch.finfo(weight.dtype).tiny)
-        middle = (weight @ c.mean) / total
-        around = c.covariance.diagonal(dim1=1, dim2=2) + (c.mean - middle).square()
-        scale = _SMALL / ((weight @ around) / total).sqrt().clamp_min(1e-30)
+        middle, variance = overall(c, weights)
+        scale = _SMALL / variance.sqrt().clamp_min(1e-30)
         has = (c.share > 0)[:, None]
         mean = torch.where(has, (c.mean - middle) * scale, 0.0)
         slope = torch.where(has[..., None], c.slope * scale[:, None], 0.0)
@@ -411,6 +408,15 @@ def joint_moments(
         padded[:, :, :dim] = slope
         means, covariances = _joint(Numbers(c.share, mean, padded, noise), means, covariances)
     return means, covariances
+
+
+def overall(c: Numbers, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and variance (A,) of a channel in K components with supports (K,); 0 and 1 if none has values."""
+    weight = weights * c.share
+    total = weight.sum().clamp_min(torch.finfo(weight.dtype).tiny)
+    mean = (weight @ c.mean) / total
+    around = c.covariance.diagonal(dim1=1, dim2=2) + (c.mean - mean).square()
+    return mean, torch.where(weight.any(), (weight @ around) / total, 1.0)
 
 
 def _ratio(values: Tensor, total: Tensor) -> Tensor:

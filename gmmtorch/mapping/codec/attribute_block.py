@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
 from gmmtorch.mapping.attributes.moments import Attributes, Channel, Labels, Numbers
-from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Ints
+from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, within
 from gmmtorch.scan import COLOUR, LARGEST_LABEL, LONGEST_NAME, MOST_CHANNELS, MOST_COLUMNS
 
 BLOCK_VERSION = 1
@@ -169,11 +169,7 @@ def _read_labels(reader: BitReader, k: int) -> _LabelSteps:
 
 
 def _column(reader: BitReader, n: int, name: str, least: int, largest: int) -> Tensor:
-    values: Ints = reader.column(n)
-    if n:
-        _bounded(int(values.min()), name, least, largest)
-        _bounded(int(values.max()), name, least, largest)
-    return torch.from_numpy(values)
+    return torch.from_numpy(within(reader.column(n), f"{name} of the attributes", least, largest))
 
 
 def _bounded(value: int, name: str, least: int, largest: int) -> int:
@@ -195,8 +191,7 @@ def _at(channel: Channel, shift: Tensor) -> Channel:
 def _steps(name: str, channel: Channel, covariances: Tensor) -> _NumberSteps | _LabelSteps:
     if isinstance(channel, Labels):
         return _label_steps(channel)
-    share = (channel.share * _SHARES).round().long().clamp(0, _SHARES)
-    share = torch.where((channel.share > 0) & (share == 0), 1, share)
+    share = _share_steps(channel.share)
     rows = share > 0
     basis = _basis(name, channel.mean)
     given = channel.mean[rows] @ basis.T
@@ -218,15 +213,18 @@ def _steps(name: str, channel: Channel, covariances: Tensor) -> _NumberSteps | _
     )
 
 
+def _share_steps(share: Tensor) -> Tensor:
+    """Shares (K,) in eighths; 0 only for none."""
+    return torch.where(share > 0, (share * _SHARES).round().long().clamp(1, _SHARES), 0)
+
+
 def _log(noise: Tensor) -> Tensor:
     """Deviations as whole powers of √2."""
     return (2 * noise.clamp_min(1e-30).log2()).round().long()
 
 
 def _label_steps(channel: Labels) -> _LabelSteps:
-    total = channel.share.sum(1)
-    share = (total * _SHARES).round().long().clamp(0, _SHARES)
-    share = torch.where((total > 0) & (share == 0), 1, share)
+    share = _share_steps(channel.share.sum(1))
     rows = share > 0
     own = channel.share[rows]
     own = own / own.sum(1, keepdim=True).clamp_min(torch.finfo(own.dtype).tiny)

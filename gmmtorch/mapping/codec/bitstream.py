@@ -278,6 +278,13 @@ class BitReader:
         return unzigzag(self.rice(len(scales), np.maximum(scales - t, 0)))
 
 
+def within(values: Ints, name: str, least: int, largest: int) -> Ints:
+    """The values, if all are from `least` to `largest`; otherwise raises `DataError`."""
+    if len(values) and not (int(values.min()) >= least and int(values.max()) <= largest):
+        raise DataError(f"The {name} reach from {values.min()} to {values.max()}, not {least} to {largest}.")
+    return values
+
+
 def _bit_places(width: Ints) -> tuple[Ints, Ints]:
     """For each bit of numbers of these widths, highest first: the number's row, and the bit's exponent."""
     which = np.repeat(np.arange(len(width)), width)

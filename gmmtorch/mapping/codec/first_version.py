@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gmmtorch.errors import DataError
-from gmmtorch.mapping.codec.bitstream import BitReader, Ints
+from gmmtorch.mapping.codec.bitstream import BitReader, Ints, within
 from gmmtorch.mapping.codec.lattice import (
     AXIS_ORDERS,
     LARGEST_DEVIATION,
@@ -48,11 +48,11 @@ def read_first(data: bytes) -> Quantized:
     if min(k, n_origins) < 0:
         raise DataError(f"{k} components and {n_origins} origins are announced.")
     reader.require(max(k * _ORDER_BITS[dim], n_origins))
-    axis_order = _within(reader.fixed(k, _ORDER_BITS[dim]), "axis orders", 0, len(AXIS_ORDERS[dim]) - 1)
+    axis_order = within(reader.fixed(k, _ORDER_BITS[dim]), "axis orders", 0, len(AXIS_ORDERS[dim]) - 1)
     ids = np.stack([reader.column(k), reader.column(k) + np.arange(k)], 1)
     places = _read_means(reader, *_read_covariances(reader, axis_order, dim))
-    count = _within(reader.column(k), "counts", NO_COUNT, LARGEST_COUNT)
-    max_range = _within(reader.column(k), "max_range flags", 0, 1)
+    count = within(reader.column(k), "counts", NO_COUNT, LARGEST_COUNT)
+    max_range = within(reader.column(k), "max_range flags", 0, 1)
     n_viewpoints, seen_from, share = _read_viewpoints(reader, k, n_origins)
     origins = [reader.column(n_origins) for _ in range(dim)]
     reader.finish()
@@ -71,9 +71,9 @@ def read_first(data: bytes) -> Quantized:
 def _read_covariances(reader: BitReader, axis_order: Ints, dim: int) -> tuple[Tensor, Tensor, Tensor]:
     """Reads axis orders, deviations and shears."""
     k = len(axis_order)
-    deviation = [_within(reader.column(k), "deviations", LEAST_DEVIATION, LARGEST_DEVIATION)]
+    deviation = [within(reader.column(k), "deviations", LEAST_DEVIATION, LARGEST_DEVIATION)]
     for _ in range(1, dim):
-        deviation.append(deviation[-1] - _within(reader.column(k), "deviations", 0, LARGEST_RATIO))
+        deviation.append(deviation[-1] - within(reader.column(k), "deviations", 0, LARGEST_RATIO))
     steps = torch.from_numpy(np.stack(deviation, 1))
     exponents = ints(shear_exponents(steps))
     shear = [reader.scaled(-exponents[:, pair]) for pair in range(exponents.shape[1])]
@@ -88,7 +88,7 @@ def _read_means(reader: BitReader, axis_order: Tensor, deviation: Tensor, shear:
     reach = 2 * FARTHEST / 2.0**exponent + 2 if abs(exponent) <= _LARGEST_SIDE else 0.0
     if max(map(abs, least + extent)) > reach or min(extent) < 1 or math.prod(extent) >> _RASTER_BITS:
         raise DataError(f"Cells of side 2^{exponent} m, {extent} of them from {least} on: out of range.")
-    number = _within(reader.column(k), "cells", 0, math.prod(extent) - 1)
+    number = within(reader.column(k), "cells", 0, math.prod(extent) - 1)
     cells = np.empty((k, dim), np.int64)
     for axis in reversed(range(dim)):
         number, cells[:, axis] = np.divmod(number, extent[axis])
@@ -105,27 +105,20 @@ def _read_means(reader: BitReader, axis_order: Tensor, deviation: Tensor, shear:
 
 
 def _read_viewpoints(reader: BitReader, k: int, n_origins: int) -> tuple[Ints, Ints, Ints]:
-    n_viewpoints = _within(reader.column(k), "viewpoints", 0, n_origins)
+    n_viewpoints = within(reader.column(k), "viewpoints", 0, n_origins)
     reader.require(int(n_viewpoints.sum(dtype=np.float64)) - k)  # shares take at least a bit each
     is_first = _firsts(n_viewpoints)
     first = reader.column(int(is_first.sum()))
     step = np.zeros(len(is_first), np.int64)
-    step[~is_first] = _within(reader.column(int((~is_first).sum())), "steps", -n_origins, n_origins)
+    step[~is_first] = within(reader.column(int((~is_first).sum())), "steps", -n_origins, n_origins)
     total = np.cumsum(step)
     start = first - total[is_first]  # the steps of a component begin at its own first origin
     seen_from = total + np.repeat(start, n_viewpoints[n_viewpoints > 0])
-    _within(seen_from, "origins seen from", 0, n_origins - 1)
+    within(seen_from, "origins seen from", 0, n_origins - 1)
     several = np.repeat(n_viewpoints, n_viewpoints) > 1
     share = np.zeros(len(seen_from), np.int64)
-    share[several] = _within(reader.rice_column(int(several.sum())), "shares", 0, LEAST_SHARE)
+    share[several] = within(reader.rice_column(int(several.sum())), "shares", 0, LEAST_SHARE)
     return n_viewpoints, seen_from, share
-
-
-def _within(values: Ints, name: str, least: int, largest: int) -> Ints:
-    """The values, if all are from `least` to `largest`; otherwise raises `DataError`."""
-    if len(values) and not (int(values.min()) >= least and int(values.max()) <= largest):
-        raise DataError(f"The {name} reach from {values.min()} to {values.max()}, not {least} to {largest}.")
-    return values
 
 
 def _firsts(n_viewpoints: Ints) -> NDArray[np.bool_]:

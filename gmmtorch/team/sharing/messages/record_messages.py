@@ -339,8 +339,10 @@ def _check_sender(sender: int, incarnation: int) -> None:
 
 
 def keys_in(datagram: bytes) -> Intervals:
-    """The keys of the records in a datagram that a replica has sent or merged. Raises
-    `DataError` if it is no datagram of `RECORD_KINDS`."""
+    """The keys of the records in a datagram that a replica has sent or merged.
+
+    Raises `DataError` if it is no datagram of `RECORD_KINDS`.
+    """
     kind, body = parse_datagram(datagram)
     if kind is Kind.COMPONENTS:
         return Intervals.of(keys_of(ids_of_batch(body)))
