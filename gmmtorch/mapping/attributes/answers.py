@@ -108,7 +108,7 @@ def _placed(
     points: Tensor,
 ) -> Prediction:
     """The prediction for all points from that for some rows of them, in portions."""
-    mean, variance = _overall(channel, support)
+    mean, variance = overall(channel, support)
     mean, variance = (value.expand(len(points), -1).clone() for value in (mean, variance))
     known = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     if parts:
@@ -120,13 +120,3 @@ def _placed(
     if name == COLOUR:
         mean = mean.clamp(0, 1)
     return Prediction(mean, variance, known, channel.labels if isinstance(channel, Labels) else None)
-
-
-def _overall(channel: Channel, support: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and variance (1, A) of a channel in the whole map; 0 and 1 if no component has values."""
-    if isinstance(channel, Labels):
-        total = support @ channel.share
-        mean = (total / total.sum().clamp_min(torch.finfo(total.dtype).tiny))[None]
-        return mean, mean * (1 - mean)
-    mean, variance = overall(channel, support)
-    return mean[None], variance[None]

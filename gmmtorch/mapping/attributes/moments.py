@@ -410,13 +410,18 @@ def joint_moments(
     return means, covariances
 
 
-def overall(c: Numbers, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and variance (A,) of a channel in K components with supports (K,); 0 and 1 if none has values."""
+def overall(c: Channel, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and variance (A,) of a channel in K components with supports (K,), or of each label's probability;
+    of numbers 0 and 1 if no component has any."""
+    if isinstance(c, Labels):
+        total = weights @ c.share
+        mean = _ratio(total, total.sum())
+        return mean, mean * (1 - mean)
     weight = weights * c.share
-    total = weight.sum().clamp_min(torch.finfo(weight.dtype).tiny)
-    mean = (weight @ c.mean) / total
+    total = weight.sum()
+    mean = _ratio(weight @ c.mean, total)
     around = c.covariance.diagonal(dim1=1, dim2=2) + (c.mean - mean).square()
-    return mean, torch.where(weight.any(), (weight @ around) / total, 1.0)
+    return mean, torch.where(total > 0, _ratio(weight @ around, total), 1.0)
 
 
 def _ratio(values: Tensor, total: Tensor) -> Tensor:
