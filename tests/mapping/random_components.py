@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from hypothesis import strategies as st
 from torch import Tensor
 
 from gmmtorch.mapping.components import Components
@@ -102,3 +103,17 @@ def counts_add_up(components: Components) -> bool:
     total = torch.zeros(len(components), dtype=torch.float64)
     total.index_add_(0, components.seen_by, components.seen_count)
     return torch.allclose(total, components.support, rtol=1e-9)
+
+
+drawn = st.builds(
+    random_components,
+    dim=st.sampled_from([2, 3]),
+    k=st.integers(0, 30),
+    seed=st.integers(0, 10**6),
+    center=st.sampled_from([0.0, -3.7, 5e5, 4.2e6]),
+    extent=st.sampled_from([0.0, 1.0, 300.0, 2e4]),
+    deviations=st.sampled_from([(1e-4, 100.0), (5e-3, 1.0), (0.1, 0.1), (1e-4, 1e-3), (20.0, 5e3)]),
+    counts=st.sampled_from([(0.01, 1e9), (1.0, 100.0)]),
+    n_origins=st.integers(3, 40),
+    max_sightings=st.integers(1, 3),
+)

@@ -1,0 +1,237 @@
+"""Batches of components: damaged and earlier ones, and the two coders."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import math
+import zlib
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from kernels.twins import by_both
+from mapping.first_version_batches import FIRST_VERSION
+from mapping.map_cases import assert_same_components
+from mapping.random_components import drawn, random_components
+
+from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.kernels.codes import context_coding
+from gmmtorch.mapping.codec import context_model
+from gmmtorch.mapping.codec.bitstream import BitWriter
+from gmmtorch.mapping.codec.component_batch import decode, encode
+from gmmtorch.mapping.codec.quantization import quantized, spatial_order
+from gmmtorch.mapping.components import Components
+
+dims = pytest.mark.parametrize("dim", [2, 3])
+
+# -- damaged batches -----------------------------------------------------------------------------------
+
+
+def sealed(body: bytes) -> bytes:
+    """The body with a valid checksum."""
+    return body + zlib.crc32(body).to_bytes(4, "little")
+
+
+@pytest.fixture(scope="module")
+def sound() -> bytes:
+    return encode(random_components(3, k=12))
+
+
+def test_every_cut_and_every_flipped_bit_is_refused(sound):
+    for length in range(len(sound)):
+        with pytest.raises(DataError):
+            decode(sound[:length])
+    for bit in range(8 * len(sound)):
+        damaged = bytearray(sound)
+        damaged[bit // 8] ^= 1 << bit % 8
+        with pytest.raises(DataError):
+            decode(bytes(damaged))
+
+
+def test_bytes_after_a_batch_are_refused(sound):
+    for longer in (sound + b"\0", sealed(sound[:-4] + b"\0"), sealed(sound[:-4] + b"\1\2\3")):
+        with pytest.raises(DataError):
+            decode(longer)
+
+
+def test_another_version_is_refused_by_name(sound):
+    with pytest.raises(DataError, match="version 9"):
+        decode(sealed(b"\x09" + sound[1:-4]))
+
+
+@settings(max_examples=120)
+@given(
+    changes=st.lists(
+        st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), min_size=1, max_size=4
+    ),
+    cut=st.sampled_from([0, 0, 1, 8]),
+)
+def test_forged_batches_are_refused_or_decode_to_valid_components(sound, changes, cut):
+    body = bytearray(sound[:-4])
+    for place, value in changes:
+        body[1 + int(place * (len(body) - 1))] = value
+    try:
+        found = decode(sealed(bytes(body[: len(body) - cut])))
+    except DataError:
+        return
+    found.checked()
+    assert bool((found.seen_count >= 0).all())
+    assert_same_components(decode(encode(found)), quantized(found))
+
+
+@pytest.mark.parametrize("k", [2**20, 2**40, 2**61])
+@pytest.mark.parametrize("what", ["components", "origins"])
+@pytest.mark.parametrize("version", [1, 2])
+def test_forged_array_lengths_allocate_no_memory(k, what, version):
+    writer = BitWriter()
+    if version == 2:
+        writer.one(1 << 5, 6)  # 3D, cells of 2⁻²⁰ m
+    sizes = (k, 1) if what == "components" else (1, k)
+    for number in (*sizes, 0) if version == 2 else (3, *sizes):
+        writer.number(number)
+    with pytest.raises(DataError, match=r"announced|it is damaged"):
+        decode(sealed(bytes([version]) + writer.to_bytes() + bytes(2000)))
+
+
+@pytest.mark.parametrize("n", [1, 60, 500])
+def test_streams_that_end_in_any_number_of_zeros_are_decoded(n):
+    """Equal counts of many origins cost almost nothing: zeros remain beyond what a reader looks ahead."""
+    one = random_components(3, k=1, n_origins=n, max_sightings=1)
+    count = torch.ones(n, dtype=torch.float64)
+    every = torch.arange(n)
+    made = replace(one, seen_by=0 * every, seen_from=every, seen_count=count, support=count.sum()[None])
+    for found in by_both(lambda: decode(encode(made))):
+        assert_same_components(found, quantized(made))
+
+
+def test_a_limit_on_components_is_kept_before_they_are_read(sound):
+    assert len(decode(sound, most=40)) == 12
+    with pytest.raises(DataError, match="12 components and"):
+        decode(sound, most=11)
+
+
+def seen_from_afar(n: int, nearest: bool) -> Components:
+    """n components, each seen from an origin of its own beside it, or from a random one."""
+    generator = torch.Generator().manual_seed(0)
+    c = random_components(3, k=n, n_origins=n, max_sightings=1, extent=100.0)
+    every = torch.arange(n)
+    origins = c.means + 0.1 if nearest else c.means[torch.randperm(n, generator=generator)] + 0.1
+    return replace(c, origins=origins, seen_by=every, seen_from=every, seen_count=c.support)
+
+
+def test_steps_do_not_grow_with_components_times_origins(monkeypatch):
+    """Origins that are near cost few steps; a batch that takes many for each byte is neither written nor
+    read."""
+    near, far = seen_from_afar(4000, nearest=True), seen_from_afar(4000, nearest=False)
+    bytes_of_far = encode(far)
+    monkeypatch.setattr(context_coding, "MOST_STEPS", 32)
+    assert_same_components(decode(encode(near)), quantized(near))
+    with pytest.raises(InvalidArgumentError, match="4000 components have viewpoints"):
+        encode(far)
+    with pytest.raises(DataError, match="damaged"):
+        decode(bytes_of_far)
+
+
+@dims
+def test_origins_at_equal_distances_are_ranked_as_the_twin_ranks_them(dim):
+    """Components in the middle of a grid of origins, eight or more of which are equally far."""
+    axis = torch.arange(-3.0, 4.0, dtype=torch.float64)
+    origins = torch.cartesian_prod(*[axis] * dim)
+    n = len(origins)
+    c = random_components(dim, k=12, n_origins=n, max_sightings=1)
+    seen_from = torch.randint(n, (12, 40), generator=torch.Generator().manual_seed(1)).flatten()
+    c = replace(
+        c,
+        means=(c.means * 0.1).round(),
+        origins=origins[torch.randperm(n, generator=torch.Generator().manual_seed(2))],
+        seen_by=torch.arange(12).repeat_interleave(40),
+        seen_from=seen_from,
+        seen_count=(c.support / 40).repeat_interleave(40),
+    )
+    twin, fused = by_both(lambda: encode(c))
+    assert twin == fused
+    for found in by_both(lambda: decode(fused)):
+        assert_same_components(found, quantized(c))
+
+
+# -- earlier versions and the two coders -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", sorted(FIRST_VERSION))
+def test_batches_of_version_1_are_read_as_they_were(name):
+    """The digests of what gmmtorch 2.0 decoded from batches that it had written."""
+    batch, digest = FIRST_VERSION[name]
+    found = decode(base64.b85decode(batch))
+    values = b"".join(value.numpy().tobytes() for value in found.tensors().values())
+    assert hashlib.blake2b(values, digest_size=16).hexdigest() == digest
+    assert_same_components(decode(encode(found)), quantized(found))
+
+
+@settings(max_examples=40)
+@given(components=drawn)
+def test_the_twin_writes_and_reads_the_bytes_of_the_kernel(components):
+    twin, fused = by_both(lambda: encode(components))
+    assert twin == fused
+    for found in by_both(lambda: decode(fused)):
+        assert_same_components(found, quantized(components))
+
+
+@settings(max_examples=80)
+@given(
+    changes=st.lists(
+        st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), min_size=1, max_size=4
+    ),
+)
+def test_the_twin_and_the_kernel_agree_about_forged_batches(sound, changes):
+    body = bytearray(sound[:-4])
+    for place, value in changes:
+        body[1 + int(place * (len(body) - 1))] = value
+
+    def outcome() -> Components | None:
+        try:
+            return decode(sealed(bytes(body)))
+        except DataError:
+            return None
+
+    twin, fused = by_both(outcome)
+    assert (twin is None) == (fused is None)
+    if twin is not None and fused is not None:
+        assert_same_components(twin, fused)
+
+
+@given(
+    bits=st.lists(st.tuples(st.integers(0, 30), st.booleans()), max_size=400),
+    numbers=st.lists(st.integers(-(2**59), 2**59) | st.integers(-40, 40), max_size=30),
+)
+def test_coded_bits_and_numbers_are_read_as_written_in_about_the_entropy(bits, numbers):
+    """Against the sum of −log₂ of the chances, which exact arithmetic coding reaches."""
+    writer = context_model._RangeCoder()
+    ideal = 0.0
+    for slot, bit in bits:
+        chance = writer.chances[slot] / 65536
+        ideal -= math.log2(1 - chance if bit else chance)
+        writer.bit(slot, int(bit))
+    assert 8 * len(writer.to_bytes().rstrip(b"\0")) <= ideal * 1.001 + 16
+    for number in numbers:
+        writer.whole(40, number)
+    reader = context_model._RangeCoder(writer.to_bytes())
+    assert [reader.bit(slot, 0) for slot, _ in bits] == [int(bit) for _, bit in bits]
+    assert [reader.whole(40, 0) for _ in numbers] == numbers
+
+
+def test_components_of_a_wall_take_fewer_bytes_than_scattered_ones():
+    """What neighbours tell: the same components, along a plane or with means drawn in a box."""
+    wall = random_components(3, k=400, extent=0.0, deviations=(0.2, 0.2), n_origins=1, max_sightings=1)
+    place = torch.rand(400, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 20
+    flat = torch.diag(torch.tensor([0.04, 0.0001, 0.04], dtype=torch.float64)).expand(400, 3, 3)
+
+    def size(means: torch.Tensor) -> int:
+        made = replace(wall, means=means, covariances=flat)
+        return len(encode(replace(made.rearranged(spatial_order(made)), ids=wall.ids)))
+
+    on_plane = place * torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64)
+    on_plane[:, 1] = 0.02 * torch.randn(400, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    assert size(on_plane) < size(place) - 6 * 400 / 8

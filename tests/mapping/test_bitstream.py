@@ -1,0 +1,92 @@
+"""Columns of whole numbers as bits, against codes by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Code, best_code, zigzag
+
+whole_numbers = st.lists(st.integers(-(2**59), 2**59) | st.integers(-9, 9), max_size=40)
+
+
+@settings(max_examples=100)
+@given(values=whole_numbers)
+def test_integer_columns_are_decoded_exactly(values):
+    column = np.array(values, np.int64)
+    writer = BitWriter()
+    writer.column(column)
+    reader = BitReader(writer.to_bytes())
+    assert reader.column(len(column)).tolist() == values
+    reader.finish()
+
+
+@given(values=st.lists(st.integers(-(2**40), 2**40)), scales=st.data())
+def test_scaled_and_single_numbers_are_decoded(values, scales):
+    scale = np.array(
+        [max(abs(v).bit_length() + scales.draw(st.integers(-3, 3)), 0) for v in values], np.int64
+    )
+    writer = BitWriter()
+    writer.one(2, 4)  # as in batches of version 1
+    writer.rice(zigzag(np.array(values, np.int64)), np.maximum(scale - 2, 0))
+    small = zigzag(np.array(values, np.int64)) % 1000
+    writer.rice_column(small)
+    for value in values:
+        writer.number(value)
+    reader = BitReader(writer.to_bytes())
+    assert reader.scaled(scale).tolist() == values
+    assert reader.rice_column(len(values)).tolist() == [
+        int(v) for v in zigzag(np.array(values, np.int64)) % 1000
+    ]
+    assert [reader.number() for _ in values] == values
+    reader.finish()
+
+
+def test_rice_codes_equal_those_by_hand():
+    """With 2 low bits, 5 = 1·4 + 01 is 0 1 01 and 2 = 0·4 + 10 is 1 10."""
+    writer = BitWriter()
+    writer.rice(np.array([5, 2]), 2)
+    assert writer.to_bytes() == bytes([0b011_01_10_0])
+
+
+@pytest.mark.parametrize(
+    ("values", "code"),
+    [
+        ([7] * 50, Code.FIXED),
+        (list(range(1000, 1050)), Code.DIFFERENCES),
+        ([0] * 40 + [1, 2, 0, 30], Code.RICE),
+        ([3, 0, 2, 1] * 12, Code.FIXED),
+    ],
+)
+def test_the_shortest_column_code_is_chosen(values, code):
+    column = np.array(values, np.int64)
+    coding = best_code(column)
+    assert coding.code is code
+    writer = BitWriter()
+    writer.column(column)
+    assert len(writer.to_bytes()) <= math.ceil((8 + 70 + coding.n_bits) / 8)
+
+
+@given(
+    ends=st.tuples(*[st.sampled_from([0, 1 << 53, 1 << 60, (1 << 61) - 1, -(1 << 61), -(1 << 62) + 1])] * 2),
+    n=st.integers(1, 40),
+    rises=st.booleans(),
+)
+def test_every_encodable_column_is_decoded(ends, n, rises):
+    """Alternating extreme values overflow the sum of differences, however few bits they take."""
+    column = np.array([ends[number % 2] for number in range(n)], np.int64)
+    column = np.sort(column) if rises else column
+    writer = BitWriter()
+    try:
+        writer.column(column)
+    except InvalidArgumentError:
+        assert max(map(abs, ends)) >= 1 << 60
+        return
+    reader = BitReader(writer.to_bytes())
+    assert reader.column(n).tolist() == column.tolist()
+    reader.finish()

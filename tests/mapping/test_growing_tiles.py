@@ -1,0 +1,262 @@
+"""Tiled maps that grow: the answers of a map in memory, whenever they are stopped or reopened."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from mapping.map_cases import FINE, open_drive
+from mapping.random_components import random_components
+from mapping.test_tiles import SETTINGS, SIDE, contents, moved, recording, written
+
+from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError, OutputError
+from gmmtorch.files import pack_tensors, read_tensors
+from gmmtorch.mapping import tiles
+from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping.tile_index import INDEX
+from gmmtorch.mapping.tiles import TiledMap, merge, tile_files
+from gmmtorch.scan import Scan
+
+RULE = replace(FINE, window=3, mean_origins=None)
+
+
+def street(n: int, dim: int) -> list[Scan]:
+    """Scans of rooms, each 15 m after the one before."""
+    found = []
+    for number, scan in enumerate(open_drive(3, dim) * -(-n // 3)):
+        shift = torch.eye(dim, dtype=torch.float64)[0] * (number // 3 * 15.0)
+        found.append(Scan(scan.points + shift, scan.origin + shift, scan.no_return + shift))
+    return found[:n]
+
+
+def around(scans: list[Scan]) -> torch.Tensor:
+    ends = torch.cat([scan.points[::7] for scan in scans])
+    return torch.cat([ends, ends + 0.3, torch.full_like(ends[:1], torch.inf), ends[:1] + 1e6])
+
+
+def grown(folder: Path, scans: list[Scan], **options: object) -> TiledMap:
+    made = TiledMap.create(folder, GaussianMap(RULE, **options), scans[0].dim, SIDE, memory=100_000)
+    for scan in scans:
+        made.insert(scan)
+    return made
+
+
+@pytest.mark.parametrize("codec", ["quantized", "float"])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_map_that_grows_in_tiles_answers_as_one_in_memory(dim, codec, tmp_path, monkeypatch):
+    monkeypatch.setattr(tiles, "_RECENT", 40)
+    scans = street(14, dim)
+    built, tiled, asked = GaussianMap(RULE, codec=codec), None, around(scans)
+    tiled = TiledMap.create(tmp_path / "map", GaussianMap(RULE, codec=codec), dim, SIDE, memory=100_000)
+    for number, scan in enumerate(scans):
+        built.insert(scan)
+        tiled.insert(scan)
+        if number % 4 == 0:
+            assert torch.isfinite(tiled.occupancy(asked)).all()
+    assert len(tiled.index) > 2
+    assert tiled.n_pending == 2
+    assert (tiled.occupancy(asked) != 0.5).any()
+    tiled.finish()
+    built.finish()
+    assert tiled.n_components == built.n_components
+    # Calibrations differ, because the tiled one predicts with its recent components only.
+    whole = built.snapshot(calibration=tiled.query_options.calibration, cutoff=tiled.query_options.cutoff)
+    expected = whole.occupancy(asked)
+    torch.testing.assert_close(tiled.occupancy(asked), expected, rtol=0, atol=1e-9)
+    opened = TiledMap(tmp_path / "map", memory=1)
+    torch.testing.assert_close(opened.occupancy(asked), expected, rtol=0, atol=1e-9)
+    torch.testing.assert_close(opened.open().occupancy(asked), expected, rtol=0, atol=1e-9)
+    assert len(opened._open) == 1
+    more = moved(recording(dim, 0), 200.0)
+    opened.add(more)
+    assert TiledMap(tmp_path / "map").n_components == tiled.n_components + len(more)
+    found = TiledMap(tmp_path / "map").occupancy(torch.cat([asked, more.means]))
+    torch.testing.assert_close(found[: len(asked)], expected, rtol=0, atol=1e-9)
+    assert (found[len(asked) :] != 0.5).any()
+
+
+def test_a_map_that_is_stopped_at_any_write_opens_with_all_finished_windows(tmp_path, monkeypatch):
+    monkeypatch.setattr(tiles, "_RECENT", 40)
+    scans, write = street(15, 2), tiles.write_bytes
+    asked = around(scans)
+    for stop in range(1, 40):
+        folder, n_written = tmp_path / str(stop), 0
+
+        def full(path: Path, data: bytes, stop: int = stop) -> None:
+            nonlocal n_written
+            n_written += 1
+            if n_written == stop:
+                raise OutputError(f"{path} cannot be written: No space left on device")
+            write(path, data)
+
+        monkeypatch.setattr(tiles, "write_bytes", full)
+        if stop == 1:
+            with pytest.raises(OutputError):
+                grown(folder, scans)
+            continue
+        made = TiledMap.create(folder, GaussianMap(RULE), 2, SIDE) if stop > 2 else None
+        if made is None:
+            continue
+        n_final, before = 0, None
+        try:
+            for scan in scans:
+                before = TiledMap(folder).occupancy(asked)
+                n_final = made.n_components
+                made.insert(scan)
+        except OutputError:
+            monkeypatch.setattr(tiles, "write_bytes", write)
+            opened = TiledMap(folder)
+            assert opened.n_components == n_final
+            assert torch.equal(opened.occupancy(asked), before)
+            made.finish()  # the disk has room again: nothing is lost
+            assert TiledMap(folder).n_components == made.n_components > n_final
+            opened_again = TiledMap(folder)
+            torch.testing.assert_close(
+                opened_again.occupancy(asked), made.occupancy(asked), rtol=0, atol=1e-9
+            )
+            opened_again.insert(scans[-1])
+            opened_again.finish()
+            assert opened_again.n_components > made.n_components
+        else:
+            break
+    assert stop > 12
+
+
+def test_a_damaged_tile_is_named_and_the_rest_answers(tmp_path, monkeypatch):
+    monkeypatch.setattr(tiles, "_RECENT", 10)
+    scans = street(30, 2)
+    folder = grown(tmp_path / "map", scans).folder
+    expected = TiledMap(folder).occupancy(around(scans[-3:])[:-2])
+    first = TiledMap(folder)
+    tile = folder / first._name(first.near(*[scans[0].origin] * 2)[0])
+    tile.write_bytes(tile.read_bytes()[:-1])
+    damaged = TiledMap(folder)
+    with pytest.raises(DataError, match=tile.name):
+        damaged.occupancy(scans[0].origin[None])
+    assert torch.equal(damaged.occupancy(around(scans[-3:])[:-2]), expected)
+    recent = next(folder.glob("recent_*"))
+    recent.write_bytes(recent.read_bytes()[:-1])
+    with pytest.raises(DataError, match=recent.name):
+        TiledMap(folder)
+    recent.unlink()
+    with pytest.raises(MissingDataError, match=recent.name):
+        TiledMap(folder)
+
+
+def test_recent_components_of_another_dimension_are_refused(tmp_path):
+    flat, solid = (TiledMap.create(tmp_path / str(dim), GaussianMap(), dim) for dim in (2, 3))
+    (recent,) = flat.folder.glob("recent_*")
+    tensors, facts = read_tensors(solid.folder / INDEX, "gmmtorch.tiles", 2)
+    facts["recent"] = flat._crc32
+    (solid.folder / INDEX).write_bytes(pack_tensors(tensors, "gmmtorch.tiles", 2, **facts))
+    (solid.folder / recent.name).write_bytes(recent.read_bytes())
+    with pytest.raises(DataError, match="2D"):
+        TiledMap(solid.folder)
+
+
+def test_maps_that_cannot_grow_in_tiles_say_why(tmp_path):
+    for rule in (replace(RULE, n_components=5), replace(RULE, forget="contradiction")):
+        with pytest.raises(InvalidArgumentError, match="budget"):
+            TiledMap.create(tmp_path / "a", GaussianMap(rule), 2)
+    merged = written(tmp_path / "b", recording(2, 0))
+    with pytest.raises(InvalidArgumentError, match="do not grow"):
+        merged.insert(street(1, 2)[0])
+    with pytest.raises(InvalidArgumentError, match="has a map"):
+        TiledMap.create(tmp_path / "b", GaussianMap(), 2)
+
+
+@pytest.mark.parametrize("n_recent", [40, 10_000])
+def test_merged_maps_that_grow_have_all_their_components(n_recent, tmp_path, monkeypatch):
+    monkeypatch.setattr(tiles, "_RECENT", n_recent)
+    scans = street(8, 2)
+    one, two = grown(tmp_path / "1", scans[:4]), grown(tmp_path / "2", scans[4:])
+    parts = [one.open().components(), two.open().components()]
+    assert one.n_pending == two.n_pending == 1
+    merged = merge(tmp_path / "all", [one, two])
+    assert merged.n_components == sum(map(len, parts))
+    options = {**vars(merged.query_options), "resolution": merged.resolution}
+    expected = GaussianMap.of(Components.concatenate(parts), **options).occupancy(around(scans))
+    torch.testing.assert_close(merged.occupancy(around(scans)), expected, rtol=0, atol=1e-9)
+
+
+def test_a_map_is_not_merged_into_its_own_folder(tmp_path):
+    made = grown(tmp_path / "map", street(4, 2))
+    before = contents(made.folder)
+    with pytest.raises(InvalidArgumentError, match="another folder"):
+        merge(tmp_path / "other" / ".." / "map", [made])
+    assert contents(made.folder) == before
+
+
+def test_a_merge_replaces_a_map_that_grows(tmp_path):
+    grown(tmp_path / "map", street(4, 2))
+    merged = merge(tmp_path / "map", [written(tmp_path / "part", recording(2, 0))])
+    assert {*contents(merged.folder)} == {*contents(tmp_path / "part")}
+
+
+def test_the_next_write_removes_what_an_interrupted_one_left(tmp_path, monkeypatch):
+    monkeypatch.setattr(tiles, "_RECENT", 40)
+    scans = street(9, 2)
+    made = grown(tmp_path / "map", scans[:6])
+    others = ["notes.safetensors", "tile_map.safetensors", "recent.txt", "index_old.safetensors"]
+    ended = ["tile_0_-7_0123abcd", "recent_0123abcd", ".index.0123456789abcdef"]
+    ended = [f"{name}.safetensors" for name in [*ended, ".tile_0_0_0123abcd.0123456789abcdef"]]
+    for name in [*others, *ended]:
+        (made.folder / name).write_bytes(b"")
+    TiledMap(made.folder).occupancy(around(scans))
+    assert {*ended} <= {*contents(made.folder)}  # reading does not change files
+    for scan in scans[6:]:
+        made.insert(scan)
+    known = {INDEX, tiles._recent_name(made._crc32), *map(made._name, range(len(made.index)))}
+    assert {*contents(made.folder)} == known | {*others}
+
+
+def test_a_second_process_cannot_overwrite_a_map(tmp_path, monkeypatch):
+    monkeypatch.setattr(tiles, "_RECENT", 40)
+    scans = street(9, 2)
+    one = grown(tmp_path / "map", scans[:3])
+    two = TiledMap(one.folder)
+    for scan in scans[3:6]:
+        one.insert(scan)
+    before = contents(one.folder)
+    with pytest.raises(OutputError, match="Open it again"):
+        two.add(recording(2, 0))
+    assert contents(one.folder) == before
+    for scan in scans[6:]:
+        one.insert(scan)
+    assert TiledMap(one.folder).n_components == one.n_components
+
+
+def test_tiles_are_not_too_small_for_their_numbers(tmp_path):
+    with pytest.raises(InvalidArgumentError, match="side"):
+        TiledMap.create(tmp_path / "map", GaussianMap(), 2, side=1e-9)
+    with pytest.raises(InvalidArgumentError, match="tile"):
+        tile_files(recording(2, 0), SETTINGS, side=1e-9)
+
+
+@pytest.mark.parametrize("n_recent", [20, 10_000])
+def test_a_map_of_added_components_answers_the_same_once_reopened(n_recent, tmp_path, monkeypatch):
+    monkeypatch.setattr(tiles, "_RECENT", n_recent)
+    parts = [random_components(2, 60, 3, center=3.0, extent=extent) for extent in (10.0, 60.0, 90.0)]
+    made = TiledMap.create(tmp_path / "1", GaussianMap(), 2, SIDE)
+    other = TiledMap.create(tmp_path / "2", GaussianMap(), 2, SIDE)
+    for part in parts:
+        made.add(part)
+        TiledMap(other.folder).add(part)
+        assert contents(made.folder) == contents(other.folder)
+    assert made._rule == TiledMap(other.folder)._rule
+
+
+def test_the_first_unfinished_window_decides_the_cutoff(tmp_path):
+    sparse = street(1, 2)[0]
+    scan = Scan(sparse.points.repeat(100, 1), sparse.origin)  # components with many points
+    built, made = GaussianMap(RULE), TiledMap.create(tmp_path / "map", GaussianMap(RULE), 2, SIDE)
+    opened = TiledMap(made.folder)
+    for one in (built, made, opened):
+        one.insert(scan)
+    expected = built.occupancy(around([scan]))
+    assert built._answers().cutoff == 3
+    assert torch.equal(made.occupancy(around([scan])), expected)
+    assert torch.equal(opened.occupancy(around([scan])), expected)
