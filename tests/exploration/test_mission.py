@@ -14,6 +14,7 @@ import pytest
 import torch
 from exploration.replays import FakeTime, Together
 from exploration.rooms import SHELF, SMALL, room, small_room, without_seconds
+from mapping.map_cases import assert_same_components
 from pretended_gpu import GPUTensor, pretended_gpu
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
@@ -170,8 +171,7 @@ def test_losses_are_repaired_to_the_bit(world: World) -> None:
     for other in others:
         second = other.components()
         assert isinstance(second, Components)
-        for name, value in first.tensors().items():
-            assert torch.equal(value, getattr(second, name)), name
+        assert_same_components(first, second)
         found = other.belief.grid.dense(world.box)
         torch.testing.assert_close(found[0], hits, rtol=1e-4, atol=1e-3)
         torch.testing.assert_close(found[1], misses, rtol=1e-4, atol=1e-3)

@@ -8,7 +8,7 @@ from functools import cache
 
 import pytest
 import torch
-from mapping.map_cases import FINE, built, drive, given_parts, open_drive
+from mapping.map_cases import FINE, assert_same_components, built, drive, given_parts, open_drive
 from occupancy.protocol_contract import RESOLUTION, SENSOR, WALL, dims, lattice, points, shifted, wall_scan
 
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
@@ -248,8 +248,7 @@ def test_a_map_asked_after_each_scan_answers_like_a_new_one(dim, method, codec, 
                     getattr(found, name), getattr(expected, name), rtol=1e-9, atol=1e-9
                 )
     expected = quantized(grown.unrounded()) if codec == "quantized" else grown.unrounded()
-    for name, values in grown.components().tensors().items():
-        assert torch.equal(values, getattr(expected, name)), name
+    assert_same_components(grown.components(), expected)
 
 
 @dims

@@ -12,6 +12,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mapping.map_cases import assert_same_components
 from mapping.random_components import random_components
 from sharing.message_examples import sealed
 from sharing.replica_histories import exchange, motion, replica_of, rows, told
@@ -152,9 +153,8 @@ def test_batches_equal_datagrams_at_all_robots():
     assert len(own) == len(heard) == len(datagrams) > 4
     for mine, theirs, datagram in zip(own, heard, datagrams, strict=True):
         sent = decode(datagram).components
-        for name, value in mine.tensors().items():
-            assert torch.equal(value, getattr(theirs, name)), name
-            assert torch.equal(value, getattr(sent, name)), name
+        assert_same_components(mine, theirs)
+        assert_same_components(mine, sent)
 
 
 def test_counters_of_unknown_components_wait_for_them():
@@ -307,8 +307,7 @@ def test_order_and_repetition_do_not_matter(seed, order):
     assert one.digest() == other.digest()
     frames = {one.placement.root, *(7 | robot << 24 for robot in range(3))}
     for frame in frames:
-        for name, value in one.components(frame).tensors().items():
-            assert torch.equal(value, getattr(other.components(frame), name)), name
+        assert_same_components(one.components(frame), other.components(frame))
 
 
 @settings(max_examples=8, deadline=None)

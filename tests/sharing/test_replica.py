@@ -10,6 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mapping.map_cases import assert_same_components
 from mapping.random_components import random_components
 from sharing.replica_histories import Model, exchange, history, motion, replica_of, rows
 from sharing.schedules import components, run_schedule
@@ -36,8 +37,7 @@ def test_order_and_repetition_do_not_matter(seed, order):
     order.shuffle(again)
     one, other = replica_of(sent), replica_of(again)
     assert one.digest() == other.digest()
-    for name, value in one.components().tensors().items():
-        assert torch.equal(value, getattr(other.components(), name)), name
+    assert_same_components(one.components(), other.components())
 
 
 @settings(max_examples=8, deadline=None)
@@ -67,8 +67,7 @@ def test_all_replicas_agree_once_the_network_heals(seed):
     assert outcome.refused.keys() <= {"own"}  # no datagram of a robot is damaged or in conflict
     one = outcome.replicas[0].components()
     for replica in outcome.replicas[1:]:
-        for name, value in one.tensors().items():
-            assert torch.equal(value, getattr(replica.components(), name)), name
+        assert_same_components(one, replica.components())
 
 
 # -- sending ---------------------------------------------------------------------------------------
