@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -228,28 +229,18 @@ class Scan:
 
     def copied(self, device: torch.device | str | None = None) -> Scan:
         """A deep copy, on `device` if given. A reader that reuses its arrays for the next scan needs it."""
-
-        def copy(x: Tensor) -> Tensor:
-            return x.detach().to(device or x.device, copy=True)
-
-        channels = {name: copy(value) for name, value in self.attributes.items()}
-        return self._with(copy(self.points), copy(self.origin), copy(self.no_return), channels)
+        return self._mapped(lambda x: x.detach().to(device or x.device, copy=True))
 
     def to(self, device: torch.device | str | None) -> Scan:
         """The scan on another device. None: where it is."""
         with naming_device(device):
-            channels = {name: value.to(device) for name, value in self.attributes.items()}
-            parts = self.points.to(device), self.origin.to(device), self.no_return.to(device)
-            return self._with(*parts, channels)
+            return self._mapped(lambda x: x.to(device))
 
-    def _with(
-        self, points: Tensor, origin: Tensor, no_return: Tensor, attributes: Mapping[str, Tensor]
-    ) -> Scan:
+    def _mapped(self, copy: Callable[[Tensor], Tensor]) -> Scan:
         """The scan with the same numbers in other tensors, which are not checked again."""
+        parts: dict[str, Any] = {name: copy(vars(self)[name]) for name in ("points", "origin", "no_return")}
+        parts["attributes"] = {name: copy(value) for name, value in self.attributes.items()}
         made = object.__new__(Scan)
-        for name, value in vars(self).items():
+        for name, value in (vars(self) | parts).items():
             object.__setattr__(made, name, value)
-        for name, value in (("points", points), ("origin", origin), ("no_return", no_return)):
-            object.__setattr__(made, name, value)
-        object.__setattr__(made, "attributes", attributes)
         return made
