@@ -46,7 +46,7 @@ def start(name: str, run: Callable[[DictConfig], Any], register: Callable[[], No
     """
     register()
     _print_any_text()
-    _log_printable_text()
+    logging.setLogRecordFactory(PrintableRecord)
     try:
         with interruptible(), _any_help():
             _hydra_main(name, run)
@@ -67,18 +67,11 @@ def _print_any_text() -> None:
             stream.reconfigure(errors="replace")
 
 
-def _log_printable_text() -> None:
+class PrintableRecord(logging.LogRecord):
     """Names in logs, such as those of frames in a bag, cannot send control characters to the terminal."""
-    make = logging.getLogRecordFactory()
-    if make.__name__ == "printable_record":
-        return
 
-    def printable_record(*arguments: Any, **options: Any) -> logging.LogRecord:
-        record = make(*arguments, **options)
-        record.msg, record.args = printable(record.getMessage()), None
-        return record
-
-    logging.setLogRecordFactory(printable_record)
+    def getMessage(self) -> str:  # noqa: N802  the name that logging calls
+        return printable(super().getMessage())
 
 
 @contextmanager
@@ -229,8 +222,8 @@ def _result_of(run: Callable[[DictConfig], Any], config: DictConfig) -> Any:
 
 def _saved() -> str:
     """A sentence on the files of a run that a full disk or the like has ended; each is complete."""
-    files = sorted(file for file in common.run_dir().glob("*.*") if file.suffix != ".log" and file.is_file())
-    names = [file.name for file in files if not file.name.startswith(".")]
+    files = (file for file in common.run_dir().glob("[!.]*.*") if file.suffix != ".log" and file.is_file())
+    names = sorted(file.name for file in files)
     return f" Saved in {common.run_dir()}: {', '.join(names)}." if names else ""
 
 
@@ -240,10 +233,9 @@ def _guarded(run: Callable[[DictConfig], Any], config: DictConfig) -> Any:
     if not common.is_job_of_sweep():
         try:
             return _result_of(run, config)
-        except OutputError as error:
-            sys.exit(f"gmmtorch: error: {error.told(schema.option_names(config))}{_saved()}")
         except GmmTorchError as error:
-            sys.exit(f"gmmtorch: error: {error.told(schema.option_names(config))}")
+            saved = _saved() if isinstance(error, OutputError) else ""
+            sys.exit(f"gmmtorch: error: {error.told(schema.option_names(config))}{saved}")
     note = common.run_dir() / ERROR_FILE
     note.unlink(missing_ok=True)  # of an earlier sweep in this folder
     try:

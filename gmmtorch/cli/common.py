@@ -193,6 +193,8 @@ def write_results(command: str, config: DictConfig, rows: list[Row], folder: Pat
 
 def show_figures(config: DictConfig, figures: Mapping[str, Any], folder: Path, board: Board | None) -> None:
     """Write every figure as NAME.png if `report.figures` is set, and to TensorBoard if there is a board."""
+    if not config.report.figures and board is None:
+        return
     from gmmtorch.files import write_bytes
     from gmmtorch.report import picture
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -27,9 +27,6 @@ from gmmtorch.mapping import (
 from gmmtorch.report import Event, Row
 from gmmtorch.scan import Scan
 
-if TYPE_CHECKING:
-    from gmmtorch.localization import Trajectory
-
 _WITHOUT_POSES = ("scan_folder", "rosbag")  # data sets that `dataset.poses=standing` reads without poses
 
 
@@ -37,7 +34,7 @@ class OpenedDataset(NamedTuple):
     """A data set; with `dataset.odometry`, also its trajectory, and the facts of it for results.json."""
 
     dataset: Dataset
-    trajectory: Trajectory | None
+    trajectory: localization.Trajectory | None
     odometry: Row | None
 
 
@@ -99,7 +96,7 @@ def _with_odometry(source: Dataset, method: str, motion: str, has_truth: bool) -
     return OpenedDataset(posed, trajectory, facts)
 
 
-def _trajectory_scores(posed: Reposed, trajectory: Trajectory, has_truth: bool) -> Row:
+def _trajectory_scores(posed: Reposed, trajectory: localization.Trajectory, has_truth: bool) -> Row:
     """ATE and RPE against the data set's own poses; None where they cannot be computed."""
     scores: Row = {"align": None, **localization.UNSCORED}
     if not has_truth or len(posed) < 3:

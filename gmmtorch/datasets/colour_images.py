@@ -10,22 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets.point_files.channels import check_channels
-from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.errors import DataError
 from gmmtorch.pinhole import is_centered
-from gmmtorch.scan import COLOUR, linear_colours
+from gmmtorch.scan import linear_colours
 
 _MAX_PIXELS = 1 << 25
 _BLOCK = 4  # pixels: a side of the blocks of the colour image in which points hide each other
 _BEHIND = 0.05  # share of the depth by which a hidden point is behind a nearer one in its block
-
-
-def check_colour(wanted: tuple[str, ...]) -> tuple[str, ...]:
-    """Channels of depth images: colour or none. Raises `InvalidArgumentError` for others."""
-    names = check_channels(wanted)
-    if not set(names) <= {COLOUR}:
-        raise InvalidArgumentError(f"attributes={list(names)}: depth images have the channel {COLOUR} only.")
-    return names
 
 
 def read_image(path: Path) -> Tensor:

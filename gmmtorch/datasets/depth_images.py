@@ -21,7 +21,8 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset, Ranges, check_poses, natural_key, require_path
-from gmmtorch.datasets.colour_images import ColourCamera, check_colour
+from gmmtorch.datasets.colour_images import ColourCamera
+from gmmtorch.datasets.point_files.channels import check_channels
 from gmmtorch.datasets.trajectory import (
     NANOSECONDS,
     order_of_rows,
@@ -46,9 +47,8 @@ _UPRIGHT = {
     "-x": [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],
 }
 """The rotation that turns an axis into z."""
-
-
 _COLOUR_INTRINSICS, _COLOUR_POSE = "color-intrinsics.txt", "color-pose.txt"
+_CHANNELS = "depth images have the channel colour only"
 
 
 class _DepthDataset(Dataset):
@@ -89,7 +89,7 @@ class DepthFrames(_DepthDataset):
         up: str = "z",
         attributes: Iterable[str] = (),
     ) -> None:
-        self.attributes = check_colour(tuple(attributes))
+        self.attributes = check_channels(attributes, [COLOUR], _CHANNELS)
         path = require_path(
             path,
             "folder",
@@ -243,7 +243,7 @@ class TumRgbd(_DepthDataset):
         pixel_stride: int = 1,
         attributes: Iterable[str] = (),
     ) -> None:
-        self.attributes = check_colour(tuple(attributes))
+        self.attributes = check_channels(attributes, [COLOUR], _CHANNELS)
         path = require_path(
             path,
             "folder",

@@ -23,7 +23,7 @@ from gmmtorch.datasets.point_files.channels import CLASS, INTENSITY, check_chann
 from gmmtorch.datasets.point_files.pcd_files import pcd_header
 from gmmtorch.datasets.point_files.point_chunks import read_cloud
 from gmmtorch.datasets.trajectory import Trajectory, kitti_poses, read_rows, read_trajectory, to_nanoseconds
-from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.errors import DataError
 from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 
@@ -187,11 +187,9 @@ class Kitti(Dataset):
         max_gap: float = 2.0,
         attributes: Iterable[str] = (),
     ) -> None:
-        self.attributes = check_channels(attributes)
-        if not set(self.attributes) <= {INTENSITY, CLASS}:
-            raise InvalidArgumentError(
-                f"attributes={list(self.attributes)}: scans of KITTI have {INTENSITY} and {CLASS}."
-            )
+        self.attributes = check_channels(
+            attributes, [INTENSITY, CLASS], "scans of KITTI have intensity and class"
+        )
         path = require_path(
             path,
             "folder",

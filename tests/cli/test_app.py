@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import os
 import re
 import signal
@@ -51,6 +52,23 @@ def test_an_interrupt_that_python_drops_ends_the_command(monkeypatch, tmp_path):
     assert done.stderr == "gmmtorch: interrupted; all files that were written are complete.\n"
     assert len(ended) < 500
     assert sys.unraisablehook is hook
+
+
+def test_a_log_call_with_wrong_arguments_ends_no_command(monkeypatch, tmp_path):
+    """The handlers of logging report it; a call that is right is printed without control characters."""
+    monkeypatch.setattr(logging, "raiseExceptions", False)
+    logger, text = logging.Logger("a package"), io.StringIO()
+    logger.addHandler(logging.StreamHandler(text))
+
+    def work(*_: object) -> list[dict[str, float]]:
+        logger.warning("%d points", "no")
+        logger.warning("frame %s", "\x1b[31m")
+        return [{}]
+
+    monkeypatch.setattr(occupancy, "_compare", work)
+    done = run_here(monkeypatch, "occupancy", tmp_path / "run", *QUIET)
+    assert done.status == 0, done.stderr
+    assert text.getvalue() == "frame \\x1b[31m\n"
 
 
 # -- mistyped options -----------------------------------------------------------------------------

@@ -26,8 +26,9 @@ from mapping.random_components import random_components
 from sensor_bags import BagWriter
 
 from gmmtorch.datasets.base import Ranges
-from gmmtorch.datasets.ros.bag_reader import LASER as LASERS
-from gmmtorch.datasets.ros.bag_reader import Sensor, Topic
+from gmmtorch.datasets.ros.bag_reader import Topic
+from gmmtorch.datasets.ros.bag_topics import LASER as LASERS
+from gmmtorch.datasets.ros.bag_topics import Sensor
 from gmmtorch.datasets.ros.transform_tree import TransformTree
 from gmmtorch.live.live_scans import LiveOptions, LiveScans
 from gmmtorch.live.ros import Node

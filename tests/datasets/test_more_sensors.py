@@ -115,7 +115,7 @@ def test_damaged_packets_are_counted(tmp_path):
 def test_a_message_without_packets_has_no_points():
     """The package alone would end the process."""
     pytest.importorskip("velodyne_decoder")
-    from gmmtorch.datasets.ros.lidar_packets import VelodynePackets
+    from gmmtorch.datasets.ros.sensor_messages import VelodynePackets
 
     assert len(VelodynePackets().points({"packets": []}).points) == 0
 

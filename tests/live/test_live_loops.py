@@ -19,7 +19,8 @@ pytest.importorskip("cyclonedds", reason="needs the extra [ros]: cyclonedds")
 from localization.looping_robot import BACK, DriftingOdometry, lap, off_the_walls
 
 from gmmtorch.datasets.base import Ranges
-from gmmtorch.datasets.ros.bag_reader import LASER, Sensor, Topic
+from gmmtorch.datasets.ros.bag_reader import Topic
+from gmmtorch.datasets.ros.bag_topics import LASER, Sensor
 from gmmtorch.datasets.ros.transform_tree import TransformTree
 from gmmtorch.live import live_scans
 from gmmtorch.live.live_mapper import LiveMapper

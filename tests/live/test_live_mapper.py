@@ -18,7 +18,8 @@ from test_live_scans import laser, recorded
 
 from gmmtorch.datasets import load
 from gmmtorch.datasets.base import Ranges
-from gmmtorch.datasets.ros.bag_reader import CLOUD, LASER, Sensor, Topic
+from gmmtorch.datasets.ros.bag_reader import Topic
+from gmmtorch.datasets.ros.bag_topics import CLOUD, LASER, Sensor
 from gmmtorch.datasets.ros.transform_tree import TransformTree
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError, told
 from gmmtorch.live.bag_player import BagPlayer

@@ -13,7 +13,8 @@ pytest.importorskip("cyclonedds", reason="needs the extra [ros]: cyclonedds")
 
 from gmmtorch.datasets import load
 from gmmtorch.datasets.base import Ranges
-from gmmtorch.datasets.ros.bag_reader import LASER, Sensor, Topic
+from gmmtorch.datasets.ros.bag_reader import Topic
+from gmmtorch.datasets.ros.bag_topics import LASER, Sensor
 from gmmtorch.datasets.ros.transform_tree import TransformTree
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.export.bag import transform_fields

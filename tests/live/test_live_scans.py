@@ -15,7 +15,8 @@ from sensor_bags import BagWriter
 
 from gmmtorch.datasets import load
 from gmmtorch.datasets.base import Ranges
-from gmmtorch.datasets.ros.bag_reader import CLOUD, DEPTH, LASER, BagReader, Sensor, Topic
+from gmmtorch.datasets.ros.bag_reader import BagReader, Topic
+from gmmtorch.datasets.ros.bag_topics import CLOUD, DEPTH, LASER, Sensor
 from gmmtorch.datasets.ros.transform_tree import TransformTree
 from gmmtorch.errors import told
 from gmmtorch.live import live_scans

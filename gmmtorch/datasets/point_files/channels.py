@@ -5,7 +5,7 @@ Sensors and programs name and scale the same channel differently; here each beco
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -28,13 +28,16 @@ _COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_
 _FROM_FLOAT = 255.0  # the largest value of colours in a floating type that are not from 0 to 1
 
 
-def check_channels(wanted: Iterable[str]) -> tuple[str, ...]:
-    """Names of channels. Raises `InvalidArgumentError` unless they are a list of distinct names."""
+def check_channels(wanted: Iterable[str], known: Collection[str] = (), fault: str = "") -> tuple[str, ...]:
+    """Names of channels. Raises `InvalidArgumentError` unless they are a list of distinct names, and with
+    `fault` for names other than the known ones, if there are some."""
     if isinstance(wanted, str):
         raise InvalidArgumentError(f"attributes={wanted!r} must be a list, such as [{wanted!r}].")
     names = tuple(wanted)
     if any(not isinstance(name, str) or not name for name in names) or len(set(names)) < len(names):
         raise InvalidArgumentError(f"attributes={list(names)} must be distinct names of channels.")
+    if known and not set(names) <= set(known):
+        raise InvalidArgumentError(f"attributes={list(names)}: {fault}.")
     return names
 
 

@@ -14,16 +14,8 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from gmmtorch.datasets.ros.bag_reader import (
-    CLOUD,
-    LIST,
-    POSE_TYPES,
-    TF_TYPES,
-    BagReader,
-    RawMessage,
-    Sensor,
-    listed,
-)
+from gmmtorch.datasets.ros.bag_reader import BagReader, RawMessage
+from gmmtorch.datasets.ros.bag_topics import CLOUD, LIST, POSE_TYPES, TF_TYPES, Sensor, listed
 from gmmtorch.datasets.ros.transform_tree import (
     TransformTree,
     frame_name,

@@ -2,8 +2,6 @@
 
 Bags are hostile input. Files are read within their length, compressed chunks are unpacked up to a limit, and
 messages are decoded by `MessageDecoder`; definitions in a bag are used only for types that ROS does not have.
-
-It also chooses between the topics of sensors.
 """
 
 from __future__ import annotations
@@ -14,16 +12,15 @@ import logging
 import re
 import shutil
 import tempfile
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, BinaryIO, NamedTuple
 
-from gmmtorch.datasets.ros.lidar_packets import DEFINITION, VELODYNE
-from gmmtorch.datasets.ros.message_decoder import BASE, NAME, SEQUENCE, MessageDecoder
+from gmmtorch.datasets.ros.message_decoder import MessageDecoder
 from gmmtorch.datasets.ros.salvage import Salvage
-from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
+from gmmtorch.errors import DataError, GmmTorchError
 from gmmtorch.optional_packages import needs_extra
 
 _log = logging.getLogger(__name__)
@@ -35,6 +32,15 @@ _REPAIRS = {
     ".mcap": "'mcap recover' repairs a recording that was interrupted",
     ".db3": "'ros2 bag reindex' or sqlite3's '.recover' repairs a recording that was interrupted",
 }
+
+VELODYNE = "velodyne_msgs/msg/VelodyneScan"
+_DEFINITION = SimpleNamespace(
+    format=SimpleNamespace(name="MSG"),
+    data="std_msgs/Header header\nvelodyne_msgs/VelodynePacket[] packets\n"
+    + "=" * 80
+    + "\nMSG: velodyne_msgs/VelodynePacket\nbuiltin_interfaces/Time stamp\nuint8[1206] data\n",
+)
+"""For SQLite bags of older ROS 2, which contain no definitions."""
 
 
 class Topic(NamedTuple):
@@ -143,16 +149,14 @@ class BagReader:
 
     def _salvaged(self) -> Salvage:
         reader_class(self._is_ros1)  # puts limits on rosbags
-        files = sorted(self.path.iterdir()) if self.path.is_dir() else [self.path]
-        files = [file for file in files if file.suffix in _SUFFIXES]
         try:
-            return Salvage(files, _unpack_chunk, MAX_CHUNK_BYTES)
+            return Salvage(_files(self.path), _unpack_chunk, MAX_CHUNK_BYTES)
         except DataError as error:
             raise DamagedBagError(str(error)) from error
 
     def _opened(self) -> Any:
         """The opened reader of rosbags: of the folder, or of its only file if metadata.yaml is unusable."""
-        for file in sorted(self.path.glob("*.db3")) if self.path.is_dir() else [self.path]:
+        for file in _files(self.path):
             _check_length(file)
         *tried, last = self.path, *_only_file(self.path)
         for path in tried:
@@ -171,7 +175,7 @@ class BagReader:
         """Definitions in the bag. One that cannot be parsed is left out."""
         found: dict[str, Any] = {}
         for c in self._connections:
-            stated = c.msgdef if c.msgdef.data or c.msgtype != VELODYNE else DEFINITION
+            stated = c.msgdef if c.msgdef.data or c.msgtype != VELODYNE else _DEFINITION
             if c.msgtype not in found and (parsed := parsed_definitions(stated, c.msgtype)):
                 found.update(parsed)
         return found
@@ -197,7 +201,7 @@ class BagReader:
 def _bag_file(path: Path) -> Path:
     """The file of the bag, or the folder with its metadata.yaml."""
     if path.is_dir() and not (path / "metadata.yaml").is_file():
-        files = [file for file in sorted(path.iterdir()) if file.suffix in _SUFFIXES]
+        files = _files(path)
         if len(files) == 1:
             return files[0]
         raise DataError(
@@ -211,21 +215,26 @@ def _bag_file(path: Path) -> Path:
     return path
 
 
+def _files(path: Path) -> list[Path]:
+    """The files of a bag: those of its folder, or the file itself."""
+    return [f for f in sorted(path.iterdir()) if f.suffix in _SUFFIXES] if path.is_dir() else [path]
+
+
+def _metadata(path: Path) -> str:
+    """The text of metadata.yaml in a bag's folder; "" of a file."""
+    return (path / "metadata.yaml").read_text("utf-8", errors="replace") if path.is_dir() else ""
+
+
 def _only_file(path: Path) -> list[Path]:
     """The file of a bag's folder, if there is one and metadata.yaml names no other."""
-    metadata = path / "metadata.yaml"
-    if not metadata.is_file():
-        return []
-    files = [file for file in path.iterdir() if file.suffix in _SUFFIXES]
-    text = metadata.read_text("utf-8", errors="replace")
+    files, text = _files(path), _metadata(path)
     named = {name.split(": ")[-1].strip(" -") for name in re.findall(r"[^\n/,'\"[]+\.(?:mcap|db3)\b", text)}
-    return files if len(files) == 1 and named <= {files[0].name} else []
+    return files if path.is_dir() and len(files) == 1 and named <= {files[0].name} else []
 
 
 def _stated(path: Path) -> tuple[int, int]:
     """The number of messages and the time (ns) of the last one by metadata.yaml, or 0."""
-    metadata = path / "metadata.yaml"
-    text = metadata.read_text("utf-8", errors="replace") if metadata.is_file() else ""
+    text = _metadata(path)
     patterns = (r"message_count: (\d{1,12})\b", r"_since_epoch: (\d{1,19})\b", r"nanoseconds: (\d{1,19})\b")
     n_messages, begin, duration = (int(found[1]) if (found := re.search(p, text)) else 0 for p in patterns)
     return n_messages, begin + duration
@@ -269,182 +278,6 @@ def _bounded(path: Path) -> Path:
             return _BoundedFile(str(self)) if mode == "rb" else super().open(mode, *args, **options)
 
     return BoundedPath(path)
-
-
-# -- topics of sensors -------------------------------------------------------------------------------
-
-
-TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-POSE_TYPES = (
-    "nav_msgs/msg/Odometry",
-    "geometry_msgs/msg/PoseStamped",
-    "geometry_msgs/msg/PoseWithCovarianceStamped",
-    "geometry_msgs/msg/TransformStamped",
-)
-INFO_TYPE = "sensor_msgs/msg/CameraInfo"
-IMU_TYPE = "sensor_msgs/msg/Imu"
-_LISTS = {"sensor_msgs/msg/PointCloud": "points"}
-_IMAGE, _COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-_DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")
-
-CLOUD, LIST, PACKETS, LASER, ECHOES, DEPTH, COMPRESSED = (
-    "cloud",
-    "list of points",
-    "lidar packets",
-    "laser",
-    "laser with echoes",
-    "depth image",
-    "compressed depth image",
-)
-LASERS = (LASER, ECHOES)
-_PREFERENCE = (CLOUD, LIST, PACKETS, *LASERS, DEPTH, COMPRESSED)
-_KINDS = {
-    "sensor_msgs/msg/PointCloud2": CLOUD,
-    "sensor_msgs/msg/LaserScan": LASER,
-    "sensor_msgs/msg/MultiEchoLaserScan": ECHOES,
-    VELODYNE: PACKETS,
-}
-
-
-class Sensor(NamedTuple):
-    """A topic of a sensor. kind: one of the constants above. field: of the list, for `LIST`."""
-
-    topic: Topic
-    kind: str
-    field: str = ""
-
-    @property
-    def is_camera(self) -> bool:
-        """Whether its messages are depth images."""
-        return self.kind in (DEPTH, COMPRESSED)
-
-
-def choose_sensor(reader: BagReader, wanted: str | None) -> Sensor:
-    """The topic `wanted`, or else the only one of the most preferred kind that the bag has.
-
-    Kinds in order: clouds, lists of points, packets of lidars, lasers, depth images. Raises `DataError` or
-    `InvalidArgumentError`, which list the topics, if there is none, or a choice.
-    """
-    named = [topic for topic in reader.topics if topic.name == wanted]
-    if wanted is not None and not named:
-        raise InvalidArgumentError(
-            f"‹topic›={wanted} is not in {reader.path}, whose topics are {listed(reader.topics)}. "
-            "Choose another ‹topic›."
-        )
-    if len(named) > 1:
-        raise DataError(
-            f"{reader.path}: topic {wanted} has messages of {len(named)} types: {listed(named)}. Choose "
-            "another ‹topic›, or write each type to a topic of its own."
-        )
-    found = sensors(reader, named)
-    if not found:
-        what = f"‹topic›={wanted} is not" if wanted else "has no topic of"
-        remedy = "Choose another ‹topic›." if wanted else "Record such a topic."
-        raise DataError(
-            f"{reader.path} {what} a range sensor with messages (PointCloud2, LaserScan, depth Image, or a "
-            f"list of points). Its topics are {listed(reader.topics)}. {remedy}"
-        )
-    kind = min((sensor.kind for sensor in found), key=_PREFERENCE.index)
-    found = [sensor for sensor in found if sensor.kind == kind]
-    if len(found) > 1:
-        raise InvalidArgumentError(
-            f"{reader.path} has {len(found)} topics of a range sensor: "
-            f"{listed([sensor.topic for sensor in found])}. Choose one: ‹topic›={found[0].topic.name}."
-        )
-    return found[0]
-
-
-def sensors(reader: BagReader, topics: Sequence[Topic] = ()) -> list[Sensor]:
-    """The range sensors with messages among some topics, or among all."""
-    chosen = [topic for topic in topics or reader.topics if topic.n_messages]
-    return [sensor for topic in chosen if (sensor := _sensor(reader, topic)) is not None]
-
-
-def listed(topics: list[Topic]) -> str:
-    """Topics with types and counts, for messages."""
-    return "; ".join(f"{t.name} ({t.type}, {t.n_messages} messages)" for t in topics) or "none"
-
-
-def _sensor(reader: BagReader, topic: Topic) -> Sensor | None:
-    if topic.type in _KINDS:
-        return Sensor(topic, _KINDS[topic.type])
-    if topic.type in _LISTS:
-        return Sensor(topic, LIST, _LISTS[topic.type])
-    if topic.type in (_IMAGE, _COMPRESSED_IMAGE):
-        return _camera(reader, topic)
-    if not topic.type.startswith(("sensor_msgs/", "std_msgs/", "geometry_msgs/", "nav_msgs/")):
-        fields = reader.fields(topic.type)
-        if fields and fields[0][1] == (NAME, "std_msgs/msg/Header"):
-            for name, desc in fields:
-                if _is_list_of_points(reader, desc):
-                    return Sensor(topic, LIST, name)
-    return None
-
-
-def _is_list_of_points(reader: BagReader, desc: Any) -> bool:
-    if desc[0] != SEQUENCE or desc[1][0][0] != NAME:
-        return False
-    fields = dict(reader.fields(desc[1][0][1]))
-    numbers = all(inner[0] == BASE and inner[1][0] != "string" for inner in fields.values())
-    return numbers and {"x", "y", "z"} <= fields.keys()
-
-
-def _camera(reader: BagReader, topic: Topic) -> Sensor | None:
-    """A camera whose first image is a depth."""
-    first = next(reader.messages([topic.name]), None)
-    if first is None:
-        return None
-    try:
-        message = reader.decode(first)
-    except DataError:
-        return None
-    if topic.type == _IMAGE:
-        return Sensor(topic, DEPTH) if message["encoding"] in _DEPTH_ENCODINGS else None
-    return Sensor(topic, COMPRESSED) if "compressedDepth" in message["format"] else None
-
-
-def choose_camera_info(reader: BagReader, image: str, wanted: str | None) -> str:
-    """The topic of the camera parameters: `wanted`, or the one that shares most of the image topic's name."""
-    infos = [topic.name for topic in reader.topics if topic.type == INFO_TYPE and topic.n_messages]
-    if wanted in infos:
-        return wanted
-    best = nearest_names(infos, image)
-    if wanted is not None or len(best) != 1:
-        choice = f"Choose one: ‹camera_info›={best[0]}, or state" if best else "State"
-        raise InvalidArgumentError(
-            f"{reader.path}: ‹camera_info›={wanted} is not clear for the images of {image}; topics of "
-            f"type CameraInfo are {', '.join(infos) or 'none'}. {choice} ‹intrinsics›=[fx,fy,cx,cy] in "
-            "pixels, without distortion."
-        )
-    return best[0]
-
-
-def choose_imu(reader: BagReader, wanted: str | None) -> str:
-    """The topic `wanted`, or else the only one of an IMU. Raises `InvalidArgumentError`, which lists them."""
-    found = [topic for topic in reader.topics if topic.type == IMU_TYPE and topic.n_messages]
-    if wanted is None and len(found) > 1:
-        raise InvalidArgumentError(
-            f"{reader.path} has {len(found)} topics of an IMU: {listed(found)}. Choose one: "
-            f"‹imu_topic›={found[0].name}."
-        )
-    chosen = [topic.name for topic in found if wanted in (None, topic.name)]
-    if not chosen:
-        what = "has no topic" if wanted is None else f"has no topic ‹imu_topic›={wanted}"
-        raise InvalidArgumentError(
-            f"motion=imu cannot be used: {reader.path} {what} of type sensor_msgs/Imu with messages, only "
-            f"{listed(found)}. Record one, or predict with ‹motion›=constant or ‹motion›=dataset."
-        )
-    return chosen[0]
-
-
-def nearest_names(names: list[str], topic: str) -> list[str]:
-    """The names that share most of a topic's name: its first parts."""
-
-    def shared(name: str) -> int:
-        pairs = zip(name.split("/"), topic.split("/"), strict=False)
-        return next((i for i, (a, b) in enumerate(pairs) if a != b), 0)
-
-    return [name for name in names if shared(name) == max(map(shared, names))]
 
 
 # -- the package rosbags, with limits on what a hostile bag can make it allocate ---------------------

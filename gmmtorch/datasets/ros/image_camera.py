@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets.ros import bag_reader, sensor_messages
-from gmmtorch.datasets.ros.bag_reader import Sensor
+from gmmtorch.datasets.ros import sensor_messages
+from gmmtorch.datasets.ros.bag_topics import DEPTH, Sensor
 from gmmtorch.errors import DataError, InvalidArgumentError, check_number, check_whole
 from gmmtorch.pinhole import back_project, check_intrinsics, is_centered, pinhole_matrix
 
@@ -119,7 +119,7 @@ class ImageCamera:
         return depth if model.raw is None else torch.cat([depth.flatten(), depth.new_zeros(1)])[model.raw]
 
     def _depth(self, message: dict[str, Any]) -> Tensor:
-        if self._sensor.kind == bag_reader.DEPTH:
+        if self._sensor.kind == DEPTH:
             depth = sensor_messages.depth_image(message, self._scale)
         else:
             depth = sensor_messages.compressed_depth_image(message, self._scale)

@@ -17,16 +17,8 @@ from torch import Tensor
 from gmmtorch.datasets.base import Dataset, Ranges, require_path
 from gmmtorch.datasets.point_files.channels import check_channels
 from gmmtorch.datasets.ros.bag_poses import BagSurvey, Record, RegisteredPoses
-from gmmtorch.datasets.ros.bag_reader import (
-    IMU_TYPE,
-    BagReader,
-    DamagedBagError,
-    RawMessage,
-    Sensor,
-    choose_camera_info,
-    choose_imu,
-    choose_sensor,
-)
+from gmmtorch.datasets.ros.bag_reader import BagReader, DamagedBagError, RawMessage
+from gmmtorch.datasets.ros.bag_topics import IMU_TYPE, Sensor, choose_camera_info, choose_imu, choose_sensor
 from gmmtorch.datasets.ros.image_camera import ImageCamera
 from gmmtorch.datasets.ros.point_times import Rate
 from gmmtorch.datasets.ros.scan_conversion import ScanConversion

@@ -10,7 +10,9 @@ import mmap
 import re
 import struct
 import zlib
+from abc import ABC, abstractmethod
 from array import array
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -18,6 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gmmtorch.datasets.trajectory import NANOSECONDS
 from gmmtorch.errors import DataError
 
 Unpack = Callable[[bytes, str, int], bytes]
@@ -28,8 +31,6 @@ _MOST_RATIO = 1000  # bytes of all chunks, packed and unpacked, for each byte of
 _LEAST_MESSAGES, _MESSAGE_BYTES = 1 << 20, 4  # of a file: messages, or fewer bytes of the file for each
 _KEPT_CHUNKS = 4  # unpacked, while messages of several are read in turn
 _MCAP_CHUNK = struct.Struct("<QQQII")  # first and last time, unpacked bytes, CRC-32, length of a name
-_NANOSECONDS = 1_000_000_000
-
 
 _Found = tuple[int, int, int, int]
 """A message: its time (ns), its connection, and two numbers by which its source finds it."""
@@ -66,72 +67,67 @@ class Salvage:
     def __init__(self, files: Collection[Path], unpack: Unpack, limit: int) -> None:
         self._unpack, self._limit = unpack, limit
         self._sources: list[_Chunked | _Database] = []
-        self._times, self._where = array("q"), array("q")  # of each message: source, connection, two numbers
         self.connections: list[Any] = []
         self.gaps: list[tuple[int, int]] = []
         self.is_cut = False
         self.unread: list[str] = []
+        parts = [np.empty((0, 5), np.int64)]
         for file in files:
             try:
-                self._add(file)
+                parts.append(self._added(file))
             except _ERRORS:
                 if len(files) == 1:
                     raise
                 self.unread.append(file.name)
-        self.n_messages = len(self._times)
+        rows = np.concatenate(parts)
+        self.n_messages = len(rows)
         if not self.n_messages:
             raise DataError(f"{', '.join(map(str, files))}: no message can be read.")
-        rows = np.array(self._where).reshape(-1, 4)
-        order = np.argsort(np.array(self._times), kind="stable")
-        self._rows, self._sorted = rows[order], np.array(self._times)[order]
-        self.first, self.last = (int(time) for time in self._sorted[[0, -1]])
-        del self._times, self._where
+        self._rows = rows[np.argsort(rows[:, 0], kind="stable")]
+        self.first, self.last = (int(time) for time in self._rows[[0, -1], 0])
 
-    def _add(self, file: Path) -> None:
+    def _added(self, file: Path) -> np.ndarray:
+        """Times, sources, connections, and two numbers (N, 5) of the messages of a file."""
         kinds: dict[str, type[_Chunked | _Database]] = {".bag": _Ros1Bag, ".mcap": _Mcap, ".db3": _Database}
         source = kinds[file.suffix](file, self._unpack, self._limit)
-        number, numbers = len(self._sources), dict[int, int]()
         self._sources.append(source)
-        last = None
-        found = array("q")
-        for time, connection, one, two in source.messages():
-            found.extend((time, connection, one, two))
+        found, last, is_after_loss = array("q"), None, False
+        for messages, is_whole in source.parts():
+            if messages:
+                begin, end = min(messages)[0], max(messages)[0]
+                if is_after_loss and last is not None and begin > last:
+                    self.gaps.append((last, begin))
+                last, is_after_loss = max(last or 0, end), False
+            is_after_loss |= not is_whole
+            for message in messages:
+                found.extend(message)
+        self.is_cut |= is_after_loss
         rows = np.array(found, np.int64).reshape(-1, 4)
-        counts = dict(
-            zip(*(part.tolist() for part in np.unique(rows[:, 1], return_counts=True)), strict=True)
-        )
+        counts, numbers = Counter(rows[:, 1].tolist()), dict[int, int]()
         for key, connection in source.connections().items():
             numbers[key] = len(self.connections)
-            self.connections.append(connection._replace(id=numbers[key], msgcount=counts.get(key, 0)))
-        known = np.isin(rows[:, 1], list(numbers))
-        rows = rows[known]
-        self._times.frombytes(rows[:, 0].tobytes())
+            self.connections.append(connection._replace(id=numbers[key], msgcount=counts[key]))
+        rows = rows[np.isin(rows[:, 1], list(numbers))]
         ids = np.array([numbers[key] for key in rows[:, 1].tolist()], np.int64)
-        where = np.column_stack([np.full_like(ids, number), ids, rows[:, 2:]]) if len(ids) else rows
-        self._where.frombytes(np.ascontiguousarray(where, np.int64).tobytes())
-        for last, following in source.lost:
-            if following is None:
-                self.is_cut = True
-            elif last is not None and following > last:
-                self.gaps.append((last, following))
+        return np.column_stack([rows[:, 0], np.full_like(ids, len(self._sources) - 1), ids, rows[:, 2:]])
 
     @property
     def missing_seconds(self) -> float:
         """Seconds between intact messages whose messages are lost."""
-        return sum(end - begin for begin, end in self.gaps) / _NANOSECONDS
+        return sum(end - begin for begin, end in self.gaps) / NANOSECONDS
 
     def messages(
         self, connections: Collection[Any], start: int | None = None
     ) -> Iterator[tuple[Any, int, bytes]]:
         """(connection, time in ns, content) of messages of some connections, from a time on."""
-        wanted = np.isin(self._rows[:, 1], [connection.id for connection in connections])
+        wanted = np.isin(self._rows[:, 2], [connection.id for connection in connections])
         if start is not None:
-            wanted &= self._sorted >= start
+            wanted &= self._rows[:, 0] >= start
         for row in np.flatnonzero(wanted):
-            source, connection, one, two = self._rows[row].tolist()
+            time, source, connection, one, two = self._rows[row].tolist()
             data = self._sources[source].content(one, two)
             if data is not None:
-                yield self.connections[connection], int(self._sorted[row]), data
+                yield self.connections[connection], time, data
 
 
 def _connection(topic: str, kind: str, form: str, definition: str) -> Any:
@@ -152,12 +148,12 @@ _ERRORS = (DataError, ValueError, KeyError, IndexError, struct.error, OverflowEr
 """What damaged records and the codecs of their chunks raise."""
 
 
-class _Chunked:
-    """A file of records. `lost`: for each part that cannot be read, the time (ns) of the last message before,
-    and of the first one after; None without one."""
+class _Chunked(ABC):
+    """A file of records."""
 
     def __init__(self, path: Path, unpack: Unpack, limit: int) -> None:
-        self._unpack, self._limit, self._places = unpack, limit, list[_Place]()
+        self._unpack, self._limit = unpack, limit
+        self._places = [_Place(0, 0)]  # the first one: of messages outside of chunks
         size = path.stat().st_size
         self._left = limit + _MOST_RATIO * size
         self._n_left = _LEAST_MESSAGES + size // _MESSAGE_BYTES
@@ -165,40 +161,41 @@ class _Chunked:
             self._data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         self._kept: dict[int, bytes] = {}
         self._connections: dict[int, Any] = {}
-        self.lost: list[tuple[int | None, int | None]] = []
 
     def connections(self) -> dict[int, Any]:
         """The connections by the numbers that messages have."""
         return self._connections
 
-    def messages(self) -> Iterator[_Found]:
-        """(time in ns, connection, chunk, byte) of each message."""
+    def parts(self) -> Iterator[tuple[list[_Found], bool]]:
+        """The messages (time in ns, connection, chunk, byte) of each part, and whether it is intact."""
         at: int | None = self._first()
         following: int | None
-        end, last, is_after_loss = len(self._data), None, False
-        while at is not None and at < end:
+        while at is not None and at < len(self._data):
             try:
                 following, found, is_whole = self._record(at)
             except _ERRORS:
                 following, found, is_whole = self._next(at + 1), self._cut_off(at), False
-            if found:
-                if is_after_loss:
-                    self.lost.append((last, min(time for time, *_ in found)))
-                    is_after_loss = False
-                last = max(last or 0, *(time for time, *_ in found))
-                yield from found
-            is_after_loss |= not is_whole
+            yield found, is_whole
             at = following
-        if is_after_loss or not self._is_complete():
-            self.lost.append((last, None))
+        yield [], self._is_complete()
 
     def content(self, chunk: int, byte: int) -> bytes | None:
         """The content of a message."""
+        if chunk == 0:
+            return self._message(self._data, byte)
         if chunk not in self._kept:
             while len(self._kept) >= _KEPT_CHUNKS:
                 del self._kept[next(iter(self._kept))]
             self._kept[chunk] = self._unpacked(self._places[chunk])
         return self._message(self._kept[chunk], byte)
+
+    def _record(self, at: int) -> tuple[int, list[_Found], bool]:
+        """The place after a record, its messages, and whether it is intact. Raises an error if it is not."""
+        place = self._chunk_at(at)
+        if place is not None:
+            return place.end, *self._chunk(place)
+        end, found = self._read(self._data, at)
+        return end, [(time, key, 0, byte) for time, key, byte in found], True
 
     def _unpacked(self, place: _Place) -> bytes:
         if max(place.size, place.end - place.begin) > self._limit:
@@ -216,10 +213,12 @@ class _Chunked:
         self._places.append(place)
         found, is_whole = list[_Found](), False
         with suppress(*_ERRORS):
-            for time, key, byte in self._inner(data):
-                if len(found) == self._n_left:
+            at = 0
+            while at < len(data):
+                at, read = self._read(data, at)
+                if len(found) + len(read) > self._n_left:
                     raise DataError("a file of this size has fewer messages")
-                found.append((time, key, number, byte))
+                found += [(time, key, number, byte) for time, key, byte in read]
             is_whole = True
         self._n_left -= len(found)
         return found, is_whole
@@ -234,39 +233,39 @@ class _Chunked:
     def _cut_off(self, at: int) -> list[_Found]:
         """The messages of a chunk that the end of the file cuts off, up to there."""
         with suppress(*_ERRORS):
-            begin, _, compression, size, _ = self._cut_chunk(at)
-            end = min(len(self._data), begin + self._limit)
-            self._spend(_Place(begin, end, size=min(size, self._limit)))
-            data = self._unpack(self._data[begin:end], compression, size)
-            return self._chunk(_Place(begin, end, compression, len(data)))[0]
+            place = self._chunk_at(at, is_cut=True)
+            if place is not None:
+                end = min(len(self._data), place.begin + self._limit)
+                self._spend(_Place(place.begin, end, size=min(place.size, self._limit)))
+                data = self._unpack(self._data[place.begin : end], place.compression, place.size)
+                return self._chunk(_Place(place.begin, end, place.compression, len(data)))[0]
         return []
 
-    def _cut_chunk(self, at: int) -> _Place:
-        """The place of a chunk that ends after the file. Raises an error if there is no such chunk."""
-        raise NotImplementedError
-
-    def _first(self) -> int | None:
+    @abstractmethod
+    def _first(self) -> int:
         """The place of the first record. Raises `DataError` if the file is of another kind."""
-        raise NotImplementedError
 
-    def _record(self, at: int) -> tuple[int, list[_Found], bool]:
-        """The place after a record, its messages, and whether it is intact. Raises an error if it is not."""
-        raise NotImplementedError
-
+    @abstractmethod
     def _next(self, at: int) -> int | None:
         """The place of the next chunk from a byte on."""
-        raise NotImplementedError
 
-    def _inner(self, data: bytes) -> Iterator[tuple[int, int, int]]:
-        """(time, connection, byte) of the messages of a chunk."""
-        raise NotImplementedError
+    @abstractmethod
+    def _chunk_at(self, at: int, is_cut: bool = False) -> _Place | None:
+        """The chunk of the record at a byte, which ends after the file if it `is_cut`; None if the record is
+        another one. Raises an error if it is damaged."""
 
-    def _message(self, data: bytes, byte: int) -> bytes:
-        raise NotImplementedError
+    @abstractmethod
+    def _read(self, data: Any, at: int) -> tuple[int, list[tuple[int, int, int]]]:
+        """The place after a record that is no chunk, and its message: time, connection, byte. Raises an error
+        if it is damaged."""
 
+    @abstractmethod
+    def _message(self, data: Any, byte: int) -> bytes:
+        """The content of the message in a record."""
+
+    @abstractmethod
     def _is_complete(self) -> bool:
         """Whether the file has the end that a closed one has."""
-        raise NotImplementedError
 
 
 # -- ROS 1 (wiki.ros.org/Bags/Format/2.0) ------------------------------------------------------------
@@ -287,19 +286,23 @@ class _Ros1Bag(_Chunked):
             raise DataError("it does not begin as a ROS 1 bag of format 2.0")
         return len(_BAG_MAGIC)
 
-    def _record(self, at: int) -> tuple[int, list[_Found], bool]:
-        fields, begin, end = _ros1_record(self._data, at)
-        kind = fields[b"op"][0]
-        if kind == _CHUNK:
-            return end, *self._chunk(_ros1_chunk(fields, begin, end))
-        if kind == _CONNECTION:
-            self._note(fields, self._data[begin:end])
-        self._has_index |= kind == _CHUNK_INFO
-        return end, [], True
+    def _chunk_at(self, at: int, is_cut: bool = False) -> _Place | None:
+        fields, begin, end = _ros1_record(self._data, at, is_cut)
+        if fields[b"op"][0] != _CHUNK:
+            return None
+        (size,) = struct.unpack("<I", fields[b"size"])
+        return _Place(begin, end, fields[b"compression"].decode(), size)
 
-    def _cut_chunk(self, at: int) -> _Place:
-        fields, begin, end = _ros1_record(self._data, at, is_cut=True)
-        return _ros1_chunk(fields, begin, end)
+    def _read(self, data: Any, at: int) -> tuple[int, list[tuple[int, int, int]]]:
+        fields, begin, end = _ros1_record(data, at)
+        kind = fields[b"op"][0]
+        if kind == _MESSAGE:
+            seconds, nanoseconds = struct.unpack("<II", fields[b"time"])
+            return end, [(seconds * NANOSECONDS + nanoseconds, *struct.unpack("<I", fields[b"conn"]), at)]
+        if kind == _CONNECTION:
+            self._note(fields, data[begin:end])
+        self._has_index |= kind == _CHUNK_INFO
+        return end, []
 
     def _next(self, at: int) -> int | None:
         while (found := self._data.find(b"\4\0\0\0op=\5", at)) >= 0:
@@ -311,18 +314,7 @@ class _Ros1Bag(_Chunked):
             at = found + 1
         return None
 
-    def _inner(self, data: bytes) -> Iterator[tuple[int, int, int]]:
-        at = 0
-        while at < len(data):
-            fields, begin, end = _ros1_record(data, at)
-            if fields[b"op"][0] == _CONNECTION:
-                self._note(fields, data[begin:end])
-            elif fields[b"op"][0] == _MESSAGE:
-                seconds, nanoseconds = struct.unpack("<II", fields[b"time"])
-                yield seconds * _NANOSECONDS + nanoseconds, *struct.unpack("<I", fields[b"conn"]), at
-            at = end
-
-    def _message(self, data: bytes, byte: int) -> bytes:
+    def _message(self, data: Any, byte: int) -> bytes:
         _, begin, end = _ros1_record(data, byte)
         return data[begin:end]
 
@@ -336,11 +328,6 @@ class _Ros1Bag(_Chunked):
 
     def _is_complete(self) -> bool:
         return self._has_index
-
-
-def _ros1_chunk(fields: dict[bytes, bytes], begin: int, end: int) -> _Place:
-    (size,) = struct.unpack("<I", fields[b"size"])
-    return _Place(begin, end, fields[b"compression"].decode(), size)
 
 
 def _ros1_record(
@@ -375,7 +362,7 @@ def _ros1_fields(header: bytes) -> dict[bytes, bytes]:
 
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
 _MCAP_SCHEMA, _MCAP_CHANNEL, _MCAP_MESSAGE, _MCAP_CHUNK_OP = 3, 4, 5, 6
-_LAST_KIND = 0x0F
+_MCAP_FOOTER, _LAST_KIND = 2, 0x0F
 _CHUNK_BEGIN = re.compile(b"\6(?=.{5}\0\0\0)", re.DOTALL)  # a chunk is smaller than 2⁴⁰ bytes
 _MCAP_FORMS = {"ros2msg": "MSG", "ros2idl": "IDL", "omgidl": "IDL"}
 
@@ -387,7 +374,6 @@ class _Mcap(_Chunked):
         super().__init__(path, unpack, limit)
         self._schemas: dict[int, tuple[str, str, str]] = {}
         self._channels: dict[int, tuple[int, str]] = {}
-        self._places.append(_Place(0, 0))  # of messages outside of chunks
 
     def connections(self) -> dict[int, Any]:
         found = {}
@@ -406,26 +392,10 @@ class _Mcap(_Chunked):
             raise DataError(f"its profile is {profile!r}, not ros2")
         return end
 
-    def _record(self, at: int) -> tuple[int, list[_Found], bool]:
-        begin, end = _mcap_record(self._data, at)
-        kind = self._data[at]
-        if kind == _MCAP_CHUNK_OP:
-            return end, *self._chunk(self._place(begin, end))
-        if kind == _MCAP_MESSAGE:
-            key, _, time = struct.unpack_from("<HIQ", self._data, begin)
-            return end, [(_within(time), key, 0, at)], True
-        if not 0 < kind <= _LAST_KIND:
-            raise DataError("a record of an unknown kind")
-        if kind in (_MCAP_SCHEMA, _MCAP_CHANNEL):
-            self._note(kind, self._data[begin:end])
-        return (len(self._data) if kind == 2 else end), [], True  # the footer is the last record
-
-    def _cut_chunk(self, at: int) -> _Place:
+    def _chunk_at(self, at: int, is_cut: bool = False) -> _Place | None:
         if self._data[at] != _MCAP_CHUNK_OP:
-            raise DataError("it is no chunk")
-        return self._place(*_mcap_record(self._data, at, is_cut=True))
-
-    def _place(self, begin: int, end: int) -> _Place:
+            return None
+        begin, end = _mcap_record(self._data, at, is_cut)
         _, _, size, crc, length = _MCAP_CHUNK.unpack_from(self._data, begin)
         at = begin + _MCAP_CHUNK.size
         (n_bytes,) = struct.unpack_from("<Q", self._data, at + length)
@@ -436,26 +406,24 @@ class _Mcap(_Chunked):
     def _next(self, at: int) -> int | None:
         for found in _CHUNK_BEGIN.finditer(self._data, at):
             with suppress(DataError, struct.error, ValueError):
-                begin, end = _mcap_record(self._data, found.start())
-                if self._place(begin, end).compression in ("", "lz4", "zstd"):
+                place = self._chunk_at(found.start())
+                if place is not None and place.compression in ("", "lz4", "zstd"):
                     return found.start()
         return None
 
-    def _inner(self, data: bytes) -> Iterator[tuple[int, int, int]]:
-        at = 0
-        while at < len(data):
-            begin, end = _mcap_record(data, at)
-            if data[at] == _MCAP_MESSAGE:
-                key, _, time = struct.unpack_from("<HIQ", data, begin)
-                yield _within(time), key, at
-            elif data[at] in (_MCAP_SCHEMA, _MCAP_CHANNEL):
-                self._note(data[at], data[begin:end])
-            elif not 0 < data[at] <= _LAST_KIND:
-                raise DataError("a record of an unknown kind")
-            at = end
-
-    def content(self, chunk: int, byte: int) -> bytes | None:
-        return self._message(self._data, byte) if chunk == 0 else super().content(chunk, byte)
+    def _read(self, data: Any, at: int) -> tuple[int, list[tuple[int, int, int]]]:
+        begin, end = _mcap_record(data, at)
+        kind = data[at]
+        if kind == _MCAP_MESSAGE:
+            key, _, time = struct.unpack_from("<HIQ", data, begin)
+            if time >= 1 << 63:
+                raise DataError("a time is damaged")
+            return end, [(time, key, at)]
+        if not 0 < kind <= _LAST_KIND:
+            raise DataError("a record of an unknown kind")
+        if kind in (_MCAP_SCHEMA, _MCAP_CHANNEL):
+            self._note(kind, data[begin:end])
+        return (len(data) if kind == _MCAP_FOOTER else end), []  # the footer is the last record
 
     def _message(self, data: Any, byte: int) -> bytes:
         begin, end = _mcap_record(data, byte)
@@ -491,13 +459,6 @@ def _mcap_text(content: bytes, at: int) -> tuple[str, int]:
     return content[at + 4 : at + 4 + length].decode(errors="replace"), at + 4 + length
 
 
-def _within(time: int) -> int:
-    """A time that fits into 63 bits. Raises `DataError`."""
-    if time >= 1 << 63:
-        raise DataError("a time is damaged")
-    return time
-
-
 # -- SQLite ------------------------------------------------------------------------------------------
 
 
@@ -512,7 +473,6 @@ class _Database:
         import sqlite3
 
         self._error = sqlite3.Error
-        self.lost: list[tuple[int | None, int | None]] = []
         self._database = sqlite3.connect(f"{path.resolve().as_uri()}?immutable=1", uri=True)
         self._database.text_factory = lambda data: data.decode(errors="replace")
         self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, limit)
@@ -529,37 +489,31 @@ class _Database:
         texts: dict[str, tuple[str, str]] = {}
         with suppress(self._error):  # older recordings have no definitions
             query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-            texts = {kind: (_MCAP_FORMS.get(form, "NONE"), text) for kind, form, text in self._rows(query)}
+            texts = {
+                kind: (_MCAP_FORMS.get(form, "NONE"), text)
+                for kind, form, text in self._database.execute(query)
+            }
         found = {}
-        for key, topic, kind in self._rows("SELECT id, name, type FROM topics"):
+        for key, topic, kind in self._database.execute("SELECT id, name, type FROM topics"):
             if isinstance(topic, str) and isinstance(kind, str):
                 found[key] = _connection(topic, kind, *texts.get(kind, ("NONE", "")))
         return found
 
-    def _rows(self, query: str) -> Iterator[Any]:
-        yield from self._database.execute(query)
-
-    def messages(self) -> Iterator[_Found]:
-        """(time in ns, topic, row, 0) of each message."""
+    def parts(self) -> Iterator[tuple[list[_Found], bool]]:
+        """The message (time in ns, topic, row, 0) of each row, and True; none, and False, for lost rows."""
         row: int | None = -1
-        last, is_after_loss = None, False
         while row is not None:
             try:
                 found = self._row_after(row)
             except (self._error, OverflowError):
-                is_after_loss, row = True, self._next(row)
+                row = self._next(row)
+                yield [], False
                 continue
             if found is None:
                 break
             row, time, topic = found
             if isinstance(time, int) and isinstance(topic, int):
-                if is_after_loss:
-                    self.lost.append((last, time))
-                    is_after_loss = False
-                last = max(last or 0, time)
-                yield time, topic, row, 0
-        if is_after_loss:
-            self.lost.append((last, None))
+                yield [(time, topic, row, 0)], True
 
     def _next(self, row: int) -> int | None:
         """The row before the next one that is intact; None without one."""

@@ -11,13 +11,12 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import Ranges
-from gmmtorch.datasets.ros import bag_reader, sensor_messages
+from gmmtorch.datasets.ros import bag_topics, sensor_messages
 from gmmtorch.datasets.ros.bag_poses import PoseSource, RegisteredPoses
-from gmmtorch.datasets.ros.bag_reader import Sensor
+from gmmtorch.datasets.ros.bag_topics import Sensor
 from gmmtorch.datasets.ros.image_camera import ImageCamera
-from gmmtorch.datasets.ros.lidar_packets import VelodynePackets
 from gmmtorch.datasets.ros.point_times import N_SAMPLES, PointTimes, Rate
-from gmmtorch.datasets.ros.sensor_messages import Reading
+from gmmtorch.datasets.ros.sensor_messages import Reading, VelodynePackets
 from gmmtorch.errors import DataError
 from gmmtorch.pose import Pose
 from gmmtorch.scan import FARTHEST, Scan
@@ -55,17 +54,17 @@ class ScanConversion:
         self._attributes = attributes
         self.source, self._camera = source, camera
         self._sensor, self._ranges = sensor, ranges
-        self._packets = VelodynePackets() if sensor.kind == bag_reader.PACKETS else None
-        self._times = PointTimes(sensor.kind in bag_reader.LASERS) if deskew and source.can_deskew else None
+        self._packets = VelodynePackets() if sensor.kind == bag_topics.PACKETS else None
+        self._times = PointTimes(sensor.kind in bag_topics.LASERS) if deskew and source.can_deskew else None
 
     def points(self, message: dict[str, Any]) -> Reading:
         """The points of a decoded message, in the sensor's frame."""
         kind = self._sensor.kind
-        if kind == bag_reader.CLOUD:
+        if kind == bag_topics.CLOUD:
             return sensor_messages.cloud_points(message, self._attributes)
-        if kind == bag_reader.LIST:
+        if kind == bag_topics.LIST:
             return sensor_messages.listed_points(message, self._sensor.field)
-        if kind in bag_reader.LASERS:
+        if kind in bag_topics.LASERS:
             return sensor_messages.laser_points(message)
         if self._packets is not None:
             return self._packets.points(message)
@@ -84,7 +83,7 @@ class ScanConversion:
         """
         planar = [is_planar(found) for found in samples if len(found.points) >= _MIN_PLANAR]
         is_planar_cloud = not self._sensor.is_camera and 2 * sum(planar) > len(planar)
-        is_planar_sensor = self._sensor.kind in bag_reader.LASERS or is_planar_cloud
+        is_planar_sensor = self._sensor.kind in bag_topics.LASERS or is_planar_cloud
         return is_planar_sensor and self.is_level(poses)
 
     def learn_times(self, found: Reading, stamp: int, rate: Rate) -> None:
