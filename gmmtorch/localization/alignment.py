@@ -19,9 +19,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels import AlignmentSums, NearLists, alignment_sums
+from gmmtorch.kernels import AlignmentSums, Lists, NearLists, alignment_sums
 from gmmtorch.mapping import Components
 from gmmtorch.mixture import Parameters, merge_components
+from gmmtorch.occupancy import cells_in_chunks, row_major
 from gmmtorch.pose import Pose
 
 CUTOFF = 3.5
@@ -33,6 +34,7 @@ _SETTLED = 0.05  # of the blur: steps below this end a climb
 _SADDLE = 0.05  # of EM's information: with less curvature Newton's step is too long
 _SIDE = 2.0  # blurs of a cell of the lists
 _MOST_CELLS = 1 << 20  # of the lists, and entries
+_AT_ONCE = 256  # motions
 _RIDGE = 1e-9
 _TURNED = math.radians(10)  # between the headings of neighbouring starts, for each metre between their places
 _FLAT = 0.25  # of the next deviation: thinner components have a face
@@ -77,6 +79,11 @@ class AlignmentTarget:
         limits = self.blur, CUTOFF**2, _OUTLIERS, _EXPLAINED
         return alignment_sums(points, motions.parts, self.lists, target, limits)
 
+    def scores(self, points: Tensor, motions: Pose) -> Tensor:
+        """ℓ (B,) of points (N, D) under each of many motions, a part of them at a time."""
+        parts = torch.arange(len(motions), device=points.device).split(_AT_ONCE)
+        return torch.cat([self.sums(points, motions[part]).score for part in parts])
+
 
 def _near_lists(means: Tensor, covariances: Tensor, blur: float) -> NearLists:
     """For each cell of a lattice, the components whose box of `CUTOFF` deviations meets it."""
@@ -86,21 +93,15 @@ def _near_lists(means: Tensor, covariances: Tensor, blur: float) -> NearLists:
     while True:
         first, last = (((means + way * half - low) / side).floor().clamp_min(0).long() for way in (-1, 1))
         shape = last.amax(0) + 1
-        n_each = (last - first + 1).prod(1)
-        if math.prod(shape.tolist()) <= _MOST_CELLS and int(n_each.sum()) <= _MOST_CELLS:
+        sizes = shape.tolist()
+        if math.prod(sizes) <= _MOST_CELLS and int((last - first + 1).prod(1).sum()) <= _MOST_CELLS:
             break
         side *= 1.5
-    row = torch.repeat_interleave(n_each)
-    rest = torch.arange(len(row), device=row.device) - (n_each.cumsum(0) - n_each)[row]
-    cell, stride = torch.zeros_like(row), torch.ones_like(shape[0])
-    for axis in range(means.shape[1] - 1, -1, -1):
-        width = (last - first + 1)[row, axis]
-        cell = cell + (first[row, axis] + rest % width) * stride
-        rest, stride = rest // width, stride * shape[axis]
-    order = cell.argsort(stable=True)
-    n_before = torch.bincount(cell, minlength=math.prod(shape.tolist())).cumsum(0)
-    starts = torch.cat([n_before.new_zeros(1), n_before])
-    return NearLists(low, side, shape, starts, row[order].int())
+    component, cells = next(cells_in_chunks(first, last - first + 1, _MOST_CELLS))  # in one chunk
+    cell = row_major(cells.unbind(), tuple(sizes))
+    lengths = torch.bincount(cell, minlength=math.prod(sizes))
+    lists = Lists.of(lengths, component[cell.argsort(stable=True)].int())
+    return NearLists(low, side, shape, *lists)
 
 
 def seen_normals(surfaces: Components) -> Tensor:

@@ -42,7 +42,6 @@ _COARSE = 1.0  # metres of blur, and between the starts, of the wide search in 3
 _TURNED = {2: 0.5, 3: 0.2}  # radians between the headings of neighbours, for each metre between their places
 _NEAR = 0.5  # metres, and half as many radians, of the deviations of the first search
 _FARTHEST = 3.0  # metres of a search
-_AT_ONCE = 256  # starts
 _SORTED = {2: 400, 3: 64}  # best starts, of which
 _CLIMBED = 24  # different ones are climbed
 _SPREAD = 0.75  # spacings between them
@@ -172,8 +171,7 @@ class LocalMap:
         places = (expected.poses.translation[:, None] + shifts)[:, :, None].expand(-1, -1, len(turns), -1)
         starts = Pose.cat([expected.poses, Pose(rotations.flatten(0, 2), places.flatten(0, 2))])
         points = scan.points[:_RANKED]
-        parts = torch.arange(len(starts)).split(_AT_ONCE)
-        score = torch.cat([target.sums(points, starts[part].shifted(-self._center)).score for part in parts])
+        score = target.scores(points, starts.shifted(-self._center))
         total = score / CORRELATED - expected.unlikely(starts)
         best = total.argsort(descending=True, stable=True)[: _SORTED[self.dim]]
         view = self._space.view(points, starts[best])

@@ -9,6 +9,7 @@ less a margin, are divided. All squares of a level are scored in one launch.
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -119,25 +120,28 @@ class PoseSearch:
         shape = ((high / side).floor() + pad + 1 - self._low).long().tolist()
         hits = points.new_zeros(shape, dtype=torch.float32)
         hits[((points / side).floor() - self._low).long().unbind(1)] = 1.0
-        weights = [math.exp(-0.5 * (shift / _BLUR) ** 2) for shift in range(_NEAR + 1)]
-        shade, near = hits, hits
-        for axis in range(self.dim):
-            shade, near = _spread(shade, weights, axis), _spread(near, [1.0] * (_NEAR + 1), axis)
-        raster = torch.where(near > 0, HIT * shade, UNKNOWN)
+        shade = hits
+        for axis in range(self.dim):  # the margin has no hits, so nothing comes in from the other end
+            near = (
+                math.exp(-0.5 * (shift / _BLUR) ** 2) * shade.roll(shift, axis)
+                for shift in range(-_NEAR, _NEAR + 1)
+            )
+            shade = functools.reduce(torch.maximum, near)
+        raster = torch.where(shade > 0, HIT * shade, UNKNOWN)
         if free is not None and len(free):
             misses = torch.zeros(math.prod(shape), dtype=torch.float64, device=points.device)
             starts, ends = (free.double() / side).unbind(1)
             count_in_grid(misses, starts, ends, tuple(shape), low=self._low)
             crossed = (misses > 0).view(shape)
-            raster = torch.where(crossed & (near == 0), FREE, raster)
+            raster = torch.where(crossed & (shade == 0), FREE, raster)
         while raster.ndim < 3:
             raster = raster[..., None]
         self._levels = [raster]
         for level in range(_LEVELS - 1):
-            wider = self._levels[-1]
-            for axis in (0, 1):
-                wider = torch.maximum(wider, _shifted(wider, 1 << level, axis, UNKNOWN))
-            self._levels.append(wider)
+            step = 1 << level
+            wide = torch.nn.functional.pad(self._levels[-1], (0, 0, 0, step, 0, step), value=UNKNOWN)
+            wide = torch.maximum(wide[:-step], wide[step:])
+            self._levels.append(torch.maximum(wide[:, :-step], wide[:, step:]))
 
     def best(self, points: Tensor, expected: Expectation, most: int) -> Found:
         """The best poses that differ, at most `most`, as far from the last expected pose as a scan can be.
@@ -246,22 +250,3 @@ def _divided(heading: Tensor, shift: Tensor, width: int) -> tuple[Tensor, Tensor
     """The four squares of `width` cells of each larger one."""
     parts = torch.tensor([[0, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0]], device=shift.device) * width
     return heading.repeat_interleave(4), (shift[:, None] + parts).flatten(0, 1)
-
-
-def _spread(values: Tensor, weights: list[float], axis: int) -> Tensor:
-    """The largest of the neighbours along an axis, times the weight of their distance in cells."""
-    found = weights[0] * values
-    for shift, weight in enumerate(weights[1:], 1):
-        for way in (shift, -shift):
-            found = torch.maximum(found, weight * _shifted(values, way, axis, 0.0))
-    return found
-
-
-def _shifted(values: Tensor, shift: int, axis: int, outside: float) -> Tensor:
-    """values[i + shift] along an axis."""
-    n = values.shape[axis]
-    if abs(shift) >= n:
-        return torch.full_like(values, outside)
-    rest = values.new_full((*values.shape[:axis], abs(shift), *values.shape[axis + 1 :]), outside)
-    kept = values.narrow(axis, max(shift, 0), n - abs(shift))
-    return torch.cat([kept, rest] if shift > 0 else [rest, kept], axis)

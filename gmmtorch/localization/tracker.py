@@ -43,7 +43,6 @@ _PLACES = 0.5  # metres between the places of a search of the whole map
 _RANKED = 8 * _CLIMBED  # best starts, of which different ones are climbed
 _RANKING_POINTS = 150  # of the scan, that rank the starts
 _GLIMPSE_POINTS = 60  # of the scan, that choose a fifth of many starts for the ranking
-_RANKED_AT_ONCE = 256  # starts
 _WIDER = 4  # times the first search
 _GLOBAL_AFTER = 1  # lost scans, after which the whole map is searched
 
@@ -212,21 +211,17 @@ class Tracker:
     def _ranked(self, rows: Tensor, starts: Pose, target: AlignmentTarget) -> Pose:
         """The best starts that differ from each other, at most `_CLIMBED`."""
         if len(starts) > 10 * _RANKED:
-            score = self._scores(rows[:_GLIMPSE_POINTS], starts, target)
+            score = target.scores(rows[:_GLIMPSE_POINTS], starts)
             starts = starts[score.topk(len(score) // 5).indices]
         n = len(starts)
         if n <= _CLIMBED:
             return starts
-        score = self._scores(rows[:_RANKING_POINTS], starts, target)
+        score = target.scores(rows[:_RANKING_POINTS], starts)
         order = score.argsort(descending=True, stable=True)
         if n > _RANKED:
             best = order[:_RANKED]
             order = best[best_distinct(starts[best], score[best], 1.01 * target.blur)]
         return starts[order[:_CLIMBED]]
-
-    def _scores(self, rows: Tensor, starts: Pose, target: AlignmentTarget) -> Tensor:
-        parts = torch.arange(len(starts), device=rows.device).split(_RANKED_AT_ONCE)
-        return torch.cat([target.sums(rows, starts[part]).score for part in parts])
 
     def _location(self, rows: Tensor, found: Alignment, is_tracked: bool) -> Location:
         covariance, loosest = pose_covariance(found.information[0], rows)

@@ -58,9 +58,11 @@ from .protocol import check_scan as check_scan
 from .protocol import optional_length as optional_length
 from .voxels.cells import Box as Box
 from .voxels.cells import CellEvidence as CellEvidence
+from .voxels.cells import cells_in_chunks as cells_in_chunks
 from .voxels.cells import flat_index as flat_index
 from .voxels.cells import intersection as intersection
 from .voxels.cells import occupied_cells as occupied_cells
+from .voxels.cells import row_major as row_major
 from .voxels.cells import sum_evidence as sum_evidence
 from .voxels.cells import to_lattice as to_lattice
 from .voxels.ray_casting import cast_evidence as cast_evidence

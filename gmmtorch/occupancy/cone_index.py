@@ -143,8 +143,6 @@ class ConeIndex:
         cutoff: Mahalanobis distance beyond which a component gives no evidence.
         smoothed: True for the point form, which widens cones by the spread of the cube (see `PointForm`);
             False for boxes that meet the cones themselves.
-        entries_per_cone: the buckets are halved while at most about this many entries per cone list all of
-            them.
         smallest: the lists of the smallest buckets serve always, which pays for many queries about the same
             places. False: a larger bucket's list serves its points if there are few.
         share: of the least number of entries that are kept, if other indices need memory, too.
@@ -160,12 +158,11 @@ class ConeIndex:
         extent: float,
         cutoff: float = CUTOFF,
         smoothed: bool = False,
-        entries_per_cone: int | None = None,
         smallest: bool = False,
         share: float = 1.0,
     ) -> None:
         self.extent = check_resolution(extent)
-        self._options = self.extent, cutoff, smoothed, entries_per_cone
+        self._options = self.extent, cutoff, smoothed
         self._smallest, self._share = smallest, share
         cones = cones if isinstance(cones, Tensor) else cones.checked()
         self.hulls = Hulls(cones, self.extent, cutoff, smoothed)
@@ -174,14 +171,13 @@ class ConeIndex:
 
     def _set_lattice(self) -> None:
         """Chooses the buckets for the present hulls, and drops all lists."""
-        hulls, per_cone = self.hulls, self._options[3]
-        n_cones = len(hulls.table)
+        hulls, n_cones = self.hulls, len(self.hulls.table)
         self._n_chosen = n_cones  # the side is chosen for so many
         self.origin = hulls.low.amin(0) if n_cones else hulls.low.new_zeros(self.dim)
         span = float((hulls.high.amax(0) - self.origin).amax()) * (1 + 1e-9) if n_cones else 0.0
         # The finest buckets whose coordinates fit the bits of the key, with room to grow.
         finest = max(self.extent, span / (self._limit - 1))
-        self.side = _chosen_side(hulls, finest, span, per_cone or _ENTRIES_PER_CONE[self.dim])
+        self.side = _chosen_side(hulls, finest, span, _ENTRIES_PER_CONE[self.dim])
         self._n_levels = 1 + math.ceil(math.log2(max(span / self.side, 1.0)) / _SHIFT)
         self._set_box()
         self._drop_all()
@@ -198,7 +194,7 @@ class ConeIndex:
         is_new, stays = former < 0, torch.zeros_like(self.hulls.low[:, 0], dtype=torch.bool)
         stays[former[~is_new]] = True
         given = cones[is_new] if isinstance(cones, Tensor) else cones.checked().taken(is_new)
-        new = Hulls(given, *self._options[:3])
+        new = Hulls(given, *self._options)
         made.hulls = self.hulls.replaced(former, new, table)
         corners = (torch.cat([new.low, new.high]) - self.origin) / self.side
         is_far = bool((corners.abs() > self._limit).any())

@@ -70,7 +70,9 @@ def pairs_of(index: ConeIndex, low: torch.Tensor, high: torch.Tensor) -> list[tu
 )
 def test_candidates_contain_all_cones_that_meet_a_box(dim, seed, extent, entries, cutoff):
     cones = random_cones(dim, 12, seed)
-    index = ConeIndex(cones, extent, cutoff, entries_per_cone=entries)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cone_index, "_ENTRIES_PER_CONE", {dim: entries})
+        index = ConeIndex(cones, extent, cutoff)
     places, which = places_on_rays(cones, 400, cutoff, seed)
     generator = torch.Generator().manual_seed(seed)
     # Boxes that contain the point, often close to a corner.

@@ -175,8 +175,9 @@ class Lists(NamedTuple):
 
     def taken(self, lists: Tensor) -> tuple[Tensor, Tensor]:
         """All entries of some lists (T,), in order: position in `lists` (P,) and cone (P,), int64."""
-        place, within = ragged_index(self.lengths()[lists])
-        return place, self.entries[self.starts[lists][place] + within].long()
+        begin = self.starts[lists]
+        place, within = ragged_index(self.starts[lists + 1] - begin)
+        return place, self.entries[begin[place] + within].long()
 
 
 def near_lists(

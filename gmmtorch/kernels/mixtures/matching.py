@@ -17,6 +17,7 @@ from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel
+from gmmtorch.kernels.evidence.point_evidence import Lists
 
 MOST_TESTED = 1 << 24
 """Pairs above which a k-d tree is faster."""
@@ -214,7 +215,10 @@ def _batched_alignment(
     n, (count, dim) = len(translations), points.shape
     lever = (points @ rotations.mT).flatten(0, 1)
     moved = lever + translations.repeat_interleave(count, 0)
-    row, component = _listed(lists.cells(moved), lists.starts, lists.entries)
+    cell = lists.cells(moved)
+    known = (cell >= 0).nonzero()[:, 0]
+    place, component = Lists(lists.starts, lists.entries).taken(cell[known])
+    row = known[place]
     offset = moved[row] - means[component]
     precision = precisions[component]
     pulls = (precision @ offset[:, :, None])[:, :, 0]
@@ -240,16 +244,6 @@ def _batched_alignment(
         (total > outliers + height).to(lever).view(n, count).sum(1),
         *(terms.unflatten(0, (n, count)).sum(1) for terms in (gradient, complete, observed)),
     )
-
-
-def _listed(bucket: Tensor, starts: Tensor, entries: Tensor) -> tuple[Tensor, Tensor]:
-    """Pairs of a point and a component (P,) of its bucket's list."""
-    known = (bucket >= 0).nonzero()[:, 0]
-    begin = starts[bucket[known]]
-    length = starts[bucket[known] + 1] - begin
-    row = torch.repeat_interleave(length)
-    within = torch.arange(len(row), device=row.device) - (length.cumsum(0) - length)[row]
-    return known[row], entries[begin[row] + within].long()
 
 
 def _arms(lever: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ again in the direct form, ‖L⁻¹x − L⁻¹μ‖² for every type.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple, Protocol
 
 import torch
@@ -203,6 +203,16 @@ def rows_of_chunk(n_components: int, dim: int, kind: str, device: torch.device) 
     # The direct form looks up the points of each component, which is worthwhile in large chunks.
     most = chunk_elements(device) * (1 if linear or device.type != "cpu" else 8)
     return max(64, most // max(n_components, width))
+
+
+def chunk_rows(points: Tensor) -> int:
+    """Rows of a chunk of points (N, D), whatever is computed of each coordinate."""
+    return max(64, chunk_elements(points.device) // points.shape[1])
+
+
+def in_chunks(points: Tensor, weight: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """Points (N, D) and their weights (N,), in chunks of `chunk_rows`."""
+    return zip(points.split(chunk_rows(points)), weight.split(chunk_rows(points)), strict=True)
 
 
 # -- moments --------------------------------------------------------------------------------------

@@ -1,7 +1,7 @@
 """Starting parameters of EM (thesis 2.1.3): k-means, random points, the bounding box, or flat pieces.
 
-Starts are computed from the distinct points, in sorted order, with summed weights. A point of weight 2
-and the same point given twice therefore give exactly the same start.
+Random draws are made among the distinct points, with summed weights, in an order that depends on the values
+only. A point of weight 2 and the same point given twice therefore give the same start, up to rounding.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels import chunk_elements
 from gmmtorch.linalg import argsort
 from gmmtorch.mixture.em import by_type
 from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em.by_type import chunk_rows
 from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.em.kmeans import kmeans, spread_out
+from gmmtorch.mixture.em.kmeans import kmeans, mean_variance, spread_out
 from gmmtorch.mixture.em.partition import FlatnessRule, partition, pool, pool_into_cells, surface_rule
 
 _FEWEST_CELLS, _CELLS_OF_A_COMPONENT = 4096, 8  # lower limits of the cells for flat pieces
@@ -75,11 +75,6 @@ def _hash(points: Tensor, rows: Tensor) -> Tensor:
         bits = (points[some] + 0.0).view(torch.int64)  # + 0, because −0 equals 0
         found.append(((bits ^ (bits >> 32)) * odd).sum(1))
     return torch.cat(found)
-
-
-def chunk_rows(points: Tensor) -> int:
-    """Rows of a chunk of points (N, D)."""
-    return max(64, chunk_elements(points.device) // points.shape[1])
 
 
 def from_kmeans(
@@ -150,11 +145,8 @@ def from_bounding_box(
 
 def _tiling(means: Tensor, cloud: Distinct, reg_covar: float, kind: str) -> Parameters:
     """Components with the cloud's mean variance, reduced as if they tile the cloud: σ² K^(−2/D)."""
-    (n_components, dim), (points, weight, *_) = means.shape, cloud
-    center, total = weight @ points / weight.sum(), weight.sum()
-    spread = weight.new_zeros(())
-    for some, p in zip(points.split(chunk_rows(points)), weight.split(chunk_rows(points)), strict=True):
-        spread = spread + (p @ (some - center).square_()).sum() / total / dim
+    n_components, dim = means.shape
+    spread = mean_variance(cloud.points, cloud.weight)
     return _isotropic(means, spread * n_components ** (-2 / dim) + reg_covar, kind)
 
 

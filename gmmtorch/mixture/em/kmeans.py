@@ -7,12 +7,12 @@ twice therefore give the same clusters.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels import chunk_elements, nearest_centers
+from gmmtorch.kernels import nearest_centers
+from gmmtorch.mixture.em.by_type import in_chunks
 
 _MAX_ITER, _TOLERANCE = 300, 1e-4  # the tolerance is a share of the mean variance, as in scikit-learn
 _STEPS_AHEAD = 8  # on a GPU: steps of Lloyd's between two waits for its convergence
@@ -33,9 +33,7 @@ def kmeans(
     the point that is farthest from its center. `rows`, `mass`: see `spread_out`.
     """
     centers = points[spread_out(points, weight, rows, mass, n_clusters, generator, n_runs)]
-    center = weight @ points / weight.sum()
-    variance = sum(p @ (x - center).square_().sum(1) for x, p in _chunks(points, weight)) / weight.sum()
-    least = _TOLERANCE * variance / points.shape[1]
+    least = _TOLERANCE * mean_variance(points, weight)
     every = 1 if points.device.type == "cpu" else _STEPS_AHEAD
     for step in range(_MAX_ITER):
         _, distance, sums = nearest_centers(points, weight, centers)
@@ -49,6 +47,15 @@ def kmeans(
                 break
     nearest, distance, _ = nearest_centers(points, weight, centers)
     return nearest, distance @ weight
+
+
+def mean_variance(points: Tensor, weight: Tensor) -> Tensor:
+    """The variance of weighted points (N, D) along an axis, on average over the axes."""
+    center, total = weight @ points / weight.sum(), weight.sum()
+    spread = weight.new_zeros(())
+    for some, p in in_chunks(points, weight):
+        spread = spread + (p @ (some - center).square_()).sum() / total / points.shape[1]
+    return spread
 
 
 def spread_out(
@@ -101,8 +108,3 @@ def _refilled(points: Tensor, distance: Tensor, centers: Tensor, empty: Tensor) 
     far = distance.topk(min(int(empty.sum(1).max()), distance.shape[1]), 1).indices
     place = (empty.cumsum(1) - 1).clamp(0, far.shape[1] - 1)
     return torch.where(empty[:, :, None], points[far.gather(1, place)], centers)
-
-
-def _chunks(points: Tensor, weight: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-    size = max(64, chunk_elements(points.device) // points.shape[1])
-    return zip(points.split(size), weight.split(size), strict=True)

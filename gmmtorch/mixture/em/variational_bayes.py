@@ -19,17 +19,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels import chunk_elements
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.mixture.em import by_type, loop
 from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em.exact import (
-    LOG_2PI,
-    Parameters,
-    compact,
-    constrain,
-    expand,
-)
+from gmmtorch.mixture.em.exact import LOG_2PI, Parameters, compact, constrain, expand
 
 
 class Prior(NamedTuple):
@@ -69,9 +62,8 @@ def unbiased_covariance(
     # No unbiased estimate exists below two points; W/2 continues W − 1 continuously.
     count = max(total - 1, total / 2)
     if covariance_type in ("diag", "spherical"):
-        rows = max(64, chunk_elements(points.device) // points.shape[1])
-        parts = zip(points.split(rows), weight.split(rows), strict=True)
-        variances = torch.stack([p @ x.square() for x, p in parts]).sum(0) / count
+        parts = [p @ x.square() for x, p in by_type.in_chunks(points, weight)]
+        variances = torch.stack(parts).sum(0) / count
         flat = ~(variances > 1e-14 * variances.amax())
         variances = torch.where(flat, variances.clamp_min(thickness), variances)
         return constrain(torch.diag(variances)[None], covariance_type)[0]
