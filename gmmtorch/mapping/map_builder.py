@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets import Dataset
-from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
+from gmmtorch.errors import DAMAGED_CONTENT, DataError, GmmTorchError, InvalidArgumentError
 from gmmtorch.files import joined_tensors, pack_tensors, read_tensors, split_tensors, write_bytes
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
@@ -255,7 +255,7 @@ class MapBuilder:
             self.map.to(self._device)
         except GmmTorchError:
             raise
-        except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+        except DAMAGED_CONTENT as error:
             raise DataError(f"{path} is damaged: {error!r}; delete it to start again.") from error
         self.record, self._poses, self.windows = record, list(poses.double()), windows
 
