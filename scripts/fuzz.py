@@ -5,9 +5,9 @@
     python scripts/fuzz.py --inputs 100000 --targets mcap,pcd
 
 Inputs are sound ones that were changed where it hurts: sizes, counts, names, numbers; checksums fit again.
-A reader may return or raise a `GmmTorchError`. Anything else is a fault: another error, more than 10 s, more
-than 512 MiB above what the process had, a new file beside the input, the death of the process. The inputs of
-faults are kept in the folder. The exit status is 1 if there is one.
+A reader may return or raise a `GmmTorchError`. Anything else is a fault: another error, more than 10 s of a
+processor, more than 512 MiB above what the process had, a new file beside the input, the death of the process.
+The inputs of faults are kept in the folder. The exit status is 1 if there is one.
 """
 
 from __future__ import annotations
@@ -62,7 +62,8 @@ from gmmtorch import datasets  # noqa: E402
 from gmmtorch.errors import GmmTorchError  # noqa: E402
 from gmmtorch.mapping import MapBuilder, TiledMap, tile_files  # noqa: E402
 
-SECONDS, MEMORY, SILENCE = 10, 512 << 20, 40
+SECONDS, MEMORY, SILENCE = 10, 512 << 20, 60
+"""Of a processor and bytes for an input, at most; seconds without an outcome."""
 BATCH, BATCH_SECONDS = 6_000, 5
 """Inputs and seconds of a process, at most: slow readers get fewer inputs."""
 
@@ -72,12 +73,14 @@ class Target(NamedTuple):
 
     mend: makes the checksums of a changed file right again.
     change: changes sound bytes, given all seeds and a source of random numbers.
+    has_thread: whether the reader starts a thread, which a fork does not copy.
     """
 
     seeds: dict[str, bytes]
     read: Callable[[Path], object]
     mend: Callable[[bytes], bytes] | None = None
     change: Change = changed
+    has_thread: bool = False
 
 
 # -- sound inputs ------------------------------------------------------------------------------------
@@ -340,6 +343,10 @@ def mixtures(folder: Path, points: torch.Tensor) -> dict[str, Target]:
     for name in ("s.ply", "s.spz"):
         export.write_splats(folder / name, export.Splats.of(built.components()))
     corners = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n" * 2
+    axes = b"".join(b"property float %c\n" % axis for axis in b"xyz")
+    ply = b"ply\nformat ascii 1.0\nelement vertex 3\n" + axes
+    ply += b"element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    ply += b"0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
     stl = bytes(80) + struct.pack("<I", 2) + struct.pack("<12fH", *range(12), 0) * 2
     found = {
         "mixture": Target(
@@ -349,7 +356,7 @@ def mixtures(folder: Path, points: torch.Tensor) -> dict[str, Target]:
         "npz as a whole": Target(taken(folder, "a.npz"), export.read_npz),
         "csv": Target(taken(folder, "a.csv"), export.read_gira_csv),
         "splats": Target(taken(folder, "s.ply", "s.spz"), export.read_splats),
-        "meshes": Target({"a.obj": corners, "a.stl": stl, **taken(folder, "text.ply")}, read_triangles),
+        "meshes": Target({"a.obj": corners, "a.stl": stl, "a.ply": ply}, read_triangles),
     }
     with contextlib.suppress(ImportError):
         from gmmtorch.experiments.baselines import OctoMapMap
@@ -503,9 +510,15 @@ def sharing(scans: list[Any]) -> dict[str, Target]:
 
 def sockets() -> dict[str, Target]:
     """The UDP transport and the viewer, each asked again after each input whether it still works."""
-    found = {"udp": Target({"frame": b"\xe1" + bytes(40), "empty": b""}, functools.partial(_to_udp, {}))}
+    found = {
+        "udp": Target(
+            {"frame": b"\xe1" + bytes(40), "empty": b""}, functools.partial(_to_udp, {}), has_thread=True
+        )
+    }
     with contextlib.suppress(ImportError):
         import viser
+
+        import gmmtorch.live.map_viewer  # noqa: F401
 
         upgrade = (
             b"Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
@@ -523,7 +536,7 @@ def sockets() -> dict[str, Target]:
             "socket": b"GET / HTTP/1.1\r\n" + host + upgrade + b"Origin: http://127.0.0.1:8080\r\n\r\n",
             "message": b"GET / HTTP/1.1\r\n" + host + upgrade + b"\r\n" + _websocket_frame(message),
         }
-        found["viewer"] = Target(seeds, functools.partial(_to_viewer, {}))
+        found["viewer"] = Target(seeds, functools.partial(_to_viewer, {}), has_thread=True)
     return found
 
 
@@ -598,7 +611,7 @@ def child(target: Target, seed: int, n: int, place: Path, to: int) -> None:
     def stop(*_: object) -> None:
         raise TooLongError
 
-    signal.signal(signal.SIGALRM, stop)
+    signal.signal(signal.SIGPROF, stop)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     before = set(place.iterdir())
     for _ in range(n):
@@ -610,7 +623,7 @@ def child(target: Target, seed: int, n: int, place: Path, to: int) -> None:
             data = target.mend(data)
         path = place / name
         path.write_bytes(data)
-        signal.alarm(SECONDS)
+        signal.setitimer(signal.ITIMER_PROF, SECONDS)
         outcome = "read"
         try:
             target.read(path)
@@ -624,7 +637,7 @@ def child(target: Target, seed: int, n: int, place: Path, to: int) -> None:
                 f"fault: {type(error).__name__} in {Path(last.filename).name}:{last.lineno} {error!s:.80}"
             )
         finally:
-            signal.alarm(0)
+            signal.setitimer(signal.ITIMER_PROF, 0)
         if outcome.startswith("fault"):
             shutil.copy(path, place / f"fault-{zlib.crc32(data):08x}-{name}")
         path.unlink()
@@ -633,6 +646,18 @@ def child(target: Target, seed: int, n: int, place: Path, to: int) -> None:
             outcome = f"fault: files were written: {extra[:3]}"
         os.write(to, (json.dumps(outcome) + "\n").encode())
     os._exit(0)
+
+
+def warm_up(name: str, target: Target, place: Path) -> None:
+    """Reads the sound inputs, so that what readers import is in memory. Raises an error if one is refused."""
+    for seed, data in target.seeds.items() if not target.has_thread else ():
+        path = place / seed
+        path.write_bytes(data)
+        try:
+            target.read(path)
+        except GmmTorchError as error:
+            raise AssertionError(f"{name}: the sound {seed} is refused: {error}") from error
+        path.unlink()
 
 
 def batch(target: Target, seed: int, n: int, place: Path) -> Iterator[str]:
@@ -691,6 +716,9 @@ def main() -> int:
         if unknown := set(names) - chosen.keys():
             parser.error(f"no targets {', '.join(sorted(unknown))}; there are {', '.join(chosen)}")
         chosen = {name: chosen[name] for name in names}
+    for name, target in chosen.items():
+        (folder / name.replace(" ", "_")).mkdir(exist_ok=True)
+        warm_up(name, target, folder / name.replace(" ", "_"))
     counts = {name: collections.Counter[str]() for name in chosen}
     seconds = collections.Counter[str]()
     end = time.monotonic() + 60 * (options.minutes or 1e9)
@@ -699,7 +727,6 @@ def main() -> int:
     while sum(map(collections.Counter.total, counts.values())) < n_inputs and time.monotonic() < end:
         for name, target in chosen.items():
             place = folder / name.replace(" ", "_")
-            place.mkdir(exist_ok=True)
             seed += 1
             start = time.monotonic()
             size = min(BATCH, max(20, n_inputs // (20 * len(chosen))))
