@@ -6,7 +6,7 @@
 
 Inputs are sound ones that were changed where it hurts: sizes, counts, names, numbers; checksums fit again.
 A reader may return or raise a `GmmTorchError`. Anything else is a fault: another error, more than 10 s of a
-processor, more than 512 MiB above what the process had, a new file beside the input, the death of the process.
+processor, more than 512 MiB above what the process had, a new file beside the input, the end of the process.
 The inputs of faults are kept in the folder. The exit status is 1 if there is one.
 """
 

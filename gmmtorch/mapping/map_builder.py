@@ -249,6 +249,8 @@ class MapBuilder:
             record, poses = BuildRecord(**state["record"]), state["poses"]
             if len(record.indices) != len(poses) or not self._dataset.can_continue(record.n_read):
                 raise ValueError("its counts disagree")
+            if poses.shape[1:] not in ((3, 3), (4, 4)):
+                raise ValueError("its poses are no matrices")
             windows = WindowMotions.restored(state["windows"]) if "windows" in state else WindowMotions()
             windows.end()  # poses of later scans are corrected without those of the earlier run
             self.map.load_state_dict(state["map"])
