@@ -232,6 +232,12 @@ def test_a_star_in_metadata_is_no_alias(tmp_path, caplog):
     assert metadata.YAML(typ="safe").load("a: 'two * three'\nb: x*y\n") == {"a": "two * three", "b": "x*y"}
     with pytest.raises(Exception, match="aliases are not read"):
         metadata.YAML(typ="safe").load("a: &x 1\nb: *x\n")
+    begin = time.process_time()
+    for text in ("[" * 3000, "a: " + "{a: " * 5000, "[" * 60 + "]" * 60):
+        with pytest.raises(Exception, match="nested too deeply"):
+            metadata.YAML(typ="safe").load(text)
+    assert time.process_time() - begin < 1
+    assert metadata.YAML(typ="safe").load("[[[]], {a: [1]}]") == [[[]], {"a": [1]}]
 
 
 def test_texts_of_a_bag_are_neither_unpickled_nor_run(tmp_path, monkeypatch):

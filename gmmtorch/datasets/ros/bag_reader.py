@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import bz2
 import io
+import itertools
 import logging
 import re
 import shutil
@@ -296,6 +297,7 @@ MAX_BAG_BYTES = 1 << 35
 space of the temporary folder."""
 
 _ZSTD_HEADER_BYTES = 18
+_MOST_BRACKETS = 50  # in one another, in YAML
 _MAGIC = {b"\x89MCAP0\r\n": ".mcap", b"SQLite f": ".db3"}
 
 
@@ -379,7 +381,8 @@ def _limit_parsers(ros1: Any, ros2: Any, mcap: Any, metadata: Any, sqlite: Any) 
 
 
 def _plain_yaml(**options: Any) -> Any:
-    """A parser of YAML that refuses aliases, with which a few lines become billions of entries."""
+    """A parser of YAML that refuses aliases, with which a few lines become billions of entries, and brackets
+    in brackets in brackets, each of which takes longer than the one around it."""
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
     from ruamel.yaml.events import AliasEvent
@@ -388,6 +391,9 @@ def _plain_yaml(**options: Any) -> Any:
         def load(self, stream: Any) -> Any:
             if "*" in stream and any(isinstance(one, AliasEvent) for one in YAML(**options).parse(stream)):
                 raise YAMLError("aliases are not read")
+            brackets = ((1 if found in "[{" else -1) for found in re.findall(r"[\[\]{}]", stream))
+            if max(itertools.accumulate(brackets), default=0) > _MOST_BRACKETS:
+                raise YAMLError("its brackets are nested too deeply")
             return super().load(stream)
 
     return PlainYaml(**options)
