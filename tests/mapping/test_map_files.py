@@ -23,11 +23,12 @@ from gmmtorch.errors import DataError, GmmTorchError
 from gmmtorch.files import pack_tensors, read_tensors
 from gmmtorch.mapping.codec import component_batch as storage
 from gmmtorch.mapping.codec.quantization import numbered
-from gmmtorch.mapping.components import UNNUMBERED
+from gmmtorch.mapping.components import UNNUMBERED, Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
 from gmmtorch.mapping.query_options import QueryOptions
 from gmmtorch.occupancy.calibrator import Calibration
+from gmmtorch.scan import Scan
 
 # -- saved and loaded ------------------------------------------------------------------------------------
 
@@ -282,6 +283,19 @@ def test_a_file_whose_settings_are_damaged_is_refused(tmp_path, packed, name, va
     tensors, facts = packed
     with pytest.raises(DataError, match=r"m\.safetensors"):
         load_parts(tmp_path, tensors, {**facts, name: value})
+
+
+def test_attributes_of_other_components_are_refused(tmp_path, packed):
+    """The block of three components beside a batch of none, each with a sound checksum."""
+    points = torch.rand(200, 3)
+    coloured = GaussianMap()
+    coloured.insert(Scan(points, torch.zeros(3), attributes={"colour": torch.rand(200, 3)}))
+    coloured.finish()
+    coloured.save(tmp_path / "c.safetensors")
+    tensors, facts = read_tensors(tmp_path / "c.safetensors", storage.FILE_KIND, storage.FILE_VERSION)
+    none = torch.frombuffer(bytearray(storage.encode(Components.empty(3))), dtype=torch.uint8)
+    with pytest.raises(DataError, match=r"m\.safetensors"):
+        load_parts(tmp_path, {**tensors, "components": none}, facts)
 
 
 def test_a_cutoff_beyond_the_whole_numbers_of_a_tensor_is_a_number(tmp_path, packed):

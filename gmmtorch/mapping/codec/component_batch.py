@@ -252,7 +252,7 @@ def _content(
             block = require(tensors, _ATTRIBUTES, (None,), torch.uint8, path).numpy().tobytes()
             found = replace(found, attributes=decode_attributes(block, found.covariances))
         return found, facts
-    except DataError as error:
+    except (DataError, *DAMAGED_CONTENT) as error:  # attributes of other components
         raise DataError(f"{path}: {error}") from error
 
 
