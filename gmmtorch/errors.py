@@ -17,6 +17,9 @@ _REST = re.compile(
 )
 """The argument at the beginning of a text; and =value fault; remedy, of the argument or of one entry."""
 
+DAMAGED_CONTENT = LookupError, TypeError, ValueError, ArithmeticError, RuntimeError, AttributeError
+"""What code raises that uses values of a file whose types and sizes are not as they were written."""
+
 
 def arg(name: str) -> str:
     """The name of an argument in the text of an error, marked so that a command can show its option."""
@@ -149,7 +152,10 @@ def check_number(
 
 def _as_float(value: object) -> float:
     """The value of a real number; NaN for anything else."""
-    return float(value) if isinstance(value, numbers.Real) else math.nan
+    try:
+        return float(value) if isinstance(value, numbers.Real) else math.nan
+    except OverflowError:  # a whole number beyond float64
+        return math.inf
 
 
 def check_choice(name: str, value: object, choices: Collection[str]) -> None:

@@ -25,6 +25,7 @@ from gmmtorch.errors import DataError, MissingDataError, OutputError
 
 MAX_FILE_BYTES = 8 << 30
 NARROW_DTYPES = (torch.uint8, torch.int16, torch.int32, torch.int64)
+_MOST_DIMS = 8
 _TENSOR = "$tensor"
 _NO_CHECKSUM = "00000000"  # stands for the checksum while it is computed
 _BEFORE_CHECKSUM = rb'"{\"crc32\":\"'  # the first bytes of our entry in the header
@@ -176,7 +177,10 @@ def unpack_tensors(
     if not isinstance(facts, dict):
         raise DataError(f"{path}: facts is not a table; the file is damaged.")
     try:
-        return safetensors_load(data), facts
+        tensors = safetensors_load(data)
+        if any(tensor.ndim > _MOST_DIMS for tensor in tensors.values()):
+            raise ValueError(f"a tensor has more than {_MOST_DIMS} dimensions")
+        return tensors, facts
     except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise DataError(f"{path} is damaged: {error}") from error
 

@@ -249,6 +249,12 @@ def test_file_without_checksum_says_to_write_it_again(tmp_path):
         read_tensors(path, KIND, VERSION)
 
 
+def test_a_tensor_of_many_dimensions_is_refused(tmp_path):
+    path = write(tmp_path, pack_tensors({"x": torch.ones([1] * 70)}, KIND, VERSION))
+    with pytest.raises(DataError, match="more than 8 dimensions"):
+        read_tensors(path, KIND, VERSION)
+
+
 def test_every_flipped_bit_is_refused(tmp_path):
     data = valid_file()
     for place in range(8 * len(data)):

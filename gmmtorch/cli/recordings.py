@@ -23,6 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 from gmmtorch.cli import common, inputs
 from gmmtorch.cli.reporting import map_outputs
 from gmmtorch.errors import (
+    DAMAGED_CONTENT,
     DataError,
     GmmTorchError,
     InvalidArgumentError,
@@ -123,7 +124,7 @@ def _finished(folder: Path, facts: dict[str, Any]) -> Row | None:
         run_facts, row = dict(stored["run"]), dict(stored["row"])
         if not all(isinstance(row[name], int | float) for name in _SUMS):
             raise TypeError("a count is not a number")
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except DAMAGED_CONTENT as error:
         raise DataError(f"{path} is damaged ({error!r}); delete {folder} to map it again.") from error
     check_same_run(path, run_facts, facts)
     return row

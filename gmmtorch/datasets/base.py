@@ -107,8 +107,10 @@ class Dataset(Sequence[Scan]):
         name: of the data set.
         ranges: how readings are interpreted.
         stride: every n-th scan of the source is read.
+        n_sensors: that the scans are of.
     """
 
+    n_sensors = 1
     _poses: Tensor | None = None
     _times: Tensor | None = None
 
@@ -153,6 +155,13 @@ class Dataset(Sequence[Scan]):
         """Times (N,) of the scans in seconds, float64; None if the source has no usable times."""
         times = self._known_times()
         return None if times is None else times[:: self.stride]
+
+    def check_one_sensor(self, what: str) -> None:
+        """Raises `InvalidArgumentError` if scans are of several sensors. what: needs those of one."""
+        if self.n_sensors > 1:
+            raise InvalidArgumentError(
+                f"‹topic› has {self.n_sensors} topics, and {what} follows one sensor; choose one ‹topic›."
+            )
 
     def turns(self) -> Tensor:
         """Rotations (N, D, D) of the sensor since the scan before, before ← now, float64, by an IMU.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from gmmtorch.declarations import option, repeated
 from gmmtorch.errors import InvalidArgumentError, MissingDataError
@@ -110,7 +111,10 @@ class RosbagOptions(TumOptions):
 
     max_gap: float = repeated(TumOptions, "max_gap", 2.0)
     depth_scale: float | None = repeated(DepthFramesOptions, "depth_scale", None)
-    topic: str | None = option(None, "topic of the sensor; null: the only one of its kind")
+    topic: Any = option(
+        None,
+        "topic of the sensor, or topics of several, such as [/front,/rear]; null: the only one of its kind",
+    )
     frame: str | None = option(
         None, "the fixed frame of TF, such as odom; null: the root of the sensor's tree"
     )

@@ -396,6 +396,7 @@ def with_odometry(
         raise InvalidArgumentError(
             f"motion={motion} does not go with odometry={method}; use odometry=mixture."
         )
+    source.check_one_sensor(f"odometry={method}")
     turns = source.turns() if motion == "imu" else None
     odometry = odometry_of(method)
     known = torch.zeros(len(source), dtype=torch.bool)

@@ -310,6 +310,7 @@ def locate_scans(
 
     Raises `InvalidArgumentError` if scans and map have different dimensions.
     """
+    dataset.check_one_sensor("localization")
     times = scan_times(dataset)
     before: Tensor | None = None
     for index in range(len(dataset)):

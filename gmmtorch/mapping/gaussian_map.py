@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike
-from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_whole
+from gmmtorch.errors import DAMAGED_CONTENT, DataError, InvalidArgumentError, check_choice, check_whole
 from gmmtorch.files import write_bytes
 from gmmtorch.mapping.attributes.answers import Prediction, predictions
 from gmmtorch.mapping.attributes.moments import check_kinds
@@ -365,7 +365,7 @@ class GaussianMap(MapState):
             next_number = check_whole("n_numbered", facts.pop("n_numbered"), 0)
             time = as_time(facts.pop("time", None))
             made = cls(read_rule(**facts.pop("learning")), **facts)
-        except (TypeError, KeyError, ValueError) as error:
+        except DAMAGED_CONTENT as error:
             raise DataError(f"{path}: its settings are damaged ({error}).") from error
         made._next_number, made._next_doubts = next_number, Doubts.none(time)
         made._commit(components)

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets import Dataset
-from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
+from gmmtorch.errors import DAMAGED_CONTENT, DataError, GmmTorchError, InvalidArgumentError
 from gmmtorch.files import joined_tensors, pack_tensors, read_tensors, split_tensors, write_bytes
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
@@ -249,13 +249,15 @@ class MapBuilder:
             record, poses = BuildRecord(**state["record"]), state["poses"]
             if len(record.indices) != len(poses) or not self._dataset.can_continue(record.n_read):
                 raise ValueError("its counts disagree")
+            if poses.shape[1:] not in ((3, 3), (4, 4)):
+                raise ValueError("its poses are no matrices")
             windows = WindowMotions.restored(state["windows"]) if "windows" in state else WindowMotions()
             windows.end()  # poses of later scans are corrected without those of the earlier run
             self.map.load_state_dict(state["map"])
             self.map.to(self._device)
         except GmmTorchError:
             raise
-        except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+        except DAMAGED_CONTENT as error:
             raise DataError(f"{path} is damaged: {error!r}; delete it to start again.") from error
         self.record, self._poses, self.windows = record, list(poses.double()), windows
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.arrays import DeviceModule
-from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
+from gmmtorch.errors import DAMAGED_CONTENT, DataError, GmmTorchError, InvalidArgumentError, check_whole
 from gmmtorch.mapping.attributes.moments import Attributes
 from gmmtorch.mapping.codec.component_batch import MapSettings, file_size
 from gmmtorch.mapping.codec.quantization import number_after, numbered
@@ -321,7 +321,7 @@ class MapState(DeviceModule):
             if not missing:
                 known = Attributes.of((state or {}).get("attributes", {}))
                 components = Components(**{name: own[name] for name in TENSORS}, attributes=known).checked()
-        except (GmmTorchError, KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+        except (GmmTorchError, *DAMAGED_CONTENT) as error:
             raise DataError(f"The state of the map is damaged ({error}).") from error
         device = self._device
         for name in TENSORS:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypedDict, get_args
 
 from gmmtorch.declarations import option
-from gmmtorch.errors import InvalidArgumentError, check_choice, check_prior, check_whole
+from gmmtorch.errors import check_choice, check_number, check_prior, check_whole
 from gmmtorch.mapping.learning.rules import LearningRule
 
 if TYPE_CHECKING:
@@ -58,8 +58,8 @@ class QueryOptions:
         for name in ("n_samples", "memory_limit"):
             check_whole(name, getattr(self, name), 1)
         check_whole("random_state", self.random_state, 0)
-        if self.cutoff is not None and not 0 < self.cutoff < float("inf"):
-            raise InvalidArgumentError(f"cutoff={self.cutoff} must be a number of deviations above zero.")
+        if self.cutoff is not None:
+            object.__setattr__(self, "cutoff", check_number("cutoff", self.cutoff, above=True))
         check_choice("sampling", self.sampling, SAMPLINGS)
 
 

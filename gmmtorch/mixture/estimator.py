@@ -19,7 +19,7 @@ from sklearn.utils._param_validation import InvalidParameterError as ScikitLearn
 from torch import Tensor
 
 from gmmtorch.arrays import as_tensor
-from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, NumericalError
+from gmmtorch.errors import DAMAGED_CONTENT, DataError, GmmTorchError, InvalidArgumentError, NumericalError
 from gmmtorch.files import pack_tensors, read_tensors, require, write_bytes
 from gmmtorch.linalg import check_symmetric, safe_cholesky
 from gmmtorch.mixture.density import InvalidParameterError, MixtureDensity
@@ -450,6 +450,6 @@ class MixtureEstimator(MixtureDensity):
                 raise DataError(f"features={names} are not the names of {dim} columns.")
             if names:
                 mixture.__dict__["feature_names_in_"] = np.array(names, object)
-        except (KeyError, TypeError, ValueError, GmmTorchError) as error:
+        except (GmmTorchError, *DAMAGED_CONTENT) as error:
             raise DataError(f"{path} does not hold a mixture: {error}") from error
         return mixture

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.arrays import as_tensor
-from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.errors import DAMAGED_CONTENT, DataError, InvalidArgumentError
 from gmmtorch.files import pack_tensors, read_tensors, write_bytes
 from gmmtorch.scan import ArrayLike, Scan
 
@@ -136,7 +136,7 @@ class BaselineMap(ABC):
             options = dict(facts)
             dim = {2: 2, 3: 3}[options.pop("dim")]
             made = cls(**options)
-        except (KeyError, TypeError, ValueError) as error:
+        except DAMAGED_CONTENT as error:
             raise DataError(f"{path}: its settings are damaged ({error!r}).") from error
         made._start(dim, torch.device("cpu"))
         made.dim = dim

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import time
 import warnings
 from pathlib import Path
 
@@ -157,6 +158,36 @@ def test_a_bag_compressed_as_a_whole_is_unpacked_to_a_limit(tmp_path, monkeypatc
     file.write_bytes(b"no zstd")
     with pytest.raises(DataError, match=r"cannot be read as a ROS bag.*reindex"):
         load("rosbag", folder)
+
+
+LAUGHS = (
+    "a{n}: &a{n} [{many}]\n",
+    "a{n}: &a{n}\n  k{n}: 1\n  <<: [{many}]\n",  # rosbags' parser copies what is merged
+)
+
+
+@pytest.mark.parametrize("line", LAUGHS)
+def test_metadata_with_aliases_of_aliases_is_not_read(tmp_path, line, caplog):
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    clouds(folder / "a.db3")
+    lines = [line.format(n=n, many=",".join([f"*a{n - 1}"] * 9)) for n in range(1, 15)]
+    (folder / "metadata.yaml").write_text("a0: &a0 {k: 1}\n" + "".join(lines))
+    begin = time.process_time()
+    assert len(load("rosbag", folder)) > 0
+    assert time.process_time() - begin < 5
+    assert "metadata.yaml is unusable" in caplog.text
+
+
+def test_a_star_in_metadata_is_no_alias(tmp_path, caplog):
+    from gmmtorch.datasets.ros.bag_reader import reader_class
+
+    reader_class(is_ros1=False)
+    from rosbags.rosbag2 import metadata
+
+    assert metadata.YAML(typ="safe").load("a: 'two * three'\nb: x*y\n") == {"a": "two * three", "b": "x*y"}
+    with pytest.raises(Exception, match="aliases are not read"):
+        metadata.YAML(typ="safe").load("a: &x 1\nb: *x\n")
 
 
 def test_texts_of_a_bag_are_neither_unpickled_nor_run(tmp_path, monkeypatch):

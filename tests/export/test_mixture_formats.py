@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import pickle
 import zipfile
@@ -143,6 +144,38 @@ def test_npz_reader_rejects_damaged_files(tmp_path):
         path.write_bytes(whole[:cut])
         with pytest.raises(DataError, match=r"broken\.npz"):
             read_npz(path)
+
+
+def test_npz_reader_rejects_headers_and_streams_that_numpy_and_zlib_do_not_expect(tmp_path):
+    path = tmp_path / "broken.npz"
+    sound = read_members(npz_of(path, **arrays_of(random_mixture())))
+    for header in (b"{'descr': ('<f8',", b'"' * 3, b"(" * 90, b"{'shape': (9L,)"):
+        member = sound["means.npy"][:10] + header.ljust(118) + sound["means.npy"][128:]
+        write_members(path, {**sound, "means.npy": member})
+        with pytest.raises(DataError, match=r"broken\.npz"):
+            read_npz(path)
+    np.savez_compressed(path, **arrays_of(random_mixture(40)))
+    whole = bytearray(path.read_bytes())
+    for place in range(60, 400, 3):
+        damaged = whole[:place] + bytes([whole[place] ^ 0xFF]) + whole[place + 1 :]
+        path.write_bytes(damaged)
+        with contextlib.suppress(DataError):
+            read_npz(path)
+
+
+def arrays_of(mixture: PlainMixture) -> dict[str, np.ndarray]:
+    return {k: v.numpy() for k, v in mixture._asdict().items() if v is not None}
+
+
+def read_members(path: Path) -> dict[str, bytes]:
+    with zipfile.ZipFile(path) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def write_members(path: Path, members: dict[str, bytes]) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
 
 
 def test_npz_reader_rejects_pickled_objects(tmp_path):

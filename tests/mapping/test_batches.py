@@ -21,11 +21,22 @@ from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.kernels.codes import context_coding
 from gmmtorch.mapping.codec import context_model
 from gmmtorch.mapping.codec.bitstream import BitWriter
-from gmmtorch.mapping.codec.component_batch import decode, encode
-from gmmtorch.mapping.codec.quantization import quantized, spatial_order
+from gmmtorch.mapping.codec.component_batch import decode, encode, encode_quantized
+from gmmtorch.mapping.codec.quantization import quantize, quantized, spatial_order
 from gmmtorch.mapping.components import Components
 
 dims = pytest.mark.parametrize("dim", [2, 3])
+
+
+@dims
+@pytest.mark.parametrize("wrong", [-1, 1 << 24, 1 << 62])
+def test_components_seen_from_an_origin_that_is_none_are_not_written(dim, wrong):
+    values = quantize(random_components(dim, k=3, seed=3))
+    seen_from = values.seen_from.clone()
+    seen_from[-1] = wrong
+    with pytest.raises((InvalidArgumentError, LookupError)):
+        encode_quantized(replace(values, seen_from=seen_from))
+
 
 # -- damaged batches -----------------------------------------------------------------------------------
 

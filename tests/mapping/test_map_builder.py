@@ -26,6 +26,7 @@ from torch import Tensor
 
 from gmmtorch.datasets import Dataset, Ranges, load
 from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.files import pack_tensors, read_tensors
 from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
@@ -158,6 +159,20 @@ def test_a_checkpoint_of_another_run_or_a_damaged_one_is_refused(tmp_path):
     path.write_bytes(data[: len(data) // 2])
     with pytest.raises(DataError):
         builder().load(path, RUN)
+
+
+def test_a_checkpoint_with_poses_of_another_shape_is_refused(tmp_path):
+    path = tmp_path / "checkpoint.safetensors"
+    first = builder()
+    next(iter(first.insert_all()))
+    first.save(path, RUN)
+    tensors, facts = read_tensors(path, "gmmtorch.map_builder", 1)
+    poses = tensors[facts["tree"]["poses"]["$tensor"]]
+    for shape in ((len(poses), -1), (-1,), (1, *poses.shape)):
+        tensors[facts["tree"]["poses"]["$tensor"]] = poses.reshape(shape)
+        path.write_bytes(pack_tensors(tensors, "gmmtorch.map_builder", 1, **facts))
+        with pytest.raises(DataError, match="delete it to start again"):
+            builder().load(path, RUN)
 
 
 # -- WindowMotions: a map follows the corrected poses of its scans, window by window ---------------------

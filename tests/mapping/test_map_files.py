@@ -244,9 +244,9 @@ def test_load_refuses_files_without_a_batch(tmp_path, packed, batch):
 DAMAGED_FACTS = {
     "n_samples": [-5, 10**30],
     "sampling": ["magic", []],
-    "resolution": [0, "x", None],
-    "prior": ["x", -1],
-    "cutoff": ["x", 0],
+    "resolution": [0, "x", None, 10**400],
+    "prior": ["x", -1, 10**400],
+    "cutoff": ["x", 0, 10**400],
     "calibration": ["x", 3],
     "random_state": [None, 2**80],
     "method": ["magic", ["point"]],
@@ -282,6 +282,13 @@ def test_a_file_whose_settings_are_damaged_is_refused(tmp_path, packed, name, va
     tensors, facts = packed
     with pytest.raises(DataError, match=r"m\.safetensors"):
         load_parts(tmp_path, tensors, {**facts, name: value})
+
+
+def test_a_cutoff_beyond_the_whole_numbers_of_a_tensor_is_a_number(tmp_path, packed):
+    tensors, facts = packed
+    found = load_parts(tmp_path, tensors, {**facts, "cutoff": 2**64})
+    assert found.query_options.cutoff == 2.0**64
+    assert found.occupancy(lattice(found.dim), 0.2).isfinite().all()
 
 
 def test_a_file_that_lacks_a_setting_is_refused(tmp_path, packed):

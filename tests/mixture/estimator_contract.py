@@ -17,7 +17,7 @@ from mixture.fit_contract import FitContract, blobs, kinds, move, rigid_motion
 from sklearn.base import clone
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError
-from gmmtorch.files import pack_tensors
+from gmmtorch.files import pack_tensors, read_tensors
 from gmmtorch.mixture.density import NotFittedError
 from gmmtorch.mixture.estimator import MixtureEstimator
 
@@ -231,6 +231,15 @@ class MixtureContract(FitContract):
             path.write_bytes(wrong)
             with pytest.raises(DataError, match=r"m\.safetensors"):
                 type(mixture).load(path)
+
+    def test_a_file_with_numbers_beyond_float64_is_refused(self, tmp_path):
+        path = tmp_path / "m.safetensors"
+        mixture = self.make().fit(blobs(2))
+        mixture.save(path)
+        tensors, facts = read_tensors(path, "gmmtorch.mixture", 1)
+        path.write_bytes(pack_tensors(tensors, "gmmtorch.mixture", 1, **{**facts, "lower_bounds": [10**400]}))
+        with pytest.raises(DataError, match=r"m\.safetensors"):
+            type(mixture).load(path)
 
     @settings(max_examples=60)
     @given(place=st.floats(0, 1, exclude_max=True), value=st.integers(0, 255), in_header=st.booleans())

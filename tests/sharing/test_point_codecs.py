@@ -189,6 +189,14 @@ def test_invalid_codec_options_are_refused():
             make()
 
 
+def test_bytes_that_are_not_of_draco_are_refused():
+    pytest.importorskip("DracoPy")
+    data = Draco(0.05).encode(cloud(20))
+    for other in (data[:-60], data[:20], data[:17] + b"PLY" + data[20:]):
+        with pytest.raises(DataError, match="Draco"):
+            Draco(0.05).decode(other)
+
+
 def test_damaged_bytes_are_refused_or_decode_to_points():
     """Draco's own reader is not put to this: it may end the process."""
     rng = np.random.default_rng(0)

@@ -65,6 +65,11 @@ class TfPoses:
         self._top = None if top is None else frame_name(top)
         self._chains: dict[str, list[str]] = {}
 
+    @property
+    def top(self) -> str | None:
+        """The fixed frame: the one that was chosen, or the root above a sensor."""
+        return self._top or next((chain[-1] for chain in self._chains.values()), None)
+
     def chain(self, frame: str) -> list[str]:
         """Frames from the sensor's to the fixed one. Raises `DataError` if TF does not connect them."""
         if frame not in self._chains:
@@ -275,6 +280,18 @@ class BagSurvey:
             )
         return next(iter(self._infos.values()), None)
 
+    @property
+    def _body(self) -> str:
+        """The frame whose poses the topic states; "" if it does not name it."""
+        return self._frames.most_common(1)[0][0][1] if self._frames else ""
+
+    @property
+    def places_sensor(self) -> bool:
+        """Whether TF says where on the robot the sensor is. Otherwise the poses are those of any sensor."""
+        if self._poses in (None, "tf"):
+            return True
+        return self._pose_topic is not None and self._extrinsic is None and self._body != ""
+
     def _check_pose_topic(self) -> None:
         types = [t.type for t in self._reader.topics if t.name == self._pose_topic]
         if not set(types) <= set(POSE_TYPES):
@@ -389,7 +406,7 @@ class BagSurvey:
 
     def _mount(self, frame: str, where: str) -> Pose:
         """body ← sensor from the static transforms."""
-        body = self._frames.most_common(1)[0][0][1] if self._frames else ""
+        body = self._body
         if body in ("", frame):
             return Pose.identity(3)
         try:

@@ -300,7 +300,7 @@ def reader_class(is_ros1: bool) -> Any:
         import rosbags.rosbag1
         import rosbags.rosbag2
     ros1, ros2 = rosbags.rosbag1, rosbags.rosbag2
-    _limit_codecs(ros1.reader, ros2.reader, ros2.storage_mcap)
+    _limit_parsers(ros1.reader, ros2.reader, ros2.storage_mcap, ros2.metadata)
     return _limited_ros1_reader(ros1) if is_ros1 else _reader_by_magic(ros2)
 
 
@@ -363,11 +363,27 @@ def _within(unpacked: bytes) -> bytes:
     return unpacked
 
 
-def _limit_codecs(ros1: Any, ros2: Any, mcap: Any) -> None:
-    """Put codecs with limits in the places where three modules of rosbags look for theirs."""
+def _limit_parsers(ros1: Any, ros2: Any, mcap: Any, metadata: Any) -> None:
+    """Put codecs and parsers with limits in the places where modules of rosbags look for theirs."""
+    ros2.YAML = metadata.YAML = _plain_yaml
     ros1.decompressors.update(bz2=_unpack_bz2, lz4=_unpack_lz4)
     mcap.DECOMPRESSORS.update(lz4=_unpack_lz4, zstd=unpack_zstd)
     ros2.zstd = SimpleNamespace(open=_limited_zstd_file(mcap.zstd), decompress=unpack_zstd)
+
+
+def _plain_yaml(**options: Any) -> Any:
+    """A parser of YAML that refuses aliases, with which a few lines become billions of entries."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+    from ruamel.yaml.events import AliasEvent
+
+    class PlainYaml(YAML):
+        def load(self, stream: Any) -> Any:
+            if "*" in stream and any(isinstance(one, AliasEvent) for one in YAML(**options).parse(stream)):
+                raise YAMLError("aliases are not read")
+            return super().load(stream)
+
+    return PlainYaml(**options)
 
 
 def _limited_zstd_file(zstd: Any) -> Any:

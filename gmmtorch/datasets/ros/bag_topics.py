@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 import struct
 from array import array
 from collections.abc import Sequence
@@ -25,6 +27,8 @@ INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 IMU_TYPE = "sensor_msgs/msg/Imu"
 _LISTS = {"sensor_msgs/msg/PointCloud": "points"}
 _IMAGE, _COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+_REALSENSE = re.compile(r"/device_\d+/sensor_\d+(?=/)")
+"""The name of a sensor in the files of librealsense."""
 _DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")
 
 CLOUD, LIST, PACKETS, LASER, ECHOES, DEPTH, COMPRESSED = (
@@ -157,6 +161,23 @@ def choose_camera_info(reader: BagReader, image: str, wanted: str | None) -> str
             "pixels, without distortion."
         )
     return best[0]
+
+
+def stated_unit(reader: BagReader, image: str) -> float | None:
+    """Metres per unit of depth images that a RealSense camera's own recorder wrote, which states it as an
+    option of the sensor; None for others. Raises `DataError` if it is no length."""
+    sensor = _REALSENSE.match(image)
+    topics = [f"{sensor[0]}/option/{name}/value" for name in ("Depth_Units", "Depth Units")] if sensor else []
+    message = next(reader.messages(topics), None)
+    if message is None:
+        return None
+    unit = reader.decode(message).get("data")
+    if not isinstance(unit, float) or not 0 < unit < math.inf:
+        raise DataError(
+            f"{reader.path}: {message.topic} states {unit} as the metres per unit of depth images; state "
+            "‹depth_scale›."
+        )
+    return unit
 
 
 def choose_imu(reader: BagReader, wanted: str | None) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -16,9 +16,16 @@ from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset, Ranges, require_path
 from gmmtorch.datasets.point_files.channels import check_channels
-from gmmtorch.datasets.ros.bag_poses import BagSurvey, Record, RegisteredPoses
+from gmmtorch.datasets.ros.bag_poses import BagSurvey, Record, RegisteredPoses, TfPoses
 from gmmtorch.datasets.ros.bag_reader import BagReader, DamagedBagError, RawMessage
-from gmmtorch.datasets.ros.bag_topics import IMU_TYPE, Sensor, choose_camera_info, choose_imu, choose_sensor
+from gmmtorch.datasets.ros.bag_topics import (
+    IMU_TYPE,
+    Sensor,
+    choose_camera_info,
+    choose_imu,
+    choose_sensor,
+    stated_unit,
+)
 from gmmtorch.datasets.ros.image_camera import ImageCamera
 from gmmtorch.datasets.ros.point_times import Rate
 from gmmtorch.datasets.ros.scan_conversion import ScanConversion
@@ -38,7 +45,7 @@ def open_rosbag(
     path: str | Path,
     ranges: Ranges,
     stride: int = 1,
-    topic: str | None = None,
+    topic: str | Sequence[str] | None = None,
     poses: str | None = None,
     frame: str | None = None,
     sensor_frame: str | None = None,
@@ -53,13 +60,13 @@ def open_rosbag(
     imu_topic: str | None = None,
     damaged: str = "read",
     attributes: Iterable[str] = (),
-) -> RosBag:
-    """The scans of one topic of a bag; see docs/recordings.md.
+) -> Dataset:
+    """The scans of one topic of a bag, or of several; see docs/recordings.md.
 
     Args:
         path: .bag (ROS 1), .db3 or .mcap (ROS 2), or the folder of a ROS 2 bag.
         ranges, stride: see `Dataset`.
-        topic: of the sensor; None: the only one of its kind.
+        topic: of the sensor, or topics of several sensors of one robot; None: the only one of its kind.
         poses: "tf", "standing", a topic of poses, or a trajectory file; None: TF.
         frame: the fixed frame of TF; None: the root of the sensor's tree.
         sensor_frame: only messages of this frame are read; those without a frame are taken to be in it.
@@ -69,7 +76,8 @@ def open_rosbag(
         deskew: whether points with times get the pose of their own time.
         camera_info: topic of the camera parameters of depth images.
         pixel_stride: every n-th pixel of every n-th row of depth images is used.
-        depth_scale: metres per unit of depth images; None: 0.001 for whole numbers, 1 for floating ones.
+        depth_scale: metres per unit of depth images; None: as a RealSense's bag states, otherwise
+            0.001 for whole numbers, 1 for floating ones.
         intrinsics: fx, fy, cx, cy in pixels of depth images without distortion; None: of `camera_info`.
         imu_topic: of the IMU of `RosBag.turns`; None: the only one.
         damaged: "read" reads the intact part of a damaged bag; "refuse" raises an error.
@@ -82,16 +90,35 @@ def open_rosbag(
         raise InvalidArgumentError(f"‹max_gap›={max_gap} must be a time above zero seconds.")
     check_choice("damaged", damaged, ("read", "refuse"))
 
-    def opened(is_salvaged: bool) -> RosBag:
-        reader = BagReader(file, is_salvaged)
-        if reader.damage:
-            _log.warning("%s is damaged: %s. damaged=refuse makes this an error.", file, reader.damage)
-        sensor = choose_sensor(reader, topic)
+    topics = [topic] if topic is None or isinstance(topic, str) else list(dict.fromkeys(map(str, topic)))
+    if not topics:
+        raise InvalidArgumentError("‹topic›=[] names no topic; leave it out to read the only sensor.")
+
+    def opened(is_salvaged: bool) -> Dataset:
+        readers = [BagReader(file, is_salvaged) for _ in topics]  # each reads on where its sensor is
+        if damage := readers[0].damage:
+            _log.warning("%s is damaged: %s. damaged=refuse makes this an error.", file, damage)
+        bags = [opened_sensor(reader, name) for reader, name in zip(readers, topics, strict=True)]
+        if len(bags) == 1:
+            return bags[0]
+        from gmmtorch.datasets.ros.several_sensors import SeveralSensors
+
+        return SeveralSensors(bags)
+
+    def opened_sensor(reader: BagReader, name: str | None) -> RosBag:
+        sensor = choose_sensor(reader, name)
         info = None
         if sensor.is_camera and intrinsics is None:
             info = choose_camera_info(reader, sensor.topic.name, camera_info)
         survey = BagSurvey(reader, sensor, info, poses, frame, extrinsic, max_gap)
-        camera = ImageCamera(sensor, survey.camera_info(), pixel_stride, depth_scale, intrinsics)
+        if len(topics) > 1 and not survey.places_sensor:
+            raise InvalidArgumentError(
+                f"‹topic›={', '.join(map(str, topics))} would all be at the same place, because "
+                f"‹poses›={poses} does not say where on the robot each sensor is. Use the poses of TF or of "
+                "an odometry without ‹extrinsic›, or choose one ‹topic›."
+            )
+        unit = stated_unit(reader, sensor.topic.name) if depth_scale is None else depth_scale
+        camera = ImageCamera(sensor, survey.camera_info(), pixel_stride, unit, intrinsics)
         options = sensor_frame, clock, deskew, imu_topic, check_channels(attributes)
         if sensor.is_camera:
             return DepthBag(reader, sensor, survey, ranges, stride, *options, camera)
@@ -167,6 +194,11 @@ class RosBag(Dataset):
         self._poses = (self._in_space.in_plane() if self._is_flat else self._in_space).matrix
         seconds = [record.stamp / NANOSECONDS for record in self._records]
         self._times = torch.tensor(seconds, dtype=torch.float64)
+
+    @property
+    def fixed_frame(self) -> str | None:
+        """The frame of TF that poses are in; None if they are from elsewhere."""
+        return self._source.top if isinstance(self._source, TfPoses) else None
 
     def _read_headers(self, messages: list[tuple[int, bytes]]) -> list[Record]:
         records = []

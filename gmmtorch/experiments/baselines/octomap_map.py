@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
+from gmmtorch.errors import DAMAGED_CONTENT, DataError, InvalidArgumentError, MissingDataError
 from gmmtorch.experiments.baselines.samples import cut_beams
 from gmmtorch.kernels import traverse
 from gmmtorch.occupancy import BaselineMap, check_resolution, optional_length
@@ -302,7 +302,7 @@ class OctoMapMap(BaselineMap):
             facts = json.loads(data[at + 8 : data.index(b"\n", at)])
             anchor = facts.pop("anchor")
             anchor = None if anchor is None else torch.tensor(anchor, dtype=torch.int64)
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
+        except DAMAGED_CONTENT as error:
             raise DataError(f"{path}: its settings are damaged ({error!r}).") from error
         made = cls._from_facts(facts, path)
         made._anchor = anchor

@@ -445,8 +445,11 @@ struct Walk {
         if (!c.good || n == 0) return begin;
         int64_t* seen = b.seen_from + begin;
         int64_t* share = b.share + begin;
-        if (WRITES)
+        if (WRITES) {
+            for (int64_t q = 0; q < n; ++q) check(seen[q] >= 0 && seen[q] < b.n_origins);
+            if (!c.good) return begin;
             for (int64_t q = 0; q < n; ++q) s.row[seen[q]] = q + 1;
+        }
         n_waiting = 0;
         wait(i, level_begin[levels] - 1);
         int64_t left = b.n_origins;

@@ -22,7 +22,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import DataError, GmmTorchError, check_choice, check_resolution, check_whole
+from gmmtorch.errors import (
+    DAMAGED_CONTENT,
+    DataError,
+    GmmTorchError,
+    check_choice,
+    check_resolution,
+    check_whole,
+)
 from gmmtorch.files import pack_tensors, read_tensors, require, unpack_tensors
 from gmmtorch.kernels import CodedBatch
 from gmmtorch.mapping.attributes.moments import Attributes
@@ -293,7 +300,7 @@ def read_settings(facts: dict[str, Any], path: str | Path) -> MapSettings:
         check_method(facts["method"])
         resolution, robot = check_resolution(facts["resolution"]), check_whole("robot", facts["robot"], 0)
         query = replace(FILE_OPTIONS, **{name: facts[name] for name in names & facts.keys()})
-    except (KeyError, TypeError, ValueError) as error:
+    except DAMAGED_CONTENT as error:
         raise DataError(f"{path}: its settings are damaged ({error!r}).") from error
     return MapSettings(resolution, facts["method"], facts["codec"], robot, query)
 

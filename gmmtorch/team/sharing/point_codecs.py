@@ -324,7 +324,7 @@ class Draco:
             return torch.zeros(0, 3, dtype=torch.float64)
         try:
             rows = np.asarray(library("DracoPy").decode(rest).points, np.float64).reshape(-1, 3)
-        except (ValueError, RuntimeError, TypeError) as error:
+        except Exception as error:  # DracoPy has errors of its own
             raise DataError(f"Draco cannot decode these bytes: {error}.") from error
         if not 0 < len(rows) <= n or not np.isfinite(rows).all():  # Draco merges equal points
             raise DataError(f"Draco decoded {len(rows)} points, but the header states {n}.")

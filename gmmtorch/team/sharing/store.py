@@ -16,7 +16,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple
 
-from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, OutputError, check_whole
+from gmmtorch.errors import (
+    DAMAGED_CONTENT,
+    DataError,
+    GmmTorchError,
+    InvalidArgumentError,
+    OutputError,
+    check_whole,
+)
 from gmmtorch.files import joined_tensors, pack_tensors, split_tensors, unpack_tensors
 from gmmtorch.team.sharing.messages.datagrams import check_datagram
 from gmmtorch.team.sharing.messages.record_messages import RECORD_KINDS, keys_in
@@ -416,7 +423,7 @@ class Store:
             tensors, about = unpack_tensors(data, self.path, "progress", 1)
             try:
                 state: dict[str, Any] = joined_tensors(about["tree"], tensors)
-            except (KeyError, TypeError, AttributeError) as error:
+            except DAMAGED_CONTENT as error:
                 raise DataError(
                     f"{self.path}: the progress after {n_scans} scans is no state ({error!r})."
                 ) from error

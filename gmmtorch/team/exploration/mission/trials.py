@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch import __version__
-from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
+from gmmtorch.errors import DAMAGED_CONTENT, DataError, GmmTorchError, InvalidArgumentError, check_whole
 from gmmtorch.files import check_writable, write_json
 from gmmtorch.occupancy import RollingWindow
 from gmmtorch.processes import end_with_parent
@@ -214,7 +214,7 @@ class Trial:
             kept = json.loads(path.read_text("utf-8"))
             row: dict[str, Any] = kept["row"]
             is_same = kept["facts"] == {**self.facts(), **more}
-        except (ValueError, KeyError, TypeError) as error:
+        except DAMAGED_CONTENT as error:
             raise DataError(f"{path} is damaged ({error!r}); delete it to run the trial again.") from error
         return row if is_same else None
 
