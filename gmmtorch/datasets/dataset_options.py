@@ -107,7 +107,7 @@ class KittiOptions(ChannelOptions):
 
 @dataclass(kw_only=True)
 class RosbagOptions(TumOptions):
-    """A ROS bag."""
+    """A ROS bag, or a network capture of a lidar."""
 
     max_gap: float = repeated(TumOptions, "max_gap", 2.0)
     depth_scale: float | None = repeated(DepthFramesOptions, "depth_scale", None)
@@ -130,6 +130,11 @@ class RosbagOptions(TumOptions):
     )
     imu_topic: str | None = option(None, "topic of the IMU of motion=imu; null: the only one")
     damaged: str = option("read", "read: the intact part of a damaged bag; refuse: a damaged bag is an error")
+    calibration: str | None = option(
+        None,
+        "file of the lidar whose packets are read: metadata (.json) of an Ouster, corrections (.csv) of a "
+        "Hesai; null: the metadata in the recording or beside it, nominal angles",
+    )
 
 
 @dataclass(kw_only=True)

@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import Ranges
+from gmmtorch.datasets.packets.lidar_packets import LidarPackets
 from gmmtorch.datasets.ros import bag_topics, sensor_messages
 from gmmtorch.datasets.ros.bag_poses import PoseSource, RegisteredPoses
 from gmmtorch.datasets.ros.bag_topics import Sensor
 from gmmtorch.datasets.ros.image_camera import ImageCamera
 from gmmtorch.datasets.ros.point_times import N_SAMPLES, PointTimes, Rate
-from gmmtorch.datasets.ros.sensor_messages import Reading, VelodynePackets
+from gmmtorch.datasets.ros.sensor_messages import Reading
 from gmmtorch.errors import DataError
 from gmmtorch.pose import Pose
 from gmmtorch.scan import FARTHEST, Scan
@@ -39,7 +40,8 @@ class ScanConversion:
         source: poses of the sensor.
         deskew: whether points with times get the pose of their own time, if the source has one.
         camera: of depth images.
-        attributes: channels of point clouds that are read.
+        attributes: channels of points that are read.
+        packets: decodes raw packets of a lidar; None: one without calibration does.
     """
 
     def __init__(
@@ -50,11 +52,12 @@ class ScanConversion:
         deskew: bool = True,
         camera: ImageCamera | None = None,
         attributes: Sequence[str] = (),
+        packets: LidarPackets | None = None,
     ) -> None:
         self._attributes = attributes
         self.source, self._camera = source, camera
         self._sensor, self._ranges = sensor, ranges
-        self._packets = VelodynePackets() if sensor.kind == bag_topics.PACKETS else None
+        self._packets = packets or LidarPackets()
         self._times = PointTimes(sensor.kind in bag_topics.LASERS) if deskew and source.can_deskew else None
 
     def points(self, message: dict[str, Any]) -> Reading:
@@ -66,8 +69,8 @@ class ScanConversion:
             return sensor_messages.listed_points(message, self._sensor.field)
         if kind in bag_topics.LASERS:
             return sensor_messages.laser_points(message)
-        if self._packets is not None:
-            return self._packets.points(message)
+        if kind == bag_topics.PACKETS:
+            return self._packets.points(message, self._attributes)
         assert self._camera is not None
         return sensor_messages.reading(self._camera.points(message), None, None)
 
