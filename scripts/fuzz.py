@@ -604,8 +604,6 @@ def child(target: Target, seed: int, n: int, place: Path, to: int) -> None:
     rng, end = random.Random(seed), time.monotonic() + BATCH_SECONDS
     if (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
         mallopt(M_ARENA_MAX, 1)  # so that the memory of idle threads does not count
-    size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (size + MEMORY, size + MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
     def stop(*_: object) -> None:
@@ -623,6 +621,8 @@ def child(target: Target, seed: int, n: int, place: Path, to: int) -> None:
             data = target.mend(data)
         path = place / name
         path.write_bytes(data)
+        size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (size + MEMORY, resource.RLIM_INFINITY))
         signal.setitimer(signal.ITIMER_PROF, SECONDS)
         outcome = "read"
         try:

@@ -1,3 +1,4 @@
+from .base import NO_POSE as NO_POSE
 from .base import Dataset as Dataset
 from .base import DatasetShard as DatasetShard
 from .base import Ranges as Ranges

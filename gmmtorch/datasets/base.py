@@ -96,6 +96,10 @@ class Ranges:
         return self.scan(Pose.from_matrix(pose).apply(points), pose[:3, 3], None, attributes)
 
 
+NO_POSE = "no pose at the time of the scan"
+"""Why a scan is left out, in `Dataset.skipped`."""
+
+
 class Dataset(Sequence[Scan]):
     """Scans in the order of their recording.
 
@@ -155,6 +159,10 @@ class Dataset(Sequence[Scan]):
         """Times (N,) of the scans in seconds, float64; None if the source has no usable times."""
         times = self._known_times()
         return None if times is None else times[:: self.stride]
+
+    def sensor_of(self, index: int) -> int:
+        """The number, from 0, of the sensor of scan `index`."""
+        return 0
 
     def check_one_sensor(self, what: str) -> None:
         """Raises `InvalidArgumentError` if scans are of several sensors. what: needs those of one."""

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets.base import Dataset, Ranges, check_poses, natural_key, require_path
+from gmmtorch.datasets.base import NO_POSE, Dataset, Ranges, check_poses, natural_key, require_path
 from gmmtorch.datasets.colour_images import ColourCamera
 from gmmtorch.datasets.point_files.channels import check_channels
 from gmmtorch.datasets.trajectory import (
@@ -262,7 +262,7 @@ class TumRgbd(_DepthDataset):
                 f"{poses or path / 'groundtruth.txt'} has poses without times; give a TUM trajectory."
             )
         found = trajectory.at(times, max_gap)
-        self._skip("no pose at the time of the scan", *np.flatnonzero(~found.known).tolist())
+        self._skip(NO_POSE, *np.flatnonzero(~found.known).tolist())
         if not found.known.any():
             raise DataError(
                 f"{path}: no depth image has a pose. Images are from {times[0] / NANOSECONDS:.3f} to "

@@ -18,7 +18,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets.base import Dataset, Ranges, check_poses, natural_key, number_rows, require_path
+from gmmtorch.datasets.base import (
+    NO_POSE,
+    Dataset,
+    Ranges,
+    check_poses,
+    natural_key,
+    number_rows,
+    require_path,
+)
 from gmmtorch.datasets.point_files.channels import CLASS, INTENSITY, check_channels, read_channels
 from gmmtorch.datasets.point_files.pcd_files import pcd_header
 from gmmtorch.datasets.point_files.point_chunks import read_cloud
@@ -217,7 +225,7 @@ class Kitti(Dataset):
                 f"{path}: no scan has a pose. Scans are from {times[0]:.3f} to {times[-1]:.3f} s, poses from "
                 f"{trajectory.times[0] / 1e9:.3f} to {trajectory.times[-1] / 1e9:.3f} s."
             )
-        self._skip("no pose at the time of the scan", *np.flatnonzero(~known).tolist())
+        self._skip(NO_POSE, *np.flatnonzero(~known).tolist())
         self._files = [file for file, is_known in zip(files, known, strict=True) if is_known]
         self._poses = found[known].matrix
         self._times = None if times is None else torch.from_numpy(times[: len(files)][known])

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets.base import Dataset, check_poses, number_rows
+from gmmtorch.datasets.base import NO_POSE, Dataset, check_poses, number_rows
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
 from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
@@ -226,7 +226,7 @@ class Reposed(Dataset):
         super().__init__(source.name, source.ranges, stride)
         self._source: Any = source
         self._indices = known.nonzero().squeeze(1).tolist()
-        self._skip("no pose at the time of the scan", *(~known).nonzero().squeeze(1).tolist())
+        self._skip(NO_POSE, *(~known).nonzero().squeeze(1).tolist())
         self._poses = poses[self._indices]
         self._times = None if source.times is None else source.times[self._indices]
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -186,19 +187,34 @@ class BagWriter:
         self._connections: dict[tuple[str, str], Any] = {}
 
     def __enter__(self) -> BagWriter:
-        self.writer.open()
+        try:
+            with self._errors():
+                self.writer.open()
+        except OutputError:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            raise
         return self
+
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        """Turns errors of the disk into an `OutputError`, such as of one that is full."""
+        import sqlite3
+
+        try:
+            yield
+        except (OSError, sqlite3.Error) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise OutputError(f"{self.path} cannot be written: {reason}; choose another folder.") from error
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         try:
-            self.writer.close()
-            if kind is None:
-                written = next(file for file in self._folder.rglob(f"*{self.path.suffix}") if file.is_file())
-                written.replace(self.path)
-        except OSError as failure:
-            raise OutputError(f"{self.path} cannot be written: {failure.strerror}.") from failure
+            with self._errors():
+                self.writer.close()
+                if kind is None:
+                    files = self._folder.rglob(f"*{self.path.suffix}")
+                    next(file for file in files if file.is_file()).replace(self.path)
         finally:
             shutil.rmtree(self._folder, ignore_errors=True)
 
@@ -214,12 +230,13 @@ class BagWriter:
         A header gets `time` as its stamp. Fields that are not given are zero or empty.
         """
         key = (topic, name)
-        if key not in self._connections:
-            self._connections[key] = self.writer.add_connection(topic, name, typestore=self.types)
         content = built_message(self.types, name, fields, _nanoseconds(time))
         serialize = self.types.serialize_ros1 if self._is_ros1 else self.types.serialize_cdr
         stamp = _nanoseconds(time if received is None else received)
-        self.writer.write(self._connections[key], stamp, serialize(content, name))
+        with self._errors():
+            if key not in self._connections:
+                self._connections[key] = self.writer.add_connection(topic, name, typestore=self.types)
+            self.writer.write(self._connections[key], stamp, serialize(content, name))
 
     def transforms(
         self, time: float, edges: Mapping[tuple[str, str], ArrayLike], static: bool = False

@@ -22,6 +22,7 @@ from gmmtorch.datasets import (
     INFO_TYPE,
     LASER,
     NANOSECONDS,
+    NO_POSE,
     Dataset,
     ImageCamera,
     PoseSource,
@@ -160,7 +161,7 @@ class LiveScans(Dataset):
                 if age <= (_PATIENCE if limit is None else limit):
                     return False
                 self._pop()
-                self._note("no pose at the time of the scan")
+                self._note(NO_POSE)
                 continue
             self._pop()
             if limit is not None and age > limit and not is_last:
@@ -251,7 +252,7 @@ class LiveScans(Dataset):
         """Makes a message the newest scan, unless it is left out."""
         conversion = self._conversion
         if conversion is None:
-            self._note("no pose at the time of the scan")
+            self._note(NO_POSE)
             return False
         last = self._last_stamp
         if last is not None and last - _BACKWARDS < item.stamp < last:
@@ -261,7 +262,7 @@ class LiveScans(Dataset):
         try:
             poses = conversion.source.at(np.array([item.stamp]), item.frame)
             if not poses.known[0] or bool((poses.poses.translation[0].abs() > FARTHEST).any()):
-                self._note("no pose at the time of the scan")
+                self._note(NO_POSE)
                 return False
             found = conversion.points(item.message)
         except (DataError, ValueError, KeyError, OverflowError) as error:

@@ -38,7 +38,7 @@ class BuildProgress:
     """The state of a map while it is built.
 
     n_read: scans read so far. n_total: all scans. n_skipped: scans that were read and could not be used.
-    n_points: returns in the map. n_components: final components. metres: length of the sensor's path.
+    n_points: returns in the map. n_components: final components. metres: length of the first sensor's path.
     seconds: computing time of all runs so far. nbytes: size of the map at the last row of the history, 0
     before the first one. It is not computed more often, because this encodes the map.
     """
@@ -200,8 +200,10 @@ class MapBuilder(Generic[AnyMap]):
         pose = torch.eye(scan.dim + 1, dtype=torch.float64) if known is None else known.double().cpu()
         pose = pose.clone()
         pose[:-1, -1] = scan.origin.double().cpu()
-        if self._poses:
-            record.metres += float((pose[:-1, -1] - self._poses[-1][:-1, -1]).norm())
+        sensor, rows = self._dataset.sensor_of, range(len(self._poses) - 1, -1, -1)
+        before = next((row for row in rows if sensor(record.indices[row]) == 0), None)
+        if before is not None and sensor(index) == 0:
+            record.metres += float((pose[:-1, -1] - self._poses[before][:-1, -1]).norm())
         self._poses.append(pose)
         self.windows.add(pose)
         record.indices.append(index)

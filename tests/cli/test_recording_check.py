@@ -14,6 +14,8 @@ pytest.importorskip("rosbags")
 
 from sensor_bags import BagWriter
 
+from gmmtorch.cli.reporting import recording_check
+from gmmtorch.errors import DataError
 from gmmtorch.export.bag import cloud_fields
 
 Run = Callable[..., Finished]
@@ -74,9 +76,9 @@ def test_a_good_bag_has_a_table_and_no_advice(check, tmp_path):
 @pytest.mark.parametrize(
     ("options", "advice"),
     [
-        ({"odometry": "/odom"}, "dataset.poses=/odom reads 20 scans"),
-        ({"odometry": ""}, "dataset.odometry=auto reads 20 scans with poses estimated from the scans"),
-        ({"sensor_delay": 5000.0}, "dataset.clock=received reads 20 scans"),
+        ({"odometry": "/odom"}, "dataset.poses=/odom, which reads 20 scans"),
+        ({"odometry": ""}, "dataset.odometry=auto, which reads 20 scans with poses estimated from the scans"),
+        ({"sensor_delay": 5000.0}, "dataset.clock=received, which reads 20 scans"),
     ],
 )
 def test_its_advice_reads_the_recording(check, tmp_path, options, advice):
@@ -85,7 +87,7 @@ def test_its_advice_reads_the_recording(check, tmp_path, options, advice):
     assert refused.status == 1
     assert "problem" in refused.stdout
     assert advice in words(refused)
-    helped = check(path, "dataset=rosbag", advice.split()[0])
+    helped = check(path, "dataset=rosbag", advice.split(",")[0])
     assert helped.status == 0
     assert "20 would be read" in helped.stdout
 
@@ -100,6 +102,48 @@ def test_its_advice_reads_the_recording(check, tmp_path, options, advice):
 )
 def test_what_looks_wrong_is_said(check, tmp_path, options, text):
     assert text in words(check(bag(tmp_path / "a.bag", **options), "dataset=rosbag", "dataset.max_gap=9"))
+
+
+def two_lidars(path: Path, n_late: int = 0) -> Path:
+    """A drive of 20 clouds of each of two lidars, of which the last have no poses."""
+    with BagWriter(path) as writer:
+        mounts = {("base", "front"): moved(1.0), ("base", "rear"): moved(-1.0)}
+        writer.transforms(0.0, mounts, static=True)
+        for i in range(21 - n_late):
+            writer.transforms(i * 0.1, {("odom", "base"): moved(i * 0.1)})
+        for i in range(20):
+            writer.cloud("/front", i * 0.1, "front", RING)
+            writer.cloud("/rear", i * 0.1 + 0.05, "rear", RING)
+    return path
+
+
+def test_several_lidars_are_merged_on_advice(check, tmp_path):
+    path = two_lidars(tmp_path / "a.mcap")
+    refused = check(path, "dataset=rosbag")
+    assert refused.status == 1
+    assert "add 'dataset.topic=[/front,/rear]', which reads 40 scans" in words(refused)
+    assert "no map can be built with these options" in words(refused)
+    done = check(path, "dataset=rosbag", "dataset.topic=[/front,/rear]")
+    assert done.status == 0
+    assert "40 would be read of /front, /rear, merged in the order of their times" in words(done)
+    assert "path of 1.9 m, at most 1.0 m/s" in words(done)
+    one = check(path, "dataset=rosbag", "dataset.topic=/front")
+    assert "/rear would not be read" in words(one)
+
+
+def test_scans_without_a_pose_are_counted(check, tmp_path):
+    done = check(two_lidars(tmp_path / "a.mcap", n_late=6), "dataset=rosbag", "dataset.topic=/front")
+    assert "poses for 15 of 20 scans" in words(done)
+    assert "5 scans: no pose at the time of the scan" in words(done)
+
+
+def test_messages_that_cannot_be_read_are_said_before_anything_else(check, tmp_path, monkeypatch):
+    def fail(reader: object) -> None:
+        raise DataError("no message can be read")
+
+    monkeypatch.setattr(recording_check, "bag_facts", fail)
+    done = check(bag(tmp_path / "a.bag"), "dataset=rosbag", "dataset.topic=/none")
+    assert done.stdout.index("the messages cannot be read: no message") < done.stdout.index("problem")
 
 
 def test_damage_and_files_that_are_no_bags(check, tmp_path):

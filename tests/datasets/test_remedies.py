@@ -170,8 +170,9 @@ def remedies(message: str, case: Case, options: dict[str, Any], folder: Path) ->
         "‹poses›=TOPIC, FILE or standing",
         "‹poses›=TOPIC ‹poses›=FILE ‹poses›=standing",
     )
-    found = re.findall(r"‹(\w+)›(?:=(\[[\w,]*\]|[\w/.-]*[\w/]))?", message)
+    found = re.findall(r"‹(\w+)›(?:=(\[[\w,/]*\]|[\w/.-]*[\w/]))?", message)
     named = [(name, known.get(value or name, value)) for name, value in found]
+    named = [(n, v[1:-1].split(",") if str(v).startswith("[/") else v) for n, v in named]
     return [
         {name: value} for name, value in named if value is not None and str(options.get(name)) != str(value)
     ]

@@ -13,6 +13,7 @@ from gmmtorch.datasets import load
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.localization import Tracker, with_odometry
 from gmmtorch.localization.tracker import locate_scans
+from gmmtorch.mapping import MapBuilder
 
 pytest.importorskip("rosbags")
 
@@ -194,3 +195,16 @@ def test_the_bag_of_a_realsense_camera_states_its_unit(tmp_path, option):
     np.testing.assert_allclose(scans[0].points[:, 2], depth, rtol=1e-6)
     stated = load("rosbag", path, poses="standing", depth_scale=0.001)
     np.testing.assert_allclose(stated[0].points[:, 2], 8.0, rtol=1e-6)
+
+
+def test_the_path_is_that_of_one_sensor(tmp_path):
+    scans = load("rosbag", two_lidars(tmp_path / "a.mcap"), topic=FRONT_REAR)
+    alone = load("rosbag", tmp_path / "a.mcap", topic="/front")
+    metres = []
+    for source in (scans, alone):
+        builder = MapBuilder(source, GaussianMap())
+        for _ in builder.insert_all():
+            pass
+        metres.append(builder.record.metres)
+    assert metres[0] == pytest.approx(metres[1])
+    assert metres[0] == pytest.approx(1.68, abs=0.02)  # a circle of 20 m, and the lidar 1 m ahead of it

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
+import logging
 import textwrap
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -13,7 +15,7 @@ from omegaconf import DictConfig
 
 from gmmtorch import datasets
 from gmmtorch.cli import inputs
-from gmmtorch.datasets import NANOSECONDS, BagFacts, BagReader, Dataset, bag_facts, whole_or_intact
+from gmmtorch.datasets import NANOSECONDS, NO_POSE, BagFacts, BagReader, Dataset, bag_facts, whole_or_intact
 from gmmtorch.errors import GmmTorchError, printable, told
 from gmmtorch.report import Row, byte_text, count_text, format_table
 
@@ -35,27 +37,71 @@ def check(config: DictConfig) -> bool:
     """Prints what the data set `dataset.*` contains and would give; returns whether a map can be built."""
     options = config.dataset
     facts = _bag(options) if options.name == "rosbag" else None
-    found, problem = None, ""
-    try:
-        found = inputs.open_dataset(options)
-    except GmmTorchError as error:
-        problem = str(error)
-    if found is not None and len(found) == 0:
-        problem = f"{found.name} has no scan."
+    found, problem, share = None, "", 0.0
     advice = list(_clock_advice(facts)) if facts else []
-    share = 0.0
-    if found is not None and not problem:
-        share = _print_scans(found, advice)
+    with _noted_warnings() as warnings:
+        try:
+            found = inputs.open_dataset(options)
+            problem = "" if len(found) else f"{found.name} has no scan."
+        except GmmTorchError as error:
+            problem = str(error)
+        if found is not None and not problem:
+            share = _print_scans(found, advice)
+        else:
+            _print_wrapped("\nproblem    ", problem)
+        if facts is not None and share < _FEW_SCANS:
+            warnings = list(warnings)  # not those of the trials
+            advice += _trials(options, facts, 0 if found is None else len(found))
+    others = _unread(facts, found) if share else []
+    if others:
+        _print_wrapped(
+            "note       ",
+            f"{', '.join(others)} would not be read; dataset.topic chooses a topic, or a list of several "
+            "sensors of the robot",
+        )
+    for text in dict.fromkeys(warnings):
+        if facts is None or not facts.damage or facts.damage not in text:  # it is printed already
+            _print_wrapped("note       ", text)
+    if share:
+        print("\nresult     a map can be built: the same options without check=true build it")
     else:
-        _print_wrapped("\nproblem    ", problem)
-    if facts is not None and share < _FEW_SCANS:
-        advice += _trials(options, facts, 0 if found is None else len(found))
-    print("\nadvice")
-    best = "no option that was tried helps; the problem above says what is missing"
-    good = "nothing looks wrong; build the map with the same options without check=true"
-    for number, text in enumerate(advice or [good if share else best], 1):
+        print("\nresult     no map can be built with these options")
+    none = (
+        "nothing looks wrong" if share else "no option that was tried helps; the problem says what is missing"
+    )
+    print("advice")
+    for number, text in enumerate(advice or [none], 1):
         _print_wrapped(f"  {number}. ", text)
     return share > 0
+
+
+def _unread(facts: BagFacts | None, found: Dataset | None) -> list[str]:
+    """The topics of sensors that are not read."""
+    read = str(getattr(found, "topic", "")).split(", ")
+    sensors = [one.topic.name for one in facts.topics if one.use.startswith("scans")] if facts else []
+    return [name for name in sensors if name not in read]
+
+
+@contextlib.contextmanager
+def _noted_warnings() -> Iterator[list[str]]:
+    """Collects the warnings of readers, which the console would have between the lines of the table."""
+    found: list[str] = []
+    logger, collector = logging.getLogger("gmmtorch"), logging.Handler()
+    collector.emit = lambda record: found.append(record.getMessage())  # type: ignore[method-assign]
+    consoles = {
+        handler: handler.level
+        for handler in logging.getLogger().handlers
+        if not isinstance(handler, logging.FileHandler)
+    }
+    logger.addHandler(collector)
+    for handler in consoles:
+        handler.setLevel(logging.ERROR)
+    try:
+        yield found
+    finally:
+        logger.removeHandler(collector)
+        for handler, level in consoles.items():
+            handler.setLevel(level)
 
 
 def _print_wrapped(label: str, text: str) -> None:
@@ -76,7 +122,8 @@ def _bag(options: DictConfig) -> BagFacts | None:
         facts = whole_or_intact(
             lambda is_salvaged: bag_facts(BagReader(path, is_salvaged)), options.damaged == "read"
         )
-    except GmmTorchError:
+    except GmmTorchError as error:
+        _print_wrapped("\ndamage     ", f"the messages cannot be read: {error}")
         return None
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
     begin = datetime.datetime.fromtimestamp(facts.first / NANOSECONDS, datetime.UTC)
@@ -101,11 +148,19 @@ def _bag(options: DictConfig) -> BagFacts | None:
         for one in facts.topics
     ]
     print(f"\n{format_table(rows)}" if rows else "\nIt has no topics.")
+    if rows:
+        _print_wrapped(
+            "",
+            "stamp_age_s: from the stamp of a message to its recording; sensors and poses whose ages differ "
+            "have different clocks",
+        )
     return facts
 
 
 def _age(offset: float | None) -> float | str | None:
-    return "another clock" if offset is not None and abs(offset) > _DAY else offset
+    if offset is None:
+        return None
+    return "another clock" if abs(offset) > _DAY else round(offset, 3) + 0.0
 
 
 def _clock_advice(facts: BagFacts) -> Iterator[str]:
@@ -118,9 +173,10 @@ def _clock_advice(facts: BagFacts) -> Iterator[str]:
             assert other.offset is not None
             apart = sensor.offset - other.offset
             if abs(apart) > _CLOCKS_DIFFER:
+                by = f"{abs(apart):,.1f} s" if abs(apart) < _DAY else f"{abs(apart) / _DAY:,.0f} days"
                 yield (
                     f"stamps of {sensor.topic.name} and {other.topic.name} that were recorded together are "
-                    f"{abs(apart):,.1f} s apart: their clocks differ, which dataset.clock=received may mend"
+                    f"{by} apart: their clocks differ, which dataset.clock=received may mend"
                 )
 
 
@@ -140,8 +196,11 @@ def _print_scans(found: Dataset, advice: list[str]) -> float:
     n_left_out = sum(found.skipped.values())
     topic = getattr(found, "topic", "")
     usable = [scan for scan in scans if scan.n_beams]
-    text = f"\nscans      {n_scans:,} would be read{f' of {printable(topic)}' if topic else ''}"
-    print(text + (f", in {usable[0].dim}D" if usable else "") + _timing(found, advice))
+    text = f"{n_scans:,} would be read{f' of {printable(topic)}' if topic else ''}"
+    if found.n_sensors > 1:
+        text += ", merged in the order of their times, each from the place of its own sensor"
+    text += (f", in {usable[0].dim}D" if usable else "") + _timing(found, advice)
+    _print_wrapped("\nscans      ", text)
     if usable:
         _print_ranges(usable, advice)
     else:
@@ -194,12 +253,15 @@ def _print_poses(found: Dataset, advice: list[str]) -> None:
         print("poses      none in the data set")
         advice.append("the data set states no poses; estimate them: dataset.odometry=auto")
         return
-    poses = torch.stack([pose for i in range(len(found)) if (pose := found.pose(i)) is not None])
+    rows = [i for i in range(len(found)) if found.sensor_of(i) == 0]  # the path of one sensor
+    poses = torch.stack([pose for i in rows if (pose := found.pose(i)) is not None])
     steps = poses[:, :-1, -1].diff(dim=0).norm(dim=1)
-    text = f"poses      for all of them; path of {float(steps.sum()):.1f} m"
+    n_without = -(-found.skipped.get(NO_POSE, 0) // found.stride)
+    known = f"for {len(found):,} of {len(found) + n_without:,} scans" if n_without else "for all scans"
+    text = f"poses      {known}; path of {float(steps.sum()):.1f} m"
     times = found.times
-    if times is not None and len(times) > 1:
-        speed = float((steps / times.diff().clamp_min(1e-3)).max())
+    if times is not None and len(rows) > 1:
+        speed = float((steps / times[rows].diff().clamp_min(1e-3)).max())
         text += f", at most {speed:.1f} m/s"
         if speed > _FASTEST:
             advice.append(
@@ -221,7 +283,9 @@ def _trials(options: DictConfig, facts: BagFacts, n_found: int) -> list[str]:
     for name in ("name", "path", "odometry", "motion"):
         given.pop(name, None)
     sensors = [one.topic.name for one in facts.topics if one.use.startswith("scans")]
-    topics: list[Mapping[str, Any]] = [{"topic": name} for name in sensors] if options.topic is None else [{}]
+    topics: list[Mapping[str, Any]] = [{}]
+    if options.topic is None and len(sensors) > 1:
+        topics = [{"topic": sensors}, *({"topic": name} for name in sensors)]
     sources = [one.topic.name for one in facts.topics if one.use.startswith("poses, if")]
     changes: list[Mapping[str, Any]] = [
         {},
@@ -231,7 +295,7 @@ def _trials(options: DictConfig, facts: BagFacts, n_found: int) -> list[str]:
         {"poses": "standing"},
     ]
     advice, n_trials = [], 0
-    for chosen in topics if len(sensors) > 1 else [{}]:
+    for chosen in topics:
         for change in changes:
             tried = {**chosen, **change}
             if not tried or n_trials == _MOST_TRIALS:
@@ -245,9 +309,14 @@ def _trials(options: DictConfig, facts: BagFacts, n_found: int) -> list[str]:
             if n_scans > n_found:
                 if change.get("poses") == "standing":
                     tried = {**chosen, "odometry": "auto"}
-                words = " ".join(f"dataset.{name}={value}" for name, value in tried.items())
+                words = " ".join(_override(name, value) for name, value in tried.items())
                 note = " with poses estimated from the scans" if "odometry" in tried else ""
-                advice.append(f"{words} reads {count_text(n_scans, 'scan')}{note}")
+                advice.append(f"add {words}, which reads {count_text(n_scans, 'scan')}{note}")
                 if not change or change.get("poses") in sources:
                     break
     return advice
+
+
+def _override(name: str, value: Any) -> str:
+    """An option as it is written on the command line; a list is quoted, as shells read brackets."""
+    return f"'dataset.{name}=[{','.join(value)}]'" if isinstance(value, list) else f"dataset.{name}={value}"

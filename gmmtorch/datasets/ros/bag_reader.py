@@ -32,6 +32,7 @@ from gmmtorch.datasets.packets.sweeps import (
 )
 from gmmtorch.datasets.ros.message_decoder import MessageDecoder
 from gmmtorch.datasets.ros.salvage import Salvage
+from gmmtorch.datasets.trajectory import NANOSECONDS
 from gmmtorch.errors import DataError, GmmTorchError
 from gmmtorch.optional_packages import needs_extra
 
@@ -39,6 +40,7 @@ _log = logging.getLogger(__name__)
 _SUFFIXES = (".bag", ".mcap", ".db3", *CAPTURES)
 _ZSTD = b"\x28\xb5\x2f\xfd"
 """Start of a compressed message: the file alone, without metadata.yaml, does not state the compression."""
+_LEAST_MISSING = 0.05  # s at the end of a bag, below which it is whole
 _REPAIRS = {
     ".bag": "'rosbag reindex' repairs a recording that was interrupted",
     ".mcap": "'mcap recover' repairs a recording that was interrupted",
@@ -184,7 +186,8 @@ class BagReader:
         if found.unread:
             text += f"; nothing can be read of {', '.join(found.unread)}"
         if end:
-            return f"{text}; {max(0, end - found.last) / 1e9:.1f} s at the end are missing"
+            missing = max(0, end - found.last) / NANOSECONDS
+            return text + f"; {missing:.1f} s at the end are missing" * (missing >= _LEAST_MISSING)
         return text + "; the file is cut off there, and does not state how much is missing" * found.is_cut
 
     def _salvaged(self) -> Salvage | CaptureMessages:

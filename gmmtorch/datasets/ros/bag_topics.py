@@ -91,9 +91,11 @@ def choose_sensor(reader: BagReader, wanted: str | None) -> Sensor:
     kind = min((sensor.kind for sensor in found), key=_PREFERENCE.index)
     found = [sensor for sensor in found if sensor.kind == kind]
     if len(found) > 1:
+        topics = [sensor.topic for sensor in found]
         raise InvalidArgumentError(
-            f"{reader.path} has {len(found)} topics of a range sensor: "
-            f"{listed([sensor.topic for sensor in found])}. Choose one: ‹topic›={found[0].topic.name}."
+            f"{reader.path} has {len(found)} topics of a range sensor: {listed(topics)}. Choose one: "
+            f"‹topic›={topics[0].name}, or several of one robot: "
+            f"‹topic›=[{','.join(topic.name for topic in topics)}]."
         )
     return found[0]
 

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets.base import Dataset, Ranges, require_path
+from gmmtorch.datasets.base import NO_POSE, Dataset, Ranges, require_path
 from gmmtorch.datasets.packets.lidar_packets import LidarPackets
 from gmmtorch.datasets.point_files.channels import check_channels
 from gmmtorch.datasets.ros.bag_poses import BagSurvey, Record, RegisteredPoses, TfPoses
@@ -246,7 +246,7 @@ class RosBag(Dataset):
                 "‹max_gap›."
             )
         unknown = (records[i].number for i in np.flatnonzero(~known))
-        self._skip("no pose at the time of the scan", *unknown)
+        self._skip(NO_POSE, *unknown)
         return [records[i] for i in np.flatnonzero(known)], poses[known]
 
     def _first_readings(self) -> dict[int, Reading]:

@@ -47,6 +47,9 @@ class SeveralSensors(Dataset):
         sensors = torch.arange(len(known)).repeat_interleave(torch.tensor([len(one) for one in known]))
         self._places = torch.stack([sensors, numbers], 1)[order].tolist()
 
+    def sensor_of(self, index: int) -> int:
+        return int(self._places[index][0])
+
     @property
     def skipped(self) -> dict[str, int]:
         return dict(sum((Counter(bag.skipped) for bag in self._bags), Counter()))
