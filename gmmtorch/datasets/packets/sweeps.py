@@ -36,13 +36,9 @@ SINGLE_PACKETS = {"ouster_ros/msg/PacketMsg": "os_sensor", "ouster_sensor_msgs/m
 """Messages with one packet and no header, which are read as sweeps, and the frame of their lidars."""
 
 
-def _ouster_sizes() -> set[int]:
-    """Bytes of packets with 16 columns of 16 to 128 channels, in all profiles with a header."""
-    return {64 + 16 * (12 + n * pixel) for n in (16, 32, 64, 128) for pixel in (4, 8, 12, 16, 20)}
-
-
-_LEGACY = {16 * (20 + 12 * n) for n in (16, 32, 64, 128)}
-_PROFILED = _ouster_sizes()
+_CHANNELS = (8, 16, 32, 64, 128)  # of an Ouster, whose packets have 16 columns
+_LEGACY = {16 * (20 + 12 * n) for n in _CHANNELS}
+_PROFILED = {64 + 16 * (12 + n * pixel) for n in _CHANNELS for pixel in (4, 8, 12, 16, 20)}
 
 
 def is_ouster(data: bytes) -> bool:
@@ -52,11 +48,7 @@ def is_ouster(data: bytes) -> bool:
 
 def is_lidar(data: bytes) -> bool:
     """Whether a datagram is a packet of a lidar that is read."""
-    return _velodyne(data) or hesai.model_of(data) is not None or is_ouster(data)
-
-
-def _velodyne(data: bytes) -> bool:
-    return len(data) == VELODYNE_BYTES and data[:2] in (b"\xff\xee", b"\xff\xdd")
+    return len(data) == VELODYNE_BYTES or hesai.model_of(data) is not None or is_ouster(data)
 
 
 def packet_of(message: bytes, is_ros1: bool) -> bytes:
@@ -96,7 +88,7 @@ class Sweeps:
 
 def _place(data: bytes) -> bytes | float:
     """The azimuth of a packet in degrees, or what changes with the number of the turn."""
-    if _velodyne(data):
+    if len(data) == VELODYNE_BYTES:
         return int.from_bytes(data[2:4], "little") / 100
     model = hesai.model_of(data)
     if model is not None:
