@@ -348,22 +348,18 @@ class NuScenes(Dataset):
         tables = _tables(path)
         name, token = _scene(tables, scene)
         super().__init__(name, ranges, stride)
-        sweeps = _sweeps(
-            tables / "sample_data.json", _records(tables / "sample.json", b'"%s"' % token.encode("latin-1"))
-        )
+        samples = _records(tables / "sample.json", b'"%s"' % token.encode("latin-1"))
+        stated = _sweeps(tables / "sample_data.json", samples)
+        sweeps = [row for row in stated if (tables.parent / row["filename"]).is_file()]
         if not sweeps:
-            raise DataError(f"{tables / 'sample_data.json'} has no sweep of a lidar in {self.name}.")
-        found = [tables.parent / row["filename"] for row in sweeps]
-        known = [file.is_file() for file in found]
-        self._skip("its file is missing", *(row for row, is_known in enumerate(known) if not is_known))
-        if not any(known):
-            raise DataError(f"{found[0]} is missing, as all sweeps of {self.name}; fetch the lidar's files.")
-        sweeps = [row for row, is_known in zip(sweeps, known, strict=True) if is_known]
-        self._files = [file for file in found if file.is_file()]
+            raise DataError(
+                f"{tables}: none of {len(stated)} sweeps in {name} has a file; fetch the lidar's."
+            )
+        self._skip("its file is missing", *range(len(stated) - len(sweeps)))
+        self._files = [tables.parent / row["filename"] for row in sweeps]
         ego = _transforms(tables / "ego_pose.json", [row["ego_pose_token"] for row in sweeps])
-        mount = _transforms(
-            tables / "calibrated_sensor.json", [row["calibrated_sensor_token"] for row in sweeps]
-        )
+        mounts = [row["calibrated_sensor_token"] for row in sweeps]
+        mount = _transforms(tables / "calibrated_sensor.json", mounts)
         self._poses = (ego @ mount).matrix
         self._times = torch.tensor([row["timestamp"] / 1e6 for row in sweeps], dtype=torch.float64)
 
@@ -407,10 +403,10 @@ def _sweeps(table: Path, samples: Collection[str]) -> list[dict[str, Any]]:
     for row in rows:
         file, time = PurePosixPath(str(row["filename"])), row.get("timestamp")
         is_inside = not file.is_absolute() and ".." not in file.parts and "\0" not in str(file)
-        tokens = isinstance(row.get("ego_pose_token"), str) and isinstance(
-            row.get("calibrated_sensor_token"), str
+        has_tokens = all(
+            isinstance(row.get(name), str) for name in ("ego_pose_token", "calibrated_sensor_token")
         )
-        if not (is_inside and tokens and isinstance(time, int) and 0 <= time < 1 << 62):
+        if not (is_inside and has_tokens and isinstance(time, int) and 0 <= time < 1 << 62):
             raise DataError(f"{table}: the record {row.get('token')!r:.80} of a sweep is damaged.")
     lidars = {PurePosixPath(row["filename"]).parent.name for row in rows}
     if len(lidars) > 1 and _TOP not in lidars:
@@ -433,10 +429,7 @@ def _transforms(table: Path, tokens: list[str]) -> Pose:
 
 
 def _records(
-    table: Path,
-    mark: bytes,
-    tokens: Collection[str] | None = None,
-    samples: Collection[str] | None = None,
+    table: Path, mark: bytes, tokens: Collection[str] | None = None, samples: Collection[str] | None = None
 ) -> dict[str, dict[str, Any]]:
     """The records of a table by their tokens: those that contain a mark, have one of some tokens, and are of
     one of some samples; None: any.
@@ -455,21 +448,19 @@ def _records(
                 if token is None or mark not in match[0]:
                     continue
                 name = token[1].decode("latin-1")
-                if tokens is None or name in tokens:
-                    row = _parsed(match[0], table)
-                    if samples is None or row.get("sample_token") in samples:
-                        found[name] = row
+                if tokens is not None and name not in tokens:
+                    continue
+                try:
+                    row = json.loads(match[0])
+                except (ValueError, RecursionError) as error:
+                    raise DataError(
+                        f"{table}: a record is not JSON ({error!s:.80}); it is damaged."
+                    ) from error
+                if samples is None or row.get("sample_token") in samples:
+                    found[name] = row
             rest = rest[end:]
             if len(rest) > _BLOCK_BYTES or len(found) > _MOST_RECORDS:
                 raise DataError(
                     f"{table} is not a table of nuScenes, or has too many records; it is damaged."
                 )
     return found
-
-
-def _parsed(text: bytes, table: Path) -> dict[str, Any]:
-    try:
-        row: dict[str, Any] = json.loads(text)
-        return row
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{table}: a record is not JSON ({error!s:.80}); it is damaged.") from error

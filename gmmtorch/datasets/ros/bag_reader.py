@@ -26,6 +26,7 @@ from gmmtorch.datasets.packets.sweeps import (
     SWEEP,
     CaptureMessages,
     Sweeps,
+    definition,
     is_lidar,
     packed,
     packet_of,
@@ -248,11 +249,6 @@ class BagReader:
                 f"{self.path} cannot be read as a ROS bag: {reason}. It is truncated, damaged, or uses an "
                 f"unknown compression; {repair}."
             ) from error
-
-
-def definition(text: str) -> SimpleNamespace:
-    """A definition of a message, as those of a reader of rosbags."""
-    return SimpleNamespace(format=SimpleNamespace(name="MSG"), data=text)
 
 
 def _known(message_type: str) -> SimpleNamespace:
