@@ -106,6 +106,13 @@ class KittiOptions(ChannelOptions):
 
 
 @dataclass(kw_only=True)
+class NuScenesOptions(ChannelOptions):
+    """A scene of nuScenes."""
+
+    scene: str | None = option(None, "name of the scene, such as scene-0061; null: the only one")
+
+
+@dataclass(kw_only=True)
 class RosbagOptions(TumOptions):
     """A ROS bag, or a network capture of a lidar."""
 
@@ -181,6 +188,7 @@ OPTIONS: dict[str, type[DatasetOptions]] = {
     "octomap_log": FileOptions,
     "rosbag": RosbagOptions,
     "kitti": KittiOptions,
+    "nuscenes": NuScenesOptions,
     "tum": TumOptions,
     "mesh": MeshOptions,
     "mesh_scans": MeshScansOptions,

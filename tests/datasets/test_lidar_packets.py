@@ -178,6 +178,20 @@ def test_messages_without_a_definition_in_the_bag_are_read(tmp_path):
     assert len(load("rosbag", tmp_path / "a.db3")[1].points) > 200
 
 
+def test_packets_of_other_lidars_leave_the_choice_to_other_sensors(tmp_path):
+    kind = "robosense_msgs/msg/RobosenseScan"
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        drive(bag)
+        bag.define("robosense_msgs/msg/RobosensePacket", "builtin_interfaces/Time stamp\nuint8[1248] data")
+        bag.define(kind, "std_msgs/Header header\nrobosense_msgs/RobosensePacket[] packets")
+        packet = {"stamp": {"sec": 1, "nanosec": 0}, "data": np.full(1248, 0x55, np.uint8)}
+        bag.message("/packets", kind, 1.0, {"header": {"frame_id": "lidar"}, "packets": [packet]})
+        bag.laser("/scan", 1.0, "lidar", np.ones(20), 0.0, 0.1, 9.0)
+    assert load("rosbag", tmp_path / "a.mcap").topic == "/scan"
+    with pytest.raises(DataError, match="is not a range sensor"):
+        load("rosbag", tmp_path / "a.mcap", topic="/packets")
+
+
 # -- Ouster ------------------------------------------------------------------------------------------
 
 

@@ -105,33 +105,29 @@ class Model(NamedTuple):
         return self.header + self.n_blocks * self.block + self.clock + 4
 
 
+_EEFF = {0: 0xEE, 1: 0xFF}
+_QT = {**_EEFF, 2: 3}
+
+
 def _xt(name: str, n_blocks: int, elevation: np.ndarray) -> Model:
     """An XT, whose channels are in one plane."""
     n = len(elevation)
-    start = {0: 0xEE, 1: 0xFF, 2: 6, 3: 1, 6: n, 7: n_blocks}
+    start = {**_EEFF, 2: 6, 3: 1, 6: n, 7: n_blocks}
     return Model(name, start, 12, 0, n_blocks, n, 4, 19, 50.0, Angles(elevation, np.zeros(n)))
 
 
-_12_BYTES = {0: 0xEE, 1: 0xFF, 2: 3}
 MODELS = (
     Model(
         *("Pandar40P", {0: 0xFF, 1: 0xEE, 124: 0xFF, 125: 0xEE}, 0, 2, 10, 40, 3, 10, 55.56),
         Angles(_PANDAR64[_OF_40], np.r_[_TURNS64[:6], np.tile([3.125, -5.208, -1.042], 8), _TURNS64[54:]]),
     ),
-    Model(
-        *("Pandar64", {0: 0xEE, 1: 0xFF, 2: 64, 3: 6}, 8, 0, 6, 64, 3, 10, 55.56), Angles(_PANDAR64, _TURNS64)
-    ),
-    Model(
-        *("PandarQT64", {**_12_BYTES, 3: 1, 6: 64, 7: 4}, 12, 0, 4, 64, 4, 12, 166.7),
-        Angles(_QT64, _TURNS_QT64),
-    ),
-    Model("QT128", {**_12_BYTES, 3: 2, 6: 128, 7: 2}, 12, 0, 2, 128, 4, 42, 111.1, None),
+    Model("Pandar64", {**_EEFF, 2: 64, 3: 6}, 8, 0, 6, 64, 3, 10, 55.56, Angles(_PANDAR64, _TURNS64)),
+    Model("PandarQT64", {**_QT, 3: 1, 6: 64, 7: 4}, 12, 0, 4, 64, 4, 12, 166.7, Angles(_QT64, _TURNS_QT64)),
+    Model("QT128", {**_QT, 3: 2, 6: 128, 7: 2}, 12, 0, 2, 128, 4, 42, 111.1, None),
     _xt("XT16", 8, 15.0 - 2 * np.arange(16)),
     _xt("XT32", 8, 15.0 - np.arange(32)),
     _xt("XT32M2X", 6, 19.5 - 1.3 * np.arange(32)),
 )
-_UNIT = 0.004
-"""Metres of a distance; the headers state other units as their number of mm."""
 
 
 def model_of(data: bytes) -> Model | None:
@@ -173,14 +169,7 @@ def returns_of(packets: Sequence[bytes], model: Model, own: Angles | None) -> Re
         )
     if any(model_of(data) is not model for data in packets):
         raise DataError(f"not all packets are those of a {model.name}")
-    cells = np.dtype(
-        {
-            "names": ["distance", "reflectivity"],
-            "formats": ["<u2", "u1"],
-            "offsets": [0, 2],
-            "itemsize": model.cell,
-        }
-    )
+    cells = np.dtype([("distance", "<u2"), ("reflectivity", "u1"), ("rest", f"V{model.cell - 3}")])
     blocks = np.dtype([("mark", f"V{model.mark}"), ("azimuth", "<u2"), ("cells", cells, model.n_channels)])
     end = model.header + model.n_blocks * model.block
     body = b"".join(data[model.header : end] for data in packets)
@@ -191,12 +180,12 @@ def returns_of(packets: Sequence[bytes], model: Model, own: Angles | None) -> Re
     kept = distance > 0
     kept[:, 1:] &= ~(repeats[..., None] & (distance[:, 1:] == distance[:, :-1]))
     passed = np.cumsum(np.c_[np.zeros(len(packets), bool), ~repeats], axis=1)  # blocks of other azimuths
-    seconds = np.diff(np.frombuffer(clock, "<u4").astype(np.int64), prepend=0)
-    seconds[0] = 0
-    began = np.cumsum(np.mod(seconds + _SECOND // 2, _SECOND) - _SECOND // 2)
+    counts = np.frombuffer(clock, "<u4").astype(np.int64)
+    steps = np.diff(counts, prepend=counts[:1])
+    began = np.cumsum(np.mod(steps + _SECOND // 2, _SECOND) - _SECOND // 2)
     times = ((began[:, None] + passed * model.period) * 1000).round().astype(np.int64)
     of_block, channel = np.nonzero(kept.reshape(-1, model.n_channels))
-    unit = _UNIT if model.header == 0 else packets[0][5 if model.header == 8 else 9] / 1000
+    unit = {0: 4, 8: packets[0][5], 12: packets[0][9]}[model.header] / 1000  # stated in mm
     length = distance[kept] * unit
     turn = np.radians(azimuth.ravel()[of_block] / 100 + angles.azimuth[channel])
     rise = np.radians(angles.elevation[channel])

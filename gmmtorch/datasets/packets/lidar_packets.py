@@ -80,10 +80,8 @@ class LidarPackets:
 
 
 def _reading(points: np.ndarray, times: np.ndarray, intensity: np.ndarray, wanted: Sequence[str]) -> Reading:
-    channels = {}
-    if INTENSITY in wanted:
-        channels[INTENSITY] = torch.from_numpy(intensity.astype(np.float64))
-    return reading(points, None, times, channels)
+    channel = torch.from_numpy(intensity.astype(np.float64))
+    return reading(points, None, times, {INTENSITY: channel} if INTENSITY in wanted else {})
 
 
 def _checked(path: Path) -> Path:

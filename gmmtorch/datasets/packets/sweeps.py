@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import NamedTuple
+from typing import Any
 
 from gmmtorch.datasets.packets import hesai
 from gmmtorch.datasets.packets.captures import Capture, Datagram
@@ -36,13 +36,9 @@ SINGLE_PACKETS = {"ouster_ros/msg/PacketMsg": "os_sensor", "ouster_sensor_msgs/m
 """Messages with one packet and no header, which are read as sweeps, and the frame of their lidars."""
 
 
-def _ouster_sizes() -> set[int]:
-    """Bytes of packets with 16 columns of 16 to 128 channels, in all profiles with a header."""
-    return {64 + 16 * (12 + n * pixel) for n in (16, 32, 64, 128) for pixel in (4, 8, 12, 16, 20)}
-
-
-_LEGACY = {16 * (20 + 12 * n) for n in (16, 32, 64, 128)}
-_PROFILED = _ouster_sizes()
+_CHANNELS = (8, 16, 32, 64, 128)  # of an Ouster, whose packets have 16 columns
+_LEGACY = {16 * (20 + 12 * n) for n in _CHANNELS}
+_PROFILED = {64 + 16 * (12 + n * pixel) for n in _CHANNELS for pixel in (4, 8, 12, 16, 20)}
 
 
 def is_ouster(data: bytes) -> bool:
@@ -52,11 +48,7 @@ def is_ouster(data: bytes) -> bool:
 
 def is_lidar(data: bytes) -> bool:
     """Whether a datagram is a packet of a lidar that is read."""
-    return _velodyne(data) or hesai.model_of(data) is not None or is_ouster(data)
-
-
-def _velodyne(data: bytes) -> bool:
-    return len(data) == VELODYNE_BYTES and data[:2] in (b"\xff\xee", b"\xff\xdd")
+    return len(data) == VELODYNE_BYTES or hesai.model_of(data) is not None or is_ouster(data)
 
 
 def packet_of(message: bytes, is_ros1: bool) -> bytes:
@@ -96,7 +88,7 @@ class Sweeps:
 
 def _place(data: bytes) -> bytes | float:
     """The azimuth of a packet in degrees, or what changes with the number of the turn."""
-    if _velodyne(data):
+    if len(data) == VELODYNE_BYTES:
         return int.from_bytes(data[2:4], "little") / 100
     model = hesai.model_of(data)
     if model is not None:
@@ -106,28 +98,21 @@ def _place(data: bytes) -> bytes | float:
 
 def packed(sweep: Sequence[tuple[int, bytes]], frame: str, is_ros1: bool) -> bytes:
     """A `SWEEP` message with the time of its first packet, in the packed form of ROS 1 or in CDR."""
-    form = "<III" if is_ros1 else "<II"
-    name = frame.encode() + b"\0" * (not is_ros1)
-    stamp = divmod(sweep[0][0], NANOSECONDS)
-    found = bytearray(struct.pack(form, *(0,) * is_ros1, *stamp) + struct.pack("<I", len(name)) + name)
-    pad = 1 if is_ros1 else 4
+    pad, name = (1, frame.encode()) if is_ros1 else (4, frame.encode() + b"\0")
+    found = bytearray(4 if is_ros1 else 0)  # the number of the message, which only ROS 1 has
+    found += struct.pack("<III", *divmod(sweep[0][0], NANOSECONDS), len(name)) + name
     found += bytes(-len(found) % pad) + struct.pack("<I", len(sweep))
     for time, data in sweep:
         found += bytes(-len(found) % pad) + struct.pack("<III", *divmod(time, NANOSECONDS), len(data)) + data
-    return (b"" if is_ros1 else b"\0\1\0\0") + bytes(found)
+    return bytes(found) if is_ros1 else b"\0\1\0\0" + found
+
+
+def definition(text: str) -> SimpleNamespace:
+    """A definition of a message, as those of a reader of rosbags."""
+    return SimpleNamespace(format=SimpleNamespace(name="MSG"), data=text)
 
 
 # -- captures ----------------------------------------------------------------------------------------
-
-
-class Connection(NamedTuple):
-    """A topic of a capture, as those of a reader of rosbags."""
-
-    id: int
-    topic: str
-    msgtype: str
-    msgcount: int
-    msgdef: SimpleNamespace
 
 
 class CaptureMessages:
@@ -156,18 +141,22 @@ class CaptureMessages:
         self.damage = self._capture.damage
         if not counts:
             raise DataError(f"{path} contains no UDP datagram over IPv4; capture the port of the lidar.")
-        self.connections = [
-            Connection(
-                number, f"/{source}/{port}", SWEEP, n_sweeps[source, port] + 1, _definition(DEFINITION)
+        self.connections: list[Any] = []
+        for (source, port), n_datagrams in counts.items():
+            is_lidar_here = (source, port) in turns
+            self.connections.append(
+                SimpleNamespace(
+                    id=len(self.connections),
+                    topic=f"/{source}/{port}",
+                    msgtype=SWEEP if is_lidar_here else _DATAGRAMS,
+                    msgcount=n_sweeps[source, port] + 1 if is_lidar_here else n_datagrams,
+                    msgdef=definition(DEFINITION if is_lidar_here else ""),
+                )
             )
-            if (source, port) in turns
-            else Connection(number, f"/{source}/{port}", _DATAGRAMS, n_datagrams, _definition(""))
-            for number, ((source, port), n_datagrams) in enumerate(counts.items())
-        ]
 
     def messages(
-        self, connections: Collection[Connection], start: int | None = None
-    ) -> Iterator[tuple[Connection, int, bytes]]:
+        self, connections: Collection[Any], start: int | None = None
+    ) -> Iterator[tuple[Any, int, bytes]]:
         """(connection, time in ns, content) of the sweeps of some topics, from a time on."""
         wanted = {one.topic: (one, Sweeps()) for one in connections if one.msgtype == SWEEP}
         for one in self._capture.datagrams(start):
@@ -178,12 +167,6 @@ class CaptureMessages:
             yield from _message(connection, sweeps.rest())
 
 
-def _message(
-    connection: Connection, sweep: list[tuple[int, bytes]]
-) -> Iterator[tuple[Connection, int, bytes]]:
+def _message(connection: Any, sweep: list[tuple[int, bytes]]) -> Iterator[tuple[Any, int, bytes]]:
     if sweep:
         yield connection, sweep[0][0], packed(sweep, "", is_ros1=False)
-
-
-def _definition(text: str) -> SimpleNamespace:
-    return SimpleNamespace(format=SimpleNamespace(name="MSG"), data=text)

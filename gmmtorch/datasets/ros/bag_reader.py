@@ -26,6 +26,7 @@ from gmmtorch.datasets.packets.sweeps import (
     SWEEP,
     CaptureMessages,
     Sweeps,
+    definition,
     is_lidar,
     packed,
     packet_of,
@@ -130,17 +131,21 @@ class BagReader:
 
         Messages with single packets of a lidar are put together to sweeps with the time of the first one.
         """
-        turns: dict[str, tuple[str, Sweeps]] = {}
+        singles = {c.topic for c in self._connections if c.msgtype in SINGLE_PACKETS}
+        return (self._messages if singles.isdisjoint(topics) else self._sweeps)(topics, start)
+
+    def _sweeps(self, topics: Collection[str], start: int | None) -> Iterator[RawMessage]:
+        """The messages, and sweeps in place of single packets."""
+        turns: dict[tuple[str, str], Sweeps] = {}
         for message in self._messages(topics, start):
             if message.type not in SINGLE_PACKETS:
                 yield message
                 continue
-            data = packet_of(message.data, self._is_ros1)
+            key, data = (message.topic, message.type), packet_of(message.data, self._is_ros1)
             if is_lidar(data):
-                _, sweeps = turns.setdefault(message.topic, (message.type, Sweeps()))
-                yield from self._sweep(message.topic, message.type, sweeps.add(message.time, data))
-        for topic, (kind, sweeps) in turns.items():
-            yield from self._sweep(topic, kind, sweeps.rest())
+                yield from self._sweep(*key, turns.setdefault(key, Sweeps()).add(message.time, data))
+        for key, sweeps in turns.items():
+            yield from self._sweep(*key, sweeps.rest())
 
     def _sweep(self, topic: str, kind: str, packets: list[tuple[int, bytes]]) -> Iterator[RawMessage]:
         if packets:
@@ -247,11 +252,6 @@ class BagReader:
                 f"{self.path} cannot be read as a ROS bag: {reason}. It is truncated, damaged, or uses an "
                 f"unknown compression; {repair}."
             ) from error
-
-
-def definition(text: str) -> SimpleNamespace:
-    """A definition of a message, as those of a reader of rosbags."""
-    return SimpleNamespace(format=SimpleNamespace(name="MSG"), data=text)
 
 
 def _known(message_type: str) -> SimpleNamespace:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gmmtorch.datasets.packets.sweeps import SINGLE_PACKETS
+from gmmtorch.datasets.packets.sweeps import SINGLE_PACKETS, is_lidar
 from gmmtorch.datasets.ros.bag_reader import BagReader, Topic
 from gmmtorch.datasets.ros.message_decoder import ARRAY, BASE, NAME, SEQUENCE
 from gmmtorch.datasets.trajectory import NANOSECONDS
@@ -127,7 +127,7 @@ def _sensor(reader: BagReader, topic: Topic) -> Sensor | None:
                 if _is_list_of_points(reader, desc):
                     return Sensor(topic, LIST, name)
                 if name == "packets" and _is_list_of_packets(reader, desc):
-                    return Sensor(topic, PACKETS)
+                    return Sensor(topic, PACKETS) if _is_of_known_lidar(reader, topic) else None
     return None
 
 
@@ -141,6 +141,16 @@ def _is_list_of_packets(reader: BagReader, desc: Any) -> bool:
     fields = _fields_in_list(reader, desc)
     kind, content = fields.get("data", (BASE, ("string", 0)))
     return "stamp" in fields and kind in (ARRAY, SEQUENCE) and content[0] == (BASE, ("uint8", 0))
+
+
+def _is_of_known_lidar(reader: BagReader, topic: Topic) -> bool:
+    """Whether the first message has packets of a lidar that is read, or none or a damaged one."""
+    first = next(reader.messages([topic.name]), None)
+    try:
+        packets = reader.decode(first)["packets"] if first is not None else []
+    except DataError:
+        return True
+    return not packets or is_lidar(bytes(packets[0]["data"][: packets[0].get("size")]))
 
 
 def _fields_in_list(reader: BagReader, desc: Any) -> dict[str, Any]:
