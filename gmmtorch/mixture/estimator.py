@@ -250,7 +250,7 @@ class MixtureEstimator(MixtureDensity):
             )
 
     def _best_start(
-        self, run: Callable[[OnIteration | None], EMResult[State]], on_iteration: OnIteration | None
+        self, run: Callable[[OnIteration], EMResult[State]], on_iteration: OnIteration | None
     ) -> EMResult[State]:
         """The result with the largest bound of `n_init` starts, or of the one that continues the last fit.
 
