@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import time
 import warnings
@@ -149,6 +150,11 @@ class MixtureEstimator(MixtureDensity):
             name = str(error).split("'")[1]
             raise InvalidParameterError(f"{name}={getattr(self, name)!r}: {error}") from None
         self._check_component_count(n_points)
+
+    @classmethod
+    @functools.cache
+    def _get_param_names(cls) -> list[str]:  # of scikit-learn, which reads the signature each time
+        return cast(list[str], super()._get_param_names())
 
     def _check_component_count(self, n_points: int | None) -> None:
         k = self.n_components
