@@ -37,7 +37,6 @@ _EXPECTATION = {dim: FusedKernel(_E_STEP, f"e_step<{dim}>") for dim in _WIDTHS}
 _MOST_LIKELY = {dim: FusedKernel(_E_STEP, f"most_likely<{dim}>") for dim in _WIDTHS}
 _NORMS = {dim: FusedKernel(_E_STEP, f"row_norms<{dim}>") for dim in _WIDTHS}
 _SHARES = {dim: FusedKernel(_E_STEP, f"component_sums<{dim}>") for dim in _WIDTHS}
-_NEAREST = FusedKernel(_E_STEP, "nearest_centers")
 _DIMENSIONS = {width: dim for dim, width in _WIDTHS.items()}
 
 
@@ -169,9 +168,6 @@ def nearest_centers(points: Tensor, weight: Tensor, centers: Tensor) -> tuple[Te
     Args:
         weight: (N,). centers: (R, K, D).
     """
-    given = points, weight, centers
-    if points.device.type == "cpu" and all(t.dtype == torch.float64 for t in given) and is_fused(*given):
-        return _fused_nearest_centers(*given)
     (n_runs, k, dim), n = centers.shape, points.shape[0]
     flat = centers.reshape(-1, dim)
     bias, offset = -0.5 * flat.square().sum(1, keepdim=True), k * torch.arange(n_runs, device=points.device)
@@ -190,18 +186,6 @@ def nearest_centers(points: Tensor, weight: Tensor, centers: Tensor) -> tuple[Te
     size = max(64, chunk_elements(points.device) // max(flat.shape))
     nearest, distance, sums = zip(*chunked(n, size, step), strict=True)
     return torch.cat(nearest, 1), torch.cat(distance, 1), torch.stack(sums).sum(0).view(n_runs, k, -1)
-
-
-def _fused_nearest_centers(points: Tensor, weight: Tensor, centers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    (n_runs, k, dim), n, n_parts = centers.shape, points.shape[0], _n_parts(points)
-    padded = torch.nn.functional.pad(centers, (0, 0, 0, -k % 4))
-    bias = torch.nn.functional.pad(-0.5 * centers.square().sum(2), (0, -k % 4), value=-1e300)
-    nearest = torch.empty(n_runs, n, dtype=torch.int64)
-    distance, scratch = points.new_empty(n_runs, n), points.new_empty(n_runs * n_parts * dim * CPU_LANES)
-    sums = points.new_zeros(n_runs, n_parts, padded.shape[1], 1 + dim)
-    given = points.contiguous(), weight.contiguous(), n, dim, padded, bias, padded.shape[1], n_parts
-    _NEAREST(n_runs * n_parts, *given, scratch, nearest, distance, sums, device=points.device)
-    return nearest, distance, sums.sum(1)[:, :k]
 
 
 def softmax(logits: Tensor, sample_weight: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
