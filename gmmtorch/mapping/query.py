@@ -154,6 +154,12 @@ def _blocks(components: Components, cutoff: float) -> list[_Block]:
     return [_Block(part, cutoff) for part in components.split(ends) if len(part.seen_by)]
 
 
+def _joined(parts: Sequence[Components]) -> list[Components]:
+    """All components of some parts, together; none if there are none."""
+    found = [part for part in parts if len(part.seen_by)]
+    return [Components.concatenate(found)] if found else []
+
+
 class Query:
     """Answers queries about fixed components. Indices and Monte Carlo rays are made at the first query.
 
@@ -163,7 +169,7 @@ class Query:
     Args:
         components: of the map.
         options: how queries are answered.
-        recent: more components, such as those of an unfinished window, in parts of which some stay.
+        recent: more components, such as those of the parts of an unfinished window. They are one block.
     """
 
     def __init__(
@@ -171,7 +177,7 @@ class Query:
     ) -> None:
         self._set(components, options, recent)
         self._blocks = _blocks(components, self.cutoff)
-        self._recent = [_Block(part, self.cutoff) for part in recent if len(part.seen_by)]
+        self._recent = [_Block(part, self.cutoff) for part in _joined(recent)]
 
     def _set(self, components: Components, options: QueryOptions, recent: Sequence[Components]) -> None:
         self.components, self.options, self.dim = components, options, components.dim
@@ -191,9 +197,18 @@ class Query:
             return Query(components, options, recent)
         if components is not self.components:
             made._blocks = self._following(components)
-        known = {id(block.components): block for block in self._recent}
-        made._recent = [known.get(id(c)) or _Block(c, self.cutoff) for c in recent if len(c.seen_by)]
+        made._recent = [
+            self._recent[0].replaced(part) if self._recent else _Block(part, self.cutoff)
+            for part in _joined(recent)
+        ]
         return made
+
+    def prepare(self, former: Query) -> None:
+        """Makes what the first query at the resolutions that `former` was asked for would make."""
+        sides = {side for block in [*former._blocks, *former._recent] for side in block.forms}
+        for block in self._recent:
+            for side in sides:
+                block.form(side, 1 / max(1, len(self._blocks)))
 
     def _following(self, components: Components) -> list[_Block]:
         """The blocks of other components. Those before the first change stay as they are; of the others, each
