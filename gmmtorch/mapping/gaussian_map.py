@@ -69,11 +69,11 @@ class GaussianMap(MapState):
 
     Queries do not change the map: the scans of an unfinished window are learned for the answer, and learned
     again when the window is full. If they are large, a query learns from them scan by scan, in less time than
-    together; a map that was asked since the last scan does so when the next one is inserted. `finish`, `components` and `save` learn from them together, and until the next scan queries
-    answer from that. Lists of the components near the points that were asked about are kept while the map
-    grows; method "monte_carlo" draws its rays anew (about a second for a million). `save` and
-    `load` keep a map with its settings. `state_dict` holds everything that learning continues from, and loads
-    into any map.
+    together; a map that was asked since the last scan does so when the next one is inserted. `finish`,
+    `components` and `save` learn from them together, and until the next scan queries answer from that. Lists
+    of the components near the points that were asked about are kept while the map grows; method "monte_carlo"
+    draws its rays anew (about a second for a million). `save` and `load` keep a map with its settings.
+    `state_dict` holds everything that learning continues from, and loads into any map.
     """
 
     any_resolution = True
@@ -256,12 +256,11 @@ class GaussianMap(MapState):
     def _rounded_final(self) -> tuple[Components, Components]:
         """The final components, and as the codec rounds them."""
         final = self._final()
-        if self.codec == "float":
-            return final, final
         none = Components.empty(final.dim, final.means.device)
         known, rounded = self._final_rounded or (none, none)
         if any(value is not getattr(final, name) for name, value in vars(known).items()):
-            self._final_rounded = final, quantized_after(known, rounded, final)
+            is_exact = self.codec == "float"
+            self._final_rounded = final, final if is_exact else quantized_after(known, rounded, final)
         return self._final_rounded or (final, rounded)
 
     def transform(self, transform: ArrayLike, ids: ArrayLike | None = None) -> None:

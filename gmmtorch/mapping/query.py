@@ -175,15 +175,23 @@ class Query:
     def __init__(
         self, components: Components, options: QueryOptions, recent: Sequence[Components] = ()
     ) -> None:
-        self._set(components, options, recent)
+        self._set(components, options, recent, count_many(components.seen_count))
         self._blocks = _blocks(components, self.cutoff)
         self._recent = [_Block(part, self.cutoff) for part in _joined(recent)]
 
-    def _set(self, components: Components, options: QueryOptions, recent: Sequence[Components]) -> None:
+    def _set(
+        self,
+        components: Components,
+        options: QueryOptions,
+        recent: Sequence[Components],
+        counts: tuple[int, int],
+    ) -> None:
+        """counts: `count_many` of the components."""
         self.components, self.options, self.dim = components, options, components.dim
         parts = [components, *recent]
         self.rule = rule_of(options, parts)
-        self.cutoff = options.cutoff or cutoff_of(*count_many(torch.cat([part.seen_count for part in parts])))
+        self._counts, more = counts, [count_many(part.seen_count) for part in recent]
+        self.cutoff = options.cutoff or cutoff_of(*map(sum, zip(counts, *more, strict=True)))
         self._lattices: dict[float, SparseEvidence] = {}
         self._bounds: tuple[Tensor, Tensor, Tensor] | None = None
 
@@ -192,10 +200,12 @@ class Query:
     ) -> Query:
         """The answers about other components; arguments as for `Query`. Blocks that did not change stay."""
         made = copy.copy(self)
-        made._set(components, options, recent)
+        is_other = components is not self.components
+        counts = count_many(components.seen_count) if is_other else self._counts
+        made._set(components, options, recent, counts)
         if made.cutoff != self.cutoff or components.dim != self.dim or not self._blocks:
             return Query(components, options, recent)
-        if components is not self.components:
+        if is_other:
             made._blocks = self._following(components)
         made._recent = [
             self._recent[0].replaced(part) if self._recent else _Block(part, self.cutoff)
