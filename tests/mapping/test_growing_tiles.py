@@ -316,6 +316,19 @@ def test_a_map_of_added_components_answers_the_same_once_reopened(n_recent, tmp_
     assert made._rule == TiledMap(other.folder)._rule
 
 
+def test_monte_carlo_draws_the_share_of_each_tile_as_the_map_grows(tmp_path, monkeypatch):
+    monkeypatch.setattr(tiled_map, "_RECENT", 10)
+    scans = street(12, 2)
+    made = TiledMap.create(tmp_path / "map", GaussianMap(RULE, cutoff=4.0), 2, SIDE)
+    for scan in scans:
+        made.insert(scan)
+        made.occupancy(around(scans[:3])[::9], 0.3, "monte_carlo")
+    made.finish()
+    asked = around(scans)[::9]
+    expected = TiledMap(made.folder).occupancy(asked, 0.3, "monte_carlo")
+    assert torch.equal(made.occupancy(asked, 0.3, "monte_carlo"), expected)
+
+
 def test_the_first_unfinished_window_decides_the_cutoff(tmp_path):
     sparse = street(1, 2)[0]
     scan = Scan(sparse.points.repeat(100, 1), sparse.origin)  # components with many points

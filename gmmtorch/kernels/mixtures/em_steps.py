@@ -24,6 +24,7 @@ from torch import Tensor
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.chunks import chunk_elements, chunked
 from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel
+from gmmtorch.linalg import order_along_curve
 
 _FEW_ROWS = 2048  # in fewer rows, their order matters little
 _PARTS = 64  # most parts of the rows; each has its own sums, so that threads write apart
@@ -79,19 +80,12 @@ def most_likely(features: Tensor, natural: Tensor) -> Tensor:
 def in_spatial_order(features: Tensor, sample_weight: Tensor) -> tuple[Tensor, Tensor]:
     """The rows (N, F), (N,) in an order in which neighbours follow each other, if the fused kernel runs.
 
-    The kernel skips what all of eight rows are far from. The order is that of a Morton curve through 32 cells
-    along each axis.
+    The kernel skips what all of eight rows are far from.
     """
     dim = _DIMENSIONS.get(features.shape[1], 0)
     if not _is_e_step_fused(features, sample_weight) or features.shape[0] < _FEW_ROWS:
         return features, sample_weight
-    places = features[:, 1 : 1 + dim].contiguous()
-    low, high = places.amin(0), places.amax(0)
-    cell = ((places - low) * (31.99 / (high - low).max().clamp_min(1e-300))).long().clamp_(0, 31)
-    spread = [sum((n >> b & 1) << (b * dim) for b in range(5)) for n in range(32)]
-    bits = torch.tensor(spread, device=places.device)
-    keys = sum((bits[cell[:, axis]] << axis for axis in range(dim)), torch.zeros_like(cell[:, 0]))
-    order = keys.short().argsort(stable=True)
+    order = order_along_curve(features[:, 1 : 1 + dim].contiguous())
     return features.index_select(0, order), sample_weight.index_select(0, order)
 
 

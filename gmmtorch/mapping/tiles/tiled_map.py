@@ -427,12 +427,15 @@ class TiledMap:
     def _query(self, row: int) -> Query:
         """The query of a tile. If the open ones need too much memory, the least recently used are dropped."""
         name = self._name(row)
+        share = float(self.index.support[row] / self.index.support.sum().clamp_min(1e-300))
+        n_samples = max(1, round(share * self.query_options.n_samples))
+        options = replace(self.query_options, n_samples=n_samples)
         if name not in self._open:
             components = self.components(row).to(self.device)
-            share = float(self.index.support[row] / self.index.support.sum().clamp_min(1e-300))
-            n_samples = max(1, round(share * self.query_options.n_samples))
-            made = Query(components, replace(self.query_options, n_samples=n_samples))
-            self._open[name] = made, len(components) * _BYTES_EACH
+            self._open[name] = Query(components, options), len(components) * _BYTES_EACH
+        known, n_bytes = self._open[name]
+        if known.options.n_samples != n_samples:  # other tiles have grown
+            self._open[name] = known.replaced(known.components, options), n_bytes
         self._open.move_to_end(name)
         while len(self._open) > 1 and sum(n_bytes for _, n_bytes in self._open.values()) > self.memory:
             self._open.popitem(last=False)
