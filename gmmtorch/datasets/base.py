@@ -107,8 +107,10 @@ class Dataset(Sequence[Scan]):
         name: of the data set.
         ranges: how readings are interpreted.
         stride: every n-th scan of the source is read.
+        keeps_point_times: scans that are not deskewed have the channel `POINT_TIMES`, if the source has it.
     """
 
+    keeps_point_times = False
     _poses: Tensor | None = None
     _times: Tensor | None = None
 
