@@ -303,13 +303,17 @@ class Diagnostics:
         self._nbytes = nbytes
         dropped = self._scans.n_dropped
         is_late, self._n_dropped = dropped > self._n_dropped, dropped
+        message = "scans are dropped" if is_late else "keeps up"
         if is_late:
             self._node.warn("dropped", f"{dropped} scans were dropped: the sensor is faster than mapping.")
+        elif (n_waiting := self._scans.n_waiting) > max(self._rate, 1.0):  # more than it maps in a second
+            is_late, message = True, f"falls behind: {n_waiting} scans wait"
+            self._node.warn("behind", f"{n_waiting} scans wait: {self._name} is slower than the sensor.")
         numbers = self.numbers(n_scans, n_components)
         status = {
             "level": _WARN if is_late else _OK,
             "name": self._name,
-            "message": "scans are dropped" if is_late else "keeps up",
+            "message": message,
             "hardware_id": self._scans.name,
             "values": [{"key": key, "value": f"{value:.6g}"} for key, value in numbers.items()],
         }

@@ -37,13 +37,15 @@ _SLIDE = 1.0  # metres that the best pose is moved at most along its loosest dir
 _SLIDES = 16  # places, each of which climbs by
 _SLIDE_STEPS = 3
 _DECISIVE = 4.0  # nats by which such a place must be better: smaller gains do not make poses more exact
-_SPACING = {2: 0.25, 3: 0.5}  # metres between the starts near the expected poses
-_COARSE = 1.0  # metres of blur, and between the starts, of the wide search in 3D
+_SPACING = {2: 0.25, 3: 1.0}  # metres between the starts near the expected poses
+_COARSE = 0.5  # metres of blur of those in 3D; in a hall, with one metre twice as many scans are missed
+_HEADINGS = 8  # from which a scan in 3D is registered, if it may have turned far
 _TURNED = {2: 0.5, 3: 0.2}  # radians between the headings of neighbours, for each metre between their places
 _NEAR = 0.5  # metres, and half as many radians, of the deviations of the first search
 _FARTHEST = 3.0  # metres of a search
-_SORTED = {2: 400, 3: 64}  # best starts, of which
-_CLIMBED = 24  # different ones are climbed
+_SORTED = {2: 400, 3: 200}  # best starts, of which
+_CLIMBED = {2: 24, 3: 48}  # different ones are climbed
+_FEW = 8  # of them in 3D, where the motion is as expected
 _SPREAD = 0.75  # spacings between them
 _COARSE_POINTS = 300  # of the scan on all levels but the last one
 _RANKED = 200  # points of the scan that rank the starts
@@ -106,15 +108,14 @@ class LocalMap:
         mixture = surface_mixture(self._components, "the local map")
         centered = mixture._replace(means=mixture.means - self._center)
         self._target = functools.partial(AlignmentTarget, centered, normals=seen_normals(self._components))
-        self._targets = [self._target(blur) for blur in _BLURS[self.dim]]
+        first = self._target(_BLURS[self.dim][0])
+        self._targets = [first, *(self._target(blur, lists=first.lists) for blur in _BLURS[self.dim][1:])]
         poses = Pose.stack([frame.pose for frame in keyframes])
         self._space = FreeSpace([frame.points for frame in keyframes], poses)
 
     @functools.cached_property
     def _search(self) -> PoseSearch:
         points = torch.cat([scan.points[:_SEARCHED] for scan in self._scans])
-        if self.dim == 3:
-            return PoseSearch(points)
         origins = torch.cat([scan.origin.expand_as(scan.points[:_SEARCHED]) for scan in self._scans])
         beams = points - origins
         ranges = beams.norm(dim=1, keepdim=True).clamp_min(1e-9)
@@ -127,10 +128,11 @@ class LocalMap:
         best: _Found | None = None
         for starts, targets in self._searches(scan, expected):
             tried = self._climbed(scan, expected, starts, targets)
+            confirmed = best is not None and best.location.found and _is_same(best.location, tried.location)
             if best is None or (tried.location.found, tried.total) > (best.location.found, best.total):
                 best = tried
             supported = best.location.explained - best.contradicted
-            if best.location.found and supported >= _USUAL * expected.explained:
+            if best.location.found and (confirmed or supported >= _USUAL * expected.explained):
                 break
         assert best is not None
         return best.location
@@ -139,37 +141,58 @@ class LocalMap:
         self, scan: Keyframe, expected: Expectation
     ) -> Iterator[tuple[Pose, list[AlignmentTarget]]]:
         """Starts, and the levels they climb; the cheapest search first."""
-        near = expected._replace(distance=min(expected.distance, _NEAR), angle=min(expected.angle, _NEAR / 2))
-        starts = self._lattice(scan, near, self._targets[0], _SPACING[self.dim])
+        first = self._targets[0]
+        limits = min(expected.distance, _NEAR), min(expected.angle, _NEAR / 2)
+        near = expected._replace(distance=limits[0], angle=limits[1])
         if self.dim == 2:
+            starts = self._lattice(scan, near, near.poses, first, _SPACING[2], 2 * near.angle)
             # Along a wall most climbs end in one wrong place: the best pose of the raster is not enough.
             yield Pose.cat([starts, self._search.best(scan.points, expected, _STARTS).poses]), self._targets
             return
+        if expected.distance <= _NEAR and expected.angle <= _NEAR / 2:  # climbs bridge such a turn
+            yield self._lattice(scan, near, near.poses, first, 2 * first.blur, 0.0, _FEW), self._targets
         still = Scan(scan.points, torch.zeros(self.dim))
         mixture = learn_window([still], self._rule, torch.Generator().manual_seed(0))
-        registered = register(mixture, self._components, expected.poses.matrix).transform
-        yield Pose.cat([Pose.from_matrix(registered[None]), starts]), self._targets
-        coarse = self._target(_COARSE)
-        wide = expected._replace(distance=_FARTHEST / 2, angle=math.pi / 2)
-        starts = self._lattice(scan, wide, coarse, coarse.blur)
-        yield starts, [coarse, *self._targets]
-        found = register(mixture, self._components, starts.matrix, coarsest=coarse.blur)
+        found = register(mixture, self._components, expected.poses.matrix)
+        registered = Pose.from_matrix(found.transform[None])
+        yield Pose.cat([registered, expected.poses]), self._targets
+        # Where pillars repeat, it may be one of them off, but has the right rotation.
+        places = torch.cat([registered.translation, expected.poses.translation])
+        around = Pose(registered.rotation.expand(len(places), 3, 3), places)
+        coarse, turn = self._target(_COARSE), _TURNED[3] * _SPACING[3]
+        yield self._lattice(scan, expected, around, coarse, _SPACING[3], turn), [coarse, *self._targets]
+        last = expected.poses[-1]
+        angles = torch.arange(_HEADINGS).double() * (2 * math.pi / _HEADINGS)
+        turned = Pose.from_yaw(angles, torch.zeros(3).double()).rotation @ last.rotation
+        found = register(
+            mixture, self._components, Pose(turned, last.translation.expand(_HEADINGS, 3)).matrix
+        )
         yield Pose.from_matrix(found.transform[None]), self._targets
 
     def _lattice(
-        self, scan: Keyframe, expected: Expectation, target: AlignmentTarget, spacing: float
+        self,
+        scan: Keyframe,
+        expected: Expectation,
+        centers: Pose,
+        target: AlignmentTarget,
+        spacing: float,
+        angle: float,
+        most: int | None = None,
     ) -> Pose:
-        """The expected poses, and the best of the starts around them, `spacing` metres apart."""
+        """Some poses, and at most `most` of the best starts around them.
+
+        They are `spacing` metres apart, with headings up to `angle` radians from those of the poses.
+        """
         reach = math.ceil(min(2 * expected.distance, _FARTHEST) / spacing)
         side = torch.arange(-reach, reach + 1).double() * spacing
         shifts = torch.nn.functional.pad(torch.cartesian_prod(side, side), (0, self.dim - 2))
         turn = _TURNED[self.dim] * spacing
-        n_turns = math.ceil(min(2 * expected.angle, math.pi) / turn)
+        n_turns = math.ceil(min(angle, math.pi) / turn)
         angles = torch.arange(-n_turns, n_turns + 1).double() * turn
         turns = Pose.from_yaw(angles, torch.zeros(self.dim).double()).rotation
-        rotations = (turns @ expected.poses.rotation[:, None, None]).expand(-1, len(shifts), -1, -1, -1)
-        places = (expected.poses.translation[:, None] + shifts)[:, :, None].expand(-1, -1, len(turns), -1)
-        starts = Pose.cat([expected.poses, Pose(rotations.flatten(0, 2), places.flatten(0, 2))])
+        rotations = (turns @ centers.rotation[:, None, None]).expand(-1, len(shifts), -1, -1, -1)
+        places = (centers.translation[:, None] + shifts)[:, :, None].expand(-1, -1, len(turns), -1)
+        starts = Pose.cat([centers, Pose(rotations.flatten(0, 2), places.flatten(0, 2))])
         points = scan.points[:_RANKED]
         score = target.scores(points, starts.shifted(-self._center))
         total = score / CORRELATED - expected.unlikely(starts)
@@ -179,7 +202,7 @@ class LocalMap:
         total = total[best] - against * len(points) / CORRELATED
         starts = starts[best[total.argsort(descending=True, stable=True)]]
         starts = starts[distinct(starts.shifted(-self._center), _SPREAD * spacing, _SPREAD * turn)]
-        return Pose.cat([expected.poses, starts[:_CLIMBED]])
+        return Pose.cat([centers, starts[: most or _CLIMBED[self.dim]]])
 
     def _climbed(
         self, scan: Keyframe, expected: Expectation, starts: Pose, targets: list[AlignmentTarget]
@@ -252,6 +275,12 @@ class LocalMap:
             covariance = covariance + _scatter(poses[best], poses[chosen])
         location = Location(poses[best].matrix, covariance, share, tuple(doubts), probability)
         return _Found(location, float(total[best]), contradicted)
+
+
+def _is_same(some: Location, other: Location) -> bool:
+    """Whether two searches found one pose."""
+    first, second = Pose.from_matrix(some.pose[None]), Pose.from_matrix(other.pose[None])
+    return float(differences(first, second, _APART, _APART)) < 1
 
 
 def _probability(*evidence: float) -> float:

@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
-from gmmtorch.datasets import Dataset, Reposed, with_poses
+from gmmtorch.datasets import POINT_TIMES, Dataset, Reposed, deskewed, with_poses
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_number, check_whole
 from gmmtorch.localization.local_map import LOST, Keyframe, LocalMap, nowhere
 from gmmtorch.localization.location import Location, continued, measured_motion
@@ -38,6 +38,8 @@ _FEWEST = 10  # returns of a scan that can be located
 _FIRST_STEP = 1.0, math.radians(30)  # standard deviations (m, rad) of the first motions
 _SURPRISE = 0.3, math.radians(10)  # least standard deviations of a motion from the predicted one
 _MEMORY = 0.7  # share of the past in the mean surprise
+_SKEW = 0.05  # metres of a point between two estimates of its skew, above which the scan is located again
+_LONGEST_SWEEP = 1.0  # seconds between scans over which a velocity deskews points
 _LONG_MEMORY = 0.9  # share of the past in the mean explained share
 
 
@@ -116,13 +118,20 @@ class Odometry:
         self._parts: list[int] = []  # keyframes that begin a map of their own, because the sensor was lost
         self._edges: list[tuple[int, Pose, Tensor]] = []  # from which scan, motion, information
         self._motion: Pose | None = None
+        self._step: Pose | None = None  # the motion that deskews the newest scan
         self._surprise = _FIRST_STEP
         self._explained = 0.95  # share of the points: few places explain less
         self._stamp: float | None = None
         self._seconds: float | None = None
         self._loops = LoopCloser(least_explained, rule)
 
-    def add(self, points: ArrayLike, stamp: float | None = None, motion: ArrayLike | None = None) -> Location:
+    def add(
+        self,
+        points: ArrayLike,
+        stamp: float | None = None,
+        motion: ArrayLike | None = None,
+        seconds: ArrayLike | None = None,
+    ) -> Location:
         """The pose of the next scan in the frame of the first one; if it is not `found`, the best guess.
 
         Args:
@@ -133,20 +142,41 @@ class Odometry:
             motion: (D+1, D+1) of the sensor since the last scan, last ← now, such as that of wheels; or its
                 rotation (D, D) alone, such as that of an IMU: the velocity in the frame of the sensor
                 continues. None: the motion continues.
+            seconds: (N,) after `stamp` at which each point was measured. The points are moved to where they
+                would be seen at the stamp, by the predicted motion, and again by the estimated one if that
+                moves one of them by more than 5 cm. None: all were measured at the stamp.
 
         Raises `InvalidArgumentError` for another shape or dimension, or for a motion that is not rigid.
         """
-        rows = self._checked(points)
+        rows, times = self._checked(points, seconds)
         dim = rows.shape[1]
         measured = None if motion is None else measured_motion(motion, dim, rows.device)
-        scan = self._scan(rows)
+        raw, times = self._scan(rows), None if times is None else times[_drawn(rows)]
         ratio = self._clock(stamp)
         if not self._poses:
-            location = Location(torch.eye(dim + 1).double(), nowhere(dim) * 0, 1.0, ())
+            location, scan = Location(torch.eye(dim + 1).double(), nowhere(dim) * 0, 1.0, ()), raw
         else:
+            self._step = self._predicted(measured, ratio)[0]
+            scan = self._deskewed(raw, times)
             location = self._located(scan, measured, ratio)
+            if location.found:
+                self._step = self._poses[-1].inverse() @ Pose.from_matrix(location.pose)
+                better = self._deskewed(raw, times)
+                moved = (better.points - scan.points).norm(dim=1)
+                scan = better
+                if bool((moved > _SKEW).any()):
+                    location = self._located(scan, self._step, ratio)
+                    self._step = self._poses[-1].inverse() @ Pose.from_matrix(location.pose)
         self._remember(scan, location)
         return location
+
+    def deskewed(self, points: Tensor, seconds: Tensor) -> Tensor:
+        """Points (N, D) of the newest scan, moved to where they would be seen at its stamp by the estimated
+        motion since the scan before; unchanged if that or its time is not known. seconds: as for `add`.
+        """
+        if self._step is None or self._seconds is None or not 0 < self._seconds <= _LONGEST_SWEEP:
+            return points
+        return deskewed(points.double(), seconds.double(), self._step, self._seconds)
 
     @property
     def poses(self) -> Tensor:
@@ -201,18 +231,28 @@ class Odometry:
 
     # -- one scan -------------------------------------------------------------------------------------
 
-    def _checked(self, points: ArrayLike) -> Tensor:
+    def _checked(self, points: ArrayLike, seconds: ArrayLike | None) -> tuple[Tensor, Tensor | None]:
         rows = as_tensor(points, "points", torch.float64).detach().cpu()
         dims = (2, 3) if not self._poses else (self._poses[0].dim,)
         if rows.ndim != 2 or rows.shape[1] not in dims:
             wanted = " or ".join(f"(N, {dim})" for dim in dims)
             raise InvalidArgumentError(f"points has shape {tuple(rows.shape)}; expected {wanted}, metres.")
-        return rows[torch.isfinite(rows).all(1)]
+        finite = torch.isfinite(rows).all(1)
+        if seconds is None:
+            return rows[finite], None
+        times = as_tensor(seconds, "seconds", torch.float64).detach().cpu()
+        if times.shape != rows.shape[:1]:
+            raise InvalidArgumentError(
+                f"seconds has shape {tuple(times.shape)}; expected ({len(rows)},), one for each point."
+            )
+        finite &= torch.isfinite(times)
+        return rows[finite], times[finite]
 
     def _scan(self, rows: Tensor) -> Keyframe:
-        draw = torch.Generator().manual_seed(0)
-        chosen = rows[torch.randperm(len(rows), generator=draw)[:_STORED]]
-        return Keyframe(chosen, Pose.identity(rows.shape[1]))
+        return Keyframe(rows[_drawn(rows)], Pose.identity(rows.shape[1]))
+
+    def _deskewed(self, scan: Keyframe, seconds: Tensor | None) -> Keyframe:
+        return scan if seconds is None else scan._replace(points=self.deskewed(scan.points, seconds))
 
     def _clock(self, stamp: float | None) -> float:
         """How many times longer than the last motion this one takes; 1 if the clocks do not say."""
@@ -227,13 +267,7 @@ class Odometry:
 
     def _located(self, scan: Keyframe, measured: Pose | Tensor | None, ratio: float) -> Location:
         last = self._poses[self._last_found]
-        step = rest = Pose.identity(last.dim)
-        if isinstance(measured, Tensor):
-            step, rest = continued(measured, self._motion, ratio), continued(measured, None)
-        elif measured is not None:
-            step = measured
-        elif self._motion is not None:
-            step = self._motion if ratio == 1.0 else rest.towards(self._motion, ratio)
+        step, rest = self._predicted(measured, ratio)
         guess = self._poses[-1] @ step  # of a scan that was lost, too
         reach = self.max_step * min(len(self._lost) + 1, _LONGEST_GAP)
         expected = Expectation(
@@ -247,6 +281,17 @@ class Odometry:
         location = self._local.locate(scan, expected)
         self._note_surprise(location, expected)
         return location
+
+    def _predicted(self, measured: Pose | Tensor | None, ratio: float) -> tuple[Pose, Pose]:
+        """The motion since the last scan, and that of a sensor that stopped."""
+        rest = Pose.identity(self._poses[-1].dim)
+        if isinstance(measured, Tensor):
+            return continued(measured, self._motion, ratio), continued(measured, None)
+        if measured is not None:
+            return measured, rest
+        if self._motion is None or ratio == 1.0:
+            return self._motion or rest, rest
+        return rest.towards(self._motion, ratio), rest
 
     def _note_surprise(self, location: Location, expected: Expectation) -> None:
         off = expected.poses[0].inverse() @ Pose.from_matrix(location.pose)
@@ -342,6 +387,11 @@ class Odometry:
         return Edges(torch.tensor(source), target, Pose.stack(motions), torch.stack(information), none)
 
 
+def _drawn(rows: Tensor) -> Tensor:
+    """Rows of the points of a keyframe, in random order."""
+    return torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))[:_STORED]
+
+
 def _bridged(poses: Pose, found: Tensor) -> Pose:
     """The poses (N), with lost ones on the way from the last found pose to the next one."""
     number, good = torch.arange(len(poses)), found.nonzero()[:, 0]
@@ -402,13 +452,14 @@ def with_odometry(
     known = torch.zeros(len(source), dtype=torch.bool)
     times = source.times
     before: int | None = None
+    source.keeps_point_times = True
     for index in range(len(source)):
-        points = _sensor_points(source, index)
+        points, seconds = _sensor_points(source, index)
         if points is not None:
             predicted = None
             if before is not None and motion != "constant":
                 predicted = _motion(source, turns, before, index)
-            odometry.add(points, None if times is None else float(times[index]), predicted)
+            odometry.add(points, None if times is None else float(times[index]), predicted, seconds)
             known[index], before = True, index
         on_scan(index + 1, len(source))
     if not known.any():
@@ -432,18 +483,21 @@ def _motion(source: Dataset, turns: Tensor | None, before: int, now: int) -> Ten
     return (Pose.from_matrix(first).inverse() @ Pose.from_matrix(last)).matrix
 
 
-def _sensor_points(source: Dataset, index: int) -> Tensor | None:
-    """Returns (N, D) of a scan in the frame of the sensor; None if it cannot be read."""
+def _sensor_points(source: Dataset, index: int) -> tuple[Tensor | None, Tensor | None]:
+    """Returns (N, D) of a scan in the frame of the sensor, and when they were measured (N,), if that is known
+    and they are not deskewed; None if it cannot be read."""
     try:
         scan, pose = source[index], source.pose(index)
     except DataError:
-        return None  # the reader counts it in `skipped`
+        return None, None  # the reader counts it in `skipped`
     if pose is None:
         raise DataError(
             f"{source.name} does not state the poses in which its points are, so they cannot be moved into "
             "the frame of the sensor."
         )
-    return Pose.from_matrix(pose).inverse().apply(scan.points.double())
+    seconds = scan.attributes.get(POINT_TIMES)
+    points = Pose.from_matrix(pose).inverse().apply(scan.points.double())
+    return points, None if seconds is None else seconds[:, 0]
 
 
 def odometry_of(method: str) -> Odometry | KissIcp:
@@ -465,7 +519,13 @@ class KissIcp:
         self._icp = KissICP(config)
         self._locations: list[Location] = []
 
-    def add(self, points: Tensor, stamp: float | None = None, motion: Tensor | None = None) -> Location:
+    def add(
+        self,
+        points: Tensor,
+        stamp: float | None = None,
+        motion: Tensor | None = None,
+        seconds: Tensor | None = None,
+    ) -> Location:
         """The pose of the next scan in the frame of the first one, without a covariance (NaN)."""
         dim = points.shape[1]
         rows = torch.nn.functional.pad(points, (0, 3 - dim))

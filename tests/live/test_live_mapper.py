@@ -247,6 +247,19 @@ def test_stamps_of_another_clock_are_said_and_do_not_count_as_latency():
     assert diagnostics.numbers(4, 0)["latency_median"] == pytest.approx(0.6)
 
 
+def test_scans_that_wait_are_said_before_any_is_dropped():
+    user: Any = Recorder()
+    sensor, options = Sensor(Topic("/scan", LASER_TYPE, 0), LASER), LiveOptions(max_latency=None)
+    scans = LiveScans(sensor, TransformTree(), Ranges(), options)
+    diagnostics = Diagnostics(user, scans)
+    diagnostics.publish(0, 0, 0)
+    assert user.take("warning") == []
+    for number in range(30):
+        scans.receive(laser(float(number)), 0)
+    diagnostics.publish(0, 0, 0)
+    assert user.take("warning") == ["30 scans wait: gmmtorch mapping is slower than the sensor."]
+
+
 def test_a_rate_of_zero_is_refused(node, tmp_path):
     path: Path = recorded(tmp_path / "a.mcap", LASER)
     with node() as user, pytest.raises(InvalidArgumentError, match="rate"):

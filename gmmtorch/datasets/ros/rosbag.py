@@ -296,6 +296,7 @@ class RosBag(Dataset):
             skip("message that cannot be decoded")
             origin = pose.translation[: 2 if self._is_flat else 3].clone()
             return Scan(origin.new_empty(0, len(origin)), origin)
+        self._conversion.keeps_times = self.keeps_point_times
         return self._conversion.scan(found, record.stamp, record.frame, pose, self._is_flat, skip)
 
     def _reading(self, index: int) -> Reading:
