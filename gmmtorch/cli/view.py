@@ -54,8 +54,8 @@ class PageOptions:
     shape: str = option("splats", "splats, ellipsoids (2σ), surfaces (the mesh, in 3D) or none")
     colour: str = option(
         "height",
-        "height, support, age (the order in which components were learned), uncertainty (of the surface), or a "
-        "channel of the map, such as colour",
+        "height, support, age (the order in which components were learned), uncertainty (of the surface), or "
+        "a channel of the map, such as colour",
     )
     host: str = option("127.0.0.1", "address of the page; 0.0.0.0: other machines can open it, too")
     port: int = option(8080, "port of the page; the next free one if it is in use")

@@ -161,8 +161,10 @@ def colours(components: Components, solid: Solid, by: str) -> Colours:
         scale = height_scale(solid.means[:, 2])
         deviations, axes = principal_axes(solid.covariances)
         change = axes[:, 2] * deviations
-        ends = [_shades(scale((solid.means[:, 2:] + sign * change).numpy())) / 255 for sign in (1, -1)]
-        slopes = (ends[0] - ends[1]) / 2
+        above, below = (
+            _shades(scale((solid.means[:, 2:] + sign * change).numpy())) / 255 for sign in (1, -1)
+        )
+        slopes = (above - below) / 2
         return Colours(
             height_shades(solid.means), (f"{scale.vmin:.2f} m", f"{scale.vmax:.2f} m"), slopes=slopes
         )
