@@ -58,11 +58,11 @@ class PageOptions(PageAddress):
     )
     bounds: list[float] | None = option(None, BOUNDS)
     html: str | None = option(None, "file to write, .html, instead of serving a page")
-    shape: str = option("ellipsoids", "ellipsoids (2σ), splats, surfaces (the mesh, in 3D) or none")
+    shape: str = option("splats", "splats, ellipsoids (2σ), surfaces (the mesh, in 3D) or none")
     colour: str = option(
         "height",
-        "height, support, age (the order in which components were learned), uncertainty (deviation across "
-        "the surface), or a channel of the map, such as colour",
+        "height, support, age (the order in which components were learned), uncertainty (of the surface), or "
+        "a channel of the map, such as colour",
     )
     runtime: common.Memory = group(common.Memory)
 
