@@ -39,6 +39,7 @@ _REPLACED = {
     "view_host": "use host.",
     "view_port": "use port.",
     "view_origins": "use origins.",
+    "map.noise": "map.side is the side (m) of the cells of an octree that is as exact.",
     "map@log.map": _LOG_MAP,
     "log.every": "use log.dataset.stride.",
     "journal.sync": "every store survives a loss of power.",
