@@ -30,8 +30,8 @@ from gmmtorch.mapping import WindowedRule, learn_window, surface_mixture
 from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 
-_BLURS = {2: (0.2, 0.08, 0.03), 3: (0.25, 0.1, 0.04)}  # metres
-_STEPS = 15  # of a level; with six on the last one, headings stay 2° off
+_BLURS = {2: (0.1, 0.03), 3: (0.25, 0.1, 0.04)}  # metres
+_STEPS = {2: 8, 3: 15}, 15  # of a level, and of the last one; with six, headings stay 2° off
 _EACH, _LAST = 3, 5  # a third of the poses go on to the next level, but at least five
 _SLIDE = 1.0  # metres that the best pose is moved at most along its loosest direction, to
 _SLIDES = 16  # places, each of which climbs by
@@ -48,8 +48,14 @@ _SPREAD = 0.75  # spacings between them
 _COARSE_POINTS = 300  # of the scan on all levels but the last one
 _RANKED = 200  # points of the scan that rank the starts
 _LOOSEST = 0.3  # metres of standard deviation
-LOST = 1.0, math.radians(20)  # deviations (m, rad) of a pose that no scan confirms
-_STARTS = 40  # poses of the search in 2D that are climbed
+LOST = 1.0, math.radians(20)
+"""Deviations (m, rad) of a pose that no scan confirms."""
+SURE = 0.99
+"""Probability: below, the search in 2D is wider, and only one lost scan is searched for again."""
+
+_STARTS = 12, 40  # poses that are climbed of the search in 2D near the prediction, and anywhere
+_DEVIATIONS = 3.0  # of the prediction: the reach of the first search in 2D,
+_MIDDLE = 1.0  # and nats against a pose in its middle, as by 1.5 deviations
 _SEARCHED = 1000  # points of a keyframe
 _APART = 0.3  # metres, and radians: poses are different
 _INSIDE = 5.0  # nats of a point on a surface, however many components it touches
@@ -59,7 +65,9 @@ _NEARBY = 1.0  # log odds that a scan is near the last one, relative to the samp
 _LEAST_PROBABILITY = 0.7  # of a pose that is found
 _LEAST_SEEN = 0.5  # share of the points of which at least so many must lie on surfaces
 _USUAL = 0.85  # of the share that is expected to be explained: less, and the search is wider
-_ALIKE = 2.0  # nats by which another pose must be worse
+_ALIKE = 2.0  # nats by which another pose must be worse,
+_NOT_MUCH_WORSE = 6.0  # and by which it may be worse to be tried with the next scan,
+_OTHERS = 4  # if it is one of the best
 _IMAGE_CELL = {2: math.radians(1), 3: math.radians(3)}  # of an image
 _MARGIN = 0.25, 0.02  # metres, and share of the range, that a point may be in front of or behind a surface
 _KEPT_POINTS = 200  # of each earlier scan, that a new scan must not look through
@@ -75,11 +83,14 @@ class Keyframe(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """The result of one search, with its log-likelihood (nats) and the share of the points against it."""
+    """The result of one search, with its log-likelihood (nats), the share of the points against it, and the
+    nats against it by what was expected.
+    """
 
     location: Location
     total: float
     contradicted: float
+    unlikely: float
 
 
 class LocalMap:
@@ -98,9 +109,7 @@ class LocalMap:
         self._center = keyframes[-1].pose.translation
         # One mixture of all points: where many scans overlap, a sum of their mixtures would outweigh the
         # surfaces that only one of them saw, and pull the next scan back.
-        self._scans = [
-            Scan(frame.points, torch.zeros(self.dim)).transformed(frame.pose.matrix) for frame in keyframes
-        ]
+        self._scans = [Scan(frame.pose.apply(frame.points), frame.pose.translation) for frame in keyframes]
         self._rule = rule
         self._components = learn_window(self._scans, rule, torch.Generator().manual_seed(0))
         mixture = surface_mixture(self._components, "the local map")
@@ -115,22 +124,32 @@ class LocalMap:
         points = torch.cat([scan.points[:_SEARCHED] for scan in self._scans])
         if self.dim == 3:
             return PoseSearch(points)
+        # Points are sparse on far walls, components are not.
+        mixture = surface_mixture(self._components, "the local map")
+        values, axes = torch.linalg.eigh(mixture.covariances.double())
+        half = (3 * values[:, -1]).sqrt()[:, None] * axes[:, :, -1]
+        along = torch.linspace(-1, 1, 16).double()[:, None, None]
+        surfaces = (mixture.means.double() + along * half).flatten(0, 1)
         origins = torch.cat([scan.origin.expand_as(scan.points[:_SEARCHED]) for scan in self._scans])
         beams = points - origins
         ranges = beams.norm(dim=1, keepdim=True).clamp_min(1e-9)
         part = 1 - (_MARGIN[0] + _MARGIN[1] * ranges) / ranges
         ends = origins + part.clamp_min(0) * beams
-        return PoseSearch(points, torch.stack([origins, ends], 1))
+        return PoseSearch(torch.cat([points, surfaces]), torch.stack([origins, ends], 1))
 
     def locate(self, scan: Keyframe, expected: Expectation) -> Location:
         """The pose of a scan, whose own pose is not used; `found` if it is sure."""
         best: _Found | None = None
         for starts, targets in self._searches(scan, expected):
             tried = self._climbed(scan, expected, starts, targets)
-            if best is None or (tried.location.found, tried.total) > (best.location.found, best.total):
+            rank = [(one.location.found, one.total) for one in (tried, best or tried)]
+            if self.dim == 2 or rank[0] >= rank[1]:  # in 2D the wider search includes the first one
                 best = tried
+            assert best is not None
             supported = best.location.explained - best.contradicted
-            if best.location.found and supported >= _USUAL * expected.explained:
+            # Rivals outside the first search in 2D are less likely than a pose near its middle.
+            is_sure = self.dim == 3 or (best.location.probability >= SURE and best.unlikely <= _MIDDLE)
+            if best.location.found and is_sure and supported >= _USUAL * expected.explained:
                 break
         assert best is not None
         return best.location
@@ -139,12 +158,19 @@ class LocalMap:
         self, scan: Keyframe, expected: Expectation
     ) -> Iterator[tuple[Pose, list[AlignmentTarget]]]:
         """Starts, and the levels they climb; the cheapest search first."""
-        near = expected._replace(distance=min(expected.distance, _NEAR), angle=min(expected.angle, _NEAR / 2))
-        starts = self._lattice(scan, near, self._targets[0], _SPACING[self.dim])
         if self.dim == 2:
             # Along a wall most climbs end in one wrong place: the best pose of the raster is not enough.
-            yield Pose.cat([starts, self._search.best(scan.points, expected, _STARTS).poses]), self._targets
+            starts = expected.poses
+            reach = _DEVIATIONS * expected.distance, min(_DEVIATIONS * expected.angle, expected.max_turn)
+            if expected.distance < LOST[0]:
+                near = expected._replace(poses=expected.poses[:1], max_step=reach[0], max_turn=reach[1])
+                starts = self._search.best(scan.points, near, _STARTS[0]).poses
+                yield starts, self._targets
+            found = self._search.best(scan.points, expected, _STARTS[1]).poses
+            yield Pose.cat([starts, found]), self._targets
             return
+        near = expected._replace(distance=min(expected.distance, _NEAR), angle=min(expected.angle, _NEAR / 2))
+        starts = self._lattice(scan, near, self._targets[0], _SPACING[self.dim])
         still = Scan(scan.points, torch.zeros(self.dim))
         mixture = learn_window([still], self._rule, torch.Generator().manual_seed(0))
         registered = register(mixture, self._components, expected.poses.matrix).transform
@@ -187,7 +213,9 @@ class LocalMap:
         motions, kept = starts.shifted(-self._center), len(starts)
         for target in targets:
             points = scan.points[: self.n_points if target is targets[-1] else _COARSE_POINTS]
-            found = align(points, target, motions, _STEPS)
+            found = align(
+                points, target, motions, _STEPS[1] if target is targets[-1] else _STEPS[0][self.dim]
+            )
             kept = max(kept // _EACH, _LAST)
             total, view = self._total(found, points, expected)
             order = total.argsort(descending=True, stable=True)
@@ -198,12 +226,14 @@ class LocalMap:
         # A climb has the points' score alone, which can rise along a wall while the sum of evidence falls.
         slid = align(points, targets[-1], _slid(found, points), _SLIDE_STEPS)
         slid_total, slid_view = self._total(slid, points, expected)
-        # A place whose own direction stays open would lose to any pose of a wider search without a doubt.
-        is_open = [pose_covariance(one, points)[1] > _LOOSEST for one in slid.information]
-        slid_total = torch.where(torch.tensor(is_open), -torch.inf, slid_total)
         order = slid_total.argsort(descending=True, stable=True)
-        if float(slid_total[order[0]] - total[0]) > _DECISIVE:
-            found, total, view = slid.at(order), slid_total[order], slid_view.at(order)
+        # A place whose own direction stays open would lose to any pose of a wider search without a doubt.
+        better = int((slid_total > total[0] + _DECISIVE).sum())
+        for place, row in enumerate(order[:better].tolist()):
+            if pose_covariance(slid.information[row], points)[1] <= _LOOSEST:
+                rows = order[place:]
+                found, total, view = slid.at(rows), slid_total[rows], slid_view.at(rows)
+                break
         return self._judged(points, found, total, view, expected)
 
     def _total(self, found: Alignment, points: Tensor, expected: Expectation) -> tuple[Tensor, View]:
@@ -232,10 +262,12 @@ class LocalMap:
         if float(total[best]) < -NEVER / 2:
             doubts.append("the pose is farther from where it is expected than max_step and max_turn allow")
         lead = total[best] - torch.where(is_apart, total, -torch.inf).amax()
-        probability = _probability(
-            float(found.explained[best]), contradicted, 1 - seen, float(lead),
-            min(loosest, 1.0), float(expected.unlikely(poses[[best]])),
-        )  # fmt: skip
+        others = poses[(is_apart & (total >= total[0] - _NOT_MUCH_WORSE)).nonzero()[:_OTHERS, 0]]
+        unlikely = float(expected.unlikely(poses[[best]]))
+        is_here, is_best = _probability(
+            float(found.explained[best]), contradicted, 1 - seen, float(lead), min(loosest, 1.0), unlikely
+        )
+        probability = is_here * is_best
         if probability < _LEAST_PROBABILITY:
             doubts.append(
                 f"the probability of the pose is {probability:.2f}: {share:.0%} of the points lie on "
@@ -243,29 +275,32 @@ class LocalMap:
             )
         if share < self.least_explained:
             doubts.append(f"only {share:.0%} of the points lie on surfaces of the last scans")
-        if doubts:
+        if is_here < _LEAST_PROBABILITY or share < self.least_explained:
             covariance = covariance + nowhere(self.dim)
         if loosest > _LOOSEST:
             doubts.append(f"the surfaces leave a direction open: a standard deviation of {loosest:.2g} m")
         if bool(rivals.any()):
             doubts.append("another pose explains the scan as well")
             covariance = covariance + _scatter(poses[best], poses[chosen])
-        location = Location(poses[best].matrix, covariance, share, tuple(doubts), probability)
-        return _Found(location, float(total[best]), contradicted)
+        location = Location(poses[best].matrix, covariance, share, tuple(doubts), probability, others.matrix)
+        return _Found(location, float(total[best]), contradicted, unlikely)
 
 
-def _probability(*evidence: float) -> float:
-    """That a pose is right: a logistic regression on 460 poses of scans in local maps of four 2D logs, half
-    of them in the map of another place. In a recording most scans are near the last one, which adds to the
-    odds.
+def _probability(*evidence: float) -> tuple[float, float]:
+    """That the scan is of the local map, and that no rival is the right pose. The first one is a logistic
+    regression on 460 poses of scans in local maps of four 2D logs, half of them in the map of another place;
+    real scans contradict true maps more than simulated ones do. The second one is that of 570 scans in 24
+    simulated floors of equal offices.
 
     evidence: shares of the points that are explained, contradicted and unseen; nats to the best pose that is
     apart; standard deviation of the loosest direction (m); nats against the pose by what was expected.
     """
     explained, contradicted, unseen, lead, loosest, unlikely = evidence
+    lead = min(lead, 60.0)
     shares = 5.5 * explained - 6.6 * contradicted - 0.6 * unseen
-    odds = shares + 0.06 * min(lead, 60.0) - 5.6 * loosest - 1.1 * unlikely - 0.4 + _NEARBY
-    return 1 / (1 + math.exp(-min(max(odds, -30.0), 30.0)))
+    is_here = shares + 0.03 * lead - 5.6 * loosest - 0.8 * unlikely - 0.4 + _NEARBY
+    here, best = (1 / (1 + math.exp(-min(max(odds, -30.0), 30.0))) for odds in (is_here, 0.44 * lead - 0.31))
+    return here, best
 
 
 def _slid(found: Alignment, points: Tensor) -> Pose:
