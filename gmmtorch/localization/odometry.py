@@ -46,7 +46,8 @@ _LONG_MEMORY = 0.9  # share of the past in the mean explained share
 class Trajectory(NamedTuple):
     """Poses (N, D+1, D+1) of N scans, world ← sensor (the world is the frame of the first one); covariances
     (N, F, F) of a shift (m) and a turn (rad) in the frame of the sensor; whether each was found (N,); the
-    number of loop closures that were used; and the reasons against each pose, empty if it was found.
+    number of loop closures that were used; the reasons against each pose, empty if it was found; and the
+    probability (N,) that each pose in its local map is right, NaN if it is not estimated.
     """
 
     poses: Tensor
@@ -54,6 +55,7 @@ class Trajectory(NamedTuple):
     found: Tensor
     n_closures: int
     doubts: tuple[str, ...]
+    probabilities: Tensor
 
 
 class Odometry:
@@ -67,13 +69,14 @@ class Odometry:
         poses = odometry.trajectory().poses
 
     The pose of a scan is the one that best explains its points by one mixture of the last keyframes and is
-    not far from the prediction. In 2D the poses that the sensor can have reached are searched by branch and
-    bound (`localization.pose_search`), and the mixture is climbed from the best ones; in 3D it is climbed
+    not far from the prediction. In 2D the poses near the prediction, and if the best one is not sure all that
+    the sensor can have reached, are searched by branch and bound (`localization.pose_search`), and the
+    mixture is climbed from the best ones; in 3D it is climbed
     from the best of a lattice of starts. The prediction continues the last motion. `trajectory`
     finds the places that were seen twice and corrects all poses by a pose graph
-    (`localization.pose_graph`). A scan that is not found never enters the local map. If the
-    next one is found, it is searched for again. The fourth in a row begins a new map, whose poses are found
-    if a closure joins them with the first.
+    (`localization.pose_graph`). A scan that is not found never enters the local map. Its other possible poses
+    are tried with the next one; if that is found, the lost one is searched for again. The fourth in a row
+    begins a new map, whose poses are found if a closure joins them with the first one.
 
     Args:
         n_keyframes: in the local map. None: 10, or 80 for a sensor with a narrow field of view, such as a
@@ -84,7 +87,8 @@ class Odometry:
         least_explained: share of the points that must lie on surfaces of the local map.
         rule: how a scan becomes a mixture.
         max_step, max_turn: largest motion (m, rad) of the sensor between two scans. A pose that is farther
-            from the last one and from the predicted one is not found.
+            from the last one and from the predicted one is not found. After ten steps in succession, twice
+            the longest one (at least 2 m), and twice the largest turn (at least 2.4 rad), limit them, too.
     """
 
     def __init__(
@@ -200,7 +204,8 @@ class Odometry:
                        for doubt, apart in zip(doubts, is_apart.tolist(), strict=True))  # fmt: skip
         best = best._replace(poses=_bridged(best.poses, found))
         found &= ~is_apart
-        return Trajectory(best.poses.matrix, best.covariances, found, int(used.sum()), doubts)
+        sure = torch.tensor([location.probability for location in self._locations]).double()
+        return Trajectory(best.poses.matrix, best.covariances, found, int(used.sum()), doubts, sure)
 
     # -- one scan -------------------------------------------------------------------------------------
 
@@ -505,4 +510,5 @@ class KissIcp:
         poses = torch.stack([location.pose for location in self._locations])
         covariances = torch.stack([location.covariance for location in self._locations])
         found = torch.ones(len(poses), dtype=torch.bool)
-        return Trajectory(poses, covariances, found, 0, ("",) * len(poses))
+        unknown = torch.full((len(poses),), torch.nan).double()
+        return Trajectory(poses, covariances, found, 0, ("",) * len(poses), unknown)
