@@ -166,8 +166,8 @@ class LocalMap:
                 near = expected._replace(poses=expected.poses[:1], max_step=reach[0], max_turn=reach[1])
                 starts = self._search.best(scan.points, near, _STARTS[0]).poses
                 yield starts, self._targets
-            found = self._search.best(scan.points, expected, _STARTS[1]).poses
-            yield Pose.cat([starts, found]), self._targets
+            anywhere = self._search.best(scan.points, expected, _STARTS[1]).poses
+            yield Pose.cat([starts, anywhere]), self._targets
             return
         near = expected._replace(distance=min(expected.distance, _NEAR), angle=min(expected.angle, _NEAR / 2))
         starts = self._lattice(scan, near, self._targets[0], _SPACING[self.dim])
