@@ -255,7 +255,7 @@ class MixtureDensity(DensityMixin, BaseEstimator, DeviceModule):
         return points
 
     def _shared(self, X: Array, reset: bool) -> Tensor | None:
-        """The memory of a table that `validate_data` would only check, in the time of a small fit."""
+        """The memory of a table that needs no `validate_data`, which takes longer than a small fit."""
         if type(X) is not np.ndarray or X.dtype != np.float64 or not X.dtype.isnative or X.ndim != 2:
             return None
         if X.size == 0 or not (X.flags.c_contiguous and X.flags.writeable):
