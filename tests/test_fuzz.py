@@ -11,10 +11,12 @@ import pytest
 
 FUZZ = Path(__file__).resolve().parents[1] / "scripts" / "fuzz.py"
 
+TARGETS = "trajectory,png,pcd,metadata,map behind,tiles,frames,stores,udp"
+
 
 @pytest.mark.slow
 def test_a_short_run_finds_nothing(tmp_path):
-    options = ["--inputs", "200", "--targets", "trajectory,png,pcd", "--folder", str(tmp_path)]
+    options = ["--inputs", "400", "--targets", TARGETS, "--folder", str(tmp_path)]
     done = subprocess.run([sys.executable, FUZZ, *options], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
 

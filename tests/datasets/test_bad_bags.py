@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import sqlite3
 import struct
 import time
 import warnings
@@ -12,7 +14,7 @@ import pytest
 import torch
 from test_rosbag import POINTS, clouds, drive, moved
 
-from gmmtorch.datasets import load
+from gmmtorch.datasets import BagReader, load
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
 
 pytest.importorskip("rosbags")
@@ -160,6 +162,48 @@ def test_a_bag_compressed_as_a_whole_is_unpacked_to_a_limit(tmp_path, monkeypatc
         load("rosbag", folder)
 
 
+ENDLESS = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) SELECT {} FROM n WHERE x < 0"
+DEFINITION = "x AS id, 'a' AS topic_type, 'a' AS encoding, 'a' AS encoded_message_definition"
+DEFINITION += ", 'a' AS type_description_hash"
+HOSTILE_TABLES = {
+    "schema": ENDLESS.format("x AS schema_version"),
+    "message_definitions": ENDLESS.format(DEFINITION),
+}
+
+
+@pytest.mark.parametrize("is_salvaged", [False, True])
+@pytest.mark.parametrize("name", HOSTILE_TABLES)
+def test_queries_of_a_database_end_whatever_its_views_are(tmp_path, name, is_salvaged):
+    path = clouds(tmp_path / "a.db3")
+    with contextlib.closing(sqlite3.connect(path)) as database:
+        database.execute(f"DROP TABLE IF EXISTS {name}")
+        database.execute(f"CREATE VIEW {name} AS {HOSTILE_TABLES[name]}")
+        database.commit()
+    if is_salvaged:
+        assert len(list(BagReader(path, is_salvaged=True).messages({"/points"}))) == 3
+    else:
+        with pytest.raises(DataError, match="more steps than a file of this size needs"):
+            BagReader(path)
+
+
+@pytest.mark.parametrize("is_salvaged", [False, True])
+def test_generated_columns_are_not_larger_than_messages(tmp_path, is_salvaged):
+    path = clouds(tmp_path / "a.db3")
+    with contextlib.closing(sqlite3.connect(path)) as database:
+        database.executescript(
+            "CREATE TABLE new (id INTEGER PRIMARY KEY, topic_id, timestamp, data AS (zeroblob(900000000)));"
+            "INSERT INTO new (id, topic_id, timestamp) SELECT id, topic_id, timestamp FROM messages;"
+            "DROP TABLE messages; ALTER TABLE new RENAME TO messages;"
+        )
+        database.commit()
+    reader = BagReader(path, is_salvaged)
+    if is_salvaged:
+        assert not list(reader.messages({"/points"}))
+    else:
+        with pytest.raises(DataError, match="too big"):
+            list(reader.messages({"/points"}))
+
+
 LAUGHS = (
     "a{n}: &a{n} [{many}]\n",
     "a{n}: &a{n}\n  k{n}: 1\n  <<: [{many}]\n",  # rosbags' parser copies what is merged
@@ -188,6 +232,12 @@ def test_a_star_in_metadata_is_no_alias(tmp_path, caplog):
     assert metadata.YAML(typ="safe").load("a: 'two * three'\nb: x*y\n") == {"a": "two * three", "b": "x*y"}
     with pytest.raises(Exception, match="aliases are not read"):
         metadata.YAML(typ="safe").load("a: &x 1\nb: *x\n")
+    begin = time.process_time()
+    for text in ("[" * 3000, "a: " + "{a: " * 5000, "[" * 60 + "]" * 60):
+        with pytest.raises(Exception, match="nested too deeply"):
+            metadata.YAML(typ="safe").load(text)
+    assert time.process_time() - begin < 1
+    assert metadata.YAML(typ="safe").load("[[[]], {a: [1]}]") == [[[]], {"a": [1]}]
 
 
 def test_texts_of_a_bag_are_neither_unpickled_nor_run(tmp_path, monkeypatch):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import bz2
 import io
+import itertools
 import logging
 import re
 import shutil
@@ -32,7 +33,7 @@ from gmmtorch.datasets.packets.sweeps import (
     packet_of,
 )
 from gmmtorch.datasets.ros.message_decoder import MessageDecoder
-from gmmtorch.datasets.ros.salvage import Salvage
+from gmmtorch.datasets.ros.salvage import QuerySteps, Salvage
 from gmmtorch.datasets.trajectory import NANOSECONDS
 from gmmtorch.errors import DataError, GmmTorchError
 from gmmtorch.optional_packages import needs_extra
@@ -245,6 +246,8 @@ class BagReader:
             raise
         except Exception as error:
             reason = str(error) or type(error).__name__
+            if reason.endswith("interrupted"):
+                reason = "a query takes more steps than a file of this size needs"
             if "index" in reason and self._is_ros1:
                 reason = f"{reason} (it was not closed)"
             repair = _REPAIRS.get(self.path.suffix, "'ros2 bag reindex' writes metadata.yaml again")
@@ -357,6 +360,7 @@ MAX_BAG_BYTES = 1 << 35
 space of the temporary folder."""
 
 _ZSTD_HEADER_BYTES = 18
+_MOST_BRACKETS = 50  # in one another, in YAML
 _MAGIC = {b"\x89MCAP0\r\n": ".mcap", b"SQLite f": ".db3"}
 
 
@@ -366,7 +370,7 @@ def reader_class(is_ros1: bool) -> Any:
         import rosbags.rosbag1
         import rosbags.rosbag2
     ros1, ros2 = rosbags.rosbag1, rosbags.rosbag2
-    _limit_parsers(ros1.reader, ros2.reader, ros2.storage_mcap, ros2.metadata)
+    _limit_parsers(ros1.reader, ros2.reader, ros2.storage_mcap, ros2.metadata, ros2.storage_sqlite3)
     return _limited_ros1_reader(ros1) if is_ros1 else _reader_by_magic(ros2)
 
 
@@ -429,8 +433,10 @@ def _within(unpacked: bytes) -> bytes:
     return unpacked
 
 
-def _limit_parsers(ros1: Any, ros2: Any, mcap: Any, metadata: Any) -> None:
+def _limit_parsers(ros1: Any, ros2: Any, mcap: Any, metadata: Any, sqlite: Any) -> None:
     """Put codecs and parsers with limits in the places where modules of rosbags look for theirs."""
+    if hasattr(sqlite.apsw, "set_default_vfs"):  # the package itself, not yet ours
+        sqlite.apsw = SimpleNamespace(**{**vars(sqlite.apsw), "Connection": _limited_database(sqlite.apsw)})
     ros2.YAML = metadata.YAML = _plain_yaml
     ros1.decompressors.update(bz2=_unpack_bz2, lz4=_unpack_lz4)
     mcap.DECOMPRESSORS.update(lz4=_unpack_lz4, zstd=unpack_zstd)
@@ -438,7 +444,8 @@ def _limit_parsers(ros1: Any, ros2: Any, mcap: Any, metadata: Any) -> None:
 
 
 def _plain_yaml(**options: Any) -> Any:
-    """A parser of YAML that refuses aliases, with which a few lines become billions of entries."""
+    """A parser of YAML that refuses aliases, with which a few lines become billions of entries, and brackets
+    in brackets in brackets, each of which takes longer than the one around it."""
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
     from ruamel.yaml.events import AliasEvent
@@ -447,9 +454,27 @@ def _plain_yaml(**options: Any) -> Any:
         def load(self, stream: Any) -> Any:
             if "*" in stream and any(isinstance(one, AliasEvent) for one in YAML(**options).parse(stream)):
                 raise YAMLError("aliases are not read")
+            brackets = ((1 if found in "[{" else -1) for found in re.findall(r"[\[\]{}]", stream))
+            if max(itertools.accumulate(brackets), default=0) > _MOST_BRACKETS:
+                raise YAMLError("its brackets are nested too deeply")
             return super().load(stream)
 
     return PlainYaml(**options)
+
+
+def _limited_database(apsw: Any) -> Any:
+    class LimitedDatabase(apsw.Connection):
+        """A database whose queries end, whatever views and generated columns it has."""
+
+        def __init__(self, filename: str, *args: Any, **options: Any) -> None:
+            super().__init__(filename, *args, **options)
+            path = Path(filename.removeprefix("file:").removesuffix("?immutable=1"))
+            steps = QuerySteps(path.stat().st_size)
+            self.limit(apsw.SQLITE_LIMIT_LENGTH, MAX_CHUNK_BYTES)
+            self.set_exec_trace(lambda *_: steps.begin())
+            self.set_progress_handler(steps.is_over, QuerySteps.EACH_CALL)
+
+    return LimitedDatabase
 
 
 def _limited_zstd_file(zstd: Any) -> Any:

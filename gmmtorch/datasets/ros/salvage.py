@@ -463,7 +463,32 @@ def _mcap_text(content: bytes, at: int) -> tuple[str, int]:
 
 
 _MOST_LOST_ROWS = 1 << 40
+_LEAST_STEPS, _STEPS_EACH_BYTE = 20_000_000, 1000  # of a query
 _NEXT_ROW = "SELECT rowid, timestamp, topic_id FROM messages WHERE rowid > ? ORDER BY rowid LIMIT 1"
+
+
+class QuerySteps:
+    """Counts the steps of SQLite's virtual machine, of which a query of a file has a number by its size.
+
+    A view or a generated column of a hostile file could take steps without end.
+    """
+
+    EACH_CALL = 10_000
+    """Steps between two calls of `is_over`."""
+
+    def __init__(self, n_bytes: int) -> None:
+        self._most = (_LEAST_STEPS + _STEPS_EACH_BYTE * n_bytes) // self.EACH_CALL
+        self._n = 0
+
+    def begin(self) -> bool:
+        """A query begins. Returns True, which lets it run."""
+        self._n = 0
+        return True
+
+    def is_over(self) -> bool:
+        """Whether the query has taken too many steps, which ends it."""
+        self._n += 1
+        return self._n > self._most
 
 
 class _Database:
@@ -476,6 +501,9 @@ class _Database:
         self._database = sqlite3.connect(f"{path.resolve().as_uri()}?immutable=1", uri=True)
         self._database.text_factory = lambda data: data.decode(errors="replace")
         self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, limit)
+        steps = QuerySteps(path.stat().st_size)
+        self._database.set_trace_callback(lambda query: steps.begin() and None)
+        self._database.set_progress_handler(steps.is_over, QuerySteps.EACH_CALL)
         self._database.execute("PRAGMA trusted_schema=OFF")
         self._database.execute("PRAGMA writable_schema=ON")  # opens a file that is shorter than it states
         query = "SELECT count(*) FROM sqlite_master WHERE type='table' AND name IN ('messages', 'topics')"
