@@ -8,10 +8,11 @@ import json
 import os
 import secrets
 import stat
+import sys
 import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import torch
@@ -103,6 +104,61 @@ def write_bytes(path: str | Path, data: bytes) -> Path:
         temporary.write_bytes(data)
 
     return write_atomically(path, write)
+
+
+class FileLock:
+    """A lock that one object at a time holds, in all processes of a machine.
+
+    The system frees it when the object or its process ends, in whatever way. The file stays.
+
+    Args:
+        path: of an empty file, which is made.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._file: BinaryIO | None = None
+
+    def hold(self) -> bool:
+        """Takes the lock. False if this object had it; raises `OutputError` if another one has it."""
+        if self._file is not None:
+            return False
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            with contextlib.ExitStack() as stack:
+                file = stack.enter_context(self._path.open("ab"))
+                _lock(file)
+                stack.pop_all()
+        except BlockingIOError as error:
+            raise OutputError(
+                f"{self._path.parent} is being written by another program, or by another object of this one; "
+                "wait until it is finished, or choose another folder."
+            ) from error
+        except OSError as error:
+            raise _unwritable(self._path, error, "choose another folder") from error
+        self._file = file
+        return True
+
+    def release(self) -> None:
+        """Frees the lock."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+
+def _lock(file: BinaryIO) -> None:
+    """Locks a file until it is closed. Raises `BlockingIOError` if it is locked."""
+    if sys.platform == "win32":
+        import msvcrt
+
+        try:
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+        except OSError as error:
+            raise BlockingIOError(*error.args) from error
+    else:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def write_npz(path: str | Path, **arrays: NDArray[Any]) -> Path:

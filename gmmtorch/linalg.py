@@ -116,6 +116,20 @@ def all_equal(pairs: Iterable[tuple[Tensor, Tensor]]) -> bool:
 # -- sorting: NumPy's vectorised sorts on the CPU, torch's elsewhere ------------------------------
 
 
+def order_along_curve(places: Tensor) -> Tensor:
+    """An order (N,) of finite points (N, 2 or 3), at least one, in which neighbours follow each other.
+
+    It is that of a Morton curve through 32 cells along each axis of their box.
+    """
+    low, high = places.amin(0), places.amax(0)
+    cell = ((places - low) * (31.99 / (high - low).max().clamp_min(1e-300))).long().clamp_(0, 31)
+    dim = places.shape[1]
+    spread = [sum((n >> b & 1) << (b * dim) for b in range(5)) for n in range(32)]
+    bits = torch.tensor(spread, device=places.device)
+    keys = sum((bits[cell[:, axis]] << axis for axis in range(dim)), torch.zeros_like(cell[:, 0]))
+    return keys.short().argsort(stable=True)
+
+
 def argsort(keys: Tensor) -> Tensor:
     """Indices (N,) that sort keys (N,). The sort is stable."""
     if keys.device.type != "cpu":

@@ -95,6 +95,8 @@ def targets(folder: Path) -> dict[str, Target]:
         **bags(folder, few, poses),
         **clouds(folder, few[0].points),
         **logs(),
+        **packets(folder),
+        **nuscenes(),
         **folders(folder),
         **mixtures(folder, few[0].points),
         **maps(folder, few),
@@ -371,6 +373,7 @@ def mixtures(folder: Path, points: torch.Tensor) -> dict[str, Target]:
 def maps(folder: Path, scans: list[Any]) -> dict[str, Target]:
     """Maps, their tiles, checkpoints and grids: each changed as a whole, and behind its checksums."""
     from gmmtorch.mapping.tile_index import read_index
+
     from gmmtorch.occupancy import OccupancyGrid
 
     built = gt.GaussianMap()
@@ -503,6 +506,76 @@ def sharing(scans: list[Any]) -> dict[str, Target]:
         ),
         "stores": Target(stored, restore),
     }
+
+
+def packets(folder: Path) -> dict[str, Target]:
+    """Captures of an XT32 and an OS-1-16, and what states their angles."""
+    from gmmtorch.datasets.packets import hesai, ouster
+
+    cells = b"\x88\x13\x09\0" * 32
+    blocks = b"".join(struct.pack("<H", 60 * block) + cells for block in range(8))
+    xt = bytes([0xEE, 0xFF, 6, 1, 0, 0, 32, 8, 1, 4, 1, 0]) + blocks + bytes(28)
+    pixels = struct.pack("<IHHHH", 5000, 9, 7, 8, 0) * 16
+    columns = [struct.pack("<QHHI", 10**6 * k, k, 1, 88 * k) + pixels + b"\xff" * 4 for k in range(16)]
+    metadata = {
+        "beam_altitude_angles": [0.5 * k for k in range(16)],
+        "beam_azimuth_angles": [0.0] * 16,
+        "lidar_mode": "512x10",
+        "lidar_to_sensor_transform": np.eye(4).ravel().tolist(),
+    }
+    (folder / "os.json").write_text(json.dumps(metadata))
+    frames = [frame for data in (xt, xt, b"".join(columns), xt) for frame in ethernet(data)]
+    pcap = struct.pack("<IHHIIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1)
+    pcap += b"".join(struct.pack("<4I", 1, 1000 * k, len(f), len(f)) + f for k, f in enumerate(frames))
+    pcapng = struct.pack("<3I2HqI", 0x0A0D0D0A, 28, 0x1A2B3C4D, 1, 0, -1, 28)
+    pcapng += struct.pack("<2I2H2I", 1, 20, 1, 0, 65535, 20)
+    for number, frame in enumerate(frames):
+        body = struct.pack("<5I", 0, 0, number, len(frame), len(frame)) + frame + bytes(-len(frame) % 4)
+        pcapng += struct.pack("<2I", 6, 12 + len(body)) + body + struct.pack("<I", 12 + len(body))
+
+    def capture(path: Path) -> None:
+        for topic in datasets.BagReader(path, True).topics:
+            if topic.type.endswith("Sweep"):
+                options = {"calibration": str(folder / "os.json")} if topic.name.endswith("3392") else {}
+                read_all("rosbag", path, poses="standing", topic=topic.name, **options)
+
+    def angles(path: Path) -> None:
+        if path.suffix == ".csv":
+            hesai.read_angles(path)
+        else:
+            ouster.read_metadata(path.read_bytes(), path.name)
+
+    rows = b"".join(b"%d,%d.5,0.1\n" % (k, 15 - k) for k in range(32))
+    stated = {"a.csv": b"Channel,Elevation,Azimuth\n" + rows, **taken(folder, "os.json")}
+    return {
+        "captures": Target({"a.pcap": pcap, "a.pcapng": pcapng}, capture),
+        "lidar angles": Target(stated, angles),
+    }
+
+
+def ethernet(data: bytes) -> list[bytes]:
+    """The frames of a datagram to the port with the number of its bytes."""
+    udp, found = struct.pack(">4H", 9, len(data), 8 + len(data), 0) + data, []
+    for at in range(0, len(udp), 1480):
+        part = udp[at : at + 1480]
+        place = at // 8 | 0x2000 * (at + 1480 < len(udp))
+        head = struct.pack(">2B3H2BH", 0x45, 0, 20 + len(part), 1, place, 64, 17, 0)
+        found.append(bytes(12) + b"\x08\0" + head + bytes([10, 0, 0, 1, 10, 0, 0, 2]) + part)
+    return found
+
+
+def nuscenes() -> dict[str, Target]:
+    from gmmtorch.datasets import scan_folders
+
+    pose = {"token": "p", "rotation": [1.0, 0.0, 0.0, 0.0], "translation": [1.0, 2.0, 0.0]}
+    sweep = {"token": "d", "sample_token": "s", "ego_pose_token": "p", "calibrated_sensor_token": "c"}
+    sweep |= {"timestamp": 5, "filename": "samples/LIDAR_TOP/a.pcd.bin"}
+
+    def table(path: Path) -> None:
+        scan_folders._transforms(path, ["p"])
+        scan_folders._sweeps(path, {"s"})
+
+    return {"nuscenes": Target({"a.json": json.dumps([pose, sweep] * 3, indent=0).encode()}, table)}
 
 
 # -- sockets: one for each process; its thread is tried again after each input -------------------------

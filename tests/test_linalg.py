@@ -17,6 +17,7 @@ from gmmtorch.linalg import (
     dense_ranks,
     inverse_factor,
     largest_indices,
+    order_along_curve,
     pack_symmetric,
     ragged_index,
     safe_cholesky,
@@ -185,3 +186,19 @@ def test_ragged_index_lists_rows_and_places(lengths):
     row, place = ragged_index(torch.tensor(lengths, dtype=torch.int64))
     expected = [(row, place) for row, length in enumerate(lengths) for place in range(length)]
     assert list(zip(row.tolist(), place.tolist(), strict=True)) == expected
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_neighbours_follow_each_other_along_the_curve(dim, generator):
+    places = torch.rand(2000, dim, generator=generator, dtype=torch.float64) * torch.tensor(
+        [7.0, 1.0, 3.0][:dim]
+    )
+    order = order_along_curve(places)
+    assert sorted(order.tolist()) == list(range(2000))
+
+    def length(sorted_places: Tensor) -> float:
+        return float(sorted_places.diff(dim=0).norm(dim=1).sum())
+
+    assert length(places[order]) < 0.2 * length(places)
+    assert order_along_curve(places[:1]).tolist() == [0]
+    assert order_along_curve(places[:1].repeat(3, 1)).tolist() == [0, 1, 2]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -13,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from gmmtorch import datasets, localization  # whose parts load when they are used
 from gmmtorch.cli import common, schema
 from gmmtorch.datasets import Dataset, Reposed
-from gmmtorch.errors import DataError, InvalidArgumentError, arg, check_choice
+from gmmtorch.errors import DataError, InvalidArgumentError, arg, check_choice, check_number
 from gmmtorch.mapping import (
     INDEX,
     SOFTMAX_DTYPES,
@@ -169,6 +170,33 @@ def open_map(
     return tiled.open(list(bounds[: tiled.dim]), list(bounds[tiled.dim :]), resolution)
 
 
+def new_map(
+    config: DictConfig, dataset: Dataset, folder: Path, device: str, is_continued: bool = False
+) -> GaussianMap | TiledMap:
+    """The empty map of the options of gmmtorch-map; with `map.memory` it grows in tiles in a folder.
+
+    is_continued: whether a map in the folder goes on. Raises `InvalidArgumentError` for another map in it.
+    """
+    memory = config.map.memory
+    target = map_factory(config, resolution=config.resolution, memory=None)()
+    if memory is None:
+        return target
+    options: dict[str, Any] = {"memory": int(check_number("map.memory", memory, least=1)), "device": device}
+    options["memory_limit"] = config.runtime.memory_limit
+    if is_continued and (folder / INDEX).exists():
+        return TiledMap(folder, **options)
+    with schema.naming({"side": "tile"}):
+        return TiledMap.create(folder, target, _dim_of(dataset), config.tile, **options)
+
+
+def _dim_of(dataset: Dataset) -> int:
+    """2 or 3, of the first scan that can be read; 3 if none can."""
+    for index in range(len(dataset)):
+        with contextlib.suppress(DataError):  # who reads the scans counts it
+            return dataset[index].dim
+    return 3
+
+
 def chosen_map(given: Any, group: str) -> dict[str, Any]:
     """All options of a map, from those that differ from map=incremental, or from the map that `name` says.
 
@@ -195,6 +223,10 @@ def map_factory(
     dtype = config.runtime.dtype
     check_choice("runtime.dtype", dtype, SOFTMAX_DTYPES)  # an incremental map does not use it
     options = {**common.as_options(config.map), **changes}
+    if options.get("memory") is not None:
+        raise InvalidArgumentError(
+            f"{group}.memory={options['memory']} is for gmmtorch-map; here maps are in memory: leave it out."
+        )
     query = {item.name: options[item.name] for item in fields(QueryOptions) if item.name in options}
     with schema.naming({f"map.{name}": f"{group}.{name}" for name in options}):
         rule = _rule(config, options["name"], changes, dtype)

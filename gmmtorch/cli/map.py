@@ -12,7 +12,7 @@ from omegaconf import MISSING, DictConfig
 from gmmtorch.cli import app, common, schema
 from gmmtorch.cli.view import ViewOptions, open_live_view, serve
 from gmmtorch.declarations import group, option
-from gmmtorch.errors import check_resolution
+from gmmtorch.errors import InvalidArgumentError, check_resolution
 from gmmtorch.report import ProgressBars, byte_text
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def run(config: DictConfig) -> None:
     """Run the command. A run directory that contains a checkpoint of the same run is continued."""
     from gmmtorch.cli import inputs, recordings
     from gmmtorch.cli.reporting import map_outputs
-    from gmmtorch.mapping import MapBuilder
+    from gmmtorch.mapping import GaussianMap, MapBuilder
 
     device, folder = common.set_up(config), common.run_dir()
     check_resolution(config.resolution)
@@ -89,32 +89,41 @@ def run(config: DictConfig) -> None:
         recordings.run(config)
         return
     dataset, poses, odometry = inputs.open_with_trajectory(config.dataset)
-    target = inputs.map_factory(config, resolution=config.resolution)()
+    if config.view and config.map.memory is not None:
+        raise InvalidArgumentError(
+            "view=true shows a map in memory; with map.memory, use gmmtorch-view afterwards."
+        )
+    place = folder / ("map.safetensors" if config.map.memory is None else "tiles")
+    target = inputs.new_map(config, dataset, place, device, map_outputs.checkpoint_of(folder).exists())
     builder = MapBuilder(dataset, target, device)
     with ProgressBars(enabled=config.report.progress) as bars:
         view = open_live_view(config)
         checkpoint = map_outputs.Checkpoint(config, builder, "dataset", lambda: builder.record.seconds)
         _build(builder, checkpoint, bars, view)
-        target.save(folder / "map.safetensors")
+        if isinstance(target, GaussianMap):
+            target.save(place)
         trajectory = map_outputs.write_trajectory(builder, folder)
         row = map_outputs.result_row(dataset.name, builder, config, odometry)
         if poses is not None:
             map_outputs.write_estimated_poses(dataset, poses, folder)
-        exported, errors = map_outputs.write_exports(config, target, folder, bars)
+        built, exported, errors = map_outputs.write_exports(config, target, folder, bars)
         common.write_results("map", config, [row], folder)
         paths = map_outputs.odometry_figure(dataset, poses, row) if config.report.figures else None
-        map_outputs.draw(config, target, [trajectory], row, folder, paths)
+        if built is not None:
+            map_outputs.draw(config, built, [trajectory], row, folder, paths)
     checkpoint.remove()
     common.print_table([row], TABLE.split(), f"{dataset.name}: {row['n_scans']} scans")
     map_outputs.print_skipped(builder.skipped)
-    print("", f"map       {folder / 'map.safetensors'}", *exported, sep="\n")
+    print("", f"map       {place}", *exported, sep="\n")
     common.print_files(folder)
     if view is not None:
         serve(view)
     map_outputs.check_exported(config, errors)
 
 
-def _build(builder: MapBuilder, checkpoint: Checkpoint, bars: ProgressBars, view: LiveView | None) -> None:
+def _build(
+    builder: MapBuilder[Any], checkpoint: Checkpoint, bars: ProgressBars, view: LiveView | None
+) -> None:
     """Inserts all scans. If the user stops the run, writes the checkpoint and ends the command."""
     moments = None
     if view is not None:

@@ -36,6 +36,10 @@ _LOG_MAP = "give options of the map as in 'log.map={name: windowed, window: 20}'
 _REPLACED = {
     "map.hit_length": "map.prior=1 gives the probabilities of counts; without it they are calibrated.",
     "map.bounds": "give bounds=[…].",
+    "view_host": "use host.",
+    "view_port": "use port.",
+    "view_origins": "use origins.",
+    "map.noise": "map.side is the side (m) of the cells of an octree that is as exact.",
     "map@log.map": _LOG_MAP,
     "log.every": "use log.dataset.stride.",
     "journal.sync": "every store survives a loss of power.",

@@ -27,7 +27,6 @@ from gmmtorch.errors import (
     DataError,
     GmmTorchError,
     InvalidArgumentError,
-    MemoryLimitError,
     MissingDataError,
     check_whole,
 )
@@ -62,7 +61,8 @@ def run(config: DictConfig) -> None:
             f"inputs are paths of dataset={config.dataset.name}: choose the data set whose files they are, "
             "such as dataset=rosbag, and leave dataset.path out."
         )
-    inputs.map_factory(config, resolution=config.resolution)  # an invalid option fails before any work
+    # An invalid option fails before any work.
+    inputs.map_factory(config, resolution=config.resolution, memory=None)
     found = find_recordings(config.inputs)
     facts = {name: _facts(config, address) for name, address in found.items()}
     with ProgressBars(enabled=config.report.progress) as bars:
@@ -161,17 +161,23 @@ def _mapped(config: DictConfig, path: Path) -> Mapped:
     device = common.use_runtime(config.runtime)
     config.dataset.path = str(path)
     dataset, poses, odometry = inputs.open_with_trajectory(config.dataset)
-    builder = MapBuilder(dataset, inputs.map_factory(config, resolution=config.resolution)(), device)
-    for _ in builder.insert_all():
-        pass
-    builder.finish()
-    files = tile_files(builder.map.components(), builder.map.settings, config.tile)
-    with tempfile.TemporaryDirectory(prefix="gmmtorch-") as folder:
-        map_outputs.write_trajectory(builder, Path(folder))
+    with tempfile.TemporaryDirectory(prefix="gmmtorch-") as name:
+        folder = Path(name)
+        built = inputs.new_map(config, dataset, folder / "growing", device)
+        builder = MapBuilder(dataset, built, device)
+        for _ in builder.insert_all():
+            pass
+        builder.finish()
+        if isinstance(built, TiledMap):
+            merge(folder, [built])
+            files = {}
+        else:
+            files = tile_files(built.components(), built.settings, config.tile)
+        map_outputs.write_trajectory(builder, folder)
         if poses is not None:
-            map_outputs.write_estimated_poses(dataset, poses, Path(folder))
-        files |= {file.name: file.read_bytes() for file in Path(folder).iterdir()}
-    row = map_outputs.result_row(dataset.name, builder, config, odometry)
+            map_outputs.write_estimated_poses(dataset, poses, folder)
+        files |= {file.name: file.read_bytes() for file in folder.iterdir() if file.suffix}
+        row = map_outputs.result_row(dataset.name, builder, config, odometry)
     row |= {"cpu_seconds": time.process_time() - begin, "worker": f"{platform.node()}:{os.getpid()}"}
     return Mapped(files, row, None)
 
@@ -214,11 +220,9 @@ def _show(
     A map that does not fit into `runtime.memory_limit` has no pictures.
     """
     tiled = TiledMap(folder / "tiles", config.runtime.device, memory_limit=config.runtime.memory_limit)
-    try:
-        built = tiled.open()
-    except MemoryLimitError as error:
-        return [f"pictures  none: {error!s}"], [str(error)] if config.export else []
-    exported, errors = map_outputs.write_exports(config, built, folder, bars)
+    built, exported, errors = map_outputs.write_exports(config, tiled, folder, bars)
+    if built is None:
+        return exported, errors
     paths = [map_outputs.positions(place / map_outputs.TRAJECTORY, tiled.dim) for place in places]
     map_outputs.draw(config, built, paths, row, folder)
     return exported, errors

@@ -295,6 +295,11 @@ class MapOptions:
 
     name: str = option("???", "name of the choice")
     codec: str = option("quantized", "quantized: about 9 bytes for each component; float: exact numbers")
+    memory: float | None = option(
+        None,
+        "of gmmtorch-map: the map grows in tiles on disk, of which these bytes are open at most; null: in "
+        "memory",
+    )
 
 
 def store(commands: Mapping[str, Any], groups: Mapping[str, Mapping[str, Any]] | None = None) -> None:

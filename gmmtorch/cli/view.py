@@ -28,21 +28,28 @@ _FLAGS_WITH_A_VALUE |= {"--config-name", "-cn", "--config-dir", "-cd"}
 
 BOUNDS = "of a map in tiles: the box [x0,y0,z0,x1,y1,z1] (m), in 2D without z, that is opened; null: all"
 
-ORIGINS = "list of addresses at which browsers find the page behind a proxy, such as https://map.example.org"
+
+@dataclass
+class PageAddress:
+    """Where a page in the browser is served."""
+
+    host: str = option("127.0.0.1", "address of the page; 0.0.0.0: other machines can open it, too")
+    port: int = option(8080, "port of the page; the next free one if it is in use")
+    origins: list[str] = option(
+        [],
+        "list of addresses at which browsers find the page behind a proxy, such as https://map.example.org",
+    )
 
 
 @dataclass
-class ViewOptions:
+class ViewOptions(PageAddress):
     """The view of a command's work in the browser."""
 
     view: bool = option(False, "show the work in the browser while it runs, and until Ctrl-C")
-    view_host: str = option("127.0.0.1", "address of the view; 0.0.0.0: other machines can open it, too")
-    view_port: int = option(8080, "port of the view; the next free one if it is in use")
-    view_origins: list[str] = option([], ORIGINS)
 
 
 @dataclass
-class PageOptions:
+class PageOptions(PageAddress):
     """Options of gmmtorch-view."""
 
     path: str | None = option(None, "map file, run directory of gmmtorch-map, or folder of tiles")
@@ -51,15 +58,12 @@ class PageOptions:
     )
     bounds: list[float] | None = option(None, BOUNDS)
     html: str | None = option(None, "file to write, .html, instead of serving a page")
-    shape: str = option("ellipsoids", "ellipsoids (2σ), splats, surfaces (the mesh, in 3D) or none")
+    shape: str = option("splats", "splats, ellipsoids (2σ), surfaces (the mesh, in 3D) or none")
     colour: str = option(
         "height",
-        "height, support, age (the order in which components were learned), uncertainty (deviation across "
-        "the surface), or a channel of the map, such as colour",
+        "height, support, age (the order in which components were learned), uncertainty (of the surface), or "
+        "a channel of the map, such as colour",
     )
-    host: str = option("127.0.0.1", "address of the page; 0.0.0.0: other machines can open it, too")
-    port: int = option(8080, "port of the page; the next free one if it is in use")
-    origins: list[str] = option([], ORIGINS)
     runtime: common.Memory = group(common.Memory)
 
 
@@ -126,8 +130,7 @@ def open_live_view(config: DictConfig) -> LiveView | None:
     from gmmtorch.live import LiveView
 
     logging.getLogger("websockets").setLevel(logging.WARNING)  # it reports every connection
-    with schema.naming({name: f"view_{name}" for name in ("host", "port", "origins")}):
-        view = LiveView(config.view_host, config.view_port, config.view_origins)
+    view = LiveView(config.host, config.port, config.origins)
     atexit.register(view.stop)  # a thread that computes while Python ends would abort the process
     print(f"The map is at {view.url}", flush=True)
     return view

@@ -47,7 +47,10 @@ from .ros.transform_tree import frame_name as frame_name
 from .ros.transform_tree import stamp_of as stamp_of
 from .sources import load as load
 from .trajectory import NANOSECONDS as NANOSECONDS
+from .trajectory import POINT_TIMES as POINT_TIMES
 from .trajectory import Reposed as Reposed
+from .trajectory import deskewed as deskewed
 from .trajectory import read_trajectory as read_trajectory
 from .trajectory import to_nanoseconds as to_nanoseconds
 from .trajectory import with_poses as with_poses
+from .trajectory import without_point_times as without_point_times

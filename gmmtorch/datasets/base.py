@@ -112,9 +112,11 @@ class Dataset(Sequence[Scan]):
         ranges: how readings are interpreted.
         stride: every n-th scan of the source is read.
         n_sensors: that the scans are of.
+        keeps_point_times: scans that are not deskewed have the channel `POINT_TIMES`, if the source has it.
     """
 
     n_sensors = 1
+    keeps_point_times = False
     _poses: Tensor | None = None
     _times: Tensor | None = None
 

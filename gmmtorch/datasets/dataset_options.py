@@ -106,8 +106,15 @@ class KittiOptions(ChannelOptions):
 
 
 @dataclass(kw_only=True)
+class NuScenesOptions(ChannelOptions):
+    """A scene of nuScenes."""
+
+    scene: str | None = option(None, "name of the scene, such as scene-0061; null: the only one")
+
+
+@dataclass(kw_only=True)
 class RosbagOptions(TumOptions):
-    """A ROS bag."""
+    """A ROS bag, or a network capture of a lidar."""
 
     max_gap: float = repeated(TumOptions, "max_gap", 2.0)
     depth_scale: float | None = repeated(DepthFramesOptions, "depth_scale", None)
@@ -130,6 +137,11 @@ class RosbagOptions(TumOptions):
     )
     imu_topic: str | None = option(None, "topic of the IMU of motion=imu; null: the only one")
     damaged: str = option("read", "read: the intact part of a damaged bag; refuse: a damaged bag is an error")
+    calibration: str | None = option(
+        None,
+        "file of the lidar whose packets are read: metadata (.json) of an Ouster, corrections (.csv) of a "
+        "Hesai; null: the metadata in the recording or beside it, nominal angles",
+    )
 
 
 @dataclass(kw_only=True)
@@ -176,6 +188,7 @@ OPTIONS: dict[str, type[DatasetOptions]] = {
     "octomap_log": FileOptions,
     "rosbag": RosbagOptions,
     "kitti": KittiOptions,
+    "nuscenes": NuScenesOptions,
     "tum": TumOptions,
     "mesh": MeshOptions,
     "mesh_scans": MeshScansOptions,

@@ -7,12 +7,18 @@ in the world frame and the sensor origin in VIEWPOINT.
 `Kitti` has `velodyne/*.bin`, float32 x, y, z, reflectance; optional `labels/*.label` of SemanticKITTI;
 `poses.txt` with a row of the left camera for each scan;
 `calib.txt` with the row `Tr`, camera ← Velodyne; and, optional, `times.txt` in seconds.
+
+`NuScenes` has tables in JSON, which state scenes, poses and the names of `*.pcd.bin` files, float32 x, y, z,
+intensity, ring.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from pathlib import Path
+import json
+import re
+from collections.abc import Collection, Iterable
+from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 import torch
@@ -31,7 +37,7 @@ from gmmtorch.datasets.point_files.channels import CLASS, INTENSITY, check_chann
 from gmmtorch.datasets.point_files.pcd_files import pcd_header
 from gmmtorch.datasets.point_files.point_chunks import read_cloud
 from gmmtorch.datasets.trajectory import Trajectory, kitti_poses, read_rows, read_trajectory, to_nanoseconds
-from gmmtorch.errors import DataError
+from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 
@@ -163,7 +169,6 @@ def _viewpoint(path: Path) -> torch.Tensor:
 # -- KITTI -------------------------------------------------------------------------------------------
 
 
-_POINT_BYTES = 16
 _CALIBRATION = "Tr: 1 0 0 0 0 1 0 0 0 0 1 0"
 
 
@@ -235,21 +240,29 @@ class Kitti(Dataset):
 
     def _read(self, index: int) -> Scan:
         path = self._files[index]
-        if path.stat().st_size % _POINT_BYTES:
-            raise DataError(
-                f"{path} is not a whole number of points of {_POINT_BYTES} bytes; it is truncated."
-            )
-        table = np.fromfile(path, "<f4").reshape(-1, 4)
-        points = table[:, :3].astype(np.float64)
-        valid = np.isfinite(points).all(1) & (points != 0).any(1)
-        channels = {}
-        if INTENSITY in self.attributes:
-            channels[INTENSITY] = torch.from_numpy(
-                np.where(np.isfinite(table[:, 3]), table[:, 3], np.nan)[valid]
-            )
+        table = _binary_points(path, 4)
+        channels = _intensity(table) if INTENSITY in self.attributes else {}
         if CLASS in self.attributes:
-            channels[CLASS] = torch.from_numpy(_kitti_labels(path, len(table))[valid])
-        return self.ranges.posed(torch.from_numpy(points[valid]), self._poses[index], channels)
+            channels[CLASS] = torch.from_numpy(_kitti_labels(path, len(table)))
+        return _valid_scan(self.ranges, table, self._poses[index], channels)
+
+
+def _binary_points(path: Path, n_numbers: int) -> np.ndarray:
+    """The points (N, n_numbers) of a file of float32."""
+    if path.stat().st_size % (4 * n_numbers):
+        raise DataError(f"{path} is not a whole number of points of {4 * n_numbers} bytes; it is truncated.")
+    return np.fromfile(path, "<f4").reshape(-1, n_numbers)
+
+
+def _intensity(table: np.ndarray) -> dict[str, Tensor]:
+    return {INTENSITY: torch.from_numpy(np.where(np.isfinite(table[:, 3]), table[:, 3], np.nan))}
+
+
+def _valid_scan(ranges: Ranges, table: np.ndarray, pose: Tensor, channels: dict[str, Tensor]) -> Scan:
+    """The scan of the points (N, …) that are finite and not at the sensor, with channels (N,)."""
+    points = torch.from_numpy(table[:, :3].astype(np.float64))
+    valid = points.isfinite().all(1) & (points != 0).any(1)
+    return ranges.posed(points[valid], pose, {name: values[valid] for name, values in channels.items()})
 
 
 def _kitti_labels(scan: Path, n_points: int) -> np.ndarray:
@@ -302,3 +315,160 @@ def _calibration(path: Path) -> Pose:
     raise DataError(
         f"{path} has no row Tr (camera ← Velodyne); a calibration without rotation: '{_CALIBRATION}'."
     )
+
+
+# -- nuScenes ----------------------------------------------------------------------------------------
+
+
+_BLOCK_BYTES, _MOST_RECORDS = 1 << 22, 1 << 16
+_RECORD = re.compile(rb"\{[^{}]*\}")
+_TOKEN = re.compile(rb'"token"\s*:\s*"([^"]{1,80})"')
+_LIDAR_FILE, _TOP = b".pcd.bin", "LIDAR_TOP"
+
+
+class NuScenes(Dataset):
+    """The sweeps of the lidar in one scene of nuScenes, at 20 a second, in the order of their times.
+
+    The world frame is that of the map of the city. Sweeps are compensated for motion already. Those whose
+    file is missing are left out and counted: if only the key frames were fetched, they are read.
+
+    Args:
+        path: the folder of the data set with `samples/`, `sweeps/` and `v1.0-mini/`, or the folder of tables.
+        ranges, stride: see `Dataset`.
+        scene: its name, as in "scene-0061"; None: the only one.
+        attributes: channels that are read: "intensity".
+    """
+
+    _poses: Tensor
+
+    def __init__(
+        self,
+        path: str | Path,
+        ranges: Ranges,
+        stride: int = 1,
+        scene: str | None = None,
+        attributes: Iterable[str] = (),
+    ) -> None:
+        self.attributes = check_channels(attributes, [INTENSITY], "scans of nuScenes have intensity")
+        path = require_path(
+            *(path, "folder", "v1.0-mini/*.json, samples/ and sweeps/", "nuscenes.org publishes this layout.")
+        )
+        tables = _tables(path)
+        name, token = _scene(tables, scene)
+        super().__init__(name, ranges, stride)
+        samples = _records(tables / "sample.json", b'"%s"' % token.encode("latin-1"))
+        stated = _sweeps(tables / "sample_data.json", samples)
+        sweeps = [row for row in stated if (tables.parent / row["filename"]).is_file()]
+        if not sweeps:
+            raise DataError(
+                f"{tables}: none of {len(stated)} sweeps in {name} has a file; fetch the lidar's."
+            )
+        self._skip("its file is missing", *range(len(stated) - len(sweeps)))
+        self._files = [tables.parent / row["filename"] for row in sweeps]
+        ego = _transforms(tables / "ego_pose.json", [row["ego_pose_token"] for row in sweeps])
+        mounts = [row["calibrated_sensor_token"] for row in sweeps]
+        mount = _transforms(tables / "calibrated_sensor.json", mounts)
+        self._poses = (ego @ mount).matrix
+        self._times = torch.tensor([row["timestamp"] / 1e6 for row in sweeps], dtype=torch.float64)
+
+    def _count(self) -> int:
+        return len(self._files)
+
+    def _read(self, index: int) -> Scan:
+        table = _binary_points(self._files[index], 5)
+        channels = _intensity(table) if INTENSITY in self.attributes else {}
+        return _valid_scan(self.ranges, table, self._poses[index], channels)
+
+
+def _tables(path: Path) -> Path:
+    """The folder with the tables."""
+    found = sorted({file.parent for file in (*path.glob("scene.json"), *path.glob("*/scene.json"))})
+    if len(found) != 1:
+        names = ", ".join(map(str, found)) or "none"
+        raise DataError(f"{path}: folders with scene.json and other tables are {names}; give one of them.")
+    return found[0]
+
+
+def _scene(tables: Path, wanted: str | None) -> tuple[str, str]:
+    """Name and token of a scene."""
+    records = _records(tables / "scene.json", b'"name"')
+    scenes = {str(row.get("name")): token for token, row in records.items()}
+    names = sorted(scenes)
+    if wanted is None and len(names) == 1:
+        wanted = names[0]
+    if wanted is None or wanted not in scenes:
+        shown = ", ".join(names[:10]) + (f" and {len(names) - 10} more" if len(names) > 10 else "")
+        raise InvalidArgumentError(
+            f"‹scene›={wanted} is not a scene of {tables}, whose scenes are {shown or 'none'}; choose one."
+        )
+    return wanted, scenes[wanted]
+
+
+def _sweeps(table: Path, samples: Collection[str]) -> list[dict[str, Any]]:
+    """The records of the sweeps of one lidar that belong to samples, in the order of their times."""
+    found = _records(table, _LIDAR_FILE, samples=samples).values()
+    rows = [row for row in found if str(row.get("filename")).endswith(_LIDAR_FILE.decode())]
+    for row in rows:
+        file, time = PurePosixPath(str(row["filename"])), row.get("timestamp")
+        is_inside = not file.is_absolute() and ".." not in file.parts and "\0" not in str(file)
+        has_tokens = all(
+            isinstance(row.get(name), str) for name in ("ego_pose_token", "calibrated_sensor_token")
+        )
+        if not (is_inside and has_tokens and isinstance(time, int) and 0 <= time < 1 << 62):
+            raise DataError(f"{table}: the record {row.get('token')!r:.80} of a sweep is damaged.")
+    lidars = {PurePosixPath(row["filename"]).parent.name for row in rows}
+    if len(lidars) > 1 and _TOP not in lidars:
+        raise DataError(f"{table} has several lidars, {', '.join(sorted(lidars))}, and none is {_TOP}.")
+    chosen = _TOP if _TOP in lidars else next(iter(lidars), "")
+    kept = [row for row in rows if PurePosixPath(row["filename"]).parent.name == chosen]
+    return sorted(kept, key=lambda row: row["timestamp"])
+
+
+def _transforms(table: Path, tokens: list[str]) -> Pose:
+    """The rigid motions (N) of records with some tokens: translation in metres, quaternion w, x, y, z."""
+    found = _records(table, b'"rotation"', set(tokens))
+    try:
+        rows = [found[token] for token in tokens]
+        shifts = np.array([row["translation"] for row in rows], np.float64).reshape(-1, 3)
+        turns = np.array([row["rotation"] for row in rows], np.float64).reshape(-1, 4)
+        return Pose.from_quaternion(shifts, np.roll(turns, -1, 1))
+    except (KeyError, ValueError, TypeError) as error:
+        raise DataError(f"{table}: the pose of a sweep is missing or damaged ({error!s:.80}).") from error
+
+
+def _records(
+    table: Path, mark: bytes, tokens: Collection[str] | None = None, samples: Collection[str] | None = None
+) -> dict[str, dict[str, Any]]:
+    """The records of a table by their tokens: those that contain a mark, have one of some tokens, and are of
+    one of some samples; None: any.
+
+    The table is a list of flat JSON objects, of up to a gigabyte: it is read in blocks, and only records that
+    are wanted are parsed. Raises `DataError`.
+    """
+    if not table.is_file():
+        raise DataError(f"{table} is missing; fetch the metadata of nuScenes, which has it.")
+    found, rest = dict[str, dict[str, Any]](), b""
+    with table.open("rb") as file:
+        while block := file.read(_BLOCK_BYTES):
+            rest, end = rest + block, 0
+            for match in _RECORD.finditer(rest):
+                end, token = match.end(), _TOKEN.search(match[0])
+                if token is None or mark not in match[0]:
+                    continue
+                name = token[1].decode("latin-1")
+                if tokens is not None and name not in tokens:
+                    continue
+                try:
+                    row = json.loads(match[0])
+                except (ValueError, RecursionError) as error:
+                    raise DataError(
+                        f"{table}: a record is not JSON ({error!s:.80}); it is damaged."
+                    ) from error
+                if samples is None or row.get("sample_token") in samples:
+                    found[name] = row
+            rest = rest[end:]
+            if len(rest) > _BLOCK_BYTES or len(found) > _MOST_RECORDS:
+                raise DataError(
+                    f"{table} is not a table of nuScenes, or has too many records; it is damaged."
+                )
+    return found

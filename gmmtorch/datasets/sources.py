@@ -29,6 +29,7 @@ _SOURCES = {
     "octomap_log": _Source("scan_logs", "OctomapLog"),
     "rosbag": _Source("ros.rosbag", "open_rosbag"),
     "kitti": _Source("scan_folders", "Kitti"),
+    "nuscenes": _Source("scan_folders", "NuScenes"),
     "tum": _Source("depth_images", "TumRgbd"),
     "mesh": _Source("synthetic", "MeshSamples"),
     "mesh_scans": _Source("synthetic", "MeshScans"),
@@ -50,8 +51,9 @@ def load(
     """The data set `name`: a sequence of scans, each read when it is accessed.
 
     Args:
-        name: carmen, scan_folder, pcd_viewpoint, depth_frames, e57, octomap_log, rosbag, kitti, tum, mesh or
-            mesh_scans, which need a `path`; synthetic_building or synthetic_building_2d, which need none.
+        name: carmen, scan_folder, pcd_viewpoint, depth_frames, e57, octomap_log, rosbag, kitti,
+            nuscenes, tum, mesh or mesh_scans, which need a `path`; synthetic_building or
+            synthetic_building_2d, which need none.
         path: the file or folder.
         max_range: a reading at this distance (m) or beyond is a beam without return. None: 50 for CARMEN
             logs, the sensor's own maximum for mesh_scans and the synthetic buildings, no limit

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bisect
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -217,6 +217,38 @@ def with_poses(source: Dataset, poses: Tensor, known: Tensor, stride: int = 1) -
     return kind(source, poses, known, stride)
 
 
+POINT_TIMES = "point_times"
+"""Channel of scans whose `Dataset.keeps_point_times` is set: seconds after the time of the scan."""
+_KNOTS = 512  # motions for the points of a sweep
+
+
+def deskewed(points: Tensor, seconds: Tensor, motion: Pose, duration: float) -> Tensor:
+    """Points of a sweep as the sensor would have measured them all at the time of the scan, its frame.
+
+    A point p of τ seconds after that time becomes T(τ) p, where T(τ) is the share τ / `duration` of a motion:
+    linear in position, spherical linear in rotation.
+
+    Args:
+        points: (N, D), each in the frame of the sensor at its own time, metres. seconds: (N,).
+        motion: of the sensor in `duration` seconds: its frame at the time of the scan ← frame then. A
+            negative duration is for the motion back to an earlier scan.
+    """
+    if not len(points):
+        return points
+    shares = seconds / duration
+    first, last = shares.aminmax()
+    knots = torch.linspace(float(first), float(last), _KNOTS, dtype=torch.float64, device=points.device)
+    nearest = ((shares - first) * ((_KNOTS - 1) / (last - first).clamp_min(1e-12))).round().long()
+    here = Pose.identity(motion.dim, device=points.device)
+    return here.towards(motion, knots)[nearest].apply(points.double()[:, None])[:, 0]
+
+
+def without_point_times(scan: Scan, points: Tensor | None = None) -> Scan:
+    """A scan without the channel of times, and with other points (N, D) if they are given."""
+    channels = {name: value for name, value in scan.attributes.items() if name != POINT_TIMES}
+    return replace(scan, points=scan.points if points is None else points, attributes=channels)
+
+
 class Reposed(Dataset):
     """Scans of another data set with other poses; made by `with_poses` and `with_trajectory`."""
 
@@ -249,8 +281,26 @@ class Reposed(Dataset):
         before = Pose.from_matrix(self._source.pose(self._indices[index]))
         now = Pose.from_matrix(self._poses[index])
         turn = (now @ before.inverse()).orthonormal().rotation  # rotations in files are rounded
-        scan: Scan = self._source[self._indices[index]]
+        scan = self._deskewed(self._source[self._indices[index]], index, before)
         return scan.transformed(Pose(turn, now.translation - turn @ before.translation).matrix)
+
+    def _deskewed(self, scan: Scan, index: int, placed: Pose) -> Scan:
+        """A scan with times of points, each moved by the motion to the next scan or from the last one."""
+        if POINT_TIMES not in scan.attributes:
+            return scan
+        seconds, points = scan.attributes[POINT_TIMES][:, 0], scan.points
+        now, still = Pose.from_matrix(self._poses[index]), torch.zeros(scan.dim)
+        for other, part in ((index - 1, seconds < 0), (index + 1, seconds >= 0)):
+            other = other if 0 <= other < len(self._indices) else 2 * index - other
+            if self._times is None or not 0 <= other < len(self._indices):
+                continue
+            duration = float(self._times[other] - self._times[index])
+            if duration and bool(part.any()):
+                motion = now.inverse() @ Pose.from_matrix(self._poses[other])
+                local = Scan(points[part], still).transformed(placed.inverse().matrix).points
+                moved = placed.apply(deskewed(local, seconds[part], motion, duration))
+                points = points.double().index_put((part.nonzero()[:, 0],), moved)
+        return without_point_times(scan, points)
 
 
 class ReposedDepth(Reposed):

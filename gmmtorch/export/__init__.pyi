@@ -20,6 +20,7 @@ from .navigation import of_grid as of_grid
 from .navigation import write_distance_field as write_distance_field
 from .navigation import write_map_server as write_map_server
 from .point_cloud import CellCloud as CellCloud
+from .point_cloud import colour_bytes as colour_bytes
 from .point_cloud import write_octomap as write_octomap
 from .point_cloud import write_pcd as write_pcd
 from .point_cloud import write_ply as write_ply

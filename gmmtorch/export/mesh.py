@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
-from gmmtorch.export.point_cloud import ply_bytes
+from gmmtorch.export.point_cloud import RGB, colour_bytes, ply_bytes
 from gmmtorch.files import write_bytes
 from gmmtorch.linalg import ragged_index
 from gmmtorch.mapping import Components
@@ -264,12 +264,13 @@ _ARRAY, _ELEMENTS = 34962, 34963  # buffer targets
 _UPRIGHT = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]  # quaternion that turns z up, ours, to y up, glTF's
 
 
-def write_mesh(path: str | Path, mesh: TriangleMesh) -> Path:
+def write_mesh(path: str | Path, mesh: TriangleMesh, colours: Tensor | None = None) -> Path:
     """Writes a mesh with its normals, atomically; the suffix `.ply`, `.obj` or `.glb` selects the format.
 
     PLY, binary: vertices x, y, z (double, m) and nx, ny, nz (float). OBJ: text, with six decimals. GLB:
     float32 relative to the middle of the mesh, whose place is the node's translation; y is up, as glTF
-    demands.
+    demands. `colours`: linear RGB (V, 3) from 0 to 1 of the vertices, written as sRGB (PLY: red, green, blue,
+    uchar; OBJ: after the coordinates) and as linear RGB (GLB).
 
     Raises `InvalidArgumentError` for another suffix or a mesh without triangles.
     """
@@ -280,54 +281,61 @@ def write_mesh(path: str | Path, mesh: TriangleMesh) -> Path:
     if len(mesh.faces) == 0:
         raise InvalidArgumentError(f"The mesh for {path} has no triangle; use smaller cells.")
     vertices, normals, faces = (part.detach().cpu().numpy() for part in mesh)
-    return write_bytes(path, writer(vertices, normals, faces))
+    linear = None if colours is None else colours.detach().cpu().double().clamp(0, 1)
+    return write_bytes(path, writer(vertices, normals, faces, linear))
 
 
-def _ply(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> bytes:
-    names = ("x", "y", "z", "nx", "ny", "nz")
-    rows = np.empty(len(vertices), [(name, "<f8" if i < 3 else "<f4") for i, name in enumerate(names)])
+def _ply(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, linear: Tensor | None) -> bytes:
+    columns = [vertices.astype("<f8"), normals.astype("<f4")]
+    columns += [] if linear is None else [colour_bytes(linear)]
+    names = ("x", "y", "z", "nx", "ny", "nz", *RGB)[: 3 * len(columns)]
+    rows = np.empty(len(vertices), [(name, columns[i // 3].dtype) for i, name in enumerate(names)])
     for i, name in enumerate(names):
-        rows[name] = (vertices if i < 3 else normals)[:, i % 3]
+        rows[name] = columns[i // 3][:, i % 3]
     return ply_bytes(rows, faces=faces)
 
 
-def _obj(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> bytes:
-    lines = ["v {:.6f} {:.6f} {:.6f}".format(*row) for row in vertices.tolist()]
+def _obj(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, linear: Tensor | None) -> bytes:
+    table = vertices if linear is None else np.concatenate([vertices, colour_bytes(linear) / 255], 1)
+    line = "v {:.6f} {:.6f} {:.6f}" + " {:.4f} {:.4f} {:.4f}" * (linear is not None)
+    lines = [line.format(*row) for row in table.tolist()]
     lines += ["vn {:.4f} {:.4f} {:.4f}".format(*row) for row in normals.tolist()]
     lines += ["f {0}//{0} {1}//{1} {2}//{2}".format(*row) for row in (faces + 1).tolist()]
     return ("\n".join(lines) + "\n").encode("ascii")
 
 
-def _glb(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> bytes:
+def _glb(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, linear: Tensor | None) -> bytes:
     middle = (vertices.min(0) + vertices.max(0)) / 2
     local = (vertices - middle).astype("<f4")
     parts = [local.tobytes(), normals.astype("<f4").tobytes(), faces.astype("<u4").tobytes()]
+    parts += [] if linear is None else [linear.numpy().astype("<f4").tobytes()]
     begins = np.cumsum([0, *map(len, parts)]).tolist()
     x, y, z = middle.tolist()
     kinds = (
         (_GLTF_FLOAT, len(local), "VEC3"),
         (_GLTF_FLOAT, len(normals), "VEC3"),
         (_GLTF_UINT, faces.size, "SCALAR"),
-    )
+        (_GLTF_FLOAT, len(local), "VEC3"),
+    )[: len(parts)]
+    attributes = {"POSITION": 0, "NORMAL": 1} | ({} if linear is None else {"COLOR_0": 3})
     accessors: list[dict[str, object]] = [
         {"bufferView": view, "componentType": kind, "count": count, "type": shape}
         for view, (kind, count, shape) in enumerate(kinds)
     ]
     accessors[0] |= {"min": local.min(0).tolist(), "max": local.max(0).tolist()}
-    grey = {"baseColorFactor": [0.75, 0.75, 0.78, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.9}
+    shade = [0.75, 0.75, 0.78, 1.0] if linear is None else [1.0] * 4
+    surface = {"baseColorFactor": shade, "metallicFactor": 0.0, "roughnessFactor": 0.9}
     content = {
         "asset": {"version": "2.0", "generator": "gmmtorch"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "rotation": _UPRIGHT, "translation": [x, z, -y]}],
-        "meshes": [
-            {"primitives": [{"attributes": {"POSITION": 0, "NORMAL": 1}, "indices": 2, "material": 0}]}
-        ],
-        "materials": [{"doubleSided": True, "pbrMetallicRoughness": grey}],
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": 2, "material": 0}]}],
+        "materials": [{"doubleSided": True, "pbrMetallicRoughness": surface}],
         "buffers": [{"byteLength": begins[-1]}],
         "bufferViews": [
             {"buffer": 0, "byteOffset": begin, "byteLength": len(part), "target": target}
-            for begin, part, target in zip(begins, parts, (_ARRAY, _ARRAY, _ELEMENTS), strict=False)
+            for begin, part, target in zip(begins, parts, (_ARRAY, _ARRAY, _ELEMENTS, _ARRAY), strict=False)
         ],
         "accessors": accessors,
     }
@@ -338,7 +346,7 @@ def _glb(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> bytes:
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
-_WRITERS: dict[str, Callable[[np.ndarray, np.ndarray, np.ndarray], bytes]] = {
+_WRITERS: dict[str, Callable[[np.ndarray, np.ndarray, np.ndarray, Tensor | None], bytes]] = {
     ".ply": _ply,
     ".obj": _obj,
     ".glb": _glb,

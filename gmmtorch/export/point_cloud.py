@@ -22,7 +22,7 @@ from gmmtorch.occupancy import (
 from gmmtorch.optional_packages import load_pyoctomap
 from gmmtorch.scan import display_colours
 
-_RGB = ("red", "green", "blue")
+RGB = ("red", "green", "blue")
 _MIN_STEPS = 16  # least number of float32 values per cell side; with fewer, centres would be too inexact
 
 
@@ -92,14 +92,19 @@ def write_ply(path: str | Path, cells: CellCloud, colours: Tensor | None = None)
     comment = f"centres of cells of {cells.resolution!r} m; intensity is the probability of occupancy"
     rows = _records(cells, "<f8")
     if colours is not None:
-        coloured = np.empty(len(rows), [*rows.dtype.descr, *((name, "u1") for name in _RGB)])
+        coloured = np.empty(len(rows), [*rows.dtype.descr, *((name, "u1") for name in RGB)])
         for name in rows.dtype.names or ():
             coloured[name] = rows[name]
-        shades = (255 * display_colours(colours.detach().cpu().clamp(0, 1))).round().numpy()
-        for name, column in zip(_RGB, shades.T, strict=True):
+        for name, column in zip(RGB, colour_bytes(colours).T, strict=True):
             coloured[name] = column
         rows = coloured
     return write_bytes(path, ply_bytes(rows, comment))
+
+
+def colour_bytes(colours: Tensor) -> np.ndarray:
+    """sRGB (M, 3) uint8 of linear RGB (M, 3) from 0 to 1."""
+    shades = 255 * display_colours(colours.detach().cpu().double().clamp(0, 1))
+    return shades.round().numpy().astype(np.uint8)
 
 
 def ply_bytes(vertices: np.ndarray, comment: str = "", faces: np.ndarray | None = None) -> bytes:
@@ -161,13 +166,18 @@ _REACH = 1 << 15  # cells on either side of the origin, because OctoMap's keys h
 _MIN_PROBABILITY = 1e-6  # least distance of a probability from 0 and 1: log-odds of ±13.8
 
 
-def write_octomap(path: str | Path, cells: CellCloud, thresholds: Thresholds | None = None) -> Path:
+def write_octomap(
+    path: str | Path,
+    cells: CellCloud,
+    thresholds: Thresholds | None = None,
+    colours: Tensor | None = None,
+) -> Path:
     """Writes the cells, atomically, as an OctoMap: `.ot` with log-odds, or `.bt` with two classes.
 
     A `.ot` file contains every cell, with its probability clamped to [10⁻⁶, 1 − 10⁻⁶]. A `.bt` file
     contains the cells that `thresholds` classify as occupied or free. Other space is absent, which means
     unknown in OctoMap. Eight equal siblings are merged into one node. A 2D map becomes the layer of cells
-    above z = 0.
+    above z = 0. With `colours`, linear RGB (M, 3) from 0 to 1, a `.ot` file has a ColorOcTree.
 
     Raises `InvalidArgumentError` for another suffix, for cells that are not aligned to multiples of the
     resolution, and for cells beyond the range of OctoMap's keys; `GmmTorchError` without pyoctomap.
@@ -178,12 +188,18 @@ def write_octomap(path: str | Path, cells: CellCloud, thresholds: Thresholds | N
     pyoctomap = load_pyoctomap()
     centers = _lattice_centers(cells)
     theta = cells.probability.detach().cpu().double().clamp(_MIN_PROBABILITY, 1 - _MIN_PROBABILITY)
-    tree = pyoctomap.OcTree(cells.resolution)
+    with_colours = colours is not None and path.suffix == ".ot"
+    tree = (pyoctomap.ColorOcTree if with_colours else pyoctomap.OcTree)(cells.resolution)
     tree.setClampingThresMin(_MIN_PROBABILITY)
     tree.setClampingThresMax(1 - _MIN_PROBABILITY)
     if path.suffix == ".ot":
         for center, value in zip(centers, theta.logit().tolist(), strict=True):
             tree.updateNode(center, value)
+        if colours is not None:
+            for center, shade in zip(centers, colour_bytes(colours).tolist(), strict=True):
+                tree.setNodeColor(center, *shade)
+            tree.updateInnerOccupancy()  # inner nodes get the mean colour
+            tree.prune()
         data = tree.write()
     else:
         label = (thresholds or Thresholds()).classify(cells.probability.detach().cpu()).numpy()

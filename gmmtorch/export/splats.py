@@ -12,6 +12,7 @@ import gzip
 import json
 import math
 import struct
+import warnings
 import zlib
 from dataclasses import replace
 from pathlib import Path
@@ -34,6 +35,7 @@ _OPACITY = 0.95
 _GREY = 0.6
 _HARMONIC = 0.28209479177387814  # √(1/4π), of degree 0
 _MOST_SPLATS, _MOST_BYTES = 1 << 24, 1 << 30
+_FARTHEST_EXACT = 2e-3 * 2**23  # m, where 24 bits with a sign have steps of 2 mm
 _THINNEST = 1e-3  # m, least deviation of a splat that becomes a component
 _POINTS = 1e4  # for each m² of a splat that becomes a component: one for each square centimetre
 _Y_UP = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
@@ -81,8 +83,19 @@ class Splats(NamedTuple):
 
 
 def write_splats(path: str | Path, splats: Splats) -> Path:
-    """Writes splats, atomically, as .ply, .spz or .glb. Raises `InvalidArgumentError` for another ending."""
+    """Writes splats, atomically, as .ply, .spz or .glb. Raises `InvalidArgumentError` for another ending.
+
+    Warns of a map so far from its origin that the numbers of the format round positions to more than 2 mm:
+    24 bits, or those of float32.
+    """
     path = Path(path)
+    reach = float(splats.means.abs().max()) if len(splats.means) else 0.0
+    if reach > _FARTHEST_EXACT:
+        warnings.warn(
+            f"{path}: the map reaches {reach:.6g} m from its origin, so that positions are rounded to "
+            f"{reach / 2**23:.2g} m or more; move it closer, as viewers also compute in float32.",
+            stacklevel=2,
+        )
     writers = dict(zip(SUFFIXES, (_ply, _spz, _glb), strict=True))
     if path.suffix.lower() not in writers:
         raise InvalidArgumentError(f"output={path} must end in {', '.join(SUFFIXES)} for splats.")

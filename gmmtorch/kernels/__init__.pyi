@@ -52,6 +52,11 @@ from .mixtures.matching import explained_points as explained_points
 from .mixtures.matching import near_pairs as near_pairs
 from .mixtures.matching import overlap_sums as overlap_sums
 from .mixtures.matching import raster_sums as raster_sums
+from .mixtures.small_fits import fused_em as fused_em
+from .mixtures.small_fits import fused_kmeans as fused_kmeans
+from .mixtures.small_fits import fused_moments as fused_moments
+from .mixtures.small_fits import is_kmeans_fused as is_kmeans_fused
+from .mixtures.small_fits import is_small as is_small
 from .rays.beam_information import Beams as Beams
 from .rays.beam_information import Cells as Cells
 from .rays.beam_information import information_by_block as information_by_block

@@ -23,6 +23,7 @@ from gmmtorch.datasets import (
     LASER,
     NANOSECONDS,
     NO_POSE,
+    POINT_TIMES,
     Dataset,
     ImageCamera,
     PoseSource,
@@ -39,6 +40,7 @@ from gmmtorch.datasets import (
     frame_name,
     nearest_names,
     stamp_of,
+    without_point_times,
 )
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, arg, text_of
 from gmmtorch.live.live_options import LiveOptions
@@ -194,7 +196,10 @@ class LiveScans(Dataset):
                     return False
                 arguments = source, self._options.deskew, self._camera
                 self._conversion = ScanConversion(self._sensor, self.ranges, *arguments)
+                self._conversion.keeps_times = self._odometry is not None and self._options.deskew
             if not isinstance(self._conversion.source, TfPoses):
+                if self._conversion.keeps_times:
+                    self._last_needed(item)
                 return True
             chain = self._conversion.source.chain(item.frame)
             latest = self._tree.latest(chain)
@@ -288,7 +293,7 @@ class LiveScans(Dataset):
             return False
         location = None
         if self._odometry is not None:
-            location = self._located(scan, item.stamp)
+            location, scan = self._located(scan, item.stamp)
             if not location.found:
                 self.trouble = "; ".join(location.doubts)
                 self._note("no pose was found by odometry")
@@ -306,21 +311,26 @@ class LiveScans(Dataset):
             with suppress(DataError, ValueError, KeyError, OverflowError):
                 yield self._conversion.points(item.message)
 
-    def _located(self, scan: Scan, stamp: int) -> Location:
-        """Where odometry finds a scan, which is in the frame of its sensor, in the fixed frame."""
+    def _located(self, scan: Scan, stamp: int) -> tuple[Location, Scan]:
+        """Where odometry finds a scan, which is in the frame of its sensor, in the fixed frame; and the scan,
+        deskewed if it has times of points."""
         assert self._odometry is not None
-        points = scan.points.double()
+        points, times = scan.points.double(), scan.attributes.get(POINT_TIMES)
+        seconds = None if times is None else times[:, 0]
         if self._tracker is not None:
             first = self._tracker.locate(points)
             if not first.found:
-                return first
+                return first, scan
             self._start, self._tracker = first, None
-        location = self._odometry.add(points, stamp / NANOSECONDS)
+        location = self._odometry.add(points, stamp / NANOSECONDS, seconds=seconds)
+        if seconds is not None:
+            deskewed = self._odometry.deskewed if isinstance(self._odometry, Odometry) else None
+            scan = without_point_times(scan, deskewed and deskewed(points, seconds))
         self._n_added += 1
         if isinstance(self._odometry, Odometry) and self._options.loops and self._odometry.close_loops():
             self._is_corrected = True
             location = replace(location, pose=self._odometry.poses[-1])
-        return location if self._start is None else composed(self._start, location)
+        return location if self._start is None else composed(self._start, location), scan
 
     def corrected_poses(self) -> tuple[Tensor, int] | None:
         """Poses (N, D+1, D+1) of the scans of this run, and the number of the first of them, if odometry has

@@ -289,7 +289,9 @@ class BuildMoments:
     which is shown; None: it is not shared.
     """
 
-    def __init__(self, builder: MapBuilder, nbytes: Callable[[], int], shared: TeamMap | None = None) -> None:
+    def __init__(
+        self, builder: MapBuilder[GaussianMap], nbytes: Callable[[], int], shared: TeamMap | None = None
+    ) -> None:
         self._builder, self._nbytes, self._shared = builder, nbytes, shared
         self._record = CurveRecord()
 

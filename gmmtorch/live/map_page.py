@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_choice
@@ -22,7 +23,7 @@ from gmmtorch.report import byte_text
 
 _TEMPLATE = Path(__file__).with_suffix(".html")
 _PLACE = "__MAP__"
-_N_SHADES = 9  # of the legend
+_SLOPE_STEPS = 254  # of a colour, as in the page
 
 
 def write_page(
@@ -30,13 +31,13 @@ def write_page(
     shown: GaussianMap,
     trajectories: Sequence[Tensor] = (),
     *,
-    shape: str = "ellipsoids",
+    shape: str = "splats",
     colour: str = "height",
 ) -> Path:
     """Writes a map as one HTML file, atomically.
 
-    The page has controls for the shape, the colour and the size of components, the height above which they
-    are hidden, the paths and a slice of occupancy at the sensor's height.
+    The page has controls for the shape, the colour and the size of components, the height above which and
+    the share of the least certain that are hidden, the paths and a slice of occupancy at the sensor's height.
 
     Args:
         path: FILE.html.
@@ -58,14 +59,16 @@ def write_page(
     if len(solid.rows) == 0:
         raise InvalidArgumentError(f"html={path}: the map has no surface to show; insert scans with returns.")
     paths = viewer_scene.in_space(trajectories)
-    frame = viewer_scene.frame(components, paths)
+    unsure = viewer_scene.first_hidden(solid, shown.resolution)
+    frame = viewer_scene.frame(components, paths, unsure / 100)
     scene = {
         "about": f"{len(components):,} components, {byte_text(shown.nbytes)}",
         "flat": components.dim == 2,
         "shape": shape,
         "shapes": [name for name in viewer_scene.SHAPES if name != "surfaces" or shape == "surfaces"],
         "colour": colour,
-        "scale": viewer_scene.colour_scale(_N_SHADES),
+        "scale": viewer_scene.colour_scale(9),
+        "unsure": unsure,
         **_view(frame),
         **_ellipsoids(components, solid, frame),
         "paths": _encoded(viewer_scene.segments(paths) - frame.shift, "<f4"),
@@ -80,8 +83,10 @@ def _view(frame: Frame) -> dict[str, Any]:
     """The first camera, and the heights (m) of the scene's frame between which components can be hidden."""
     low, high = frame.low - frame.shift, frame.high - frame.shift
     top = float(high[2]) + 0.1
+    shown = torch.cat([high[:2], high[2:].clamp_max(frame.open_height - float(frame.shift[2]))])
     return {
-        "middle": ((low + high) / 2).tolist(),
+        "middle": ((low + shown) / 2).tolist(),
+        "half": ((shown - low) / 2).tolist(),
         "distance": 1.35 * frame.distance,
         "low": float(low[2]),
         "high": top,
@@ -90,22 +95,21 @@ def _view(frame: Frame) -> dict[str, Any]:
 
 
 def _ellipsoids(components: Components, solid: Solid, frame: Frame) -> dict[str, Any]:
-    """One sphere, its place, turn (x, y, z, w) and standard deviations of each component, and colours."""
+    """Place, turn (x, y, z, w), standard deviations and uncertainty of each component, and colours."""
     balls = viewer_scene.instances(solid)
     places = np.zeros((len(solid.rows), 3, 4))
     places[:, 0, :3] = balls.positions - frame.shift.numpy()
     places[:, 1] = balls.wxyz[:, [1, 2, 3, 0]]
     places[:, 2, :3] = balls.scales / viewer_scene.N_SIGMA
-    vertices, faces = viewer_scene.sphere(len(solid.means))
+    places[:, 2, 3] = viewer_scene.uncertainty(solid)
     colours = {}
     for by in viewer_scene.colour_choices(components):
         found = viewer_scene.colours(components, solid, by)
         colours[by] = {"rgb": _encoded(found.rgb, "u1"), "ends": found.ends, "legend": found.legend}
-    return {
-        "places": _encoded(places, "<f4"),
-        "sphere": {"vertices": _encoded(vertices, "<f4"), "faces": _encoded(faces, "<u2")},
-        "colours": colours,
-    }
+        if found.slopes is not None:
+            slopes = np.clip(np.round(_SLOPE_STEPS * found.slopes), -127, 127) + 128
+            colours[by]["slopes"] = _encoded(slopes, "u1")
+    return {"places": _encoded(places, "<f4"), "colours": colours}
 
 
 def _slice(shown: GaussianMap, frame: Frame) -> dict[str, Any]:

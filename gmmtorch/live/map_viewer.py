@@ -27,7 +27,7 @@ from gmmtorch.optional_packages import needs_extra
 _PATH_COLOUR, _PATH_WIDTH = (213, 94, 0), 4.0
 _FINEST, _COARSEST = 0.02, 1.0  # m, of the slider of the resolution
 _LAST_PORT = 65535
-_ROOM = 1.2  # the controls cover a part of the page
+_ROOM = 1.1  # the controls cover a part of the page
 Rgb = tuple[int, int, int]
 _WELCOME = "Click a place to see what the map knows about it."
 
@@ -61,7 +61,7 @@ class MapViewer:
         shown: GaussianMap,
         trajectories: Sequence[Tensor] = (),
         *,
-        shape: str = "ellipsoids",
+        shape: str = "splats",
         colour: str = "height",
         host: str = "127.0.0.1",
         port: int = 8080,
@@ -124,7 +124,9 @@ class MapViewer:
             if choices != self._colour.options:  # a channel of an earlier map may be gone
                 self._colour.options = choices
             self._paths, self._path_colours = viewer_scene.in_space(trajectories), colours
-            self._show(viewer_scene.frame(self._components, self._paths))
+            unsure = viewer_scene.first_hidden(viewer_scene.surfaces(self._components), shown.resolution)
+            self._choose(self._unsure, unsure)
+            self._show(viewer_scene.frame(self._components, self._paths, self._unsure.value / 100))
             self._draw_components()
             self._draw_paths()
             self._draw_slice()
@@ -175,6 +177,7 @@ class MapViewer:
             for control in (self._cut, self._height):
                 _assign(control, min=low, max=high)
             self._choose(self._height, view.height)
+            self._choose(self._visible, flat)
             self._choose(self._resolution, max(_FINEST, min(self._map.resolution, _COARSEST)))
             if not cut_is_chosen:
                 _assign(self._cut, value=min(view.open_height, high))
@@ -198,12 +201,13 @@ class MapViewer:
 
     def _draw_components(self) -> None:
         below = self._highest()
-        solid = viewer_scene.surfaces(self._components, below)
+        solid = viewer_scene.surfaces(self._components, below, self._unsure.value / 100)
         shape = self._shape.value
         if shape == "none" or len(solid.rows) == 0:
             self._remove("components")
             return
-        colours = viewer_scene.colours(self._components, solid, self._colour.value).rgb
+        colours = viewer_scene.colours(self._components, solid, self._colour.value)
+        self._legend.content = colours.html
         scene = self.server.scene
         solid = solid._replace(means=solid.means - self.shift)
         if shape == "surfaces" and self._map.dim == 3:
@@ -214,7 +218,7 @@ class MapViewer:
         elif shape == "splats":
             self._nodes["components"] = viewer_scene.add_splats(scene, solid, colours)
         else:
-            self._nodes["components"] = viewer_scene.add_ellipsoids(scene, solid, colours)
+            self._nodes["components"] = viewer_scene.add_ellipsoids(scene, solid, colours.rgb)
 
     def _draw_paths(self) -> None:
         given = self._path_colours or [_PATH_COLOUR] * len(self._paths)
@@ -254,15 +258,17 @@ class MapViewer:
         with components:
             self._shape = gui.add_dropdown("shape", viewer_scene.SHAPES, initial_value=shape)
             self._colour = gui.add_dropdown("colour", (*viewer_scene.COLOURS, colour), initial_value=colour)
+            self._legend = gui.add_html("")
             self._cut = gui.add_slider("hide above [m]", 0.0, 1.0, 0.05, 1.0)
+            self._unsure = gui.add_slider("hide least certain [%]", 0, 100, 1, 0)
             self._with_paths = gui.add_checkbox("trajectory", True)
         with occupancy:
-            self._visible = gui.add_checkbox("slice", True)
+            self._visible = gui.add_checkbox("slice", False)
             self._height = gui.add_slider("height [m]", 0.0, 1.0, 0.05, 0.5)
             self._resolution = gui.add_slider("resolution [m]", _FINEST, _COARSEST, 0.01, 0.1)
         with place:
             self._place = gui.add_markdown(_WELCOME)
-        for control in (self._shape, self._colour, self._cut):
+        for control in (self._shape, self._colour, self._cut, self._unsure):
             control.on_update(lambda _: self._redraw(self._draw_components))
         self._with_paths.on_update(lambda _: self._redraw(self._draw_paths))
         for control in (self._visible, self._height, self._resolution):
@@ -284,7 +290,8 @@ class MapViewer:
             dim = self._components.dim
             nearest = math.inf
             if self._shape.value != "none":
-                solid = viewer_scene.surfaces(self._components, self._highest())
+                hidden = self._unsure.value / 100
+                solid = viewer_scene.surfaces(self._components, self._highest(), hidden)
                 nearest = viewer_scene.first_hit(solid, start, along)
             if self._visible.value and float(along[2]):
                 plane = (self._height.value if dim == 3 else 0.0) - float(start[2])

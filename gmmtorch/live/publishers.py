@@ -14,6 +14,7 @@ from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, a
 from gmmtorch.export import (
     CellCloud,
     cloud_fields,
+    colour_bytes,
     highest_in_band,
     odometry_fields,
     of_components,
@@ -24,9 +25,10 @@ from gmmtorch.live.live_scans import SETTLING, LiveScan, LiveScans
 from gmmtorch.live.ros import Node
 from gmmtorch.live.ros.topics import LATCHED
 from gmmtorch.localization import Location
-from gmmtorch.mapping import GaussianMap, Query, resident_bytes
+from gmmtorch.mapping import GaussianMap, Numbers, Query, resident_bytes
 from gmmtorch.occupancy import CellClass, KeptEvidence, Thresholds, VoxelGrid, probability
 from gmmtorch.pose import Pose
+from gmmtorch.scan import COLOUR
 
 CLOUDS = ("cells", "means", "none")
 _EXTENT = 3.0  # standard deviations around each component that the grid covers
@@ -85,11 +87,15 @@ class MapPublisher:
             flat = grid, theta if grid.dim == 2 else highest_in_band(grid, theta)[1]
             self._publish_grid(_cells(*flat, self._rule), header, stamp)
         if self._cloud == "cells" and grid is not None:
-            points = CellCloud.of_grid(grid, theta).above(self._rule.occupied).positions()
-            self._send_cloud(cloud_fields(frame, _table(points)), stamp)
+            cells = CellCloud.of_grid(grid, theta).above(self._rule.occupied)
+            known = shown.attributes(cells.centers).get(COLOUR)
+            colours = None if known is None else known.mean
+            self._send_cloud(cloud_fields(frame, _table(cells.positions(), colours)), stamp)
         elif self._cloud == "means":
-            means = viewer_scene.surfaces(shown.components()).means.numpy()
-            self._send_cloud(cloud_fields(frame, _table(means)), stamp)
+            solid = viewer_scene.surfaces(shown.components())
+            channel = shown.components().attributes.channels.get(COLOUR)
+            colours = channel.mean.cpu()[solid.rows] if isinstance(channel, Numbers) else None
+            self._send_cloud(cloud_fields(frame, _table(solid.means.numpy(), colours)), stamp)
         if self._send_ellipsoids is not None:
             self._send_ellipsoids({"markers": _markers(shown, header["header"])}, stamp)
 
@@ -159,9 +165,15 @@ def _cells(grid: VoxelGrid, theta: Tensor, rule: Thresholds) -> _Grid:
     return _Grid(flat, np.ascontiguousarray(values.T.numpy()))
 
 
-def _table(points: np.ndarray) -> np.ndarray:
-    """Points (N, 3) as a structured array with fields x, y, z, float32."""
-    return np.ascontiguousarray(points, "<f4").view([(axis, "<f4") for axis in "xyz"]).reshape(-1)
+def _table(points: np.ndarray, colours: Tensor | None = None) -> np.ndarray:
+    """Points (N, 3) as a structured array with fields x, y, z, float32; and rgb, whose bits are 0x00RRGGBB of
+    linear RGB (N, 3), as RViz and Foxglove expect."""
+    columns = [np.ascontiguousarray(points, "<f4")]
+    if colours is not None:
+        red, green, blue = colour_bytes(colours).astype("<u4").T
+        columns.append((red << 16 | green << 8 | blue).astype("<u4").view("<f4")[:, None])
+    names = ("x", "y", "z", "rgb")[: 2 + len(columns)]
+    return np.concatenate(columns, 1).view([(name, "<f4") for name in names]).reshape(-1)
 
 
 def _markers(shown: GaussianMap, header: dict[str, Any]) -> list[dict[str, Any]]:
@@ -303,13 +315,17 @@ class Diagnostics:
         self._nbytes = nbytes
         dropped = self._scans.n_dropped
         is_late, self._n_dropped = dropped > self._n_dropped, dropped
+        message = "scans are dropped" if is_late else "keeps up"
         if is_late:
             self._node.warn("dropped", f"{dropped} scans were dropped: the sensor is faster than mapping.")
+        elif (n_waiting := self._scans.n_waiting) > max(self._rate, 1.0):  # more than it maps in a second
+            is_late, message = True, f"falls behind: {n_waiting} scans wait"
+            self._node.warn("behind", f"{n_waiting} scans wait: {self._name} is slower than the sensor.")
         numbers = self.numbers(n_scans, n_components)
         status = {
             "level": _WARN if is_late else _OK,
             "name": self._name,
-            "message": "scans are dropped" if is_late else "keeps up",
+            "message": message,
             "hardware_id": self._scans.name,
             "values": [{"key": key, "value": f"{value:.6g}"} for key, value in numbers.items()],
         }

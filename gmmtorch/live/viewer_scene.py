@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -19,6 +20,7 @@ from gmmtorch.report import (
     N_SIGMA,
     SOUTH_WEST,
     MapPanel,
+    colour,
     cut_away,
     first_viewpoints,
     height_colour_map,
@@ -31,30 +33,32 @@ from gmmtorch.report import (
 )
 from gmmtorch.scan import COLOUR, display_colours
 
-SHAPES = ("ellipsoids", "splats", "surfaces", "none")
-"""How components are drawn: 2σ ellipsoids, Gaussian splats, or the triangle mesh of the surfaces."""
+SHAPES = ("splats", "ellipsoids", "surfaces", "none")
+"""How components are drawn: Gaussian splats, 2σ ellipsoids, or the triangle mesh of the surfaces."""
 
 COLOURS = ("height", "support", "age", "uncertainty")
 """What colours the components of every map: z of the mean; log of the support; order in which they were
-learned; log of the deviation across the surface. Channels of the map, such as colour, come after these."""
+learned; log of the `uncertainty`. Channels of the map, such as colour, come after these."""
 
 _UNKNOWN = 160  # grey of components without a value of a channel
-_HUES = 12  # colours of classes, which repeat after so many
 
 _SPHERES = ((1500, 162), (math.inf, 42))  # number of components, at most, and vertices of each ellipsoid
 _FLATNESS = 0.01  # m, thickness of a 2D component
 _FREE_ALPHA, _OCCUPIED_ALPHA = 90, 240
 _FAR = 1e4  # m from the origin, above which float32 is too coarse and the scene is moved to the origin
 _SLICE_PIXELS = 1000  # along the longer side of a slice
+_UNSURE = 3.0  # cells of the map's resolution: uncertainty of components that are hidden at first
 _UNDERNEATH = -0.05  # m, height of the slice of a 2D map: below its components
 
 
 class Solid(NamedTuple):
-    """Components in space: means (K, 3), metres; covariances (K, 3, 3), m²; rows (K,) in the map."""
+    """Components in space: means (K, 3), metres; covariances (K, 3, 3), m²; rows (K,) in the map; support
+    (K,)."""
 
     means: Tensor
     covariances: Tensor
     rows: Tensor
+    support: Tensor
 
 
 class Instances(NamedTuple):
@@ -74,18 +78,41 @@ class Slice(NamedTuple):
     size: tuple[float, float]
 
 
-def surfaces(components: Components, below: float = float("inf")) -> Solid:
-    """The surface components with means below a height (m); 2D ones become flat ones at z = 0."""
+def surfaces(components: Components, below: float = math.inf, hidden: float = 0.0) -> Solid:
+    """The surface components with means below a height (m), without a share of the least certain ones.
+
+    2D ones become flat ones at z = 0.
+    """
     kept = ~components.max_range & (components.support > 0)
     if components.dim == 3:
         kept = kept & (components.means[:, 2] <= below)
     rows = kept.nonzero().squeeze(1)
+    support = components.support[rows].double().cpu()
     mean, covariance = components.means[rows].cpu(), components.covariances[rows].cpu()
     if components.dim == 2:
         mean = torch.nn.functional.pad(mean, (0, 1))
         covariance = torch.nn.functional.pad(covariance, (0, 1, 0, 1))
         covariance[:, 2, 2] = (_FLATNESS / 2) ** 2
-    return Solid(mean, covariance, rows.cpu())
+    solid = Solid(mean, covariance, rows.cpu(), support)
+    if not hidden:
+        return solid
+    surest = torch.argsort(uncertainty(solid), stable=True)[: math.ceil((1 - hidden) * len(rows))]
+    return Solid(*(values[surest.sort().values] for values in solid))
+
+
+def uncertainty(solid: Solid) -> Tensor:
+    """How uncertain the surface of each component is (K,), metres: the larger one of its deviation across
+    the surface and the mean distance between its points."""
+    deviations = torch.linalg.eigvalsh(solid.covariances).clamp_min(0).sqrt()
+    area = 2 * math.pi * deviations[:, 1] * deviations[:, 2]
+    return torch.maximum(deviations[:, 0], (area / solid.support).sqrt())
+
+
+def first_hidden(solid: Solid, resolution: float) -> int:
+    """Percent of the components that are hidden at first: they are less certain than three cells of the
+    map's resolution (m), and would hide what is certain."""
+    unsure = uncertainty(solid) > _UNSURE * resolution
+    return math.ceil(100 * int(unsure.sum()) / max(len(unsure), 1))
 
 
 def sphere(n_components: int) -> tuple[Tensor, Tensor]:
@@ -102,11 +129,24 @@ def instances(solid: Solid) -> Instances:
 
 class Colours(NamedTuple):
     """Colours of components, rgb (K, 3) uint8, and what the first and the last colour of the scale mean;
-    None: they are not of the scale. legend: names and CSS colours of classes."""
+    None: they are not of the scale. legend: names and CSS colours of classes. slopes (K, 3, 3): change of the
+    RGB, from 0 to 1, in a deviation along each principal axis; None: it does not vary in a component."""
 
     rgb: np.ndarray
     ends: tuple[str, str] | None = None
     legend: Sequence[tuple[str, str]] = ()
+    slopes: np.ndarray | None = None
+
+    @property
+    def html(self) -> str:
+        """The scale with its ends, or the legend of the classes; empty without both."""
+        if self.ends is None:
+            mark = '<span style="background:{};display:inline-block;width:10px;height:10px"></span> {}<br>'
+            return "".join(mark.format(css, html.escape(name)) for name, css in self.legend)
+        bar = f"height:10px;background:linear-gradient(to right,{','.join(colour_scale(_N_SHADES))})"
+        ends = "<span>{}</span><span>{}</span>".format(*self.ends)
+        row = "display:flex;justify-content:space-between;padding:0 1em;font-size:12px"
+        return f'<div style="{bar}"></div><div style="{row}">{ends}</div>'
 
 
 def colour_choices(components: Components) -> tuple[str, ...]:
@@ -119,40 +159,51 @@ def colours(components: Components, solid: Solid, by: str) -> Colours:
     check_choice("colour", by, colour_choices(components))
     if by == "height":
         scale = height_scale(solid.means[:, 2])
-        return Colours(height_shades(solid.means), (f"{scale.vmin:.2f} m", f"{scale.vmax:.2f} m"))
+        deviations, axes = principal_axes(solid.covariances)
+        change = axes[:, 2] * deviations
+        above, below = (
+            _shades(scale((solid.means[:, 2:] + sign * change).numpy())) / 255 for sign in (1, -1)
+        )
+        slopes = (above - below) / 2
+        return Colours(
+            height_shades(solid.means), (f"{scale.vmin:.2f} m", f"{scale.vmax:.2f} m"), slopes=slopes
+        )
     if by == "age":
         value = components.ids[:, 1].cpu()[solid.rows].double()
         return Colours(_spread(value, *_range(value)), ("oldest", "newest"))
     if by in COLOURS:
-        value = components.support.cpu()[solid.rows].double()
-        if by == "uncertainty":
-            value = 1e3 * torch.linalg.eigvalsh(solid.covariances)[:, 0].clamp_min(0).sqrt()
+        value = 1e3 * uncertainty(solid) if by == "uncertainty" else solid.support
         low, high = _range(value)
-        unit = "points" if by == "support" else "mm across"
+        unit = "points" if by == "support" else "mm"
         ends = (f"{low:.3g} {unit}", f"{high:.3g} {unit}")
         low, high = math.log(max(low, 1e-9)), math.log(max(high, 1e-9))
         return Colours(_spread(value.clamp_min(1e-9).log(), low, high), ends)
-    return _channel_colours(by, components.attributes.selected(solid.rows.to(components.means.device)))
+    chosen = components.attributes.selected(solid.rows.to(components.means.device)).on_cpu()
+    return _channel_colours(by, chosen, solid)
 
 
-def _channel_colours(name: str, attributes: Attributes) -> Colours:
+def _channel_colours(name: str, attributes: Attributes, solid: Solid) -> Colours:
     """The colours of a channel; grey where it is unknown."""
-    channel, legend, ends = attributes.channels[name], [], None
+    channel, legend, ends, slopes = attributes.channels[name], [], None, None
     if isinstance(channel, Labels):
-        hues = _shades((np.arange(_HUES) + 0.5) / _HUES)[np.arange(len(channel.labels)) * 5 % _HUES]
+        hues = np.array([list(bytes.fromhex(colour(i)[1:])) for i in range(len(channel.labels))], np.uint8)
         known, rgb = channel.share.sum(1) > 0, hues[channel.share.cpu().argmax(1).numpy()]
         names = map(str, channel.labels.tolist())
         legend = [(label, _css(hue)) for label, hue in zip(names, hues.tolist(), strict=True)]
     elif name == COLOUR:
         known, seen = channel.share > 0, display_colours(channel.mean.clamp(0, 1))
         rgb = (255 * seen).round().cpu().numpy().astype(np.uint8)
+        deviations, axes = principal_axes(solid.covariances)
+        change = (channel.slope @ axes[:, : channel.slope.shape[2]] * deviations[:, None]).mT
+        nearby = [display_colours((channel.mean[:, None] + sign * change).clamp(0, 1)) for sign in (1, -1)]
+        slopes = ((nearby[0] - nearby[1]) / 2).numpy()
     else:
         known, value = channel.share > 0, channel.mean[:, 0].cpu()
         some = value[known.cpu()]
         low, high = some.quantile(torch.tensor([0.02, 0.98]).double()).tolist() if len(some) else (0.0, 1.0)
         rgb, ends = _spread(value, low, high), (f"{low:.3g}", f"{high:.3g}")
     rgb = np.where(known.cpu().numpy()[:, None], rgb, _UNKNOWN).astype(np.uint8)
-    return Colours(rgb, ends, legend)
+    return Colours(rgb, ends, legend, slopes)
 
 
 def _range(value: Tensor) -> tuple[float, float]:
@@ -182,7 +233,7 @@ def _css(shade: Sequence[int]) -> str:
 
 def _shades(share: np.ndarray) -> np.ndarray:
     """Colours (K, 3) uint8 of shares (K,) of the scale."""
-    return np.round(255 * height_colour_map(lighter=0.0)(share)[:, :3]).astype(np.uint8)
+    return np.round(255 * height_colour_map(lighter=0.0)(share)[..., :3]).astype(np.uint8)
 
 
 class Frame(NamedTuple):
@@ -214,9 +265,9 @@ def segments(paths: Sequence[Tensor]) -> Tensor:
     return torch.cat(pieces) if pieces else torch.zeros(0, 2, 3, dtype=torch.float64)
 
 
-def frame(components: Components, paths: Sequence[Tensor]) -> Frame:
-    """The first view of components and the sensor's paths (S, 3)."""
-    solid = surfaces(components)
+def frame(components: Components, paths: Sequence[Tensor], hidden: float = 0.0) -> Frame:
+    """The first view of components, without a share of the least certain, and the sensor's paths (S, 3)."""
+    solid = surfaces(components, hidden=hidden)
     found = frame_of(solid.means, paths)
     if components.dim == 2:
         return found
@@ -233,7 +284,7 @@ def frame_of(places: Tensor, paths: Sequence[Tensor]) -> Frame:
     low, high = torch.tensor(corners, dtype=torch.float64)
     far = max(float(low.abs().max()), float(high.abs().max())) > _FAR
     shift = ((low + high) / 2).round() if far else torch.zeros(3, dtype=torch.float64)
-    distance = 0.6 * float((high - low)[:2].norm()) + 2.0
+    distance = 0.65 * float((high - low).norm())
     height = float(path[:, 2].median()) if len(path) else float(low[2] + high[2]) / 2
     return Frame(low, high, shift, distance, height, math.inf)
 
@@ -294,7 +345,9 @@ def place_text(shown: GaussianMap, position: Tensor, resolution: float) -> str:
 
 
 _MESH_COLOUR, _BACKGROUND = (205, 205, 210), (240, 242, 245)
-_OPACITY = 0.9  # of a splat
+_OPACITY, _WIDER = 1.0, 1.3  # of a splat; 1.3 times as wide, the splats of a surface leave no gaps
+_N_SHADES = 9  # of a legend
+_LAMPS = ((-0.5, -0.8, 1.0), (0.9, 0.4, 0.5))
 _UNSHADED = {"cast_shadow": False, "receive_shadow": False}
 _BODY = 0.2  # m, radius of the ball that is a robot
 _FRUSTUM = 0.8  # m, depth of a frustum
@@ -312,7 +365,7 @@ def add_lights(scene: Any, distance: float) -> None:
     scene.configure_environment_map(None)
     scene.configure_default_lights(enabled=False)
     scene.add_light_ambient("/lights/everywhere", intensity=0.7)
-    for name, place, strength in (("key", (-0.5, -0.8, 1.0), 1.0), ("fill", (0.9, 0.4, 0.5), 0.4)):
+    for name, place, strength in zip(("key", "fill"), _LAMPS, (1.0, 0.4), strict=True):
         scene.add_light_directional(
             f"/lights/{name}",
             intensity=strength,
@@ -338,11 +391,18 @@ def add_ellipsoids(scene: Any, solid: Solid, colours: np.ndarray) -> Any:
     )
 
 
-def add_splats(scene: Any, solid: Solid, colours: np.ndarray) -> Any:
-    """Components in the scene's frame as Gaussian splats with colours (K, 3) uint8."""
-    opacity = np.full((len(colours), 1), _OPACITY, np.float32)
-    means, covariances = solid.means.float().numpy(), solid.covariances.float().numpy()
-    return scene.add_gaussian_splats("/components", means, covariances, colours, opacity)
+def add_splats(scene: Any, solid: Solid, colours: Colours) -> Any:
+    """Components in the scene's frame as Gaussian splats. Light falls on them, except on colours of a camera,
+    which have the light of the place."""
+    opacity = np.full((len(solid.means), 1), _OPACITY, np.float32)
+    means, covariances = solid.means.float().numpy(), _WIDER**2 * solid.covariances.float().numpy()
+    shades = colours.rgb
+    if colours.ends or colours.legend:
+        normal = principal_axes(solid.covariances)[1][:, :, 0]
+        lamps = torch.nn.functional.normalize(normal.new_tensor(_LAMPS), dim=1)
+        light = 0.5 + (normal @ lamps.T).abs() @ normal.new_tensor([0.45, 0.2])
+        shades = (shades * light.clamp_max(1)[:, None].numpy()).astype(np.uint8)
+    return scene.add_gaussian_splats("/components", means, covariances, shades, opacity)
 
 
 def add_mesh(scene: Any, mesh: TriangleMesh, shift: Tensor) -> Any:

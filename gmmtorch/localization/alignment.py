@@ -65,13 +65,19 @@ class AlignmentTarget:
             a surface by more than the blur does not see it, so the two faces of a wall are not confused.
     """
 
-    def __init__(self, surfaces: Parameters, blur: float, normals: Tensor | None = None) -> None:
+    def __init__(
+        self,
+        surfaces: Parameters,
+        blur: float,
+        normals: Tensor | None = None,
+        lists: NearLists | None = None,
+    ) -> None:
         means, dim = surfaces.means, surfaces.means.shape[1]
         covariances = surfaces.covariances + blur**2 * torch.eye(dim).to(means)
         normals = torch.zeros_like(means) if normals is None else normals.to(means)
         self.blur, self.means, self.normals = blur, means.contiguous(), normals.contiguous()
         self.precisions = torch.linalg.inv(covariances).contiguous()  # else each sum would copy them
-        self.lists = _near_lists(means, covariances, blur)
+        self.lists = _near_lists(means, covariances, blur) if lists is None else lists
 
     def sums(self, points: Tensor, motions: Pose) -> AlignmentSums:
         """ℓ of points (N, D) under each motion, and its derivatives."""
@@ -89,7 +95,7 @@ def _near_lists(means: Tensor, covariances: Tensor, blur: float) -> NearLists:
     """For each cell of a lattice, the components whose box of `CUTOFF` deviations meets it."""
     half = CUTOFF * covariances.diagonal(dim1=1, dim2=2).sqrt()
     low = (means - half).amin(0)
-    side = _SIDE * blur
+    side = max(_SIDE * blur, float(half.median()))  # in smaller cells the lists are the same
     while True:
         first, last = (((means + way * half - low) / side).floor().clamp_min(0).long() for way in (-1, 1))
         shape = last.amax(0) + 1

@@ -13,9 +13,9 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
-from gmmtorch.datasets import Dataset, Reposed, with_poses
+from gmmtorch.datasets import POINT_TIMES, Dataset, Reposed, deskewed, with_poses
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_number, check_whole
-from gmmtorch.localization.local_map import LOST, Keyframe, LocalMap, nowhere
+from gmmtorch.localization.local_map import LOST, SURE, Keyframe, LocalMap, nowhere
 from gmmtorch.localization.location import Location, continued, measured_motion
 from gmmtorch.localization.loop_closure import LoopCloser, closed, information_of
 from gmmtorch.localization.pose_graph import Edges, optimised
@@ -34,17 +34,22 @@ _NARROW = 0.8  # length of the mean direction of its points; 0.64 for a half cir
 _GIVEN_UP = 3  # lost scans in a row, after which the next one begins a new local map
 _APART = "the sensor was lost before, and no place that it saw later is known from before"
 _LONGEST_GAP = 2  # steps that a sensor may have moved since the last pose that was found, at most
+_STEPS = 10  # that are found, before the longest one, and the largest turn, limit the next one:
+_LONGER, _LEAST = 2.0, (2.0, 2.4)  # times as far, but never less than these (m, rad)
 _FEWEST = 10  # returns of a scan that can be located
 _FIRST_STEP = 1.0, math.radians(30)  # standard deviations (m, rad) of the first motions
 _SURPRISE = 0.3, math.radians(10)  # least standard deviations of a motion from the predicted one
 _MEMORY = 0.7  # share of the past in the mean surprise
+_SKEW = 0.05  # metres of a point between two estimates of its skew, above which the scan is located again
+_LONGEST_SWEEP = 1.0  # seconds between scans over which a velocity deskews points
 _LONG_MEMORY = 0.9  # share of the past in the mean explained share
 
 
 class Trajectory(NamedTuple):
     """Poses (N, D+1, D+1) of N scans, world ← sensor (the world is the frame of the first one); covariances
     (N, F, F) of a shift (m) and a turn (rad) in the frame of the sensor; whether each was found (N,); the
-    number of loop closures that were used; and the reasons against each pose, empty if it was found.
+    number of loop closures that were used; the reasons against each pose, empty if it was found; and the
+    probability (N,) that each pose in its local map is right, NaN if it is not estimated.
     """
 
     poses: Tensor
@@ -52,6 +57,7 @@ class Trajectory(NamedTuple):
     found: Tensor
     n_closures: int
     doubts: tuple[str, ...]
+    probabilities: Tensor
 
 
 class Odometry:
@@ -65,13 +71,14 @@ class Odometry:
         poses = odometry.trajectory().poses
 
     The pose of a scan is the one that best explains its points by one mixture of the last keyframes and is
-    not far from the prediction. In 2D the poses that the sensor can have reached are searched by branch and
-    bound (`localization.pose_search`), and the mixture is climbed from the best ones; in 3D it is climbed
+    not far from the prediction. In 2D the poses near the prediction, and if the best one is not sure all that
+    the sensor can have reached, are searched by branch and bound (`localization.pose_search`), and the
+    mixture is climbed from the best ones; in 3D it is climbed
     from the best of a lattice of starts. The prediction continues the last motion. `trajectory`
     finds the places that were seen twice and corrects all poses by a pose graph
-    (`localization.pose_graph`). A scan that is not found never enters the local map. If the
-    next one is found, it is searched for again. The fourth in a row begins a new map, whose poses are found
-    if a closure joins them with the first.
+    (`localization.pose_graph`). A scan that is not found never enters the local map. Its other possible poses
+    are tried with the next one; if that is found, the lost one is searched for again. The fourth in a row
+    begins a new map, whose poses are found if a closure joins them with the first one.
 
     Args:
         n_keyframes: in the local map. None: 10, or 80 for a sensor with a narrow field of view, such as a
@@ -82,7 +89,8 @@ class Odometry:
         least_explained: share of the points that must lie on surfaces of the local map.
         rule: how a scan becomes a mixture.
         max_step, max_turn: largest motion (m, rad) of the sensor between two scans. A pose that is farther
-            from the last one and from the predicted one is not found.
+            from the last one and from the predicted one is not found. After ten steps in succession, twice
+            the longest one (at least 2 m), and twice the largest turn (at least 2.4 rad), limit them, too.
     """
 
     def __init__(
@@ -116,13 +124,21 @@ class Odometry:
         self._parts: list[int] = []  # keyframes that begin a map of their own, because the sensor was lost
         self._edges: list[tuple[int, Pose, Tensor]] = []  # from which scan, motion, information
         self._motion: Pose | None = None
+        self._step: Pose | None = None  # the motion that deskews the newest scan
+        self._longest, self._n_steps = (0.0, 0.0), 0
         self._surprise = _FIRST_STEP
         self._explained = 0.95  # share of the points: few places explain less
         self._stamp: float | None = None
         self._seconds: float | None = None
         self._loops = LoopCloser(least_explained, rule)
 
-    def add(self, points: ArrayLike, stamp: float | None = None, motion: ArrayLike | None = None) -> Location:
+    def add(
+        self,
+        points: ArrayLike,
+        stamp: float | None = None,
+        motion: ArrayLike | None = None,
+        seconds: ArrayLike | None = None,
+    ) -> Location:
         """The pose of the next scan in the frame of the first one; if it is not `found`, the best guess.
 
         Args:
@@ -133,20 +149,41 @@ class Odometry:
             motion: (D+1, D+1) of the sensor since the last scan, last ← now, such as that of wheels; or its
                 rotation (D, D) alone, such as that of an IMU: the velocity in the frame of the sensor
                 continues. None: the motion continues.
+            seconds: (N,) after `stamp` at which each point was measured. The points are moved to where they
+                would be seen at the stamp, by the predicted motion, and again by the estimated one if that
+                moves one of them by more than 5 cm. None: all were measured at the stamp.
 
         Raises `InvalidArgumentError` for another shape or dimension, or for a motion that is not rigid.
         """
-        rows = self._checked(points)
+        rows, times = self._checked(points, seconds)
         dim = rows.shape[1]
         measured = None if motion is None else measured_motion(motion, dim, rows.device)
-        scan = self._scan(rows)
+        raw, times = self._scan(rows), None if times is None else times[_drawn(rows)]
         ratio = self._clock(stamp)
         if not self._poses:
-            location = Location(torch.eye(dim + 1).double(), nowhere(dim) * 0, 1.0, ())
+            location, scan = Location(torch.eye(dim + 1).double(), nowhere(dim) * 0, 1.0, ()), raw
         else:
+            self._step = self._predicted(measured, ratio)[0]
+            scan = self._deskewed(raw, times)
             location = self._located(scan, measured, ratio)
+            if location.found:
+                self._step = self._poses[-1].inverse() @ Pose.from_matrix(location.pose)
+                better = self._deskewed(raw, times)
+                moved = (better.points - scan.points).norm(dim=1)
+                scan = better
+                if bool((moved > _SKEW).any()):
+                    location = self._located(scan, self._step, ratio)
+                    self._step = self._poses[-1].inverse() @ Pose.from_matrix(location.pose)
         self._remember(scan, location)
         return location
+
+    def deskewed(self, points: Tensor, seconds: Tensor) -> Tensor:
+        """Points (N, D) of the newest scan, moved to where they would be seen at its stamp by the estimated
+        motion since the scan before; unchanged if that or its time is not known. seconds: as for `add`.
+        """
+        if self._step is None or self._seconds is None or not 0 < self._seconds <= _LONGEST_SWEEP:
+            return points
+        return deskewed(points.double(), seconds.double(), self._step, self._seconds)
 
     @property
     def poses(self) -> Tensor:
@@ -197,22 +234,33 @@ class Odometry:
                        for doubt, apart in zip(doubts, is_apart.tolist(), strict=True))  # fmt: skip
         best = best._replace(poses=_bridged(best.poses, found))
         found &= ~is_apart
-        return Trajectory(best.poses.matrix, best.covariances, found, int(used.sum()), doubts)
+        sure = torch.tensor([location.probability for location in self._locations]).double()
+        return Trajectory(best.poses.matrix, best.covariances, found, int(used.sum()), doubts, sure)
 
     # -- one scan -------------------------------------------------------------------------------------
 
-    def _checked(self, points: ArrayLike) -> Tensor:
+    def _checked(self, points: ArrayLike, seconds: ArrayLike | None) -> tuple[Tensor, Tensor | None]:
         rows = as_tensor(points, "points", torch.float64).detach().cpu()
         dims = (2, 3) if not self._poses else (self._poses[0].dim,)
         if rows.ndim != 2 or rows.shape[1] not in dims:
             wanted = " or ".join(f"(N, {dim})" for dim in dims)
             raise InvalidArgumentError(f"points has shape {tuple(rows.shape)}; expected {wanted}, metres.")
-        return rows[torch.isfinite(rows).all(1)]
+        finite = torch.isfinite(rows).all(1)
+        if seconds is None:
+            return rows[finite], None
+        times = as_tensor(seconds, "seconds", torch.float64).detach().cpu()
+        if times.shape != rows.shape[:1]:
+            raise InvalidArgumentError(
+                f"seconds has shape {tuple(times.shape)}; expected ({len(rows)},), one for each point."
+            )
+        finite &= torch.isfinite(times)
+        return rows[finite], times[finite]
 
     def _scan(self, rows: Tensor) -> Keyframe:
-        draw = torch.Generator().manual_seed(0)
-        chosen = rows[torch.randperm(len(rows), generator=draw)[:_STORED]]
-        return Keyframe(chosen, Pose.identity(rows.shape[1]))
+        return Keyframe(rows[_drawn(rows)], Pose.identity(rows.shape[1]))
+
+    def _deskewed(self, scan: Keyframe, seconds: Tensor | None) -> Keyframe:
+        return scan if seconds is None else scan._replace(points=self.deskewed(scan.points, seconds))
 
     def _clock(self, stamp: float | None) -> float:
         """How many times longer than the last motion this one takes; 1 if the clocks do not say."""
@@ -227,18 +275,18 @@ class Odometry:
 
     def _located(self, scan: Keyframe, measured: Pose | Tensor | None, ratio: float) -> Location:
         last = self._poses[self._last_found]
-        step = rest = Pose.identity(last.dim)
-        if isinstance(measured, Tensor):
-            step, rest = continued(measured, self._motion, ratio), continued(measured, None)
-        elif measured is not None:
-            step = measured
-        elif self._motion is not None:
-            step = self._motion if ratio == 1.0 else rest.towards(self._motion, ratio)
+        step, rest = self._predicted(measured, ratio)
         guess = self._poses[-1] @ step  # of a scan that was lost, too
-        reach = self.max_step * min(len(self._lost) + 1, _LONGEST_GAP)
-        expected = Expectation(
-            Pose.stack([guess, last @ rest]), *self._surprise, self._explained, reach, self.max_turn
-        )
+        starts, surprise = Pose.stack([guess, last @ rest]), self._surprise
+        reach, turn = self._limits()
+        if self._lost:
+            surprise, reach = (max(surprise[0], LOST[0]), max(surprise[1], LOST[1])), reach * _LONGEST_GAP
+            others = self._locations[-1].others
+            if others is not None:
+                starts = Pose.cat([Pose.from_matrix(others) @ step, starts])  # a later scan decides
+            is_near = (starts.translation - last.translation).norm(dim=1) <= reach
+            starts = starts[is_near.nonzero()[:, 0]]  # one after the other, lost scans would go anywhere
+        expected = Expectation(starts, *surprise, self._explained, reach, turn)
         if len(scan.points) < _FEWEST or self._local is None:
             doubt = (
                 "the scan has too few points" if len(scan.points) < _FEWEST else "no scan before had points"
@@ -247,6 +295,26 @@ class Odometry:
         location = self._local.locate(scan, expected)
         self._note_surprise(location, expected)
         return location
+
+    def _predicted(self, measured: Pose | Tensor | None, ratio: float) -> tuple[Pose, Pose]:
+        """The motion since the last scan, and that of a sensor that stopped."""
+        rest = Pose.identity(self._poses[-1].dim)
+        if isinstance(measured, Tensor):
+            return continued(measured, self._motion, ratio), continued(measured, None)
+        if measured is not None:
+            return measured, rest
+        if self._motion is None or ratio == 1.0:
+            return self._motion or rest, rest
+        return rest.towards(self._motion, ratio), rest
+
+    def _limits(self) -> tuple[float, float]:
+        """The largest shift (m) and turn (rad) to the next scan, by `max_step` and `max_turn` and, after some
+        steps, by those that were found: a recording has scans after certain times or motions.
+        """
+        if self._n_steps < _STEPS:
+            return self.max_step, self.max_turn
+        step, turn = (max(_LONGER * found, least) for found, least in zip(self._longest, _LEAST, strict=True))
+        return min(step, self.max_step), min(turn, self.max_turn)
 
     def _note_surprise(self, location: Location, expected: Expectation) -> None:
         off = expected.poses[0].inverse() @ Pose.from_matrix(location.pose)
@@ -268,6 +336,10 @@ class Odometry:
             self._edges.append((self._last_frame, since, information_of(location)))
             if location.found:
                 self._motion = self._poses[-1].inverse() @ pose if not self._lost else None
+                if self._motion is not None:
+                    seen = float(self._motion.translation.norm()), float(self._motion.chord())
+                    self._longest = max(self._longest[0], seen[0]), max(self._longest[1], seen[1])
+                    self._n_steps += 1
                 self._last_found = number
             elif len(self._lost) >= _GIVEN_UP:
                 self._motion = None  # a sensor that is covered for long may have stopped
@@ -292,20 +364,21 @@ class Odometry:
                 is_narrow = float(directions.mean(0).norm()) > _NARROW
                 self.n_keyframes = _MANY_KEYFRAMES if is_narrow else _KEYFRAMES
             self._set_local_map(self.n_keyframes)
-        if location.found and len(lost) == 1:
-            self._search_again(lost[0])
+        if location.found and lost and (len(lost) == 1 or location.probability >= SURE):
+            self._search_again(lost)
 
-    def _search_again(self, scan: Keyframe) -> None:
-        """The last scan but one, which was lost, between the poses on both sides of it. Of several lost scans
-        in a row none is searched for: the pose that ends them is less sure.
-        """
-        if self._local is None or len(scan.points) < _FEWEST:
-            return
-        number, last = len(self._poses) - 2, self._last_frame
-        before, after = self._poses[number - 1], self._poses[-1]
-        way, limits = Pose.stack([before.towards(after, 0.5), before]), (self.max_step, self.max_turn)
-        location = self._local.locate(scan, Expectation(way, *self._surprise, self._explained, *limits))
-        if location.found:
+    def _search_again(self, scans: list[Keyframe]) -> None:
+        """The lost scans before the last one, the latest first, from the pose that is known after each."""
+        assert self._local is not None
+        last, end = self._last_frame, len(self._poses) - 1
+        before, limits = self._poses[end - len(scans) - 1], (self.max_step, self.max_turn)
+        for n, scan in zip(range(len(scans), 0, -1), reversed(scans), strict=True):
+            number = end - len(scans) + n - 1
+            after = self._poses[number + 1]
+            way = Pose.stack([before.towards(after, n / (n + 1)), after])
+            expected = Expectation(way, *self._surprise, self._explained, *limits)
+            if len(scan.points) < _FEWEST or not (location := self._local.locate(scan, expected)).found:
+                return
             pose = Pose.from_matrix(location.pose)
             self._edges[number - 1] = (last, self._poses[last].inverse() @ pose, information_of(location))
             self._poses[number], self._locations[number] = pose, location
@@ -340,6 +413,11 @@ class Odometry:
             return Edges(target, target, Pose.identity(dim, 0), torch.zeros(0, free, free).double(), none)
         source, motions, information = zip(*self._edges, strict=True)
         return Edges(torch.tensor(source), target, Pose.stack(motions), torch.stack(information), none)
+
+
+def _drawn(rows: Tensor) -> Tensor:
+    """Rows of the points of a keyframe, in random order."""
+    return torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))[:_STORED]
 
 
 def _bridged(poses: Pose, found: Tensor) -> Pose:
@@ -402,13 +480,14 @@ def with_odometry(
     known = torch.zeros(len(source), dtype=torch.bool)
     times = source.times
     before: int | None = None
+    source.keeps_point_times = True
     for index in range(len(source)):
-        points = _sensor_points(source, index)
+        points, seconds = _sensor_points(source, index)
         if points is not None:
             predicted = None
             if before is not None and motion != "constant":
                 predicted = _motion(source, turns, before, index)
-            odometry.add(points, None if times is None else float(times[index]), predicted)
+            odometry.add(points, None if times is None else float(times[index]), predicted, seconds)
             known[index], before = True, index
         on_scan(index + 1, len(source))
     if not known.any():
@@ -432,18 +511,21 @@ def _motion(source: Dataset, turns: Tensor | None, before: int, now: int) -> Ten
     return (Pose.from_matrix(first).inverse() @ Pose.from_matrix(last)).matrix
 
 
-def _sensor_points(source: Dataset, index: int) -> Tensor | None:
-    """Returns (N, D) of a scan in the frame of the sensor; None if it cannot be read."""
+def _sensor_points(source: Dataset, index: int) -> tuple[Tensor | None, Tensor | None]:
+    """Returns (N, D) of a scan in the frame of the sensor, and when they were measured (N,), if that is known
+    and they are not deskewed; None if it cannot be read."""
     try:
         scan, pose = source[index], source.pose(index)
     except DataError:
-        return None  # the reader counts it in `skipped`
+        return None, None  # the reader counts it in `skipped`
     if pose is None:
         raise DataError(
             f"{source.name} does not state the poses in which its points are, so they cannot be moved into "
             "the frame of the sensor."
         )
-    return Pose.from_matrix(pose).inverse().apply(scan.points.double())
+    seconds = scan.attributes.get(POINT_TIMES)
+    points = Pose.from_matrix(pose).inverse().apply(scan.points.double())
+    return points, None if seconds is None else seconds[:, 0]
 
 
 def odometry_of(method: str) -> Odometry | KissIcp:
@@ -465,7 +547,13 @@ class KissIcp:
         self._icp = KissICP(config)
         self._locations: list[Location] = []
 
-    def add(self, points: Tensor, stamp: float | None = None, motion: Tensor | None = None) -> Location:
+    def add(
+        self,
+        points: Tensor,
+        stamp: float | None = None,
+        motion: Tensor | None = None,
+        seconds: Tensor | None = None,
+    ) -> Location:
         """The pose of the next scan in the frame of the first one, without a covariance (NaN)."""
         dim = points.shape[1]
         rows = torch.nn.functional.pad(points, (0, 3 - dim))
@@ -483,4 +571,5 @@ class KissIcp:
         poses = torch.stack([location.pose for location in self._locations])
         covariances = torch.stack([location.covariance for location in self._locations])
         found = torch.ones(len(poses), dtype=torch.bool)
-        return Trajectory(poses, covariances, found, 0, ("",) * len(poses))
+        unknown = torch.full((len(poses),), torch.nan).double()
+        return Trajectory(poses, covariances, found, 0, ("",) * len(poses), unknown)

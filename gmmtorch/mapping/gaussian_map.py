@@ -69,11 +69,11 @@ class GaussianMap(MapState):
 
     Queries do not change the map: the scans of an unfinished window are learned for the answer, and learned
     again when the window is full. If they are large, a query learns from them scan by scan, in less time than
-    together. `finish`, `components` and `save` learn from them together, and until the next scan queries
-    answer from that. Lists of the components near the points that were asked about are kept while the map
-    grows; method "monte_carlo" draws its rays anew (about a second for a million). `save` and
-    `load` keep a map with its settings. `state_dict` holds everything that learning continues from, and loads
-    into any map.
+    together; a map that was asked since the last scan does so when the next one is inserted. `finish`,
+    `components` and `save` learn from them together, and until the next scan queries answer from that. Lists
+    of the components near the points that were asked about are kept while the map grows; method "monte_carlo"
+    draws its rays anew (about a second for a million). `save` and `load` keep a map with its settings.
+    `state_dict` holds everything that learning continues from, and loads into any map.
     """
 
     any_resolution = True
@@ -183,7 +183,11 @@ class GaussianMap(MapState):
         known = (one.attributes for one in self._pending)
         check_kinds([self._attributes.channels, *known, scan.attributes])
         self._prepare(scan.dim, scan.points.device, "scan is")
+        former = self._query if self._is_asked else None
         self._add(scan.copied(self._device))
+        if former is not None:  # asked since the scan before: the next query does not wait for this one
+            self._answers().prepare(former)
+        self._is_asked = False
 
     def insert_depth(
         self,
@@ -252,12 +256,11 @@ class GaussianMap(MapState):
     def _rounded_final(self) -> tuple[Components, Components]:
         """The final components, and as the codec rounds them."""
         final = self._final()
-        if self.codec == "float":
-            return final, final
         none = Components.empty(final.dim, final.means.device)
         known, rounded = self._final_rounded or (none, none)
         if any(value is not getattr(final, name) for name, value in vars(known).items()):
-            self._final_rounded = final, quantized_after(known, rounded, final)
+            is_exact = self.codec == "float"
+            self._final_rounded = final, final if is_exact else quantized_after(known, rounded, final)
         return self._final_rounded or (final, rounded)
 
     def transform(self, transform: ArrayLike, ids: ArrayLike | None = None) -> None:
@@ -333,6 +336,7 @@ class GaussianMap(MapState):
         return {name: prediction.to(query.device) for name, prediction in found.items()}
 
     def _answers(self) -> Query:
+        self._is_asked = True
         if self._query is None or self._is_stale:
             parts = self._window_parts()
             found = self.components() if parts is None else self._rounded_final()[1]

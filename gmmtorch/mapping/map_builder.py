@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -25,6 +25,7 @@ from gmmtorch.errors import DAMAGED_CONTENT, DataError, GmmTorchError, InvalidAr
 from gmmtorch.files import joined_tensors, pack_tensors, read_tensors, split_tensors, write_bytes
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping.tiles.tiled_map import TiledMap
 from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 
@@ -71,7 +72,10 @@ class BuildRecord:
     seconds: float = 0.0
 
 
-class MapBuilder:
+AnyMap = TypeVar("AnyMap", bound=GaussianMap | TiledMap)
+
+
+class MapBuilder(Generic[AnyMap]):
     """Inserts the scans of a data set into a map.
 
         builder = MapBuilder(dataset, GaussianMap())
@@ -79,7 +83,8 @@ class MapBuilder:
             print(progress.n_read, progress.n_components)
 
     A scan that cannot be read (`DataError`) or has no beam is skipped and counted. The map is a
-    function of the scans alone: stops, checkpoints and progress do not change it.
+    function of the scans alone: stops, checkpoints and progress do not change it. A `TiledMap` continues
+    from its own files: scans that are in them are read again, but not learned from.
 
     Attributes:
         map: the map.
@@ -91,7 +96,7 @@ class MapBuilder:
         windows: the windows of the map, and how `correct` has moved them.
     """
 
-    def __init__(self, dataset: Dataset, target: GaussianMap, device: str | torch.device = "cpu") -> None:
+    def __init__(self, dataset: Dataset, target: AnyMap, device: str | torch.device = "cpu") -> None:
         self.map = target
         self.record = BuildRecord()
         self.windows = WindowMotions()
@@ -142,7 +147,7 @@ class MapBuilder:
         self.record.seconds += time.monotonic() - begin
         self._add_row()
 
-    def correct(self, poses: Tensor, first: int) -> MotionAt | None:
+    def correct(self: MapBuilder[GaussianMap], poses: Tensor, first: int) -> MotionAt | None:
         """Moves the map, window by window, to corrected poses (N, D+1, D+1) of the scans of the data set from
         number `first` on, up to the last one in the map or further.
 
@@ -177,7 +182,8 @@ class MapBuilder:
         except DataError as error:
             reason = str(error)
         if scan is not None and scan.n_beams > 0:
-            self.map.insert(scan)
+            if not isinstance(self.map, TiledMap) or len(record.indices) >= self.map.n_scans:
+                self.map.insert(scan)
             self._note(index, scan)
             if self.map.n_pending == 0:
                 self.windows.end()
@@ -221,14 +227,17 @@ class MapBuilder:
     # -- checkpoints ----------------------------------------------------------------------------------
 
     def save(self, path: str | Path, run: Mapping[str, Any]) -> None:
-        """Writes everything that building continues from, atomically.
+        """Writes everything that building continues from, atomically; of a `TiledMap` only at the ends of
+        windows, what is not in its files.
 
         Args:
             path: the file.
             run: the settings of the run, in JSON types; `load` compares them.
         """
+        if isinstance(self.map, TiledMap) and self.map.n_pending:
+            return  # the last file agrees with the windows in the files
         state = {
-            "map": dict(self.map.state_dict()),
+            "map": {} if isinstance(self.map, TiledMap) else dict(self.map.state_dict()),
             "poses": self.poses,
             "record": vars(self.record),
             "windows": self.windows.state(),
@@ -255,8 +264,12 @@ class MapBuilder:
                 raise ValueError("its poses are no matrices")
             windows = WindowMotions.restored(state["windows"]) if "windows" in state else WindowMotions()
             windows.end()  # poses of later scans are corrected without those of the earlier run
-            self.map.load_state_dict(state["map"])
-            self.map.to(self._device)
+            if isinstance(self.map, TiledMap):
+                if len(record.indices) > self.map.n_scans:
+                    raise ValueError(f"{self.map.folder} has fewer scans")
+            else:
+                self.map.load_state_dict(state["map"])
+                self.map.to(self._device)
         except GmmTorchError:
             raise
         except DAMAGED_CONTENT as error:

@@ -92,6 +92,7 @@ class MapState(DeviceModule):
         self._final_rounded: tuple[Components, Components] | None = None  # final components, and rounded
         self._query: Query | None = None
         self._is_stale = False  # the query is of earlier components
+        self._is_asked = False  # there was a query since the last scan
 
     def __getattr__(self, name: str) -> Any:
         if name in TENSORS:

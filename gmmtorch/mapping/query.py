@@ -154,6 +154,12 @@ def _blocks(components: Components, cutoff: float) -> list[_Block]:
     return [_Block(part, cutoff) for part in components.split(ends) if len(part.seen_by)]
 
 
+def _joined(parts: Sequence[Components]) -> list[Components]:
+    """All components of some parts, together; none if there are none."""
+    found = [part for part in parts if len(part.seen_by)]
+    return [Components.concatenate(found)] if found else []
+
+
 class Query:
     """Answers queries about fixed components. Indices and Monte Carlo rays are made at the first query.
 
@@ -163,21 +169,29 @@ class Query:
     Args:
         components: of the map.
         options: how queries are answered.
-        recent: more components, such as those of an unfinished window, in parts of which some stay.
+        recent: more components, such as those of the parts of an unfinished window. They are one block.
     """
 
     def __init__(
         self, components: Components, options: QueryOptions, recent: Sequence[Components] = ()
     ) -> None:
-        self._set(components, options, recent)
+        self._set(components, options, recent, count_many(components.seen_count))
         self._blocks = _blocks(components, self.cutoff)
-        self._recent = [_Block(part, self.cutoff) for part in recent if len(part.seen_by)]
+        self._recent = [_Block(part, self.cutoff) for part in _joined(recent)]
 
-    def _set(self, components: Components, options: QueryOptions, recent: Sequence[Components]) -> None:
+    def _set(
+        self,
+        components: Components,
+        options: QueryOptions,
+        recent: Sequence[Components],
+        counts: tuple[int, int],
+    ) -> None:
+        """counts: `count_many` of the components."""
         self.components, self.options, self.dim = components, options, components.dim
         parts = [components, *recent]
         self.rule = rule_of(options, parts)
-        self.cutoff = options.cutoff or cutoff_of(*count_many(torch.cat([part.seen_count for part in parts])))
+        self._counts, more = counts, [count_many(part.seen_count) for part in recent]
+        self.cutoff = options.cutoff or cutoff_of(*map(sum, zip(counts, *more, strict=True)))
         self._lattices: dict[float, SparseEvidence] = {}
         self._bounds: tuple[Tensor, Tensor, Tensor] | None = None
 
@@ -186,14 +200,25 @@ class Query:
     ) -> Query:
         """The answers about other components; arguments as for `Query`. Blocks that did not change stay."""
         made = copy.copy(self)
-        made._set(components, options, recent)
+        is_other = components is not self.components
+        counts = count_many(components.seen_count) if is_other else self._counts
+        made._set(components, options, recent, counts)
         if made.cutoff != self.cutoff or components.dim != self.dim or not self._blocks:
             return Query(components, options, recent)
-        if components is not self.components:
+        if is_other:
             made._blocks = self._following(components)
-        known = {id(block.components): block for block in self._recent}
-        made._recent = [known.get(id(c)) or _Block(c, self.cutoff) for c in recent if len(c.seen_by)]
+        made._recent = [
+            self._recent[0].replaced(part) if self._recent else _Block(part, self.cutoff)
+            for part in _joined(recent)
+        ]
         return made
+
+    def prepare(self, former: Query) -> None:
+        """Makes what the first query at the resolutions that `former` was asked for would make."""
+        sides = {side for block in [*former._blocks, *former._recent] for side in block.forms}
+        for block in self._recent:
+            for side in sides:
+                block.form(side, 1 / max(1, len(self._blocks)))
 
     def _following(self, components: Components) -> list[_Block]:
         """The blocks of other components. Those before the first change stay as they are; of the others, each

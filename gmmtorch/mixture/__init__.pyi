@@ -18,6 +18,7 @@ from .em.loop import run_em as run_em
 from .em.partition import Cells as Cells
 from .em.partition import FlatnessRule as FlatnessRule
 from .em.partition import coarsest_allowed as coarsest_allowed
+from .em.partition import least_support as least_support
 from .em.partition import partition as partition
 from .em.partition import pool as pool
 from .em.partition import pool_into_cells as pool_into_cells

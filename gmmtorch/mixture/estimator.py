@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import time
 import warnings
@@ -150,6 +151,11 @@ class MixtureEstimator(MixtureDensity):
             raise InvalidParameterError(f"{name}={getattr(self, name)!r}: {error}") from None
         self._check_component_count(n_points)
 
+    @classmethod
+    @functools.cache
+    def _get_param_names(cls) -> list[str]:  # of scikit-learn, which reads the signature each time
+        return cast(list[str], super()._get_param_names())
+
     def _check_component_count(self, n_points: int | None) -> None:
         k = self.n_components
         if k is not None and not self._finds_n_components and n_points is not None and n_points < k:
@@ -250,7 +256,7 @@ class MixtureEstimator(MixtureDensity):
             )
 
     def _best_start(
-        self, run: Callable[[OnIteration | None], EMResult[State]], on_iteration: OnIteration | None
+        self, run: Callable[[OnIteration], EMResult[State]], on_iteration: OnIteration | None
     ) -> EMResult[State]:
         """The result with the largest bound of `n_init` starts, or of the one that continues the last fit.
 

@@ -12,6 +12,7 @@ from sklearn.utils._param_validation import Interval, StrOptions
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.kernels import is_small
 from gmmtorch.mixture.em import by_type, loop
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.distributed import SINGLE_PROCESS, Processes
@@ -129,7 +130,12 @@ class GaussianMixture(MixtureEstimator):
         points, weight, center = cloud
         rows = self._rows(points, weight)
         generator = as_generator(self.random_state)
-        best = self._best_start(lambda report: self._run(rows, center, generator, report), on_iteration)
+        fused = iter(self._small_runs(rows, center, generator))
+
+        def run(report: OnIteration) -> EMResult[Parameters]:
+            return self._run(rows, center, generator, report, next(fused, None))
+
+        best = self._best_start(run, on_iteration)
         seen = {"n_samples_seen": weight.sum()}
         self._store_fit(best.parameters, center, best.lower_bounds, best.converged, seen)
 
@@ -202,12 +208,36 @@ class GaussianMixture(MixtureEstimator):
         cells = pool_into_cells(points, self.max_cells, max(float(self.reg_covar), 1e-12) ** 0.5, weight)
         return Rows(cells.features, cells.weight, are_points=False)
 
+    def _small_runs(
+        self, rows: Rows, center: Tensor, generator: torch.Generator
+    ) -> list[EMResult[Parameters]]:
+        """What EM of a small table finds from each start, all in one launch; nothing for other tables."""
+        k, kind, (n, dim) = self.n_components, self.covariance_type, rows.values.shape
+        if k is None or not rows.are_points or self._truncates(n, k, dim):
+            return []
+        if not is_small(rows.values, rows.weight, k, kind):
+            return []
+        n_starts = 1 if self._continues() else self.n_init
+        starts = [self._start(rows, center, generator)[0] for _ in range(n_starts)]
+        limits = self.tol, self.max_iter, self._previous_bound()
+        return loop.run_small(rows.values, rows.weight, starts, kind, float(self.reg_covar), *limits)
+
     def _run(
-        self, rows: Rows, center: Tensor, generator: torch.Generator, on_iteration: OnIteration | None
+        self,
+        rows: Rows,
+        center: Tensor,
+        generator: torch.Generator,
+        on_iteration: OnIteration,
+        known: EMResult[Parameters] | None,
     ) -> EMResult[Parameters]:
-        """EM from one start."""
+        """EM from one start, or from what is known of it."""
         reg, dtype = float(self.reg_covar), em.SOFTMAX_DTYPES[self.dtype]
-        first, owner = self._start(rows, center, generator)
+        if known is None:
+            first, owner = self._start(rows, center, generator)
+        else:
+            first, owner = known.parameters, None
+            for iteration, bound in enumerate(known.lower_bounds, 1):
+                on_iteration(iteration, bound)
         if not self._truncates(rows.weight.shape[0], *first.means.shape):
             start = [first]
             del first  # which may be most of the memory
@@ -217,6 +247,7 @@ class GaussianMixture(MixtureEstimator):
                 tol=self.tol,
                 max_iter=self.max_iter,
                 on_iteration=on_iteration,
+                lower_bounds=known.lower_bounds if known else (),
                 previous_bound=self._previous_bound(),
             )
         owner = nearest(rows.points, first.means) if owner is None else owner

@@ -95,7 +95,7 @@ def test_a_map_is_shown_while_it_is_built(watched, monkeypatch, tmp_path):
 
 @pytest.mark.parametrize("kind", ["gmm_shared", "grid_shared"])
 def test_a_mission_is_shown_and_goes_on_as_without_a_view(kind, watched, in_room):
-    shown = succeeded(in_room("explore", f"team={kind}", "view_port=8430"))
+    shown = succeeded(in_room("explore", f"team={kind}", "port=8430"))
     assert "The map is at http://127.0.0.1:843" in shown.stdout
     (row,) = shown.results()["rows"]
     last = watched.moments[-1]
@@ -137,8 +137,8 @@ def test_a_robot_that_replays_a_log_shows_where_its_components_were_seen(watched
 
 
 def test_what_a_view_cannot_do_is_said_before_the_mission(watched, in_room, monkeypatch):
-    assert "view_port=70000 must be at most 65535" in refused(in_room("explore", "view_port=70000"))
-    assert "view_host=192.0.2.1 is not an address of this" in refused(in_room("robot", "view_host=192.0.2.1"))
+    assert "port=70000 must be at most 65535" in refused(in_room("explore", "port=70000"))
+    assert "host=192.0.2.1 is not an address of this" in refused(in_room("robot", "host=192.0.2.1"))
     monkeypatch.setitem(sys.modules, "viser", None)
     for command in ("explore", "robot", "team"):
         assert "pip install 'gmmtorch[viewer]'" in refused(in_room(command))

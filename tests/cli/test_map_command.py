@@ -12,10 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 from command_runs import QUIET, Disk, Finished, refused, run_here, succeeded
+from mapping.map_cases import assert_same_components
 
 from gmmtorch.datasets import load
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.map_builder import MapBuilder
+from gmmtorch.mapping.tiles.tiled_map import TiledMap
 from gmmtorch.report import Board
 
 Run = Callable[..., Finished]
@@ -81,6 +83,41 @@ def test_a_stopped_run_continues_to_the_same_map(run, whole, monkeypatch):
     assert inserted == list(range(10))
     for name in ("map.safetensors", "trajectory.tum"):
         assert (again.folder / name).read_bytes() == (whole.folder / name).read_bytes()
+
+
+def test_a_map_larger_than_its_memory_grows_in_tiles_and_continues(monkeypatch, tmp_path):
+    options = [*SMALL, *QUIET, "map.memory=1e5", "tile=5"]
+    whole = succeeded(run_here(monkeypatch, "map", tmp_path / "whole", *options))
+    insert = MapBuilder._insert
+
+    def stopped_after(self: MapBuilder, index: int) -> None:
+        insert(self, index)
+        if index == 6:  # one window of four scans is finished
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(MapBuilder, "_insert", stopped_after)
+    assert run_here(monkeypatch, "map", tmp_path / "run", *options).status != 0
+    assert TiledMap(tmp_path / "run" / "tiles").n_scans == 4
+    monkeypatch.setattr(MapBuilder, "_insert", insert)
+    other = run_here(monkeypatch, "map", tmp_path / "run", *options, "seed=5")
+    assert "is of another run: it has seed=0, this run has seed=5" in other.stderr
+    again = succeeded(run_here(monkeypatch, "map", tmp_path / "run", *options))
+    assert "checkpoint.safetensors" not in again.files()
+    one, other = (TiledMap(run.folder / "tiles") for run in (whole, again))
+    # The calibration goes on from that of the file, which has the coefficients without the predictions.
+    assert_same_components(one.open().components(), other.open().components())
+    assert one.n_scans == again.results()["rows"][0]["n_scans"] == 10
+    assert (again.folder / "trajectory.tum").read_bytes() == (whole.folder / "trajectory.tum").read_bytes()
+    third = run_here(monkeypatch, "map", tmp_path / "run", *options)
+    assert "has a map" in third.stderr
+
+
+def test_options_of_a_map_in_tiles_are_checked(run, monkeypatch, tmp_path):
+    assert "map.memory" in refused(run("map.memory=0"))
+    assert "with map.memory, use gmmtorch-view" in refused(run("map.memory=1e6", "view=true"))
+    assert "budget" in refused(run("map.memory=1e6", "map.max_bytes=1000"))
+    options = [*SMALL[:2], *QUIET, "map.memory=1e6"]
+    assert "map.memory" in refused(run_here(monkeypatch, "occupancy", tmp_path / "other", *options))
 
 
 def test_a_wrong_export_is_refused_before_any_work(run):

@@ -21,7 +21,7 @@ from gmmtorch.datasets import load
 from gmmtorch.errors import MissingDataError
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.tiles import TiledMap
+from gmmtorch.mapping.tiles.tiled_map import TiledMap
 from gmmtorch.occupancy.calibrator import Calibration
 
 Run = Callable[..., Finished]

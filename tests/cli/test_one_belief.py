@@ -17,7 +17,8 @@ from gmmtorch.datasets import load
 from gmmtorch.live import viewer_scene
 from gmmtorch.live.publishers import MapPublisher
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.tiles import TiledMap, tile_files
+from gmmtorch.mapping.tiles.tile_files import tile_files
+from gmmtorch.mapping.tiles.tiled_map import TiledMap
 from gmmtorch.occupancy.calibrator import Calibration
 from gmmtorch.occupancy.evidence import Thresholds
 from gmmtorch.occupancy.grid import VoxelGrid

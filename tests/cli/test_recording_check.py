@@ -205,3 +205,26 @@ def test_options_that_read_only_empty_scans_are_no_advice(check, tmp_path):
     assert done.status == 1
     assert "1. no points in 3 scans: the map would be empty" in words(done)
     assert "problem" not in words(done)
+
+
+def test_the_missing_metadata_of_a_lidar_are_named(check, tmp_path, monkeypatch):
+    pytest.importorskip("dpkt")
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "datasets"))
+    from packet_files import ouster_metadata, ouster_packet, write_capture
+
+    ranges = np.full((2, 16, 32), 5000)
+    packets = [
+        (frame / 10 + k / 80, ouster_packet("LEGACY", frame, 16 * k, ranges, 9, 10**8 * frame, 10**6))
+        for frame in range(4)
+        for k in range(8)
+    ]
+    path = write_capture(tmp_path / "a.pcap", packets, 7502)
+    done = check(path, "dataset=rosbag")
+    assert done.status == 1
+    assert "/192.168.1.201/7502 lidar_packets/Sweep 4 10 0.1 0 scans (lidar packets)" in words(done)
+    assert "give the file (.json) that was recorded with it, dataset.calibration=FILE" in words(done)
+    (tmp_path / "a.json").write_text(ouster_metadata("LEGACY", 32, 128))
+    assert "dataset.odometry=auto reads 4 scans" in words(check(path, "dataset=rosbag"))
+    done = check(path, "dataset=rosbag", "dataset.poses=standing")
+    assert done.status == 0
+    assert "4 would be read of /192.168.1.201/7502" in words(done)

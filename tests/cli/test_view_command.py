@@ -9,7 +9,7 @@ from gmmtorch.cli import inputs
 from gmmtorch.cli.view import overrides
 from gmmtorch.datasets import load
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.tiles import tile_files
+from gmmtorch.mapping.tiles.tile_files import tile_files
 
 pytest.importorskip("viser")
 

@@ -53,7 +53,7 @@ def test_paths_without_a_bag_are_refused(tmp_path):
     with pytest.raises(DataError, match=r"no metadata\.yaml and 0 bag files"):
         load("rosbag", tmp_path)
     (tmp_path / "a.txt").write_text("hello")
-    with pytest.raises(DataError, match="is not a ROS bag"):
+    with pytest.raises(DataError, match="is not a recording"):
         load("rosbag", tmp_path / "a.txt")
     (tmp_path / "a.mcap").write_bytes(b"hello" * 100)
     with pytest.raises(DataError, match="cannot be read as a ROS bag"):

@@ -115,9 +115,9 @@ def test_damaged_packets_are_counted(tmp_path):
 def test_a_message_without_packets_has_no_points():
     """The package alone would end the process."""
     pytest.importorskip("velodyne_decoder")
-    from gmmtorch.datasets.ros.sensor_messages import VelodynePackets
+    from gmmtorch.datasets.packets.lidar_packets import LidarPackets
 
-    assert len(VelodynePackets().points({"packets": []}).points) == 0
+    assert len(LidarPackets().points({"packets": []}).points) == 0
 
 
 def test_packets_without_a_definition_in_the_bag_are_read(tmp_path):

@@ -262,6 +262,16 @@ def test_a_moving_robot_sends_every_plan_and_the_first_at_rest() -> None:
 # -- what it sends ----------------------------------------------------------------------------------------
 
 
+def test_views_are_sent_every_ten_seconds_and_after_the_clock_was_set_back() -> None:
+    one, post = agent()
+    for second in (0.0, 2.0, 9.0, 10.0, 12.0, 3.0):
+        place = torch.tensor([[100.0 * second, 0.0, 0.0, 0.0]], dtype=torch.float64)
+        one.robot.library.add(place, torch.ones(1), second, 0.0)
+        one.send_views(second)
+    assert [now for now, _ in post.of("views")] == [0.0, 10.0, 3.0]
+    assert sum(len(decode(datagram).ids) for _, datagram in post.of("views")) == 6
+
+
 @pytest.mark.parametrize("kind", MAPS)
 def test_datagrams_are_sent_under_their_kind(kind: str) -> None:
     one, post = agent(2, kind, announce_every=1.0)

@@ -30,9 +30,12 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.learning.fitting import fit_window
+from gmmtorch.mapping.learning.merging import all_origins
 from gmmtorch.mapping.learning.novelty import beam_novelty, count_explained
 from gmmtorch.occupancy.voxels.cells import Box, intersection
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
+from gmmtorch.scan import Scan
 from gmmtorch.simulation.robot_camera import DepthFrame
 from gmmtorch.team.exploration.robot.gmm_mapper import FrameRule, GmmMapper
 from gmmtorch.team.exploration.robot.mapper import FrameUpdate, Memo
@@ -179,6 +182,23 @@ def test_sense_returns_the_evidence_it_adds(codec: str, flight: tuple, broadcast
     torch.testing.assert_close(found[1], misses, rtol=1e-5, atol=1e-4)
 
 
+def test_surfaces_are_as_exact_as_an_octree_of_the_side_and_coarser_ones_take_fewer_components() -> None:
+    ways = torch.randn(20_000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    sphere = Scan(2.0 * ways / ways.norm(dim=1, keepdim=True), torch.zeros(3, dtype=torch.float64))
+    sizes = []
+    for side in (0.05, 0.1, 0.2, 0.6):
+        rule = FrameRule(side=side, length=3.0, cell=0.05)
+        found = fit_window([sphere], rule.surface_fit(), all_origins())
+        thickness = torch.linalg.eigvalsh(found.covariances)[:, 0].sqrt()
+        assert float(thickness.quantile(0.9)) < side / 2 + 0.03  # and the noise of the sensor
+        cells = (sphere.points / side).floor()
+        off = (sphere.points - (cells + 0.5) * side).norm(dim=1)
+        assert float(off.square().mean().sqrt()) == pytest.approx(side / 2, rel=0.1)  # of an octree
+        sizes.append(len(found))
+    assert sizes == sorted(sizes, reverse=True)
+    assert sizes[0] > 2 * sizes[-1]
+
+
 # -- repeated frames -------------------------------------------------------------------------------
 
 
@@ -194,9 +214,9 @@ def test_frames_of_a_known_place_are_sent_as_counts() -> None:
     assert bool(first.novel.all())
     assert counts[0] == []
     for later, components in zip(again[2:], told[3:], strict=True):
-        assert float(later.novel.double().mean()) < 0.1
+        assert float(later.novel.double().mean()) < 0.12
         assert len(components) < 0.5 * len(told[0])
-        assert sum(components.values()) < 0.1 * sum(told[0].values())
+        assert sum(components.values()) < 0.12 * sum(told[0].values())
     assert any(counts)
 
 
@@ -288,6 +308,8 @@ def test_invalid_frame_rules_are_rejected() -> None:
         ({"cell": float("nan")}, "cell=nan"),
         ({"rays": 0.0}, "rays=0"),
         ({"shell": -1.0}, "shell=-1"),
+        ({"side": 0.0}, "side=0"),
+        ({"side": float("nan")}, "side=nan"),
         ({"components": 0}, "components=0"),
         ({"update_stride": 0}, "update_stride=0"),
         ({"update_at": 0.9}, "update_at=0.9"),

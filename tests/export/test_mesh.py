@@ -13,6 +13,7 @@ import torch
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
 from gmmtorch.export.mesh import TriangleMesh, surface_mesh, write_mesh
 from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.scan import display_colours
 
 
 def components_at(means, normals, spread, thickness, origin, flags=None):
@@ -137,6 +138,41 @@ def test_files_are_read_by_open3d(suffix, tmp_path):
     np.testing.assert_allclose(corners, mesh.vertices[mesh.faces].numpy(), atol=1e-6)
     normals = np.asarray(found.vertex_normals)[np.asarray(found.triangles)]
     np.testing.assert_allclose(normals, mesh.normals[mesh.faces].numpy(), atol=1e-4)
+
+
+def test_colours_of_a_ply_mesh_are_read_by_open3d(tmp_path):
+    open3d = pytest.importorskip("open3d")
+    mesh = surface_mesh(plane(), 0.1)
+    colours = torch.rand(len(mesh.vertices), 3, generator=torch.Generator().manual_seed(0)).double()
+    path = write_mesh(tmp_path / "a.ply", mesh, colours)
+    found = open3d.io.read_triangle_mesh(str(path))
+    np.testing.assert_allclose(np.asarray(found.vertex_colors), display_colours(colours), atol=0.51 / 255)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj"])
+def test_colours_of_vertices_are_read_by_trimesh(suffix, tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    mesh = surface_mesh(plane(), 0.1)
+    colours = torch.rand(len(mesh.vertices), 3, generator=torch.Generator().manual_seed(0)).double()
+    path = write_mesh(tmp_path / f"a{suffix}", mesh, colours)
+    found = trimesh.load(path, process=False)
+    shades = found.visual.vertex_colors[found.faces][:, :, :3]
+    expected = 255 * display_colours(colours)[mesh.faces].numpy()
+    np.testing.assert_allclose(shades, expected, atol=1.01)
+
+
+def test_colours_of_a_glb_are_linear(tmp_path):
+    mesh = surface_mesh(plane(), 0.1)
+    colours = torch.rand(len(mesh.vertices), 3, generator=torch.Generator().manual_seed(0)).double()
+    data = write_mesh(tmp_path / "a.glb", mesh, colours).read_bytes()
+    length = struct.unpack_from("<I", data, 12)[0]
+    content = json.loads(data[20 : 20 + length])
+    number = content["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]
+    view = content["bufferViews"][content["accessors"][number]["bufferView"]]
+    begin = 28 + length + view["byteOffset"]
+    found = np.frombuffer(data, "<f4", colours.numel(), begin).reshape(-1, 3)
+    np.testing.assert_allclose(found, colours.numpy(), atol=1e-6)
+    assert content["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"] == [1.0] * 4
 
 
 def test_glb_has_the_structure_of_gltf_and_the_mesh_far_from_the_origin(tmp_path):

@@ -80,3 +80,18 @@ def test_octomap_writer_rejects_other_suffixes_and_unaligned_cells(tmp_path):
     with pytest.raises(InvalidArgumentError, match=r"VoxelGrid\.covering"):
         write_octomap(tmp_path / "map.bt", CellCloud(cells.centers + 0.03, torch.ones(1), 0.1))
     assert not list(tmp_path.iterdir())
+
+
+def test_a_coloured_octree_has_the_colour_of_each_cell(tmp_path, generator):
+    shape = (5, 6, 7)
+    grid, theta = example_grid(shape), random_probabilities(shape)
+    cells = CellCloud.of_grid(grid, theta)
+    colours = torch.rand(len(cells), 3, generator=generator).double()
+    path = write_octomap(tmp_path / "map.ot", cells, colours=colours)
+    tree = pyoctomap.ColorOcTree(0.5).read(str(path))
+    assert tree.getTreeType() == "ColorOcTree"
+    expected = np.where(colours <= 0.0031308, 12.92 * colours, 1.055 * colours ** (1 / 2.4) - 0.055)
+    for center, theta_of, shade in zip(cells.centers.numpy(), cells.probability, expected, strict=True):
+        node = tree.search(center)
+        assert node.getOccupancy() == pytest.approx(float(theta_of.clamp(1e-6, 1 - 1e-6)), abs=2e-6)
+        np.testing.assert_allclose(node.getColor(), 255 * shade, atol=0.51)

@@ -57,6 +57,48 @@ def test_splats_come_back_in_the_frame_of_the_map(tmp_path, suffix):
         assert bool((error < 0.08 * c.covariances.flatten(1).norm(dim=1)).all())
 
 
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".glb"])
+def test_far_maps_are_written_with_a_warning(tmp_path, suffix):
+    splats = Splats.of(coloured())
+    far = splats._replace(means=splats.means + torch.tensor([5e5, 3e6, 0]).double())
+    with pytest.warns(UserWarning, match="rounded"):
+        path = write_splats(tmp_path / f"map{suffix}", far)
+    if suffix != ".glb":
+        torch.testing.assert_close(read_splats(path).means, far.means, rtol=0, atol=0.51)
+
+
+@pytest.mark.slow
+def test_a_million_splats_become_a_map(tmp_path):
+    n, generator = 1_000_000, torch.Generator().manual_seed(0)
+    places = 100 * torch.rand(n, 3, generator=generator).double()
+    turn = torch.eye(3).double().expand(n, 3, 3)
+    splats = Splats(places, torch.full_like(places, 0.05), turn, places / 100, torch.full((n,), 0.9).double())
+    found = read_splats(write_splats(tmp_path / "many.spz", splats))
+    assert len(found.means) == n
+    made = map_of_splats(found)
+    assert len(made.components()) == n
+    torch.testing.assert_close(made.components().means, places, rtol=0, atol=2**-13)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".glb"])
+def test_other_readers_find_the_places_and_colours(tmp_path, suffix):
+    c = coloured()
+    path, seen = write_splats(tmp_path / f"map{suffix}", Splats.of(c)), c.means.numpy()
+    shades = display_colours(c.attributes.channels["colour"].mean).numpy()
+    if suffix == ".glb":
+        trimesh = pytest.importorskip("trimesh")
+        (cloud,) = trimesh.load(path).geometry.values()
+        np.testing.assert_allclose(cloud.vertices, seen[:, [0, 2, 1]] * [1, 1, -1], atol=1e-5)
+        return
+    open3d = pytest.importorskip("open3d")
+    cloud = open3d.t.io.read_point_cloud(str(path)).point
+    y_up = seen if suffix == ".ply" else seen[:, [0, 2, 1]] * [1, 1, -1]
+    np.testing.assert_allclose(cloud.positions.numpy(), y_up, atol=2**-13)
+    atol = 1e-5 if suffix == ".ply" else 0.5 / 255 / 0.15 * C0 + 1e-5
+    np.testing.assert_allclose(0.5 + C0 * cloud.f_dc.numpy(), shades, atol=atol)
+    np.testing.assert_allclose(cloud.opacity.numpy()[:, 0], np.log(0.95 / 0.05), atol=0.03)
+
+
 def test_a_map_without_surfaces_is_written_where_the_format_allows_it(tmp_path):
     nothing = Splats.of(Components.empty(3))
     for suffix in (".ply", ".spz"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from gmmtorch.live.live_scans import LiveOptions, LiveScans, find_sensor, open_s
 from gmmtorch.live.publishers import Diagnostics, MapPublisher
 from gmmtorch.live.ros import Node, Quality
 from gmmtorch.live.ros.topics import LATCHED
+from gmmtorch.mapping import Attributes, Numbers
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.map_builder import MapBuilder
 from gmmtorch.team.sharing import Replica
@@ -102,6 +104,24 @@ class Recorder:
 
     def take(self, topic: str) -> list[Any]:
         return [message for name, message in self.sent if name == topic]
+
+
+@pytest.mark.parametrize("shown", ["cells", "means"])
+def test_a_cloud_of_a_coloured_map_has_packed_colours(shown):
+    user: Any = Recorder()
+    found = pillar(3.0).components()
+    shade = torch.tensor([1.0, 0.0, 0.21404114]).double()  # linear: sRGB 255, 0, 127.5
+    none = torch.zeros(len(found), 3, 3).double()
+    share = torch.ones(len(found)).double()
+    known = Numbers(share, shade.expand(len(found), 3).contiguous(), none[:, :, : found.dim], none)
+    made = GaussianMap.of(replace(found, attributes=Attributes({"colour": known})))
+    MapPublisher(user, 0.2, cloud=shown).publish(made, "map", 5)
+    (cloud,) = user.take("cloud")
+    names = [field["name"] for field in cloud["fields"]]
+    assert names == ["x", "y", "z", "rgb"]
+    rows = np.frombuffer(np.asarray(cloud["data"], np.uint8).tobytes(), "<u4").reshape(-1, 4)
+    assert len(rows) > 0
+    assert set(rows[:, 3].tolist()) <= {0xFF007F, 0xFF0080}
 
 
 def test_the_grid_has_the_layout_of_ros_and_updates_where_it_changed():
@@ -245,6 +265,19 @@ def test_stamps_of_another_clock_are_said_and_do_not_count_as_latency():
     assert all("node.use_sim_time=true" in text and "sensor.clock=received" in text for text in warnings)
     assert "3600 s away" in warnings[1]
     assert diagnostics.numbers(4, 0)["latency_median"] == pytest.approx(0.6)
+
+
+def test_scans_that_wait_are_said_before_any_is_dropped():
+    user: Any = Recorder()
+    sensor, options = Sensor(Topic("/scan", LASER_TYPE, 0), LASER), LiveOptions(max_latency=None)
+    scans = LiveScans(sensor, TransformTree(), Ranges(), options)
+    diagnostics = Diagnostics(user, scans)
+    diagnostics.publish(0, 0, 0)
+    assert user.take("warning") == []
+    for number in range(30):
+        scans.receive(laser(float(number)), 0)
+    diagnostics.publish(0, 0, 0)
+    assert user.take("warning") == ["30 scans wait: gmmtorch mapping is slower than the sensor."]
 
 
 def test_a_rate_of_zero_is_refused(node, tmp_path):

@@ -92,12 +92,49 @@ def test_colours_follow_the_order_of_their_quantity(by, maps):
         "height": solid.means[:, 2],
         "support": components.support[solid.rows],
         "age": components.ids[solid.rows, 1],
-        "uncertainty": torch.linalg.eigvalsh(solid.covariances)[:, 0],
+        "uncertainty": viewer_scene.uncertainty(solid),
     }[by]
     low, high = int(quantity.argmin()), int(quantity.argmax())
     assert colours[high, 1] > colours[low, 1] + 100  # viridis: from violet to yellow, with rising green
     with pytest.raises(InvalidArgumentError, match="colour"):
         viewer_scene.colours(components, solid, "taste")
+
+
+def test_the_least_certain_components_are_hidden(maps):
+    components = maps[3][0].components()
+    solid = viewer_scene.surfaces(components)
+    for row, unsure in enumerate(viewer_scene.uncertainty(solid)[:20].tolist()):
+        deviations = np.sqrt(np.linalg.svd(solid.covariances[row].numpy(), compute_uv=False))
+        area = 2 * math.pi * deviations[0] * deviations[1]
+        spacing = math.sqrt(area / float(components.support[solid.rows[row]]))
+        assert unsure == pytest.approx(max(deviations[2], spacing), rel=1e-6)
+    kept = viewer_scene.surfaces(components, hidden=0.3)
+    assert len(kept.rows) == math.ceil(0.7 * len(solid.rows))
+    left = ~torch.isin(solid.rows, kept.rows)
+    assert viewer_scene.uncertainty(kept).max() <= viewer_scene.uncertainty(solid)[left].min()
+    assert torch.equal(kept.rows, kept.rows.sort().values)
+    share = viewer_scene.first_hidden(solid, 0.02) / 100
+    shown = viewer_scene.surfaces(components, hidden=share)
+    assert 0 < share < 1
+    assert float(viewer_scene.uncertainty(shown).max()) <= 0.06
+    assert viewer_scene.first_hidden(solid, 100.0) == 0
+
+
+def test_slopes_are_the_change_of_the_colour_in_a_deviation(maps):
+    components = maps[3][0].components()
+    solid, k = viewer_scene.surfaces(components), len(components)
+    slope = 0.02 * torch.randn(k, 3, 3, generator=torch.Generator().manual_seed(1)).double()
+    none, middle = torch.zeros(k, 3, 3).double(), torch.full((k, 3), 0.5).double()
+    known = Attributes({"colour": Numbers(torch.ones(k).double(), middle, slope, none)})
+    found = viewer_scene.colours(replace(components, attributes=known), solid, "colour").slopes
+    deviations, axes = np.linalg.eigh(solid.covariances.numpy())
+    step = np.sqrt(deviations.clip(0))[:, None, :] * axes
+    for row in range(0, len(solid.rows), 7):
+        for axis in range(3):
+            change = slope[solid.rows[row]].numpy() @ step[row, :, axis]
+            ends = [display_colours(torch.from_numpy(0.5 + sign * change)).numpy() for sign in (1, -1)]
+            expected = np.abs(ends[0] - ends[1]) / 2  # the direction of an axis is free
+            np.testing.assert_allclose(np.abs(found[row, axis]), expected, atol=1e-9)
 
 
 def test_channels_of_the_map_colour_its_components(maps):
@@ -183,14 +220,21 @@ def test_a_place_has_the_evidence_from_which_its_occupancy_follows(dim, maps):
 
 
 def test_controls_change_the_scene_and_a_click_says_what_the_map_knows(viewer, maps):
-    assert {"components", "paths/0", "slice"} <= viewer._nodes.keys()
-    viewer._height.value = 0.8
+    assert {"components", "paths/0"} == viewer._nodes.keys()
+    viewer._shape.value = "ellipsoids"
+    viewer._redraw(viewer._draw_components)
+    viewer._visible.value, viewer._height.value = True, 0.8
     viewer._redraw(viewer._draw_slice)
     assert viewer._nodes["slice"].position[2] == pytest.approx(0.8)
     n_all = len(viewer._nodes["components"].batched_positions)
     viewer._cut.value = 1.0
     viewer._redraw(viewer._draw_components)
-    assert 0 < len(viewer._nodes["components"].batched_positions) < n_all
+    n_below = len(viewer._nodes["components"].batched_positions)
+    assert 0 < n_below < n_all
+    viewer._unsure.value = 50
+    viewer._redraw(viewer._draw_components)
+    assert 0 < len(viewer._nodes["components"].batched_positions) < n_below
+    assert "linear-gradient" in viewer._legend.content
     viewer._show_place((2.0, 2.0, 0.81), (0.0, 0.0, -1.0))
     theta = maps[3][0].occupancy(np.array([[2.0, 2.0, 0.8]]), 0.1)[0]
     assert "at (2.00, 2.00, 0.80) m" in viewer._place.content
@@ -200,7 +244,7 @@ def test_controls_change_the_scene_and_a_click_says_what_the_map_knows(viewer, m
     assert "slice" not in viewer._nodes
 
 
-@pytest.mark.parametrize("shape", ["splats", "surfaces", "none"])
+@pytest.mark.parametrize("shape", ["ellipsoids", "splats", "surfaces", "none"])
 def test_other_shapes(shape, viewer):
     viewer._shape.value = shape
     viewer._redraw(viewer._draw_components)

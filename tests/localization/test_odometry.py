@@ -337,7 +337,7 @@ def test_the_motion_of_the_data_set_predicts_the_poses(monkeypatch):
     monkeypatch.setattr(
         Odometry,
         "add",
-        lambda self, points, stamp, motion: (motions.append(motion), add(self, points, stamp, motion)),
+        lambda self, points, stamp, motion, _: (motions.append(motion), add(self, points, stamp, motion)),
     )
     with_odometry(few, motion="dataset")
     assert motions[0] is None

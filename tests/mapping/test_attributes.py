@@ -25,7 +25,8 @@ from gmmtorch.mapping.codec.bitstream import BitWriter
 from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.merging import compact, merged
-from gmmtorch.mapping.tiles import TiledMap, tile_files
+from gmmtorch.mapping.tiles.tile_files import tile_files
+from gmmtorch.mapping.tiles.tiled_map import TiledMap
 from gmmtorch.mixture import Cells, merge_components, quadratic_features
 from gmmtorch.scan import Scan, display_colours, linear_colours
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -13,11 +17,12 @@ from mapping.test_tiles import SETTINGS, SIDE, contents, moved, recording, writt
 
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError, OutputError
 from gmmtorch.files import pack_tensors, read_tensors
-from gmmtorch.mapping import tiles
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.tile_index import INDEX
-from gmmtorch.mapping.tiles import TiledMap, merge, tile_files
+from gmmtorch.mapping.tiles import tiled_map
+from gmmtorch.mapping.tiles.tile_files import tile_files
+from gmmtorch.mapping.tiles.tile_index import INDEX
+from gmmtorch.mapping.tiles.tiled_map import TiledMap, merge
 from gmmtorch.scan import Scan
 
 RULE = replace(FINE, window=3, mean_origins=None)
@@ -47,7 +52,7 @@ def grown(folder: Path, scans: list[Scan], **options: object) -> TiledMap:
 @pytest.mark.parametrize("codec", ["quantized", "float"])
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_map_that_grows_in_tiles_answers_as_one_in_memory(dim, codec, tmp_path, monkeypatch):
-    monkeypatch.setattr(tiles, "_RECENT", 40)
+    monkeypatch.setattr(tiled_map, "_RECENT", 40)
     scans = street(14, dim)
     built, tiled, asked = GaussianMap(RULE, codec=codec), None, around(scans)
     tiled = TiledMap.create(tmp_path / "map", GaussianMap(RULE, codec=codec), dim, SIDE, memory=100_000)
@@ -79,8 +84,8 @@ def test_a_map_that_grows_in_tiles_answers_as_one_in_memory(dim, codec, tmp_path
 
 
 def test_a_map_that_is_stopped_at_any_write_opens_with_all_finished_windows(tmp_path, monkeypatch):
-    monkeypatch.setattr(tiles, "_RECENT", 40)
-    scans, write = street(15, 2), tiles.write_bytes
+    monkeypatch.setattr(tiled_map, "_RECENT", 40)
+    scans, write = street(15, 2), tiled_map.write_bytes
     asked = around(scans)
     for stop in range(1, 40):
         folder, n_written = tmp_path / str(stop), 0
@@ -92,7 +97,7 @@ def test_a_map_that_is_stopped_at_any_write_opens_with_all_finished_windows(tmp_
                 raise OutputError(f"{path} cannot be written: No space left on device")
             write(path, data)
 
-        monkeypatch.setattr(tiles, "write_bytes", full)
+        monkeypatch.setattr(tiled_map, "write_bytes", full)
         if stop == 1:
             with pytest.raises(OutputError):
                 grown(folder, scans)
@@ -107,7 +112,7 @@ def test_a_map_that_is_stopped_at_any_write_opens_with_all_finished_windows(tmp_
                 n_final = made.n_components
                 made.insert(scan)
         except OutputError:
-            monkeypatch.setattr(tiles, "write_bytes", write)
+            monkeypatch.setattr(tiled_map, "write_bytes", write)
             opened = TiledMap(folder)
             assert opened.n_components == n_final
             assert torch.equal(opened.occupancy(asked), before)
@@ -126,7 +131,7 @@ def test_a_map_that_is_stopped_at_any_write_opens_with_all_finished_windows(tmp_
 
 
 def test_a_damaged_tile_is_named_and_the_rest_answers(tmp_path, monkeypatch):
-    monkeypatch.setattr(tiles, "_RECENT", 10)
+    monkeypatch.setattr(tiled_map, "_RECENT", 10)
     scans = street(30, 2)
     folder = grown(tmp_path / "map", scans).folder
     expected = TiledMap(folder).occupancy(around(scans[-3:])[:-2])
@@ -170,7 +175,7 @@ def test_maps_that_cannot_grow_in_tiles_say_why(tmp_path):
 
 @pytest.mark.parametrize("n_recent", [40, 10_000])
 def test_merged_maps_that_grow_have_all_their_components(n_recent, tmp_path, monkeypatch):
-    monkeypatch.setattr(tiles, "_RECENT", n_recent)
+    monkeypatch.setattr(tiled_map, "_RECENT", n_recent)
     scans = street(8, 2)
     one, two = grown(tmp_path / "1", scans[:4]), grown(tmp_path / "2", scans[4:])
     parts = [one.open().components(), two.open().components()]
@@ -197,7 +202,7 @@ def test_a_merge_replaces_a_map_that_grows(tmp_path):
 
 
 def test_the_next_write_removes_what_an_interrupted_one_left(tmp_path, monkeypatch):
-    monkeypatch.setattr(tiles, "_RECENT", 40)
+    monkeypatch.setattr(tiled_map, "_RECENT", 40)
     scans = street(9, 2)
     made = grown(tmp_path / "map", scans[:6])
     others = ["notes.safetensors", "tile_map.safetensors", "recent.txt", "index_old.safetensors"]
@@ -209,17 +214,18 @@ def test_the_next_write_removes_what_an_interrupted_one_left(tmp_path, monkeypat
     assert {*ended} <= {*contents(made.folder)}  # reading does not change files
     for scan in scans[6:]:
         made.insert(scan)
-    known = {INDEX, tiles._recent_name(made._crc32), *map(made._name, range(len(made.index)))}
+    known = {INDEX, tiled_map._recent_name(made._crc32), *map(made._name, range(len(made.index)))}
     assert {*contents(made.folder)} == known | {*others}
 
 
 def test_a_second_process_cannot_overwrite_a_map(tmp_path, monkeypatch):
-    monkeypatch.setattr(tiles, "_RECENT", 40)
+    monkeypatch.setattr(tiled_map, "_RECENT", 40)
     scans = street(9, 2)
     one = grown(tmp_path / "map", scans[:3])
     two = TiledMap(one.folder)
     for scan in scans[3:6]:
         one.insert(scan)
+    one.finish()
     before = contents(one.folder)
     with pytest.raises(OutputError, match="Open it again"):
         two.add(recording(2, 0))
@@ -227,6 +233,67 @@ def test_a_second_process_cannot_overwrite_a_map(tmp_path, monkeypatch):
     for scan in scans[6:]:
         one.insert(scan)
     assert TiledMap(one.folder).n_components == one.n_components
+
+
+def test_a_second_writer_is_refused_until_the_first_ends(tmp_path):
+    scans = street(9, 2)
+    one = TiledMap.create(tmp_path / "map", GaussianMap(RULE), 2, SIDE)
+    one.insert(scans[0])
+    two = TiledMap(one.folder)
+    for write in (partial(two.insert, scans[1]), partial(two.add, recording(2, 0)), two.finish):
+        with pytest.raises(OutputError, match="is being written"):
+            write()
+    with pytest.raises(OutputError, match="is being written"):
+        merge(one.folder, [written(tmp_path / "part", recording(2, 0))])
+    one.finish()
+    with pytest.raises(OutputError, match="Open it again"):
+        two.add(recording(2, 0))
+    two = write = None  # the lock is free
+    three = TiledMap(one.folder)
+    three.insert(scans[2])
+    with pytest.raises(OutputError, match="is being written"):
+        one.insert(scans[3])
+    del three  # its scan is lost, and its lock is free
+    one.insert(scans[3])
+    one.finish()
+    assert TiledMap(one.folder).n_scans == 2
+
+
+_WRITER = """
+import sys
+from mapping.test_growing_tiles import RULE, SIDE, GaussianMap, TiledMap, street
+made = TiledMap.create(sys.argv[1], GaussianMap(RULE), 2, SIDE)
+for scan in street(5, 2):
+    made.insert(scan)
+print("waits", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_a_killed_writer_leaves_its_finished_windows_and_no_lock(tmp_path):
+    paths = [str(Path(__file__).parents[1]), *sys.path]
+    command = [sys.executable, "-c", _WRITER, str(tmp_path / "map")]
+    process = subprocess.Popen(
+        command,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "waits\n"
+    opened = TiledMap(tmp_path / "map")
+    assert opened.n_scans == 3
+    with pytest.raises(OutputError, match="is being written"):
+        opened.insert(street(5, 2)[3])
+    process.kill()
+    process.communicate()
+    for scan in street(5, 2)[3:]:
+        opened.insert(scan)
+    opened.finish()
+    whole = grown(tmp_path / "whole", street(5, 2))
+    whole.finish()
+    assert contents(opened.folder) == contents(whole.folder)
 
 
 def test_tiles_are_not_too_small_for_their_numbers(tmp_path):
@@ -238,7 +305,7 @@ def test_tiles_are_not_too_small_for_their_numbers(tmp_path):
 
 @pytest.mark.parametrize("n_recent", [20, 10_000])
 def test_a_map_of_added_components_answers_the_same_once_reopened(n_recent, tmp_path, monkeypatch):
-    monkeypatch.setattr(tiles, "_RECENT", n_recent)
+    monkeypatch.setattr(tiled_map, "_RECENT", n_recent)
     parts = [random_components(2, 60, 3, center=3.0, extent=extent) for extent in (10.0, 60.0, 90.0)]
     made = TiledMap.create(tmp_path / "1", GaussianMap(), 2, SIDE)
     other = TiledMap.create(tmp_path / "2", GaussianMap(), 2, SIDE)
@@ -249,11 +316,24 @@ def test_a_map_of_added_components_answers_the_same_once_reopened(n_recent, tmp_
     assert made._rule == TiledMap(other.folder)._rule
 
 
+def test_monte_carlo_draws_the_share_of_each_tile_as_the_map_grows(tmp_path, monkeypatch):
+    monkeypatch.setattr(tiled_map, "_RECENT", 10)
+    scans = street(12, 2)
+    made = TiledMap.create(tmp_path / "map", GaussianMap(RULE, cutoff=4.0), 2, SIDE)
+    for scan in scans:
+        made.insert(scan)
+        made.occupancy(around(scans[:3])[::9], 0.3, "monte_carlo")
+    made.finish()
+    asked = around(scans)[::9]
+    expected = TiledMap(made.folder).occupancy(asked, 0.3, "monte_carlo")
+    assert torch.equal(made.occupancy(asked, 0.3, "monte_carlo"), expected)
+
+
 def test_the_first_unfinished_window_decides_the_cutoff(tmp_path):
     sparse = street(1, 2)[0]
     scan = Scan(sparse.points.repeat(100, 1), sparse.origin)  # components with many points
     built, made = GaussianMap(RULE), TiledMap.create(tmp_path / "map", GaussianMap(RULE), 2, SIDE)
-    opened = TiledMap(made.folder)
+    opened = TiledMap(TiledMap.create(tmp_path / "opened", GaussianMap(RULE), 2, SIDE).folder)
     for one in (built, made, opened):
         one.insert(scan)
     expected = built.occupancy(around([scan]))

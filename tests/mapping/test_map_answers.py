@@ -302,6 +302,21 @@ def test_a_large_unfinished_window_answers_from_its_parts_until_it_is_learned(di
 
 
 @dims
+def test_a_map_that_is_asked_between_scans_learns_when_they_are_inserted(dim, monkeypatch):
+    monkeypatch.setattr(map_state, "_PART", 1)
+    asked, other = GaussianMap(replace(FINE, window=4)), GaussianMap(replace(FINE, window=4))
+    points = lattice(dim)
+    for number, scan in enumerate(corridor(11, dim)):
+        asked.insert(scan)
+        other.insert(scan)
+        assert asked._is_stale == (number in (0, 7))  # nobody asked between the scan before and this one
+        if number != 6:
+            asked.occupancy(points)
+    found, expected = asked.occupancy(points), other.occupancy(points)
+    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
+
+
+@dims
 @pytest.mark.parametrize("block", [8192, 5])
 def test_components_that_are_replaced_give_no_evidence(dim, block, monkeypatch):
     for module in (point_form, cone_index):

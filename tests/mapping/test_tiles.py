@@ -19,8 +19,9 @@ from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.query_options import QueryOptions
-from gmmtorch.mapping.tile_index import INDEX
-from gmmtorch.mapping.tiles import TiledMap, canonical, merge, tile_files
+from gmmtorch.mapping.tiles.tile_files import canonical, tile_files
+from gmmtorch.mapping.tiles.tile_index import INDEX
+from gmmtorch.mapping.tiles.tiled_map import TiledMap, merge
 from gmmtorch.occupancy.calibrator import Calibration
 
 SIDE = 10.0
@@ -54,7 +55,7 @@ def moved(components: Components, x: float) -> Components:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.name != ".lock"}
 
 
 # -- answers -------------------------------------------------------------------------------------------

@@ -388,3 +388,21 @@ def test_unknown_parameters_in_a_file_are_ignored(tmp_path):
     tensors, facts = valid_parts()
     facts["parameters"] = {"n_components": 3, "unheard_of": 1, "tol": 0.5}
     assert GaussianMixture.load(write_parts(tmp_path, tensors, facts)).tol == 0.5
+
+
+def test_tables_that_are_not_validated_at_length_are_checked_all_the_same():
+    x = np.random.default_rng(0).normal(size=(40, 3))
+    mixture = GaussianMixture(2, random_state=0).fit(x)
+    expected = mixture.score_samples(x)
+    for same in (x.tolist(), np.asfortranarray(x), x.astype(">f8"), np.repeat(x, 2, 1)[:, ::2]):
+        np.testing.assert_allclose(mixture.score_samples(same), expected)
+    for bad in (np.nan, np.inf):
+        broken = x.copy()
+        broken[3, 1] = bad
+        for method in (mixture.score, GaussianMixture(2).fit):
+            with pytest.raises(ValueError, match=r"NaN|infinity"):
+                method(broken)
+    with pytest.raises(ValueError, match="expecting 3 features"):
+        mixture.score(x[:, :2].copy())
+    large = GaussianMixture(1).fit(np.full((4, 1), 1e308))  # whose sum is not finite
+    assert np.isfinite(large.means_).all()

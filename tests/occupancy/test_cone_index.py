@@ -261,7 +261,8 @@ def test_places_that_are_asked_again_get_shorter_lists_and_the_same_answers(monk
 
 @pytest.mark.parametrize("case", ["clusters", "hundred metres", "needles", "one component", "one place"])
 def test_strange_cones_give_the_evidence_of_all(case, monkeypatch):
-    monkeypatch.setattr(point_form, "_FEW_PAIRS", 0)
+    for module in (point_form, cone_index):
+        monkeypatch.setattr(module, "_FEW_PAIRS", 0)
     cones = random_cones(3, 40, 7, room=True)
     if case == "clusters":
         far = (torch.arange(40) % 2 * 1e6)[:, None].double()

@@ -141,19 +141,25 @@ def write_space(config: DictConfig, source: Source, on_event: Event) -> str:
         mesh = surface_mesh(source.components(), side, memory_limit=config.runtime.memory_limit)
         if space.is_limited:
             mesh = mesh.inside(*space.box())
-        write_mesh(output, mesh)
+        write_mesh(output, mesh, _colours(source, mesh.vertices))
         return f"{_size(output)}: {len(mesh.faces):,} triangles, cells of {side:g} m"
     cells = space.cloud(on_event)
     if config.format == "octomap":
-        write_octomap(output, cells, rule)
+        colours = _colours(source, cells.centers) if output.suffix == ".ot" else None
+        write_octomap(output, cells, rule, colours)
     else:
         cells = cells.above(rule.occupied)
         if config.format == "ply":
-            found = source.attributes(cells.centers) if isinstance(source, GaussianMap) else {}
-            write_ply(output, cells, found[COLOUR].mean if COLOUR in found else None)
+            write_ply(output, cells, _colours(source, cells.centers))
         else:
             write_pcd(output, cells)
     return f"{_size(output)}: {len(cells):,} cells of {cells.resolution:g} m"
+
+
+def _colours(source: Source, points: Tensor) -> Tensor | None:
+    """Linear RGB (M, 3) at points (M, D) of a map with colours; None without."""
+    found = source.attributes(points) if isinstance(source, GaussianMap) else {}
+    return found[COLOUR].mean if COLOUR in found else None
 
 
 class _Space:

@@ -16,9 +16,15 @@ from gmmtorch import localization, report  # whose parts load when they are used
 from gmmtorch.cli import common, schema
 from gmmtorch.cli.export import ExportOptions
 from gmmtorch.datasets import Dataset, Reposed, read_trajectory
-from gmmtorch.errors import GmmTorchError, InvalidArgumentError, MissingDataError, check_number
+from gmmtorch.errors import (
+    GmmTorchError,
+    InvalidArgumentError,
+    MemoryLimitError,
+    MissingDataError,
+    check_number,
+)
 from gmmtorch.export import write_pose_table, write_tum
-from gmmtorch.mapping import Components, GaussianMap, MapBuilder
+from gmmtorch.mapping import Components, GaussianMap, MapBuilder, TiledMap
 from gmmtorch.occupancy import reliability_of, scores_of
 from gmmtorch.optional_packages import load_pyoctomap
 from gmmtorch.pose import Pose
@@ -60,6 +66,11 @@ def run_facts(config: DictConfig, source: str) -> dict[str, Any]:
     }
 
 
+def checkpoint_of(folder: Path) -> Path:
+    """The file of a `Checkpoint` in a run directory."""
+    return folder / "checkpoint.safetensors"
+
+
 class Checkpoint:
     """The file in a run directory from which a run that was stopped or killed goes on.
 
@@ -74,16 +85,18 @@ class Checkpoint:
     """
 
     def __init__(
-        self, config: DictConfig, builder: MapBuilder, source: str, clock: Callable[[], float]
+        self, config: DictConfig, builder: MapBuilder[Any], source: str, clock: Callable[[], float]
     ) -> None:
         check_number("checkpoint_seconds", config.checkpoint_seconds)
         self._builder, self._clock, self._period = builder, clock, config.checkpoint_seconds
         self._facts = run_facts(config, source)
-        self._path = common.run_dir() / "checkpoint.safetensors"
+        self._path = checkpoint_of(common.run_dir())
         self.is_continued = self._path.exists()
         if self.is_continued:
             builder.load(self._path, self._facts)
             print(f"continues after scan {builder.record.n_read} of {self._path}", flush=True)
+        elif isinstance(builder.map, TiledMap):
+            self.save()  # says of which run the map is
         self._saved = clock()
 
     def save_when_due(self) -> None:
@@ -106,7 +119,7 @@ RECORDINGS = "recordings"
 """Folder of a run with `inputs`: one folder for each recording."""
 
 
-def write_trajectory(builder: MapBuilder, folder: Path) -> Tensor:
+def write_trajectory(builder: MapBuilder[Any], folder: Path) -> Tensor:
     """Write the trajectory as TUM; returns the sensor positions (S, D)."""
     write_tum(folder / TRAJECTORY, builder.times, builder.poses)
     return builder.poses[:, :-1, -1]
@@ -155,9 +168,14 @@ def print_skipped(skipped: Mapping[str, int]) -> None:
 
 
 def write_exports(
-    config: DictConfig, source: GaussianMap, folder: Path, on_event: Event
-) -> tuple[list[str], list[str]]:
-    """Write the exports that the options name; returns messages, and the errors of those that failed."""
+    config: DictConfig, built: GaussianMap | TiledMap, folder: Path, on_event: Event
+) -> tuple[GaussianMap | None, list[str], list[str]]:
+    """Write the exports that the options name; returns the map that pictures show, messages, and the errors
+    of the exports that failed. A tiled map that does not fit into `runtime.memory_limit` has neither."""
+    try:
+        source = built.open() if isinstance(built, TiledMap) else built
+    except MemoryLimitError as error:
+        return None, [f"pictures  none: {error!s}"], [str(error)] if config.export else []
     messages, errors = [], []
     for name in config.export:
         from gmmtorch.cli.reporting import exported_files
@@ -178,7 +196,7 @@ def write_exports(
             errors.append(f"{name}: {error}")
             continue
         messages.append("export    " + written.replace("\n", "\n          "))
-    return messages, errors
+    return source, messages, errors
 
 
 def check_exported(config: DictConfig, errors: Sequence[str]) -> None:
@@ -187,7 +205,7 @@ def check_exported(config: DictConfig, errors: Sequence[str]) -> None:
         raise GmmTorchError(f"not all of export={list(config.export)} was written: {' '.join(errors)}")
 
 
-def result_row(name: str, builder: MapBuilder, config: DictConfig, odometry: Row | None = None) -> Row:
+def result_row(name: str, builder: MapBuilder[Any], config: DictConfig, odometry: Row | None = None) -> Row:
     """The row of results.json of a recording. odometry: facts of the estimated trajectory."""
     now, record, built = builder.progress(), builder.record, builder.map
     nbytes, seconds = built.nbytes, max(now.seconds, 1e-9)

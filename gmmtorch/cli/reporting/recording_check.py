@@ -294,7 +294,7 @@ def _trials(options: DictConfig, facts: BagFacts, n_found: int) -> list[str]:
         {"max_gap": 10.0},
         {"poses": "standing"},
     ]
-    advice, n_trials = [], 0
+    advice, n_trials, fault = [], 0, ""
     for chosen in topics:
         for change in changes:
             tried = {**chosen, **change}
@@ -304,7 +304,9 @@ def _trials(options: DictConfig, facts: BagFacts, n_found: int) -> list[str]:
             try:
                 found = datasets.load("rosbag", options.path, **{**given, **tried})
                 n_scans = len(found) if any(found[i].n_beams for i in range(min(len(found), _N_TRIED))) else 0
-            except GmmTorchError:
+            except GmmTorchError as error:
+                if change.get("poses") == "standing":
+                    fault = str(error.told({name: f"dataset.{name}" for name in map(str, options)}))
                 continue
             if n_scans > n_found:
                 if change.get("poses") == "standing":
@@ -314,7 +316,7 @@ def _trials(options: DictConfig, facts: BagFacts, n_found: int) -> list[str]:
                 advice.append(f"add {words}, which reads {count_text(n_scans, 'scan')}{note}")
                 if not change or change.get("poses") in sources:
                     break
-    return advice
+    return advice or ([f"with estimated poses there is another problem: {fault}"] if fault else [])
 
 
 def _override(name: str, value: Any) -> str:

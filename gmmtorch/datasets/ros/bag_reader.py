@@ -1,4 +1,5 @@
-"""Reads ROS bags: ROS 1 (.bag), ROS 2 SQLite (.db3) and MCAP (.mcap), with the package rosbags.
+"""Reads ROS bags: ROS 1 (.bag), ROS 2 SQLite (.db3) and MCAP (.mcap), with the package rosbags; and network
+captures of lidars.
 
 Bags are hostile input. Files are read within their length, compressed chunks are unpacked up to a limit, and
 messages are decoded by `MessageDecoder`; definitions in a bag are used only for types that ROS does not have.
@@ -19,6 +20,18 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, BinaryIO, NamedTuple
 
+from gmmtorch.datasets.packets.captures import SUFFIXES as CAPTURES
+from gmmtorch.datasets.packets.sweeps import DEFINITION as SWEEP_DEFINITION
+from gmmtorch.datasets.packets.sweeps import (
+    SINGLE_PACKETS,
+    SWEEP,
+    CaptureMessages,
+    Sweeps,
+    definition,
+    is_lidar,
+    packed,
+    packet_of,
+)
 from gmmtorch.datasets.ros.message_decoder import MessageDecoder
 from gmmtorch.datasets.ros.salvage import QuerySteps, Salvage
 from gmmtorch.datasets.trajectory import NANOSECONDS
@@ -26,7 +39,7 @@ from gmmtorch.errors import DataError, GmmTorchError
 from gmmtorch.optional_packages import needs_extra
 
 _log = logging.getLogger(__name__)
-_SUFFIXES = (".bag", ".mcap", ".db3")
+_SUFFIXES = (".bag", ".mcap", ".db3", *CAPTURES)
 _ZSTD = b"\x28\xb5\x2f\xfd"
 """Start of a compressed message: the file alone, without metadata.yaml, does not state the compression."""
 _LEAST_MISSING = 0.05  # s at the end of a bag, below which it is whole
@@ -36,14 +49,14 @@ _REPAIRS = {
     ".db3": "'ros2 bag reindex' or sqlite3's '.recover' repairs a recording that was interrupted",
 }
 
-VELODYNE = "velodyne_msgs/msg/VelodyneScan"
-_DEFINITION = SimpleNamespace(
-    format=SimpleNamespace(name="MSG"),
-    data="std_msgs/Header header\nvelodyne_msgs/VelodynePacket[] packets\n"
-    + "=" * 80
-    + "\nMSG: velodyne_msgs/VelodynePacket\nbuiltin_interfaces/Time stamp\nuint8[1206] data\n",
-)
-"""For SQLite bags of older ROS 2, which contain no definitions."""
+_PACKETS = {
+    "velodyne_msgs/msg/VelodyneScan": ("VelodynePacket", "uint8[1206] data"),
+    "pandar_msgs/msg/PandarScan": ("PandarPacket", "uint8[1500] data\nuint32 size"),
+    "nebula_msgs/msg/NebulaPackets": ("NebulaPacket", "uint8[] data"),
+    "hesai_ros_driver/msg/UdpFrame": ("UdpPacket", "uint8[] data\nuint32 size"),
+}
+"""Types of messages with packets of a lidar, and the names and fields of their packets: SQLite bags of older
+ROS 2 contain no definitions."""
 
 
 class Topic(NamedTuple):
@@ -86,8 +99,14 @@ class BagReader:
             self._connections = [
                 c for c in self._reader.connections if isinstance(c.topic, str) and isinstance(c.msgtype, str)
             ]  # columns of a damaged database can be empty
+            sweep = parsed_definitions(definition(SWEEP_DEFINITION), SWEEP)
             self._decoder = MessageDecoder(
-                {**self._own_definitions(), **standard_definitions(self._is_ros1)},
+                {
+                    **self._own_definitions(),
+                    **dict.fromkeys(SINGLE_PACKETS, sweep[SWEEP]),
+                    **sweep,
+                    **standard_definitions(self._is_ros1),
+                },
                 packed=self._is_ros1,
             )
 
@@ -109,7 +128,33 @@ class BagReader:
         return list(self._decoder.definitions.get(message_type, ((), ()))[1])
 
     def messages(self, topics: Collection[str], start: int | None = None) -> Iterator[RawMessage]:
-        """The messages of some topics in the order of recording, from time `start` (ns) on."""
+        """The messages of some topics in the order of recording, from time `start` (ns) on.
+
+        Messages with single packets of a lidar are put together to sweeps with the time of the first one.
+        """
+        singles = {c.topic for c in self._connections if c.msgtype in SINGLE_PACKETS}
+        return (self._messages if singles.isdisjoint(topics) else self._sweeps)(topics, start)
+
+    def _sweeps(self, topics: Collection[str], start: int | None) -> Iterator[RawMessage]:
+        """The messages, and sweeps in place of single packets."""
+        turns: dict[tuple[str, str], Sweeps] = {}
+        for message in self._messages(topics, start):
+            if message.type not in SINGLE_PACKETS:
+                yield message
+                continue
+            key, data = (message.topic, message.type), packet_of(message.data, self._is_ros1)
+            if is_lidar(data):
+                yield from self._sweep(*key, turns.setdefault(key, Sweeps()).add(message.time, data))
+        for key, sweeps in turns.items():
+            yield from self._sweep(*key, sweeps.rest())
+
+    def _sweep(self, topic: str, kind: str, packets: list[tuple[int, bytes]]) -> Iterator[RawMessage]:
+        if packets:
+            data = packed(packets, SINGLE_PACKETS[kind], self._is_ros1)
+            yield RawMessage(topic, kind, packets[0][0], data)
+
+    def _messages(self, topics: Collection[str], start: int | None) -> Iterator[RawMessage]:
+        """The messages as they are recorded."""
         chosen = [c for c in self._connections if c.topic in topics]
         if not chosen:
             return
@@ -133,7 +178,7 @@ class BagReader:
     def damage(self) -> str:
         """What is missing in a damaged bag whose intact part is read; "" if nothing is."""
         if not isinstance(self._reader, Salvage):
-            return ""
+            return getattr(self._reader, "damage", "")
         found, first = self._reader, self._reader.first
         n_stated, end = _stated(self.path)
         of_all = f" of {n_stated:,}" if n_stated else ""
@@ -151,15 +196,23 @@ class BagReader:
             return text + f"; {missing:.1f} s at the end are missing" * (missing >= _LEAST_MISSING)
         return text + "; the file is cut off there, and does not state how much is missing" * found.is_cut
 
-    def _salvaged(self) -> Salvage:
+    def _salvaged(self) -> Salvage | CaptureMessages:
         reader_class(self._is_ros1)  # puts limits on rosbags
+        if self.path.suffix in CAPTURES:
+            return CaptureMessages(self.path)
         try:
             return Salvage(_files(self.path), _unpack_chunk, MAX_CHUNK_BYTES)
         except DataError as error:
             raise DamagedBagError(str(error)) from error
 
     def _opened(self) -> Any:
-        """The opened reader of rosbags: of the folder, or of its only file if metadata.yaml is unusable."""
+        """The opened reader of a capture, or that of rosbags: of the folder, or of its only file if
+        metadata.yaml is unusable."""
+        if self.path.suffix in CAPTURES:
+            capture = CaptureMessages(self.path)
+            if capture.damage:
+                raise DamagedBagError(f"{self.path} is damaged: {capture.damage}.")
+            return capture
         for file in _files(self.path):
             _check_length(file)
         *tried, last = self.path, *_only_file(self.path)
@@ -179,7 +232,7 @@ class BagReader:
         """Definitions in the bag. One that cannot be parsed is left out."""
         found: dict[str, Any] = {}
         for c in self._connections:
-            stated = c.msgdef if c.msgdef.data or c.msgtype != VELODYNE else _DEFINITION
+            stated = c.msgdef if c.msgdef.data or c.msgtype not in _PACKETS else _known(c.msgtype)
             if c.msgtype not in found and (parsed := parsed_definitions(stated, c.msgtype)):
                 found.update(parsed)
         return found
@@ -204,6 +257,16 @@ class BagReader:
             ) from error
 
 
+def _known(message_type: str) -> SimpleNamespace:
+    """The definition of a message with packets of a lidar."""
+    package, (name, fields) = message_type.split("/")[0], _PACKETS[message_type]
+    packet = f"{package}/{name}"
+    return definition(
+        f"std_msgs/Header header\n{packet}[] packets\n{'=' * 80}\nMSG: {packet}\n"
+        f"builtin_interfaces/Time stamp\n{fields}\n"
+    )
+
+
 def _bag_file(path: Path) -> Path:
     """The file of the bag, or the folder with its metadata.yaml."""
     if path.is_dir() and not (path / "metadata.yaml").is_file():
@@ -212,10 +275,10 @@ def _bag_file(path: Path) -> Path:
             return files[0]
         raise DataError(
             f"{path} has no metadata.yaml and {len(files)} bag files; give one file: "
-            f"{', '.join(file.name for file in files) or '.bag, .mcap or .db3'}."
+            f"{', '.join(file.name for file in files) or '.bag, .mcap, .db3 or .pcap'}."
         )
     if path.is_file() and path.suffix not in _SUFFIXES:
-        raise DataError(f"{path} does not end in {', '.join(_SUFFIXES)}; it is not a ROS bag.")
+        raise DataError(f"{path} does not end in {', '.join(_SUFFIXES)}; it is not a recording.")
     if path.is_file() and path.stat().st_size == 0:
         raise DataError(f"{path} is empty; record or copy it again.")
     return path
@@ -303,7 +366,7 @@ _MAGIC = {b"\x89MCAP0\r\n": ".mcap", b"SQLite f": ".db3"}
 
 def reader_class(is_ros1: bool) -> Any:
     """The reader of ROS 1 or of ROS 2 bags, with limits. Raises `GmmTorchError` if rosbags does not load."""
-    with needs_extra("ROS bags need", "rosbags", "bags"):
+    with needs_extra("ROS bags and network captures need", "rosbags", "bags"):
         import rosbags.rosbag1
         import rosbags.rosbag2
     ros1, ros2 = rosbags.rosbag1, rosbags.rosbag2

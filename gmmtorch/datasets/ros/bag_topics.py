@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gmmtorch.datasets.ros.bag_reader import VELODYNE, BagReader, Topic
-from gmmtorch.datasets.ros.message_decoder import BASE, NAME, SEQUENCE
+from gmmtorch.datasets.packets.sweeps import SINGLE_PACKETS, is_lidar
+from gmmtorch.datasets.ros.bag_reader import BagReader, Topic
+from gmmtorch.datasets.ros.message_decoder import ARRAY, BASE, NAME, SEQUENCE
 from gmmtorch.datasets.trajectory import NANOSECONDS
 from gmmtorch.errors import DataError, InvalidArgumentError
 
@@ -46,7 +47,6 @@ _KINDS = {
     "sensor_msgs/msg/PointCloud2": CLOUD,
     "sensor_msgs/msg/LaserScan": LASER,
     "sensor_msgs/msg/MultiEchoLaserScan": ECHOES,
-    VELODYNE: PACKETS,
 }
 
 
@@ -85,8 +85,8 @@ def choose_sensor(reader: BagReader, wanted: str | None) -> Sensor:
         what = f"‹topic›={wanted} is not" if wanted else "has no topic of"
         remedy = "Choose another ‹topic›." if wanted else "Record such a topic."
         raise DataError(
-            f"{reader.path} {what} a range sensor with messages (PointCloud2, LaserScan, depth Image, or a "
-            f"list of points). Its topics are {listed(reader.topics)}. {remedy}"
+            f"{reader.path} {what} a range sensor with messages (PointCloud2, LaserScan, depth Image, a "
+            f"list of points, or packets of a lidar). Its topics are {listed(reader.topics)}. {remedy}"
         )
     kind = min((sensor.kind for sensor in found), key=_PREFERENCE.index)
     found = [sensor for sensor in found if sensor.kind == kind]
@@ -118,21 +118,45 @@ def _sensor(reader: BagReader, topic: Topic) -> Sensor | None:
         return Sensor(topic, LIST, _LISTS[topic.type])
     if topic.type in (_IMAGE, _COMPRESSED_IMAGE):
         return _camera(reader, topic)
+    if topic.type in SINGLE_PACKETS:  # also of the IMU in the lidar
+        return Sensor(topic, PACKETS) if next(reader.messages([topic.name]), None) else None
     if not topic.type.startswith(("sensor_msgs/", "std_msgs/", "geometry_msgs/", "nav_msgs/")):
         fields = reader.fields(topic.type)
         if fields and fields[0][1] == (NAME, "std_msgs/msg/Header"):
             for name, desc in fields:
                 if _is_list_of_points(reader, desc):
                     return Sensor(topic, LIST, name)
+                if name == "packets" and _is_list_of_packets(reader, desc):
+                    return Sensor(topic, PACKETS) if _is_of_known_lidar(reader, topic) else None
     return None
 
 
 def _is_list_of_points(reader: BagReader, desc: Any) -> bool:
-    if desc[0] != SEQUENCE or desc[1][0][0] != NAME:
-        return False
-    fields = dict(reader.fields(desc[1][0][1]))
+    fields = _fields_in_list(reader, desc)
     numbers = all(inner[0] == BASE and inner[1][0] != "string" for inner in fields.values())
     return numbers and {"x", "y", "z"} <= fields.keys()
+
+
+def _is_list_of_packets(reader: BagReader, desc: Any) -> bool:
+    fields = _fields_in_list(reader, desc)
+    kind, content = fields.get("data", (BASE, ("string", 0)))
+    return "stamp" in fields and kind in (ARRAY, SEQUENCE) and content[0] == (BASE, ("uint8", 0))
+
+
+def _is_of_known_lidar(reader: BagReader, topic: Topic) -> bool:
+    """Whether the first message has packets of a lidar that is read, or none or a damaged one."""
+    first = next(reader.messages([topic.name]), None)
+    try:
+        packets = reader.decode(first)["packets"] if first is not None else []
+    except DataError:
+        return True
+    return not packets or is_lidar(bytes(packets[0]["data"][: packets[0].get("size")]))
+
+
+def _fields_in_list(reader: BagReader, desc: Any) -> dict[str, Any]:
+    """The fields of the messages in a list; empty if a field is none."""
+    is_list = desc[0] == SEQUENCE and desc[1][0][0] == NAME
+    return dict(reader.fields(desc[1][0][1])) if is_list else {}
 
 
 def _camera(reader: BagReader, topic: Topic) -> Sensor | None:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import NO_POSE, Dataset, Ranges, require_path
+from gmmtorch.datasets.packets.lidar_packets import LidarPackets
 from gmmtorch.datasets.point_files.channels import check_channels
 from gmmtorch.datasets.ros.bag_poses import BagSurvey, Record, RegisteredPoses, TfPoses
 from gmmtorch.datasets.ros.bag_reader import BagReader, DamagedBagError, RawMessage
@@ -59,12 +60,13 @@ def open_rosbag(
     intrinsics: list[float] | None = None,
     imu_topic: str | None = None,
     damaged: str = "read",
+    calibration: str | None = None,
     attributes: Iterable[str] = (),
 ) -> Dataset:
-    """The scans of one topic of a bag, or of several; see docs/recordings.md.
+    """The scans of one topic of a bag or of a network capture, or of several; see docs/recordings.md.
 
     Args:
-        path: .bag (ROS 1), .db3 or .mcap (ROS 2), or the folder of a ROS 2 bag.
+        path: .bag (ROS 1), .db3 or .mcap (ROS 2), the folder of a ROS 2 bag, or .pcap or .pcapng.
         ranges, stride: see `Dataset`.
         topic: of the sensor, or topics of several sensors of one robot; None: the only one of its kind.
         poses: "tf", "standing", a topic of poses, or a trajectory file; None: TF.
@@ -81,10 +83,12 @@ def open_rosbag(
         intrinsics: fx, fy, cx, cy in pixels of depth images without distortion; None: of `camera_info`.
         imu_topic: of the IMU of `RosBag.turns`; None: the only one.
         damaged: "read" reads the intact part of a damaged bag; "refuse" raises an error.
-        attributes: channels of point clouds that are read, such as "intensity" and "colour".
+        calibration: file of the lidar whose packets are read, see `LidarPackets`.
+        attributes: channels of points that are read, such as "intensity" and "colour".
     """
     source = "A bag of ROS 1 is a file; one of ROS 2 is a file or its folder."
-    file = require_path(path, "file or folder", "a ROS bag (.bag, .mcap, .db3)", source)
+    content = "a ROS bag (.bag, .mcap, .db3) or a network capture (.pcap, .pcapng)"
+    file = require_path(path, "file or folder", content, source)
     check_choice("clock", clock, ("header", "received"))
     if not max_gap > 0:
         raise InvalidArgumentError(f"‹max_gap›={max_gap} must be a time above zero seconds.")
@@ -119,7 +123,8 @@ def open_rosbag(
             )
         unit = stated_unit(reader, sensor.topic.name) if depth_scale is None else depth_scale
         camera = ImageCamera(sensor, survey.camera_info(), pixel_stride, unit, intrinsics)
-        options = sensor_frame, clock, deskew, imu_topic, check_channels(attributes)
+        packets = LidarPackets(calibration, reader)
+        options = sensor_frame, clock, deskew, imu_topic, check_channels(attributes), packets
         if sensor.is_camera:
             return DepthBag(reader, sensor, survey, ranges, stride, *options, camera)
         return RosBag(reader, sensor, survey, ranges, stride, *options)
@@ -166,6 +171,7 @@ class RosBag(Dataset):
         deskew: bool,
         imu_topic: str | None,
         attributes: tuple[str, ...],
+        packets: LidarPackets,
         camera: ImageCamera | None = None,
     ) -> None:
         super().__init__(reader.path.stem, ranges, stride)
@@ -184,7 +190,7 @@ class RosBag(Dataset):
             records = kept
         records = self._ordered(records)
         self._source = survey.source(records, self._where, sensor_frame)
-        self._conversion = ScanConversion(sensor, ranges, self._source, deskew, camera, attributes)
+        self._conversion = ScanConversion(sensor, ranges, self._source, deskew, camera, attributes, packets)
         self._records, self._in_space = self._posed(records)
         self._samples = self._first_readings()
         rate = Rate.of(records, clock)
@@ -290,6 +296,7 @@ class RosBag(Dataset):
             skip("message that cannot be decoded")
             origin = pose.translation[: 2 if self._is_flat else 3].clone()
             return Scan(origin.new_empty(0, len(origin)), origin)
+        self._conversion.keeps_times = self.keeps_point_times
         return self._conversion.scan(found, record.stamp, record.frame, pose, self._is_flat, skip)
 
     def _reading(self, index: int) -> Reading:
@@ -299,8 +306,8 @@ class RosBag(Dataset):
             return self._conversion.points(message)
         except (DataError, ValueError, KeyError, OverflowError) as error:
             raise DataError(
-                f"{self._where}, frame {record.frame}, stamp {record.stamp / NANOSECONDS:.3f} s: "
-                f"{f'{error}'.removesuffix('.')}."
+                f"{self._where}, frame {record.frame or '(unnamed)'}, "
+                f"stamp {record.stamp / NANOSECONDS:.3f} s: {f'{error}'.removesuffix('.')}."
             ) from error
 
     def _message(self, index: int) -> dict[str, Any]:

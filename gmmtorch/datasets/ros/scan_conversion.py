@@ -11,12 +11,14 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import Ranges
+from gmmtorch.datasets.packets.lidar_packets import LidarPackets
 from gmmtorch.datasets.ros import bag_topics, sensor_messages
 from gmmtorch.datasets.ros.bag_poses import PoseSource, RegisteredPoses
 from gmmtorch.datasets.ros.bag_topics import Sensor
 from gmmtorch.datasets.ros.image_camera import ImageCamera
 from gmmtorch.datasets.ros.point_times import N_SAMPLES, PointTimes, Rate
-from gmmtorch.datasets.ros.sensor_messages import Reading, VelodynePackets
+from gmmtorch.datasets.ros.sensor_messages import Reading
+from gmmtorch.datasets.trajectory import NANOSECONDS, POINT_TIMES
 from gmmtorch.errors import DataError
 from gmmtorch.pose import Pose
 from gmmtorch.scan import FARTHEST, Scan
@@ -39,7 +41,11 @@ class ScanConversion:
         source: poses of the sensor.
         deskew: whether points with times get the pose of their own time, if the source has one.
         camera: of depth images.
-        attributes: channels of point clouds that are read.
+        attributes: channels of points that are read.
+        packets: decodes raw packets of a lidar; None: one without calibration does.
+
+    Attributes:
+        keeps_times: of a source without poses during a sweep: scans have the channel `POINT_TIMES`.
     """
 
     def __init__(
@@ -50,12 +56,14 @@ class ScanConversion:
         deskew: bool = True,
         camera: ImageCamera | None = None,
         attributes: Sequence[str] = (),
+        packets: LidarPackets | None = None,
     ) -> None:
         self._attributes = attributes
         self.source, self._camera = source, camera
         self._sensor, self._ranges = sensor, ranges
-        self._packets = VelodynePackets() if sensor.kind == bag_topics.PACKETS else None
-        self._times = PointTimes(sensor.kind in bag_topics.LASERS) if deskew and source.can_deskew else None
+        self._packets = packets or LidarPackets()
+        self.keeps_times = False
+        self._times = PointTimes(sensor.kind in bag_topics.LASERS) if deskew else None
 
     def points(self, message: dict[str, Any]) -> Reading:
         """The points of a decoded message, in the sensor's frame."""
@@ -66,8 +74,8 @@ class ScanConversion:
             return sensor_messages.listed_points(message, self._sensor.field)
         if kind in bag_topics.LASERS:
             return sensor_messages.laser_points(message)
-        if self._packets is not None:
-            return self._packets.points(message)
+        if kind == bag_topics.PACKETS:
+            return self._packets.points(message, self._attributes)
         assert self._camera is not None
         return sensor_messages.reading(self._camera.points(message), None, None)
 
@@ -128,7 +136,10 @@ class ScanConversion:
         ends = self._in_world(found.points, offsets, stamp, frame, pose, skip)
         ends[(ends.abs() > FARTHEST).any(1)] = torch.nan  # no sensor measures them
         ends, no_return = ends[:, :dim].contiguous(), torch.from_numpy(found.no_return)
-        return self._ranges.scan(ends, origin, no_return, found.channels)
+        channels = found.channels
+        if offsets is not None and not self.source.can_deskew:
+            channels = {**channels, POINT_TIMES: torch.from_numpy(offsets / NANOSECONDS)}
+        return self._ranges.scan(ends, origin, no_return, channels)
 
     def times(self, found: Reading, stamp: int) -> tuple[int, int]:
         """The first and last times (ns) at which poses are needed."""
@@ -142,7 +153,9 @@ class ScanConversion:
     ) -> tuple[Reading, np.ndarray | None]:
         """The points whose times fit, and these (N,) in ns after the stamp; all points and None if scans are
         not deskewed or the times cannot be used."""
-        if self._times is None or not len(found.points):
+        is_registered = isinstance(self.source, RegisteredPoses)  # by another program, which deskews
+        is_used = self.source.can_deskew or (self.keeps_times and not is_registered)
+        if self._times is None or not is_used or not len(found.points):
             return found, None
         try:
             if found.doubt:
@@ -169,7 +182,7 @@ class ScanConversion:
     ) -> Tensor:
         """Points (N, 3) in the world frame, each with the pose of its own time (N,) if that is known."""
         local = torch.from_numpy(points)
-        if offsets is not None:
+        if offsets is not None and self.source.can_deskew:
             first, last = int(offsets.min()), int(offsets.max())
             n_knots = min(_KNOTS, len(points)) if last > first else 1
             knots = np.linspace(first, last, n_knots).round().astype(np.int64)

@@ -1,4 +1,4 @@
-"""Points of sensor messages: PointCloud2, LaserScan, depth images, lists of points, packets of lidars.
+"""Points of sensor messages: PointCloud2, LaserScan, depth images, lists of points.
 
 Input are messages as `MessageDecoder` returns them. Every size in them is checked against their data.
 """
@@ -19,7 +19,6 @@ from gmmtorch.datasets.depth_images import MAX_PIXELS, metric, read_png
 from gmmtorch.datasets.point_files.channels import channel_of, fields_of
 from gmmtorch.datasets.point_files.point_rows import PACKED
 from gmmtorch.errors import DataError
-from gmmtorch.optional_packages import needs_extra
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _TIME_FIELDS = frozenset(
@@ -32,7 +31,6 @@ _MILLIMETRE = 0.001
 _ALIGNMENT = 8  # bytes; a row of points is padded by less
 _COMPRESSED_DEPTH_BYTES = 12
 _PNG = b"\x89PNG"
-_PACKET_BYTES = 1206  # of a Velodyne lidar
 
 
 class Reading(NamedTuple):
@@ -252,33 +250,3 @@ def _finite(depth: np.ndarray, scale: float | None) -> Tensor:
     with np.errstate(invalid="ignore"):
         valid = torch.from_numpy(np.where(np.isfinite(depth) & (depth > 0), depth, 0.0))
     return valid if scale is None else valid * scale
-
-
-class VelodynePackets:
-    """Decodes raw packets of one Velodyne lidar with the package velodyne-decoder.
-
-    The first packet states the model, except for the HDL-64E.
-    """
-
-    def __init__(self) -> None:
-        with needs_extra("Velodyne packets need", "velodyne-decoder", "packets"):
-            import velodyne_decoder
-        self._package: Any = velodyne_decoder
-        self._decoder = velodyne_decoder.ScanDecoder(velodyne_decoder.Config())
-
-    def points(self, message: dict[str, Any]) -> Reading:
-        """The points of a VelodyneScan, with times in seconds from its stamp. Raises `DataError`."""
-        packets = []
-        for packet in message["packets"]:
-            stamp, data = packet["stamp"], bytes(packet["data"])
-            if len(data) != _PACKET_BYTES:
-                raise DataError(f"a packet has {len(data)} bytes instead of {_PACKET_BYTES}")
-            packets.append((int(stamp["sec"]) + int(stamp["nanosec"]) * 1e-9, list(data)))
-        if not packets:  # the decoder would end the process
-            return reading(np.empty((0, 3)), None, None)
-        try:
-            made = [self._package.VelodynePacket(*packet) for packet in packets]
-            _, table = self._decoder.decode(made, as_pcl_structs=True)
-        except (RuntimeError, TypeError, ValueError) as error:
-            raise DataError(f"the packets cannot be decoded: {str(error).splitlines()[0]}") from error
-        return reading(np.stack([table[axis].astype(np.float64) for axis in "xyz"], 1), None, table["time"])

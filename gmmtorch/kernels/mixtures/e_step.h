@@ -107,53 +107,6 @@ GMM_KERNEL most_likely(int64_t item, const double* features, int64_t n_rows, con
     }
 }
 
-// A step of k-means. An item is a part of the points in one of the runs, with sums of its own: the nearest of
-// the run's centers, the squared distance to it, and the weight and the sum of the points of each center.
-// biases: -|center|^2 / 2.
-GMM_KERNEL nearest_centers(int64_t item, const double* points, const double* weight, int64_t n_rows,
-                           int64_t dim, const double* centers, const double* biases, int64_t n_centers,
-                           int64_t n_parts, double* scratch, int64_t* nearest, double* distance,
-                           double* partial) {
-    const int64_t run = item / n_parts, part = item % n_parts;
-    const int64_t begin = n_rows * part / n_parts, stop = n_rows * (part + 1) / n_parts;
-    const double *bias = biases + run * n_centers, *own = centers + run * n_centers * dim;
-    double* sums = partial + item * n_centers * (dim + 1);
-    vec* x = (vec*)(scratch + item * dim * LANES);
-    for (int64_t row = begin; row < stop; row += LANES) {
-        const int64_t lane_rows = minimum((int64_t)LANES, stop - row);
-        for (int l = 0; l < LANES; ++l) {
-            const double* given = points + (row + minimum((int64_t)l, lane_rows - 1)) * dim;
-            for (int64_t f = 0; f < dim; ++f) set(x[f], l, given[f]);
-        }
-        vec square = (vec)(0.0), peak = (vec)(-1e300), first = (vec)(0.0);
-        for (int64_t f = 0; f < dim; ++f) square = fused(x[f], x[f], square);
-        auto compare = [&](int64_t k, vec product) {
-            first = product > peak ? (vec)((double)k) : first;
-            peak = product > peak ? product : peak;
-        };
-        for (int64_t k = 0; k < n_centers; k += 4) {
-            const double *p = own + k * dim, *q = p + dim, *r = q + dim, *s = r + dim;
-            vec a = (vec)(bias[k]), b = (vec)(bias[k + 1]), c = (vec)(bias[k + 2]), d = (vec)(bias[k + 3]);
-            for (int64_t f = 0; f < dim; ++f) {
-                a = fused(x[f], (vec)(p[f]), a);
-                b = fused(x[f], (vec)(q[f]), b);
-                c = fused(x[f], (vec)(r[f]), c);
-                d = fused(x[f], (vec)(s[f]), d);
-            }
-            compare(k, a), compare(k + 1, b), compare(k + 2, c), compare(k + 3, d);
-        }
-        for (int l = 0; l < lane_rows; ++l) {
-            const int64_t i = row + l, k = (int64_t)get(first, l);
-            const double *given = points + i * dim, p = weight[i];
-            double* sum = sums + k * (dim + 1);
-            nearest[run * n_rows + i] = k;
-            distance[run * n_rows + i] = maximum(0.0, get(square, l) - 2.0 * get(peak, l));
-            sum[0] += p;
-            for (int64_t f = 0; f < dim; ++f) sum[1 + f] += p * given[f];
-        }
-    }
-}
-
 // On a GPU, an item of the first kernel is a row, and sums over its components.
 template <int DIM>
 GMM_KERNEL row_norms(int64_t item, const double* features, int64_t n_rows, const double* natural,

@@ -24,6 +24,7 @@ from torch import Tensor
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.chunks import chunk_elements, chunked
 from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel
+from gmmtorch.linalg import order_along_curve
 
 _FEW_ROWS = 2048  # in fewer rows, their order matters little
 _PARTS = 64  # most parts of the rows; each has its own sums, so that threads write apart
@@ -37,7 +38,6 @@ _EXPECTATION = {dim: FusedKernel(_E_STEP, f"e_step<{dim}>") for dim in _WIDTHS}
 _MOST_LIKELY = {dim: FusedKernel(_E_STEP, f"most_likely<{dim}>") for dim in _WIDTHS}
 _NORMS = {dim: FusedKernel(_E_STEP, f"row_norms<{dim}>") for dim in _WIDTHS}
 _SHARES = {dim: FusedKernel(_E_STEP, f"component_sums<{dim}>") for dim in _WIDTHS}
-_NEAREST = FusedKernel(_E_STEP, "nearest_centers")
 _DIMENSIONS = {width: dim for dim, width in _WIDTHS.items()}
 
 
@@ -80,19 +80,12 @@ def most_likely(features: Tensor, natural: Tensor) -> Tensor:
 def in_spatial_order(features: Tensor, sample_weight: Tensor) -> tuple[Tensor, Tensor]:
     """The rows (N, F), (N,) in an order in which neighbours follow each other, if the fused kernel runs.
 
-    The kernel skips what all of eight rows are far from. The order is that of a Morton curve through 32 cells
-    along each axis.
+    The kernel skips what all of eight rows are far from.
     """
     dim = _DIMENSIONS.get(features.shape[1], 0)
     if not _is_e_step_fused(features, sample_weight) or features.shape[0] < _FEW_ROWS:
         return features, sample_weight
-    places = features[:, 1 : 1 + dim].contiguous()
-    low, high = places.amin(0), places.amax(0)
-    cell = ((places - low) * (31.99 / (high - low).max().clamp_min(1e-300))).long().clamp_(0, 31)
-    spread = [sum((n >> b & 1) << (b * dim) for b in range(5)) for n in range(32)]
-    bits = torch.tensor(spread, device=places.device)
-    keys = sum((bits[cell[:, axis]] << axis for axis in range(dim)), torch.zeros_like(cell[:, 0]))
-    order = keys.short().argsort(stable=True)
+    order = order_along_curve(features[:, 1 : 1 + dim].contiguous())
     return features.index_select(0, order), sample_weight.index_select(0, order)
 
 
@@ -169,9 +162,6 @@ def nearest_centers(points: Tensor, weight: Tensor, centers: Tensor) -> tuple[Te
     Args:
         weight: (N,). centers: (R, K, D).
     """
-    given = points, weight, centers
-    if points.device.type == "cpu" and all(t.dtype == torch.float64 for t in given) and is_fused(*given):
-        return _fused_nearest_centers(*given)
     (n_runs, k, dim), n = centers.shape, points.shape[0]
     flat = centers.reshape(-1, dim)
     bias, offset = -0.5 * flat.square().sum(1, keepdim=True), k * torch.arange(n_runs, device=points.device)
@@ -190,18 +180,6 @@ def nearest_centers(points: Tensor, weight: Tensor, centers: Tensor) -> tuple[Te
     size = max(64, chunk_elements(points.device) // max(flat.shape))
     nearest, distance, sums = zip(*chunked(n, size, step), strict=True)
     return torch.cat(nearest, 1), torch.cat(distance, 1), torch.stack(sums).sum(0).view(n_runs, k, -1)
-
-
-def _fused_nearest_centers(points: Tensor, weight: Tensor, centers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    (n_runs, k, dim), n, n_parts = centers.shape, points.shape[0], _n_parts(points)
-    padded = torch.nn.functional.pad(centers, (0, 0, 0, -k % 4))
-    bias = torch.nn.functional.pad(-0.5 * centers.square().sum(2), (0, -k % 4), value=-1e300)
-    nearest = torch.empty(n_runs, n, dtype=torch.int64)
-    distance, scratch = points.new_empty(n_runs, n), points.new_empty(n_runs * n_parts * dim * CPU_LANES)
-    sums = points.new_zeros(n_runs, n_parts, padded.shape[1], 1 + dim)
-    given = points.contiguous(), weight.contiguous(), n, dim, padded, bias, padded.shape[1], n_parts
-    _NEAREST(n_runs * n_parts, *given, scratch, nearest, distance, sums, device=points.device)
-    return nearest, distance, sums.sum(1)[:, :k]
 
 
 def softmax(logits: Tensor, sample_weight: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:

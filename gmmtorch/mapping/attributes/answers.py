@@ -55,6 +55,8 @@ def predictions(components: Components, points: Tensor, cutoff: float = CUTOFF) 
     support · share · N(x; μ, Σ); the variance is that of the mixture of their predictions. Memory does not
     grow with the number of pairs of points and components.
     """
+    if not components.attributes:
+        return {}
     solid = components.selected((~components.max_range & (components.support > 0)).nonzero().squeeze(1))
     inside = torch.isfinite(points).all(1).nonzero().squeeze(1)
     asked = points[inside]

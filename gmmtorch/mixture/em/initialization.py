@@ -13,6 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gmmtorch.kernels import fused_moments, is_small
 from gmmtorch.linalg import argsort
 from gmmtorch.mixture.em import by_type
 from gmmtorch.mixture.em import exact as em
@@ -89,6 +90,8 @@ def from_kmeans(
     points, weight = cloud.points, cloud.weight
     labels, scatter = kmeans(*cloud, n_components, generator, n_init)
     best = labels[scatter.argmin()]
+    if is_small(points, weight, n_components, kind):
+        return Parameters(*fused_moments(points, weight, best, n_components, kind, reg_covar))
     if points.shape[1] > 3:
         found = by_type.moments_of_labels(points, weight, best, n_components, kind)
         return by_type.maximized(found, reg_covar, None, kind)

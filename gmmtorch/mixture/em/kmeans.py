@@ -11,7 +11,7 @@ import math
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels import nearest_centers
+from gmmtorch.kernels import fused_kmeans, is_kmeans_fused, nearest_centers
 from gmmtorch.mixture.em.by_type import in_chunks
 
 _MAX_ITER, _TOLERANCE = 300, 1e-4  # the tolerance is a share of the mean variance, as in scikit-learn
@@ -34,6 +34,9 @@ def kmeans(
     """
     centers = points[spread_out(points, weight, rows, mass, n_clusters, generator, n_runs)]
     least = _TOLERANCE * mean_variance(points, weight)
+    if is_kmeans_fused(points, weight):
+        nearest, distance = fused_kmeans(points, weight, centers, _MAX_ITER, float(least))
+        return nearest, distance @ weight
     every = 1 if points.device.type == "cpu" else _STEPS_AHEAD
     for step in range(_MAX_ITER):
         _, distance, sums = nearest_centers(points, weight, centers)

@@ -19,10 +19,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gmmtorch.kernels import fused_em, is_small
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.mixture.em import by_type, loop
 from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em.exact import LOG_2PI, Parameters, compact, constrain, expand
+from gmmtorch.mixture.em.exact import LOG_2PI, Parameters, compact, constrain, expand, type_shape
 
 
 class Prior(NamedTuple):
@@ -147,7 +148,7 @@ def expected_log_density(posterior: Posterior) -> tuple[Tensor, Parameters]:
     weight = expected_log_weights(posterior.concentration)
     weight = weight + 0.5 * (log_det - dim / posterior.mean_precision)
     # Log-weights a million nats below the largest have no effect, but must not be infinite.
-    weight = weight.clamp_min(float(weight.max()) - 1e6)
+    weight = torch.maximum(weight, weight.amax() - 1e6)
     return weight, Parameters(torch.ones_like(weight), posterior.means, posterior.covariances)
 
 
@@ -170,28 +171,28 @@ def assigned_log_density(moments: Parameters, log_weight: Tensor, factors: by_ty
 
 
 def log_evidence(
-    prior: Prior, posterior: Posterior, n_points: float, covariance_type: str = "full"
+    of_prior: Tensor, posterior: Posterior, n_points: float, covariance_type: str = "full"
 ) -> Tensor:
     """log p(X | assignments) + log p(assignments), nats, of the points that `posterior` includes.
 
     The ratio of the normalisers of posterior and prior, times (2π)^(−ND/2). Plus the entropy of the
     responsibilities, it is the lower bound of log p(X) once q(θ) is optimal for them. For sticks it is that
     of the whole process: components beyond the K-th have no points and equal the prior.
+    of_prior: `log_normaliser` of the posterior without points.
     """
-    dim = prior.mean.shape[0]
-    dof = posterior.degrees_of_freedom
+    dim = posterior.means.shape[1]
+    return log_normaliser(posterior, covariance_type) - of_prior - 0.5 * n_points * dim * LOG_2PI
+
+
+def log_normaliser(posterior: Posterior, covariance_type: str = "full") -> Tensor:
+    """The logarithm of the normaliser of q(μ, Λ) q(π), without the factors π of the Gaussians."""
+    dim, dof = posterior.means.shape[1], posterior.degrees_of_freedom
     log_det = _log_det(posterior.covariances, covariance_type, dim) + dim * dof.log()
-    components = _log_wishart(dof, log_det, dim)
-    first = _log_det(compact(prior.covariance[None], covariance_type), covariance_type, dim)
-    components = components - _log_wishart(prior.degrees_of_freedom[None], first, dim)
-    components = components + 0.5 * dim * torch.log(prior.mean_precision / posterior.mean_precision)
-    sticks = posterior.concentration
-    if sticks.shape[0] == 2:
-        first = torch.stack([torch.ones_like(prior.concentration), prior.concentration])[:, None]
-        weights = (_log_dirichlet(sticks) - _log_dirichlet(first)).sum()
-    else:
-        weights = _log_dirichlet(sticks[0]) - _log_dirichlet(prior.concentration.expand(sticks.shape[1]))
-    return components.sum() + weights - 0.5 * n_points * dim * LOG_2PI
+    log_wishart = 0.5 * dof * (dim * math.log(2) - log_det) + torch.mvlgamma(0.5 * dof, dim)
+    components = log_wishart - 0.5 * dim * posterior.mean_precision.log()
+    sticks = posterior.concentration if len(posterior.concentration) == 2 else posterior.concentration.T
+    log_dirichlet = torch.lgamma(sticks).sum(0) - torch.lgamma(sticks.sum(0))
+    return components.sum() + log_dirichlet.sum()
 
 
 def _log_det(covariances: Tensor, kind: str, dim: int) -> Tensor:
@@ -201,17 +202,6 @@ def _log_det(covariances: Tensor, kind: str, dim: int) -> Tensor:
         return 2 * torch.log(factors.diagonal(dim1=-2, dim2=-1)).sum(1)
     log = covariances.log()
     return log.sum(1) if kind == "diag" else dim * log
-
-
-def _log_wishart(degrees_of_freedom: Tensor, log_det: Tensor, dim: int) -> Tensor:
-    """log ∫ |Λ|^((ν−D−1)/2) exp(−½ tr W⁻¹Λ) dΛ (K,), with log |W⁻¹| (K,). Bishop (B.79)."""
-    half = 0.5 * degrees_of_freedom
-    return half * (dim * math.log(2) - log_det) + torch.mvlgamma(half, dim)
-
-
-def _log_dirichlet(concentration: Tensor) -> Tensor:
-    """Logarithm of the multivariate beta function, over the first axis."""
-    return torch.lgamma(concentration).sum(0) - torch.lgamma(concentration.sum(0))
 
 
 def log_predictive(points: Tensor, posterior: Posterior, covariance_type: str = "full") -> Tensor:
@@ -255,8 +245,27 @@ def variational_step(
     total = float(sample_weight.sum())
     kind = covariance_type
 
+    @functools.cache
+    def of_prior(n_components: int) -> Tensor:
+        shapes = (
+            (n_components,),
+            (n_components, points.shape[1]),
+            type_shape(kind, n_components, points.shape[1]),
+        )
+        none = Parameters(*(points.new_zeros(shape) for shape in shapes))
+        return log_normaliser(update(prior, none, process, kind), kind)
+
     def step(posterior: Posterior) -> tuple[Posterior, float]:
         log_weight, gaussians = expected_log_density(posterior)
+        if is_small(points, sample_weight, len(log_weight), kind):
+            start = Parameters(*(part.clone()[None] for part in gaussians))
+            moved = fused_em(points, sample_weight, start, kind, reg_covar, log_weights=log_weight)
+            if not moved.failed[0]:
+                found = Parameters(moved.counts[0], moved.means[0], moved.covariances[0])
+                new = update(prior, found, process, kind)
+                return new, float(
+                    moved.entropy[0] + log_evidence(of_prior(len(log_weight)), new, total, kind)
+                ) / total
         factors = by_type.Factors(gaussians, kind)
         if features is None:
             found, value = _typed_moments(
@@ -272,7 +281,7 @@ def variational_step(
         diagonal = plain.diagonal(dim1=-2, dim2=-1) if kind in ("full", "tied") else plain
         diagonal.sub_(reg_covar)
         entropy = value - assigned_log_density(found._replace(covariances=plain), log_weight, factors)
-        return new, float(entropy + log_evidence(prior, new, total, kind)) / total
+        return new, float(entropy + log_evidence(of_prior(len(log_weight)), new, total, kind)) / total
 
     return step
 

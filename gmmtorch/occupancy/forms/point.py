@@ -25,7 +25,7 @@ from gmmtorch.kernels import (
     listed_evidence,
     pair_evidence,
 )
-from gmmtorch.linalg import safe_cholesky
+from gmmtorch.linalg import order_along_curve, safe_cholesky
 from gmmtorch.occupancy.cone_index import ConeIndex, chunks_of, replaced_rows, spectrum_of
 from gmmtorch.occupancy.cones import CUTOFF, Cones, former_rows
 from gmmtorch.occupancy.evidence import occupancy_probability
@@ -73,7 +73,8 @@ CHUNK_PAIRS = 1 << 16
 
 _CHUNK_POINTS = 1 << 20  # points sorted in one pass
 _FARTHEST = 1e15  # metres: products of larger positions are infinite
-_FEW_PAIRS = 1 << 19  # of a point and a cone: for at most so many an index does not pay
+_FEW = 64  # points that are not sorted
+_FEW_PAIRS = 1 << 21  # of a point and a cone: for at most so many an index does not pay
 
 
 class PointEvidence(NamedTuple):
@@ -235,8 +236,9 @@ class PointForm:
         if len(points) * len(self.rows) <= _FEW_PAIRS:
             bucket = torch.zeros_like(points[:, 0], dtype=torch.int64)
             every = torch.arange(len(self.rows), dtype=torch.int32, device=points.device)
-            # Lanes of the kernel take each list once where its points follow each other.
             order = (points.abs() <= _FARTHEST).all(1).nonzero().squeeze(1)
+            if len(order) > _FEW:  # the kernel skips cones that eight points in a row are far from
+                order = order[order_along_curve(points[order])]
             listed_evidence(points, order, bucket, Lists.of(order.new_tensor([len(every)]), every), *settings)
             return found
         for rows, number in self.index.parts(points):

@@ -198,7 +198,8 @@ def _trouble(node: Node, scans: LiveScans) -> str:
     """Why no scan was mapped so far."""
     silent = [s for s in node.subscriptions if s.n_received == 0 and not s.topic.endswith("/tf_static")]
     if silent:
-        return "; ".join(node.explain_silence(subscription) for subscription in silent)
+        remedy = {"/tf": "; sensor.poses=mixture estimates the poses from the scans, without TF"}
+        return "; ".join(node.explain_silence(topic) + remedy.get(topic.topic, "") for topic in silent)
     reasons = ", ".join(f"{reason} ({n} scans)" for reason, n in scans.skipped.items())
     return "; ".join(text for text in (reasons, scans.trouble) if text) or "the scans wait for their poses"
 

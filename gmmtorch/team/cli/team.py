@@ -124,7 +124,7 @@ TABLE = "robot n_components n_records bytes_sent wire_bytes datagrams path_lengt
 _SUMS = ("bytes_sent", "wire_bytes", "datagrams", "path_length", "collisions")
 _OWN = ("id", "link.listen", "link.peers", "link.listen_endpoints", "link.connect_endpoints")
 """Options that each robot gets from this command."""
-_NOT_OF_ROBOTS = ("clock", "view", "view_host", "view_port")
+_NOT_OF_ROBOTS = ("clock", "view", "host", "port", "origins")
 _STAGE = "seconds"
 _COMPARED = {True: "all hold the same map", False: "their maps differ", None: "their maps have no digest"}
 _PAUSE = 0.2

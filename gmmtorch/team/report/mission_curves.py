@@ -122,7 +122,7 @@ def bandwidth_figure(rows: Rows, draco_error: float = 0.03) -> Figure:
     other codecs: means over seeds in 95 % bands. Labels give the mean total, and its ratio to that of E0.
 
     rows: explore rows; E2 sends nothing and has no line. Series that are null are left out. draco_error: RMS
-    error (m) of Draco's points: `map.noise` of the missions.
+    error (m) of Draco's points: `FrameRule.noise` of the missions.
 
     Raises `InvalidArgumentError`: nothing was sent in any row.
     """

@@ -28,8 +28,10 @@ _MOST_ROBOTS = 31
 """Bits of the integer that stores which robots saw a cell."""
 _LATE_JITTERS = 5
 """Mean jitters. Less than 1 % of the datagrams arrive later."""
-_EMPTY_LENGTH = 0.75
+_EMPTY_LENGTH = 2 / 3
 """Length of components of free space, as a share of that of surfaces."""
+_FLAT = 0.5
+"""Thickness of a flat piece, as a share of `FrameRule.side`."""
 _ROUNDING = 1e-9
 
 FRAMEWORKS = ("gmm_shared", "grid_shared", "grid_isolated", "gmm_thesis")
@@ -130,8 +132,9 @@ class Dynamics:
 
 @dataclass(frozen=True)
 class FrameRule:
-    """How a frame becomes components; lengths in metres. See `IncrementalRule` for the first five.
+    """How a frame becomes components; lengths in metres. See `IncrementalRule` for the five after `side`.
 
+    side: pieces of surfaces are halved until they are thinner than half of this (standard deviation).
     rays: for each cell that a component covers; see `component_evidence`.
     shell: cells before a component's surface that its rays do not count as free.
     hits_per_ray: points drawn from a component of a surface for each of its rays.
@@ -144,8 +147,9 @@ class FrameRule:
         mixture.
     """
 
-    noise: float = option(0.03, "metres; pieces up to twice as thick are flat")
-    length: float = 0.6
+    side: float = option(0.2, "metres; surfaces are as exact as an octree with cells of this side")
+    noise: float = 0.03
+    length: float = 0.9
     cell: float = 0.15
     components: int = 200
     iterations: int = 4
@@ -159,7 +163,7 @@ class FrameRule:
     update_every: int = 10
 
     def __post_init__(self) -> None:
-        for name in ("noise", "length", "cell"):
+        for name in ("side", "noise", "length", "cell"):
             if not getattr(self, name) > 0:
                 raise InvalidArgumentError(f"{name}={getattr(self, name)} must be above zero metres.")
         check_number("rays", self.rays, above=True)
@@ -174,8 +178,14 @@ class FrameRule:
     def surface_fit(self) -> SurfaceFit:
         """How the returns of a frame become components."""
         from gmmtorch.mapping import cell_fit
+        from gmmtorch.mixture import least_support
 
-        return cell_fit(self.noise, self.length, self.cell, self.components, self.iterations, 3)
+        fit = cell_fit(self.noise, self.length, self.cell, self.components, self.iterations, 3)
+        least = least_support(3)
+        flat = replace(
+            fit.flatness, thickness=_FLAT * self.side, min_weight=least, min_weight_thick=_FLAT * least
+        )
+        return replace(fit, flatness=flat)
 
     def empty_fit(self) -> SurfaceFit:
         """The same for no-return beams: finer, because they end at the edges of the field of view."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
 from collections.abc import Collection
 
@@ -211,6 +212,7 @@ class Robot:
 _SEEDS_PER_MISSION = 1 << 10  # robot ids for which the random draws differ
 _LATEST_PLANS = 10  # A plan whose number is lower than the last one's by more comes from a restarted robot
 _RESTING_PLANS = 10  # plans of a robot at rest, of which one is sent
+_VIEWS_EVERY = 10.0  # seconds between messages of views: many change or are removed before they are sent
 _PATIENCE = 15
 """Consecutive plans without progress after which a robot looks around. Leaving a start takes up to six."""
 
@@ -254,6 +256,7 @@ class Agent:
         self._rests = False
         self._seen_from: tuple[Tensor, Tensor] | None = None  # the last pose, and the distances there
         self._plan: Plan | None = None
+        self._views_at = -math.inf  # when views were sent last
         self._sent_pose: Tensor | None = None  # where it rests, according to the last plan sent
         self._n_unsent = 0  # plans at that pose since
 
@@ -308,14 +311,16 @@ class Agent:
         self.radio.send(datagrams, now)
 
     def send_views(self, now: float) -> None:
-        """Sends views, if the map leaves enough of the budget."""
+        """Sends views every `_VIEWS_EVERY` seconds, if the map leaves enough of the budget."""
         library = self.robot.library
+        is_due = not self._views_at <= now < self._views_at + _VIEWS_EVERY  # or the clock was set back
         with self.watch("sharing"):
-            if self.options.shares:
+            if self.options.shares and is_due:
                 views = self.radio.within_budget(
                     lambda budget: library.datagrams(budget=budget), now, spare=MAX_BYTES
                 )
                 self.radio.send(views, now)
+                self._views_at = now if views else self._views_at
 
     def listen(self, now: float) -> None:
         """Merges the messages that arrived by the time `now` (s)."""

@@ -9,6 +9,7 @@ the answers are those of the whole map, up to the rounding of sums.
 `TiledMap.create` makes a map that grows in its folder: one more file has the components of recent windows.
 Files are never changed: new ones have other names, and count once the index names them. So a map that is
 stopped at any moment opens with all finished windows. The next write removes what an interrupted one left.
+One object writes at a time: it locks the folder from its first scan to `finish`, or to its end.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import os
 import re
 import zlib
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -31,30 +32,30 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import (
     DataError,
+    GmmTorchError,
     InvalidArgumentError,
     MemoryLimitError,
     MissingDataError,
     OutputError,
     check_whole,
 )
-from gmmtorch.files import write_bytes
-from gmmtorch.mapping.codec.component_batch import (
-    MapSettings,
-    file_size,
-    map_bytes,
-    read_map_bytes,
-    read_settings,
-    settings_facts,
-)
-from gmmtorch.mapping.codec.quantization import quantized, spatial_order
+from gmmtorch.files import FileLock, write_bytes
+from gmmtorch.mapping.codec.component_batch import read_map_bytes, read_settings, settings_facts
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.merging import compact_to_bytes
 from gmmtorch.mapping.learning.rules import IncrementalRule
 from gmmtorch.mapping.learning.windows import learns_in_parts
 from gmmtorch.mapping.query import Query, count_many, cutoff_of, mean_range, rule_of
 from gmmtorch.mapping.query_options import check_method
-from gmmtorch.mapping.tile_index import INDEX, TileIndex, check_side, index_row, read_index, tile_name
+from gmmtorch.mapping.tiles.tile_files import (
+    SIDE,
+    by_tile,
+    calibrated,
+    index_file,
+    tile_file,
+    with_calibration,
+)
+from gmmtorch.mapping.tiles.tile_index import INDEX, TileIndex, check_side, read_index, tile_name
 from gmmtorch.occupancy import (
     CUTOFF,
     Calibration,
@@ -66,14 +67,13 @@ from gmmtorch.occupancy import (
 )
 from gmmtorch.scan import Scan
 
-SIDE = 100.0
-"""Side (m) of the tiles if none is given."""
 _BYTES_EACH = 1536  # memory of a component that answers queries, with its part of the spatial index
 _RECENT = 4096  # components in memory before the older half goes into tiles
 _REMEDY = (
     "open the map again if another process changes it; otherwise copy the folder again from where it was "
     "written, or merge the recordings again"
 )
+_LOCK = ".lock"
 _WRITTEN = re.compile(r"\.?(tile_-?\d+_-?\d+|recent|index)(_[0-9a-f]{8})?(\.[0-9a-f]{16})?\.safetensors")
 """Names of files that a map writes; with a dot before an interrupted write has renamed them."""
 
@@ -100,6 +100,7 @@ class TiledMap:
         index: see `TileIndex`. dim: 2 or 3. side: of the tiles (m).
         resolution, method, query_options: as of a `GaussianMap`; the cutoff is that of the whole map.
         settings: of the tiles' files.
+        n_scans: number of scans of all finished windows, which are in the files.
         n_read: number of tile files read so far.
 
     Raises `MissingDataError` if there is no index, and `DataError` if it is damaged.
@@ -124,6 +125,8 @@ class TiledMap:
         self._open: OrderedDict[str, tuple[Query, int]] = OrderedDict()
         self._crc32 = int(facts.get("recent", 0))  # of the file with the recent components
         self._recent = self._read_recent() if "recent" in facts else None
+        self.n_scans = self._n_inserted = int(facts.get("n_scans", 0))
+        self._lock = FileLock(self.folder / _LOCK)
         self._update()
 
     @classmethod
@@ -199,18 +202,21 @@ class TiledMap:
 
         The cost does not depend on the size of the map. Raises `InvalidArgumentError` if the map does not
         grow, and `OutputError` if a file cannot be written: the scan is then in memory, and the next full
-        window, or `finish`, writes it. Only one process may write; another one gets an `OutputError`.
+        window, or `finish`, writes it. Also raises `OutputError` while another object, of this or another
+        process, writes the map.
         """
         self._growing().insert(scan)
+        self._n_inserted += 1
         if not self.n_pending:
             self._store()
 
     def finish(self) -> None:
-        """Ends the unfinished window, and writes all that is not in the files."""
+        """Ends the unfinished window, writes all that is not in the files, and lets other objects write."""
         recent = self._growing()
         if recent.n_pending:
             recent.revise(lambda components: components)
         self._store()
+        self._lock.release()
 
     def add(self, components: Components) -> None:
         """Adds components, such as those of another map, and writes them. An unfinished window ends.
@@ -225,28 +231,38 @@ class TiledMap:
         self._store()
 
     def _growing(self) -> GaussianMap:
+        """The recent components, for a change of the map."""
         if self._recent is None:
             raise InvalidArgumentError(f"{self.folder} has merged tiles, which do not grow; use `create`.")
+        if self._lock.hold():
+            try:
+                self._check_current()
+            except GmmTorchError:
+                self._lock.release()
+                raise
         return self._recent
 
-    def _store(self) -> None:
-        """Writes the recent components; if there are more than `_RECENT`, the older ones into tiles."""
-        recent, known = self._growing(), self.settings.query
+    def _check_current(self) -> None:
+        """Raises `OutputError` if the files are not those that were read or written here."""
         if read_index(self.folder / INDEX)[1].get("recent") != self._crc32:
             raise OutputError(
                 f"{self.folder} cannot be written: another process has changed the map since it was opened "
                 "here. Open it again by TiledMap, and insert again what it does not contain."
             )
+
+    def _store(self) -> None:
+        """Writes the recent components; if there are more than `_RECENT`, the older ones into tiles."""
+        recent, known = self._growing(), self.settings.query
         found, query = recent.components(), recent.query_options
         query = replace(query, cutoff=known.cutoff, calibration=query.calibration or known.calibration)
-        settings = _calibrated(replace(recent.settings, query=query, robot=0), found)
+        settings = calibrated(replace(recent.settings, query=query, robot=0), found)
         n_old = len(found) - _RECENT // 2 if len(found) > _RECENT else 0
         rows, index = [], self.index
         number = {tuple(tile): row for row, tile in enumerate(index.tiles.tolist())} if n_old else {}
-        for tile, part in _by_tile(found.selected(torch.arange(n_old, device=self.device)), self.side):
+        for tile, part in by_tile(found.selected(torch.arange(n_old, device=self.device)), self.side):
             row = number.get(tuple(tile))
             parts = [part.on_cpu()] if row is None else [self.components(row), part.on_cpu()]
-            data, made = _tile(tile, Components.concatenate(parts), settings, None)
+            data, made = tile_file(tile, Components.concatenate(parts), settings, None)
             write_bytes(self.folder / tile_name(tile, made["crc32"]), data)
             rows.append(made)
         if rows:
@@ -255,9 +271,9 @@ class TiledMap:
         data = recent._file(found.selected(left).with_used_origins())
         crc32 = zlib.crc32(data)
         write_bytes(self.folder / _recent_name(crc32), data)
-        facts = settings_facts(settings) | {"recent": crc32}
+        facts = settings_facts(settings) | {"recent": crc32, "n_scans": self._n_inserted}
         write_bytes(self.folder / INDEX, index.to_bytes(side=self.side, **facts))
-        self.index, self.settings, self._crc32 = index, settings, crc32
+        self.index, self.settings, self._crc32, self.n_scans = index, settings, crc32, self._n_inserted
         if n_old:
             recent.revise(lambda components: components.selected(left).with_used_origins())
         self._update()
@@ -291,6 +307,16 @@ class TiledMap:
     def n_components(self) -> int:
         """Number of components without those of an unfinished window."""
         return int(self.index.n_components.sum()) + (self._recent.n_final if self._recent else 0)
+
+    @property
+    def n_final(self) -> int:
+        """As `n_components`."""
+        return self.n_components
+
+    @property
+    def predictions(self) -> dict[float, Tensor]:
+        """As `GaussianMap.predictions`, of the scans since the map was opened here."""
+        return {} if self._recent is None else self._recent.predictions
 
     @property
     def nbytes(self) -> int:
@@ -401,12 +427,15 @@ class TiledMap:
     def _query(self, row: int) -> Query:
         """The query of a tile. If the open ones need too much memory, the least recently used are dropped."""
         name = self._name(row)
+        share = float(self.index.support[row] / self.index.support.sum().clamp_min(1e-300))
+        n_samples = max(1, round(share * self.query_options.n_samples))
+        options = replace(self.query_options, n_samples=n_samples)
         if name not in self._open:
             components = self.components(row).to(self.device)
-            share = float(self.index.support[row] / self.index.support.sum().clamp_min(1e-300))
-            n_samples = max(1, round(share * self.query_options.n_samples))
-            made = Query(components, replace(self.query_options, n_samples=n_samples))
-            self._open[name] = made, len(components) * _BYTES_EACH
+            self._open[name] = Query(components, options), len(components) * _BYTES_EACH
+        known, n_bytes = self._open[name]
+        if known.options.n_samples != n_samples:  # other tiles have grown
+            self._open[name] = known.replaced(known.components, options), n_bytes
         self._open.move_to_end(name)
         while len(self._open) > 1 and sum(n_bytes for _, n_bytes in self._open.values()) > self.memory:
             self._open.popitem(last=False)
@@ -423,35 +452,6 @@ def _remove_others(folder: Path, names: set[str]) -> None:
 def _recent_name(crc32: int) -> str:
     """Name of the file with the recent components of a map that grows."""
     return f"recent_{crc32:08x}.safetensors"
-
-
-_RULE = IncrementalRule()  # in the files of tiles; a map that continues from one adapts it to its scans
-
-
-def tile_files(components: Components, settings: MapSettings, side: float = SIDE) -> dict[str, bytes]:
-    """The files of a tiled map by name: its tiles, and last its index.
-
-    Args:
-        components: as the codec rounds them, such as `GaussianMap.components()`.
-        settings: of the files. Components get new ids.
-        side: of the tiles (m).
-    """
-    check_side("tile", side)
-    settings = _calibrated(replace(settings, robot=0), components)
-    files, rows = {}, []
-    for tile, part in _by_tile(components, side):
-        files[tile_name(tile)], row = _tile(tile, part, settings, None)
-        rows.append(row)
-    files[INDEX] = _index(rows, components.dim, settings, side)
-    return files
-
-
-def _by_tile(components: Components, side: float) -> Iterator[tuple[list[int], Components]]:
-    """Each tile (2,) that contains means, and its components."""
-    place = (components.means[:, :2].detach() / side).floor().long()
-    tiles, which = torch.unique(place, dim=0, return_inverse=True)
-    for number, tile in enumerate(tiles.tolist()):
-        yield tile, components.selected((which == number).nonzero().squeeze(1))
 
 
 def merge(
@@ -483,12 +483,12 @@ def merge(
     first, folder = parts[0], Path(folder)
     known = [part.settings.query.calibration for part in parts]
     calibration = Calibration.merged([one for one in known if one is not None]) if any(known) else None
-    settings = _with(first.settings, calibration)
+    settings = with_calibration(first.settings, calibration)
     for part in parts[1:]:
         for name in ("dim", "side", "settings"):
             found = [getattr(one, name) for one in (part, first)]
             if name == "settings":
-                found = [_with(one, None) for one in found]
+                found = [with_calibration(one, None) for one in found]
             if found[0] != found[1]:
                 raise InvalidArgumentError(
                     f"{part.folder} has {name}={found[0]}, but {first.folder} has {found[1]}; map all "
@@ -499,85 +499,20 @@ def merge(
         for number, tile in enumerate(part.index.tiles.tolist()):
             owners.setdefault(tuple(tile), []).append(partial(part.components, number))
         if part._recent is not None:
-            for tile, recent in _by_tile(part._recent.components(), first.side):
+            for tile, recent in by_tile(part._recent.components(), first.side):
                 owners.setdefault(tuple(tile), []).append(recent.on_cpu)
+    lock = FileLock(folder / _LOCK)
+    lock.hold()
     (folder / INDEX).unlink(missing_ok=True)  # a merge that is stopped leaves no index, not a wrong one
     _remove_others(folder, set(map(tile_name, owners)))
     rows = []
     for done, tile in enumerate(sorted(owners), 1):
         joined = Components.concatenate([components() for components in owners[tile]])
-        data, row = _tile(tile, joined, settings, tile_bytes)
+        data, row = tile_file(tile, joined, settings, tile_bytes)
         write_bytes(folder / tile_name(tile), data)
         rows.append(row)
         if on_event is not None:
             on_event("merging tiles", done, len(owners))
-    write_bytes(folder / INDEX, _index(rows, first.dim, settings, first.side))
+    write_bytes(folder / INDEX, index_file(rows, first.dim, settings, first.side))
+    lock.release()
     return TiledMap(folder, first.device)
-
-
-def _calibrated(settings: MapSettings, components: Components) -> MapSettings:
-    """The settings with the calibration of the sensor model, for the ranges of the components, if they have
-    none. A tile alone does not show these ranges."""
-    if settings.query.calibration is not None or settings.query.prior is not None:
-        return settings
-    return _with(settings, Calibration.prior(mean_range([components])))
-
-
-def _with(settings: MapSettings, calibration: Calibration | None) -> MapSettings:
-    return replace(settings, query=replace(settings.query, calibration=calibration))
-
-
-def _tile(
-    tile: Sequence[int], components: Components, settings: MapSettings, tile_bytes: int | None
-) -> tuple[bytes, dict[str, Any]]:
-    """The file of a tile, and its row of the index."""
-    found = canonical(components)
-    if tile_bytes is not None:
-        size = partial(file_size, rule=_RULE, settings=settings, next_number=0)
-        found = compact_to_bytes(found, tile_bytes, _RULE.max_origins, _RULE.mean_origins, size)
-        found = canonical(found if settings.codec == "float" else quantized(found))
-    data = map_bytes(found, _RULE, settings, 0)
-    return data, index_row(tile, found, settings.query.cutoff, len(data), zlib.crc32(data))
-
-
-def _index(rows: Sequence[dict[str, Any]], dim: int, settings: MapSettings, side: float) -> bytes:
-    return TileIndex.joined(rows, dim).to_bytes(side=float(side), **settings_facts(settings))
-
-
-def canonical(components: Components) -> Components:
-    """The same components on the CPU in an order that depends on their values alone: by place.
-
-    Ids are (0, 0), (0, 1), … Origins are distinct and sorted, and all used.
-    """
-    c = components.on_cpu()
-    origins, seen_from = torch.unique(c.origins[c.seen_from] + 0.0, dim=0, return_inverse=True)  # no −0
-    c = replace(c, origins=origins, seen_from=seen_from)
-    c = _viewpoints_in_order(c.rearranged(_order(c)))
-    numbers = torch.stack([torch.zeros(len(c), dtype=torch.int64), torch.arange(len(c))], 1)
-    return replace(c, ids=numbers)
-
-
-def _order(components: Components) -> Tensor:
-    """An order (K,) by place, and then by all values. Only equal components keep their order."""
-    c = components
-    columns = [*c.means.T, *c.covariances.flatten(1).T, c.support, c.max_range, _viewpoint_hashes(c)]
-    by_value = torch.from_numpy(np.lexsort([column.numpy() for column in columns[::-1]]))
-    return by_value[spatial_order(c.selected(by_value))]  # a stable sort
-
-
-def _viewpoint_hashes(components: Components) -> Tensor:
-    """A hash (K,) int64 of the viewpoints of each component, which does not depend on their order."""
-    c = components
-    values = torch.cat([c.origins[c.seen_from], c.seen_count[:, None]], 1).contiguous().view(torch.int64)
-    word = torch.zeros_like(c.seen_by)
-    for column in values.T:
-        word = (word ^ column) * 0x2545F4914F6CDD1D  # products modulo 2⁶⁴
-        word = word ^ (word >> 29)
-    return torch.zeros(len(c), dtype=torch.int64).index_add_(0, c.seen_by, word)
-
-
-def _viewpoints_in_order(components: Components) -> Components:
-    """The same components with their viewpoints sorted by component and origin."""
-    c = components
-    order = torch.from_numpy(np.lexsort([c.seen_from.numpy(), c.seen_by.numpy()]))
-    return replace(c, seen_by=c.seen_by[order], seen_from=c.seen_from[order], seen_count=c.seen_count[order])

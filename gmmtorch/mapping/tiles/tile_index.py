@@ -119,7 +119,7 @@ def index_row(
 
 
 def read_index(path: Path) -> tuple[TileIndex, dict[str, Any]]:
-    """The index and its facts; `side` (m) and `recent` are checked, the others are not.
+    """The index and its facts; `side` (m), `recent` and `n_scans` are checked, the others are not.
 
     Raises `MissingDataError` if the file does not exist, and `DataError` if it is damaged.
     """
@@ -137,8 +137,8 @@ def read_index(path: Path) -> tuple[TileIndex, dict[str, Any]]:
     )
     try:
         check_side("side", facts.get("side"))
-        if "recent" in facts:
-            check_whole("recent", facts["recent"], 0)
+        for name in {"recent", "n_scans"} & facts.keys():
+            check_whole(name, facts[name], 0)
     except GmmTorchError as error:
         raise DataError(f"{path}: {error} The file is damaged.") from error
     _check(index, path)

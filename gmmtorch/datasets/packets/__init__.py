@@ -1,0 +1,1 @@
+"""Raw packets of lidars, in messages and in network captures."""

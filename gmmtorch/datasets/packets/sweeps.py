@@ -1,0 +1,172 @@
+"""Sweeps: packets of a lidar that come one by one, as messages with one turn each.
+
+Drivers of Velodyne and Hesai lidars record such messages. That of Ouster records single packets, and so does
+a network capture.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from collections.abc import Collection, Iterator, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from gmmtorch.datasets.packets import hesai
+from gmmtorch.datasets.packets.captures import Capture, Datagram
+from gmmtorch.datasets.trajectory import NANOSECONDS
+from gmmtorch.errors import DataError
+
+VELODYNE_BYTES = 1206
+_BACK = 36.0
+"""A turn ends where the azimuth jumps back by more degrees: packets can overtake each other."""
+_MOST_PACKETS, _MOST_BYTES = 1 << 14, 1 << 26  # of a sweep
+_MOST_TOPICS = 256
+
+SWEEP = "lidar_packets/msg/Sweep"
+_DATAGRAMS = "UDP datagrams"
+"""The type of other datagrams in a capture, which are not read."""
+DEFINITION = (
+    f"std_msgs/Header header\nlidar_packets/Packet[] packets\n{'=' * 80}\n"
+    "MSG: lidar_packets/Packet\nbuiltin_interfaces/Time stamp\nuint8[] data\n"
+)
+
+SINGLE_PACKETS = {"ouster_ros/msg/PacketMsg": "os_sensor", "ouster_sensor_msgs/msg/PacketMsg": "os_sensor"}
+"""Messages with one packet and no header, which are read as sweeps, and the frame of their lidars."""
+
+
+_CHANNELS = (8, 16, 32, 64, 128)  # of an Ouster, whose packets have 16 columns
+_LEGACY = {16 * (20 + 12 * n) for n in _CHANNELS}
+_PROFILED = {64 + 16 * (12 + n * pixel) for n in _CHANNELS for pixel in (4, 8, 12, 16, 20)}
+
+
+def is_ouster(data: bytes) -> bool:
+    """Whether a datagram looks like a packet of an Ouster lidar, which has no mark of its own."""
+    return len(data) in _LEGACY or (len(data) in _PROFILED and data[0] == 1)
+
+
+def is_lidar(data: bytes) -> bool:
+    """Whether a datagram is a packet of a lidar that is read."""
+    return len(data) == VELODYNE_BYTES or hesai.model_of(data) is not None or is_ouster(data)
+
+
+def packet_of(message: bytes, is_ros1: bool) -> bytes:
+    """The packet in a message of `SINGLE_PACKETS`."""
+    at = 0 if is_ros1 else 4
+    is_big = not is_ros1 and message[1:2] == b"\0"
+    return message[at + 4 :][: int.from_bytes(message[at : at + 4], "big" if is_big else "little")]
+
+
+class Sweeps:
+    """Collects packets until a turn of the lidar is complete."""
+
+    def __init__(self) -> None:
+        self._packets: list[tuple[int, bytes]] = []
+        self._n_bytes = 0
+        self._last: bytes | float | None = None
+
+    def add(self, time: int, data: bytes) -> list[tuple[int, bytes]]:
+        """Adds a packet and its time (ns); returns the turn before it if it begins the next, or nothing."""
+        place = _place(data)
+        if isinstance(place, float) and isinstance(self._last, float):
+            begins = place < self._last - _BACK
+        else:
+            begins = self._last is not None and place != self._last
+        self._last = place
+        is_full = len(self._packets) >= _MOST_PACKETS or self._n_bytes + len(data) > _MOST_BYTES
+        done = self.rest() if begins or is_full else []
+        self._packets.append((time, data))
+        self._n_bytes += len(data)
+        return done
+
+    def rest(self) -> list[tuple[int, bytes]]:
+        """The packets of the last turn, which may be incomplete."""
+        found, self._packets, self._n_bytes = self._packets, [], 0
+        return found
+
+
+def _place(data: bytes) -> bytes | float:
+    """The azimuth of a packet in degrees, or what changes with the number of the turn."""
+    if len(data) == VELODYNE_BYTES:
+        return int.from_bytes(data[2:4], "little") / 100
+    model = hesai.model_of(data)
+    if model is not None:
+        return hesai.azimuth_of(data, model)
+    return data[10:12] if len(data) in _LEGACY else data[2:8]
+
+
+def packed(sweep: Sequence[tuple[int, bytes]], frame: str, is_ros1: bool) -> bytes:
+    """A `SWEEP` message with the time of its first packet, in the packed form of ROS 1 or in CDR."""
+    pad, name = (1, frame.encode()) if is_ros1 else (4, frame.encode() + b"\0")
+    found = bytearray(4 if is_ros1 else 0)  # the number of the message, which only ROS 1 has
+    found += struct.pack("<III", *divmod(sweep[0][0], NANOSECONDS), len(name)) + name
+    found += bytes(-len(found) % pad) + struct.pack("<I", len(sweep))
+    for time, data in sweep:
+        found += bytes(-len(found) % pad) + struct.pack("<III", *divmod(time, NANOSECONDS), len(data)) + data
+    return bytes(found) if is_ros1 else b"\0\1\0\0" + found
+
+
+def definition(text: str) -> SimpleNamespace:
+    """A definition of a message, as those of a reader of rosbags."""
+    return SimpleNamespace(format=SimpleNamespace(name="MSG"), data=text)
+
+
+# -- captures ----------------------------------------------------------------------------------------
+
+
+class CaptureMessages:
+    """The packets of lidars in a network capture as messages of sweeps. Each sender and port is a topic.
+
+    Attributes:
+        connections: as those of a reader of rosbags.
+        damage: of the file, see `Capture`.
+
+    Raises `DataError` if the file is not a capture, or has no UDP datagram.
+    """
+
+    def __init__(self, path: Path) -> None:
+        counts, n_sweeps = Counter[tuple[str, int]](), Counter[tuple[str, int]]()
+        turns: dict[tuple[str, int], Sweeps] = {}
+
+        def note(one: Datagram) -> None:
+            key = one.source, one.port
+            if key not in counts and len(counts) >= _MOST_TOPICS:
+                return
+            counts[key] += 1
+            if is_lidar(one.data):
+                n_sweeps[key] += bool(turns.setdefault(key, Sweeps()).add(one.time, one.data))
+
+        self._capture = Capture(path, note)
+        self.damage = self._capture.damage
+        if not counts:
+            raise DataError(f"{path} contains no UDP datagram over IPv4; capture the port of the lidar.")
+        self.connections: list[Any] = []
+        for (source, port), n_datagrams in counts.items():
+            is_lidar_here = (source, port) in turns
+            self.connections.append(
+                SimpleNamespace(
+                    id=len(self.connections),
+                    topic=f"/{source}/{port}",
+                    msgtype=SWEEP if is_lidar_here else _DATAGRAMS,
+                    msgcount=n_sweeps[source, port] + 1 if is_lidar_here else n_datagrams,
+                    msgdef=definition(DEFINITION if is_lidar_here else ""),
+                )
+            )
+
+    def messages(
+        self, connections: Collection[Any], start: int | None = None
+    ) -> Iterator[tuple[Any, int, bytes]]:
+        """(connection, time in ns, content) of the sweeps of some topics, from a time on."""
+        wanted = {one.topic: (one, Sweeps()) for one in connections if one.msgtype == SWEEP}
+        for one in self._capture.datagrams(start):
+            found = wanted.get(f"/{one.source}/{one.port}")
+            if found is not None and is_lidar(one.data):
+                yield from _message(found[0], found[1].add(one.time, one.data))
+        for connection, sweeps in wanted.values():
+            yield from _message(connection, sweeps.rest())
+
+
+def _message(connection: Any, sweep: list[tuple[int, bytes]]) -> Iterator[tuple[Any, int, bytes]]:
+    if sweep:
+        yield connection, sweep[0][0], packed(sweep, "", is_ros1=False)
