@@ -165,7 +165,9 @@ def spz(version: int, turn: bytes, degree: int = 0, n: int = 1) -> bytes:
     header = struct.pack("<IIIBBBB", 0x5053474E, version, n, degree, 8, 0, 0)
     place = b"".join((256 * x & 0xFFFFFF).to_bytes(3, "little") for x in (1, 2, -3))
     harmonics = bytes(3 * (0, 3, 8, 15)[degree])
-    return gzip.compress(header + place + bytes([255, 128, 255, 0, 160, 144, 128]) + turn + harmonics)
+    return gzip.compress(
+        header + place + bytes([255, 128, 255, 0, 160, 144, 128]) + turn + harmonics, mtime=0
+    )
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
