@@ -429,8 +429,8 @@ def _transforms(table: Path, tokens: list[str]) -> Pose:
     found = _records(table, b'"rotation"', set(tokens))
     try:
         rows = [found[token] for token in tokens]
-        shifts = np.array([row["translation"] for row in rows], np.float64).reshape(-1, 3)
-        turns = np.array([row["rotation"] for row in rows], np.float64).reshape(-1, 4)
+        shifts = np.array([row["translation"] for row in rows], np.float64).reshape(len(rows), 3)
+        turns = np.array([row["rotation"] for row in rows], np.float64).reshape(len(rows), 4)
         return Pose.from_quaternion(shifts, np.roll(turns, -1, 1))
     except (KeyError, ValueError, TypeError) as error:
         raise DataError(f"{table}: the pose of a sweep is missing or damaged ({error!s:.80}).") from error

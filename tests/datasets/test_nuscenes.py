@@ -146,6 +146,7 @@ def changed(folder: Path, table: str, before: str, after: str) -> None:
         ("sample_data", '"sample_token"', '"sample_token'),
         ("ego_pose", '"rotation": [', '"rotation": [0, '),
         ("ego_pose", '"token"', '"other"'),
+        ("ego_pose", '"rotation": [', '"rotation": [0, 0, 0, 0, '),
         ("ego_pose", "60", "NaN"),
         ("calibrated_sensor", '"rotation": [', '"rotation": "'),
         ("calibrated_sensor", "0.9", "1e999"),
