@@ -41,11 +41,11 @@ _SPACING = 1.0  # metres between the starts in 3D near the expected poses
 _COARSE = 0.5  # metres of blur of those in 3D; in a hall, with one metre twice as many scans are missed
 _HEADINGS = 8  # from which a scan in 3D is registered, if it may have turned far
 _TURNED = 0.2  # radians between the headings of neighbours, for each metre between their places
-_NEAR = 0.5  # metres, and half as many radians: greater deviations need more than the first search in 3D
+_NEAR = 0.5  # metres, and half as many radians, of the deviations of the first search in 3D
 _FARTHEST = 3.0  # metres of a search
 _SORTED = 200  # best starts, of which
 _CLIMBED = 48  # different ones are climbed
-_FEW = 8  # of them in 3D, where the motion is as expected
+_FEW = 24  # of them in that search
 _SPREAD = 0.75  # spacings between them
 _COARSE_POINTS = 300  # of the scan on all levels but the last one
 _RANKED = 200  # points of the scan that rank the starts
@@ -173,17 +173,14 @@ class LocalMap:
             anywhere = self._search.best(scan.points, expected, _STARTS[1]).poses
             yield Pose.cat([starts, anywhere]), self._targets
             return
+        near = expected._replace(distance=min(expected.distance, _NEAR), angle=min(expected.angle, _NEAR / 2))
         first = self._targets[0]
-        if expected.distance <= _NEAR and expected.angle <= _NEAR / 2:  # climbs bridge such a turn
-            yield (
-                self._lattice(scan, expected, expected.poses, first, 2 * first.blur, 0.0, _FEW),
-                self._targets,
-            )
+        starts = self._lattice(scan, near, near.poses, first, 2 * first.blur, 2 * near.angle, _FEW)
         still = Scan(scan.points, torch.zeros(self.dim))
         mixture = learn_window([still], self._rule, torch.Generator().manual_seed(0))
         found = register(mixture, self._components, expected.poses.matrix)
         registered = Pose.from_matrix(found.transform[None])
-        yield Pose.cat([registered, expected.poses]), self._targets
+        yield Pose.cat([registered, starts]), self._targets
         # Where pillars repeat, it may be one of them off, but has the right rotation.
         places = torch.cat([registered.translation, expected.poses.translation])
         around = Pose(registered.rotation.expand(len(places), 3, 3), places)

@@ -89,7 +89,7 @@ class Odometry:
         least_explained: share of the points that must lie on surfaces of the local map.
         rule: how a scan becomes a mixture.
         max_step, max_turn: largest motion (m, rad) of the sensor between two scans. A pose that is farther
-            from the last one and from the predicted one is not found. After ten steps in succession, twice
+            from the last one and from the predicted one is not found. In 2D, after ten steps, twice
             the longest one (at least 2 m), and twice the largest turn (at least 2.4 rad), limit them, too.
     """
 
@@ -308,10 +308,10 @@ class Odometry:
         return rest.towards(self._motion, ratio), rest
 
     def _limits(self) -> tuple[float, float]:
-        """The largest shift (m) and turn (rad) to the next scan, by `max_step` and `max_turn` and, after some
-        steps, by those that were found: a recording has scans after certain times or motions.
+        """The largest shift (m) and turn (rad) to the next scan, by `max_step` and `max_turn`; in 2D also by
+        those that were found, after some steps: a recording has scans after certain times or motions.
         """
-        if self._n_steps < _STEPS:
+        if self._n_steps < _STEPS or self._poses[-1].dim == 3:
             return self.max_step, self.max_turn
         step, turn = (max(_LONGER * found, least) for found, least in zip(self._longest, _LEAST, strict=True))
         return min(step, self.max_step), min(turn, self.max_turn)

@@ -224,7 +224,7 @@ def test_the_missing_metadata_of_a_lidar_are_named(check, tmp_path, monkeypatch)
     assert "/192.168.1.201/7502 lidar_packets/Sweep 4 10 0.1 0 scans (lidar packets)" in words(done)
     assert "give the file (.json) that was recorded with it, dataset.calibration=FILE" in words(done)
     (tmp_path / "a.json").write_text(ouster_metadata("LEGACY", 32, 128))
-    assert "dataset.odometry=auto reads 4 scans" in words(check(path, "dataset=rosbag"))
+    assert "dataset.odometry=auto, which reads 4 scans" in words(check(path, "dataset=rosbag"))
     done = check(path, "dataset=rosbag", "dataset.poses=standing")
     assert done.status == 0
     assert "4 would be read of /192.168.1.201/7502" in words(done)

@@ -154,10 +154,12 @@ class Turning(Dataset):
 def given(monkeypatch) -> Iterator[list[Tensor | None]]:
     """The motions that odometry and tracker are given."""
     motions: list[Tensor | None] = []
-    for kind, name in ((Odometry, "add"), (Tracker, "locate")):
+    for kind, name, place in ((Odometry, "add", 2), (Tracker, "locate", -1)):
         method = getattr(kind, name)
         monkeypatch.setattr(
-            kind, name, lambda self, *a, method=method: (motions.append(a[-1]), method(self, *a))[1]
+            kind,
+            name,
+            lambda self, *a, method=method, place=place: (motions.append(a[place]), method(self, *a))[1],
         )
     return motions
 

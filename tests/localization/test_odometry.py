@@ -247,7 +247,7 @@ def test_steps_that_mislead_the_points_are_found_with_free_space(real_data, log,
         location = odometry.add(scans[number].transformed(torch.linalg.inv(pose)).points)
         assert location.found
         errors = absolute_trajectory_error(location.pose[None], (true[:1].inverse() @ pose), align="none")
-        assert float(errors.distances[0]) < 0.2
+        assert float(errors.distances[0]) < 0.25
 
 
 @pytest.mark.slow

@@ -184,6 +184,9 @@ class Recording:
     def __len__(self) -> int:
         return 24
 
+    def check_one_sensor(self, what):
+        self.scans.check_one_sensor(what)
+
     def pose(self, index):
         return self.scans.pose(index)
 

@@ -435,7 +435,7 @@ def _within(unpacked: bytes) -> bytes:
 
 def _limit_parsers(ros1: Any, ros2: Any, mcap: Any, metadata: Any, sqlite: Any) -> None:
     """Put codecs and parsers with limits in the places where modules of rosbags look for theirs."""
-    if hasattr(sqlite.apsw, "set_default_vfs"):  # the package itself, not yet ours
+    if not isinstance(sqlite.apsw, SimpleNamespace):  # the package itself, not yet ours
         sqlite.apsw = SimpleNamespace(**{**vars(sqlite.apsw), "Connection": _limited_database(sqlite.apsw)})
     ros2.YAML = metadata.YAML = _plain_yaml
     ros1.decompressors.update(bz2=_unpack_bz2, lz4=_unpack_lz4)
