@@ -82,24 +82,33 @@ def _unread(facts: BagFacts | None, found: Dataset | None) -> list[str]:
     return [name for name in sensors if name not in read]
 
 
+class _Notes(logging.Handler):
+    """Keeps the texts of a log."""
+
+    def __init__(self, level: int) -> None:
+        super().__init__(level)
+        self.texts: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.texts.append(record.getMessage())
+
+
 @contextlib.contextmanager
 def _noted_warnings() -> Iterator[list[str]]:
     """Collects the warnings of readers, which the console would have between the lines of the table."""
-    found: list[str] = []
-    logger, collector = logging.getLogger("gmmtorch"), logging.Handler()
-    collector.emit = lambda record: found.append(record.getMessage())  # type: ignore[method-assign]
+    logger, notes = logging.getLogger("gmmtorch"), _Notes(logging.WARNING)
     consoles = {
         handler: handler.level
         for handler in logging.getLogger().handlers
         if not isinstance(handler, logging.FileHandler)
     }
-    logger.addHandler(collector)
+    logger.addHandler(notes)
     for handler in consoles:
         handler.setLevel(logging.ERROR)
     try:
-        yield found
+        yield notes.texts
     finally:
-        logger.removeHandler(collector)
+        logger.removeHandler(notes)
         for handler, level in consoles.items():
             handler.setLevel(level)
 
