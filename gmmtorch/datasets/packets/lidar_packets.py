@@ -68,7 +68,7 @@ class LidarPackets:
         if self._metadata is None and self._path is not None:
             self._metadata = ouster.read_metadata(self._path.read_bytes(), str(self._path))
         if self._metadata is None and self._recording is not None:
-            self._metadata = stated_metadata(self._recording, n_bytes)
+            self._metadata = _stated_metadata(self._recording, n_bytes)
         if self._metadata is None:
             raise DataError(
                 "the recording lacks the metadata of the Ouster lidar, which state its angles: give the file "
@@ -126,7 +126,7 @@ _STRING = "std_msgs/msg/String"
 _MOST_FILES = 200
 
 
-def stated_metadata(recording: BagReader, n_bytes: int) -> ouster.Metadata | None:
+def _stated_metadata(recording: BagReader, n_bytes: int) -> ouster.Metadata | None:
     """The metadata of the Ouster lidar with packets of a size that a bag or a file beside it states.
 
     Those with the name of the recording come first. Raises `DataError` if there are several.
