@@ -51,7 +51,7 @@ def check(config: DictConfig) -> bool:
             _print_wrapped("\nproblem    ", problem)
         if facts is not None and share < _FEW_SCANS:
             warnings = list(warnings)  # not those of the trials
-            advice += _trials(options, facts, 0 if found is None else len(found))
+            advice += _trials(options, facts, 0 if found is None else len(found), problem)
     others = _unread(facts, found) if share else []
     if others:
         _print_wrapped(
@@ -286,8 +286,9 @@ def _print_poses(found: Dataset, advice: list[str]) -> None:
 # -- other options -----------------------------------------------------------------------------------
 
 
-def _trials(options: DictConfig, facts: BagFacts, n_found: int) -> list[str]:
-    """Options with which more scans can be read, each tried on the recording."""
+def _trials(options: DictConfig, facts: BagFacts, n_found: int, problem: str) -> list[str]:
+    """Options with which more scans can be read, each tried on the recording; or what else than the problem
+    stands in their way."""
     given = {str(key): options[key] for key in options if options[key] is not None}
     for name in ("name", "path", "odometry", "motion"):
         given.pop(name, None)
@@ -325,7 +326,8 @@ def _trials(options: DictConfig, facts: BagFacts, n_found: int) -> list[str]:
                 advice.append(f"add {words}, which reads {count_text(n_scans, 'scan')}{note}")
                 if not change or change.get("poses") in sources:
                     break
-    return advice or ([f"with estimated poses there is another problem: {fault}"] if fault else [])
+    is_other = fault not in ("", problem)
+    return advice or ([f"with estimated poses there is another problem: {fault}"] if is_other else [])
 
 
 def _override(name: str, value: Any) -> str:
