@@ -8,6 +8,7 @@ import re
 from collections.abc import Collection, Mapping
 from typing import Self
 
+_SHOWN = 4000  # characters of the beginning and of the end of a longer message
 _LARGEST_CELL = 1e9  # metres; powers of larger sides overflow
 _MARKED = re.compile(r"‹([\w.]+)›")
 _HEAD = re.compile(r"‹([\w.]+)›|([\w.]+)(?=(?:\[\d+\](?:\.\w+)?)?=)")
@@ -45,7 +46,8 @@ def text_of(error: Exception) -> str:
 class GmmTorchError(Exception):
     """Base class of all errors that gmmtorch raises deliberately.
 
-    Their text is one line that is safe to print: control characters, as in a file's name, are escaped.
+    Their text is one line that is safe to print: control characters, as in a file's name, are escaped, and
+    the middle of a very long text, as that of a damaged number, is left out.
     The error of an argument says `argument=value fault; remedy`.
     """
 
@@ -95,7 +97,8 @@ class GmmTorchError(Exception):
 
     def __format__(self, spec: str) -> str:
         """The text for another error, with its marks."""
-        return printable(text_of(self))
+        text = printable(text_of(self))
+        return text if len(text) <= 2 * _SHOWN else f"{text[:_SHOWN]} … {text[-_SHOWN:]}"
 
 
 class InvalidArgumentError(GmmTorchError, ValueError):

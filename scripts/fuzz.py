@@ -6,7 +6,8 @@
 
 Inputs are sound ones that were changed where it hurts: sizes, counts, names, numbers; checksums fit again.
 A reader may return or raise a `GmmTorchError`. Anything else is a fault: another error, more than 10 s of a
-processor, more than 512 MiB above what the process had, a new file beside the input, the end of the process.
+processor, more than 512 MiB above what the process had, a new file beside the input, a message that is long
+or controls the terminal, the end of the process.
 The inputs of faults are kept in the folder. The exit status is 1 if there is one.
 """
 
@@ -48,6 +49,8 @@ from gmmtorch.errors import GmmTorchError  # noqa: E402
 
 SECONDS, MEMORY, SILENCE = 10, 512 << 20, 60
 """Of a processor and bytes for an input, at most; seconds without an outcome."""
+LONGEST = 20_000
+"""Characters of a message, at most."""
 BATCH, BATCH_SECONDS = 6_000, 5
 """Inputs and seconds of a process, at most: slow readers get fewer inputs."""
 
@@ -122,6 +125,8 @@ def child(target: Target, seed: int, n: int, place: Path, to: int) -> None:
             outcome = "refused"
             if not str(error).isprintable():
                 outcome = "fault: a message with control characters"
+            elif len(str(error)) > LONGEST:
+                outcome = f"fault: a message of {len(str(error)):,} characters"
         except BaseException as error:
             last = traceback.extract_tb(error.__traceback__)[-1]
             outcome = (

@@ -59,3 +59,11 @@ def test_an_error_has_the_parts_of_its_text_and_can_name_options():
     outer = errors.DataError(f"file: {plain}")
     assert outer.argument is None
     assert str(outer.told({"window": "map.window"})) == "file: noise=-1 must be above 0, or map.window=3."
+
+
+def test_the_middle_of_a_very_long_text_is_left_out():
+    error = errors.DataError(f"a.csv: {'9' * 10**6} is no number; correct it.")
+    assert len(str(error)) < 10_000
+    assert str(error).startswith("a.csv: 999")
+    assert str(error).endswith("is no number; correct it.")
+    assert len(str(errors.DataError(f"b.csv: {error}"))) < 10_000
