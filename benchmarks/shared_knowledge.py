@@ -18,6 +18,7 @@ error; a range image has every third or sixth pixel of a row and a column, in wh
 from __future__ import annotations
 
 import itertools
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -45,15 +46,15 @@ Record = list[tuple[float, int, Tensor, DepthFrame]]
 """Time, robot, its state (7,), and its frame."""
 
 
-class Points:
+class Points(ABC):
     """Counts the bytes of the beams of frames, and returns them as receivers decode them."""
 
     def __init__(self) -> None:
         self.n_bytes = 0.0
 
+    @abstractmethod
     def send(self, ends: Tensor, pixel: Tensor) -> Tensor:
         """The decoded ends of some beams, which are all hits or all not; `pixel`: theirs."""
-        raise NotImplementedError
 
     def finish(self) -> dict[str, float]:
         """Bytes by the name of the code."""

@@ -117,7 +117,7 @@ def all_equal(pairs: Iterable[tuple[Tensor, Tensor]]) -> bool:
 
 
 def order_along_curve(places: Tensor) -> Tensor:
-    """An order (N,) of finite points (N, 2 or 3), at least one, in which neighbours follow each other.
+    """An order (N,) of finite points (N, D), D ≤ 3, at least one, in which neighbours follow each other.
 
     It is that of a Morton curve through 32 cells along each axis of their box.
     """

@@ -176,6 +176,7 @@ def _mapped(config: DictConfig, path: Path) -> Mapped:
         map_outputs.write_trajectory(builder, folder)
         if poses is not None:
             map_outputs.write_estimated_poses(dataset, poses, folder)
+        # The growing map and the lock of the merged one have no suffix.
         files |= {file.name: file.read_bytes() for file in folder.iterdir() if file.suffix}
         row = map_outputs.result_row(dataset.name, builder, config, odometry)
     row |= {"cpu_seconds": time.process_time() - begin, "worker": f"{platform.node()}:{os.getpid()}"}

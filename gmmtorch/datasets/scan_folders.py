@@ -37,7 +37,7 @@ from gmmtorch.datasets.point_files.channels import CLASS, INTENSITY, check_chann
 from gmmtorch.datasets.point_files.pcd_files import pcd_header
 from gmmtorch.datasets.point_files.point_chunks import read_cloud
 from gmmtorch.datasets.trajectory import Trajectory, kitti_poses, read_rows, read_trajectory, to_nanoseconds
-from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.errors import DAMAGED_CONTENT, DataError, InvalidArgumentError
 from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 
@@ -432,7 +432,7 @@ def _transforms(table: Path, tokens: list[str]) -> Pose:
         shifts = np.array([row["translation"] for row in rows], np.float64).reshape(len(rows), 3)
         turns = np.array([row["rotation"] for row in rows], np.float64).reshape(len(rows), 4)
         return Pose.from_quaternion(shifts, np.roll(turns, -1, 1))
-    except (KeyError, ValueError, TypeError) as error:
+    except DAMAGED_CONTENT as error:
         raise DataError(f"{table}: the pose of a sweep is missing or damaged ({error!s:.80}).") from error
 
 

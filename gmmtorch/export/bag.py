@@ -171,13 +171,9 @@ class BagWriter:
         )
         if self._is_ros1:  # rosbags has no TF among the types of ROS 1
             self.define("tf2_msgs/msg/TFMessage", "geometry_msgs/TransformStamped[] transforms\n")
-        try:
+        with self._errors():
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._folder = Path(tempfile.mkdtemp(prefix=f".{self.path.stem}.", dir=self.path.parent))
-        except OSError as error:
-            raise OutputError(
-                f"{path} cannot be written: {error.strerror}; choose another folder."
-            ) from error
         self.writer: Any
         if self._is_ros1:
             self.writer = rosbag1.Writer(self._folder / "a.bag")

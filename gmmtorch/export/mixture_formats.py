@@ -147,7 +147,11 @@ def read_npz(path: str | Path) -> PlainMixture:
             if missing:
                 raise DataError(f"{path} lacks {', '.join(missing)}; it is not a mixture.")
             wanted = (*names, "support") if "support" in stored else names
-            arrays = {name: torch.from_numpy(np.asarray(stored[name], dtype=np.float64)) for name in wanted}
+            found = {name: stored[name] for name in wanted}  # bytes if it is not in NumPy's format
+        for name, array in found.items():
+            if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
+                raise DataError(f"{path} is damaged, or not an NPZ file of numbers: {name} has none.")
+        arrays = {name: torch.from_numpy(array.astype(np.float64)) for name, array in found.items()}
     except GmmTorchError:
         raise
     except Exception as error:  # also SyntaxError and TokenError of a header, and errors of zlib and zipfile

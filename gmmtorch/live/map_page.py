@@ -67,7 +67,7 @@ def write_page(
         "shape": shape,
         "shapes": [name for name in viewer_scene.SHAPES if name != "surfaces" or shape == "surfaces"],
         "colour": colour,
-        "scale": viewer_scene.colour_scale(9),
+        "scale": viewer_scene.colour_scale(),
         "unsure": unsure,
         **_view(frame),
         **_ellipsoids(components, solid, frame),

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import check_choice
-from gmmtorch.export import TriangleMesh
+from gmmtorch.export import TriangleMesh, colour_bytes
 from gmmtorch.mapping import Attributes, Components, GaussianMap, Labels
 from gmmtorch.occupancy import VoxelGrid
 from gmmtorch.pose import Pose
@@ -143,7 +143,7 @@ class Colours(NamedTuple):
         if self.ends is None:
             mark = '<span style="background:{};display:inline-block;width:10px;height:10px"></span> {}<br>'
             return "".join(mark.format(css, html.escape(name)) for name, css in self.legend)
-        bar = f"height:10px;background:linear-gradient(to right,{','.join(colour_scale(_N_SHADES))})"
+        bar = f"height:10px;background:linear-gradient(to right,{','.join(colour_scale())})"
         ends = "<span>{}</span><span>{}</span>".format(*self.ends)
         row = "display:flex;justify-content:space-between;padding:0 1em;font-size:12px"
         return f'<div style="{bar}"></div><div style="{row}">{ends}</div>'
@@ -183,26 +183,25 @@ def colours(components: Components, solid: Solid, by: str) -> Colours:
 
 
 def _channel_colours(name: str, attributes: Attributes, solid: Solid) -> Colours:
-    """The colours of a channel; grey where it is unknown."""
+    """The colours of a channel of components on the CPU; grey where it is unknown."""
     channel, legend, ends, slopes = attributes.channels[name], [], None, None
     if isinstance(channel, Labels):
         hues = np.array([list(bytes.fromhex(colour(i)[1:])) for i in range(len(channel.labels))], np.uint8)
-        known, rgb = channel.share.sum(1) > 0, hues[channel.share.cpu().argmax(1).numpy()]
+        known, rgb = channel.share.sum(1) > 0, hues[channel.share.argmax(1).numpy()]
         names = map(str, channel.labels.tolist())
         legend = [(label, _css(hue)) for label, hue in zip(names, hues.tolist(), strict=True)]
     elif name == COLOUR:
-        known, seen = channel.share > 0, display_colours(channel.mean.clamp(0, 1))
-        rgb = (255 * seen).round().cpu().numpy().astype(np.uint8)
+        known, rgb = channel.share > 0, colour_bytes(channel.mean)
         deviations, axes = principal_axes(solid.covariances)
         change = (channel.slope @ axes[:, : channel.slope.shape[2]] * deviations[:, None]).mT
         nearby = [display_colours((channel.mean[:, None] + sign * change).clamp(0, 1)) for sign in (1, -1)]
         slopes = ((nearby[0] - nearby[1]) / 2).numpy()
     else:
-        known, value = channel.share > 0, channel.mean[:, 0].cpu()
-        some = value[known.cpu()]
+        known, value = channel.share > 0, channel.mean[:, 0]
+        some = value[known]
         low, high = some.quantile(torch.tensor([0.02, 0.98]).double()).tolist() if len(some) else (0.0, 1.0)
         rgb, ends = _spread(value, low, high), (f"{low:.3g}", f"{high:.3g}")
-    rgb = np.where(known.cpu().numpy()[:, None], rgb, _UNKNOWN).astype(np.uint8)
+    rgb = np.where(known.numpy()[:, None], rgb, _UNKNOWN).astype(np.uint8)
     return Colours(rgb, ends, legend, slopes)
 
 
@@ -222,9 +221,9 @@ def height_shades(places: Tensor) -> np.ndarray:
     return _shades(np.asarray(height_scale(places[:, 2])(places[:, 2].numpy())))
 
 
-def colour_scale(n_colours: int) -> list[str]:
-    """The scale of the colours as CSS colours, from the first to the last."""
-    return [_css(shade) for shade in _shades(np.linspace(0, 1, n_colours)).tolist()]
+def colour_scale() -> list[str]:
+    """The scale of a legend as CSS colours, from the first to the last."""
+    return [_css(shade) for shade in _shades(np.linspace(0, 1, _N_SHADES)).tolist()]
 
 
 def _css(shade: Sequence[int]) -> str:

@@ -63,6 +63,7 @@ class AlignmentTarget:
         blur: s (m), above zero.
         normals: (K, D), towards the side from which a surface is seen; zero: from all sides. A sensor behind
             a surface by more than the blur does not see it, so the two faces of a wall are not confused.
+        lists: of a target with the same surfaces and a larger blur. None: they are made.
     """
 
     def __init__(

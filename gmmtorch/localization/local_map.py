@@ -37,18 +37,17 @@ _SLIDE = 1.0  # metres that the best pose is moved at most along its loosest dir
 _SLIDES = 16  # places, each of which climbs by
 _SLIDE_STEPS = 3
 _DECISIVE = 4.0  # nats by which such a place must be better: smaller gains do not make poses more exact
-_SPACING = 1.0  # metres between the starts in 3D near the expected poses
-_COARSE = 0.5  # metres of blur of those in 3D; in a hall, with one metre twice as many scans are missed
-_HEADINGS = 8  # from which a scan in 3D is registered, if it may have turned far
-_TURNED = 0.2  # radians between the headings of neighbours, for each metre between their places
-_NEAR = 0.5  # metres, and half as many radians, of the deviations of the first search in 3D
-_FARTHEST = 3.0  # metres of a search
-_SORTED = 200  # best starts, of which
-_CLIMBED = 48  # different ones are climbed
-_FEW = 24  # of them in that search
-_SPREAD = 0.75  # spacings between them
 _COARSE_POINTS = 300  # of the scan on all levels but the last one
-_RANKED = 200  # points of the scan that rank the starts
+_NEAR = 0.5  # metres, and half as many radians, of the deviations of the first search in 3D
+_SPACING = 1.0  # metres between the starts of the second one
+_COARSE = 0.5  # metres of its blur; in a hall, with one metre twice as many scans are missed
+_HEADINGS = 8  # from which a scan in 3D is registered, if it may have turned far
+_TURNED = 0.2  # radians between the headings of neighbours of a lattice, for each metre between their places
+_FARTHEST = 3.0  # metres that a lattice reaches
+_RANKED = 200  # points of the scan that rank its starts
+_SORTED = 200  # best starts, of which
+_CLIMBED = 24, 48  # different ones are climbed in the first search and in the second one
+_SPREAD = 0.75  # spacings between them
 _LOOSEST = 0.3  # metres of standard deviation
 LOST = 1.0, math.radians(20)
 """Deviations (m, rad) of a pose that no scan confirms."""
@@ -94,6 +93,10 @@ class _Found(NamedTuple):
     contradicted: float
     unlikely: float
 
+    @property
+    def rank(self) -> tuple[bool, float]:
+        return self.location.found, self.total
+
 
 class LocalMap:
     """The components of some keyframes in one frame.
@@ -114,8 +117,8 @@ class LocalMap:
         self._scans = [Scan(frame.pose.apply(frame.points), frame.pose.translation) for frame in keyframes]
         self._rule = rule
         self._components = learn_window(self._scans, rule, torch.Generator().manual_seed(0))
-        mixture = surface_mixture(self._components, "the local map")
-        centered = mixture._replace(means=mixture.means - self._center)
+        self._surfaces = surface_mixture(self._components, "the local map")
+        centered = self._surfaces._replace(means=self._surfaces.means - self._center)
         self._target = functools.partial(AlignmentTarget, centered, normals=seen_normals(self._components))
         first = self._target(_BLURS[self.dim][0])
         self._targets = [first, *(self._target(blur, lists=first.lists) for blur in _BLURS[self.dim][1:])]
@@ -124,13 +127,13 @@ class LocalMap:
 
     @functools.cached_property
     def _search(self) -> PoseSearch:
+        """Of the surfaces and the free space in 2D."""
         points = torch.cat([scan.points[:_SEARCHED] for scan in self._scans])
         # Points are sparse on far walls, components are not.
-        mixture = surface_mixture(self._components, "the local map")
-        values, axes = torch.linalg.eigh(mixture.covariances.double())
+        values, axes = torch.linalg.eigh(self._surfaces.covariances.double())
         half = (3 * values[:, -1]).sqrt()[:, None] * axes[:, :, -1]
         along = torch.linspace(-1, 1, 16).double()[:, None, None]
-        surfaces = (mixture.means.double() + along * half).flatten(0, 1)
+        surfaces = (self._surfaces.means.double() + along * half).flatten(0, 1)
         origins = torch.cat([scan.origin.expand_as(scan.points[:_SEARCHED]) for scan in self._scans])
         beams = points - origins
         ranges = beams.norm(dim=1, keepdim=True).clamp_min(1e-9)
@@ -145,10 +148,8 @@ class LocalMap:
             tried = self._climbed(scan, expected, starts, targets)
             confirmed = best is not None and best.location.found and _is_same(best.location, tried.location)
             # In 2D the wider search includes the first one.
-            ranks = [(one.location.found, one.total) for one in (tried, best or tried)]
-            if self.dim == 2 or ranks[0] >= ranks[1]:
+            if best is None or self.dim == 2 or tried.rank >= best.rank:
                 best = tried
-            assert best is not None
             supported = best.location.explained - best.contradicted
             # Rivals outside the first search in 2D are less likely than a pose near its middle.
             is_sure = self.dim == 3 or (best.location.probability >= SURE and best.unlikely <= _MIDDLE)
@@ -165,9 +166,10 @@ class LocalMap:
         if self.dim == 2:
             # Along a wall most climbs end in one wrong place: the best pose of the raster is not enough.
             starts = expected.poses
-            reach = _DEVIATIONS * expected.distance, min(_DEVIATIONS * expected.angle, expected.max_turn)
             if expected.distance < LOST[0]:
-                near = expected._replace(poses=expected.poses[:1], max_step=reach[0], max_turn=reach[1])
+                reach, turn = _DEVIATIONS * expected.distance, _DEVIATIONS * expected.angle
+                turn = min(turn, expected.max_turn)
+                near = expected._replace(poses=expected.poses[:1], max_step=reach, max_turn=turn)
                 starts = self._search.best(scan.points, near, _STARTS[0]).poses
                 yield starts, self._targets
             anywhere = self._search.best(scan.points, expected, _STARTS[1]).poses
@@ -175,8 +177,8 @@ class LocalMap:
             return
         near = expected._replace(distance=min(expected.distance, _NEAR), angle=min(expected.angle, _NEAR / 2))
         first = self._targets[0]
-        starts = self._lattice(scan, near, near.poses, first, 2 * first.blur, 2 * near.angle, _FEW)
-        still = Scan(scan.points, torch.zeros(self.dim))
+        starts = self._lattice(scan, near, near.poses, first, 2 * first.blur, 2 * near.angle, _CLIMBED[0])
+        still = Scan(scan.points, torch.zeros(3))
         mixture = learn_window([still], self._rule, torch.Generator().manual_seed(0))
         found = register(mixture, self._components, expected.poses.matrix)
         registered = Pose.from_matrix(found.transform[None])
@@ -185,7 +187,8 @@ class LocalMap:
         places = torch.cat([registered.translation, expected.poses.translation])
         around = Pose(registered.rotation.expand(len(places), 3, 3), places)
         coarse, turn = self._target(_COARSE), _TURNED * _SPACING
-        yield self._lattice(scan, expected, around, coarse, _SPACING, turn), [coarse, *self._targets]
+        starts = self._lattice(scan, expected, around, coarse, _SPACING, turn, _CLIMBED[1])
+        yield starts, [coarse, *self._targets]
         last = expected.poses[-1]
         angles = torch.arange(_HEADINGS).double() * (2 * math.pi / _HEADINGS)
         turned = Pose.from_yaw(angles, torch.zeros(3).double()).rotation @ last.rotation
@@ -202,7 +205,7 @@ class LocalMap:
         target: AlignmentTarget,
         spacing: float,
         angle: float,
-        most: int | None = None,
+        most: int,
     ) -> Pose:
         """Some poses in 3D, and at most `most` of the best starts around them.
 
@@ -227,22 +230,20 @@ class LocalMap:
         total = total[best] - against * len(points) / CORRELATED
         starts = starts[best[total.argsort(descending=True, stable=True)]]
         starts = starts[distinct(starts.shifted(-self._center), _SPREAD * spacing, _SPREAD * turn)]
-        return Pose.cat([centers, starts[: most or _CLIMBED]])
+        return Pose.cat([centers, starts[:most]])
 
     def _climbed(
         self, scan: Keyframe, expected: Expectation, starts: Pose, targets: list[AlignmentTarget]
     ) -> _Found:
         motions, kept = starts.shifted(-self._center), len(starts)
         for target in targets:
-            points = scan.points[: self.n_points if target is targets[-1] else _COARSE_POINTS]
-            found = align(
-                points, target, motions, _STEPS[1] if target is targets[-1] else _STEPS[0][self.dim]
-            )
+            is_last = target is targets[-1]
+            points = scan.points[: self.n_points if is_last else _COARSE_POINTS]
+            found = align(points, target, motions, _STEPS[1] if is_last else _STEPS[0][self.dim])
             kept = max(kept // _EACH, _LAST)
             total, view = self._total(found, points, expected)
             order = total.argsort(descending=True, stable=True)
-            order = order[distinct(found.motions[order], target.blur / 2, target.blur / 2)]
-            order = order[:kept]
+            order = order[distinct(found.motions[order], target.blur / 2, target.blur / 2)][:kept]
             found, total, view = found.at(order), total[order], view.at(order)
             motions = found.motions
         # A climb has the points' score alone, which can rise along a wall while the sum of evidence falls.

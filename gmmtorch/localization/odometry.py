@@ -73,9 +73,10 @@ class Odometry:
     The pose of a scan is the one that best explains its points by one mixture of the last keyframes and is
     not far from the prediction. In 2D the poses near the prediction, and if the best one is not sure all that
     the sensor can have reached, are searched by branch and bound (`localization.pose_search`), and the
-    mixture is climbed from the best ones; in 3D it is climbed
-    from the best of a lattice of starts. The prediction continues the last motion. `trajectory`
-    finds the places that were seen twice and corrects all poses by a pose graph
+    mixture is climbed from the best ones. In 3D it is climbed from the best of a lattice of starts around the
+    prediction, and from where the scan's own mixture is registered (`localization.registration`); if the best
+    pose is not sure, from a wider lattice and from other headings. The prediction continues the last motion.
+    `trajectory` finds the places that were seen twice and corrects all poses by a pose graph
     (`localization.pose_graph`). A scan that is not found never enters the local map. Its other possible poses
     are tried with the next one; if that is found, the lost one is searched for again. The fourth in a row
     begins a new map, whose poses are found if a closure joins them with the first one.
@@ -370,10 +371,10 @@ class Odometry:
     def _search_again(self, scans: list[Keyframe]) -> None:
         """The lost scans before the last one, the latest first, from the pose that is known after each."""
         assert self._local is not None
-        last, end = self._last_frame, len(self._poses) - 1
-        before, limits = self._poses[end - len(scans) - 1], (self.max_step, self.max_turn)
-        for n, scan in zip(range(len(scans), 0, -1), reversed(scans), strict=True):
-            number = end - len(scans) + n - 1
+        last, first = self._last_frame, len(self._poses) - len(scans) - 2
+        before, limits = self._poses[first], (self.max_step, self.max_turn)
+        for n, scan in reversed([*enumerate(scans, 1)]):
+            number = first + n
             after = self._poses[number + 1]
             way = Pose.stack([before.towards(after, n / (n + 1)), after])
             expected = Expectation(way, *self._surprise, self._explained, *limits)
@@ -547,14 +548,11 @@ class KissIcp:
         self._icp = KissICP(config)
         self._locations: list[Location] = []
 
-    def add(
-        self,
-        points: Tensor,
-        stamp: float | None = None,
-        motion: Tensor | None = None,
-        seconds: Tensor | None = None,
-    ) -> Location:
-        """The pose of the next scan in the frame of the first one, without a covariance (NaN)."""
+    def add(self, points: Tensor, *unused: object, seconds: object = None) -> Location:
+        """The pose of the next scan in the frame of the first one, without a covariance (NaN).
+
+        The other arguments of `Odometry.add` are not used.
+        """
         dim = points.shape[1]
         rows = torch.nn.functional.pad(points, (0, 3 - dim))
         if len(rows):

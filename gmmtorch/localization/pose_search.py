@@ -1,4 +1,4 @@
-"""PoseSearch: the poses in which a scan may lie in a map, among all within a reach, by branch and bound.
+"""PoseSearch: the poses in which a 2D scan may lie in a map, among all within a reach, by branch and bound.
 
 A raster of the map gives each cell the log-likelihood of a return: high at surfaces, low in free space, and
 between where nothing was seen. The score of a pose is the sum over the scan's points. Of a square of poses
@@ -27,7 +27,7 @@ HIT, UNKNOWN, FREE = 8.0, 4.0, -8.0
 """Nats of a point on a surface, where nothing was seen, and in free space."""
 
 _CELLS = 1 << 18  # of a raster at most
-_FINEST = {2: 0.1, 3: 0.4}  # metres of a cell
+_FINEST = 0.1  # metres of a cell
 _ROUNDED = 1.0  # cells that a point may be off by rounding of its pose,
 _BLUR = 1.0  # and standard deviation (cells) of a surface beyond
 _TAIL = 3.5  # nats: beyond, the prior falls as a power of the deviation
@@ -87,7 +87,7 @@ class Found(NamedTuple):
 
 
 class _Tried(NamedTuple):
-    """Of H headings: the turns (H,) from the last expected pose, the rotations (H, D, D), the cells (H, N, 3)
+    """Of H headings: the turns (H,) from the last expected pose, the rotations (H, 2, 2), the cells (H, N, 3)
     of the points, and the turns (H, B) from the expected poses; and how many observations a point stands for.
     """
 
@@ -100,29 +100,27 @@ class _Tried(NamedTuple):
 
 
 class PoseSearch:
-    """A raster of a map, with its maxima.
+    """A raster of a 2D map, with its maxima.
 
     Args:
-        points: (N, D) on the surfaces, world frame, metres; at least one.
-        free: (M, 2, D) segments through free space; none: cells away from surfaces are unknown.
+        points: (N, 2) on the surfaces, world frame, metres; at least one.
+        free: (M, 2, 2) segments through free space; none: cells away from surfaces are unknown.
         cell: side (m) of a cell; it is larger where the raster would have too many cells.
     """
 
     def __init__(self, points: Tensor, free: Tensor | None = None, cell: float | None = None) -> None:
-        self.dim = points.shape[1]
         low, high = points.amin(0), points.amax(0)
-        side = _FINEST[self.dim] if cell is None else cell
+        side = _FINEST if cell is None else cell
         while (volume := math.prod(((high - low) / side + 1).tolist())) > _CELLS:
-            side *= 1.01 * (volume / _CELLS) ** (1 / self.dim)
+            side *= 1.01 * (volume / _CELLS) ** 0.5
         self.cell = side
         margin = 1 << _LEVELS
-        pad = torch.tensor([margin, margin, _NEAR][: self.dim]).to(points)
-        self._low = (low / side).floor() - pad
-        shape = ((high / side).floor() + pad + 1 - self._low).long().tolist()
+        self._low = (low / side).floor() - margin
+        shape = ((high / side).floor() + margin + 1 - self._low).long().tolist()
         hits = points.new_zeros(shape, dtype=torch.float32)
         hits[((points / side).floor() - self._low).long().unbind(1)] = 1.0
         shade = hits
-        for axis in range(self.dim):  # the margin has no hits, so nothing comes in from the other end
+        for axis in (0, 1):  # the margin has no hits, so nothing comes in from the other end
             near = (
                 math.exp(-0.5 * (max(abs(shift) - _ROUNDED, 0) / _BLUR) ** 2) * shade.roll(shift, axis)
                 for shift in range(-_NEAR, _NEAR + 1)
@@ -135,9 +133,7 @@ class PoseSearch:
             count_in_grid(misses, starts, ends, tuple(shape), low=self._low)
             crossed = (misses > 0).view(shape)
             raster = torch.where(crossed & (shade == 0), FREE, raster)
-        while raster.ndim < 3:
-            raster = raster[..., None]
-        self._levels = [raster]
+        self._levels = [raster[..., None]]
         for level in range(_LEVELS - 1):
             step = 1 << level
             wide = torch.nn.functional.pad(self._levels[-1], (0, 0, 0, step, 0, step), value=UNKNOWN)
@@ -147,10 +143,8 @@ class PoseSearch:
     def best(self, points: Tensor, expected: Expectation, most: int) -> Found:
         """The best poses that differ, at most `most`, as far from the last expected pose as a scan can be.
 
-        In 3D the poses have the height of that one, and its rotation but for a turn about the vertical.
-
         Args:
-            points: (N, D) of the scan, sensor frame, in random order; the first ones are used.
+            points: (N, 2) of the scan, sensor frame, in random order; the first ones are used.
         """
         tried = self._tried(points.double(), expected)
         level = self._first_level(expected.max_step)
@@ -184,10 +178,9 @@ class PoseSearch:
         n_turns = min(math.ceil(expected.max_turn / step), round(math.pi / step))
         angles = torch.arange(-n_turns, n_turns + 1).to(rows) * step
         center = expected.poses[-1]
-        turned = Pose.from_yaw(angles, rows.new_zeros(self.dim)).rotation @ center.rotation
+        turned = Pose.from_yaw(angles, rows.new_zeros(2)).rotation @ center.rotation
         placed = (rows @ turned.mT + center.translation) / self.cell
-        cells = (placed.floor() - self._low).long()
-        cells = torch.nn.functional.pad(cells, (0, 3 - self.dim))
+        cells = torch.nn.functional.pad((placed.floor() - self._low).long(), (0, 1))
         off = expected.turned(turned)
         return _Tried(expected, angles, turned, cells, off, len(points) / len(rows) / CORRELATED)
 
@@ -201,9 +194,8 @@ class PoseSearch:
         return tried.share * sums - tried.expected.against(gap, tried.off[heading])
 
     def _middle(self, tried: _Tried, shift: Tensor, width: int) -> Tensor:
-        """The middle (S, D) of squares, metres."""
-        cells = shift[:, : self.dim].double()
-        cells[:, :2] += (width - 1) / 2
+        """The middle (S, 2) of squares, metres."""
+        cells = shift[:, :2].double() + (width - 1) / 2
         return tried.expected.poses[-1].translation + cells * self.cell
 
     def _told_apart(self, tried: _Tried, heading: Tensor, shift: Tensor, score: Tensor, most: int) -> Found:

@@ -207,10 +207,17 @@ def test_options_that_read_only_empty_scans_are_no_advice(check, tmp_path):
     assert "problem" not in words(done)
 
 
-def test_the_missing_metadata_of_a_lidar_are_named(check, tmp_path, monkeypatch):
+def test_a_problem_that_no_option_mends_is_said_once(check, tmp_path):
+    with BagWriter(tmp_path / "a.mcap") as writer:
+        writer.transforms(0.0, {("odom", "lidar"): moved(0.0)})
+    said = words(check(tmp_path / "a.mcap", "dataset=rosbag"))
+    assert said.count("no topic of a range sensor") == 1
+    assert "no option that was tried helps" in said
+
+
+def test_the_missing_metadata_of_a_lidar_are_named(check, tmp_path):
     pytest.importorskip("dpkt")
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "datasets"))
-    from packet_files import ouster_metadata, ouster_packet, write_capture
+    from datasets.packet_files import ouster_metadata, ouster_packet, write_capture
 
     ranges = np.full((2, 16, 32), 5000)
     packets = [

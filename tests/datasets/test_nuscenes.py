@@ -148,6 +148,7 @@ def changed(folder: Path, table: str, before: str, after: str) -> None:
         ("ego_pose", '"token"', '"other"'),
         ("ego_pose", '"rotation": [', '"rotation": [0, 0, 0, 0, '),
         ("ego_pose", "60", "NaN"),
+        ("ego_pose", '"translation": [', '"translation": [' + "9" * 400 + ", "),
         ("calibrated_sensor", '"rotation": [', '"rotation": "'),
         ("calibrated_sensor", "0.9", "1e999"),
         ("scene", '"token"', '"other"'),

@@ -54,7 +54,7 @@ def grown(folder: Path, scans: list[Scan], **options: object) -> TiledMap:
 def test_a_map_that_grows_in_tiles_answers_as_one_in_memory(dim, codec, tmp_path, monkeypatch):
     monkeypatch.setattr(tiled_map, "_RECENT", 40)
     scans = street(14, dim)
-    built, tiled, asked = GaussianMap(RULE, codec=codec), None, around(scans)
+    built, asked = GaussianMap(RULE, codec=codec), around(scans)
     tiled = TiledMap.create(tmp_path / "map", GaussianMap(RULE, codec=codec), dim, SIDE, memory=100_000)
     for number, scan in enumerate(scans):
         built.insert(scan)

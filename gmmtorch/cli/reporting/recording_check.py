@@ -51,7 +51,7 @@ def check(config: DictConfig) -> bool:
             _print_wrapped("\nproblem    ", problem)
         if facts is not None and share < _FEW_SCANS:
             warnings = list(warnings)  # not those of the trials
-            advice += _trials(options, facts, 0 if found is None else len(found))
+            advice += _trials(options, facts, 0 if found is None else len(found), problem)
     others = _unread(facts, found) if share else []
     if others:
         _print_wrapped(
@@ -82,24 +82,33 @@ def _unread(facts: BagFacts | None, found: Dataset | None) -> list[str]:
     return [name for name in sensors if name not in read]
 
 
+class _Notes(logging.Handler):
+    """Keeps the texts of a log."""
+
+    def __init__(self, level: int) -> None:
+        super().__init__(level)
+        self.texts: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.texts.append(record.getMessage())
+
+
 @contextlib.contextmanager
 def _noted_warnings() -> Iterator[list[str]]:
     """Collects the warnings of readers, which the console would have between the lines of the table."""
-    found: list[str] = []
-    logger, collector = logging.getLogger("gmmtorch"), logging.Handler()
-    collector.emit = lambda record: found.append(record.getMessage())  # type: ignore[method-assign]
+    logger, notes = logging.getLogger("gmmtorch"), _Notes(logging.WARNING)
     consoles = {
         handler: handler.level
         for handler in logging.getLogger().handlers
         if not isinstance(handler, logging.FileHandler)
     }
-    logger.addHandler(collector)
+    logger.addHandler(notes)
     for handler in consoles:
         handler.setLevel(logging.ERROR)
     try:
-        yield found
+        yield notes.texts
     finally:
-        logger.removeHandler(collector)
+        logger.removeHandler(notes)
         for handler, level in consoles.items():
             handler.setLevel(level)
 
@@ -277,8 +286,9 @@ def _print_poses(found: Dataset, advice: list[str]) -> None:
 # -- other options -----------------------------------------------------------------------------------
 
 
-def _trials(options: DictConfig, facts: BagFacts, n_found: int) -> list[str]:
-    """Options with which more scans can be read, each tried on the recording."""
+def _trials(options: DictConfig, facts: BagFacts, n_found: int, problem: str) -> list[str]:
+    """Options with which more scans can be read, each tried on the recording; or what else than the problem
+    stands in their way."""
     given = {str(key): options[key] for key in options if options[key] is not None}
     for name in ("name", "path", "odometry", "motion"):
         given.pop(name, None)
@@ -316,7 +326,8 @@ def _trials(options: DictConfig, facts: BagFacts, n_found: int) -> list[str]:
                 advice.append(f"add {words}, which reads {count_text(n_scans, 'scan')}{note}")
                 if not change or change.get("poses") in sources:
                     break
-    return advice or ([f"with estimated poses there is another problem: {fault}"] if fault else [])
+    is_other = fault not in ("", problem)
+    return advice or ([f"with estimated poses there is another problem: {fault}"] if is_other else [])
 
 
 def _override(name: str, value: Any) -> str:

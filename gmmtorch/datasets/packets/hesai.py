@@ -11,7 +11,7 @@ import numpy as np
 from gmmtorch.datasets.base import number_rows
 from gmmtorch.errors import DataError
 
-_MOST_CALIBRATION_BYTES = 1 << 20
+MOST_CALIBRATION_BYTES = 1 << 20
 _SECOND = 1_000_000  # µs, after which the clock in a packet begins again
 
 # -- nominal elevations and azimuths of channels in degrees -------------------------------------------
@@ -60,7 +60,7 @@ def read_angles(path: Path) -> Angles:
 
     Raises `DataError`.
     """
-    if path.stat().st_size > _MOST_CALIBRATION_BYTES:
+    if path.stat().st_size > MOST_CALIBRATION_BYTES:
         raise DataError(f"{path} is not a correction file of a lidar: it has {path.stat().st_size:,} bytes.")
     lines = path.read_text("utf-8", errors="replace").splitlines()
     rows = [" ".join(line.split(",")[:3]) for line in lines if line.strip()[:1].isdigit()]

@@ -11,15 +11,13 @@ import numpy as np
 import torch
 
 from gmmtorch.datasets.packets import hesai, ouster
-from gmmtorch.datasets.packets.sweeps import VELODYNE_BYTES, is_ouster
+from gmmtorch.datasets.packets.sweeps import VELODYNE_BYTES
 from gmmtorch.datasets.point_files.channels import INTENSITY
 from gmmtorch.datasets.ros.bag_reader import BagReader
 from gmmtorch.datasets.ros.sensor_messages import Reading, reading
 from gmmtorch.datasets.trajectory import NANOSECONDS
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.optional_packages import needs_extra
-
-MOST_BYTES = 1 << 20
 
 
 class LidarPackets:
@@ -57,7 +55,7 @@ class LidarPackets:
             if self._path is not None and self._angles is None:
                 self._angles = hesai.read_angles(self._path)
             found = hesai.returns_of(packets, model, self._angles)
-        elif is_ouster(packets[0]) or self._path is not None:
+        elif ouster.is_packet(packets[0]) or self._path is not None:
             found = ouster.returns_of(packets, self._ouster(len(packets[0])))
         else:
             raise DataError(f"packets of {len(packets[0]):,} bytes are of no lidar that is read")
@@ -70,7 +68,7 @@ class LidarPackets:
         if self._metadata is None and self._path is not None:
             self._metadata = ouster.read_metadata(self._path.read_bytes(), str(self._path))
         if self._metadata is None and self._recording is not None:
-            self._metadata = stated_metadata(self._recording, n_bytes)
+            self._metadata = _stated_metadata(self._recording, n_bytes)
         if self._metadata is None:
             raise DataError(
                 "the recording lacks the metadata of the Ouster lidar, which state its angles: give the file "
@@ -85,7 +83,7 @@ def _reading(points: np.ndarray, times: np.ndarray, intensity: np.ndarray, wante
 
 
 def _checked(path: Path) -> Path:
-    if not path.is_file() or path.stat().st_size > MOST_BYTES:
+    if not path.is_file() or path.stat().st_size > hesai.MOST_CALIBRATION_BYTES:
         raise InvalidArgumentError(
             f"‹calibration›={path} is not a calibration of a lidar; give the file that its manufacturer "
             "delivers with it: .json of an Ouster, .csv of a Hesai."
@@ -128,7 +126,7 @@ _STRING = "std_msgs/msg/String"
 _MOST_FILES = 200
 
 
-def stated_metadata(recording: BagReader, n_bytes: int) -> ouster.Metadata | None:
+def _stated_metadata(recording: BagReader, n_bytes: int) -> ouster.Metadata | None:
     """The metadata of the Ouster lidar with packets of a size that a bag or a file beside it states.
 
     Those with the name of the recording come first. Raises `DataError` if there are several.
@@ -143,7 +141,8 @@ def stated_metadata(recording: BagReader, n_bytes: int) -> ouster.Metadata | Non
                 found[topic.name] = ouster.read_metadata(text, f"{path}, topic {topic.name}")
     folder = path if path.is_dir() else path.parent
     for file in sorted(folder.glob("*.json"))[:_MOST_FILES] if not found else ():
-        if file.is_file() and file.stat().st_size <= MOST_BYTES and ouster.is_metadata(file.read_bytes()):
+        is_small = file.is_file() and file.stat().st_size <= hesai.MOST_CALIBRATION_BYTES
+        if is_small and ouster.is_metadata(file.read_bytes()):
             with suppress(DataError):  # of another lidar
                 found[str(file)] = ouster.read_metadata(file.read_bytes(), str(file))
     fitting = {name: one for name, one in found.items() if one.n_bytes == n_bytes}

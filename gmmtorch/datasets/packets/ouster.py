@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gmmtorch.datasets.packets.hesai import Returns
-from gmmtorch.errors import DataError
+from gmmtorch.datasets.packets.hesai import MOST_CALIBRATION_BYTES, Returns
+from gmmtorch.errors import DAMAGED_CONTENT, DataError
 
-MOST_METADATA_BYTES = 1 << 20
 _MOST_CHANNELS, _MOST_COLUMNS = 1024, 65535
 _NEEDED = ("beam_altitude_angles", "beam_azimuth_angles", "lidar_mode")
 _LEGACY = "LEGACY"
@@ -43,6 +42,21 @@ _PROFILES = {
     "RNG15_RFL8_NIR8_DUAL": _LOW_DUAL,
     "FUSA_RNG15_RFL8_NIR8_DUAL": _LOW_DUAL,
 }
+
+
+_SIZES = (8, 16, 32, 64, 128)  # channels, in packets with 16 columns
+_LEGACY_BYTES = {16 * (20 + 12 * n) for n in _SIZES}
+_PROFILED_BYTES = {64 + 16 * (12 + n * pixel) for n in _SIZES for pixel in (4, 8, 12, 16, 20)}
+
+
+def is_packet(data: bytes) -> bool:
+    """Whether a datagram looks like a packet of an Ouster lidar, which has no mark of its own."""
+    return len(data) in _LEGACY_BYTES or (len(data) in _PROFILED_BYTES and data[0] == 1)
+
+
+def turn_of(data: bytes) -> bytes:
+    """What in a packet changes with the number of the turn."""
+    return data[10:12] if len(data) in _LEGACY_BYTES else data[2:8]
 
 
 class Metadata(NamedTuple):
@@ -96,7 +110,7 @@ def is_metadata(text: str | bytes) -> bool:
 
 def read_metadata(text: str | bytes, where: str) -> Metadata:
     """The metadata in JSON, in the form before or after firmware 2.0. Raises `DataError`."""
-    if len(text) > MOST_METADATA_BYTES:
+    if len(text) > MOST_CALIBRATION_BYTES:
         raise DataError(f"{where} is not the metadata of an Ouster lidar: it has {len(text):,} bytes.")
     try:
         found = _flat(json.loads(text))
@@ -111,7 +125,7 @@ def read_metadata(text: str | bytes, where: str) -> Metadata:
             offset = np.array([float(found.get("lidar_origin_to_beam_origin_mm", 0)), 0, 0])
         else:
             offset = np.array(beams, np.float64).reshape(4, 4)[:3, 3]
-    except (ValueError, TypeError, KeyError, RecursionError, OverflowError) as error:
+    except DAMAGED_CONTENT as error:
         raise DataError(f"{where} is not the metadata of an Ouster lidar ({error!r}).") from error
     if name not in _PROFILES:
         raise DataError(f"{where}: packets of the profile {name[:60]!r} are not read; record clouds.")

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from gmmtorch.datasets.packets import hesai
+from gmmtorch.datasets.packets import hesai, ouster
 from gmmtorch.datasets.packets.captures import Capture, Datagram
 from gmmtorch.datasets.trajectory import NANOSECONDS
 from gmmtorch.errors import DataError
@@ -36,19 +36,9 @@ SINGLE_PACKETS = {"ouster_ros/msg/PacketMsg": "os_sensor", "ouster_sensor_msgs/m
 """Messages with one packet and no header, which are read as sweeps, and the frame of their lidars."""
 
 
-_CHANNELS = (8, 16, 32, 64, 128)  # of an Ouster, whose packets have 16 columns
-_LEGACY = {16 * (20 + 12 * n) for n in _CHANNELS}
-_PROFILED = {64 + 16 * (12 + n * pixel) for n in _CHANNELS for pixel in (4, 8, 12, 16, 20)}
-
-
-def is_ouster(data: bytes) -> bool:
-    """Whether a datagram looks like a packet of an Ouster lidar, which has no mark of its own."""
-    return len(data) in _LEGACY or (len(data) in _PROFILED and data[0] == 1)
-
-
 def is_lidar(data: bytes) -> bool:
     """Whether a datagram is a packet of a lidar that is read."""
-    return len(data) == VELODYNE_BYTES or hesai.model_of(data) is not None or is_ouster(data)
+    return len(data) == VELODYNE_BYTES or hesai.model_of(data) is not None or ouster.is_packet(data)
 
 
 def packet_of(message: bytes, is_ros1: bool) -> bytes:
@@ -93,7 +83,7 @@ def _place(data: bytes) -> bytes | float:
     model = hesai.model_of(data)
     if model is not None:
         return hesai.azimuth_of(data, model)
-    return data[10:12] if len(data) in _LEGACY else data[2:8]
+    return ouster.turn_of(data)
 
 
 def packed(sweep: Sequence[tuple[int, bytes]], frame: str, is_ros1: bool) -> bytes:

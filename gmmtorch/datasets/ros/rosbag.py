@@ -1,4 +1,4 @@
-"""ROS bags as data sets: the scans of one topic, with poses from TF, a topic of poses, or a file."""
+"""ROS bags as data sets: scans of one topic or of several, with poses from TF, a topic, or a file."""
 
 from __future__ import annotations
 
@@ -40,6 +40,7 @@ from gmmtorch.scan import FARTHEST, Scan
 HEADER = "std_msgs/msg/Header"
 _SHORT_SKIP = 16
 T = TypeVar("T")
+_log = logging.getLogger(__name__)
 
 
 def open_rosbag(
@@ -103,11 +104,7 @@ def open_rosbag(
         if damage := readers[0].damage:
             _log.warning("%s is damaged: %s. damaged=refuse makes this an error.", file, damage)
         bags = [opened_sensor(reader, name) for reader, name in zip(readers, topics, strict=True)]
-        if len(bags) == 1:
-            return bags[0]
-        from gmmtorch.datasets.ros.several_sensors import SeveralSensors
-
-        return SeveralSensors(bags)
+        return bags[0] if len(bags) == 1 else SeveralSensors(bags)
 
     def opened_sensor(reader: BagReader, name: str | None) -> RosBag:
         sensor = choose_sensor(reader, name)
@@ -343,6 +340,58 @@ class DepthBag(RosBag):
         return self._camera.image(self._message(position)), self._poses[position]
 
 
+class SeveralSensors(Dataset):
+    """The scans of the topics of a bag in the order of their times, each with the pose of its own sensor.
+
+    A scan has one origin, so a scan of one sensor stays a scan; the map joins them. The stride of each topic
+    is its own, so that no sensor is left out. `topic` lists the topics.
+
+    Raises `InvalidArgumentError` if the scans of some are 2D and of others 3D, or TF does not connect them.
+    """
+
+    def __init__(self, bags: Sequence[RosBag]) -> None:
+        super().__init__(bags[0].name, bags[0].ranges)
+        self.topic = ", ".join(bag.topic for bag in bags)
+        self.n_sensors, self._bags = len(bags), list(bags)
+        frames = {bag.fixed_frame: bag.topic for bag in bags}
+        if len(frames) > 1:
+            raise InvalidArgumentError(
+                f"‹topic›={self.topic} have poses in different frames: "
+                f"{', '.join(f'{topic} in {frame}' for frame, topic in frames.items())}; choose sensors "
+                "that TF connects, or the ‹frame› that all are in."
+            )
+        if len({len(pose) for bag in bags if (pose := bag.pose(0)) is not None}) > 1:
+            raise InvalidArgumentError(
+                f"‹topic›={self.topic} have scans in 2D and in 3D, which no map has together; choose those "
+                "of one kind."
+            )
+        known = [times for bag in bags if (times := bag.times) is not None]
+        times = torch.cat(known)
+        order = times.argsort(stable=True)
+        self._times = times[order]
+        numbers = torch.cat([torch.arange(len(one)) for one in known])
+        sensors = torch.arange(len(known)).repeat_interleave(torch.tensor([len(one) for one in known]))
+        self._places = torch.stack([sensors, numbers], 1)[order].tolist()
+
+    def sensor_of(self, index: int) -> int:
+        return int(self._places[index][0])
+
+    @property
+    def skipped(self) -> dict[str, int]:
+        return dict(sum((Counter(bag.skipped) for bag in self._bags), Counter()))
+
+    def _count(self) -> int:
+        return len(self._places)
+
+    def _read(self, index: int) -> Scan:
+        sensor, number = self._places[index]
+        return self._bags[sensor][number]
+
+    def _known_pose(self, index: int) -> Tensor | None:
+        sensor, number = self._places[index]
+        return self._bags[sensor].pose(number)
+
+
 # -- rotations by an IMU -----------------------------------------------------------------------------
 
 
@@ -351,7 +400,6 @@ IMU_GAP = 0.2
 the turn over such a gap is wrong by at most 3°."""
 _FASTEST = 100.0
 """Largest rate (rad/s) that a gyroscope of a robot measures."""
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)

@@ -171,7 +171,7 @@ GMM_KERNEL em_runs(int64_t item, const double* points, const double* weight, int
         return true;
     };
 
-    // -log N(x|k) but for its constant; x: eight rows.
+    // The squared Mahalanobis distance of eight rows x from component k.
     auto squared = [&](const vec* x, int64_t k) {
         const double *mean = means + k * dim, *w = whiten + (kind == 1 ? 0 : k) * padded;
         vec a = (vec)(0.0), b = (vec)(0.0);

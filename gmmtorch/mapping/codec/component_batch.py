@@ -172,7 +172,7 @@ def _least_bytes(k: int, n_origins: int, e: int) -> int:
 FILE_KIND, FILE_VERSION = "gmmtorch.map", 2
 
 CODECS = ("quantized", "float")
-"""About 8 bytes a component, rounded within bounds; or every number as it is, about 150 bytes."""
+"""6 to 8 bytes a component, rounded within bounds; or every number as it is, about 150 bytes."""
 
 FILE_OPTIONS = QueryOptions(prior=1.0, cutoff=5.0)
 """The query options of a file that contains none; they are not those of `GaussianMap()`."""

@@ -61,6 +61,7 @@ def calibrated(settings: MapSettings, components: Components) -> MapSettings:
 
 
 def with_calibration(settings: MapSettings, calibration: Calibration | None) -> MapSettings:
+    """The settings with a calibration of the answers, or without one."""
     return replace(settings, query=replace(settings.query, calibration=calibration))
 
 
@@ -78,6 +79,7 @@ def tile_file(
 
 
 def index_file(rows: Sequence[dict[str, Any]], dim: int, settings: MapSettings, side: float) -> bytes:
+    """The index of tiles of `side` (m), from their rows."""
     return TileIndex.joined(rows, dim).to_bytes(side=float(side), **settings_facts(settings))
 
 
