@@ -50,7 +50,9 @@ class MapOptions(ViewOptions):
     inputs: list[str] = option(
         [], "list of paths, globs and URLs of recordings, in place of dataset.path; maps are merged in tiles"
     )
-    tile: float = option(100.0, "side (m) of the tiles into which the maps of inputs are merged")
+    tile: float = option(
+        100.0, "side (m) of the tiles of map.memory, and of those into which the maps of inputs are merged"
+    )
     tile_bytes: int | None = option(None, "bytes of a tile's file, at most; null: no limit")
     workers: int = option(1, "processes of this machine that map inputs; more than one needs Ray")
     cluster: str | None = option(
