@@ -38,7 +38,6 @@ from gmmtorch.team.sharing.transport.simulated_network import Network
 
 NOISE = 1e-3  # metres of standard deviation that move every point of a run
 WRONG = 0.2  # metres of a step
-SURE = 0.99  # probability
 RESOLUTION = {2: 0.1, 3: 0.2}  # metres of a cell
 
 
@@ -81,13 +80,11 @@ def measured(scans: Chosen, method: str, seed: int) -> dict[str, Any]:
     steps, found = relative_pose_error(trajectory.poses, true), trajectory.found
     # A lost scan has no pose of its own: a step goes from a scan that was found to the next one.
     believed = relative_pose_error(trajectory.poses[found], true[found]).distances
-    sure = trajectory.probabilities[found][1:] >= SURE
     return {
         "ate": f"{absolute_trajectory_error(trajectory.poses, true).rmse:.2f}",
         "rpe": f"{steps.rmse:.2f}",
         "step": float(steps.distances.median()),
         "wrong": str(int((believed > WRONG).sum())),
-        "sure": f"{int((believed[sure] <= WRONG).sum())} of {int(sure.sum())}",
         "lost": str(int((~found).sum())),
         "closures": str(trajectory.n_closures),
         "rate": len(posed) / seconds,
@@ -111,7 +108,7 @@ def measure(options: Any) -> Iterator[Row]:
             runs = [measured(scans, method, seed) for seed in options.seeds]
             each = {part: ", ".join(r[part] for r in runs) for part in ("ate", "rpe", "wrong")}
             if method == "mixture":
-                each |= {part: ", ".join(r[part] for r in runs) for part in ("sure", "lost", "closures")}
+                each |= {part: ", ".join(r[part] for r in runs) for part in ("lost", "closures")}
             row: dict[str, Any] = {
                 "data": name + (f", every {options.every}" if options.every > 1 else ""),
                 "scans": len(scans),
@@ -120,7 +117,6 @@ def measure(options: Any) -> Iterator[Row]:
                 "RPE": each["rpe"] + " m",
                 "median step error": 1e3 * statistics.median(r["step"] for r in runs),
                 f"steps off by over {WRONG} m": each["wrong"],
-                f"right, of those with a probability of {SURE}": each.get("sure"),
                 "lost scans": each.get("lost"),
                 "closures": each.get("closures"),
                 "scans/s": statistics.median(r["rate"] for r in runs),

@@ -96,7 +96,7 @@ def _near_lists(means: Tensor, covariances: Tensor, blur: float) -> NearLists:
     """For each cell of a lattice, the components whose box of `CUTOFF` deviations meets it."""
     half = CUTOFF * covariances.diagonal(dim1=1, dim2=2).sqrt()
     low = (means - half).amin(0)
-    side = max(_SIDE * blur, float(half.median()))  # in smaller cells the lists are the same
+    side = _SIDE * blur
     while True:
         first, last = (((means + way * half - low) / side).floor().clamp_min(0).long() for way in (-1, 1))
         shape = last.amax(0) + 1

@@ -30,33 +30,27 @@ from gmmtorch.mapping import WindowedRule, learn_window, surface_mixture
 from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 
-_BLURS = {2: (0.1, 0.03), 3: (0.25, 0.1, 0.04)}  # metres
-_STEPS = {2: 8, 3: 15}, 15  # of a level, and of the last one; with six, headings stay 2° off
+_BLURS = {2: (0.2, 0.08, 0.03), 3: (0.25, 0.1, 0.04)}  # metres
+_STEPS = 15  # of a level; with six on the last one, headings stay 2° off
 _EACH, _LAST = 3, 5  # a third of the poses go on to the next level, but at least five
 _SLIDE = 1.0  # metres that the best pose is moved at most along its loosest direction, to
 _SLIDES = 16  # places, each of which climbs by
 _SLIDE_STEPS = 3
 _DECISIVE = 4.0  # nats by which such a place must be better: smaller gains do not make poses more exact
-_COARSE_POINTS = 300  # of the scan on all levels but the last one
-_NEAR = 0.5  # metres, and half as many radians, of the deviations of the first search in 3D
-_SPACING = 1.0  # metres between the starts of the second one
-_COARSE = 0.5  # metres of its blur; in a hall, with one metre twice as many scans are missed
+_SPACING = {2: 0.25, 3: 0.5}  # metres between the starts near the expected poses
+_COARSE, _FAR = 0.5, 1.0  # metres of blur, and between the starts, of the wider search in 3D
 _HEADINGS = 8  # from which a scan in 3D is registered, if it may have turned far
-_TURNED = 0.2  # radians between the headings of neighbours of a lattice, for each metre between their places
-_FARTHEST = 3.0  # metres that a lattice reaches
-_RANKED = 200  # points of the scan that rank its starts
-_SORTED = 200  # best starts, of which
-_CLIMBED = 24, 48  # different ones are climbed in the first search and in the second one
+_TURNED = {2: 0.5, 3: 0.2}  # radians between the headings of neighbours, for each metre between their places
+_NEAR = 0.5  # metres, and half as many radians, of the deviations of the first search
+_FARTHEST = 3.0  # metres of a search
+_SORTED = {2: 400, 3: 200}  # best starts, of which
+_CLIMBED = 24, 48  # different ones are climbed, of the first and of the wider search
 _SPREAD = 0.75  # spacings between them
+_COARSE_POINTS = 300  # of the scan on all levels but the last one
+_RANKED = 200  # points of the scan that rank the starts
 _LOOSEST = 0.3  # metres of standard deviation
-LOST = 1.0, math.radians(20)
-"""Deviations (m, rad) of a pose that no scan confirms."""
-SURE = 0.99
-"""Probability: below, the search in 2D is wider, and only one lost scan is searched for again."""
-
-_STARTS = 12, 40  # poses that are climbed of the search in 2D near the prediction, and anywhere
-_DEVIATIONS = 3.0  # of the prediction: the reach of the first search in 2D,
-_MIDDLE = 1.0  # and nats against a pose in its middle, as by 1.5 deviations
+LOST = 1.0, math.radians(20)  # deviations (m, rad) of a pose that no scan confirms
+_STARTS = 40  # poses of the search in 2D that are climbed
 _SEARCHED = 1000  # points of a keyframe
 _APART = 0.3  # metres, and radians: poses are different
 _INSIDE = 5.0  # nats of a point on a surface, however many components it touches
@@ -66,9 +60,7 @@ _NEARBY = 1.0  # log odds that a scan is near the last one, relative to the samp
 _LEAST_PROBABILITY = 0.7  # of a pose that is found
 _LEAST_SEEN = 0.5  # share of the points of which at least so many must lie on surfaces
 _USUAL = 0.85  # of the share that is expected to be explained: less, and the search is wider
-_ALIKE = 2.0  # nats by which another pose must be worse,
-_NOT_MUCH_WORSE = 6.0  # and by which it may be worse to be tried with the next scan,
-_OTHERS = 4  # if it is one of the best
+_ALIKE = 2.0  # nats by which another pose must be worse
 _IMAGE_CELL = {2: math.radians(1), 3: math.radians(3)}  # of an image
 _MARGIN = 0.25, 0.02  # metres, and share of the range, that a point may be in front of or behind a surface
 _KEPT_POINTS = 200  # of each earlier scan, that a new scan must not look through
@@ -84,18 +76,11 @@ class Keyframe(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """The result of one search, with its log-likelihood (nats), the share of the points against it, and the
-    nats against it by what was expected.
-    """
+    """The result of one search, with its log-likelihood (nats) and the share of the points against it."""
 
     location: Location
     total: float
     contradicted: float
-    unlikely: float
-
-    @property
-    def rank(self) -> tuple[bool, float]:
-        return self.location.found, self.total
 
 
 class LocalMap:
@@ -114,11 +99,13 @@ class LocalMap:
         self._center = keyframes[-1].pose.translation
         # One mixture of all points: where many scans overlap, a sum of their mixtures would outweigh the
         # surfaces that only one of them saw, and pull the next scan back.
-        self._scans = [Scan(frame.pose.apply(frame.points), frame.pose.translation) for frame in keyframes]
+        self._scans = [
+            Scan(frame.points, torch.zeros(self.dim)).transformed(frame.pose.matrix) for frame in keyframes
+        ]
         self._rule = rule
         self._components = learn_window(self._scans, rule, torch.Generator().manual_seed(0))
-        self._surfaces = surface_mixture(self._components, "the local map")
-        centered = self._surfaces._replace(means=self._surfaces.means - self._center)
+        mixture = surface_mixture(self._components, "the local map")
+        centered = mixture._replace(means=mixture.means - self._center)
         self._target = functools.partial(AlignmentTarget, centered, normals=seen_normals(self._components))
         first = self._target(_BLURS[self.dim][0])
         self._targets = [first, *(self._target(blur, lists=first.lists) for blur in _BLURS[self.dim][1:])]
@@ -127,19 +114,13 @@ class LocalMap:
 
     @functools.cached_property
     def _search(self) -> PoseSearch:
-        """Of the surfaces and the free space in 2D."""
         points = torch.cat([scan.points[:_SEARCHED] for scan in self._scans])
-        # Points are sparse on far walls, components are not.
-        values, axes = torch.linalg.eigh(self._surfaces.covariances.double())
-        half = (3 * values[:, -1]).sqrt()[:, None] * axes[:, :, -1]
-        along = torch.linspace(-1, 1, 16).double()[:, None, None]
-        surfaces = (self._surfaces.means.double() + along * half).flatten(0, 1)
         origins = torch.cat([scan.origin.expand_as(scan.points[:_SEARCHED]) for scan in self._scans])
         beams = points - origins
         ranges = beams.norm(dim=1, keepdim=True).clamp_min(1e-9)
         part = 1 - (_MARGIN[0] + _MARGIN[1] * ranges) / ranges
         ends = origins + part.clamp_min(0) * beams
-        return PoseSearch(torch.cat([points, surfaces]), torch.stack([origins, ends], 1))
+        return PoseSearch(points, torch.stack([origins, ends], 1))
 
     def locate(self, scan: Keyframe, expected: Expectation) -> Location:
         """The pose of a scan, whose own pose is not used; `found` if it is sure."""
@@ -147,14 +128,10 @@ class LocalMap:
         for starts, targets in self._searches(scan, expected):
             tried = self._climbed(scan, expected, starts, targets)
             confirmed = best is not None and best.location.found and _is_same(best.location, tried.location)
-            # In 2D the wider search includes the first one.
-            if best is None or self.dim == 2 or tried.rank >= best.rank:
+            if best is None or (tried.location.found, tried.total) > (best.location.found, best.total):
                 best = tried
             supported = best.location.explained - best.contradicted
-            # Rivals outside the first search in 2D are less likely than a pose near its middle.
-            is_sure = self.dim == 3 or (best.location.probability >= SURE and best.unlikely <= _MIDDLE)
-            is_usual = supported >= _USUAL * expected.explained
-            if best.location.found and is_sure and (is_usual or confirmed):
+            if best.location.found and (confirmed or supported >= _USUAL * expected.explained):
                 break
         assert best is not None
         return best.location
@@ -163,22 +140,14 @@ class LocalMap:
         self, scan: Keyframe, expected: Expectation
     ) -> Iterator[tuple[Pose, list[AlignmentTarget]]]:
         """Starts, and the levels they climb; the cheapest search first."""
+        near = expected._replace(distance=min(expected.distance, _NEAR), angle=min(expected.angle, _NEAR / 2))
+        first, spacing = self._targets[0], _SPACING[self.dim]
+        starts = self._lattice(scan, near, near.poses, first, spacing, 2 * near.angle, _CLIMBED[0])
         if self.dim == 2:
             # Along a wall most climbs end in one wrong place: the best pose of the raster is not enough.
-            starts = expected.poses
-            if expected.distance < LOST[0]:
-                reach, turn = _DEVIATIONS * expected.distance, _DEVIATIONS * expected.angle
-                turn = min(turn, expected.max_turn)
-                near = expected._replace(poses=expected.poses[:1], max_step=reach, max_turn=turn)
-                starts = self._search.best(scan.points, near, _STARTS[0]).poses
-                yield starts, self._targets
-            anywhere = self._search.best(scan.points, expected, _STARTS[1]).poses
-            yield Pose.cat([starts, anywhere]), self._targets
+            yield Pose.cat([starts, self._search.best(scan.points, expected, _STARTS).poses]), self._targets
             return
-        near = expected._replace(distance=min(expected.distance, _NEAR), angle=min(expected.angle, _NEAR / 2))
-        first = self._targets[0]
-        starts = self._lattice(scan, near, near.poses, first, 2 * first.blur, 2 * near.angle, _CLIMBED[0])
-        still = Scan(scan.points, torch.zeros(3))
+        still = Scan(scan.points, torch.zeros(self.dim))
         mixture = learn_window([still], self._rule, torch.Generator().manual_seed(0))
         found = register(mixture, self._components, expected.poses.matrix)
         registered = Pose.from_matrix(found.transform[None])
@@ -186,8 +155,8 @@ class LocalMap:
         # Where pillars repeat, it may be one of them off, but has the right rotation.
         places = torch.cat([registered.translation, expected.poses.translation])
         around = Pose(registered.rotation.expand(len(places), 3, 3), places)
-        coarse, turn = self._target(_COARSE), _TURNED * _SPACING
-        starts = self._lattice(scan, expected, around, coarse, _SPACING, turn, _CLIMBED[1])
+        coarse, turn = self._target(_COARSE), _TURNED[3] * _FAR
+        starts = self._lattice(scan, expected, around, coarse, _FAR, turn, _CLIMBED[1])
         yield starts, [coarse, *self._targets]
         last = expected.poses[-1]
         angles = torch.arange(_HEADINGS).double() * (2 * math.pi / _HEADINGS)
@@ -207,24 +176,24 @@ class LocalMap:
         angle: float,
         most: int,
     ) -> Pose:
-        """Some poses in 3D, and at most `most` of the best starts around them.
+        """Some poses, and at most `most` of the best starts around them.
 
         They are `spacing` metres apart, with headings up to `angle` radians from those of the poses.
         """
         reach = math.ceil(min(2 * expected.distance, _FARTHEST) / spacing)
         side = torch.arange(-reach, reach + 1).double() * spacing
-        shifts = torch.nn.functional.pad(torch.cartesian_prod(side, side), (0, 1))
-        turn = _TURNED * spacing
+        shifts = torch.nn.functional.pad(torch.cartesian_prod(side, side), (0, self.dim - 2))
+        turn = _TURNED[self.dim] * spacing
         n_turns = math.ceil(min(angle, math.pi) / turn)
         angles = torch.arange(-n_turns, n_turns + 1).double() * turn
-        turns = Pose.from_yaw(angles, torch.zeros(3).double()).rotation
+        turns = Pose.from_yaw(angles, torch.zeros(self.dim).double()).rotation
         rotations = (turns @ centers.rotation[:, None, None]).expand(-1, len(shifts), -1, -1, -1)
         places = (centers.translation[:, None] + shifts)[:, :, None].expand(-1, -1, len(turns), -1)
         starts = Pose.cat([centers, Pose(rotations.flatten(0, 2), places.flatten(0, 2))])
         points = scan.points[:_RANKED]
         score = target.scores(points, starts.shifted(-self._center))
         total = score / CORRELATED - expected.unlikely(starts)
-        best = total.argsort(descending=True, stable=True)[:_SORTED]
+        best = total.argsort(descending=True, stable=True)[: _SORTED[self.dim]]
         view = self._space.view(points, starts[best])
         against = _CONTRADICTED * (view.in_free_space + view.looked_through) - _UNKNOWN * view.unknown
         total = total[best] - against * len(points) / CORRELATED
@@ -237,26 +206,24 @@ class LocalMap:
     ) -> _Found:
         motions, kept = starts.shifted(-self._center), len(starts)
         for target in targets:
-            is_last = target is targets[-1]
-            points = scan.points[: self.n_points if is_last else _COARSE_POINTS]
-            found = align(points, target, motions, _STEPS[1] if is_last else _STEPS[0][self.dim])
+            points = scan.points[: self.n_points if target is targets[-1] else _COARSE_POINTS]
+            found = align(points, target, motions, _STEPS)
             kept = max(kept // _EACH, _LAST)
             total, view = self._total(found, points, expected)
             order = total.argsort(descending=True, stable=True)
-            order = order[distinct(found.motions[order], target.blur / 2, target.blur / 2)][:kept]
+            order = order[distinct(found.motions[order], target.blur / 2, target.blur / 2)]
+            order = order[:kept]
             found, total, view = found.at(order), total[order], view.at(order)
             motions = found.motions
         # A climb has the points' score alone, which can rise along a wall while the sum of evidence falls.
         slid = align(points, targets[-1], _slid(found, points), _SLIDE_STEPS)
         slid_total, slid_view = self._total(slid, points, expected)
-        order = slid_total.argsort(descending=True, stable=True)
         # A place whose own direction stays open would lose to any pose of a wider search without a doubt.
-        better = int((slid_total > total[0] + _DECISIVE).sum())
-        for place, row in enumerate(order[:better].tolist()):
-            if pose_covariance(slid.information[row], points)[1] <= _LOOSEST:
-                rows = order[place:]
-                found, total, view = slid.at(rows), slid_total[rows], slid_view.at(rows)
-                break
+        is_open = [pose_covariance(one, points)[1] > _LOOSEST for one in slid.information]
+        slid_total = torch.where(torch.tensor(is_open), -torch.inf, slid_total)
+        order = slid_total.argsort(descending=True, stable=True)
+        if float(slid_total[order[0]] - total[0]) > _DECISIVE:
+            found, total, view = slid.at(order), slid_total[order], slid_view.at(order)
         return self._judged(points, found, total, view, expected)
 
     def _total(self, found: Alignment, points: Tensor, expected: Expectation) -> tuple[Tensor, View]:
@@ -285,12 +252,10 @@ class LocalMap:
         if float(total[best]) < -NEVER / 2:
             doubts.append("the pose is farther from where it is expected than max_step and max_turn allow")
         lead = total[best] - torch.where(is_apart, total, -torch.inf).amax()
-        others = poses[(is_apart & (total >= total[0] - _NOT_MUCH_WORSE)).nonzero()[:_OTHERS, 0]]
-        unlikely = float(expected.unlikely(poses[[best]]))
-        is_here, is_best = _probability(
-            float(found.explained[best]), contradicted, 1 - seen, float(lead), min(loosest, 1.0), unlikely
-        )
-        probability = is_here * is_best
+        probability = _probability(
+            float(found.explained[best]), contradicted, 1 - seen, float(lead),
+            min(loosest, 1.0), float(expected.unlikely(poses[[best]])),
+        )  # fmt: skip
         if probability < _LEAST_PROBABILITY:
             doubts.append(
                 f"the probability of the pose is {probability:.2f}: {share:.0%} of the points lie on "
@@ -298,15 +263,15 @@ class LocalMap:
             )
         if share < self.least_explained:
             doubts.append(f"only {share:.0%} of the points lie on surfaces of the last scans")
-        if is_here < _LEAST_PROBABILITY or share < self.least_explained:
+        if doubts:
             covariance = covariance + nowhere(self.dim)
         if loosest > _LOOSEST:
             doubts.append(f"the surfaces leave a direction open: a standard deviation of {loosest:.2g} m")
         if bool(rivals.any()):
             doubts.append("another pose explains the scan as well")
             covariance = covariance + _scatter(poses[best], poses[chosen])
-        location = Location(poses[best].matrix, covariance, share, tuple(doubts), probability, others.matrix)
-        return _Found(location, float(total[best]), contradicted, unlikely)
+        location = Location(poses[best].matrix, covariance, share, tuple(doubts), probability)
+        return _Found(location, float(total[best]), contradicted)
 
 
 def _is_same(some: Location, other: Location) -> bool:
@@ -315,21 +280,18 @@ def _is_same(some: Location, other: Location) -> bool:
     return float(differences(first, second, _APART, _APART)) < 1
 
 
-def _probability(*evidence: float) -> tuple[float, float]:
-    """That the scan is of the local map, and that no rival is the right pose. The first one is a logistic
-    regression on 460 poses of scans in local maps of four 2D logs, half of them in the map of another place;
-    real scans contradict true maps more than simulated ones do. The second one is that of 570 scans in 24
-    simulated floors of equal offices.
+def _probability(*evidence: float) -> float:
+    """That a pose is right: a logistic regression on 460 poses of scans in local maps of four 2D logs, half
+    of them in the map of another place. In a recording most scans are near the last one, which adds to the
+    odds.
 
     evidence: shares of the points that are explained, contradicted and unseen; nats to the best pose that is
     apart; standard deviation of the loosest direction (m); nats against the pose by what was expected.
     """
     explained, contradicted, unseen, lead, loosest, unlikely = evidence
-    lead = min(lead, 60.0)
     shares = 5.5 * explained - 6.6 * contradicted - 0.6 * unseen
-    is_here = shares + 0.03 * lead - 5.6 * loosest - 0.8 * unlikely - 0.4 + _NEARBY
-    here, best = (1 / (1 + math.exp(-min(max(odds, -30.0), 30.0))) for odds in (is_here, 0.44 * lead - 0.31))
-    return here, best
+    odds = shares + 0.06 * min(lead, 60.0) - 5.6 * loosest - 1.1 * unlikely - 0.4 + _NEARBY
+    return 1 / (1 + math.exp(-min(max(odds, -30.0), 30.0)))
 
 
 def _slid(found: Alignment, points: Tensor) -> Pose:

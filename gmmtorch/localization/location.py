@@ -26,7 +26,6 @@ class Location:
     explained: share of the points that lie on surfaces of the map.
     doubts: reasons against the pose; the sensor is `found` if there are none.
     probability: that the pose is right; NaN if it is not estimated.
-    others: (R, D+1, D+1), poses that explain the scan nearly as well, as `pose`; None if they are not known.
     """
 
     pose: Tensor
@@ -34,7 +33,6 @@ class Location:
     explained: float
     doubts: tuple[str, ...]
     probability: float = math.nan
-    others: Tensor | None = None
 
     @property
     def found(self) -> bool:
@@ -63,8 +61,7 @@ def composed(first: Location, then: Location) -> Location:
     still = torch.eye(before.dim, dtype=torch.float64)
     lever = Pose(still, -(before.rotation @ after.translation)).adjoint()  # an error of the first turn shifts
     covariance = turned @ then.covariance @ turned.mT + lever @ first.covariance @ lever.mT
-    others = None if then.others is None else first.pose @ then.others
-    return replace(then, pose=(before @ after).matrix, covariance=covariance, others=others)
+    return replace(then, pose=(before @ after).matrix, covariance=covariance)
 
 
 # -- predictions ----------------------------------------------------------------------------------

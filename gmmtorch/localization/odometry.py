@@ -15,7 +15,7 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.datasets import POINT_TIMES, Dataset, Reposed, deskewed, with_poses
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_number, check_whole
-from gmmtorch.localization.local_map import LOST, SURE, Keyframe, LocalMap, nowhere
+from gmmtorch.localization.local_map import LOST, Keyframe, LocalMap, nowhere
 from gmmtorch.localization.location import Location, continued, measured_motion
 from gmmtorch.localization.loop_closure import LoopCloser, closed, information_of
 from gmmtorch.localization.pose_graph import Edges, optimised
@@ -34,8 +34,6 @@ _NARROW = 0.8  # length of the mean direction of its points; 0.64 for a half cir
 _GIVEN_UP = 3  # lost scans in a row, after which the next one begins a new local map
 _APART = "the sensor was lost before, and no place that it saw later is known from before"
 _LONGEST_GAP = 2  # steps that a sensor may have moved since the last pose that was found, at most
-_STEPS = 10  # that are found, before the longest one, and the largest turn, limit the next one:
-_LONGER, _LEAST = 2.0, (2.0, 2.4)  # times as far, but never less than these (m, rad)
 _FEWEST = 10  # returns of a scan that can be located
 _FIRST_STEP = 1.0, math.radians(30)  # standard deviations (m, rad) of the first motions
 _SURPRISE = 0.3, math.radians(10)  # least standard deviations of a motion from the predicted one
@@ -48,8 +46,7 @@ _LONG_MEMORY = 0.9  # share of the past in the mean explained share
 class Trajectory(NamedTuple):
     """Poses (N, D+1, D+1) of N scans, world ← sensor (the world is the frame of the first one); covariances
     (N, F, F) of a shift (m) and a turn (rad) in the frame of the sensor; whether each was found (N,); the
-    number of loop closures that were used; the reasons against each pose, empty if it was found; and the
-    probability (N,) that each pose in its local map is right, NaN if it is not estimated.
+    number of loop closures that were used; and the reasons against each pose, empty if it was found.
     """
 
     poses: Tensor
@@ -57,7 +54,6 @@ class Trajectory(NamedTuple):
     found: Tensor
     n_closures: int
     doubts: tuple[str, ...]
-    probabilities: Tensor
 
 
 class Odometry:
@@ -71,15 +67,14 @@ class Odometry:
         poses = odometry.trajectory().poses
 
     The pose of a scan is the one that best explains its points by one mixture of the last keyframes and is
-    not far from the prediction. In 2D the poses near the prediction, and if the best one is not sure all that
-    the sensor can have reached, are searched by branch and bound (`localization.pose_search`), and the
-    mixture is climbed from the best ones. In 3D it is climbed from the best of a lattice of starts around the
-    prediction, and from where the scan's own mixture is registered (`localization.registration`); if the best
-    pose is not sure, from a wider lattice and from other headings. The prediction continues the last motion.
-    `trajectory` finds the places that were seen twice and corrects all poses by a pose graph
-    (`localization.pose_graph`). A scan that is not found never enters the local map. Its other possible poses
-    are tried with the next one; if that is found, the lost one is searched for again. The fourth in a row
-    begins a new map, whose poses are found if a closure joins them with the first one.
+    not far from the prediction, which continues the last motion. In 2D the poses that the sensor can have
+    reached are searched by branch and bound (`localization.pose_search`), and the mixture is climbed from the
+    best ones. In 3D it is climbed from the best of a lattice of starts around the prediction, and from where
+    the scan's own mixture is registered (`localization.registration`); if the points do not support the best
+    pose, from a wider lattice and from other headings. `trajectory` finds the places that were seen twice and
+    corrects all poses by a pose graph (`localization.pose_graph`). A scan that is not found never enters the
+    local map. If the next one is found, it is searched for again. The fourth in a row begins a new map, whose
+    poses are found if a closure joins them with the first.
 
     Args:
         n_keyframes: in the local map. None: 10, or 80 for a sensor with a narrow field of view, such as a
@@ -90,8 +85,7 @@ class Odometry:
         least_explained: share of the points that must lie on surfaces of the local map.
         rule: how a scan becomes a mixture.
         max_step, max_turn: largest motion (m, rad) of the sensor between two scans. A pose that is farther
-            from the last one and from the predicted one is not found. In 2D, after ten steps, twice
-            the longest one (at least 2 m), and twice the largest turn (at least 2.4 rad), limit them, too.
+            from the last one and from the predicted one is not found.
     """
 
     def __init__(
@@ -126,7 +120,6 @@ class Odometry:
         self._edges: list[tuple[int, Pose, Tensor]] = []  # from which scan, motion, information
         self._motion: Pose | None = None
         self._step: Pose | None = None  # the motion that deskews the newest scan
-        self._longest, self._n_steps = (0.0, 0.0), 0
         self._surprise = _FIRST_STEP
         self._explained = 0.95  # share of the points: few places explain less
         self._stamp: float | None = None
@@ -235,8 +228,7 @@ class Odometry:
                        for doubt, apart in zip(doubts, is_apart.tolist(), strict=True))  # fmt: skip
         best = best._replace(poses=_bridged(best.poses, found))
         found &= ~is_apart
-        sure = torch.tensor([location.probability for location in self._locations]).double()
-        return Trajectory(best.poses.matrix, best.covariances, found, int(used.sum()), doubts, sure)
+        return Trajectory(best.poses.matrix, best.covariances, found, int(used.sum()), doubts)
 
     # -- one scan -------------------------------------------------------------------------------------
 
@@ -278,16 +270,10 @@ class Odometry:
         last = self._poses[self._last_found]
         step, rest = self._predicted(measured, ratio)
         guess = self._poses[-1] @ step  # of a scan that was lost, too
-        starts, surprise = Pose.stack([guess, last @ rest]), self._surprise
-        reach, turn = self._limits()
-        if self._lost:
-            surprise, reach = (max(surprise[0], LOST[0]), max(surprise[1], LOST[1])), reach * _LONGEST_GAP
-            others = self._locations[-1].others
-            if others is not None:
-                starts = Pose.cat([Pose.from_matrix(others) @ step, starts])  # a later scan decides
-            is_near = (starts.translation - last.translation).norm(dim=1) <= reach
-            starts = starts[is_near.nonzero()[:, 0]]  # one after the other, lost scans would go anywhere
-        expected = Expectation(starts, *surprise, self._explained, reach, turn)
+        reach = self.max_step * min(len(self._lost) + 1, _LONGEST_GAP)
+        expected = Expectation(
+            Pose.stack([guess, last @ rest]), *self._surprise, self._explained, reach, self.max_turn
+        )
         if len(scan.points) < _FEWEST or self._local is None:
             doubt = (
                 "the scan has too few points" if len(scan.points) < _FEWEST else "no scan before had points"
@@ -307,15 +293,6 @@ class Odometry:
         if self._motion is None or ratio == 1.0:
             return self._motion or rest, rest
         return rest.towards(self._motion, ratio), rest
-
-    def _limits(self) -> tuple[float, float]:
-        """The largest shift (m) and turn (rad) to the next scan, by `max_step` and `max_turn`; in 2D also by
-        those that were found, after some steps: a recording has scans after certain times or motions.
-        """
-        if self._n_steps < _STEPS or self._poses[-1].dim == 3:
-            return self.max_step, self.max_turn
-        step, turn = (max(_LONGER * found, least) for found, least in zip(self._longest, _LEAST, strict=True))
-        return min(step, self.max_step), min(turn, self.max_turn)
 
     def _note_surprise(self, location: Location, expected: Expectation) -> None:
         off = expected.poses[0].inverse() @ Pose.from_matrix(location.pose)
@@ -337,10 +314,6 @@ class Odometry:
             self._edges.append((self._last_frame, since, information_of(location)))
             if location.found:
                 self._motion = self._poses[-1].inverse() @ pose if not self._lost else None
-                if self._motion is not None:
-                    seen = float(self._motion.translation.norm()), float(self._motion.chord())
-                    self._longest = max(self._longest[0], seen[0]), max(self._longest[1], seen[1])
-                    self._n_steps += 1
                 self._last_found = number
             elif len(self._lost) >= _GIVEN_UP:
                 self._motion = None  # a sensor that is covered for long may have stopped
@@ -365,21 +338,20 @@ class Odometry:
                 is_narrow = float(directions.mean(0).norm()) > _NARROW
                 self.n_keyframes = _MANY_KEYFRAMES if is_narrow else _KEYFRAMES
             self._set_local_map(self.n_keyframes)
-        if location.found and lost and (len(lost) == 1 or location.probability >= SURE):
-            self._search_again(lost)
+        if location.found and len(lost) == 1:
+            self._search_again(lost[0])
 
-    def _search_again(self, scans: list[Keyframe]) -> None:
-        """The lost scans before the last one, the latest first, from the pose that is known after each."""
-        assert self._local is not None
-        last, first = self._last_frame, len(self._poses) - len(scans) - 2
-        before, limits = self._poses[first], (self.max_step, self.max_turn)
-        for n, scan in reversed([*enumerate(scans, 1)]):
-            number = first + n
-            after = self._poses[number + 1]
-            way = Pose.stack([before.towards(after, n / (n + 1)), after])
-            expected = Expectation(way, *self._surprise, self._explained, *limits)
-            if len(scan.points) < _FEWEST or not (location := self._local.locate(scan, expected)).found:
-                return
+    def _search_again(self, scan: Keyframe) -> None:
+        """The last scan but one, which was lost, between the poses on both sides of it. Of several lost scans
+        in a row none is searched for: the pose that ends them is less sure.
+        """
+        if self._local is None or len(scan.points) < _FEWEST:
+            return
+        number, last = len(self._poses) - 2, self._last_frame
+        before, after = self._poses[number - 1], self._poses[-1]
+        way, limits = Pose.stack([before.towards(after, 0.5), before]), (self.max_step, self.max_turn)
+        location = self._local.locate(scan, Expectation(way, *self._surprise, self._explained, *limits))
+        if location.found:
             pose = Pose.from_matrix(location.pose)
             self._edges[number - 1] = (last, self._poses[last].inverse() @ pose, information_of(location))
             self._poses[number], self._locations[number] = pose, location
@@ -569,5 +541,4 @@ class KissIcp:
         poses = torch.stack([location.pose for location in self._locations])
         covariances = torch.stack([location.covariance for location in self._locations])
         found = torch.ones(len(poses), dtype=torch.bool)
-        unknown = torch.full((len(poses),), torch.nan).double()
-        return Trajectory(poses, covariances, found, 0, ("",) * len(poses), unknown)
+        return Trajectory(poses, covariances, found, 0, ("",) * len(poses))

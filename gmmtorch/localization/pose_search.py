@@ -28,9 +28,8 @@ HIT, UNKNOWN, FREE = 8.0, 4.0, -8.0
 
 _CELLS = 1 << 18  # of a raster at most
 _FINEST = 0.1  # metres of a cell
-_ROUNDED = 1.0  # cells that a point may be off by rounding of its pose,
-_BLUR = 1.0  # and standard deviation (cells) of a surface beyond
-_TAIL = 3.5  # nats: beyond, the prior falls as a power of the deviation
+_BLUR = 1.5  # cells of standard deviation of a surface
+_TAIL = 2.0  # nats: beyond, the prior falls as a power of the deviation
 NEVER = 1e4
 """Nats against a pose that is farther from the expected poses than the sensor moves."""
 _NEAR = 3  # cells from a surface: neither free nor unknown
@@ -122,7 +121,7 @@ class PoseSearch:
         shade = hits
         for axis in (0, 1):  # the margin has no hits, so nothing comes in from the other end
             near = (
-                math.exp(-0.5 * (max(abs(shift) - _ROUNDED, 0) / _BLUR) ** 2) * shade.roll(shift, axis)
+                math.exp(-0.5 * (shift / _BLUR) ** 2) * shade.roll(shift, axis)
                 for shift in range(-_NEAR, _NEAR + 1)
             )
             shade = functools.reduce(torch.maximum, near)

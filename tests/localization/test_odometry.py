@@ -235,12 +235,7 @@ def test_a_motion_beyond_the_bounds_is_not_found():
 @pytest.mark.real_data
 @pytest.mark.parametrize(
     ("log", "first", "last"),
-    [
-        ("intel", 0, 2),
-        ("intel", 54, 60),
-        pytest.param("intel", 884, 895, marks=pytest.mark.xfail(reason="a step of 0.4 m along the corridor")),
-        ("hall", 20, 24),
-    ],
+    [("intel", 0, 2), ("intel", 54, 60), ("intel", 884, 895), ("hall", 20, 24)],
     ids=["a wall grows behind the sensor", "a corridor", "a corridor with doors", "a turn by 135 degrees"],
 )
 def test_steps_that_mislead_the_points_are_found_with_free_space(real_data, log, first, last):
