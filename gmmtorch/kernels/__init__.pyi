@@ -77,6 +77,7 @@ from .rays.component_casting import hidden_area as hidden_area
 from .rays.component_casting import truncated_normals as truncated_normals
 from .rays.path_clearance import Motions as Motions
 from .rays.path_clearance import motions_are_clear as motions_are_clear
+from .rays.range_views import range_views as range_views
 from .rays.ray_traversal import CHUNK_VISITS as CHUNK_VISITS
 from .rays.ray_traversal import BlockTable as BlockTable
 from .rays.ray_traversal import count_in_blocks as count_in_blocks

@@ -20,6 +20,7 @@ struct OneLane {
 GMM_INLINE bool any(bool m) { return m; }
 GMM_INLINE double root(double x) { return sqrt(x); }
 GMM_INLINE double down(double x) { return floor(x); }
+GMM_INLINE double nearby(double x) { return rint(x); }
 GMM_INLINE double absolute(double x) { return fabs(x); }
 GMM_INLINE int64_t integer(double x) { return (int64_t)x; }
 GMM_INLINE double expo(double x) { return exp(x); }
@@ -50,6 +51,7 @@ constexpr int LANES = Lanes::LANES;
 GMM_INLINE bool any(mask m) { return __builtin_reduce_or(m) != 0; }
 GMM_INLINE vec root(vec x) { return __builtin_elementwise_sqrt(x); }
 GMM_INLINE vec down(vec x) { return __builtin_elementwise_floor(x); }
+GMM_INLINE vec nearby(vec x) { return __builtin_elementwise_roundeven(x); }
 GMM_INLINE vec absolute(vec x) { return __builtin_elementwise_abs(x); }
 GMM_INLINE Lanes::whole integer(vec x) { return __builtin_convertvector(x, Lanes::whole); }
 GMM_INLINE vec fused(vec a, vec b, vec c) { return __builtin_elementwise_fma(a, b, c); }
@@ -95,6 +97,34 @@ GMM_INLINE vec logarithm(vec x) {
     vec p = (vec)(1.0 / 21.0);
     for (int i = 19; i >= 1; i -= 2) p = p * tt + 1.0 / i;
     return power * 0.693147180559945309417 + 2.0 * t * p;
+}
+
+// The angle of (x, y); error below 4e-16. Rational function of Cephes (Moshier 1989).
+GMM_INLINE vec arctangent(vec y, vec x) {
+#if defined(GMM_VECTORS)
+    const vec ax = absolute(x), ay = absolute(y);
+    const mask is_steep = ay > ax;
+    vec small = is_steep ? ax : ay, large = is_steep ? ay : ax;
+    large = large > 0.0 ? large : (vec)(1.0);
+    const mask is_wide = small > 0.66 * large;  // beyond, the angle from 45 degrees
+    const vec t = (is_wide ? small - large : small) / (is_wide ? small + large : large), z = t * t;
+    vec p = (vec)(-0.8750608600031904122785), q = z + 24.85846490142306297962;
+    p = p * z - 16.15753718733365076637;
+    p = p * z - 75.00855792314704667340;
+    p = p * z - 122.8866684490136173410;
+    p = p * z - 64.85021904942025371773;
+    q = q * z + 165.0270098316988542046;
+    q = q * z + 432.8810604912902668951;
+    q = q * z + 485.3903996359136964868;
+    q = q * z + 194.5506571482613964425;
+    vec angle = t + t * (z * p / q);
+    angle = is_wide ? angle + 0.78539816339744830962 : angle;
+    angle = is_steep ? 1.57079632679489661923 - angle : angle;
+    angle = x < 0.0 ? 3.14159265358979323846 - angle : angle;
+    return y < 0.0 ? -angle : angle;
+#else
+    return atan2(y, x);
+#endif
 }
 
 // Mills' ratio R(x) = e^(x*x/2) integral of e^(-w*w/2) from x, for x >= 0. A polynomial in t = (x - 3.5)/(x

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gmmtorch.kernels import is_fused, range_views
 from gmmtorch.localization.alignment import (
     Alignment,
     AlignmentTarget,
@@ -351,16 +352,12 @@ class FreeSpace:
 
     def view(self, points: Tensor, poses: Pose) -> View:
         """How a scan's points (N, D) agree with the space that was seen, at poses (B)."""
-        there = self._inverse[:, None].apply(poses.apply(points))  # (K, B, N, D)
-        free, known = _compared(there, self._nearest, self._farthest)
-        free_anywhere = free.any(0)
-        is_unknown = ~(known.any(0) | free_anywhere)
-        seen = poses.inverse().apply(self._points)
+        free, unknown = _counted(points, poses, (self._nearest, self._farthest), self._inverse)
         nearest, farthest = range_image(points)
-        through, met = _compared(seen[None], nearest[None], farthest[None])
-        through, met = through[0], met[0]
-        share = through.sum(1) / (through | met).sum(1).clamp_min(_KEPT_POINTS // 4)
-        return View(free_anywhere.double().mean(1), is_unknown.double().mean(1), share.double())
+        still = Pose.identity(poses.dim, 1)
+        through, hidden = _counted(self._points, poses.inverse(), (nearest[None], farthest[None]), still)
+        share = through / (len(self._points) - hidden).clamp_min(_KEPT_POINTS // 4)
+        return View(free / len(points), unknown / len(points), share)
 
 
 def range_image(points: Tensor) -> tuple[Tensor, Tensor]:
@@ -379,17 +376,21 @@ def range_image(points: Tensor) -> tuple[Tensor, Tensor]:
     return around, farthest
 
 
-def _compared(points: Tensor, nearest: Tensor, farthest: Tensor) -> tuple[Tensor, Tensor]:
-    """Whether points (K, B, N, D) are in front of the surfaces of K images, and whether they are on them."""
-    cells, distance = _cells(points)
-    flat = cells.flatten(1)
-    near = nearest.gather(1, flat).view_as(distance)
-    far = farthest.gather(1, flat).view_as(distance)
+def _counted(
+    points: Tensor, motions: Pose, images: tuple[Tensor, Tensor], frames: Pose
+) -> tuple[Tensor, Tensor]:
+    """Numbers (B,) of points (N, D) under each motion in front of the surface of any of K range images
+    (K, C), and of those that no image shows. frames: (K), image ← world.
+    """
+    if is_fused(points, *motions.parts, *images, *frames.parts):
+        limits = _IMAGE_CELL[motions.dim], *_MARGIN
+        return range_views(points, motions.parts, frames.parts, images, _size(motions.dim), limits)
+    cells, distance = _cells(frames[:, None].apply(motions.apply(points)))  # (K, B, N)
+    near, far = (image.gather(1, cells.flatten(1)).view_as(distance) for image in images)
     margin = _MARGIN[0] + _MARGIN[1] * distance
-    is_seen = torch.isfinite(near)
-    return is_seen & (distance < near - margin), is_seen & (distance >= near - margin) & (
-        distance <= far + margin
-    )
+    is_free = torch.isfinite(near) & (distance < near - margin)
+    is_known = torch.isfinite(near) & (distance <= far + margin)
+    return is_free.any(0).sum(1).double(), (~is_known.any(0)).sum(1).double()
 
 
 def _cells(points: Tensor) -> tuple[Tensor, Tensor]:

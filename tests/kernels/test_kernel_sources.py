@@ -104,6 +104,16 @@ def test_the_mills_ratio_equals_the_error_function(tmp_path):
     assert float((found / exact - 1).abs().max()) < 2e-14
 
 
+def test_the_angle_of_a_place_equals_the_library_function(tmp_path):
+    draw = torch.Generator().manual_seed(0)
+    places = torch.randn(4000, 2, generator=draw).double() * 10 ** (6 * torch.randn(4000, 1, generator=draw))
+    places[:8] = torch.tensor([[0, 0], [1, 0], [0, 1], [-1, 0], [0, -1], [1, 1], [-2, 2], [-3, -3]]).double()
+    found = places.clone().T.contiguous()
+    body = f"vec& y = ((vec*)x)[item]; y = arctangent(y, ((vec*)x)[item + {4000 // CPU_LANES}]);"
+    kernel_of(tmp_path, body, FOLDER / "lanes.h")(4000 // CPU_LANES, found, device=found.device)
+    torch.testing.assert_close(found[0], torch.atan2(places[:, 0], places[:, 1]), rtol=4e-16, atol=1e-300)
+
+
 def test_a_kernel_is_compiled_again_when_a_file_that_it_includes_changes(tmp_path):
     (tmp_path / "one.h").write_text(f'#include "{FOLDER / "device.h"}"\nconstexpr double NUMBER = 1.0;\n')
     for number in (1.0, 2.0):
