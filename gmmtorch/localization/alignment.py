@@ -30,6 +30,7 @@ CUTOFF = 3.5
 
 _OUTLIERS = 0.05  # ε, relative to the peak of a component
 _EXPLAINED = 0.1  # q above which components explain a point
+_INSIDE = 5.0  # nats of a point on a surface, however many components it touches
 _SETTLED = 0.05  # of the blur: steps below this end a climb
 _SADDLE = 0.05  # of EM's information: with less curvature Newton's step is too long
 _SIDE = 2.0  # blurs of a cell of the lists
@@ -50,6 +51,13 @@ class Alignment(NamedTuple):
     explained: Tensor
     information: Tensor
     converged: Tensor
+
+    @property
+    def evidence(self) -> Tensor:
+        """Nats of a point (B,) for a pose: ℓ/N, in which a point that touches many components counts more
+        than its surface tells, and as much for each explained point.
+        """
+        return self.score + _INSIDE * self.explained
 
     def at(self, rows: Tensor) -> Alignment:
         return Alignment(self.motions[rows], *(value[rows] for value in self[1:]))

@@ -25,7 +25,14 @@ from gmmtorch.localization.alignment import (
     seen_normals,
 )
 from gmmtorch.localization.location import Location, pose_covariance
-from gmmtorch.localization.pose_search import CORRELATED, NEVER, Expectation, PoseSearch
+from gmmtorch.localization.pose_search import (
+    CORRELATED,
+    MARGIN,
+    NEVER,
+    Expectation,
+    PoseSearch,
+    free_segments,
+)
 from gmmtorch.localization.registration import register
 from gmmtorch.mapping import WindowedRule, learn_window, surface_mixture
 from gmmtorch.pose import Pose
@@ -54,7 +61,6 @@ LOST = 1.0, math.radians(20)  # deviations (m, rad) of a pose that no scan confi
 _STARTS = 40  # poses of the search in 2D that are climbed
 _SEARCHED = 1000  # points of a keyframe
 _APART = 0.3  # metres, and radians: poses are different
-_INSIDE = 5.0  # nats of a point on a surface, however many components it touches
 _UNKNOWN = 4.0  # nats of a point that the local map could not see: neither for nor against a pose
 _CONTRADICTED = 8.0  # nats that a point costs in free space, or an earlier point that the scan looks through
 _NEARBY = 1.0  # log odds that a scan is near the last one, relative to the sample
@@ -63,7 +69,6 @@ _LEAST_SEEN = 0.5  # share of the points of which at least so many must lie on s
 _USUAL = 0.85  # of the share that is expected to be explained: less, and the search is wider
 _ALIKE = 2.0  # nats by which another pose must be worse
 _IMAGE_CELL = {2: math.radians(1), 3: math.radians(3)}  # of an image
-_MARGIN = 0.25, 0.02  # metres, and share of the range, that a point may be in front of or behind a surface
 _KEPT_POINTS = 200  # of each earlier scan, that a new scan must not look through
 
 
@@ -117,11 +122,7 @@ class LocalMap:
     def _search(self) -> PoseSearch:
         points = torch.cat([scan.points[:_SEARCHED] for scan in self._scans])
         origins = torch.cat([scan.origin.expand_as(scan.points[:_SEARCHED]) for scan in self._scans])
-        beams = points - origins
-        ranges = beams.norm(dim=1, keepdim=True).clamp_min(1e-9)
-        part = 1 - (_MARGIN[0] + _MARGIN[1] * ranges) / ranges
-        ends = origins + part.clamp_min(0) * beams
-        return PoseSearch(points, torch.stack([origins, ends], 1))
+        return PoseSearch(points, free_segments(origins, points, points.new_zeros(len(points)).bool()))
 
     def locate(self, scan: Keyframe, expected: Expectation) -> Location:
         """The pose of a scan, whose own pose is not used; `found` if it is sure."""
@@ -232,9 +233,7 @@ class LocalMap:
         poses = found.motions.orthonormal().shifted(self._center)
         view = self._space.view(points, poses)
         contradicted = view.in_free_space + view.looked_through
-        mean = (
-            found.score + _INSIDE * found.explained + _UNKNOWN * view.unknown - _CONTRADICTED * contradicted
-        )
+        mean = found.evidence + _UNKNOWN * view.unknown - _CONTRADICTED * contradicted
         return mean * len(points) / CORRELATED - expected.unlikely(poses), view
 
     def _judged(
@@ -383,11 +382,11 @@ def _counted(
     (K, C), and of those that no image shows. frames: (K), image ← world.
     """
     if is_fused(points, *motions.parts, *images, *frames.parts):
-        limits = _IMAGE_CELL[motions.dim], *_MARGIN
+        limits = _IMAGE_CELL[motions.dim], *MARGIN
         return range_views(points, motions.parts, frames.parts, images, _size(motions.dim), limits)
     cells, distance = _cells(frames[:, None].apply(motions.apply(points)))  # (K, B, N)
     near, far = (image.gather(1, cells.flatten(1)).view_as(distance) for image in images)
-    margin = _MARGIN[0] + _MARGIN[1] * distance
+    margin = MARGIN[0] + MARGIN[1] * distance
     is_free = torch.isfinite(near) & (distance < near - margin)
     is_known = torch.isfinite(near) & (distance <= far + margin)
     return is_free.any(0).sum(1).double(), (~is_known.any(0)).sum(1).double()

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from gmmtorch.kernels import count_in_grid, raster_sums
 from gmmtorch.localization.alignment import distinct
+from gmmtorch.mapping import Components
 from gmmtorch.pose import Pose
 
 CORRELATED = 10.0
@@ -38,9 +39,13 @@ _MOST_SQUARES = 150  # of one heading
 _TURNS = math.radians(0.7), math.radians(4)  # least and largest step between headings
 _FAR = 0.8  # quantile of the ranges that a step between headings moves by a cell
 _POINTS = 128  # of the scan
-_KEPT = 3000  # squares of a level at most
+_KEPT, _KEPT_ANYWHERE = 3000, 20000  # squares of a level at most, near an expected pose and in a whole map
+_REACH = 2.0  # standard deviations of a component that are a surface, along it
+_BEAMS = (-0.4, -0.15, 0.15, 0.4)  # of this reach: where the beams end that saw a component
+MARGIN = 0.25, 0.02
+"""Metres, and share of the range, that a point may be in front of or behind a surface."""
 _FIRST = 50  # best squares, which are divided first, for a score to compare with
-_MARGIN = 12.0  # nats below the best score that are kept: refinement may turn the order
+_BELOW = 12.0  # nats below the best score that are kept: refinement may turn the order
 _PLACES = 6  # times as many poses of different places, from which those that differ are chosen
 _TOLD_APART = 0.3, math.radians(8)  # metres and radians between poses that are returned
 
@@ -139,11 +144,37 @@ class PoseSearch:
             wide = torch.maximum(wide[:-step], wide[step:])
             self._levels.append(torch.maximum(wide[:, :-step], wide[:, step:]))
 
-    def best(self, points: Tensor, expected: Expectation, most: int) -> Found:
+    @classmethod
+    def of_map(cls, components: Components, center: Tensor) -> PoseSearch:
+        """The search of a whole map in 2D, whose poses are about `center` (2,)."""
+        variances, axes = torch.linalg.eigh(components.covariances.double())
+        half = _REACH * variances[:, 1].clamp_min(0).sqrt()
+        means, along = components.means.double() - center, half[:, None] * axes[:, :, 1]
+        n_points = torch.where(components.max_range, 0, (2 * half / _FINEST).long() + 1)
+        component = torch.repeat_interleave(n_points)
+        place = torch.arange(len(component)).to(component) - (n_points.cumsum(0) - n_points)[component]
+        offset = (2 * place + 1) / n_points[component] - 1  # from −1 to 1 along the component
+        by, parts = components.seen_by, torch.tensor(_BEAMS).to(means)
+        ends = (means[by] + parts[:, None, None] * along[by]).flatten(0, 1)
+        origins = (components.origins.double()[components.seen_from] - center).repeat(len(parts), 1)
+        free = free_segments(origins, ends, components.max_range[by].repeat(len(parts)))
+        return cls(means[component] + offset[:, None] * along[component], free)
+
+    def anywhere(self, points: Tensor, most: int) -> Found:
+        """The best poses in the whole raster that differ, at most `most`; arguments as of `best`."""
+        size = self._levels[0].shape[:2]
+        middle = self.cell * (self._low + torch.tensor(size).to(self._low) / 2)
+        level = Pose(torch.eye(2).to(middle)[None], middle[None])
+        reach = self.cell * max(size) / math.sqrt(2)
+        unknown = Expectation(level, math.inf, math.inf, 1.0, reach)
+        return self.best(points, unknown, most, _KEPT_ANYWHERE)
+
+    def best(self, points: Tensor, expected: Expectation, most: int, kept: int = _KEPT) -> Found:
         """The best poses that differ, at most `most`, as far from the last expected pose as a scan can be.
 
         Args:
             points: (N, 2) of the scan, sensor frame, in random order; the first ones are used.
+            kept: squares of a level, at most, which are divided.
         """
         tried = self._tried(points.double(), expected)
         level = self._first_level(expected.max_step)
@@ -156,18 +187,21 @@ class PoseSearch:
         shift = flat.repeat(n_turns, 1)
         bound = self._scored(tried, heading, shift, level)
         first = bound.topk(min(_FIRST, len(bound))).indices
-        some, at, least = heading[first], shift[first], -math.inf
+        some, at, dived = heading[first], shift[first], bound[first]
         for finer in range(level - 1, -1, -1):
             some, at = _divided(some, at, 1 << finer)
             score = self._scored(tried, some, at, finer)
             best = score.topk(min(_FIRST, len(score))).indices
-            some, at, least = some[best], at[best], float(score[best[0]])
+            some, at, dived = some[best], at[best], score[best]
+        least = float(dived[0])
         for finer in range(level - 1, -1, -1):
-            kept = _most(bound, least - _MARGIN)
-            heading, shift = _divided(heading[kept], shift[kept], 1 << finer)
+            rows = _most(bound, least - _BELOW, kept)
+            heading, shift = _divided(heading[rows], shift[rows], 1 << finer)
             bound = self._scored(tried, heading, shift, finer)
-        kept = _most(bound, max(least, float(bound.max())) - _MARGIN)
-        return self._told_apart(tried, heading[kept], shift[kept], bound[kept], most)
+        # Where more squares than `kept` may hold a better pose, the first ones may not be among them.
+        heading, shift, bound = torch.cat([heading, some]), torch.cat([shift, at]), torch.cat([bound, dived])
+        rows = _most(bound, float(bound.max()) - _BELOW, kept)
+        return self._told_apart(tried, heading[rows], shift[rows], bound[rows], most)
 
     def _tried(self, points: Tensor, expected: Expectation) -> _Tried:
         """The headings of a search, with a step that moves most of the points by a cell."""
@@ -232,10 +266,20 @@ def _firsts(rows: Tensor) -> Tensor:
     return first.scatter_reduce(0, kind, number, "amin").sort().values
 
 
-def _most(bound: Tensor, least: float) -> Tensor:
-    """Rows of the bounds above `least`, but of the largest `_KEPT` only."""
+def _most(bound: Tensor, least: float, most: int) -> Tensor:
+    """Rows of the bounds above `least`, but of the `most` largest only."""
     kept = (bound >= least).nonzero()[:, 0]
-    return kept if len(kept) <= _KEPT else kept[bound[kept].topk(_KEPT).indices]
+    return kept if len(kept) <= most else kept[bound[kept].topk(most).indices]
+
+
+def free_segments(origins: Tensor, ends: Tensor, is_empty: Tensor) -> Tensor:
+    """The segments (B, 2, D) of free space from origins to the ends of beams (B, D): all of a beam that
+    `is_empty` (B,), because it met no surface, else the part before the margin of its surface.
+    """
+    beams = ends - origins
+    ranges = beams.norm(dim=1, keepdim=True).clamp_min(1e-9)
+    part = 1 - torch.where(is_empty[:, None], 0.0, MARGIN[0] / ranges + MARGIN[1])
+    return torch.stack([origins, origins + part.clamp_min(0) * beams], 1)
 
 
 def _divided(heading: Tensor, shift: Tensor, width: int) -> tuple[Tensor, Tensor]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import time
 from collections.abc import Iterator
@@ -26,6 +27,7 @@ from gmmtorch.localization.alignment import (
     seen_normals,
 )
 from gmmtorch.localization.location import UNSEEN, Location, continued, measured_motion, pose_covariance
+from gmmtorch.localization.pose_search import CORRELATED, MARGIN, PoseSearch
 from gmmtorch.mapping import Components, GaussianMap, Surfaces, surface_mixture
 from gmmtorch.pose import Pose
 from gmmtorch.scan import check_positions
@@ -39,6 +41,7 @@ _COARSE_SHARE = 0.4  # of the points, on all levels but the last one
 _SAME = 0.25  # of the blur: motions that are closer have climbed one peak
 _SECOND_CHANCE = 1  # the level after the first: starts are ranked there once more, by its blur
 _CLIMBED = 6  # starts that the first level climbs; each level after it climbs the better half
+_RASTERED = 16  # starts from the raster of a map in 2D, which are climbed as they are
 _PLACES = 0.5  # metres between the places of a search of the whole map
 _RANKED = 8 * _CLIMBED  # best starts, of which different ones are climbed
 _RANKING_POINTS = 150  # of the scan, that rank the starts
@@ -49,13 +52,14 @@ _GLOBAL_AFTER = 1  # lost scans, after which the whole map is searched
 _USUAL = 0.9  # of the share that the last scan had: less, and the search is wider
 _SURE = 0.95  # of the share that the last scan had: less, and a pose away from the prediction is not accepted
 _LOOSEST = 0.3  # metres of standard deviation
-_ALIKE = 0.98  # of the best score: another pose is as good
+_ALIKE = 2.0  # nats by which another pose must be worse
 _APART = 0.3  # metres, and radians: poses are different
 _FEWEST = 10  # points of a scan
 _NEAREST = 0.2  # metres from the sensor: nearer points are its own cover, which would fit any wall
-_FREE = 0.2  # occupancy of a cell that the map saw as free,
-_CELL = 0.1  # metres, its side
-_MOST_FREE = 1.5  # times the share that need not be explained: points in free space
+_FREE, _OCCUPIED = 0.2, 0.9  # occupancy of cells that the map is sure of,
+_CELL = 0.1  # metres, their side
+_BEAM_POINTS = 64  # of a beam, which are asked
+_MOST_CONTRADICTED = 1.5  # times the share that need not be explained
 
 
 class Tracker:
@@ -103,14 +107,14 @@ class Tracker:
         self._center = mixture.means.mean(0)  # numbers stay small anywhere in the world
         centered = mixture._replace(means=mixture.means - self._center)
         seen = surfaces.components() if isinstance(surfaces, GaussianMap) else surfaces
-        normals = seen_normals(seen) if isinstance(seen, Components) else None
-        normals = torch.zeros_like(centered.means) if normals is None else normals
+        self._seen = seen if isinstance(seen, Components) else None
+        normals = torch.zeros_like(centered.means) if self._seen is None else seen_normals(self._seen)
         self._targets = [
             AlignmentTarget(merged, blur, faces)
             for blur in _BLURS
             for merged, faces in (merged_below(centered, normals, blur),)
         ]
-        self._places = _places(seen, self._center) if isinstance(seen, Components) else mixture.means[:0]
+        self._places = mixture.means[:0] if self._seen is None else _places(self._seen, self._center)
         self.restart(pose)
 
     def restart(self, pose: ArrayLike | None = None) -> None:
@@ -151,7 +155,8 @@ class Tracker:
         predicted = self._predicted(measured)
         rows = self._thinned(rows[rows.norm(dim=1) > _NEAREST])
         best: Location | None = None
-        for level, starts, is_enough in self._searches(predicted, measured is not None) if len(rows) else ():
+        searches = self._searches(rows, predicted, measured is not None) if len(rows) else ()
+        for level, starts, is_enough in searches:
             found = self._climbed(rows, starts, level)
             best = found if best is None else _better(best, found)
             if best.found and best.explained >= is_enough:
@@ -177,7 +182,9 @@ class Tracker:
         step = self._motion if measured is None else measured
         return self._last if self._last is None or step is None else self._last @ step
 
-    def _searches(self, predicted: Pose | None, is_measured: bool) -> Iterator[tuple[int, Pose, float]]:
+    def _searches(
+        self, rows: Tensor, predicted: Pose | None, is_measured: bool
+    ) -> Iterator[tuple[int, Pose, float]]:
         """First level, starts, and the explained share that ends the search; the cheapest search first."""
         if predicted is not None:
             start = predicted[None]
@@ -187,7 +194,18 @@ class Tracker:
             wide = _WIDER * self.distance, min(_WIDER * self.angle, math.pi)
             yield 0, around(start, *wide, _BLURS[0]), 0.0
         if len(self._places) and (predicted is None or self.n_lost >= _GLOBAL_AFTER):
-            yield _FINE, everywhere(self._places, _BLURS[_FINE]), 0.0
+            if self._raster is None:
+                yield _FINE, everywhere(self._places, _BLURS[_FINE]), 0.0
+            else:  # from the last level that blurs more than a cell of the raster
+                first = max(sum(blur >= self._raster.cell for blur in _BLURS) - 1, 0)
+                yield first, self._raster.anywhere(rows, _RASTERED).poses, 0.0
+
+    @functools.cached_property
+    def _raster(self) -> PoseSearch | None:
+        """The search of the whole map in 2D, whose raster knows its free space."""
+        if self.dim == 3 or self._seen is None:
+            return None
+        return PoseSearch.of_map(self._seen, self._center)
 
     def _thinned(self, rows: Tensor) -> Tensor:
         draw = torch.Generator().manual_seed(0)
@@ -196,25 +214,25 @@ class Tracker:
     def _climbed(self, rows: Tensor, starts: Pose, first: int) -> Location:
         """The location that the levels from `first` on reach from the best of the starts."""
         motions = self._ranked(rows, starts, self._targets[first])
+        n_starts, are_all = len(motions), len(motions) == len(starts)
         for number, target in enumerate(self._targets[first:]):
-            if number == _SECOND_CHANCE:
+            if number == _SECOND_CHANCE and not are_all:
                 motions = Pose.cat([motions, self._ranked(rows, starts, target)])
             is_last = target is self._targets[-1]
             used = rows if is_last else rows[: max(_RANKING_POINTS, int(_COARSE_SHARE * len(rows)))]
             found = align(used, target, motions, _STEPS if is_last or number == 0 else _BETWEEN_STEPS)
-            found = found.at(
-                best_distinct(found.motions, found.score, target.blur * _SAME)[: max(2, _CLIMBED >> number)]
-            )
+            order = best_distinct(found.motions, found.evidence, target.blur * _SAME)
+            found = found.at(order[: max(2, n_starts >> number)])
             motions = found.motions
         return self._location(rows, found, is_tracked=len(starts) == 1)
 
     def _ranked(self, rows: Tensor, starts: Pose, target: AlignmentTarget) -> Pose:
-        """The best starts that differ from each other, at most `_CLIMBED`."""
+        """The best starts that differ from each other, at most `_CLIMBED`; all of them if they are few."""
         if len(starts) > 10 * _RANKED:
             score = target.scores(rows[:_GLIMPSE_POINTS], starts)
             starts = starts[score.topk(len(score) // 5).indices]
         n = len(starts)
-        if n <= _CLIMBED:
+        if n <= _RASTERED:
             return starts
         score = target.scores(rows[:_RANKING_POINTS], starts)
         order = score.argsort(descending=True, stable=True)
@@ -234,22 +252,32 @@ class Tracker:
         if loosest > _LOOSEST:
             doubts.append(f"the surfaces leave a direction open: a standard deviation of {loosest:.2g} m")
         other = differences(found.motions, found.motions, _APART, _APART)[0] > 1
-        if bool((other & (found.score >= _ALIKE * found.score[0])).any()):
+        lead = (found.evidence[0] - found.evidence) * len(rows) / CORRELATED
+        if bool((other & (lead <= _ALIKE)).any()):
             doubts.append("another pose explains the scan as well")
         if len(rows) < _FEWEST:
             doubts.append(f"the scan has only {len(rows)} points beyond {_NEAREST} m: is the sensor covered?")
         pose = found.motions[0].shifted(self._center)
-        in_free_space = 0.0 if doubts or is_tracked else self._in_free_space(rows, pose)
-        if in_free_space > _MOST_FREE * (1 - self.least_explained):
-            doubts.append(f"{in_free_space:.0%} of the points lie where the map saw free space")
+        if not doubts and not is_tracked and self._map is not None:
+            in_free_space, through = self._contradicted(self._map, rows[:_RANKING_POINTS], pose)
+            if in_free_space + through > _MOST_CONTRADICTED * (1 - self.least_explained):
+                doubts.append(
+                    f"{in_free_space:.0%} of the points lie where the map saw free space, and {through:.0%} "
+                    "of the beams pass through its surfaces"
+                )
         return Location(pose.matrix, covariance, share, tuple(doubts))
 
-    def _in_free_space(self, rows: Tensor, pose: Pose) -> float:
-        """Share of the points that lie in free space of the map; 0 if the surfaces are no map."""
-        if self._map is None:
-            return 0.0
-        occupancy = self._map.occupancy(pose.apply(rows[:_RANKING_POINTS]), _CELL)
-        return float((torch.as_tensor(occupancy) < _FREE).double().mean())
+    def _contradicted(self, known: GaussianMap, rows: Tensor, pose: Pose) -> tuple[float, float]:
+        """Shares of the points in free space of the map, and of the beams that pass through a surface."""
+        margin = MARGIN[0] / rows.norm(dim=1) + MARGIN[1]
+        parts = torch.linspace(0, 1, _BEAM_POINTS + 1).to(rows)[1:]
+        along = parts * (1 - margin).clamp_min(0)[:, None]
+        asked = torch.cat([rows[:, None], along[..., None] * rows[:, None]], 1)
+        occupancy = torch.as_tensor(known.occupancy(pose.apply(asked.flatten(0, 1)), _CELL)).view(
+            len(rows), -1
+        )
+        through = (occupancy[:, 1:] > _OCCUPIED).any(1)
+        return float((occupancy[:, 0] < _FREE).double().mean()), float(through.double().mean())
 
     def _nothing(self, predicted: Pose | None) -> Location:
         """The prediction, for a scan without points."""

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+import gmmtorch as gt
 from gmmtorch.kernels import kernels, raster_sums
 from gmmtorch.localization.pose_search import CORRELATED, FREE, UNKNOWN, Expectation, PoseSearch
 from gmmtorch.pose import Pose
@@ -48,6 +49,32 @@ def test_the_best_pose_is_that_of_all_placements(seed):
                 score = sums * len(points) / len(rows) / CORRELATED
                 scores.append(score - float(expected.unlikely(there[None])))
     assert float(found.scores[0]) == pytest.approx(max(scores), abs=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_squares_that_are_divided_first_are_not_lost(seed):
+    search, draw = PoseSearch(room(600, 0)), torch.Generator().manual_seed(seed)
+    pose = Pose.from_yaw(6 * torch.rand((), generator=draw), 1 + 2 * torch.rand(2, generator=draw).double())
+    points = pose.inverse().apply(room(120, seed + 1))
+    unknown = Expectation(Pose.from_yaw([0.0], [4.5, 3.5]), math.inf, math.inf, 1.0, 8.0)
+    found, few = search.anywhere(points, 5), search.best(points, unknown, 5, kept=1)
+    assert len(few.scores)
+    assert float(few.scores[0]) >= float(found.scores[0]) - 20
+
+
+def test_the_raster_of_a_map_knows_walls_free_space_and_what_is_behind():
+    wall = torch.stack([torch.full((200,), 3.0), torch.linspace(-2, 2, 200)], 1).double()
+    made = gt.GaussianMap()
+    made.insert(gt.Scan(wall, torch.zeros(2)))
+    made.finish()
+    center = torch.tensor([1.0, 0.5]).double()
+    search = PoseSearch.of_map(made.components(), center)
+    asked = torch.tensor([[1.5, 0.0], [3.0, 0.4], [3.0, -1.2], [3.8, 0.0]]).double() - center
+    cells = ((asked / search.cell).floor() - search._low).long()
+    free, *walls, behind = search._levels[0][cells[:, 0], cells[:, 1], 0].tolist()
+    assert free == FREE
+    assert min(walls) > UNKNOWN
+    assert behind == UNKNOWN
 
 
 @pytest.mark.parametrize("seed", range(6))

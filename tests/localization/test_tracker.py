@@ -84,6 +84,18 @@ def test_the_first_pose_may_be_unknown(building):
     assert errors(found.pose, truth)[0] < 0.1
 
 
+def test_scans_without_a_pose_are_found_right_or_not_at_all(building):
+    scans, m = building
+    tracker, n_found = Tracker(m), 0
+    for number in range(0, len(scans), 20):
+        truth = scans.pose(number)
+        tracker.restart()
+        found = tracker.locate(in_sensor_frame(scans[number], truth))
+        n_found += found.found
+        assert not found.found or errors(found.pose, truth)[0] < 0.1, number
+    assert n_found >= 11  # of 12
+
+
 def test_a_scan_of_another_place_is_not_found(building):
     _, m = building
     angle = torch.linspace(0, 2 * math.pi, 300).double()
@@ -99,9 +111,13 @@ def test_points_in_free_space_and_too_few_points_are_doubts(building, monkeypatc
     points = in_sensor_frame(scans[7], truth)
     few = Tracker(m, truth).locate(points[:9])
     assert "only 9 points" in " ".join(few.doubts)
-    monkeypatch.setattr(gt.GaussianMap, "occupancy", lambda *_: torch.zeros(len(points)))
-    found = Tracker(m, truth).locate(points)
-    assert found.doubts == ("100% of the points lie where the map saw free space",)
+    monkeypatch.setattr(gt.GaussianMap, "occupancy", lambda _, asked, *__: torch.zeros(len(asked)))
+    (doubt,) = Tracker(m, truth).locate(points).doubts
+    assert doubt.startswith("100% of the points lie where the map saw free space, and 0% of the beams")
+    monkeypatch.setattr(gt.GaussianMap, "occupancy", lambda _, asked, *__: torch.ones(len(asked)))
+    (doubt,) = Tracker(m, truth).locate(points).doubts
+    assert doubt.endswith("0% of the points lie where the map saw free space, and 100% of the beams pass "
+                          "through its surfaces")  # fmt: skip
 
 
 def test_a_corridor_leaves_its_direction_open():
