@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch import GaussianMap, Scan
-from gmmtorch.baselines import OctoMapMap
+from gmmtorch.experiments.baselines import OctoMapMap
 from gmmtorch.experiments.harness import Case, Row, alone, recording, run
 from gmmtorch.mapping import TiledMap, resident_bytes
 from gmmtorch.report import (
@@ -145,9 +145,9 @@ CASES = (
     Case(
         "growth",
         measured,
-        "After each scan the map is asked about 500 points on its beams. Cells have a side of 0.2 m in street, "
-        "0.1 m in freiburg-campus. Costs are CPU ms, the mean of a twelfth of the scans: the first, the "
-        "seventh, the last. Memory is that of the process above that before the first scan.",
+        "After each scan the map is asked about 500 points on its beams. Cells are 0.2 m wide in street, "
+        "0.1 m on the campus. Costs are CPU ms, the mean of a twelfth of the scans: the first, the seventh, "
+        "the last. Memory is that of the process above that before the first scan.",
         dict.fromkeys(("data", "map", "scans", "a scan, ms", "a query, ms", "MB"), ""),
         tuple(CELLS),
         MAPS,

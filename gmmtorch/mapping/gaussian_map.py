@@ -380,4 +380,6 @@ class GaussianMap(MapState):
             raise DataError(f"{path}: its settings are damaged ({error}).") from error
         made._next_number, made._next_doubts = next_number, Doubts.none(time)
         made._commit(components)
+        if not components.attributes:  # rounding again would change nothing
+            made._rounded = [(block.components, block.components) for block in made._blocks]
         return made

@@ -31,6 +31,7 @@ from gmmtorch.occupancy import (
     former_rows,
     probability,
     sample_rays,
+    spectrum_of,
 )
 
 _RAYS_AT_ONCE = 1 << 20
@@ -107,20 +108,24 @@ class Block:
         return count_many(self.components.seen_count)
 
     def box(self, cutoff: float) -> tuple[Tensor, Tensor, Tensor]:
-        """low, high (D,), distance (): the first arguments of `evidence_boxes`. There must be a viewpoint."""
+        """low, high (D,), distance (): the first arguments of `evidence_boxes`. There must be a viewpoint.
+
+        The distance is that of the corners of the box, which bounds it.
+        """
         if cutoff not in self._boxes:
-            c = self.components
-            means, origins = c.means.detach().double(), c.origins.detach().double()[c.seen_from]
-            extent = cutoff * c.covariances.detach().double().diagonal(dim1=1, dim2=2).sqrt()
+            means, origins = (x.detach().double() for x in (self.components.means, self.components.origins))
+            variances = self.components.covariances.detach().double().diagonal(dim1=1, dim2=2)
+            extent = cutoff * variances.sqrt()
             low = torch.minimum((means - extent).amin(0), origins.amin(0))
             high = torch.maximum((means + extent).amax(0), origins.amax(0))
-            self._boxes[cutoff] = low, high, (means[c.seen_by] - origins).norm(dim=1).amax()
+            self._boxes[cutoff] = low, high, (high - low).norm()
         return self._boxes[cutoff]
 
     def form(self, resolution: float, cutoff: float, share: float) -> PointForm:
         self._use(cutoff)
         if resolution not in self.forms:
-            self.forms[resolution] = PointForm(self.components.cones(), resolution, cutoff, share)
+            axes = spectrum_of(self.components.covariances)[1][self.components.seen_by]
+            self.forms[resolution] = PointForm(self.components.cones(), resolution, cutoff, share, axes)
         return self.forms[resolution]
 
     def index(self, resolution: float, cutoff: float) -> ConeIndex:

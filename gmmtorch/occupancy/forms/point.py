@@ -151,6 +151,7 @@ class PointForm:
         resolution: h (m).
         cutoff: Mahalanobis distance beyond which a component gives no evidence.
         share: see `ConeIndex`.
+        axes: (C, D, D), see `spectrum_of`; None: computed for each cone.
     """
 
     def __init__(
@@ -159,6 +160,7 @@ class PointForm:
         resolution: float,
         cutoff: float = CUTOFF,
         share: float = 1.0,
+        axes: Tensor | None = None,
     ) -> None:
         self.resolution = check_resolution(resolution)
         cones = cones.checked()
@@ -166,7 +168,8 @@ class PointForm:
             raise InvalidArgumentError(f"cutoff={cutoff} must be finite and above zero.")
         self.dim, self.cutoff = cones.dim, float(cutoff)
         safe_cholesky(cones.covariances.double().detach())  # raises if one is not positive definite
-        self._table = _table_of(cones, spectrum_of(cones.covariances)[1], self.resolution)
+        axes = spectrum_of(cones.covariances)[1] if axes is None else axes
+        self._table = _table_of(cones, axes, self.resolution)
         self._share = share
         self._index: ConeIndex | Callable[[], ConeIndex] = self._new_index
 
