@@ -24,7 +24,7 @@ from torch import Tensor
 
 from gmmtorch import GaussianMap, Scan
 from gmmtorch.experiments.baselines import OctoMapMap
-from gmmtorch.experiments.harness import Case, Row, alone, recording, run
+from gmmtorch.experiments.harness import Case, Row, Table, alone, recording, results_of, run
 from gmmtorch.mapping import TiledMap, resident_bytes
 from gmmtorch.report import (
     draw_grid,
@@ -103,8 +103,7 @@ def growth(data: Path, recorded: str, name: str, library: str | None) -> dict[st
 
 
 def measured(options: Any) -> Iterator[Row]:
-    """A row for each map; its costs at every twelfth of the scans."""
-    found = []
+    """A row for every twelfth of the scans of each map."""
     for recorded in options.names:
         for name in options.methods:
             if name == "Bonxai" and options.bonxai is None:
@@ -112,29 +111,24 @@ def measured(options: Any) -> Iterator[Row]:
             result = alone(growth, options.data, recorded, name, options.bonxai)
             if "rows" not in result:
                 raise RuntimeError(f"{recorded}, {name}: {result['error']}")
-            rows = result["rows"]
-            found.append((recorded, name, rows))
-            parts = zip(*(rows[0], rows[len(rows) // 2], rows[-1]), strict=True)
-            scans, learning, query, memory = (", ".join(f"{v:.3g}" for v in part) for part in parts)
-            yield recorded, name, scans.split(", ")[-1], learning, query, memory
-    draw(found, options.figure)
+            for row in result["rows"]:
+                yield recorded, name, *row
+    draw(Table.load(results_of(CASES[0]) / "growth.json").rows, options.figure)
 
 
-def draw(found: list[tuple[str, str, list[tuple[float, ...]]]], path: Path) -> None:
-    recorded = list(dict.fromkeys(one for one, _, _ in found))
-    figure = new_figure(13, 4 * len(recorded))
+def draw(rows: list[list[Any]], path: Path) -> None:
+    """Rows of the table, also those of earlier runs."""
+    recorded = list(dict.fromkeys(row[0] for row in rows))
+    figure = new_figure(13, 3.6 * len(recorded))
     panels = figure.subplots(len(recorded), 3, squeeze=False)
     titles = ("a scan [ms]", f"a query of {N_POINTS} points [ms]", "memory of the map [MB]")
-    for row, one in zip(panels, recorded, strict=True):
-        for column, (axes, title) in enumerate(zip(row, titles, strict=True), 1):
-            shown = []
-            for given, name, rows in found:
-                if given == one:
-                    values = np.array(rows).T
-                    costs = values[column].clip(0.01)
-                    axes.plot(values[0], costs, label=name, **line_look(MAPS.index(name)))
-                    shown += costs.tolist()
-            log_axis(axes, "y", shown)
+    for line, one in zip(panels, recorded, strict=True):
+        for column, (axes, title) in enumerate(zip(line, titles, strict=True), 3):
+            for index, name in enumerate(MAPS):
+                found = [(row[2], max(row[column], 0.01)) for row in rows if row[:2] == [one, name]]
+                if found:
+                    axes.plot(*zip(*found, strict=True), label=name, **line_look(index))
+            log_axis(axes, "y", [max(row[column], 0.01) for row in rows if row[0] == one])
             label_axes(axes, f"{one}: {title}", "scans")
             draw_grid(axes)
     legend_below(figure)
@@ -146,12 +140,18 @@ CASES = (
         "growth",
         measured,
         "After each scan the map is asked about 500 points on its beams. Cells are 0.2 m wide in street, "
-        "0.1 m on the campus. Costs are CPU ms, the mean of a twelfth of the scans: the first, the seventh, "
-        "the last. Memory is that of the process above that before the first scan.",
-        dict.fromkeys(("data", "map", "scans", "a scan, ms", "a query, ms", "MB"), ""),
+        "0.1 m on the campus. Costs are CPU ms, means of the scans since the row before. Memory is that of "
+        "the process above that before the first scan. Other programs ran on the machine.",
+        {
+            "data": "",
+            "map": "",
+            "scans": ".0f",
+            **dict.fromkeys(("a scan, ms", "a query, ms"), "3"),
+            "MB": ".0f",
+        },
         tuple(CELLS),
         MAPS,
-        key=2,
+        key=3,
     ),
 )
 
