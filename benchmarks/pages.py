@@ -62,7 +62,7 @@ SHOWN: dict[str, dict[str, tuple[str, ...]]] = {
             "on the wire, with headers (kB)",
         )
     },
-    "growing-map": {"scans": ("38", "228")},
+    "growth": {"scans": ("228",)},
     "kernels": {
         "work": (
             "rays through 0.2 m, counted, dense",

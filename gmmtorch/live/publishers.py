@@ -108,7 +108,7 @@ class MapPublisher:
             grid = VoxelGrid.covering(low, high, self._resolution, shown.query_options.memory_limit)
             if shown.method != "point":
                 return grid, shown.evidence(grid).probability().cpu()
-            query = Query(shown.components(), shown.query_options)
+            query = Query([shown.components()], shown.query_options)
             evidence = self._evidence.update(query.cones, grid, query.cutoff)
             theta = probability(*evidence, self._resolution, grid.dim, query.rule)
             return grid, theta.cpu()

@@ -18,13 +18,13 @@ from gmmtorch.files import write_bytes
 from gmmtorch.mapping.attributes.answers import Prediction, predictions
 from gmmtorch.mapping.attributes.moments import check_kinds
 from gmmtorch.mapping.codec.component_batch import CODECS, MapSettings, map_bytes, read_map
-from gmmtorch.mapping.codec.quantization import quantized_after
+from gmmtorch.mapping.codec.quantization import joined, quantized_after
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.fitting import DepthFrame, depth_and_pose
 from gmmtorch.mapping.learning.rules import IncrementalRule, LearningRule, WindowedRule, read_rule
 from gmmtorch.mapping.learning.windows import Doubts
 from gmmtorch.mapping.map_state import MapState
-from gmmtorch.mapping.query import Query
+from gmmtorch.mapping.query import Block, Query
 from gmmtorch.mapping.query_options import (
     MapOptions,
     QueryOptions,
@@ -39,9 +39,9 @@ from gmmtorch.scan import Scan, as_time, extent
 class GaussianMap(MapState):
     """A map that learns Gaussian components from windows of neighbouring scans.
 
-    The components are buffers, and attributes: means, covariances, support, max_range, ids, origins, seen_by,
-    seen_from, seen_count; see `Components` for shapes. The attributes include the components of the
-    unfinished window, the buffers do not. Queries and files use the components as the codec rounds them
+    The components are attributes: means, covariances, support, max_range, ids, origins, seen_by, seen_from,
+    seen_count; see `Components` for shapes. They include the components of the unfinished window; those in
+    the `state_dict` do not. Queries and files use the components as the codec rounds them
     (`components()`), so a loaded map gives the same answers as the saved one.
 
     Args:
@@ -123,10 +123,10 @@ class GaussianMap(MapState):
         scans = f"{self.n_pending} pending scan{'s' if self.n_pending != 1 else ''}"
         if self.dim is None:
             return f"GaussianMap(empty, {type(self.learning).__name__})"
-        known = self._learned[0] if self._learned else self._final()
         if self.n_pending and self._learned is None:
-            size = f"{len(known)} components and {scans} not learned yet in {self.dim}D"
+            size = f"{self.n_final} components and {scans} not learned yet in {self.dim}D"
         else:
+            known = self.unrounded()
             size = f"{len(known)} components in {self.dim}D{extent(known.means)}, {self.nbytes} bytes"
             size += f", {scans}" if self.n_pending else ""
         return f"GaussianMap({size}, {type(self.learning).__name__}, {self._device})"
@@ -181,7 +181,8 @@ class GaussianMap(MapState):
         """
         check_scan(scan)
         known = (one.attributes for one in self._pending)
-        check_kinds([self._attributes.channels, *known, scan.attributes])
+        final = (block.components.attributes.channels for block in self._blocks)
+        check_kinds([*final, *known, scan.attributes])
         self._prepare(scan.dim, scan.points.device, "scan is")
         former = self._query if self._is_asked else None
         self._add(scan.copied(self._device))
@@ -231,7 +232,8 @@ class GaussianMap(MapState):
 
         def predict(known: Components, window: Sequence[Scan | DepthFrame]) -> None:
             nonlocal calibrator, n_windows
-            calibrator = self._predicted(known, window, calibrator, n_windows)
+            blocks = [*self._blocks[:-1], Block(known)]
+            calibrator = self._predicted(blocks, window, calibrator, n_windows)
             n_windows += 1
 
         learned = self._absorbed(taken, self.learning, float(pixel_stride**2), predict)
@@ -241,27 +243,33 @@ class GaussianMap(MapState):
     def finish(self) -> None:
         """Learns from the scans of the unfinished window together, as from those of a full one."""
         if self.dim is not None:
-            self.components()
+            self._rounded_parts()
 
     def components(self) -> Components:
         """All components as the codec rounds them, with those of the unfinished window."""
-        if self._rounded is None:
-            learned, (known, rounded) = self.unrounded(), self._rounded_final()
-            if self.codec == "float":
-                self._rounded = learned
-            else:
-                self._rounded = quantized_after(known, rounded, learned) if self.n_pending else rounded
-        return self._rounded
+        if self._all_rounded is None:
+            parts = self._rounded_parts()
+            self._all_rounded = Components.concatenate(parts) if self.codec == "float" else joined(parts)
+        return self._all_rounded
 
-    def _rounded_final(self) -> tuple[Components, Components]:
-        """The final components, and as the codec rounds them."""
-        final = self._final()
-        none = Components.empty(final.dim, final.means.device)
-        known, rounded = self._final_rounded or (none, none)
-        if any(value is not getattr(final, name) for name, value in vars(known).items()):
-            is_exact = self.codec == "float"
-            self._final_rounded = final, final if is_exact else quantized_after(known, rounded, final)
-        return self._final_rounded or (final, rounded)
+    def _rounded_parts(self, pending: bool = True) -> list[Components]:
+        """The components of each block as the codec rounds them, the last with those of the unfinished window
+        if `pending`."""
+        last = self._upcoming()[0] if pending else self._last
+        if self.codec == "float":
+            return [*self._parts_before, last]
+        none = Components.empty(last.dim, last.means.device)
+        former = [*self._rounded, *[(none, none)] * len(self._blocks)]
+        self._rounded = [
+            (final, rounded if known is final else quantized_after(known, rounded, final))
+            for block, (known, rounded) in zip(self._blocks, former, strict=False)
+            for final in [block.components]
+        ]
+        *before, final = self._rounded
+        return [
+            *(rounded for _, rounded in before),
+            final[1] if last is final[0] else quantized_after(*final, last),
+        ]
 
     def transform(self, transform: ArrayLike, ids: ArrayLike | None = None) -> None:
         """Moves components and their sensor origins by a rigid motion (D+1, D+1), as a pose correction does.
@@ -284,7 +292,7 @@ class GaussianMap(MapState):
     @property
     def n_components(self) -> int:
         """Number of components, those of the unfinished window included."""
-        return len(self.components()) if self.dim is not None else 0
+        return self.n_final + len(self._upcoming()[0]) - len(self._last) if self.dim is not None else 0
 
     # -- queries --------------------------------------------------------------------------------------
 
@@ -339,8 +347,7 @@ class GaussianMap(MapState):
         self._is_asked = True
         if self._query is None or self._is_stale:
             parts = self._window_parts()
-            found = self.components() if parts is None else self._rounded_final()[1]
-            asked = found, self.query_options, parts or ()
+            asked = self._rounded_parts(parts is None), self.query_options, parts or ()
             self._query = Query(*asked) if self._query is None else self._query.replaced(*asked)
             self._is_stale = False
         return self._query
@@ -373,4 +380,6 @@ class GaussianMap(MapState):
             raise DataError(f"{path}: its settings are damaged ({error}).") from error
         made._next_number, made._next_doubts = next_number, Doubts.none(time)
         made._commit(components)
+        if not components.attributes:  # rounding again would change nothing
+            made._rounded = [(block.components, block.components) for block in made._blocks]
         return made

@@ -24,12 +24,13 @@ from gmmtorch.mapping.learning.windows import (
     Doubts,
     absorb,
     joined,
+    keeps_components,
     learn_part,
     learn_window,
     learns_in_parts,
     predicted,
 )
-from gmmtorch.mapping.query import Query
+from gmmtorch.mapping.query import Block, Query, in_blocks
 from gmmtorch.mapping.query_options import QueryOptions
 from gmmtorch.occupancy import Calibrator
 from gmmtorch.scan import Scan
@@ -51,7 +52,10 @@ def _field(name: str, about: str) -> Any:
 
 
 class MapState(DeviceModule):
-    """The final components of a map (buffers), the pending scans of its unfinished window, and its settings.
+    """The final components of a map, the pending scans of its unfinished window, and its settings.
+
+    Components are in blocks. If the rule keeps components, the end of a window changes the last block only,
+    so its cost does not depend on the size of the map; otherwise there is one block.
 
     Args:
         learning: how scans become components.
@@ -81,15 +85,15 @@ class MapState(DeviceModule):
         self._calibrator = None if known is None else Calibrator.continued(known, len(SIDES))
         self.learning = learning
         self._random_state = random_state
-        self._attributes = Attributes()  # of the final components
+        self._blocks: list[Block] = []  # the final components
         self._pending: list[Scan] = []
         self._n_windows = 0
         self._next_number = 0  # of the next new component
         self._doubts = self._next_doubts = Doubts.none()  # of the final components; after the pending scans
-        self._learned: tuple[Components, int] | None = None  # what follows from buffers and pending scans
+        self._learned: tuple[Components, int] | None = None  # the last block with those of pending scans
         self._parts: dict[tuple[int, int], Components] = {}  # learned from these pending scans
-        self._rounded: Components | None = None
-        self._final_rounded: tuple[Components, Components] | None = None  # final components, and rounded
+        self._all_rounded: Components | None = None
+        self._rounded: list[tuple[Components, Components]] = []  # of each block, and rounded
         self._query: Query | None = None
         self._is_stale = False  # the query is of earlier components
         self._is_asked = False  # there was a query since the last scan
@@ -102,18 +106,16 @@ class MapState(DeviceModule):
     @property
     def dim(self) -> int | None:
         """2 or 3; None while the map is empty."""
-        means = self._buffers.get("means")
-        return None if means is None else means.shape[1]
+        return self._blocks[0].components.dim if self._blocks else None
 
     @property
     def _device(self) -> torch.device | None:
-        means = self._buffers.get("means")
-        return None if means is None else means.device
+        return self._blocks[0].components.means.device if self._blocks else None
 
     @property
     def n_final(self) -> int:
         """Number of components without those of the unfinished window, which is not learned for it."""
-        return 0 if self.dim is None else len(self._final())
+        return sum(len(block.components) for block in self._blocks)
 
     @property
     def n_pending(self) -> int:
@@ -149,20 +151,29 @@ class MapState(DeviceModule):
 
     def _final(self) -> Components:
         """The components without those of the unfinished window, not rounded."""
-        if self.dim is None:
+        return Components.concatenate([*self._parts_before, self._last])
+
+    @property
+    def _last(self) -> Components:
+        """The components of the last block, not rounded."""
+        if not self._blocks:
             raise InvalidArgumentError("The map is empty; insert a scan first.")
-        buffers = {name: self._buffers[name] for name in TENSORS}
-        known = {name: value for name, value in buffers.items() if value is not None}
-        return Components(**known, attributes=self._attributes)
+        return self._blocks[-1].components
+
+    @property
+    def _parts_before(self) -> list[Components]:
+        """The components of the other blocks, not rounded."""
+        return [block.components for block in self._blocks[:-1]]
 
     def unrounded(self) -> Components:
         """All components, not rounded."""
-        return self._upcoming()[0]
+        return Components.concatenate([*self._parts_before, self._upcoming()[0]])
 
     def _upcoming(self) -> tuple[Components, int]:
-        """All components, not rounded, and the number of the next new one after them."""
+        """The last block with the components of the unfinished window, not rounded; and the number of the
+        next new one after them."""
         if not self._pending:
-            return self._final(), self._next_number
+            return self._last, self._next_number
         if self._learned is None:
             self._learned = self._absorbed(self._pending, self.learning.fitted(self._pending))
             self._is_stale = True  # the query may be of parts of the window
@@ -203,7 +214,7 @@ class MapState(DeviceModule):
 
         before: is called with each window before it is learned, see `absorb`.
         """
-        known = self._final()
+        known = self._last
         if isinstance(rule, WindowedRule):
             window = as_scans(scans)
             new = learn_window(window, rule, self._generator())
@@ -227,12 +238,12 @@ class MapState(DeviceModule):
         except GmmTorchError:
             self._pending.pop()
             raise
-        self._calibrator = self._predicted(self._final(), self._pending, self._calibrator, self._n_windows)
+        self._calibrator = self._predicted(self._blocks, self._pending, self._calibrator, self._n_windows)
         self._commit(*learned)
 
     def _predicted(
         self,
-        known: Components,
+        known: Sequence[Block],
         window: Sequence[Scan | DepthFrame],
         calibrator: Calibrator | None,
         number: int,
@@ -250,46 +261,54 @@ class MapState(DeviceModule):
             raise InvalidArgumentError(f"{what} {dim}-dimensional, but the map is {self.dim}-dimensional.")
 
     def _commit(self, components: Components, next_number: int | None = None) -> None:
-        """Replaces all components, those of the unfinished window included.
+        """Ends the unfinished window: replaces the last block, or all components.
 
-        `next_number`: of the next new component; None: the one after all ids.
+        `next_number`: of the next new component after those of the last block; None: all are replaced, and it
+        is the one after all ids.
         """
         self.learning = self.learning.fitted(self._pending)
         self._doubts = self._next_doubts
         self._n_windows += bool(self._pending)
         self._pending, self._parts = [], {}
+        before = [] if next_number is None else self._blocks[:-1]
         self._next_number = next_number or number_after(components.ids, self._next_number)
-        self._set(components)
+        self._set(components, before)
 
-    def _set(self, components: Components) -> None:
-        for name in TENSORS:
-            self._buffers[name] = getattr(components, name)  # properties have the names of the buffers
-        self._attributes = components.attributes
+    def _set(self, components: Components, before: Sequence[Block] = ()) -> None:
+        """Replaces all components by those of the blocks `before`, and these."""
+        parts = in_blocks(components) if keeps_components(self.learning) else [components]
+        self._blocks = [*before, *map(Block, parts)]
         self._forget()
 
     def _forget(self) -> None:
         """Drops what was computed from the components. The query keeps what the next one can use."""
-        self._learned, self._rounded, self._is_stale = None, None, True
+        self._learned, self._all_rounded, self._is_stale = None, None, True
 
     # -- torch ----------------------------------------------------------------------------------------
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Moves the map and its pending scans between devices."""
         super()._apply(fn, recurse)
-        if self.dim is not None:
-            self._pending = [scan.to(self._device) for scan in self._pending]
-            self._attributes = self._attributes.changed(lambda value: value.to(self._device))
+        if self._blocks:
+            device = fn(self._last.means[:0]).device
+            self._blocks = [Block(block.components.to(device)) for block in self._blocks]
+            self._pending = [scan.to(device) for scan in self._pending]
         self._parts = {}
-        self._query = self._final_rounded = None  # are on the former device
+        self._query, self._rounded = None, []  # are on the former device
         self._forget()
         return self
+
+    def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+        if self._blocks:
+            destination.update({prefix + name: value for name, value in self._final().tensors().items()})
 
     def get_extra_state(self) -> dict[str, Any]:
         """The learning rule, the pending scans and the counters, as part of `state_dict`."""
         return {
             "learning": rule_facts(self.learning),
             "pending": [dict(vars(scan)) for scan in self._pending],
-            "attributes": self._attributes.tensors(),
+            "attributes": self._final().attributes.tensors() if self._blocks else {},
             "n_windows": self._n_windows,
             "n_numbered": self._next_number,
             "doubts": dict(vars(self._doubts)),
@@ -325,9 +344,7 @@ class MapState(DeviceModule):
         except (GmmTorchError, *DAMAGED_CONTENT) as error:
             raise DataError(f"The state of the map is damaged ({error}).") from error
         device = self._device
-        for name in TENSORS:
-            self._buffers.pop(name, None)
-        self._pending, self._parts = [], {}
+        self._blocks, self._pending, self._parts = [], [], {}
         if extra is not None:
             self.learning, self._pending, self._n_windows, self._next_number, self._doubts = extra[:5]
             self._calibrator = extra[5]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -30,6 +31,7 @@ from gmmtorch.occupancy import (
     former_rows,
     probability,
     sample_rays,
+    spectrum_of,
 )
 
 _RAYS_AT_ONCE = 1 << 20
@@ -89,182 +91,164 @@ def evidence_boxes(
 _BLOCK = 8192  # components
 
 
-class _Block:
-    """Components of a map that answer together: the forms and indices of their cones for each resolution that
-    was asked for. Both are made when a query needs the block.
+class Block:
+    """Components that answer together, with the forms and indices of their cones for each resolution that was
+    asked for, and what is known about all of them. Everything is made when it is needed."""
 
-    low, high (D,), distance (): see `evidence_boxes`.
-    """
-
-    def __init__(self, components: Components, cutoff: float) -> None:
-        self.components, self.cutoff = components, cutoff
+    def __init__(self, components: Components) -> None:
+        self.components = components
         self.forms: dict[float, PointForm] = {}
-        self.indices: dict[float, ConeIndex] = {}
-        c = components
-        means, origins = c.means.detach().double(), c.origins.detach().double()[c.seen_from]
-        extent = cutoff * c.covariances.detach().double().diagonal(dim1=1, dim2=2).sqrt()
-        self.low = torch.minimum((means - extent).amin(0), origins.amin(0))
-        self.high = torch.maximum((means + extent).amax(0), origins.amax(0))
-        self.distance = (means[c.seen_by] - origins).norm(dim=1).amax()
+        self._indices: dict[float, ConeIndex] = {}
+        self._boxes: dict[float, tuple[Tensor, Tensor, Tensor]] = {}  # for each cutoff
+        self._cutoff = 0.0  # of forms and indices
 
-    def form(self, resolution: float, share: float) -> PointForm:
+    @functools.cached_property
+    def counts(self) -> tuple[int, int]:
+        """`count_many` of the components."""
+        return count_many(self.components.seen_count)
+
+    def box(self, cutoff: float) -> tuple[Tensor, Tensor, Tensor]:
+        """low, high (D,), distance (): the first arguments of `evidence_boxes`. There must be a viewpoint.
+
+        The distance is that of the corners of the box, which bounds it.
+        """
+        if cutoff not in self._boxes:
+            means, origins = (x.detach().double() for x in (self.components.means, self.components.origins))
+            variances = self.components.covariances.detach().double().diagonal(dim1=1, dim2=2)
+            extent = cutoff * variances.sqrt()
+            low = torch.minimum((means - extent).amin(0), origins.amin(0))
+            high = torch.maximum((means + extent).amax(0), origins.amax(0))
+            self._boxes[cutoff] = low, high, (high - low).norm()
+        return self._boxes[cutoff]
+
+    def form(self, resolution: float, cutoff: float, share: float) -> PointForm:
+        self._use(cutoff)
         if resolution not in self.forms:
-            self.forms[resolution] = PointForm(self.components.cones(), resolution, self.cutoff, share)
+            axes = spectrum_of(self.components.covariances)[1][self.components.seen_by]
+            self.forms[resolution] = PointForm(self.components.cones(), resolution, cutoff, share, axes)
         return self.forms[resolution]
 
-    def index(self, resolution: float) -> ConeIndex:
-        if resolution not in self.indices:
-            self.indices[resolution] = ConeIndex(self.components.cones(), resolution, self.cutoff)
-        return self.indices[resolution]
+    def index(self, resolution: float, cutoff: float) -> ConeIndex:
+        self._use(cutoff)
+        if resolution not in self._indices:
+            self._indices[resolution] = ConeIndex(self.components.cones(), resolution, cutoff)
+        return self._indices[resolution]
 
-    def replaced(self, components: Components) -> _Block:
+    def _use(self, cutoff: float) -> None:
+        if cutoff != self._cutoff:
+            self._cutoff, self.forms, self._indices = cutoff, {}, {}
+
+    def replaced(self, components: Components) -> Block:
         """The block of other components, which keeps the lists that it can."""
+        if components is self.components:
+            return self
         if _same(self.components, components):
             made = copy.copy(self)
             made.components = components  # else this would keep all earlier components in memory
             return made
-        made, cones = _Block(components, self.cutoff), components.cones()
+        made, cones = Block(components), components.cones()
+        made._cutoff = self._cutoff
         former = former_rows(self.components.cones(), cones)
         if 2 * int((former < 0).sum()) <= len(former):
             made.forms = {side: form.replaced(cones, former) for side, form in self.forms.items()}
-            made.indices = {side: index.replaced(cones, former) for side, index in self.indices.items()}
+            made._indices = {side: index.replaced(cones, former) for side, index in self._indices.items()}
         return made
 
 
 def _same(one: Components, other: Components) -> bool:
     """Whether all cones are equal. Origins may have other numbers."""
-    if one is other:
-        return True
     parts = ("means", "covariances", "max_range", "seen_by", "seen_count")
     pairs = ((getattr(one, name), getattr(other, name)) for name in parts)
     origins = ((c.origins, c.seen_from) for c in (one, other))
     return all_equal(pairs) and torch.equal(*(places[number] for places, number in origins))
 
 
-def _identities(parts: Iterable[Components]) -> Cones:
-    """What tells components apart, as the argument of `former_rows`."""
-    each = [(c.means, c.covariances, c.means, c.support, c.max_range) for c in parts]
-    return Cones(*map(torch.cat, zip(*each, strict=True)))
+def in_blocks(components: Components) -> list[Components]:
+    """The components in parts of as many as a block has, and a part of the rest, each with its origins."""
+    n = len(components)
+    if n < _BLOCK:
+        return [components]
+    ends = [*range(_BLOCK, n + 1, _BLOCK), n]
+    return [part.with_used_origins() for part in components.split(ends)]
 
 
-def _blocks(components: Components, cutoff: float) -> list[_Block]:
-    if len(components) <= _BLOCK:
-        return [_Block(components, cutoff)] if len(components.seen_by) else []
-    ends = [*range(_BLOCK, len(components), _BLOCK), len(components)]
-    return [_Block(part, cutoff) for part in components.split(ends) if len(part.seen_by)]
-
-
-def _joined(parts: Sequence[Components]) -> list[Components]:
-    """All components of some parts, together; none if there are none."""
+def _replaced(former: Sequence[Block], parts: Iterable[Components]) -> list[Block]:
+    """The blocks of parts with viewpoints; each keeps what it can from the former block in its place."""
     found = [part for part in parts if len(part.seen_by)]
-    return [Components.concatenate(found)] if found else []
+    pairs = itertools.zip_longest(former[: len(found)], found)
+    return [Block(part) if old is None else old.replaced(part) for old, part in pairs]
+
+
+def cutoff_for(blocks: Iterable[Block]) -> float:
+    """`cutoff_of` all components of some blocks."""
+    return cutoff_of(*map(sum, zip((0, 0), *(block.counts for block in blocks), strict=True)))
+
+
+def bounds_of(blocks: Sequence[Block], cutoff: float) -> tuple[Tensor, Tensor, Tensor]:
+    """low, high (B, D), distance (B,): the first arguments of `evidence_boxes`, of at least one block."""
+    low, high, distance = map(torch.stack, zip(*(block.box(cutoff) for block in blocks), strict=True))
+    return low, high, distance
 
 
 class Query:
     """Answers queries about fixed components. Indices and Monte Carlo rays are made at the first query.
 
-    Components that follow each other form blocks, so a query needs only the blocks near its points, and a
-    change only the blocks that it touches.
+    Each part is a block, so a query needs only the blocks near its points, and a change only the blocks that
+    it touches. Parts with many components become several blocks.
 
     Args:
-        components: of the map.
+        parts: components of the map.
         options: how queries are answered.
         recent: more components, such as those of the parts of an unfinished window. They are one block.
     """
 
     def __init__(
-        self, components: Components, options: QueryOptions, recent: Sequence[Components] = ()
-    ) -> None:
-        self._set(components, options, recent, count_many(components.seen_count))
-        self._blocks = _blocks(components, self.cutoff)
-        self._recent = [_Block(part, self.cutoff) for part in _joined(recent)]
-
-    def _set(
         self,
-        components: Components,
+        parts: Sequence[Components],
         options: QueryOptions,
-        recent: Sequence[Components],
-        counts: tuple[int, int],
+        recent: Sequence[Components] = (),
+        former: Query | None = None,
     ) -> None:
-        """counts: `count_many` of the components."""
-        self.components, self.options, self.dim = components, options, components.dim
-        parts = [components, *recent]
-        self.rule = rule_of(options, parts)
-        self._counts, more = counts, [count_many(part.seen_count) for part in recent]
-        self.cutoff = options.cutoff or cutoff_of(*map(sum, zip(counts, *more, strict=True)))
+        """former: a query of other components, whose lists are kept where it is possible."""
+        self.parts, self.options = parts, options
+        self.dim, self._device = parts[0].dim, parts[0].means.device
+        every = [one for part in parts for one in (in_blocks(part) if len(part) > 2 * _BLOCK else [part])]
+        self._blocks: list[Block] = _replaced(former._blocks if former else [], every)
+        some = [part for part in recent if len(part.seen_by)]
+        joined = [Components.concatenate(some)] if some else []
+        self._recent: list[Block] = _replaced(former._recent if former else [], joined)
+        self.rule = rule_of(options, [*parts, *recent])
+        self.cutoff = options.cutoff or cutoff_for([*self._blocks, *self._recent])
         self._lattices: dict[float, SparseEvidence] = {}
         self._bounds: tuple[Tensor, Tensor, Tensor] | None = None
 
     def replaced(
-        self, components: Components, options: QueryOptions, recent: Sequence[Components] = ()
+        self, parts: Sequence[Components], options: QueryOptions, recent: Sequence[Components] = ()
     ) -> Query:
         """The answers about other components; arguments as for `Query`. Blocks that did not change stay."""
-        made = copy.copy(self)
-        is_other = components is not self.components
-        counts = count_many(components.seen_count) if is_other else self._counts
-        made._set(components, options, recent, counts)
-        if made.cutoff != self.cutoff or components.dim != self.dim or not self._blocks:
-            return Query(components, options, recent)
-        if is_other:
-            made._blocks = self._following(components)
-        made._recent = [
-            self._recent[0].replaced(part) if self._recent else _Block(part, self.cutoff)
-            for part in _joined(recent)
-        ]
-        return made
+        return Query(parts, options, recent, self if parts[0].dim == self.dim else None)
 
     def prepare(self, former: Query) -> None:
         """Makes what the first query at the resolutions that `former` was asked for would make."""
         sides = {side for block in [*former._blocks, *former._recent] for side in block.forms}
         for block in self._recent:
             for side in sides:
-                block.form(side, 1 / max(1, len(self._blocks)))
-
-    def _following(self, components: Components) -> list[_Block]:
-        """The blocks of other components. Those before the first change stay as they are; of the others, each
-        has those of its components that stay."""
-        ends = list(itertools.accumulate(len(block.components) for block in self._blocks))
-        *parts, rest = components.split(
-            [*(end for end in ends[:-1] if end <= len(components)), len(components)]
-        )
-        kept: list[_Block] = []
-        for block, part in zip(self._blocks, parts, strict=False):
-            if not _same(block.components, part):
-                break
-            kept.append(block.replaced(part))
-        old, n = self._blocks[len(kept) :], len(kept)
-        begin = ends[n - 1] if n else 0
-        rest = components.split([begin, len(components)])[1]
-        former = former_rows(_identities(block.components for block in old), _identities([rest]))
-        if not len(former) or int(former.amax()) < 0:
-            return kept + _blocks(rest, self.cutoff)
-        latest = former.cummax(0).values
-        bounds = torch.tensor([end - begin for end in ends[n:]], device=latest.device)
-        n_old = int((latest < latest[-1]).sum()) + 1  # rows up to the last component that stays
-        owner = torch.bucketize(latest[:n_old], bounds, right=True)
-        counts, n_new = torch.bincount(owner, minlength=len(old)).tolist(), len(rest) - n_old
-        if counts[-1] < _BLOCK and counts[-1] + n_new <= 2 * _BLOCK:
-            counts[-1], n_new = counts[-1] + n_new, 0
-        *parts, new = rest.split(list(itertools.accumulate([*counts, n_new])))
-        kept += [b.replaced(part) for b, part in zip(old, parts, strict=True) if len(part.seen_by)]
-        return kept + _blocks(new, self.cutoff)
+                block.form(side, self.cutoff, 1 / max(1, len(self._blocks)))
 
     @property
     def cones(self) -> Cones:
         """The cones of all components."""
         every = [block.components.cones() for block in [*self._blocks, *self._recent]]
-        return Cones(*map(torch.cat, zip(*every, strict=True))) if every else self.components.cones()
+        return Cones(*map(torch.cat, zip(*every, strict=True))) if every else self.parts[0].cones()
 
-    def _near(self, points: Tensor, side: float) -> Iterator[tuple[_Block, Tensor | None]]:
+    def _near(self, points: Tensor, side: float) -> Iterator[tuple[Block, Tensor | None]]:
         """The blocks that can give evidence at points (M, D), and the points (R,) of each; None: all."""
         blocks = [*self._blocks, *self._recent]
         if len(blocks) <= 1:
             yield from ((block, None) for block in blocks)
             return
         if self._bounds is None:
-            bounds = zip(*((b.low, b.high, b.distance) for b in blocks), strict=True)
-            low, high, distance = (torch.stack(values) for values in bounds)
-            self._bounds = low, high, distance
+            self._bounds = bounds_of(blocks, self.cutoff)
         low, high = evidence_boxes(*self._bounds, side, self.cutoff)
         fixed = points.detach().to(low)
         finite = torch.where(torch.isfinite(fixed), fixed, torch.nan)
@@ -314,7 +298,7 @@ class Query:
         """
         check_method(method)
         grid.check_memory(self.options.memory_limit)
-        evidence = replace(Evidence.empty(grid, self.components.means.device), rule=self.rule)
+        evidence = replace(Evidence.empty(grid, self._device), rule=self.rule)
         if not self._blocks and not self._recent:
             return evidence
         if method == "monte_carlo":
@@ -324,7 +308,7 @@ class Query:
             return replace(flux_evidence(self.cones, grid, self.cutoff), rule=self.rule)
         half, parts = 0.5 * grid.resolution, []
         for first in range(0, grid.n_cells, _CELLS_AT_ONCE):  # centres of all cells take more than evidence
-            centers = grid.centers(self.components.means.device, range(first, first + _CELLS_AT_ONCE))
+            centers = grid.centers(self._device, range(first, first + _CELLS_AT_ONCE))
             if method == "point":
                 parts.append(self._at_points(centers, grid.resolution))
             else:
@@ -336,7 +320,7 @@ class Query:
         """Evidence of the point form. The sum over all cones has one order, in whichever blocks they are."""
         found = PointEvidence(*torch.zeros(2, len(points), dtype=points.dtype, device=points.device))
         for block, rows in self._near(points, resolution):
-            form = block.form(resolution, 1 / max(1, len(self._blocks)))
+            form = block.form(resolution, self.cutoff, 1 / max(1, len(self._blocks)))
             if rows is None:
                 found = form(points, found)
             else:
@@ -354,7 +338,7 @@ class Query:
         for block, chosen in self._near(0.5 * (low + high), side):
             rows, cones = every if chosen is None else chosen, block.components.cones()
             boxes = low[rows], high[rows]
-            pairs = block.index(side).candidates(*boxes)
+            pairs = block.index(side, self.cutoff).candidates(*boxes)
             if cells is None:
                 found = cone_evidence(cones, *boxes, pairs, cutoff=self.cutoff)
             else:

@@ -9,6 +9,7 @@ and those of the largest buckets from all cones. Where there are few points, a l
 from __future__ import annotations
 
 import copy
+import functools
 import math
 from collections.abc import Iterator
 
@@ -55,23 +56,34 @@ class Hulls:
         self.table = rows = cones.detach() if isinstance(cones, Tensor) else hull_rows(cones)
         dim = self.dim = _dim_of(rows)
         self.cutoff = cutoff
-        axes = rows[:, : dim * dim].view(-1, dim, dim)
-        means, origins, _, variances = (rows[:, dim * dim + i * dim :][:, :dim] for i in range(4))
-        squares = cutoff**2 * variances.clamp_min(0)  # (C, D) squared half axes, ascending
-        distance = (means - origins).norm(dim=1, keepdim=True)
         self.reach = 0.5 * extent * dim**0.5  # from the centre of the cube to its corners
         self.spread = cutoff * extent / 12**0.5 if smoothed else 0.0  # cutoff radius of the cube's Gaussian
+
+    @functools.cached_property
+    def _corners(self) -> tuple[Tensor, Tensor]:
+        rows, dim = self.table, self.dim
+        axes = rows[:, : dim * dim].view(-1, dim, dim)
+        means, origins, _, variances = (rows[:, dim * dim + i * dim :][:, :dim] for i in range(4))
+        squares = self.cutoff**2 * variances.clamp_min(0)  # (C, D) squared half axes, ascending
+        distance = (means - origins).norm(dim=1, keepdim=True)
         # The spread as seen from the sensor origin at range r is spread · distance / r, and at most r.
         widest = max(self.reach, self.spread)
         pad = (widest * distance).sqrt().clamp_min(widest)
         half = (axes**2 @ squares[:, :, None]).squeeze(2).sqrt()
-        self.low = torch.minimum(means - half, origins) - pad
-        self.high = torch.maximum(means + half, origins) + pad
+        return torch.minimum(means - half, origins) - pad, torch.maximum(means + half, origins) + pad
+
+    @property
+    def low(self) -> Tensor:
+        return self._corners[0]
+
+    @property
+    def high(self) -> Tensor:
+        return self._corners[1]
 
     def taken(self, rows: Tensor) -> Hulls:
         """The hulls of some rows."""
         made = copy.copy(self)
-        made.table, made.low, made.high = self.table[rows], self.low[rows], self.high[rows]
+        made.table, made._corners = self.table[rows], (self.low[rows], self.high[rows])
         return made
 
     def replaced(self, former: Tensor, new: Hulls, table: Tensor | None) -> Hulls:
@@ -79,9 +91,9 @@ class Hulls:
         of them, if it is known."""
         made = copy.copy(self)
         made.table = replaced_rows(self.table, former, new.table) if table is None else table
-        made.low, made.high = (
-            replaced_rows(*rows) for rows in ((self.low, former, new.low), (self.high, former, new.high))
-        )
+        pairs = zip(self._corners, new._corners, strict=True)
+        low, high = (replaced_rows(old, former, added) for old, added in pairs)
+        made._corners = low, high
         return made
 
     def near(self, given: Lists, lists: Tensor, centers: Tensor, radii: Tensor) -> Lists:

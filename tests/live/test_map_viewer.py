@@ -211,7 +211,7 @@ def test_a_place_has_the_evidence_from_which_its_occupancy_follows(dim, maps):
     position = known.means[~known.max_range][0]  # beams without a return give no hits
     theta, hits, misses = viewer_scene.place_at(built, position, 0.1)
     given = (torch.tensor(value).double() for value in (hits, misses))
-    expected = Query(built.components(), built.query_options).rule.probability(*given, 0.1, dim)
+    expected = Query([built.components()], built.query_options).rule.probability(*given, 0.1, dim)
     assert hits > 0
     assert theta == pytest.approx(float(expected))
 

@@ -8,7 +8,15 @@ from functools import cache
 
 import pytest
 import torch
-from mapping.map_cases import FINE, assert_same_components, built, drive, given_parts, open_drive
+from mapping.map_cases import (
+    FINE,
+    assert_close_components,
+    assert_same_components,
+    built,
+    drive,
+    given_parts,
+    open_drive,
+)
 from occupancy.protocol_contract import RESOLUTION, SENSOR, WALL, dims, lattice, points, shifted, wall_scan
 
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
@@ -207,7 +215,7 @@ def test_the_default_cutoff_follows_the_support_of_the_components():
     components = built(open_drive(2, 2), FINE).components()
     counts = torch.full_like(components.seen_count, 1000.0)
     many = replace(components, seen_count=counts)
-    assert [Query(many, QueryOptions(cutoff=given)).cutoff for given in (4.0, None)] == [4, 3]
+    assert [Query([many], QueryOptions(cutoff=given)).cutoff for given in (4.0, None)] == [4, 3]
 
 
 # -- a map that is asked while it grows ------------------------------------------------------------------
@@ -262,14 +270,14 @@ def test_blocks_answer_as_one_form_of_all_cones_however_the_components_change(di
     asked = torch.cat([asked, torch.full_like(asked[:1], torch.inf), 1e7 + asked[:1]])
     generator = torch.Generator().manual_seed(0)
     options = QueryOptions(cutoff=4.0)
-    answers = Query(every.selected(torch.arange(10)), options)
+    answers = Query([every.selected(torch.arange(10))], options)
     for step in range(12):
         kept = torch.rand(len(every), generator=generator) < (step / 8 if step < 8 else 0.9)
         changed = every.selected(kept.nonzero().squeeze(1))
         if step % 3 == 1 and len(changed):
             changed.seen_count[: 1 + len(changed) // 3] *= 2  # `selected` copies
         recent = [every.selected(torch.arange(step, step + 2))] if step % 2 else []
-        answers = answers.replaced(changed, options, recent)
+        answers = answers.replaced([changed], options, recent)
         cones = Cones(*map(torch.cat, zip(*(c.cones() for c in (changed, *recent)), strict=True)))
         expected = point_form.PointForm(cones, 0.1, 4.0)(asked)
         found = answers.evidence_at(asked, 0.1, "point")
@@ -289,7 +297,7 @@ def test_a_large_unfinished_window_answers_from_its_parts_until_it_is_learned(di
     whole = built(corridor(4, dim), replace(FINE, window=4), codec="quantized").components().cones()
     parts = [c.cones() for c in grown._parts.values()]
     cones = Cones(*map(torch.cat, zip(whole, *parts, strict=True)))
-    query = Query(grown.components(), grown.query_options)
+    query = Query([grown.components()], grown.query_options)
     evidence = point_form.PointForm(cones, grown.resolution, query.cutoff)(asked)
     expected = grown.query_options.calibration.probability(*evidence, grown.resolution, dim)
     torch.testing.assert_close(theta, expected, rtol=1e-12, atol=1e-12)
@@ -336,3 +344,66 @@ def test_components_that_are_replaced_give_no_evidence(dim, block, monkeypatch):
     assert (made.occupancy(query) == 0.5).all()
     made.insert(corridor(1, dim)[0])
     torch.testing.assert_close(made.occupancy(query), made.snapshot().occupancy(query), rtol=1e-9, atol=1e-9)
+
+
+@dims
+@pytest.mark.parametrize("codec", ["quantized", "float"])
+def test_a_map_in_blocks_is_the_same_map_to_the_bit(dim, codec, monkeypatch):
+    rule = replace(FINE, window=3, mean_origins=None)
+    scans = corridor(14, dim)
+    whole = built(scans, rule, codec=codec)
+    monkeypatch.setattr(map_query, "_BLOCK", 20)
+    grown = built(scans, rule, codec=codec)
+    assert len(grown._blocks) > 2
+    assert grown.n_pending == 2
+    for name in ("means", "covariances", "support", "max_range", "ids"):
+        assert torch.equal(getattr(grown.components(), name), getattr(whole.components(), name)), name
+    assert_close_components(grown.components(), whole.components())  # counts of one block are scaled again
+    assert grown.query_options == whole.query_options  # the same predictions
+    asked = torch.cat([scan.points[::9] for scan in scans]) + 0.02
+    if codec == "quantized":
+        assert torch.equal(grown.occupancy(asked), whole.occupancy(asked))
+    grown.finish()
+    assert grown.n_components == len(grown.unrounded()) == whole.n_components > grown.n_final
+
+
+@pytest.mark.parametrize("codec", ["quantized", "float"])
+def test_a_map_in_blocks_continues_bit_by_bit_from_its_state_and_its_file(codec, monkeypatch, tmp_path):
+    monkeypatch.setattr(map_query, "_BLOCK", 20)
+    rule = replace(FINE, window=3)
+    scans = corridor(20, 2)
+    first = built(scans[:13], rule, codec=codec)
+    restored = GaussianMap(rule, codec=codec)
+    restored.load_state_dict(first.state_dict())
+    assert [len(block.components) for block in restored._blocks] == [len(b.components) for b in first._blocks]
+    assert len(first._blocks) > 2
+    first.save(tmp_path / "map.safetensors")  # an unfinished window ends there
+    first.revise(lambda components: components)
+    loaded = GaussianMap.load(tmp_path / "map.safetensors")
+    for scan in scans[13:]:
+        for made in (first, restored, loaded):
+            made.insert(scan)
+    other = built(scans, rule, codec=codec)
+    assert_same_components(restored.components(), other.components())
+    if codec == "float":
+        assert_same_components(loaded.components(), first.components())
+
+
+def test_a_scan_changes_and_reads_the_last_block_only(monkeypatch):
+    monkeypatch.setattr(map_query, "_BLOCK", 20)
+    grown = GaussianMap(replace(FINE, window=3))
+    for scan in corridor(12, 2):
+        grown.insert(scan)
+        grown.occupancy(scan.points[:9])
+    before = [(block, block.components) for block in grown._blocks[:-1]]
+    answered = grown._answers()._blocks[: len(before)]
+    assert len(before) > 1
+    for scan in corridor(15, 2)[12:]:
+        grown.insert(scan)
+        grown.occupancy(scan.points[:9])
+    assert grown.n_pending == 0
+    for (block, components), now in zip(before, grown._blocks, strict=False):
+        assert now is block
+        assert now.components is components
+    for block, now in zip(answered, grown._answers()._blocks, strict=False):
+        assert now is block

@@ -171,7 +171,7 @@ def _sources(
             built.insert(scan)
         built.finish()
         seconds = time.perf_counter() - begin
-        query = Query(built.components(), replace(built.query_options, prior=None))
+        query = Query([built.components()], replace(built.query_options, prior=None))
         facts = {"n_components": built.n_components, "nbytes": built.nbytes, "build_seconds": seconds}
         assert isinstance(query.rule, Calibration)  # without a prior
         yield n_components, Source(query.evidence_at, query.rule, facts)

@@ -7,6 +7,7 @@ multiples of 2⁻⁸ m. Every number is rounded by itself, so components can be 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -235,7 +236,14 @@ def quantized_after(known: Components, rounded: Components, components: Componen
     if len(components) == k:
         return rounded
     rows = torch.arange(k, len(components), device=components.means.device)
-    both = Components.concatenate([rounded, quantized(components.selected(rows))])
+    return joined([rounded, quantized(components.selected(rows))])
+
+
+def joined(parts: Sequence[Components]) -> Components:
+    """All components of rounded parts, in order, rounded as if they were together: origins are distinct."""
+    both = Components.concatenate(parts)
+    if any(both is part for part in parts):
+        return both
     origins = both.origins.cpu().numpy()
     distinct, place = (torch.from_numpy(v).to(both.means.device) for v in _first_uses(origins))
     seen_from = place[both.seen_from]

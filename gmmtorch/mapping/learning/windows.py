@@ -53,7 +53,7 @@ from gmmtorch.mapping.learning.rules import (
     NoveltyRule,
     WindowedRule,
 )
-from gmmtorch.mapping.query import count_many, cutoff_of
+from gmmtorch.mapping.query import Block, bounds_of, cutoff_for, evidence_boxes
 from gmmtorch.mixture import SOFTMAX_DTYPES, FlatnessRule, surface_rule
 from gmmtorch.occupancy import (
     Calibrator,
@@ -210,8 +210,15 @@ def learn_part(scans: Sequence[Scan], rule: LearningRule, generator: torch.Gener
 
 
 def learns_in_parts(rule: LearningRule) -> bool:
-    """Whether the components of a window do not depend on those of the map, which it leaves as they are."""
+    """Whether the components of a window do not depend on those of the map."""
     return rule.forget == FORGET_OFF and (isinstance(rule, WindowedRule) or rule.novelty is None)
+
+
+def keeps_components(rule: LearningRule) -> bool:
+    """Whether a window leaves the components of the map as they are, except the latest: those whose number of
+    origins is limited together with that of the new ones."""
+    budgets = () if isinstance(rule, WindowedRule) else (rule.n_components, rule.max_bytes, rule.max_cost)
+    return learns_in_parts(rule) and all(budget is None for budget in budgets)
 
 
 # -- a WindowedRule -------------------------------------------------------------------------------------
@@ -394,7 +401,7 @@ _SHARE = 0.04  # of the time of learning that predictions take
 
 
 def predicted(
-    known: Components, window: Sequence[Scan | DepthFrame], calibrator: Calibrator | None, number: int
+    known: Sequence[Block], window: Sequence[Scan | DepthFrame], calibrator: Calibrator | None, number: int
 ) -> Calibrator | None:
     """What is known about the calibration after a map has predicted the beams of a window.
 
@@ -415,7 +422,7 @@ def predicted(
         return calibrator
     if calibrator is None:
         calibrator = Calibrator.of(_mean_range(window), len(SIDES))
-    if not len(known):
+    if not any(len(block.components.seen_by) for block in known):
         return calibrator
     share = torch.rand(len(ends), 1, generator=generator, dtype=torch.float64).to(ends.device)
     points = torch.cat([ends, origins + share * (ends - origins)])
@@ -427,7 +434,7 @@ def predicted(
         kept = (seen >= seen.median()) & (seen > 0)
         predictions.append(Prediction(hits[kept], misses[kept], occupied[kept], side))
     due = number + _windows_between(n_pairs, sum(map(_size, window)))
-    return replace(calibrator.updated(predictions, known.dim), next_window=due)
+    return replace(calibrator.updated(predictions, ends.shape[1]), next_window=due)
 
 
 def _windows_between(n_pairs: int, n_points: int) -> int:
@@ -457,10 +464,17 @@ def _beams(window: Sequence[Scan | DepthFrame], generator: torch.Generator) -> t
     return scan.origin.double().expand_as(points), points.double()
 
 
-def few_points(known: Components, points: Tensor, sides: Sequence[float]) -> tuple[list[PointEvidence], int]:
+def few_points(
+    blocks: Sequence[Block], points: Tensor, sides: Sequence[float]
+) -> tuple[list[PointEvidence], int]:
     """Evidence (M,) of cubes of several sides (m) at a few points (M, D), without an index; and the number of
-    pairs of a point and a cone that it takes."""
-    cutoff = cutoff_of(*count_many(known.seen_count))
+    pairs of a point and a cone that it takes. `blocks`: at least one has a viewpoint."""
+    cutoff = cutoff_for(blocks)
+    blocks = [block for block in blocks if len(block.components.seen_by)]
+    low, high = evidence_boxes(*bounds_of(blocks, cutoff), max(sides), cutoff)
+    met = ((low <= points.amax(0)) & (high >= points.amin(0))).all(1).tolist()
+    near = [block.components for block, is_met in zip(blocks, met, strict=True) if is_met]
+    known = Components.concatenate(near or [blocks[0].components])
     point, view = _near(known, points, max(sides), cutoff)
     used, cone = torch.unique(view, return_inverse=True)
     by = known.seen_by[used]

@@ -43,8 +43,7 @@ from gmmtorch.files import FileLock, write_bytes
 from gmmtorch.mapping.codec.component_batch import read_map_bytes, read_settings, settings_facts
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.rules import IncrementalRule
-from gmmtorch.mapping.learning.windows import learns_in_parts
+from gmmtorch.mapping.learning.windows import keeps_components
 from gmmtorch.mapping.query import Query, count_many, cutoff_of, mean_range, rule_of
 from gmmtorch.mapping.query_options import check_method
 from gmmtorch.mapping.tiles.tile_files import (
@@ -143,11 +142,10 @@ class TiledMap:
         Raises `InvalidArgumentError` if the folder has an index, or the rule needs all of the map: with
         novelty, forgetting or a budget.
         """
-        folder, rule = Path(folder), target.learning
+        folder = Path(folder)
         if (folder / INDEX).exists():
             raise InvalidArgumentError(f"{folder} has a map; open it by TiledMap, or choose another folder.")
-        budgets = [name for name in ("n_components", "max_bytes", "max_cost") if getattr(rule, name, None)]
-        if not learns_in_parts(rule) or (budgets and isinstance(rule, IncrementalRule)):
+        if not keeps_components(target.learning):
             raise InvalidArgumentError(
                 "The learning rule has novelty, forgetting or a budget, which need all of the map; give a "
                 "rule without them."
@@ -432,10 +430,10 @@ class TiledMap:
         options = replace(self.query_options, n_samples=n_samples)
         if name not in self._open:
             components = self.components(row).to(self.device)
-            self._open[name] = Query(components, options), len(components) * _BYTES_EACH
+            self._open[name] = Query([components], options), len(components) * _BYTES_EACH
         known, n_bytes = self._open[name]
         if known.options.n_samples != n_samples:  # other tiles have grown
-            self._open[name] = known.replaced(known.components, options), n_bytes
+            self._open[name] = known.replaced(known.parts, options), n_bytes
         self._open.move_to_end(name)
         while len(self._open) > 1 and sum(n_bytes for _, n_bytes in self._open.values()) > self.memory:
             self._open.popitem(last=False)

@@ -26,7 +26,7 @@ from gmmtorch.kernels import (
     pair_evidence,
 )
 from gmmtorch.linalg import order_along_curve, safe_cholesky
-from gmmtorch.occupancy.cone_index import ConeIndex, chunks_of, replaced_rows, spectrum_of
+from gmmtorch.occupancy.cone_index import ConeIndex, Hulls, chunks_of, replaced_rows, spectrum_of
 from gmmtorch.occupancy.cones import CUTOFF, Cones, former_rows
 from gmmtorch.occupancy.evidence import occupancy_probability
 from gmmtorch.occupancy.grid import MEMORY_LIMIT, VoxelGrid, check_resolution
@@ -73,8 +73,8 @@ CHUNK_PAIRS = 1 << 16
 
 _CHUNK_POINTS = 1 << 20  # points sorted in one pass
 _FARTHEST = 1e15  # metres: products of larger positions are infinite
-_FEW = 64  # points that are not sorted
-_FEW_PAIRS = 1 << 21  # of a point and a cone: for at most so many an index does not pay
+_GROUP = 64  # points whose cones are found together
+_FEW_PAIRS = 1 << 23  # of a point and a cone: for at most so many an index does not pay
 
 
 class PointEvidence(NamedTuple):
@@ -151,6 +151,7 @@ class PointForm:
         resolution: h (m).
         cutoff: Mahalanobis distance beyond which a component gives no evidence.
         share: see `ConeIndex`.
+        axes: (C, D, D), see `spectrum_of`; None: computed for each cone.
     """
 
     def __init__(
@@ -159,6 +160,7 @@ class PointForm:
         resolution: float,
         cutoff: float = CUTOFF,
         share: float = 1.0,
+        axes: Tensor | None = None,
     ) -> None:
         self.resolution = check_resolution(resolution)
         cones = cones.checked()
@@ -166,7 +168,8 @@ class PointForm:
             raise InvalidArgumentError(f"cutoff={cutoff} must be finite and above zero.")
         self.dim, self.cutoff = cones.dim, float(cutoff)
         safe_cholesky(cones.covariances.double().detach())  # raises if one is not positive definite
-        self._table = _table_of(cones, spectrum_of(cones.covariances)[1], self.resolution)
+        axes = spectrum_of(cones.covariances)[1] if axes is None else axes
+        self._table = _table_of(cones, axes, self.resolution)
         self._share = share
         self._index: ConeIndex | Callable[[], ConeIndex] = self._new_index
 
@@ -234,16 +237,29 @@ class PointForm:
         """Adds hits and misses to `found` (2, M) by the fused kernel."""
         settings = self.rows, self.resolution, self.cutoff, found
         if len(points) * len(self.rows) <= _FEW_PAIRS:
-            bucket = torch.zeros_like(points[:, 0], dtype=torch.int64)
-            every = torch.arange(len(self.rows), dtype=torch.int32, device=points.device)
             order = (points.abs() <= _FARTHEST).all(1).nonzero().squeeze(1)
-            if len(order) > _FEW:  # the kernel skips cones that eight points in a row are far from
+            if len(order):
                 order = order[order_along_curve(points[order])]
-            listed_evidence(points, order, bucket, Lists.of(order.new_tensor([len(every)]), every), *settings)
+                bucket, lists = self._listed(points, order)
+                listed_evidence(points, order, bucket, lists, *settings)
             return found
         for rows, number in self.index.parts(points):
             listed_evidence(points, rows, number, self.index.lists, *settings)
         return found
+
+    def _listed(self, points: Tensor, order: Tensor) -> tuple[Tensor, Lists]:
+        """Lists of the cones near groups of `_GROUP` points that follow each other in `order`, and the list
+        of each of the points (M, D). Takes less time than an index where there are few points."""
+        place = torch.arange(len(order) + -len(order) % _GROUP, device=order.device)
+        group = place[: len(order)] // _GROUP
+        bucket = torch.zeros_like(points[:, 0], dtype=torch.int64).index_copy_(0, order, group)
+        some = points[order[place.clamp_max(len(order) - 1)]].view(-1, _GROUP, self.dim)
+        centers = 0.5 * (some.amin(1) + some.amax(1))
+        radii = (some - centers[:, None]).norm(dim=2).amax(1)
+        every = torch.arange(len(self.rows), dtype=torch.int32, device=points.device)
+        given = Lists.of(order.new_tensor([len(every)]), every)
+        hulls = Hulls(self.rows, self.resolution, self.cutoff, smoothed=True)
+        return bucket, hulls.near(given, torch.zeros_like(group[: len(some)]), centers, radii)
 
     def _near_cones(self, blocks: PointBlocks, part: slice) -> tuple[Tensor, Tensor]:
         """Pairs of a block (R,), counted from the start of `part`, and a cone (R,) near it."""
