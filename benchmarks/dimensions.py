@@ -1,6 +1,6 @@
 """Mixtures in many dimensions, beside scikit-learn: seconds, peak memory and log-likelihoods.
 
-    python benchmarks/dimensions.py [--threads 1] [--parts TEXT …] [--most 6e10]
+    python benchmarks/dimensions.py [--threads 1] [--parts TEXT …] [--most 6e10] [--peers tgmm torchgmm]
 
 Both fit the same clouds from the same start for the same number of iterations; --most leaves out fits of
 more products of N, K and D (full covariances: D²). Whole fits start as each package does by itself.
@@ -10,14 +10,18 @@ from __future__ import annotations
 
 import ctypes
 import itertools
+import logging
 import math
+import sys
 import warnings
 from collections.abc import Callable, Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import sklearn.mixture
+import torch
 from scipy.ndimage import gaussian_filter
 from sklearn.datasets import load_digits, load_iris
 
@@ -124,72 +128,105 @@ def status(name: str) -> float:
     return int(text.split(f"{name}:")[1].split()[0]) / 1000
 
 
-def measured(ours: bool, cell: Cell) -> dict[str, Any]:
-    """Seconds of the processor of a fit and of its score, the memory of the fit, and what it found."""
+def fitted(package: str, points: np.ndarray, cell: Cell, seed: int) -> Any:
+    """The mixture that a package fits to a cell's points."""
+    options: dict[str, Any] = {"covariance_type": cell.kind, "reg_covar": 1e-6, "random_state": seed}
+    options |= {} if cell.table else start(points, cell)
+    if package == "scikit-learn":
+        return sklearn.mixture.GaussianMixture(cell.k, **options).fit(points)
+    if package == "gmmtorch":
+        options |= {"init_params": "kmeans"} if cell.table else {"algorithm": "exact"}
+        return gmmtorch.GaussianMixture(cell.k, **options).fit(points)
+    table, means = torch.from_numpy(points), torch.from_numpy(options["means_init"])
+    if package == "torchgmm":  # takes no other start, and makes float32 of float64
+        limits = {
+            "convergence_tolerance": 0.0,
+            "trainer_params": {"max_epochs": N_ITER, "logger": False, "enable_progress_bar": False},
+        }
+        made = import_module("torchgmm.bayes").GaussianMixture
+        return made(cell.k, covariance_type=cell.kind, init_means=means.float(), **limits).fit(table.float())
+    covariances = 1 / torch.from_numpy(options["precisions_init"]).clamp_min(1e-300)
+    if cell.kind in ("full", "tied"):
+        covariances = torch.linalg.inv(torch.from_numpy(options["precisions_init"]))
+    first = {"init_means": means, "init_covariances": covariances}
+    settings = {"covariance_type": cell.kind, "max_iter": N_ITER, "tol": 1e-300, "random_state": seed}
+    return import_module("tgmm").GaussianMixture(cell.k, cell.dim, **settings, **first).fit(table)
+
+
+def measured(cell: Cell, packages: tuple[str, ...]) -> dict[str, dict[str, float]]:
+    """Seconds of the processor of a fit and of its score, the memory of the fit, and what it found.
+
+    The packages take turns, because other programs load the machine.
+    """
     points = TABLES[cell.table](cell.n, cell.dim) if cell.table else blobs(cell.n, cell.dim, cell.k)
-    options: dict[str, Any] = {"covariance_type": cell.kind, "reg_covar": 1e-6}
-    if not cell.table:
-        options |= start(points, cell)
-        options |= {"algorithm": "exact"} if ours else {}
-    elif ours:
-        options |= {"init_params": "kmeans"}
-    made = gmmtorch.GaussianMixture if ours else sklearn.mixture.GaussianMixture
-    seconds, scores, memory, values = [], [], [], []
-    least = SEEDS.get(cell.table, 1)
-    for seed in range(max(least, 5)):
-        options["random_state"] = seed
-        ctypes.CDLL(None).malloc_trim(0)
-        Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew
-        before = status("VmRSS")
-        begin = clock()
-        mixture = made(cell.k, **options).fit(points)
-        seconds.append(clock() - begin)
-        memory.append(status("VmHWM") - before)
-        for _ in range(3):  # the first makes what the next ones find
-            begin = clock()
-            value = mixture.score(points)
-            scores.append(clock() - begin)
-        values.append(value)
-        if sum(seconds) > 2 and seed + 1 >= least:
-            break
-    return {
-        "seconds": min(seconds),
-        "score_seconds": min(scores),
-        "megabytes": min(memory),
-        "nats": float(np.mean(values)),
-        "iterations": mixture.n_iter_,
+    table = {name: torch.from_numpy(points) for name in packages} | {
+        "gmmtorch": points,
+        "scikit-learn": points,
     }
+    table["torchgmm"] = torch.from_numpy(points).float()
+    found: dict[str, list[tuple[float, ...]]] = {name: [] for name in packages}
+    least, total = SEEDS.get(cell.table, 1), 0.0
+    for seed in range(20):
+        for name in packages if seed % 2 else packages[::-1]:
+            ctypes.CDLL(None).malloc_trim(0)
+            Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew
+            before = status("VmRSS")
+            begin = clock()
+            mixture = fitted(name, points, cell, seed)
+            seconds, megabytes, scores = clock() - begin, status("VmHWM") - before, []
+            for _ in range(3):  # the first makes what the next ones find
+                begin = clock()
+                value = float(mixture.score(table[name]))
+                scores.append(clock() - begin)
+            value = -value if name == "torchgmm" else value  # the negative log-likelihood
+            found[name].append((seconds, min(scores), megabytes, value))
+            total += seconds + sum(scores)
+        if seed + 1 >= least and (total > 6 or (total > 1 and seed >= 4)):
+            break
+    result = {}
+    for name, runs in found.items():
+        low = np.min(runs, 0)
+        nats = float(np.mean([run[3] for run in runs[:least]]))
+        result[name] = {"seconds": low[0], "score": low[1], "megabytes": low[2], "nats": nats}
+    return result
 
 
-def both(cells: list[Cell], ours: bool) -> dict[str, Any]:
-    """The measurements of one package for some cells, by the kind of covariances."""
+def together(cells: list[Cell], packages: tuple[str, ...]) -> dict[str, Any]:
+    """The measurements of some cells, by the kind of covariances."""
     warnings.simplefilter("ignore")
-    measured(ours, Cell("full", 2000, 3, 8))  # loads libraries and compiles
-    return {cell.kind: measured(ours, cell) for cell in cells}
+    logging.disable()
+    measured(Cell("full", 2000, 3, 8), packages)  # loads libraries and compiles
+    return {cell.kind: measured(cell, packages) for cell in cells}
 
 
 def measure(options: Any) -> Iterator[Row]:
     """A row for each size, with each covariance type's speed and memory relative to scikit-learn's."""
     sizes: dict[tuple[Any, ...], list[Cell]] = {}
     for cell in cells(options.most):
-        if all(part in cell.name() for part in options.parts or ()):
-            sizes.setdefault((cell.table or "blobs", f"{cell.n:,} × {cell.dim}", cell.k), []).append(cell)
+        if all(part in cell.name() for part in options.parts or ()) and not (cell.table and options.peers):
+            cloud = " beside ".join(filter(None, [cell.table or "blobs", ", ".join(options.peers)]))
+            sizes.setdefault((cloud, f"{cell.n:,} × {cell.dim}", cell.k), []).append(cell)
+    packages = ("gmmtorch", "scikit-learn", *options.peers)
     for (cloud, points, k), some in sizes.items():
-        ours, peer = alone(both, some, True), alone(both, some, False)
+        found = alone(together, some, packages)
+        if "error" in found:
+            print(cloud, points, k, found, file=sys.stderr)
+            continue
         row: dict[str, Any] = {"cloud": cloud, "points": points, "K": k} | dict.fromkeys(COVARIANCE_TYPES)
-        for cell in some:
-            if cell.kind in ours and cell.kind in peer:
-                row[cell.kind] = comparison(ours[cell.kind], peer[cell.kind], bool(cell.table))
-        yield row
+        yield row | {cell.kind: comparison(found[cell.kind], bool(cell.table)) for cell in some}
 
 
-def comparison(ours: dict[str, Any], peer: dict[str, Any], own_start: bool) -> str:
-    """Seconds of both; how many times faster fit and score are; the share of memory, if it is measurable."""
-    fit, score = (peer[name] / ours[name] for name in ("seconds", "score_seconds"))
+def comparison(found: dict[str, dict[str, float]], own_start: bool) -> str:
+    """Seconds; how many times faster fit and score are; the share of memory, if it is measurable."""
+    ours, peer, *others = found.values()
+    fit, score = (peer[name] / ours[name] for name in ("seconds", "score"))
     text = f"{ours['seconds']:.2g} / {peer['seconds']:.2g} s: {fit:.1f}×, score {score:.1f}×"
     if peer["megabytes"] > 10 or ours["megabytes"] > 10:
         text += f", memory {ours['megabytes'] / max(peer['megabytes'], 1):.2f}"
-    if own_start:
+    for name, other in zip(list(found)[2:], others, strict=True):
+        text += f"; {name} {other['seconds']:.2g} s, score {other['score'] / ours['score']:.1f}×"
+        text += f", memory {ours['megabytes'] / max(other['megabytes'], 1):.2f}, nats {other['nats']:.4g}"
+    if own_start or others:
         return f"{text}, nats {ours['nats']:.2f} / {peer['nats']:.2f}"
     different = abs(ours["nats"] - peer["nats"]) / abs(peer["nats"])
     return text if different < 1e-6 else f"{text}, nats differ by {different:.0e}"
@@ -213,4 +250,5 @@ if __name__ == "__main__":
         CASE,
         parts={"nargs": "*", "help": "cells whose names contain all of these"},
         most={"type": float, "default": 2e10, "help": "products of a cell's iteration"},
+        peers={"nargs": "*", "default": [], "help": "tgmm, torchgmm: blobs only"},
     )

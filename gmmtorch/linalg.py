@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 import numpy as np
@@ -44,9 +45,10 @@ def safe_cholesky(matrices: Tensor, name: str = "covariances") -> Tensor:
     matrix, if jitter does not help or if a matrix has NaN or infinite entries.
     """
     factors, info = torch.linalg.cholesky_ex(matrices)
-    finite = torch.isfinite(factors).flatten(1).all(1)
-    bad = (info != 0) | ~finite
-    if not bool(bad.any()):
+    if math.isfinite(float(factors.detach().sum().masked_fill_(info.any(), math.nan))):
+        return factors
+    bad = (info != 0) | ~torch.isfinite(factors).flatten(1).all(1)
+    if not bool(bad.any()):  # only their sum overflows
         return factors
     if not bool(torch.isfinite(matrices).all()):
         first = int((~torch.isfinite(matrices).flatten(1).all(1)).nonzero()[0])

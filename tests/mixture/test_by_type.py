@@ -6,6 +6,7 @@ import warnings
 
 import numpy as np
 import pytest
+import scipy.special
 import sklearn.mixture
 import torch
 from mixture.mixture_cases import random_parameters, scipy_log_joint
@@ -235,6 +236,21 @@ def test_variational_moments_of_a_type_are_those_of_features(kind, dim):
     projected = by_type.compacted(expected, kind).covariances
     torch.testing.assert_close(tuple(found), (*expected[:2], projected), rtol=1e-7, atol=1e-8)
     torch.testing.assert_close(same, value)
+
+
+@types
+def test_scores_are_those_of_scipy_where_all_shares_but_one_underflow(kind):
+    parameters = typed(kind, 40, 3)
+    means = parameters.means + torch.tensor([[0.0], [100.0], [-100.0]])
+    mixture = GaussianMixture.from_parameters(
+        parameters.weights / parameters.weights.sum(), means, parameters.covariances, covariance_type=kind
+    )
+    points = means.repeat(20, 1) + torch.randn(60, 40, generator=torch.Generator().manual_seed(1)).double()
+    joint = scipy_log_joint(points, Parameters(mixture.weights, mixture.means, mixture.covariances))
+    assert np.ptp(joint, axis=1).min() > 745  # beyond the least exponent of float64
+    np.testing.assert_allclose(
+        mixture.score_samples(points), scipy.special.logsumexp(joint, axis=1), rtol=1e-9
+    )
 
 
 # -- bad input -----------------------------------------------------------------------------------------

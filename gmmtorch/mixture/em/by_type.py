@@ -142,7 +142,8 @@ class Factors:
                     rows = self.whiten[part, a : a + width, : a + width]
                     bias = -middle[part, a : a + width].reshape(-1, 1)
                     z = torch.addmm(bias, rows.reshape(-1, rows.shape[2]), points[:, : a + width].mT)
-                    total = total + (z * z).view(*rows.shape[:2], -1).sum(1)
+                    z = z * z if z.requires_grad else z.square_()
+                    total = total + z.view(*rows.shape[:2], -1).sum(1)
                 return total
             if self.kind == "tied":
                 z = points - middle[part, None, :]
@@ -153,7 +154,7 @@ class Factors:
 
         def joint(points: Tensor, square: Tensor | None = None) -> Tensor:
             points = points @ self.whiten.mT if self.kind == "tied" else points
-            most = 2 * chunk_elements(points.device)
+            most = chunk_elements(points.device)
             rows = max(64, min(_ROWS[points.device.type != "cpu"], most // dim))
             found = []
             for some in points.split(rows):

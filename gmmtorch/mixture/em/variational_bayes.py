@@ -100,7 +100,7 @@ def update(prior: Prior, moments: Parameters, process: bool, covariance_type: st
     else:
         scatter = scatter + count * covariance + pull * offset.square().mean(1)
     if process:  # 1 + N_k for taking stick k, and γ₀ + Σ_{j>k} N_j for passing it
-        later = torch.cat([count.flip(0).cumsum(0).flip(0)[1:], count.new_zeros(1)])
+        later = (count.sum() - count.cumsum(0)).clamp_min_(0)
         concentration = torch.stack([1 + count, prior.concentration + later])
     else:
         concentration = (prior.concentration + count)[None]
@@ -133,7 +133,7 @@ def expected_log_weights(concentration: Tensor) -> Tensor:
     if concentration.shape[0] == 1:
         return expected[0] - torch.digamma(concentration.sum())
     expected = expected - torch.digamma(concentration.sum(0))
-    return expected[0] + torch.cat([expected.new_zeros(1), expected[1].cumsum(0)[:-1]])
+    return expected[0] + expected[1].cumsum(0) - expected[1]
 
 
 def expected_log_density(posterior: Posterior) -> tuple[Tensor, Parameters]:
