@@ -262,20 +262,20 @@ def test_a_moving_robot_sends_every_plan_and_the_first_at_rest() -> None:
 # -- what it sends ----------------------------------------------------------------------------------------
 
 
-def test_views_are_sent_every_ten_seconds_and_after_the_clock_was_set_back() -> None:
+def test_views_are_sent_every_twenty_seconds_and_after_the_clock_was_set_back() -> None:
     one, post = agent()
-    for second in (0.0, 2.0, 9.0, 10.0, 12.0, 3.0):
+    for second in (0.0, 2.0, 19.0, 20.0, 22.0, 3.0):
         place = torch.tensor([[100.0 * second, 0.0, 0.0, 0.0]], dtype=torch.float64)
         one.robot.library.add(place, torch.ones(1), second, 0.0)
         one.send_views(second)
-    assert [now for now, _ in post.of("views")] == [0.0, 10.0, 3.0]
+    assert [now for now, _ in post.of("views")] == [0.0, 20.0, 3.0]
     assert sum(len(decode(datagram).ids) for _, datagram in post.of("views")) == 6
 
 
 @pytest.mark.parametrize("kind", MAPS)
 def test_datagrams_are_sent_under_their_kind(kind: str) -> None:
     one, post = agent(2, kind, announce_every=1.0)
-    for seed in range(5):
+    for seed in range(10):
         for place in PLACES[:2]:
             one.learn(frame(*place, seed=seed), float(seed))
     one.robot.library.add(views(2).poses, torch.ones(2), 1.0, 0.0)
@@ -318,7 +318,7 @@ def test_views_use_what_the_map_leaves_of_the_budget() -> None:
     one.robot.library.add(places, torch.ones(200), 0.0, 0.0, most=200)
     for seed, place in enumerate(PLACES):
         one.robot.sense(frame(*place, seed=seed))
-    for tick in range(400):  # ten times a second
+    for tick in range(800):  # ten times a second
         one.send_map(tick / 10)
         one.send_views(tick / 10)
     assert_within(1300.0, [(now, datagram) for now, _, datagram, _ in post.sent])
