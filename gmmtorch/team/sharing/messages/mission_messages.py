@@ -155,8 +155,8 @@ def encode_views(message: ViewsMessage) -> list[bytes]:
     """Datagrams of views, 7 to 9 bytes each, and of removed keys; empty without either. Ids in any order.
 
     Poses are rounded to 1 cm and 1/256 of a turn (`quantized_poses`), values to four significant bits
-    (`quantized_values`), stamps to 0.1 s. Raises `InvalidArgumentError` for values that are not finite, for duplicate ids, and for
-    rows of different lengths.
+    (`quantized_values`), stamps to 0.1 s. Raises `InvalidArgumentError` for values that are not finite, for
+    duplicate ids, and for rows of different lengths.
     """
     m = message
     sizes = (len(m.poses), len(m.values), len(m.stamps))
