@@ -1,6 +1,6 @@
 """What teams send and know in missions: E0 and E1, on networks that lose, and with few bytes a second.
 
-    python benchmarks/missions.py                             # three seeds of 600 s each
+    python benchmarks/missions.py                             # three seeds; E0 and E1 for 600 s
     python benchmarks/missions.py --only networks --seeds 0
 
 Three robots explore the warehouse. The octree of a mission is that of its novel points, cells of 0.2 m; its
@@ -29,6 +29,7 @@ from gmmtorch.team.sharing import bytes_of_points
 _TEAMS = {"E0": "gmm_shared", "E1": "grid_shared"}
 _LOSSES = {"lossless": 0.0, "30 % lost": 0.3, "50 % lost": 0.5}
 _BUDGETS = {"no limit": None, "20 kbit/s": 2500.0, "5 kbit/s": 625.0, "1 kbit/s": 125.0}
+_SHORT = 300.0  # seconds of the missions on networks that lose
 
 
 def flown(options: Any, team: TeamOptions) -> list[dict[str, Any]]:
@@ -80,19 +81,28 @@ def _kind(rows: Sequence[dict[str, Any]], *kinds: str) -> str:
     return _cell([sum(row["bytes_by_kind"].get(kind, 0) for kind in kinds) for row in rows], ",.0f", 1e-3)
 
 
-def _groups(options: Any, teams: dict[str, TeamOptions]) -> dict[str, list[dict[str, Any]]]:
+def _groups(
+    options: Any, teams: dict[str, TeamOptions], duration: float | None = None
+) -> dict[str, list[dict[str, Any]]]:
     """Rows by name of a team, with the times that need all of them."""
     parts = {name: flown(options, team) for name, team in teams.items()}
     rows = iter(compared([row for part in parts.values() for row in part]))
-    options.about = f"Three robots in the embedded warehouse (50×40×8 m), {options.duration:g} s, "
+    seconds = options.duration if duration is None else duration
+    options.about = f"Three robots in the embedded warehouse (50×40×8 m), {seconds:g} s, "
     options.about += f"{len(options.seeds)} seeds: mean (range)."
     return {name: [next(rows) for _ in part] for name, part in parts.items()}
+
+
+def _table(groups: dict[str, list[dict[str, Any]]], *facts: tuple[str, str, str, float]) -> Iterator[Row]:
+    for label, field, form, scale in facts:
+        yield {"": label, **{name: _of(rows, field, form, scale) for name, rows in groups.items()}}
 
 
 def exploration(options: Any) -> Iterator[Row]:
     team = TeamOptions(duration=options.duration, sample_every=10.0, codecs=("draco",))
     groups = _groups(options, {name: replace(team, framework=kind) for name, kind in _TEAMS.items()})
-    for label, field, form, scale in (
+    yield from _table(
+        groups,
         ("entropy taken away (kbit)", "entropy_reduction_bits", ",.0f", 1e-3),
         ("t50 (s)", "t50", ".0f", 1.0),
         ("t90 (s)", "t90", ".0f", 1.0),
@@ -110,45 +120,40 @@ def exploration(options: Any) -> Iterator[Row]:
         ("the same as an octree, contexts (kB)", "octree_contexts", ",.0f", 1e-3),
         ("on the wire, with headers (kB)", "wire_bytes", ",.0f", 1e-3),
         ("maps equal after the end (s)", "converged_after", ".0f", 1.0),
-    ):
-        yield {"": label, **{name: _of(rows, field, form, scale) for name, rows in groups.items()}}
+    )
     for kind in ("components", "counts", "views", "plans", "announcements"):
         kinds = (kind, "supersessions") if kind == "counts" else (kind,)
         yield {"": f"of what is sent: {kind} (kB)", **{name: _kind(r, *kinds) for name, r in groups.items()}}
 
 
 def networks(options: Any) -> Iterator[Row]:
-    team = TeamOptions(duration=options.duration, sample_every=10.0, codecs=("draco",))
-    groups = _groups(options, {name: replace(team, loss=loss) for name, loss in _LOSSES.items()})
-    for name, rows in groups.items():
-        yield {
-            "": name,
-            "entropy taken away (kbit)": _of(rows, "entropy_reduction_bits", ",.0f", 1e-3),
-            "t90 (s)": _of(rows, "t90", ".0f"),
-            "on the wire, with headers (kB)": _of(rows, "wire_bytes", ",.0f", 1e-3),
-            "lossless = 1": _of(rows, "wire_ratio", ".2f"),
-            "maps equal seconds after the end": _of(rows, "converged_after", ".0f"),
-        }
+    team = TeamOptions(duration=_SHORT, sample_every=10.0)
+    yield from _table(
+        _groups(options, {name: replace(team, loss=loss) for name, loss in _LOSSES.items()}, _SHORT),
+        ("entropy taken away (kbit)", "entropy_reduction_bits", ",.0f", 1e-3),
+        ("t90 (s)", "t90", ".0f", 1.0),
+        ("on the wire, with headers (kB)", "wire_bytes", ",.0f", 1e-3),
+        ("bytes on the wire, lossless = 1", "wire_ratio", ".2f", 1.0),
+        ("maps equal seconds after the end (s)", "converged_after", ".0f", 1.0),
+    )
 
 
 def budgets(options: Any) -> Iterator[Row]:
-    options.duration = 300.0
-    team = TeamOptions(duration=options.duration, sample_every=10.0, loss=0.3)
-    groups = _groups(options, {name: replace(team, budget=budget) for name, budget in _BUDGETS.items()})
-    for name, rows in groups.items():
-        known = [
+    team = TeamOptions(duration=_SHORT, sample_every=10.0, loss=0.3)
+    groups = _groups(options, {name: replace(team, budget=most) for name, most in _BUDGETS.items()}, _SHORT)
+    known = {
+        name: [
             [(row["observable_bits"] - curve[-1]) / 1e3 for curve in row["entropy_bits_per_robot"]]
             for row in rows
         ]
-        yield {
-            "a robot may send": name,
-            "entropy taken away by the team's frames (kbit)": _of(
-                rows, "entropy_reduction_bits", ",.0f", 1e-3
-            ),
-            "known to a robot (kbit)": _cell([sum(each) / len(each) for each in known], ",.0f"),
-            "to the one that knows least": _cell([min(each) for each in known], ",.0f"),
-            "sent (kB)": _of(rows, "bytes_sent", ",.0f", 1e-3),
-        }
+        for name, rows in groups.items()
+    }
+    means = {name: _cell([sum(each) / len(each) for each in rows], ",.0f") for name, rows in known.items()}
+    yield {"": "entropy that a robot's map lost (kbit)", **means}
+    yield {"": "that of the worst robot (kbit)"} | {
+        name: _cell([min(each) for each in rows], ",.0f") for name, rows in known.items()
+    }
+    yield from _table(groups, ("sent (kB)", "bytes_sent", ",.0f", 1e-3))
 
 
 CASES = (

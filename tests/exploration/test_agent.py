@@ -261,7 +261,8 @@ def test_a_plan_has_every_second_pose_and_the_views_after_the_path() -> None:
     fly(one, 0.0, 0, rests=False)
     (datagram,) = (datagram for _, datagram in post.of("plans"))
     plan, said = one._plan, decode(datagram)
-    assert isinstance(said, PlanMessage) and plan is not None
+    assert isinstance(said, PlanMessage)
+    assert plan is not None
     assert said.step == pytest.approx(2 * one.options.dynamics.step)
     assert torch.equal(said.path, quantized_poses(plan.path[1::2, :4]))
     assert torch.equal(torch.cat([said.path[-1:], said.views]), quantized_poses(plan.views))
