@@ -196,3 +196,38 @@ def _scale(axes: Axes, values: Sequence[float]) -> None:
     axes.xaxis.set_major_locator(LogLocator())
     tick_text(axes.xaxis, lambda value: byte_text(value, digits=1))
     axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+_TEAMS = {  # label, colour, marker
+    "E0": ("mixture (gmmtorch)", PALETTE[0], "o"),
+    "octree, contexts": ("octree, contexts", PALETTE[1], "s"),
+    "octree, zstd": ("octree, zstd", PALETTE[5], "P"),
+    "octree and counts, contexts": ("octree and counts, contexts", PALETTE[6], "X"),
+    "Draco": ("Draco", PALETTE[2], "^"),
+    "range image": ("range image, zstd", PALETTE[4], "v"),
+}
+_KNOWN = {"AUC": "AUC of the team's map", "entropy taken away (kbit)": "entropy taken away [kbit]"}
+
+
+def knowledge_figure(rows: Rows) -> Figure:
+    """Draws what a team knows against the bytes of its map, a line for each way to share it.
+
+    Args:
+        rows: of the table "shared-knowledge".
+    """
+    figure = new_figure(11.0, 5.0)
+    for axes, (quality, y_label) in zip(figure.subplots(1, 2), _KNOWN.items(), strict=True):
+        for name, (label, hue, mark) in _TEAMS.items():
+            first, _, code = name.partition(", ")
+            own = [
+                (row["kB"], row[quality])
+                for row in rows
+                if str(row["shared"]).startswith(f"{first},") and str(row["shared"]).endswith(code)
+            ]
+            axes.plot(*zip(*sorted(own), strict=True), color=hue, marker=mark, label=label)
+        axes.set_xlim(left=0)
+        label_axes(axes, "", "kilobytes that the team sends of its map", y_label)
+        draw_grid(axes)
+    legend_below(figure, max_columns=3)
+    figure_title(figure, "What a team knows against its bytes")
+    return figure

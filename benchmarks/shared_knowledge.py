@@ -2,6 +2,7 @@
 
     python benchmarks/shared_knowledge.py                      # three robots in the warehouse, 150 s
     python benchmarks/shared_knowledge.py --world tunnels      # in a mine
+    python benchmarks/shared_knowledge.py --figure known.png   # the picture of the table, too
 
 A mission of E0 is recorded. Then the robots fly the same paths again, once for each way to share. A robot
 sends the beams that are novel to its map, and all robots, the sender too, learn only what the receivers of
@@ -22,14 +23,17 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from rate_distortion_figures import knowledge_figure
 from torch import Tensor
 
 from gmmtorch.experiments.harness import Case, Row, run
+from gmmtorch.report.style import save_figure
 from gmmtorch.simulation import DepthFrame
 from gmmtorch.team.exploration.mission.mission import Mission
 from gmmtorch.team.exploration.mission.options import FrameRule, TeamOptions, WorldOptions
@@ -238,6 +242,15 @@ def knowledge(world: World, mission: Mission) -> dict[str, float]:
 
 
 def measure(options: Any) -> Iterator[Row]:
+    rows = []
+    for row in measured(options):
+        rows.append(row)
+        yield row
+    if options.figure is not None:
+        save_figure(knowledge_figure(rows), options.figure, dpi=100)
+
+
+def measured(options: Any) -> Iterator[dict[str, Any]]:
     torch.set_num_threads(1)
     place = WorldOptions(name=options.world)
     team = TeamOptions(duration=options.duration, seed=options.seed)
@@ -286,4 +299,5 @@ if __name__ == "__main__":
         world={"default": "warehouse", "choices": ("warehouse", "tunnels")},
         duration={"type": float, "default": 150.0},
         seed={"type": int, "default": 0},
+        figure={"type": Path, "default": None},
     )

@@ -30,7 +30,7 @@ from gmmtorch.team.exploration.robot.mapper import GridMapper, Mapper, Memo
 from gmmtorch.team.exploration.world.starts import InitialFreeSpace
 from gmmtorch.team.sharing.messages.component_messages import encode_components
 from gmmtorch.team.sharing.messages.message_registry import decode, kind_of
-from gmmtorch.team.sharing.messages.mission_messages import PlanMessage, encode_plan
+from gmmtorch.team.sharing.messages.mission_messages import PlanMessage, encode_plan, quantized_poses
 from gmmtorch.team.sharing.replica.replica import Replica
 from gmmtorch.team.sharing.view_library import ViewLibrary
 
@@ -239,6 +239,35 @@ def fly(one: Agent, now: float, number: int, rests: bool) -> None:
     one.robot.advance(0, 100)
 
 
+def test_a_plan_is_sent_unless_no_teammate_can_be_near() -> None:
+    one, post = agent()
+    hear(one, post, (1, plan_datagram(0, 500.0, sender=1)), now=0.0)
+    fly(one, 0.0, 0, rests=False)  # robot 2 may be anywhere
+    hear(one, post, (2, plan_datagram(0, -500.0, sender=2)), now=2.0)
+    for number in range(1, 5):
+        fly(one, 2.0 * number, number, rests=False)
+    hear(one, post, (2, encode_plan(2, 9, 0.0, 0.2, torch.zeros(0, 4))[0]), now=10.0)  # it may be anywhere
+    fly(one, 10.0, 5, rests=False)
+    hear(one, post, (2, plan_datagram(10, -30.0, sender=2)), now=12.0)
+    fly(one, 12.0, 6, rests=False)
+    fly(one, 60.0, 7, rests=False)  # it may have flown 80 m since
+    assert [decode(datagram).number for _, datagram in post.of("plans")] == [0, 5, 7]
+
+
+def test_a_plan_has_every_second_pose_and_the_views_after_the_path() -> None:
+    one, post = agent()
+    local = one.robot.mapper.local
+    local.add(CellEvidence.from_dense(local.box.low, torch.zeros(local.shape), torch.full(local.shape, 50.0)))
+    fly(one, 0.0, 0, rests=False)
+    (datagram,) = (datagram for _, datagram in post.of("plans"))
+    plan, said = one._plan, decode(datagram)
+    assert isinstance(said, PlanMessage)
+    assert plan is not None
+    assert said.step == pytest.approx(2 * one.options.dynamics.step)
+    assert torch.equal(said.path, quantized_poses(plan.path[1::2, :4]))
+    assert torch.equal(torch.cat([said.path[-1:], said.views]), quantized_poses(plan.views))
+
+
 def test_a_resting_robot_sends_one_plan_in_ten() -> None:
     one, post = agent()
     for number in range(25):
@@ -262,20 +291,20 @@ def test_a_moving_robot_sends_every_plan_and_the_first_at_rest() -> None:
 # -- what it sends ----------------------------------------------------------------------------------------
 
 
-def test_views_are_sent_every_ten_seconds_and_after_the_clock_was_set_back() -> None:
+def test_views_are_sent_every_twenty_seconds_and_after_the_clock_was_set_back() -> None:
     one, post = agent()
-    for second in (0.0, 2.0, 9.0, 10.0, 12.0, 3.0):
+    for second in (0.0, 2.0, 19.0, 20.0, 22.0, 3.0):
         place = torch.tensor([[100.0 * second, 0.0, 0.0, 0.0]], dtype=torch.float64)
         one.robot.library.add(place, torch.ones(1), second, 0.0)
         one.send_views(second)
-    assert [now for now, _ in post.of("views")] == [0.0, 10.0, 3.0]
+    assert [now for now, _ in post.of("views")] == [0.0, 20.0, 3.0]
     assert sum(len(decode(datagram).ids) for _, datagram in post.of("views")) == 6
 
 
 @pytest.mark.parametrize("kind", MAPS)
 def test_datagrams_are_sent_under_their_kind(kind: str) -> None:
     one, post = agent(2, kind, announce_every=1.0)
-    for seed in range(5):
+    for seed in range(10):
         for place in PLACES[:2]:
             one.learn(frame(*place, seed=seed), float(seed))
     one.robot.library.add(views(2).poses, torch.ones(2), 1.0, 0.0)
@@ -318,7 +347,7 @@ def test_views_use_what_the_map_leaves_of_the_budget() -> None:
     one.robot.library.add(places, torch.ones(200), 0.0, 0.0, most=200)
     for seed, place in enumerate(PLACES):
         one.robot.sense(frame(*place, seed=seed))
-    for tick in range(400):  # ten times a second
+    for tick in range(800):  # ten times a second
         one.send_map(tick / 10)
         one.send_views(tick / 10)
     assert_within(1300.0, [(now, datagram) for now, _, datagram, _ in post.sent])

@@ -363,7 +363,8 @@ def test_a_robot_avoids_the_paths_that_it_has_heard(hall, monkeypatch):
     with transports(1) as (link,):
         heard = [plan(10, sender=4), plan(3, sender=2)]
         seen = planned_beside(mission_of(0, hall, TEAM, link), heard, 0.4, monkeypatch)
-    assert seen["peers"].paths[..., 0].tolist() == [[3.0] * 8, [3, 4, 5, 6, 7, 8, 9, 10]]
+    ahead = torch.tensor([[3.0] * 8, [3, 4, 5, 6, 7, 8, 9, 10]], dtype=torch.float64)
+    assert torch.allclose(seen["peers"].paths[..., 0], ahead)
     assert seen["peers"].separation == pytest.approx(0.7)
     assert sorted(seen["final"]) == [2, 4]
     assert seen["since"] == 48.0

@@ -22,6 +22,7 @@ from gmmtorch.team.sharing.messages.mission_messages import (
     encode_points,
     encode_views,
     quantized_poses,
+    quantized_values,
 )
 from gmmtorch.team.sharing.messages.record_messages import (
     CalibrationMessage,
@@ -70,8 +71,8 @@ def views(n: int, n_removed: int = 0, seed: int = 0, center: float = 0.0) -> Vie
     return ViewsMessage(
         ids=torch.stack([torch.arange(n) % 3, torch.arange(n) * 2], 1),
         poses=quantized_poses(poses + center),
-        values=(torch.rand(n, generator=generator) * 200).half().double(),
-        stamps=torch.arange(n, dtype=torch.float64) / 8,
+        values=quantized_values(torch.rand(n, generator=generator) * 200),
+        stamps=torch.arange(n, dtype=torch.float64) / 10,
         removed=Intervals.of(first_key(7) + 2 * np.arange(n_removed)),
     )
 

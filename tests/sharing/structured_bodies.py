@@ -23,7 +23,7 @@ from gmmtorch.mapping.codec.component_batch import encode_quantized
 from gmmtorch.mapping.codec.lattice import Lattice
 from gmmtorch.mapping.codec.quantization import Quantized, quantize
 from gmmtorch.mapping.codec.thesis_message import UPDATE_TYPE, message_type
-from gmmtorch.team.sharing.messages.datagrams import MAX_BYTES, VERSION, Kind
+from gmmtorch.team.sharing.messages.datagrams import MAX_BYTES, Kind, first_byte
 from gmmtorch.team.sharing.replica.record_keys import END
 
 WIDE = 1 << 62
@@ -36,7 +36,7 @@ _ODD = 0.06  # share of fields with an unusual value
 def structured(kind: Kind, rng: Random) -> bytes:
     """A datagram of a kind with valid checksums."""
     body = _BODIES[kind](rng)[: MAX_BYTES - 5]
-    head = bytes([VERSION << 4 | kind])
+    head = bytes([first_byte(kind)])
     if kind == Kind.COMPONENTS:
         return head + body + zlib.crc32(body).to_bytes(4, "little")
     return head + body + zlib.crc32(head + body).to_bytes(4, "little")
@@ -268,9 +268,7 @@ def _views(rng: Random) -> bytes:
     writer = BitWriter()
     n = _ids(writer, rng)
     _poses(writer, rng, n)
-    values = np.abs(_reals(rng, min(n, 500), scale=100.0))
-    with np.errstate(all="ignore"):
-        writer.fixed(values.astype(np.float16).view(np.uint16).astype(np.int64), 16)
+    _column(writer, rng, n, -rng.choice([0, 9, 300]), rng.choice([247, 248, 300]))
     _column(writer, rng, n, 0, 10**6)
     _intervals(writer, rng)
     return writer.to_bytes()
@@ -283,9 +281,16 @@ def _plan(rng: Random) -> bytes:
     n = _number(writer, rng, rng.choice([_size(rng), 1000, 1001]))
     for axis in range(4 if n else 0):
         _number(writer, rng, rng.randrange(256 if axis == 3 else 5000))
-        _column(writer, rng, max(0, n - 1), -9, 9)
-    _poses(writer, rng, _number(writer, rng, _size(rng)))
+    _moves(writer, rng, min(n - 1, 1))
+    _moves(writer, rng, n - 2)
+    _moves(writer, rng, _number(writer, rng, _size(rng)))
     return writer.to_bytes()
+
+
+def _moves(writer: BitWriter, rng: Random, n: int) -> None:
+    for _ in range(2 if n > 0 else 0):
+        largest = rng.choice([9, 9, 9, 300, 1 << 33, 1 << 36, WIDE - 1])
+        writer.rice_column(np.array([rng.randint(0, largest) for _ in range(min(2 * n, 800))], np.int64))
 
 
 def _announcement(rng: Random) -> bytes:

@@ -66,7 +66,10 @@ def test_every_kind_decodes_to_its_message(sound):
     kinds += [AnnouncementMessage, SupersessionMessage, CountersMessage, CorrectionMessage, FrameMessage]
     kinds.append(CalibrationMessage)
     assert [type(decode(datagram)) for datagram in sound] == kinds
-    assert [datagram[0] for datagram in sound] == [0x10 | kind for kind in [*range(1, 14), 15, 0]]
+    version = {8: 0x20, 9: 0x20}  # views and plans
+    assert [datagram[0] for datagram in sound] == [
+        version.get(kind, 0x10) | kind for kind in [*range(1, 14), 15, 0]
+    ]
 
 
 def test_every_damage_of_a_datagram_is_detected(sound):
@@ -84,8 +87,13 @@ def test_every_damage_of_a_datagram_is_detected(sound):
 
 
 def test_other_versions_kinds_and_sizes_are_refused_by_name():
-    with pytest.raises(DataError, match="version 2"):
-        decode(sealed(b"\x24" + bytes(9)))
+    for first, versions in (
+        (0x24, "version 2.*version 1"),
+        (0x19, "version 1.*version 2"),
+        (0x38, "version 3"),
+    ):
+        with pytest.raises(DataError, match=versions):
+            decode(sealed(bytes([first]) + bytes(9)))
     with pytest.raises(DataError, match="kind 14"):
         decode(sealed(b"\x1e" + bytes(9)))
     with pytest.raises(DataError, match="1201 bytes"):

@@ -90,7 +90,7 @@ def test_views_are_kept_apart_and_the_best_come_first(seed):
     library.add(poses, values, 1.0, least=2.0, most=60)
     kept = library.candidates()
     assert len(kept.keys) > 3
-    assert float(kept.values.min()) >= 1.99
+    assert float(kept.values.min()) >= 2.0 * 0.93
 
     def near(one: torch.Tensor, other: torch.Tensor, metres: float, degrees: float) -> bool:
         turn = (float(one[3] - other[3]) + math.pi) % (2 * math.pi) - math.pi
@@ -101,7 +101,7 @@ def test_views_are_kept_apart_and_the_best_come_first(seed):
     for pose, value in zip(poses, values.tolist(), strict=True):
         if value > 2.01:  # kept, or next to one that is worth more
             rows = [row for row, other in enumerate(kept.poses) if near(pose, other, 1.52, 47)]
-            assert any(float(kept.values[row]) >= value * 0.998 for row in rows)
+            assert any(float(kept.values[row]) >= value * 0.93 for row in rows)
 
 
 def test_own_views_are_bounded_and_the_best_are_kept(monkeypatch):
@@ -259,9 +259,9 @@ def test_repetitions_are_few_and_keep_the_budget():
     assert sum(n_bytes) < 40 * 25
     libraries[0].revalue(libraries[0].candidates().keys, torch.full((40,), 99.0), 120.0, 0.0)
     assert libraries[0].datagrams(120.0, budget=20) == []
-    limited = libraries[0].datagrams(120.0, budget=150)
-    assert 0 < sum(map(len, limited)) <= 150
-    assert sum(map(len, libraries[0].datagrams(120.0))) > 50
+    limited = libraries[0].datagrams(120.0, budget=60)
+    assert 0 < sum(map(len, limited)) <= 60
+    assert sum(map(len, libraries[0].datagrams(120.0))) > 30
 
 
 def test_hostile_messages_are_refused_and_memory_is_bounded(monkeypatch):

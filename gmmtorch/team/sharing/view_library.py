@@ -15,10 +15,11 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.team.sharing.messages.mission_messages import (
     LATEST,
-    TICKS,
+    STAMP_TICKS,
     ViewsMessage,
     encode_views,
     quantized_poses,
+    quantized_values,
 )
 from gmmtorch.team.sharing.replica.record_keys import (
     LARGEST_INCARNATION,
@@ -162,9 +163,9 @@ class ViewLibrary:
                     self._valued_at[key] = now
                     continue
                 # Later than the known version, even if that comes from a clock that is ahead.
-                at, half = _rounded(value, now)
-                after = min(_milliseconds(known.stamp + 1 / TICKS), LATEST)
-                self._put(key, View(max(at, after), half, known.pose), now)
+                at, rounded = _rounded(value, now)
+                after = min(_in_ticks(known.stamp + 1 / STAMP_TICKS), LATEST)
+                self._put(key, View(max(at, after), rounded, known.pose), now)
                 self._due.add(key)
 
     def remove(self, keys: list[int], now: float) -> None:
@@ -333,12 +334,12 @@ def _rounded(value: float, now: float) -> tuple[float, float]:
         raise InvalidArgumentError(
             f"value={value} and now={now} s must be finite, the time up to {LATEST:g}."
         )
-    half = float(np.float16(max(-_LARGEST_VALUE, min(value, _LARGEST_VALUE))))
-    return _milliseconds(now), half + 0.0  # −0 becomes 0
+    rounded = quantized_values(torch.tensor([max(-_LARGEST_VALUE, min(value, _LARGEST_VALUE))]))
+    return _in_ticks(now), float(rounded[0]) + 0.0  # −0 becomes 0
 
 
-def _milliseconds(seconds: float) -> float:
-    return round(seconds * TICKS) / TICKS
+def _in_ticks(seconds: float) -> float:
+    return round(seconds * STAMP_TICKS) / STAMP_TICKS
 
 
 def _is_near(one: Tensor, others: Tensor, spacing: float, turn: float) -> Tensor:

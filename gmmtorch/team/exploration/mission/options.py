@@ -260,7 +260,7 @@ class TeamOptions(LinkConditions):
         _CODEC, "code of components: quantized (about 6 bytes each), float, or thesis (57 bytes)"
     )
     announce_every: float = option(
-        5.0, "seconds between announcements of a robot's records, while these change", "network.announce"
+        10.0, "seconds between announcements of a robot's records, while these change", "network.announce"
     )
     budget: float | None = option(
         None,

@@ -238,8 +238,10 @@ class AgentMoments:
 
     def _flight(self, plan: PlanMessage, now: float) -> tuple[Tensor, Tensor]:
         """The pose (4,) of a teammate that flies a plan, and the positions (A, 3) ahead of it."""
-        step = int((now - self._agent.heard_at[plan.sender]) / plan.step)
-        row = min(max(step, 0), len(plan.path) - 1)
+        step = round(
+            (now - self._agent.heard_at[plan.sender]) / plan.step
+        )  # pose k is that after k + 1 steps
+        row = min(max(step - 1, 0), len(plan.path) - 1)
         return plan.path[row].double(), plan.path[row:, :3].double()
 
     def __call__(self, now: float) -> Moment:

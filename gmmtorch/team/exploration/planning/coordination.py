@@ -152,13 +152,15 @@ def clear_of(path: Tensor, peers: PeerTrajectories, start: Tensor | None = None)
 
 def predicted_path(plan: PlanMessage, age: float, step: float) -> Tensor:
     """Positions (S, 3), metres, of a teammate after 1, 2, …, S steps of `step` seconds from now, by a plan
-    that was heard `age` seconds ago. Each is the plan's pose nearest in time, at most half a step of the plan
-    off, which `clear_of` allows for."""
+    that was heard `age` seconds ago: on straight lines between the plan's poses, and on the first of these
+    before its first pose."""
     n = len(plan.path)
     left = n * plan.step - age
     ahead = step * torch.arange(1, min(max(math.ceil(left / step - 1e-9), 1), _MOST_STEPS) + 1)
-    rows = ((age + ahead.double()) / plan.step).round().clamp(1, n).long() - 1
-    return plan.path[rows, :3].double()
+    at = ((age + ahead.double()) / plan.step - 1).clamp(-1, n - 1)
+    before = at.floor().clamp(0, max(n - 2, 0)).long()
+    path = plan.path[:, :3].double()
+    return torch.lerp(path[before], path[(before + 1).clamp_max(n - 1)], (at - before)[:, None])
 
 
 def _longer_step(path: Tensor) -> Tensor:

@@ -212,7 +212,7 @@ class Robot:
 _SEEDS_PER_MISSION = 1 << 10  # robot ids for which the random draws differ
 _LATEST_PLANS = 10  # A plan whose number is lower than the last one's by more comes from a restarted robot
 _RESTING_PLANS = 10  # plans of a robot at rest, of which one is sent
-_VIEWS_EVERY = 10.0  # seconds between messages of views: many change or are removed before they are sent
+_VIEWS_EVERY = 20.0  # seconds between messages of views: many change or are removed before they are sent
 _PATIENCE = 15
 """Consecutive plans without progress after which a robot looks around. Leaving a start takes up to six."""
 
@@ -379,7 +379,7 @@ class Agent:
                 self._plan = self._waiting.rest(self.robot.state)
                 return self._plan
             known = [
-                heard.views.to(torch.float64)
+                torch.cat([heard.path[-1:], heard.views]).to(torch.float64)
                 for number, heard in sorted(self.robot.plans.items())
                 if number in final and self.heard_at[number] >= (now if since is None else since)
             ]
@@ -409,13 +409,33 @@ class Agent:
             self.robot.follow(self._plan)
 
     def send_plan(self, now: float, number: int) -> None:
-        """Sends the plan proposed last, as that of planning round `number`."""
-        if self._plan is None or not self.options.shares or self._repeats(self._plan):
+        """Sends the plan proposed last, as that of planning round `number`, unless it changes no plan of a
+        teammate."""
+        if self._plan is None or not self.options.shares:
             return
         with self.watch("sharing"):
-            path, views = self._plan.path[:, :4], self._plan.views
-            step = self.options.dynamics.step
+            path, views, step = self._plan.path[:, :4], self._plan.views, self.options.dynamics.step
+            if len(views) and torch.equal(views[0], path[-1]):
+                views = views[1:]  # a robot always observes from the end of its path
+            if self._is_far(torch.cat([path, views])[:, :3], now) or self._repeats(self._plan):
+                return
+            if len(path) % 2 == 0:
+                path, step = path[1::2], 2 * step  # a path is interpolated
             self.radio.send(encode_plan(self.number, number, now, step, path, views), now)
+
+    def _is_far(self, places: Tensor, now: float) -> bool:
+        """Whether places (N, 3) of a plan are so far from all teammates that no camera sees the same from
+        both, wherever these have flown since their last plans."""
+        options, heard = self.options, self.robot.plans
+        if len(heard) < options.size - 1:
+            return False
+        for number, plan in heard.items():
+            theirs = torch.cat([plan.path, plan.views])[:, :3].double()
+            apart = torch.cdist(places.double(), theirs).amin().item() if len(theirs) else 0.0
+            flown = math.hypot(options.dynamics.speed, options.dynamics.climb) * (now - self.heard_at[number])
+            if apart <= 2 * options.camera.max_range + max(0.0, flown):
+                return False
+        return True
 
     def _repeats(self, plan: Plan) -> bool:
         """Whether a plan rests at the pose of the last plan sent, and need not be sent again yet."""

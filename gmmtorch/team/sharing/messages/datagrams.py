@@ -15,7 +15,6 @@ from gmmtorch.mapping import BitReader, BitWriter, Ints
 from gmmtorch.pose import Pose
 from gmmtorch.team.sharing.replica.record_keys import END, MOST_RECORDS, NUMBER_BITS, Intervals, authors
 
-VERSION = 1
 MAX_BYTES = 1200
 """Longest datagram. With its headers it fits the smallest path of IPv6, so it is never fragmented."""
 FARTHEST = 2.0**24
@@ -30,7 +29,7 @@ _CHECKSUM_BYTES = 4
 
 
 class Kind(IntEnum):
-    """The low half of a datagram's first byte; the high half is the version. 14 is retired."""
+    """The low half of a datagram's first byte; the high half is the version of the body. 14 is retired."""
 
     CALIBRATION = 0
     COMPONENTS = 1
@@ -51,11 +50,18 @@ class Kind(IntEnum):
 
 OWN_CHECKSUM = frozenset({Kind.COMPONENTS})
 """Kinds whose body ends with a checksum of its own, and gets no second one."""
+_SECOND_VERSION = frozenset({Kind.VIEWS, Kind.PLAN})
+
+
+def first_byte(kind: Kind) -> int:
+    """The first byte of a datagram: the version of the kind's body, and the kind. Records keep the version in
+    which stores hold them."""
+    return (1 + (kind in _SECOND_VERSION)) << _KIND_BITS | kind
 
 
 def make_datagram(kind: Kind, body: bytes) -> bytes:
     """First byte, body, CRC-32 of both (4 bytes, little-endian)."""
-    data = bytes([VERSION << _KIND_BITS | kind]) + body
+    data = bytes([first_byte(kind)]) + body
     if kind in OWN_CHECKSUM:
         return data
     return data + zlib.crc32(data).to_bytes(_CHECKSUM_BYTES, "little")
@@ -68,15 +74,16 @@ def parse_datagram(datagram: bytes) -> tuple[Kind, bytes]:
     if not datagram:
         raise DataError("The datagram is empty.")
     version, number = datagram[0] >> _KIND_BITS, datagram[0] & ((1 << _KIND_BITS) - 1)
-    if version != VERSION:
-        raise DataError(
-            f"The datagram is of version {version}; this gmmtorch reads version {VERSION}. It is foreign or "
-            "damaged, or gmmtorch must be updated on one of the robots."
-        )
     try:
         kind = Kind(number)
     except ValueError as error:
         raise DataError(f"The datagram has the unknown kind {number}: it is foreign or damaged.") from error
+    if datagram[0] != first_byte(kind):
+        raise DataError(
+            f"The datagram of kind {number} is of version {version}; this gmmtorch reads version "
+            f"{first_byte(kind) >> _KIND_BITS}. It is foreign or damaged, or gmmtorch must be updated on one "
+            "of the robots."
+        )
     if kind in OWN_CHECKSUM:
         return kind, datagram[1:]
     data, checksum = datagram[:-_CHECKSUM_BYTES], datagram[-_CHECKSUM_BYTES:]

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
-from gmmtorch.mapping import BitReader, BitWriter, Ints
+from gmmtorch.mapping import BitReader, BitWriter, Ints, unzigzag, zigzag
 from gmmtorch.team.sharing.messages.datagrams import (
     FARTHEST,
     MAX_BYTES,
@@ -111,12 +111,13 @@ STEPS_PER_METRE = 100
 """Positions are whole centimetres."""
 YAW_STEPS = 256
 """Steps of a full turn."""
-TICKS = 1000
-"""Times are whole milliseconds."""
+TICKS, STAMP_TICKS = 1000, 10
+"""Times of plans are whole milliseconds; stamps of views are whole tenths of a second."""
 LATEST = 1e9
 """Latest time (s)."""
 _FARTHEST_STEP = FARTHEST * STEPS_PER_METRE
-_HALF_BITS = 16
+_VALUE_SHIFT = 7  # lowest bits of a float16 that values of views leave out: they are rounded by up to 6 %
+_LARGEST_VALUE = 0x7BFF  # the bits of the largest float16
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,11 +152,11 @@ class PlanMessage:
 
 
 def encode_views(message: ViewsMessage) -> list[bytes]:
-    """Datagrams of views, 9 to 11 bytes each, and of removed keys; empty without either. Ids in any order.
+    """Datagrams of views, 7 to 9 bytes each, and of removed keys; empty without either. Ids in any order.
 
-    Poses are rounded to 1 cm and 1/256 of a turn (`quantized_poses`), values to float16 (65504 at most),
-    stamps to 1 ms. Raises `InvalidArgumentError` for values that are not finite, for duplicate ids, and for
-    rows of different lengths.
+    Poses are rounded to 1 cm and 1/256 of a turn (`quantized_poses`), values to four significant bits
+    (`quantized_values`), stamps to 0.1 s. Raises `InvalidArgumentError` for values that are not finite, for
+    duplicate ids, and for rows of different lengths.
     """
     m = message
     sizes = (len(m.poses), len(m.values), len(m.stamps))
@@ -172,8 +173,8 @@ def encode_views(message: ViewsMessage) -> list[bytes]:
         raise InvalidArgumentError(f"ids: {error}") from error
     order, removed = np.argsort(keys), m.removed
     keys = keys[order]
-    steps, halves = _pose_steps("poses", m.poses)[order], _halves(m.values)[order]
-    times = _ticks("stamps", m.stamps)[order]
+    steps, values = _pose_steps("poses", m.poses)[order], _value_steps(m.values)[order]
+    times = _ticks("stamps", m.stamps, STAMP_TICKS)[order]
 
     def part(begin: int, end: int) -> bytes:
         """Items begin … end − 1 of all views, followed by all intervals of removed keys."""
@@ -182,7 +183,7 @@ def encode_views(message: ViewsMessage) -> list[bytes]:
         writer = BitWriter()
         write_keys(writer, keys[views])
         _write_poses(writer, steps[views])
-        writer.fixed(halves[views], _HALF_BITS)
+        writer.column(values[views])
         writer.column(times[views])
         write_intervals(writer, Intervals(removed.edges[edges]), 0)
         return make_datagram(Kind.VIEWS, writer.to_bytes())
@@ -194,19 +195,19 @@ def read_views(body: bytes) -> ViewsMessage:
     reader = BitReader(body)
     keys = read_keys(reader)
     poses = _read_poses(reader, len(keys))
-    values = reader.fixed(len(keys), _HALF_BITS).astype(np.uint16).view(np.float16).astype(np.float64)
-    if not np.isfinite(values).all():
+    values = reader.column(len(keys))
+    if len(values) and int(np.abs(values).max()) > _LARGEST_VALUE >> _VALUE_SHIFT:
         raise DataError("Values are NaN or infinite: it is damaged.")
-    stamps = _seconds_of(reader.column(len(keys)))
+    stamps = _seconds_of(reader.column(len(keys)), STAMP_TICKS)
     removed = read_intervals(reader, 0, END)
     reader.finish()
-    return ViewsMessage(ids_of(keys), poses, torch.from_numpy(values), stamps, removed)
+    return ViewsMessage(ids_of(keys), poses, _values(values), stamps, removed)
 
 
 def encode_plan(
     sender: int, number: int, time: float, step: float, path: Tensor, views: Tensor | None = None
 ) -> list[bytes]:
-    """The datagram of a plan, 1 to 3 bytes per pose of the path, 5 a view.
+    """The datagram of a plan, 1 to 3 bytes per pose of the path, 4 to 5 a view.
 
     Poses are rounded to 1 cm and 1/256 of a turn, times to 1 ms.
 
@@ -223,14 +224,16 @@ def encode_plan(
     if pace < 1:
         raise InvalidArgumentError(f"step={step} must be at least a millisecond.")
     writer.number(pace)
-    for name, poses, write in (
-        ("path", path, _write_path),
-        ("views", path[:0] if views is None else views, _write_poses),
-    ):
+    last = np.zeros((1, 4), np.int64)
+    for name, poses in (("path", path), ("views", path[:0] if views is None else views)):
         if len(poses) > MOST_POSES:
             raise InvalidArgumentError(f"{name} has {len(poses)} poses; {MOST_POSES} are the most.")
         writer.number(len(poses))
-        write(writer, _pose_steps(name, poses))
+        steps = _pose_steps(name, poses)
+        if name == "path" and len(steps):
+            last = _write_path(writer, steps)
+        else:
+            _write_moves(writer, _moves(np.concatenate([last, steps])))
     datagram = make_datagram(Kind.PLAN, writer.to_bytes())
     if len(datagram) > MAX_BYTES:
         raise InvalidArgumentError(
@@ -247,9 +250,10 @@ def read_plan(body: bytes) -> PlanMessage:
     if not step > 0:
         raise DataError(f"The poses of a path are {step} s apart: it is damaged.")
     path = _read_path(reader, _read_size(reader))
-    views = _read_poses(reader, _read_size(reader))
+    last = path[-1:] if len(path) else np.zeros((1, 4), np.int64)
+    views = last + np.cumsum(_read_moves(reader, _read_size(reader)), 0)
     reader.finish()
-    return PlanMessage(sender, number, time, step, path, views)
+    return PlanMessage(sender, number, time, step, _checked_poses(path), _checked_poses(views))
 
 
 def _read_size(reader: BitReader) -> int:
@@ -259,12 +263,25 @@ def _read_size(reader: BitReader) -> int:
     return n
 
 
-def _halves(values: Tensor) -> Ints:
-    """The bits (V,) of values rounded to float16."""
+def quantized_values(values: Tensor) -> Tensor:
+    """Values (V,) of views as messages round them: to four significant bits, so by up to 6 %."""
+    return _values(_value_steps(values))
+
+
+def _value_steps(values: Tensor) -> Ints:
+    """The highest bits (V,) of values as float16, rounded, with their sign."""
     rows = values.detach().double().cpu().numpy()
     if rows.ndim != 1 or not (np.abs(rows) <= np.finfo(np.float16).max).all():
         raise InvalidArgumentError("values must be a row of numbers up to 65504, the most of float16.")
-    return rows.astype(np.float16).view(np.uint16).astype(np.int64)
+    halves = np.abs(rows).astype(np.float16).view(np.uint16).astype(np.int64)
+    half_step = 1 << (_VALUE_SHIFT - 1)
+    size = np.minimum((halves + half_step) >> _VALUE_SHIFT, _LARGEST_VALUE >> _VALUE_SHIFT)
+    return np.where(rows < 0, -size, size)
+
+
+def _values(steps: Ints) -> Tensor:
+    size = (np.abs(steps) << _VALUE_SHIFT).astype(np.uint16).view(np.float16).astype(np.float64)
+    return torch.from_numpy(np.where(steps < 0, -size, size))
 
 
 # -- poses and times ------------------------------------------------------------------------------------
@@ -307,40 +324,66 @@ def _read_poses(reader: BitReader, n: int) -> Tensor:
     return _checked_poses(steps)
 
 
-def _write_path(writer: BitWriter, steps: Ints) -> None:
-    """Write poses (S, 4) of a path: the first, then columns of the steps, which are nearly equal."""
-    for axis in range(4 if len(steps) else 0):
-        ways = np.diff(steps[:, axis])
-        if axis == 3:  # the shorter direction
-            ways = (ways + YAW_STEPS // 2) % YAW_STEPS - YAW_STEPS // 2
-        writer.number(int(steps[0, axis]))
-        writer.column(ways)
+def _write_path(writer: BitWriter, steps: Ints) -> Ints:
+    """Write poses (S, 4) of a path: the first pose, the first move, then how each move differs from the one
+    before, which is little. Returns the last pose (1, 4)."""
+    for value in steps[0].tolist():
+        writer.number(value)
+    moves = _moves(steps)
+    _write_moves(writer, moves[:1])
+    _write_moves(writer, np.diff(moves, axis=0))
+    return steps[-1:]
 
 
-def _read_path(reader: BitReader, n: int) -> Tensor:
-    """Poses (n, 4) of a path. The caller must bound n, as in `_read_poses`."""
-    steps = np.zeros((n, 4), np.int64)
-    for axis in range(4 if n else 0):
-        ways = np.concatenate([np.array([reader.number()], np.int64), reader.column(n - 1)])
-        if float(np.abs(ways.astype(np.float64)).sum()) > _FARTHEST_STEP * 2 * n:
-            raise DataError("A path leaves the world: it is damaged.")
-        steps[:, axis] = np.cumsum(ways)
-    return _checked_poses(steps)
+def _read_path(reader: BitReader, n: int) -> Ints:
+    """Poses (n, 4) of a path, in steps."""
+    if not n:
+        return np.zeros((0, 4), np.int64)
+    first = np.array([[reader.number() for _ in range(4)]], np.int64)
+    moves = np.cumsum([*_read_moves(reader, min(n - 1, 1)), *_read_moves(reader, max(n - 2, 0))], 0)
+    moves = moves.reshape(n - 1, 4)
+    return np.concatenate([first, first + np.cumsum(moves, 0)])
 
 
-def _ticks(name: str, seconds: Tensor) -> Ints:
-    """Times (N,) in milliseconds, of times in seconds."""
+def _moves(steps: Ints) -> Ints:
+    """The moves (S − 1, 4) from each of poses (S, 4) to the next; the yaw takes the shorter way round."""
+    moves = np.diff(steps, axis=0)
+    moves[:, 3] = (moves[:, 3] + YAW_STEPS // 2) % YAW_STEPS - YAW_STEPS // 2
+    return moves
+
+
+_AXES = slice(0, 2), slice(2, 4)
+"""Moves along x and y are of one size, those along z and turns of another."""
+
+
+def _write_moves(writer: BitWriter, moves: Ints) -> None:
+    for axes in _AXES if len(moves) else ():
+        writer.rice_column(zigzag(moves[:, axes].reshape(-1)))
+
+
+def _read_moves(reader: BitReader, n: int) -> Ints:
+    """Moves (n, 4), of at least a bit for each number, so the data bound the memory."""
+    moves = np.zeros((n, 4), np.int64)
+    for axes in _AXES if n else ():
+        moves[:, axes] = unzigzag(reader.rice_column(2 * n)).reshape(n, 2)
+    if n and int(np.abs(moves).max()) > 4 * _FARTHEST_STEP:
+        raise DataError("A path leaves the world: it is damaged.")
+    return moves
+
+
+def _ticks(name: str, seconds: Tensor, ticks: int = TICKS) -> Ints:
+    """Times (N,) in ticks, so many a second, of times in seconds."""
     times = seconds.detach().double().cpu()
     if times.ndim != 1 or not bool((times.abs() <= LATEST).all()):
         raise InvalidArgumentError(f"{name} must be a row of times (s) of at most {LATEST:g}, and finite.")
-    return (times * TICKS).round().long().numpy()
+    return (times * ticks).round().long().numpy()
 
 
-def _seconds_of(steps: Ints) -> Tensor:
-    """Times (N,) in seconds, of times in milliseconds."""
-    if len(steps) and int(np.abs(steps).max()) > LATEST * TICKS:
+def _seconds_of(steps: Ints, ticks: int = TICKS) -> Tensor:
+    """Times (N,) in seconds, of times in ticks, so many a second."""
+    if len(steps) and int(np.abs(steps).max()) > LATEST * ticks:
         raise DataError(f"Times are later than {LATEST:g} s: it is damaged.")
-    return torch.from_numpy(steps.astype(np.float64) / TICKS)
+    return torch.from_numpy(steps.astype(np.float64) / ticks)
 
 
 def _checked_poses(steps: Ints) -> Tensor:

@@ -97,6 +97,7 @@ class Backlog:
 
 
 _RUN = 160  # components with consecutive keys that are sent together: about one datagram
+_COMPONENT_BYTES = 6  # about, in a datagram
 
 
 def packets(
@@ -108,7 +109,8 @@ def packets(
         due: keys of records to send, none superseded. ready: encoded components; they are sent unchanged.
         max_bytes: largest size of a datagram.
         by_information: False: components in the order of their keys, which takes the fewest bytes. True: in
-            runs of consecutive keys, the runs with most `_information` first, which takes few more.
+            runs of consecutive keys, the runs with most `_information` for a byte first, which takes few
+            more.
     """
     due &= records.held
     if not due:
@@ -141,7 +143,9 @@ def _in_order(
     found: list[Packet | Ints] = [*ready, *runs]
     members = [*(packet[1].numbers() for packet in ready), *runs]
     if by_information:
-        rank = [-float(_information(records.table.selected(one)).sum()) for one in members]
+        sizes = [*(len(packet[0]) for packet in ready), *(_COMPONENT_BYTES * len(run) for run in runs)]
+        worth = [float(_information(records.table.selected(one)).sum()) for one in members]
+        rank = [-information / size for information, size in zip(worth, sizes, strict=True)]
     else:
         rank = [float(one[0]) for one in members]
     return [found[row] for row in np.argsort(np.array(rank), kind="stable")]
