@@ -10,7 +10,7 @@ its points have each label. Both are relative to the support of the component.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -89,6 +89,21 @@ class Attributes:
     def selected(self, rows: Tensor | slice) -> Attributes:
         """Those of some components (J,), in that order."""
         return self._of_rows(lambda value: value[rows])
+
+    def only(self, names: Container[str]) -> Attributes:
+        """The channels with these names."""
+        return Attributes({name: c for name, c in self.channels.items() if name in names})
+
+    def present(self) -> Attributes:
+        """The channels and labels that a component has."""
+        found: dict[str, Channel] = {}
+        for name, c in self.channels.items():
+            if isinstance(c, Labels):
+                used = (c.share > 0).any(0)
+                c = Labels(c.share[:, used], c.labels[used])
+            if bool((c.share > 0).any()):
+                found[name] = c
+        return Attributes(found)
 
     def _of_rows(self, change: Callable[[Tensor], Tensor]) -> Attributes:
         """The attributes with `change` applied to each tensor that has a row for each component."""

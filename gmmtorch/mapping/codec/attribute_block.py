@@ -103,21 +103,44 @@ def encode_attributes(attributes: Attributes, covariances: Tensor) -> bytes:
     return bytes([BLOCK_VERSION]) + writer.to_bytes()
 
 
-def decode_attributes(data: bytes, covariances: Tensor) -> Attributes:
+def rows_of(attributes: Attributes, covariances: Tensor) -> dict[str, Tensor]:
+    """The numbers that are written of each of K components, by channel: (K, n) int64, the share first; those
+    of a component do not depend on the others."""
+    found = {}
+    for name, channel in sorted(attributes.channels.items()):
+        steps = _steps(name, channel, covariances)
+        if isinstance(steps, _NumberSteps):
+            own = torch.cat([steps.deviation, steps.mean, steps.slope.flatten(1)], 1)
+        else:
+            second = torch.where(steps.rest > 0, steps.labels[steps.second], 0)
+            own = torch.stack([steps.labels[steps.first], steps.rest, second], 1)
+        rows = own.new_zeros(len(steps.share), 1 + own.shape[1])
+        rows[:, 0] = steps.share
+        rows[steps.share > 0, 1:] = own
+        found[name] = rows
+    return found
+
+
+def decode_attributes(data: bytes, covariances: Tensor, most: int | None = None) -> Attributes:
     """The attributes of components with these covariances (K, D, D). Raises `DataError` for data that
-    `encode_attributes` did not write for K components."""
+    `encode_attributes` did not write for K components. most: largest number of values in memory."""
     if not data or data[0] != BLOCK_VERSION:
         raise DataError(
             f"The attributes are version {data[0] if data else 'none'}; this gmmtorch reads {BLOCK_VERSION}."
         )
     reader = BitReader(data[1:])
     k, dim = covariances.shape[:2]
+    left = _MOST_SHARES if most is None else most
     found: dict[str, Channel] = {}
     for _ in range(_bounded(reader.number(), "channels", 0, MOST_CHANNELS)):
         name = _read_name(reader)
         width = _bounded(reader.number(), "columns", 0, MOST_COLUMNS)
-        steps = _read_numbers(reader, k, width, dim) if width else _read_labels(reader, k)
+        if width and most is not None:
+            left -= k * (1 + width * (1 + dim + width))
+            _bounded(most - left, "values", 0, most)
+        steps = _read_numbers(reader, k, width, dim) if width else _read_labels(reader, k, left)
         found[name] = _restored(name, steps, covariances)
+        left -= 0 if width or most is None else sum(value.numel() for value in found[name])
     reader.finish()
     try:
         return Attributes(found).checked(k, dim)
@@ -152,9 +175,9 @@ def _read_numbers(reader: BitReader, k: int, width: int, dim: int) -> _NumberSte
     return _NumberSteps(share, deviation, mean, slope)
 
 
-def _read_labels(reader: BitReader, k: int) -> _LabelSteps:
+def _read_labels(reader: BitReader, k: int, most: int) -> _LabelSteps:
     n_labels = _bounded(reader.number(), "labels", 0, LARGEST_LABEL + 1)
-    if k * n_labels > _MOST_SHARES:
+    if k * n_labels > most:
         raise DataError(f"{k} components with {n_labels} labels are too many to read.")
     labels = _column(reader, n_labels, "labels", 0, LARGEST_LABEL)
     share = _column(reader, k, "shares", 0, _SHARES)
