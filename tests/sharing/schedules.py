@@ -47,8 +47,9 @@ class Older(Replica):
 
 @dataclass(frozen=True)
 class Outcome:
-    """converged: all digests are equal; those of older robots among themselves. complete: all robots hold every record that any robot held before the
-    network healed; rounds: exchanges without loss until then; refused: datagrams by reason, of all robots."""
+    """converged: all digests are equal, those of older robots among themselves; complete: all robots hold
+    every record that any robot held before the network healed; rounds: exchanges without loss until then;
+    refused: datagrams by reason, of all robots."""
 
     converged: bool
     complete: bool

@@ -155,8 +155,9 @@ def _with_block(batch: bytes, rng: Random, k: int) -> bytes:
         block.fixed(np.frombuffer(name, np.uint8).astype(np.int64), 8)
         width = _number(block, rng, 3 if name == b"colour" else rng.choice([0, 0, 1, 8]))
         if width:
-            for _ in range(1 + min(max(width, 0), 9) * 4):
-                _column(block, rng, k, 0, 8)
+            data = rng.randbytes(rng.choice([0, 1, 9, 60]))
+            _number(block, rng, len(data))
+            block.fixed(np.frombuffer(data, np.uint8).astype(np.int64), 8)
         else:
             n_labels = _number(block, rng, rng.choice([0, 1, 2, 9, 256, 65536]))
             _column(block, rng, max(n_labels, 0), 0, 30)
