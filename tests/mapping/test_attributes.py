@@ -546,3 +546,20 @@ def test_the_twin_and_the_kernel_agree_about_forged_numbers(data, k, width):
 
     twin, fused = by_both(outcome)
     assert twin == fused
+
+
+def test_a_channel_far_from_zero_is_as_accurate_as_one_near_it(tmp_path):
+    """Times of scans (s since 1970) in a map and its file, beside times since the first scan."""
+    scans = drive(6)
+    found = []
+    for since in (0.0, 1.6e9):
+        made = gt.GaussianMap(FINE)
+        for number, scan in enumerate(scans):
+            times = torch.full((len(scan.points),), since + 0.1 * number, dtype=torch.float64)
+            made.insert(replace(scan, attributes={"time": times}))
+        made.finish()
+        made.save(tmp_path / "map.gmm")
+        loaded = gt.GaussianMap.load(tmp_path / "map.gmm").attributes(scans[0].points)["time"]
+        found.append((loaded.mean - since, loaded.variance.sqrt()))
+    for near, far in zip(*found, strict=True):
+        torch.testing.assert_close(near, far, atol=0.02, rtol=0)

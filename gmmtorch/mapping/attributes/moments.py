@@ -246,9 +246,12 @@ def learned(
     found: dict[str, Channel] = {}
     for name, values in channels.items():
         if values.is_floating_point():
-            sums = _cell_sums(values, cells).index_select(0, kept)
+            values = values.double()
+            middle = values.nanmean(0).nan_to_num()  # sums of squares far from zero lose all digits
+            sums = _cell_sums(values - middle, cells).index_select(0, kept)
             places = cells.features.index_select(0, kept)
-            found[name] = _regression(sums, values.shape[1], places, owner, means, covariances, total)
+            own = _regression(sums, values.shape[1], places, owner, means, covariances, total)
+            found[name] = own._replace(mean=own.mean + middle * (own.share > 0)[:, None])
         else:
             found[name] = _label_shares(values, cells, kept, owner, total)
     return Attributes(found)
