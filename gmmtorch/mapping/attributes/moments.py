@@ -246,10 +246,9 @@ def learned(
     found: dict[str, Channel] = {}
     for name, values in channels.items():
         if values.is_floating_point():
-            values = values.double()
-            middle = values.nanmean(0).nan_to_num()  # sums of squares far from zero lose all digits
-            sums = _cell_sums(values - middle, cells).index_select(0, kept)
+            sums, middle = _cell_sums(values, cells)
             places = cells.features.index_select(0, kept)
+            sums = sums.index_select(0, kept)
             own = _regression(sums, values.shape[1], places, owner, means, covariances, total)
             found[name] = own._replace(mean=own.mean + middle * (own.share > 0)[:, None])
         else:
@@ -262,17 +261,21 @@ def _sums(group: Tensor, n: int, values: Tensor) -> Tensor:
     return torch.bincount(group, values, minlength=n)
 
 
-def _cell_sums(values: Tensor, cells: Cells) -> Tensor:
+def _cell_sums(values: Tensor, cells: Cells) -> tuple[Tensor, Tensor]:
     """Of the values (N, A), NaN where unknown, in each of C cells: their number, sums, and sums of products,
-    (C, 1 + A + A(A+1)/2)."""
+    (C, 1 + A + A(A+1)/2), less one of the values (A,), which is returned: squares far from zero have no
+    digits left for a variance."""
     member, n = cells.member, len(cells.weight)
     columns = list(values.T.double().contiguous())
     known = torch.isfinite(sum(columns))
-    columns = [torch.where(known, column, 0.0) for column in columns]
+    middle = (
+        values[known.byte().argmax()].double().nan_to_num() if len(values) else values.new_zeros(len(columns))
+    )
+    columns = [torch.where(known, column - own, 0.0) for column, own in zip(columns, middle, strict=True)]
     rows, others = triangle_indices(len(columns))
     products = [columns[i] * columns[j] for i, j in zip(rows.tolist(), others.tolist(), strict=True)]
     count = _sums(member, n, known.double())
-    return torch.stack([count, *(_sums(member, n, column) for column in [*columns, *products])], 1)
+    return torch.stack([count, *(_sums(member, n, column) for column in [*columns, *products])], 1), middle
 
 
 def _label_shares(values: Tensor, cells: Cells, kept: Tensor, owner: Tensor, total: Tensor) -> Labels:

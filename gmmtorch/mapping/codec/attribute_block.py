@@ -222,7 +222,8 @@ def _steps(name: str, channel: Channel, covariances: Tensor) -> _NumberSteps | _
     given = channel.mean[rows] @ basis.T
     noise = (basis @ channel.covariance[rows] @ basis.T).diagonal(dim1=1, dim2=2).clamp_min(1e-30).sqrt()
     deviation, mean = _log(noise), given
-    for _ in range(3):  # the second time for the rounded mean, so that rounding again changes nothing
+    # More than once, as the least deviation follows the rounded mean: so rounding again changes nothing.
+    for _ in range(1 if name == COLOUR else 3):
         least = torch.full_like(mean, _LEAST_COLOUR) if name == COLOUR else _LEAST_RELATIVE * mean.abs()
         deviation = torch.where(deviation < _log(least) - 2, _log(least), deviation).clamp_min(-DEVIATIONS)
         mean = (given / _power(deviation) * _MEAN_STEPS).round() * _power(deviation) / _MEAN_STEPS
