@@ -1,15 +1,20 @@
 """Learns the chances with which the codec's slots begin, and writes them into the package.
 
     python scripts/context_chances.py
+    python scripts/context_chances.py --attributes   # those of attributes only
 
 They are learned from simulated worlds only: all datagrams of components of two missions, in tunnels and in a
-warehouse other than those of the benchmarks, and the maps of the synthetic buildings. Takes about 5 minutes.
-New chances need a new version of batches.
+warehouse other than those of the benchmarks, and the maps of the synthetic buildings; those of attributes
+from the buildings with random colours and reflectivities. Takes about 5 minutes. New chances need a new
+version of batches.
 """
 
 from __future__ import annotations
 
 import base64
+import dataclasses
+import math
+import sys
 import textwrap
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
@@ -19,9 +24,11 @@ import torch
 from torch import Tensor
 
 import gmmtorch as gt
-from gmmtorch.kernels import ChanceTables, context_coding
-from gmmtorch.mapping.codec import context_model
+from gmmtorch.kernels import ChanceTables, context_coding, number_coding
+from gmmtorch.mapping.codec import context_model, number_model
+from gmmtorch.mapping.codec.attribute_block import rows_of
 from gmmtorch.mapping.codec.component_batch import coded
+from gmmtorch.mapping.codec.context_chances import CHANCES
 from gmmtorch.mapping.codec.quantization import Quantized, cell_exponent, quantize, spatial_order
 from gmmtorch.team.exploration.mission.options import TeamOptions
 from gmmtorch.team.exploration.mission.trials import assemble
@@ -34,6 +41,9 @@ MEMORY = 1000  # bits of a slot that count while it learns
 MISSIONS = (("tunnels", {}, 7, 200.0), ("warehouse", {"size": (30.0, 30.0, 8.0), "seed": 5}, 3, 250.0))
 MAPS = (("synthetic_building", {}, 0.1), ("synthetic_building", {"sensor": "depth_camera"}, 0.05))
 FLAT = ("synthetic_building_2d", {}, 0.1)
+DATAGRAM = 90  # components
+WIDTH = {"colour": 3, "intensity": 1}
+LIGHTNESS = torch.tensor([[1.0, 1, 1], [1, 0, -1], [1, -2, 1]], dtype=torch.float64)
 TARGET = Path(gt.__file__).parent / "mapping" / "codec" / "context_chances.py"
 
 
@@ -64,43 +74,94 @@ def in_order(components: gt.Components) -> Quantized:
 
 def learned(batches: Iterable[Quantized]) -> Tensor:
     """The chance of each slot in 1/256; 0: unknown."""
-    first = context_model.first_tables()
-    tables = ChanceTables(
+    tables = blank(context_model.first_tables())
+    for values in batches:
+        stream = torch.zeros(256 + 96 * len(values) + 24 * len(values.origins), dtype=torch.uint8)
+        batch = coded(values, cell_exponent(values.places))
+        assert context_coding(batch, tables, stream, writes=True) > 0
+    return found(tables)
+
+
+def blank(first: ChanceTables) -> ChanceTables:
+    return ChanceTables(
         chances=torch.full_like(first.chances, 1 << 15),
         n_coded=torch.zeros_like(first.n_coded),
         rates=torch.tensor([(10 << 16) // (10 * n + 16) for n in range(MEMORY + 1)]),
         first_slot=first.first_slot,
     )
-    for values in batches:
-        stream = torch.zeros(256 + 96 * len(values) + 24 * len(values.origins), dtype=torch.uint8)
-        batch = coded(values, cell_exponent(values.places))
-        assert context_coding(batch, tables, stream, writes=True) > 0
+
+
+def found(tables: ChanceTables) -> Tensor:
     return torch.where(tables.n_coded < FEWEST, 0, (tables.chances >> 8).clamp(1, 255))
 
 
+def painted(scan: gt.Scan, generator: torch.Generator) -> gt.Scan:
+    """The scan with colours whose waves have amplitudes in proportion to their lengths, from 16 m to 0.1 m,
+    as in photographs (Field 1987), and a reflectivity of each surface. With noise."""
+    fixed = torch.Generator().manual_seed(0)
+    points = torch.nn.functional.pad(scan.points.double(), (0, 3 - scan.dim))
+    tone = torch.zeros(len(points), 3, dtype=torch.float64)
+    for octave in range(8):
+        for _ in range(4):
+            direction = torch.nn.functional.normalize(torch.randn(3, generator=fixed).double(), dim=0)
+            phase = points @ direction * (2 * math.pi * 2**octave / 16) + 6.3 * torch.rand(1, generator=fixed)
+            tint = torch.tensor([1.0, 0.3, 0.2]).double() * torch.randn(3, generator=fixed).double()
+            tone += 0.3 * 0.6**octave * phase.sin()[:, None] * tint
+    colour = 0.4 + tone @ LIGHTNESS / math.sqrt(3)
+    noise = torch.randn(len(points), 4, generator=generator).double()
+    cell = (points / 3).floor().long() @ torch.tensor([7, 13, 29])
+    level = 20 + 60 * torch.rand(64, generator=fixed).double()[cell % 64] + 5 * noise[:, 3]
+    channels = {"colour": (colour + 0.02 * noise[:, :3]).clamp(0, 1), "intensity": level}
+    return dataclasses.replace(scan, attributes=channels)
+
+
+def learned_attributes() -> Tensor:
+    """The chances of `number_model`, from parts of maps as large as datagrams."""
+    generator = torch.Generator().manual_seed(1)
+    tables = blank(number_model.first_tables())
+    for name, options, resolution in (FLAT, *MAPS):
+        made = gt.GaussianMap(resolution=resolution)
+        for scan in gt.datasets.load(name, **options):
+            made.insert(painted(scan, generator))
+        c = made.components()
+        c = c.rearranged(spatial_order(c))
+        for channel, rows in rows_of(c.attributes, c.covariances).items():
+            for part in rows.split(DATAGRAM):
+                stream = torch.zeros(64 + 64 * part.numel(), dtype=torch.uint8)
+                width, power = WIDTH[channel], number_model.powers()
+                assert number_coding(part.contiguous(), width, power, tables, stream, writes=True) > 0
+    return found(tables)
+
+
 def map_batch(name: str, options: dict, resolution: float) -> Quantized:
-    found = gt.GaussianMap(resolution=resolution)
+    made = gt.GaussianMap(resolution=resolution)
     for scan in gt.datasets.load(name, **options):
-        found.insert(scan)
-    return in_order(found.components())
+        made.insert(scan)
+    return in_order(made.components())
 
 
 def main() -> None:
+    if "--attributes" in sys.argv:
+        save(CHANCES, packed(learned_attributes()))
+        return
     batches = [map_batch(*FLAT), *(map_batch(*one) for one in MAPS)]
     for one in MISSIONS:
         batches += mission_batches(*one)
-    save(learned(batches))
+    save(packed(learned(batches)), packed(learned_attributes()))
 
 
-def save(chances: Tensor) -> None:
+def packed(chances: Tensor) -> str:
     text = base64.b85encode(zlib.compress(bytes(chances.tolist()), 9)).decode()
     assert not set(text) & set('"\\')
-    rows = "\n".join(textwrap.wrap(text, 100))
+    return "\n" + "\n".join(textwrap.wrap(text, 100)) + "\n"
+
+
+def save(batches: str, attributes: str) -> None:
     TARGET.write_text(
-        '"""The chances with which the slots of `context_model` begin, learned from simulated worlds;\n'
-        "written by scripts/context_chances.py. A byte for each slot: the probability of a 0 in 1/256; 0:\n"
-        'unknown."""\n\n'
-        f'CHANCES = """\n{rows}\n"""\n',
+        '"""The chances with which the slots of `context_model` and `number_model` begin, learned from\n'
+        "simulated worlds; written by scripts/context_chances.py. A byte for each slot: the probability of\n"
+        'a 0 in 1/256; 0: unknown."""\n\n'
+        f'CHANCES = """{batches}"""\nOF_ATTRIBUTES = """{attributes}"""\n',
         encoding="utf-8",
     )
 

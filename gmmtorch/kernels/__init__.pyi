@@ -8,6 +8,7 @@ from .chunks import memory_error as memory_error
 from .codes.context_coding import ChanceTables as ChanceTables
 from .codes.context_coding import CodedBatch as CodedBatch
 from .codes.context_coding import context_coding as context_coding
+from .codes.number_coding import number_coding as number_coding
 from .evidence.beam_passes import PassLimits as PassLimits
 from .evidence.beam_passes import beam_passes as beam_passes
 from .evidence.grid_flux import add_cell_mass as add_cell_mass

@@ -257,7 +257,8 @@ class MapViewer:
         components, occupancy, place = self._folders
         with components:
             self._shape = gui.add_dropdown("shape", viewer_scene.SHAPES, initial_value=shape)
-            self._colour = gui.add_dropdown("colour", (*viewer_scene.COLOURS, colour), initial_value=colour)
+            known = dict.fromkeys((*viewer_scene.COLOURS, colour))  # each once, or the page stays blank
+            self._colour = gui.add_dropdown("colour", tuple(known), initial_value=colour)
             self._legend = gui.add_html("")
             self._cut = gui.add_slider("hide above [m]", 0.0, 1.0, 0.05, 1.0)
             self._unsure = gui.add_slider("hide least certain [%]", 0, 100, 1, 0)

@@ -1,7 +1,9 @@
 from .attributes.answers import Prediction as Prediction
 from .attributes.moments import Attributes as Attributes
+from .attributes.moments import Channel as Channel
 from .attributes.moments import Labels as Labels
 from .attributes.moments import Numbers as Numbers
+from .codec.attribute_block import rows_of as rows_of
 from .codec.bitstream import BitReader as BitReader
 from .codec.bitstream import BitWriter as BitWriter
 from .codec.bitstream import Ints as Ints
@@ -10,6 +12,8 @@ from .codec.bitstream import zigzag as zigzag
 from .codec.component_batch import decode as decode
 from .codec.component_batch import encode as encode
 from .codec.component_batch import encode_quantized as encode_quantized
+from .codec.component_batch import fits as fits
+from .codec.component_batch import has_channels as has_channels
 from .codec.component_batch import ids_of_batch as ids_of_batch
 from .codec.lattice import LARGEST_VARIANCE as LARGEST_VARIANCE
 from .codec.lattice import scaled as scaled

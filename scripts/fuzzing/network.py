@@ -22,7 +22,7 @@ import gmmtorch as gt
 
 def sharing(scans: list[Any]) -> dict[str, Target]:
     """Datagrams and frames of teams, codes of points, and stores."""
-    from sharing.message_examples import examples
+    from sharing.message_examples import channel_examples, examples
     from sharing.structured_bodies import structured
 
     from gmmtorch.team.sharing import POINT_CODECS, Replica, Store, TeamKey, ViewLibrary, ViewsMessage, decode
@@ -36,7 +36,7 @@ def sharing(scans: list[Any]) -> dict[str, Target]:
         built.insert(scan)
     built.finish()
     replica.add(built.components())
-    packets = [*replica.datagrams(1_200)[:8], *examples()]
+    packets = [*replica.datagrams(1_200)[:8], *examples(), *channel_examples()]
     listeners: dict[str, Any] = {}
 
     def receive(data: bytes) -> None:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from hypothesis import strategies as st
 from torch import Tensor
 
+from gmmtorch.mapping.attributes.moments import Attributes, Labels, Numbers
 from gmmtorch.mapping.components import Components
 
 
@@ -58,6 +61,34 @@ def random_components(
         seen_from=seen_from,
         seen_count=weight * (support / total)[seen_by],
     )
+
+
+def painted(components: Components, seed: int = 0, n_labels: int = 3) -> Components:
+    """The components with a colour, an intensity of some of them, and a class."""
+    generator = torch.Generator().manual_seed(seed)
+    k, dim = components.means.shape
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    def numbers(share: Tensor, width: int, scale: float) -> Numbers:
+        noise = scale * (uniform(k, width, width) - 0.5)
+        covariance = noise @ noise.mT + 1e-4 * scale**2 * torch.eye(width, dtype=torch.float64)
+        parts = (uniform(k, width), uniform(k, width, dim) - 0.5, covariance)
+        has = (share > 0).double()
+        return Numbers(
+            share,
+            *(scale * p * has.view(-1, *[1] * (p.ndim - 1)) for p in parts[:2]),
+            parts[2] * has[:, None, None],
+        )
+
+    classes = torch.softmax(8 * uniform(k, n_labels), 1)
+    channels = {
+        "colour": numbers(0.1 + 0.9 * uniform(k), 3, 1.0),
+        "intensity": numbers(uniform(k) * (uniform(k) < 0.6), 1, 200.0),
+        "class": Labels(classes * uniform(k)[:, None], 5 * torch.arange(n_labels)),
+    }
+    return replace(components, attributes=Attributes(channels)).checked()
 
 
 def normal_components(

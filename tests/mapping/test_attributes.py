@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given
+from kernels.twins import by_both
 from mapping.map_cases import FINE, assert_same_components, drive, some_motion
 from scipy.stats import multivariate_normal
 from torch import Tensor
@@ -20,6 +21,7 @@ from gmmtorch.files import read_tensors
 from gmmtorch.mapping.attributes import moments
 from gmmtorch.mapping.attributes.answers import predictions
 from gmmtorch.mapping.attributes.moments import Attributes, Labels, Numbers
+from gmmtorch.mapping.codec import number_model
 from gmmtorch.mapping.codec.attribute_block import decode_attributes, encode_attributes
 from gmmtorch.mapping.codec.bitstream import BitWriter
 from gmmtorch.mapping.codec.quantization import quantized
@@ -513,3 +515,51 @@ def test_channels_follow_their_points():
 def test_display_colours_invert_linear_ones(value):
     given = torch.tensor([value], dtype=torch.float64)
     torch.testing.assert_close(linear_colours(display_colours(given)), given, rtol=1e-6, atol=1e-6)
+
+
+@given(
+    dim=st.sampled_from([2, 3]), width=st.integers(1, 8), k=st.integers(0, 20), seed=st.integers(0, 10**6),
+    most=st.sampled_from([0, 1, 5, 1000, number_model.MOST_STEPS]),
+)  # fmt: skip
+def test_the_twin_writes_and_reads_the_numbers_of_the_kernel(dim, width, k, seed, most):
+    rng = np.random.default_rng(seed)
+    own = [rng.integers(-80, 81, (k, width)), rng.integers(-most, most + 1, (k, width * dim))]
+    rows = torch.from_numpy(np.concatenate([rng.integers(0, 9, (k, 1)), *own], 1))
+    rows[rows[:, 0] == 0] = 0
+    twin, fused = by_both(lambda: number_model.write_rows(rows, width))
+    assert twin == fused
+    for found in by_both(lambda: number_model.read_rows(fused, k, rows.shape[1], width)):
+        assert torch.equal(found, rows)
+
+
+@given(
+    data=st.binary(max_size=60),
+    k=st.integers(0, 30),
+    width=st.integers(1, 3),
+)
+def test_the_twin_and_the_kernel_agree_about_forged_numbers(data, k, width):
+    def outcome() -> list[list[int]] | None:
+        try:
+            return number_model.read_rows(data, k, 1 + 4 * width, width).tolist()
+        except DataError:
+            return None
+
+    twin, fused = by_both(outcome)
+    assert twin == fused
+
+
+def test_a_channel_far_from_zero_is_as_accurate_as_one_near_it(tmp_path):
+    """Times of scans (s since 1970) in a map and its file, beside times since the first scan."""
+    scans = drive(6)
+    found = []
+    for since in (0.0, 1.6e9):
+        made = gt.GaussianMap(FINE)
+        for number, scan in enumerate(scans):
+            times = torch.full((len(scan.points),), since + 0.1 * number, dtype=torch.float64)
+            made.insert(replace(scan, attributes={"time": times}))
+        made.finish()
+        made.save(tmp_path / "map.gmm")
+        loaded = gt.GaussianMap.load(tmp_path / "map.gmm").attributes(scans[0].points)["time"]
+        found.append((loaded.mean - since, loaded.variance.sqrt()))
+    for near, far in zip(*found, strict=True):
+        torch.testing.assert_close(near, far, atol=0.02, rtol=0)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import strategies as st
-from mapping.random_components import random_components
+from mapping.random_components import painted, random_components
 
 from gmmtorch.mapping.codec.quantization import spatial_order
 from gmmtorch.mapping.components import Components
@@ -34,7 +34,7 @@ from gmmtorch.team.sharing.messages.record_messages import (
     encode_announcements,
     encode_record,
 )
-from gmmtorch.team.sharing.replica.record_keys import Intervals, first_key
+from gmmtorch.team.sharing.replica.record_keys import CHANNELS, Intervals, first_key
 
 codecs = pytest.mark.parametrize("codec", CODECS)
 numbers = st.integers(0, 300) | st.integers(0, (1 << 60) - 1)
@@ -90,6 +90,13 @@ def records() -> list[RecordMessage]:
         CorrectionMessage(first_key(2, 9), 3, 1, span(2, 4, 6), pose_of(torch.eye(4))),
         FrameMessage(first_key(2, 9) + 1, 2 << 24 | 9, 2, 1 << 24 | 5, pose_of(torch.eye(3))),
     ]
+
+
+def channel_examples() -> list[bytes]:
+    """Valid datagrams of components with channels, and of an announcement of channels."""
+    components = painted(frame_of_components(9), 1)
+    held = span(0, 0, 70).shifted(CHANNELS)
+    return [*encode_components(components), *encode_announcements(1, 2, held, lowest=CHANNELS)]
 
 
 def examples() -> list[bytes]:

@@ -10,13 +10,17 @@ from __future__ import annotations
 
 import random
 from dataclasses import dataclass, field
+from typing import Any
 from unittest import mock
 
 import torch
-from mapping.random_components import random_components
+from mapping.random_components import painted, random_components
 from torch import Tensor
 
+from gmmtorch.mapping.codec.component_batch import has_channels
 from gmmtorch.mapping.components import Components
+from gmmtorch.team.sharing.messages.message_registry import Message, decode
+from gmmtorch.team.sharing.messages.record_messages import AnnouncementMessage
 from gmmtorch.team.sharing.replica import authorship
 from gmmtorch.team.sharing.replica.record_keys import Intervals
 from gmmtorch.team.sharing.replica.replica import Replica
@@ -27,10 +31,25 @@ _LONGEST_DELAY = 6  # steps; so datagrams overtake one another
 _SNAPSHOT_EVERY = 5
 
 
+class Older(Replica):
+    """A robot of a version that knows no channels: it refuses what it does not know."""
+
+    def __init__(self, robot: int, **options: Any) -> None:
+        super().__init__(robot, channels=(), **options)
+
+    def receive(self, datagram: bytes, message: Message | None = None) -> bool:
+        if datagram[:1] == b"\x11" and has_channels(datagram[1:]):
+            return False
+        found = decode(datagram)
+        is_foreign = isinstance(found, AnnouncementMessage) and found.begin < 0
+        return not is_foreign and super().receive(datagram, message)
+
+
 @dataclass(frozen=True)
 class Outcome:
-    """converged: all digests are equal; complete: all robots hold every record that any robot held before the
-    network healed; rounds: exchanges without loss until then; refused: datagrams by reason, of all robots."""
+    """converged: all digests are equal, those of older robots among themselves; complete: all robots hold
+    every record that any robot held before the network healed; rounds: exchanges without loss until then;
+    refused: datagrams by reason, of all robots."""
 
     converged: bool
     complete: bool
@@ -74,7 +93,7 @@ class _Team:
         """A new process with an old snapshot of its disk or without records."""
         self.crashes += 1
         self.note_refused(robot)
-        self.replicas[robot] = Replica(robot, incarnation=self.rng.getrandbits(24))
+        self.replicas[robot] = type(self.replicas[robot])(robot, incarnation=self.rng.getrandbits(24))
         if keeps_disk and robot in self.snapshots:
             assert self.replicas[robot].load(*self.snapshots[robot]) == 0
 
@@ -87,15 +106,20 @@ def components(rng: random.Random, n: int) -> Components:
     return random_components(3, k=n, seed=rng.getrandbits(31), extent=8.0)
 
 
-def act(rng: random.Random, replica: Replica) -> None:
-    """A random change of the map of a robot: add, supersede, count or correct."""
+def act(rng: random.Random, replica: Replica, paints: bool = False) -> None:
+    """A random change of the map of a robot: add, supersede, count or correct. paints: with attributes."""
+
+    def new(n: int) -> Components:
+        made = components(rng, n)
+        return painted(made, rng.getrandbits(31)) if paints and rng.random() < 0.8 else made
+
     known = replica.components().ids
     own = known[known[:, 0] == replica.robot]
     kind = rng.choice(["add", "add", "supersede", "supersede", "count", "count", "correct"])
     if kind == "add":
-        replica.add(components(rng, rng.randint(1, 5)))
+        replica.add(new(rng.randint(1, 5)))
     elif kind == "supersede" and len(own):
-        replica.add(components(rng, rng.randint(0, 2)), supersedes=_some(rng, own))
+        replica.add(new(rng.randint(0, 2)), supersedes=_some(rng, own))
     elif kind == "count" and len(known):
         replica.count({tuple(row): rng.uniform(0.5, 500.0) for row in _some(rng, known).tolist()})
     elif kind == "correct" and len(own):
@@ -108,24 +132,28 @@ def _some(rng: random.Random, rows: Tensor) -> Tensor:
     return rows[sorted(rng.sample(range(len(rows)), rng.randint(1, min(4, len(rows)))))]
 
 
-def run_schedule(seed: int, n_robots: int = 3, n_steps: int = 40) -> Outcome:
-    """A team with network trouble for `n_steps`, then without.
+def run_schedule(
+    seed: int, n_robots: int = 3, n_steps: int = 40, painters: int = 0, older: int = 0
+) -> Outcome:
+    """A team with network trouble for `n_steps`, then without. The first robots, `painters`, have components
+    with attributes; the last ones, `older`, know no channels.
 
     With odd seeds robots compact their records as soon as possible, which otherwise takes long missions.
     """
     tidy = {"_MOST_SUPERSESSIONS": 1, "_MOST_OUTDATED": 1} if seed % 2 else {"_MOST_SUPERSESSIONS": 32}
     with mock.patch.multiple(authorship, **tidy):
-        return _run(random.Random(seed), n_robots, n_steps)
+        return _run(random.Random(seed), n_robots, n_steps, painters, older)
 
 
-def _run(rng: random.Random, n_robots: int, n_steps: int) -> Outcome:
-    replicas = [Replica(robot, incarnation=rng.getrandbits(24)) for robot in range(n_robots)]
+def _run(rng: random.Random, n_robots: int, n_steps: int, painters: int, older: int) -> Outcome:
+    kinds = [Replica] * (n_robots - older) + [Older] * older
+    replicas = [kind(robot, incarnation=rng.getrandbits(24)) for robot, kind in enumerate(kinds)]
     team = _Team(rng, replicas, loss=rng.choice([0.0, 0.1, 0.3, 0.5]), repeats=rng.choice([0.0, 0.3]))
     for team.now in range(n_steps):
         _trouble(team)
         for robot, replica in enumerate(team.replicas):
             if rng.random() < 0.3:
-                act(rng, replica)
+                act(rng, replica, robot < painters)
             if rng.random() < 0.3:
                 team.broadcast(robot, replica.announcements())
             if rng.random() < 0.7:
@@ -169,4 +197,7 @@ def _heal(team: _Team) -> int:
 
 
 def _agree(replicas: list[Replica]) -> bool:
-    return len({replica.digest() for replica in replicas}) == 1
+    return all(
+        len({replica.digest() for replica in replicas if type(replica) is kind}) < 2
+        for kind in (Replica, Older)
+    ) and all(replica.held == replicas[0].held for replica in replicas)

@@ -130,6 +130,8 @@ def _batch(rng: Random) -> bytes:
         values = _many(values, rng.choice([200, 1024, 1025, 3000]))
     for _ in range(rng.choice([0, 1, 1, 2])):
         values = _altered(values, rng)
+    if rng.random() < 0.4:
+        return _with_block(encode_quantized(made), rng, len(made))
     try:
         with np.errstate(invalid="raise"):
             batch = encode_quantized(values)
@@ -139,6 +141,29 @@ def _batch(rng: Random) -> bytes:
     if rng.random() < 0.2:
         body[rng.randrange(1, min(len(body), 12))] = rng.choice([0, 1, 2, 4, 126, 128, 254, 255])
     return bytes(body)
+
+
+def _with_block(batch: bytes, rng: Random, k: int) -> bytes:
+    """A batch of k components with channels: names, columns, shares, labels and numbers of any size."""
+    size, block = BitWriter(), BitWriter()
+    _number(size, rng, len(batch) - 4)
+    n_channels = rng.randint(0, 3)
+    _number(block, rng, n_channels)
+    for _ in range(n_channels):
+        name = rng.choice([b"colour", b"class", b"x", b"\xff", b"x" * 64])
+        _number(block, rng, len(name))
+        block.fixed(np.frombuffer(name, np.uint8).astype(np.int64), 8)
+        width = _number(block, rng, 3 if name == b"colour" else rng.choice([0, 0, 1, 8]))
+        if width:
+            data = rng.randbytes(rng.choice([0, 1, 9, 60]))
+            _number(block, rng, len(data))
+            block.fixed(np.frombuffer(data, np.uint8).astype(np.int64), 8)
+        else:
+            n_labels = _number(block, rng, rng.choice([0, 1, 2, 9, 256, 65536]))
+            _column(block, rng, max(n_labels, 0), 0, 30)
+            for _ in range(4):
+                _column(block, rng, k, 0, 3)
+    return b"\3" + size.to_bytes() + batch[:-4] + b"\1" + block.to_bytes()
 
 
 @functools.cache

@@ -15,7 +15,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapping.random_components import random_components
-from sharing.message_examples import examples, forged, sealed
+from sharing.message_examples import channel_examples, examples, forged, sealed
 from sharing.structured_bodies import structured
 
 from gmmtorch.errors import DataError
@@ -73,7 +73,7 @@ def test_every_kind_decodes_to_its_message(sound):
 
 
 def test_every_damage_of_a_datagram_is_detected(sound):
-    for datagram in sound:
+    for datagram in [*sound, *channel_examples()]:
         for length in range(len(datagram)):
             with pytest.raises(DataError):
                 decode(datagram[:length])
@@ -116,6 +116,7 @@ def assert_sound(message: Message) -> None:
         assert float(c.covariances.abs().max()) <= LARGEST_VARIANCE
         assert float(c.support.max()) <= MOST_POINTS
         assert 0 <= int(c.ids.min()) <= int(c.ids.max()) < 1 << 60
+        assert sum(value.numel() for value in c.attributes.tensors().values()) <= 1 << 17
     if isinstance(message, CountsMessage):
         assert all(0 <= count <= 2.0**40 for count in message.counts.values())
     for places in places_of(message):

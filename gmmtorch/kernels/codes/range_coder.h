@@ -1,5 +1,5 @@
-// An adaptive binary range coder (Martin 1979), which writes or reads. The twin is `_RangeCoder` in
-// mapping/codec/context_model.py.
+// An adaptive binary range coder (Martin 1979), which writes or reads. The twin is `RangeCoder` in
+// mapping/codec/range_coder.py.
 #pragma once
 
 #include "../device.h"

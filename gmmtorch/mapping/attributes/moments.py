@@ -10,7 +10,7 @@ its points have each label. Both are relative to the support of the component.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -89,6 +89,21 @@ class Attributes:
     def selected(self, rows: Tensor | slice) -> Attributes:
         """Those of some components (J,), in that order."""
         return self._of_rows(lambda value: value[rows])
+
+    def only(self, names: Container[str]) -> Attributes:
+        """The channels with these names."""
+        return Attributes({name: c for name, c in self.channels.items() if name in names})
+
+    def present(self) -> Attributes:
+        """The channels and labels that a component has."""
+        found: dict[str, Channel] = {}
+        for name, c in self.channels.items():
+            if isinstance(c, Labels):
+                used = (c.share > 0).any(0)
+                c = Labels(c.share[:, used], c.labels[used])
+            if bool((c.share > 0).any()):
+                found[name] = c
+        return Attributes(found)
 
     def _of_rows(self, change: Callable[[Tensor], Tensor]) -> Attributes:
         """The attributes with `change` applied to each tensor that has a row for each component."""
@@ -231,9 +246,11 @@ def learned(
     found: dict[str, Channel] = {}
     for name, values in channels.items():
         if values.is_floating_point():
-            sums = _cell_sums(values, cells).index_select(0, kept)
+            sums, middle = _cell_sums(values, cells)
             places = cells.features.index_select(0, kept)
-            found[name] = _regression(sums, values.shape[1], places, owner, means, covariances, total)
+            sums = sums.index_select(0, kept)
+            own = _regression(sums, values.shape[1], places, owner, means, covariances, total)
+            found[name] = own._replace(mean=own.mean + middle * (own.share > 0)[:, None])
         else:
             found[name] = _label_shares(values, cells, kept, owner, total)
     return Attributes(found)
@@ -244,17 +261,21 @@ def _sums(group: Tensor, n: int, values: Tensor) -> Tensor:
     return torch.bincount(group, values, minlength=n)
 
 
-def _cell_sums(values: Tensor, cells: Cells) -> Tensor:
+def _cell_sums(values: Tensor, cells: Cells) -> tuple[Tensor, Tensor]:
     """Of the values (N, A), NaN where unknown, in each of C cells: their number, sums, and sums of products,
-    (C, 1 + A + A(A+1)/2)."""
+    (C, 1 + A + A(A+1)/2), less one of the values (A,), which is returned: squares far from zero have no
+    digits left for a variance."""
     member, n = cells.member, len(cells.weight)
     columns = list(values.T.double().contiguous())
     known = torch.isfinite(sum(columns))
-    columns = [torch.where(known, column, 0.0) for column in columns]
+    middle = (
+        values[known.byte().argmax()].double().nan_to_num() if len(values) else values.new_zeros(len(columns))
+    )
+    columns = [torch.where(known, column - own, 0.0) for column, own in zip(columns, middle, strict=True)]
     rows, others = triangle_indices(len(columns))
     products = [columns[i] * columns[j] for i, j in zip(rows.tolist(), others.tolist(), strict=True)]
     count = _sums(member, n, known.double())
-    return torch.stack([count, *(_sums(member, n, column) for column in [*columns, *products])], 1)
+    return torch.stack([count, *(_sums(member, n, column) for column in [*columns, *products])], 1), middle
 
 
 def _label_shares(values: Tensor, cells: Cells, kept: Tensor, owner: Tensor, total: Tensor) -> Labels:

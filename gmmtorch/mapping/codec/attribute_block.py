@@ -18,16 +18,14 @@ from torch import Tensor
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
 from gmmtorch.mapping.attributes.moments import Attributes, Channel, Labels, Numbers
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, within
+from gmmtorch.mapping.codec.number_model import DEVIATIONS, MOST_STEPS, WHOLE, read_rows, write_rows
 from gmmtorch.scan import COLOUR, LARGEST_LABEL, LONGEST_NAME, MOST_CHANNELS, MOST_COLUMNS
 
 BLOCK_VERSION = 1
 _MEAN_STEPS, _SLOPE_STEPS = 2.0, 1.0  # in a deviation
-_SHARES = 8
 _MOST_REST = 3  # eighths of the second label
-_DEVIATIONS = -80, 80  # least and largest, in powers of √2
 _LEAST_COLOUR = 2.0**-8  # deviation
-_LEAST_RELATIVE = 2.0**-8  # deviation of other numbers, relative to the mean
-_MOST_STEPS = 1 << 40
+_LEAST_RELATIVE = 2.0**-36  # deviation of other numbers, relative to the mean
 _MOST_SHARES = 1 << 28  # of labels in components, 2 GiB in memory
 _LIGHTNESS = torch.tensor([[1.0, 1.0, 1.0], [1.0, 0.0, -1.0], [1.0, -2.0, 1.0]], dtype=torch.float64)
 _LIGHTNESS = _LIGHTNESS / _LIGHTNESS.norm(dim=1, keepdim=True)
@@ -41,6 +39,11 @@ class _NumberSteps(NamedTuple):
     deviation: Tensor
     mean: Tensor
     slope: Tensor
+
+    def rows(self) -> Tensor:
+        """(K, n), as `number_model` codes them."""
+        own = torch.cat([self.deviation, self.mean, self.slope.flatten(1)], 1)
+        return _spread(self.share, own)
 
 
 class _LabelSteps(NamedTuple):
@@ -82,11 +85,10 @@ def encode_attributes(attributes: Attributes, covariances: Tensor) -> bytes:
         _write_name(writer, name)
         steps = _steps(name, channel, covariances)
         if isinstance(steps, _NumberSteps):
+            data = write_rows(steps.rows(), steps.mean.shape[1])
             writer.number(steps.mean.shape[1])
-            writer.column(steps.share.numpy())
-            for values in (steps.deviation, steps.mean, steps.slope.flatten(1)):
-                for column in values.T:
-                    writer.column(column.contiguous().numpy())
+            writer.number(len(data))
+            writer.fixed(np.frombuffer(data, np.uint8).astype(np.int64), 8)
         else:
             if channel.share.numel() > _MOST_SHARES:
                 raise InvalidArgumentError(
@@ -103,21 +105,49 @@ def encode_attributes(attributes: Attributes, covariances: Tensor) -> bytes:
     return bytes([BLOCK_VERSION]) + writer.to_bytes()
 
 
-def decode_attributes(data: bytes, covariances: Tensor) -> Attributes:
+def rows_of(attributes: Attributes, covariances: Tensor) -> dict[str, Tensor]:
+    """The numbers that are written of each of K components, by channel: (K, n) int64, the share first; those
+    of a component do not depend on the others."""
+    found = {}
+    for name, channel in sorted(attributes.channels.items()):
+        steps = _steps(name, channel, covariances)
+        if isinstance(steps, _NumberSteps):
+            found[name] = steps.rows()
+        else:
+            second = torch.where(steps.rest > 0, steps.labels[steps.second], 0)
+            own = torch.stack([steps.labels[steps.first], steps.rest, second], 1)
+            found[name] = _spread(steps.share, own)
+    return found
+
+
+def _spread(share: Tensor, own: Tensor) -> Tensor:
+    """Rows (K, 1 + n): the share (K,), and the numbers (J, n) of the components that have one."""
+    rows = own.new_zeros(len(share), 1 + own.shape[1])
+    rows[:, 0] = share
+    rows[share > 0, 1:] = own
+    return rows
+
+
+def decode_attributes(data: bytes, covariances: Tensor, most: int | None = None) -> Attributes:
     """The attributes of components with these covariances (K, D, D). Raises `DataError` for data that
-    `encode_attributes` did not write for K components."""
+    `encode_attributes` did not write for K components. most: largest number of values in memory."""
     if not data or data[0] != BLOCK_VERSION:
         raise DataError(
             f"The attributes are version {data[0] if data else 'none'}; this gmmtorch reads {BLOCK_VERSION}."
         )
     reader = BitReader(data[1:])
     k, dim = covariances.shape[:2]
+    left = _MOST_SHARES if most is None else most
     found: dict[str, Channel] = {}
     for _ in range(_bounded(reader.number(), "channels", 0, MOST_CHANNELS)):
         name = _read_name(reader)
         width = _bounded(reader.number(), "columns", 0, MOST_COLUMNS)
-        steps = _read_numbers(reader, k, width, dim) if width else _read_labels(reader, k)
+        if width and most is not None:
+            left -= k * (1 + width * (1 + dim + width))
+            _bounded(most - left, "values", 0, most)
+        steps = _read_numbers(reader, k, width, dim) if width else _read_labels(reader, k, left)
         found[name] = _restored(name, steps, covariances)
+        left -= 0 if width or most is None else sum(value.numel() for value in found[name])
     reader.finish()
     try:
         return Attributes(found).checked(k, dim)
@@ -139,25 +169,20 @@ def _read_name(reader: BitReader) -> str:
 
 
 def _read_numbers(reader: BitReader, k: int, width: int, dim: int) -> _NumberSteps:
-    share = _column(reader, k, "shares", 0, _SHARES)
-    n = int((share > 0).sum())
-
-    def table(columns: int, name: str, least: int, largest: int) -> Tensor:
-        found = [_column(reader, n, name, least, largest) for _ in range(columns)]
-        return torch.stack(found, 1) if found else torch.zeros(n, 0, dtype=torch.int64)
-
-    deviation = table(width, "deviations", *_DEVIATIONS)
-    mean = table(width, "means", -_MOST_STEPS, _MOST_STEPS)
-    slope = table(width * (dim - 1), "slopes", -_MOST_STEPS, _MOST_STEPS).view(n, width, dim - 1)
-    return _NumberSteps(share, deviation, mean, slope)
+    n_bytes = _bounded(reader.number(), "bytes", 0, reader.left // 8)
+    data = reader.fixed(n_bytes, 8).astype(np.uint8).tobytes()
+    rows = read_rows(data, k, 1 + width * (dim + 1), width)
+    own = rows[rows[:, 0] > 0, 1:]
+    deviation, mean, slope = own.split([width, width, width * (dim - 1)], 1)
+    return _NumberSteps(rows[:, 0], deviation, mean, slope.reshape(len(own), width, dim - 1))
 
 
-def _read_labels(reader: BitReader, k: int) -> _LabelSteps:
+def _read_labels(reader: BitReader, k: int, most: int) -> _LabelSteps:
     n_labels = _bounded(reader.number(), "labels", 0, LARGEST_LABEL + 1)
-    if k * n_labels > _MOST_SHARES:
+    if k * n_labels > most:
         raise DataError(f"{k} components with {n_labels} labels are too many to read.")
     labels = _column(reader, n_labels, "labels", 0, LARGEST_LABEL)
-    share = _column(reader, k, "shares", 0, _SHARES)
+    share = _column(reader, k, "shares", 0, WHOLE)
     n = int((share > 0).sum())
     if n and not n_labels:
         raise DataError("Components have labels, but there are none: the attributes are damaged.")
@@ -197,25 +222,24 @@ def _steps(name: str, channel: Channel, covariances: Tensor) -> _NumberSteps | _
     given = channel.mean[rows] @ basis.T
     noise = (basis @ channel.covariance[rows] @ basis.T).diagonal(dim1=1, dim2=2).clamp_min(1e-30).sqrt()
     deviation, mean = _log(noise), given
-    for _ in range(3):  # the second time for the rounded mean, so that rounding again changes nothing
+    # More than once, as the least deviation follows the rounded mean: so rounding again changes nothing.
+    for _ in range(1 if name == COLOUR else 3):
         least = torch.full_like(mean, _LEAST_COLOUR) if name == COLOUR else _LEAST_RELATIVE * mean.abs()
-        deviation = torch.where(deviation < _log(least) - 2, _log(least), deviation).clamp_min(_DEVIATIONS[0])
+        deviation = torch.where(deviation < _log(least) - 2, _log(least), deviation).clamp_min(-DEVIATIONS)
         mean = (given / _power(deviation) * _MEAN_STEPS).round() * _power(deviation) / _MEAN_STEPS
-    if bool((deviation > _DEVIATIONS[1]).any()):
+    if bool((deviation > DEVIATIONS).any()):
         raise InvalidArgumentError(
             f"attributes {name!r} reach {float(given.abs().max()):g}, too large to be stored."
         )
     unit = _power(deviation)
     along = (basis @ channel.slope[rows]) @ _factors(covariances[rows])[:, :, :-1]
     steps = (given / unit * _MEAN_STEPS).round(), (along / unit[:, :, None] * _SLOPE_STEPS).round()
-    return _NumberSteps(
-        share, deviation, *(values.clamp(-_MOST_STEPS, _MOST_STEPS).long() for values in steps)
-    )
+    return _NumberSteps(share, deviation, *(values.clamp(-MOST_STEPS, MOST_STEPS).long() for values in steps))
 
 
 def _share_steps(share: Tensor) -> Tensor:
     """Shares (K,) in eighths; 0 only for none."""
-    return torch.where(share > 0, (share * _SHARES).round().long().clamp(1, _SHARES), 0)
+    return torch.where(share > 0, (share * WHOLE).round().long().clamp(1, WHOLE), 0)
 
 
 def _log(noise: Tensor) -> Tensor:
@@ -233,15 +257,15 @@ def _label_steps(channel: Labels) -> _LabelSteps:
         return _LabelSteps(share, first, second, torch.zeros_like(first), channel.labels)
     (largest, next_one), (first, second) = (part.unbind(1) for part in own.topk(2, 1))
     pair = next_one / (largest + next_one)
-    rest = (pair * _SHARES).round().long().clamp(0, _MOST_REST)
+    rest = (pair * WHOLE).round().long().clamp(0, _MOST_REST)
     return _LabelSteps(share, first, second, rest, channel.labels)
 
 
 def _restored(name: str, steps: _NumberSteps | _LabelSteps, covariances: Tensor) -> Channel:
     k, dim = covariances.shape[:2]
-    share, rows = steps.share.double() / _SHARES, (steps.share > 0).nonzero().squeeze(1)
+    share, rows = steps.share.double() / WHOLE, (steps.share > 0).nonzero().squeeze(1)
     if isinstance(steps, _LabelSteps):
-        rest = steps.rest.double() / _SHARES
+        rest = steps.rest.double() / WHOLE
         table = share.new_zeros(k, len(steps.labels))
         table.index_put_((rows, steps.second), share[rows] * rest, accumulate=True)
         table.index_put_((rows, steps.first), share[rows] * (1 - rest), accumulate=True)

@@ -6,7 +6,8 @@ in every batch: `decode(encode(c))` is `quantized(c)`, and encoding decoded comp
 changes nothing.
 
 A batch is its sizes, and one code of all values (`context_model`), in which neighbours predict one another.
-Components in `spatial_order` take the fewest bytes.
+Components in `spatial_order` take the fewest bytes. A batch with channels ends with the block of their
+attributes (`attribute_block`).
 
 A map file is a safetensors container, about 200 bytes, with a batch and the settings of the map that differ
 from the defaults of the file format. No pickle.
@@ -33,7 +34,7 @@ from gmmtorch.errors import (
 from gmmtorch.files import pack_tensors, read_tensors, require, unpack_tensors
 from gmmtorch.kernels import CodedBatch
 from gmmtorch.mapping.attributes.moments import Attributes
-from gmmtorch.mapping.codec.attribute_block import decode_attributes, encode_attributes, rounded
+from gmmtorch.mapping.codec.attribute_block import decode_attributes, encode_attributes
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter
 from gmmtorch.mapping.codec.context_model import read_batch, write_batch
 from gmmtorch.mapping.codec.first_version import read_first
@@ -56,19 +57,38 @@ from gmmtorch.mapping.query_options import QueryOptions, check_method
 from gmmtorch.occupancy import Calibration
 from gmmtorch.scan import FARTHEST
 
-FIRST_VERSION, BATCH_VERSION = 1, 2
+FIRST_VERSION, BATCH_VERSION, CHANNELS_VERSION = 1, 2, 3
 _VERSION_BYTES, _CHECKSUM_BYTES = 1, 4
 _SIDE_BITS = 5
 _LONGEST_SIZES = 32  # bytes
+_VALUES_EACH = 64  # values of attributes for each component that a batch of limited size may have
 
 
-def encode(components: Components) -> bytes:
+def encode(components: Components, channels: bool = False) -> bytes:
     """A batch of components. Raises `InvalidArgumentError` for values that are too large to be stored."""
-    return encode_quantized(quantize(components))
+    return encode_quantized(quantize(components), channels)
 
 
-def encode_quantized(values: Quantized) -> bytes:
-    """A batch of components that `quantize` has rounded. The values are not checked again."""
+def encode_quantized(values: Quantized, channels: bool = False) -> bytes:
+    """A batch of components that `quantize` has rounded. The values are not checked again.
+
+    channels: whether it has their attributes, those that a component has.
+    """
+    if not channels:
+        return _sealed(_geometry(values))
+    _, covariances = values.places.restored()
+    geometry, block = _geometry(values), encode_attributes(values.attributes.present(), covariances)
+    size = BitWriter()
+    size.number(len(geometry))
+    return _sealed(bytes([CHANNELS_VERSION]) + size.to_bytes() + geometry + block)
+
+
+def _sealed(body: bytes) -> bytes:
+    return body + zlib.crc32(body).to_bytes(_CHECKSUM_BYTES, "little")
+
+
+def _geometry(values: Quantized) -> bytes:
+    """A batch without attributes and checksum."""
     k, e, side = len(values), len(values.seen_from), cell_exponent(values.places)
     writer = BitWriter()
     writer.one(values.places.dim - 2, 1)
@@ -76,8 +96,17 @@ def encode_quantized(values: Quantized) -> bytes:
     for size in (k, len(values.origins), e - k):
         writer.number(size)
     stream = write_batch(coded(values, side)).ljust(_least_bytes(k, len(values.origins), e), b"\0")
-    body = bytes([BATCH_VERSION]) + writer.to_bytes() + stream
-    return body + zlib.crc32(body).to_bytes(_CHECKSUM_BYTES, "little")
+    return bytes([BATCH_VERSION]) + writer.to_bytes() + stream
+
+
+def has_channels(batch: bytes) -> bool:
+    """Whether a batch says which attributes its components have."""
+    return batch[:_VERSION_BYTES] == bytes([CHANNELS_VERSION])
+
+
+def fits(attributes: Attributes, most: int) -> bool:
+    """Whether `decode` with this limit reads a batch with these attributes."""
+    return sum(value.numel() for value in attributes.present().tensors().values()) <= _VALUES_EACH * most
 
 
 def decode(data: bytes, most: int | None = None) -> Components:
@@ -87,7 +116,7 @@ def decode(data: bytes, most: int | None = None) -> Components:
     to the length of the data, for any numbers in them.
     """
     try:
-        return _values(data, most).restored().checked()
+        return _components(data, most)
     except DataError:
         raise
     except GmmTorchError as error:
@@ -96,20 +125,41 @@ def decode(data: bytes, most: int | None = None) -> Components:
 
 def ids_of_batch(data: bytes) -> Tensor:
     """The ids (K, 2) of the components of a batch. Raises as `decode` does, but does not check the rest."""
-    return _values(data).ids
+    return _values(_parts(data)[0]).ids
 
 
-def _values(data: bytes, most: int | None = None) -> Quantized:
+def _components(data: bytes, most: int | None) -> Components:
+    geometry, block = _parts(data)
+    found = _values(geometry, most).restored()
+    if block is not None:
+        limit = None if most is None else _VALUES_EACH * most
+        found = replace(found, attributes=decode_attributes(block, found.covariances, limit))
+    return found.checked()
+
+
+def _parts(data: bytes) -> tuple[bytes, bytes | None]:
+    """The geometry of a batch without checksum, and the block of its attributes; None if it has none."""
     body, checksum = data[:-_CHECKSUM_BYTES], data[-_CHECKSUM_BYTES:]
     if len(data) <= _CHECKSUM_BYTES:
         raise DataError(f"{len(data)} bytes are too few for a batch of components: it is truncated.")
-    if body[0] not in (FIRST_VERSION, BATCH_VERSION):
+    if not FIRST_VERSION <= body[0] <= CHANNELS_VERSION:
         raise DataError(
-            f"The batch of components is version {body[0]}; this gmmtorch reads versions {FIRST_VERSION} and "
-            f"{BATCH_VERSION}. It is foreign or damaged, or gmmtorch needs an update."
+            f"The batch of components is version {body[0]}; this gmmtorch reads versions {FIRST_VERSION} to "
+            f"{CHANNELS_VERSION}. It is foreign or damaged, or gmmtorch needs an update."
         )
     if zlib.crc32(body) != int.from_bytes(checksum, "little"):
         raise DataError("The batch of components does not match its checksum: it is truncated or damaged.")
+    if not has_channels(body):
+        return body, None
+    size = BitReader(body[_VERSION_BYTES:_LONGEST_SIZES])
+    n_bits, n = size.left, size.number()
+    begin = _VERSION_BYTES + (n_bits - size.left) // 8
+    if not 0 < n <= len(body) - begin or body[begin] != BATCH_VERSION:
+        raise DataError(f"{len(body)} bytes have no batch of {n} bytes: it is damaged.")
+    return body[begin : begin + n], body[begin + n :]
+
+
+def _values(body: bytes, most: int | None = None) -> Quantized:
     rest = body[_VERSION_BYTES:]
     found = read_first(rest) if body[0] == FIRST_VERSION else _read(rest, most)
     farthest = int(FARTHEST / ORIGIN_STEP)
@@ -160,7 +210,7 @@ def _read(data: bytes, most: int | None) -> Quantized:
 def coded(values: Quantized, side: int) -> CodedBatch:
     """The values as the coder takes them."""
     arrays = {**vars(values), **vars(values.places), "cells": torch.from_numpy(cells_of(values.places, side))}
-    del arrays["places"]
+    del arrays["places"], arrays["attributes"]
     return CodedBatch(side, **{name: array.long().contiguous() for name, array in arrays.items()})
 
 
@@ -203,9 +253,7 @@ def map_bytes(components: Components, rule: LearningRule, settings: MapSettings,
     facts = _facts(rule, settings, number_after(components.ids, next_number))
     if settings.codec == "float":
         return _exact_file(components, facts)
-    c = components.on_cpu()
-    block = encode_attributes(c.attributes, c.covariances) if c.attributes else b""
-    return _container(encode(c), block, facts)
+    return _container(quantize(components), facts)
 
 
 def file_size(components: Components, rule: LearningRule, settings: MapSettings, next_number: int) -> int:
@@ -219,13 +267,7 @@ def file_size(components: Components, rule: LearningRule, settings: MapSettings,
     if settings.codec == "float":
         data = _exact_file(components, facts)
     else:
-        values, order = quantize_numbered(components, settings.robot, next_number)
-        block = b""
-        if components.attributes:
-            found, given = values.restored(), components.attributes.on_cpu().selected(order)
-            moved = rounded(given, components.means.detach().cpu()[order], found.means, found.covariances)
-            block = encode_attributes(moved, found.covariances)
-        data = _container(encode_quantized(values), block, facts)
+        data = _container(quantize_numbered(components, settings.robot, next_number), facts)
     return len(data) + _ROOM_FOR_SETTINGS
 
 
@@ -305,8 +347,10 @@ def read_settings(facts: dict[str, Any], path: str | Path) -> MapSettings:
     return MapSettings(resolution, facts["method"], facts["codec"], robot, query)
 
 
-def _container(batch: bytes, attributes: bytes, facts: dict[str, Any]) -> bytes:
-    blocks = {"components": batch, **({_ATTRIBUTES: attributes} if attributes else {})}
+def _container(values: Quantized, facts: dict[str, Any]) -> bytes:
+    blocks = {"components": encode_quantized(values)}
+    if values.attributes:
+        blocks[_ATTRIBUTES] = encode_attributes(values.attributes, values.places.restored()[1])
     tensors = {name: torch.frombuffer(bytearray(data), dtype=torch.uint8) for name, data in blocks.items()}
     return pack_tensors(tensors, FILE_KIND, FILE_VERSION, **facts)
 

@@ -1,6 +1,6 @@
-"""The chances with which the slots of `context_model` begin, learned from simulated worlds;
-written by scripts/context_chances.py. A byte for each slot: the probability of a 0 in 1/256; 0:
-unknown."""
+"""The chances with which the slots of `context_model` and `number_model` begin, learned from
+simulated worlds; written by scripts/context_chances.py. A byte for each slot: the probability of
+a 0 in 1/256; 0: unknown."""
 
 CHANCES = """
 c-rk62T)Yk_N*<U<`Wwd<*SL&ps1+d#72lQ#zeuWh#Hg;3!;GZy0k}IcG*VRWm$HYZ7jWaP%t1O#2OVf=9@$_$@pVpie-Lcl=t7e
@@ -52,4 +52,9 @@ _GbKc{Y-lsHtnoOwfAketv6oVv_dW*Jwn_GU9o;Wur=O~G4ggN;&Vye=?FZTkY-zyAlh#S)d#ezn<ZlC
 ^tqCTW8H@nK_6ru*B;k+rV2%c`~YObLQ-
 m;?G!I{W%4X^o=3bxBbfYH&PAcqK;}X^A9S|Sy&}7W|_XNe)N%}XEJO}x6|~a&pwO~2*VGe_e;)*krtDt&-I|s-
 pL~%mPQpYC7%3`#3+mBrdT;My_M}=G|C_JzWV83qGjY0_=ocw{mttiIo@`XJ;k*f!xL$5Zcu*gTmA#XM*E-
+"""
+OF_ATTRIBUTES = """
+c-ouJ$iTqJ$oQWD4*sLiQRNH_s~;@=3zI!}`4X63%&-
+hhH#adb9QyDZuKPBWxe3besbgR`{S#sOJqA>u1(bJ5u9~%W%PlZ}>bx~O4qOGA+dg&jq`DaliuDW(R%Kg`UAY5MKYitiOItwdTIb
+E#S|7-85U79OtAB9w&OL+BP~{AZ%NQ7*Ald&4&HkCy3=Gc@+8N%U$#-@F-TVi^e~u;(0Ib(P$^
 """

@@ -1,7 +1,6 @@
 """Batches as an adaptive binary code: each value is predicted from the components before it; docs/formats.md.
 
-A range coder (Martin 1979) writes bits, each with the chance of a 0 that its *slot* has learned from the bits
-that it coded before. A slot is one bit of one field in one context, such as "the smallest deviation differs
+A slot of the `range_coder` is one bit of one field in one context, such as "the smallest deviation differs
 from that of the neighbours". The model uses whole numbers, and sums, products and quotients of doubles, which
 every machine rounds equally: a batch is read with the chances with which it was written.
 
@@ -10,10 +9,8 @@ The fused kernel does the work. This twin defines it, and takes about 100 times 
 
 from __future__ import annotations
 
-import base64
 import functools
 import math
-import zlib
 from collections.abc import Sequence
 
 import numpy as np
@@ -30,38 +27,34 @@ from gmmtorch.mapping.codec.lattice import (
     STEEPEST,
 )
 from gmmtorch.mapping.codec.quantization import LARGEST_COUNT, LEAST_SHARE, NO_COUNT, ORIGIN_STEP, offset_of
+from gmmtorch.mapping.codec.range_coder import NUMBER, RangeCoder, copied, first_chances
 
 _NEIGHBOURS = 64  # components before a component among which its neighbours are searched
 _MOST_LEVELS = 52
-_NUMBER = 32  # slots of a number
 _TOO_SLOW = -2  # of the fused kernel
-_MOST_CODED, _MOST_TRAINED = 120, 12  # bits of a slot that count; of those from which its first chance comes
-_LEAST_CHANCE = 64
-_ONE = 1 << 16
 
 FIELDS = {
     "FLAG": (4, 1),
-    "LEVEL": (3, _NUMBER),
+    "LEVEL": (3, NUMBER),
     "DIGIT": (8, 8),
     "LOWER": (12, 1),
     "ORDER": (26, 8),
-    "WIDE": (4, _NUMBER),
-    "RATIO": (12, _NUMBER),
-    "THIN": (8, _NUMBER),
-    "TURN": (16, _NUMBER),
-    "TILT": (56, _NUMBER),
-    "SLOPE": (84, _NUMBER),
-    "ACROSS": (64, _NUMBER),
-    "COUNT": (4, _NUMBER),
-    "VIEWS": (8, _NUMBER),
-    "RANK": (4, _NUMBER),
-    "SHARE": (4, _NUMBER),
-    "ORIGIN": (6, _NUMBER),
-    "ROBOT": (2, _NUMBER),
-    "NUMBER": (2, _NUMBER),
+    "WIDE": (4, NUMBER),
+    "RATIO": (12, NUMBER),
+    "THIN": (8, NUMBER),
+    "TURN": (16, NUMBER),
+    "TILT": (56, NUMBER),
+    "SLOPE": (84, NUMBER),
+    "ACROSS": (64, NUMBER),
+    "COUNT": (4, NUMBER),
+    "VIEWS": (8, NUMBER),
+    "RANK": (4, NUMBER),
+    "SHARE": (4, NUMBER),
+    "ORIGIN": (6, NUMBER),
+    "ROBOT": (2, NUMBER),
+    "NUMBER": (2, NUMBER),
 }
 """Contexts of each field, and slots of each context."""
-N_SLOTS = sum(contexts * slots for contexts, slots in FIELDS.values())
 
 
 def write_batch(batch: CodedBatch) -> bytes:
@@ -70,7 +63,7 @@ def write_batch(batch: CodedBatch) -> bytes:
     stream = torch.zeros(size, dtype=torch.uint8)
     try:
         if is_fused(batch.mean):
-            n = context_coding(batch, _tables(), stream, writes=True)
+            n = context_coding(batch, copied(first_tables()), stream, writes=True)
             if n == _TOO_SLOW:
                 raise InvalidArgumentError(
                     f"{len(batch.count)} components have viewpoints that are farther than thousands of the "
@@ -79,7 +72,7 @@ def write_batch(batch: CodedBatch) -> bytes:
                 )
             _require(n >= 0)
             return stream[:n].numpy().tobytes().rstrip(b"\0")
-        writer = _RangeCoder()
+        writer = RangeCoder(first_tables())
         _Walk(writer, batch).run()
         return writer.to_bytes().rstrip(b"\0")
     except DataError as error:
@@ -95,125 +88,16 @@ def read_batch(batch: CodedBatch, data: bytes) -> None:
     more time than a batch of that length may; the twin does not bound its time."""
     if is_fused(batch.mean):
         stream = torch.frombuffer(bytearray(data or b"\0"), dtype=torch.uint8)
-        _require(context_coding(batch, _tables(), stream, writes=False) >= 0)
+        _require(context_coding(batch, copied(first_tables()), stream, writes=False) >= 0)
     else:
-        _Walk(_RangeCoder(data), batch).run()
+        _Walk(RangeCoder(first_tables(), data), batch).run()
     _require(write_batch(batch) == data.rstrip(b"\0"))
-
-
-def _tables() -> ChanceTables:
-    chances, n_coded, rates, first_slot = first_tables()
-    return ChanceTables(chances.clone(), n_coded.clone(), rates, first_slot)
 
 
 @functools.cache
 def first_tables() -> ChanceTables:
     """The tables before the first bit."""
-    sizes = [contexts * slots for contexts, slots in FIELDS.values()]
-    packed = base64.b85decode("".join(CHANCES.split()))
-    known = zlib.decompress(packed) if packed else bytes(N_SLOTS)
-    chances = torch.tensor(list(known))
-    return ChanceTables(
-        chances=torch.where(chances == 0, _ONE // 2, chances << 8).int(),
-        n_coded=torch.where(chances == 0, 0, _MOST_TRAINED).int(),
-        rates=torch.tensor([10 * _ONE // (10 * n + 16) for n in range(_MOST_CODED + 1)]),
-        first_slot=torch.tensor([0, *np.cumsum(sizes[:-1]).tolist()]),
-    )
-
-
-# -- the twin: the range coder ---------------------------------------------------------------------------
-
-
-class _RangeCoder:
-    """Numbers as bits in slots: written, or read from `data`.
-
-    writes: whether a value that is given is written; otherwise it is unused.
-    """
-
-    def __init__(self, data: bytes | None = None) -> None:
-        tables = first_tables()
-        self.chances, self.n_coded = tables.chances.tolist(), tables.n_coded.tolist()
-        self._rates, first = tables.rates.tolist(), tables.first_slot.tolist()
-        self.first = dict(zip(FIELDS, first, strict=True))
-        self.writes, self._range = data is None, (1 << 32) - 1
-        self._at = 4  # bytes written, with those of the range; or read
-        self._data = data or b""
-        # Where the range begins, of all bytes written; or how far above that the bytes read are.
-        self._place = int.from_bytes(self._data[:4].ljust(4, b"\0"), "big")
-
-    def bit(self, slot: int, value: int) -> int:
-        """A bit; `value` is what a writer writes."""
-        chance, n = self.chances[slot], self.n_coded[slot]
-        bound = (self._range >> 16) * chance
-        value = value if self.writes else int(self._place >= bound)
-        self._move(bound if value else 0, self._range - bound if value else bound)
-        moved = chance + (((0 if value else _ONE) - chance) * self._rates[n] >> 16)
-        self.chances[slot] = min(max(moved, _LEAST_CHANCE), _ONE - _LEAST_CHANCE)
-        self.n_coded[slot] = min(n + 1, _MOST_CODED)
-        return value
-
-    def _move(self, step: int, width: int) -> None:
-        """To the part of the range that begins after `step`, of this width; then to the next bytes."""
-        self._place, self._range = self._place + (step if self.writes else -step), width
-        while self._range < 1 << 24:
-            self._range <<= 8
-            following = self._data[self._at : self._at + 1]  # none at the end, where zeros are not written
-            self._place = self._place << 8 | int.from_bytes(following, "big")
-            self._place &= -1 if self.writes else 0xFFFFFFFF
-            self._at += 1
-
-    def to_bytes(self) -> bytes:
-        """Of the numbers that say the same, the one with most zeros at its end."""
-        last = self._place
-        for n in range(1, 32):
-            rounder = (self._place + (1 << n) - 1) >> n << n
-            last = rounder if rounder < self._place + self._range else last
-        return last.to_bytes(self._at, "big")
-
-    def raw(self, n: int, value: int) -> int:
-        """n bits without slots, highest first, eight at a time."""
-        found = 0
-        while n > 0:
-            width = min(n, 8)
-            n -= width
-            size, most = self._range >> width, (1 << width) - 1
-            part = value >> n & most if self.writes else min(self._place // size, most)
-            self._move(part * size, size)
-            found = found << width | part
-        return found
-
-    def tree(self, first: int, n: int, value: int) -> int:
-        """n bits, each with a slot for every choice of the bits before it."""
-        node = 1
-        for i in range(n - 1, -1, -1):
-            node = node << 1 | self.bit(first + node, value >> i & 1)
-        return node - (1 << n)
-
-    def number(self, first: int, value: int) -> int:
-        """A number ≥ 0 below 2^60: the length of value + 1 in unary, then its other bits; the two highest of
-        these have slots."""
-        whole, length = value + 1, 0
-        while self.bit(first + 4 + min(length, 11), int(whole >> (length + 1) != 0)):
-            length += 1
-            if length > 60:
-                raise DataError("A number is too large: it is damaged.")
-        found = 1
-        if length > 0:
-            found = 2 | self.bit(first + 15 + min(length, 8), whole >> (length - 1) & 1)
-        if length > 1:
-            slot = 24 + 2 * (length - 2) + (found & 1) if length < 5 else 30
-            found = found << 1 | self.bit(first + slot, whole >> (length - 2) & 1)
-        if length > 2:
-            found = found << (length - 2) | self.raw(length - 2, whole & (1 << (length - 2)) - 1)
-        return found - 1
-
-    def whole(self, first: int, value: int, side: int = 0) -> int:
-        """Any whole number. side: 0, 1 or 2, the slot of its sign."""
-        if not self.bit(first, int(value != 0)):
-            return 0
-        negative = self.bit(first + 1 + side, int(value < 0))
-        size = self.number(first, abs(value) - 1) + 1
-        return -size if negative else size
+    return first_chances(CHANCES, [contexts * slots for contexts, slots in FIELDS.values()])
 
 
 # -- the twin: the model ---------------------------------------------------------------------------------
@@ -225,7 +109,8 @@ class _Walk:
     Contexts and predictions are stated in docs/formats.md.
     """
 
-    def __init__(self, coder: _RangeCoder, batch: CodedBatch) -> None:
+    def __init__(self, coder: RangeCoder, batch: CodedBatch) -> None:
+        self._first = dict(zip(FIELDS, coder.first, strict=True))
         self.c, self.b, self.dim, self.side = coder, batch, batch.dim, batch.side
         self.places, self.normals = np.zeros(batch.mean.shape), np.zeros(batch.mean.shape)
         self.offset = offset_of(self.side)
@@ -250,8 +135,8 @@ class _Walk:
                 found = getattr(self.b, name)
                 found.copy_(torch.tensor(values, dtype=torch.int64).reshape(found.shape))
 
-    def _slots(self, field: str, context: int, size: int = _NUMBER) -> int:
-        return self.c.first[field] + context * size
+    def _slots(self, field: str, context: int, size: int = NUMBER) -> int:
+        return self._first[field] + context * size
 
     def _id(self, i: int) -> None:
         ids = self.v["ids"]

@@ -8,7 +8,7 @@ multiples of 2⁻⁸ m. Every number is rounded by itself, so components can be 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.linalg import all_equal, on_cpu
+from gmmtorch.mapping.attributes.moments import Attributes
 from gmmtorch.mapping.codec import attribute_block, lattice
 from gmmtorch.mapping.codec.bitstream import Ints
 from gmmtorch.mapping.codec.lattice import PER_OCTAVE, Lattice
@@ -50,6 +51,7 @@ class Quantized:
     n_viewpoints (K,): number of viewpoints of each component. For each viewpoint, sorted by component:
     seen_from (E,), its origin, by rising coordinates; share (E,), −log2 of its share of the component's
     largest, in steps.
+    attributes: rounded, as `attribute_block` does.
     """
 
     places: Lattice
@@ -60,6 +62,7 @@ class Quantized:
     n_viewpoints: Tensor
     seen_from: Tensor
     share: Tensor
+    attributes: Attributes = field(default_factory=Attributes)
 
     def __len__(self) -> int:
         return len(self.count)
@@ -86,6 +89,7 @@ class Quantized:
             n_viewpoints=n,
             seen_from=self.seen_from[kept],
             share=self.share[kept],
+            attributes=self.attributes.selected(rows),
         )
 
     def restored(self) -> Components:
@@ -105,6 +109,7 @@ class Quantized:
             seen_by=seen_by,
             seen_from=self.seen_from,
             seen_count=weight * (support / total)[seen_by],
+            attributes=self.attributes,
         )
 
 
@@ -134,6 +139,9 @@ def quantize(components: Components) -> Quantized:
     _, kept, pair = np.unique(by * len(origins) + rank[seen], return_index=True, return_inverse=True)
     seen_count = torch.from_numpy(np.bincount(pair, counts, len(kept)))
     seen_by, seen_from = torch.from_numpy(by[kept]), torch.from_numpy(seen[kept])
+    attributes = c.attributes
+    if attributes:
+        attributes = attribute_block.rounded(attributes, c.means, *places.restored())
     return Quantized(
         places=places,
         count=count,
@@ -143,17 +151,13 @@ def quantize(components: Components) -> Quantized:
         n_viewpoints=torch.from_numpy(np.bincount(by[kept], minlength=len(c))),
         seen_from=seen_from,
         share=_share_steps(seen_count, seen_by, count),
+        attributes=attributes,
     )
 
 
 def quantized(components: Components) -> Components:
     """The components after writing and reading them, on their device, without writing bits."""
-    found = quantize(components).restored()
-    if components.attributes:
-        given = components.on_cpu()
-        known = attribute_block.rounded(given.attributes, given.means, found.means, found.covariances)
-        found = replace(found, attributes=known)
-    return found.to(components.means.device)
+    return quantize(components).restored().to(components.means.device)
 
 
 def _support_steps(support: Tensor) -> Tensor:
@@ -293,13 +297,12 @@ def number_after(ids: Tensor, next_number: int) -> int:
     return max(next_number, int(ids[:, 1].max()) + 1 if len(ids) else 0)
 
 
-def quantize_numbered(components: Components, robot: int, first: int) -> tuple[Quantized, Tensor]:
-    """The same as `quantize(numbered(components, robot, first)[0])`, rounding every component once; and the
-    rows (K,) of the components in that order."""
+def quantize_numbered(components: Components, robot: int, first: int) -> Quantized:
+    """The same as `quantize(numbered(components, robot, first)[0])`, rounding every component once."""
     values = quantize(components)
     new = (values.ids[:, 1] < 0).nonzero().squeeze(1)
     ids, order = _numbering(values.ids, order_of(values.places.taken(new)), robot, first)
-    return replace(values.reordered(order), ids=ids), order
+    return replace(values.reordered(order), ids=ids)
 
 
 def _numbering(ids: Tensor, by_place: Tensor, robot: int, first: int) -> tuple[Tensor, Tensor]:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import check_whole
-from gmmtorch.mapping import Components, spatial_order, summed
+from gmmtorch.mapping import Attributes, Components, spatial_order, summed
 from gmmtorch.simulation import DepthFrame
 from gmmtorch.team.sharing.messages.component_messages import (
     ComponentsMessage,
@@ -59,9 +59,10 @@ class SendOnce:
 class Broadcast(SendOnce):
     """The counterpart of `Replica` without repair of losses: for networks without losses, and to compare.
 
-    The sender holds the decoded values of its datagrams. Repeated components count once; repeated counts are
-    added again, because nothing distinguishes them; counts of unknown components are ignored. A robot numbers
-    its components from 0 in each session, so teammates ignore a restarted one until it has sent more.
+    Components are without attributes. The sender holds the decoded values of its datagrams. Repeated
+    components count once; repeated counts are added again, because nothing distinguishes them; counts of
+    unknown components are ignored. A robot numbers its components from 0 in each session, so teammates ignore
+    a restarted one until it has sent more.
 
     Attributes:
         refused: number of messages that were refused: "other" (neither components nor counts), "unfit"
@@ -89,7 +90,7 @@ class Broadcast(SendOnce):
         numbers = self._n_numbered + torch.arange(len(new))
         self._n_numbered += len(new)
         ids = torch.stack([torch.full_like(numbers, self.robot), numbers], 1)
-        self._send(encode_components(replace(new, ids=ids), self.codec))
+        self._send(encode_components(replace(new, ids=ids, attributes=Attributes()), self.codec))
         return ids
 
     def count(self, gains: Mapping[tuple[int, int], float]) -> None:
@@ -122,7 +123,7 @@ class Broadcast(SendOnce):
             self.refused["unfit"] += 1
             return False
         if isinstance(message, ComponentsMessage):
-            self._add_batch(message.components)
+            self._add_batch(replace(message.components, attributes=Attributes()))
         elif isinstance(message, CountsMessage):
             self._add_counts(message)
         else:

@@ -337,7 +337,7 @@ class Store:
                 n_refused,
                 len(batches) + len(datagrams),
             )
-        self._replica, self._kept = replica, (replica.held - before).up_to(_MOST_NAMES)
+        self._replica, self._kept = replica, (replica.known - before).up_to(_MOST_NAMES)
         self._log_bytes = sum(map(len, datagrams))
         return Restored(len(batches) + len(datagrams) - n_refused, n_refused)
 
@@ -385,7 +385,7 @@ class Store:
 
         if not self._write(replace):
             return False
-        self._kept = self._replica.held.up_to(_MOST_NAMES)
+        self._kept = self._replica.known.up_to(_MOST_NAMES)
         self._patience = self._waited = 0
         return True
 

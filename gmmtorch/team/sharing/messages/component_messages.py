@@ -32,6 +32,7 @@ from gmmtorch.mapping import (
     encode_quantized,
     encode_thesis,
     encode_thesis_updates,
+    fits,
     points_of,
     quantize,
     scaled,
@@ -72,8 +73,9 @@ class ComponentsMessage:
 def encode_components(components: Components, codec: str = "quantized") -> list[bytes]:
     """Datagrams of components in order, each with the sensor origins that it needs; empty without components.
 
-    codec: "quantized": 5 to 8 bytes per component, rounded as `mapping.codec.quantized` does. "float":
-    float64, unchanged. "thesis": 57 bytes for each component and sensor origin.
+    codec: "quantized": 5 to 8 bytes per component, rounded as `mapping.codec.quantized` does, and about 4 for
+    a colour. "float": float64, unchanged. "thesis": 57 bytes for each component and sensor origin. Both
+    without attributes.
 
     Raises `InvalidArgumentError` for values that the codec cannot store, positions beyond
     `datagrams.FARTHEST`, and a component with so many sensor origins that it does not fit into a datagram.
@@ -88,14 +90,19 @@ def encode_components(components: Components, codec: str = "quantized") -> list[
         return write(components.selected(rows).with_used_origins())
 
     def is_allowed(begin: int, end: int) -> bool:
-        return max(end - begin, so_far[end] - so_far[begin]) <= MOST_COMPONENTS_SENT
+        part = components.attributes.selected(slice(begin, end))
+        n = max(end - begin, so_far[end] - so_far[begin])
+        return n <= MOST_COMPONENTS_SENT and fits(part, MOST_COMPONENTS_SENT)
 
     return split(len(components), part, "component", is_allowed=is_allowed)
 
 
-def fitted(values: Quantized, max_bytes: int = MAX_BYTES) -> Iterator[tuple[bytes, Quantized]]:
+def fitted(
+    values: Quantized, max_bytes: int = MAX_BYTES, channels: bool = False
+) -> Iterator[tuple[bytes, Quantized]]:
     """Datagrams of quantised components in order, each with as many as fit; and the components of each. Their
-    number is estimated from the datagram before, which takes fewer attempts than halving."""
+    number is estimated from the datagram before, which takes fewer attempts than halving. channels: whether
+    they have their attributes."""
     _check_viewpoints(values.n_viewpoints)
     _check_quantized(values)
     so_far = values.n_viewpoints.cumsum(0)
@@ -106,9 +113,9 @@ def fitted(values: Quantized, max_bytes: int = MAX_BYTES) -> Iterator[tuple[byte
         n = min(n, MOST_COMPONENTS_SENT, n_allowed)
         whole = begin == 0 and n >= len(values)
         part = values if whole else values.arranged(torch.arange(begin, min(begin + n, len(values))))
-        datagram = make_datagram(Kind.COMPONENTS, encode_quantized(part))
+        datagram = make_datagram(Kind.COMPONENTS, encode_quantized(part, channels))
         room = int(_FILL * len(part) * max_bytes / len(datagram))
-        if len(datagram) <= max_bytes:
+        if len(datagram) <= max_bytes and (not channels or fits(part.attributes, MOST_COMPONENTS_SENT)):
             yield datagram, part
             begin, n = begin + len(part), max(1, room)
         elif len(part) > 1:
@@ -123,7 +130,7 @@ def fitted(values: Quantized, max_bytes: int = MAX_BYTES) -> Iterator[tuple[byte
 def _quantized(components: Components) -> bytes:
     values = quantize(components)
     _check_quantized(values)
-    return make_datagram(Kind.COMPONENTS, encode_quantized(values))
+    return make_datagram(Kind.COMPONENTS, encode_quantized(values, bool(values.attributes.present())))
 
 
 def read_quantized(body: bytes) -> ComponentsMessage:

@@ -9,7 +9,15 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
-from gmmtorch.mapping import LARGEST_COUNT, NO_COUNT, BitReader, BitWriter, count_steps, ids_of_batch
+from gmmtorch.mapping import (
+    LARGEST_COUNT,
+    NO_COUNT,
+    BitReader,
+    BitWriter,
+    count_steps,
+    has_channels,
+    ids_of_batch,
+)
 from gmmtorch.occupancy import N_BYTES, Calibration
 from gmmtorch.team.sharing.messages.component_messages import counts_of
 from gmmtorch.team.sharing.messages.datagrams import (
@@ -32,6 +40,7 @@ from gmmtorch.team.sharing.messages.datagrams import (
     write_number,
 )
 from gmmtorch.team.sharing.replica.record_keys import (
+    CHANNELS,
     END,
     LARGEST_INCARNATION,
     LARGEST_ROBOT,
@@ -280,7 +289,8 @@ def counters_message(key: int, points: dict[int, float]) -> CountersMessage:
 
 @dataclass(frozen=True, eq=False)
 class AnnouncementMessage:
-    """Of the keys from `begin` to `end` − 1, this incarnation of robot `sender` holds exactly `held`."""
+    """Of the keys from `begin` to `end` − 1, this incarnation of robot `sender` holds exactly `held`. Keys of
+    channels are below zero, others are not."""
 
     sender: int
     incarnation: int
@@ -294,18 +304,18 @@ class AnnouncementMessage:
 
 
 def encode_announcements(
-    sender: int, incarnation: int, held: Intervals, max_bytes: int = MAX_BYTES
+    sender: int, incarnation: int, held: Intervals, max_bytes: int = MAX_BYTES, lowest: int = 0
 ) -> list[bytes]:
     """Datagrams of all keys that are held, at least one; each covers another range, so any may be lost.
-    Raises `InvalidArgumentError` for values out of range."""
+    lowest: 0, or `CHANNELS` for keys of channels. Raises `InvalidArgumentError` for values out of range."""
     _check_sender(sender, incarnation)
-    if not Intervals.span(0, END).covers(held):
-        raise InvalidArgumentError(f"held={held!r} goes beyond the largest key, {END - 1}.")
+    if not Intervals.span(lowest, lowest + END).covers(held):
+        raise InvalidArgumentError(f"held={held!r} goes beyond the largest key, {lowest + END - 1}.")
     n = len(held)
 
     def part(begin: int, end: int) -> bytes:
-        first = int(held.edges[2 * begin]) if begin else 0
-        last = int(held.edges[2 * end]) - 1 if end < n else END - 1
+        first = int(held.edges[2 * begin]) if begin else lowest
+        last = int(held.edges[2 * end]) - 1 if end < n else lowest + END - 1
         writer = BitWriter()
         for name, value in (("sender", sender), ("incarnation", incarnation)):
             write_number(writer, name, value)
@@ -323,7 +333,8 @@ def read_announcement(body: bytes) -> AnnouncementMessage:
     _check_sender(sender, incarnation)
     begin = reader.number()
     end = begin + reader.number() + 1
-    if not 0 <= begin < end <= END:
+    lowest = CHANNELS if begin < 0 else 0
+    if not lowest <= begin < end <= lowest + END:
         raise DataError(f"An announcement of the keys from {begin} to {end}: it is damaged.")
     held = read_intervals(reader, begin, end)
     reader.finish()
@@ -345,7 +356,8 @@ def keys_in(datagram: bytes) -> Intervals:
     """
     kind, body = parse_datagram(datagram)
     if kind is Kind.COMPONENTS:
-        return Intervals.of(keys_of(ids_of_batch(body)))
+        keys = Intervals.of(keys_of(ids_of_batch(body)))
+        return keys | keys.shifted(CHANNELS) if has_channels(body) else keys
     if kind not in RECORD_KINDS:
         raise DataError(f"A datagram of kind {int(kind)} has no records.")
     key = BitReader(body).number()

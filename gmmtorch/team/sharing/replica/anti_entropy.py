@@ -12,7 +12,16 @@ from torch import Tensor
 from gmmtorch.mapping import Components, quantize
 from gmmtorch.team.sharing.messages.component_messages import fitted
 from gmmtorch.team.sharing.messages.record_messages import AnnouncementMessage, CountersMessage
-from gmmtorch.team.sharing.replica.record_keys import Intervals, Ints, authors, evict, keys_of, keys_of_robot
+from gmmtorch.team.sharing.replica.record_keys import (
+    CHANNELS,
+    END,
+    Intervals,
+    Ints,
+    authors,
+    evict,
+    keys_of,
+    keys_of_robot,
+)
 from gmmtorch.team.sharing.replica.records import Records
 
 _CALLS_IN_FLIGHT = 3
@@ -38,17 +47,20 @@ class Backlog:
 
     A robot's own records are sent at once to robots that lack them. Records of others are sent if they are
     still lacking in the next announcement, as otherwise all robots would answer at once. Records that were
-    just sent are in flight, and not due: the announcement may be older than them.
+    just sent are in flight, and not due: the announcement may be older than them. A component that is due
+    with its channels has two keys here, of which robots of earlier versions announce one.
     """
 
     def __init__(self, robot: int) -> None:
-        self._own = keys_of_robot(robot)
+        own = keys_of_robot(robot)
+        self._own = Intervals.union([own.shifted(CHANNELS), own])
         self.due = Intervals.empty()
         self.ready: list[Packet] = []
         self._in_flight = [Intervals.empty()] * _CALLS_IN_FLIGHT  # since the last call of `sent`, and before
         self._gaps: OrderedDict[int, Intervals] = OrderedDict()  # what others lack, by robot
         self._theirs: OrderedDict[int, Intervals] = OrderedDict()  # what others hold and this robot lacked
         self._waited: dict[int, int] = {}  # announcements made here since those others announced
+        self._know_channels: list[int] = []  # robots that announced channels
 
     def add(self, keys: Intervals, packets: Sequence[Packet] = ()) -> None:
         """New records; packets: encoded datagrams of some of them."""
@@ -79,6 +91,11 @@ class Backlog:
         gap = (held & message.scope) - message.held
         before = self._gaps.get(message.sender, Intervals.empty())
         lacking = (gap & self._own) | (gap & before)
+        if message.begin < 0:
+            others = [robot for robot in self._know_channels if robot != message.sender]
+            self._know_channels = [message.sender, *others][:MOST_PEERS]
+        elif message.sender in self._know_channels:
+            lacking |= lacking.shifted(CHANNELS) & held
         for keys in self._in_flight:
             lacking -= keys
         self.due = (self.due | lacking) - dead
@@ -96,6 +113,7 @@ class Backlog:
         return Intervals.union(self._theirs.values()) - held
 
 
+_OF_CHANNELS = Intervals.span(CHANNELS, CHANNELS + END)
 _RUN = 160  # components with consecutive keys that are sent together: about one datagram
 _COMPONENT_BYTES = 6  # about, in a datagram
 
@@ -106,42 +124,46 @@ def packets(
     """Datagrams with the keys of their records: supersessions and corrections, components, then counters.
 
     Args:
-        due: keys of records to send, none superseded. ready: encoded components; they are sent unchanged.
+        due: keys of records to send, none superseded; keys of channels, for components with channels.
+        ready: encoded components; they are sent unchanged.
         max_bytes: largest size of a datagram.
         by_information: False: components in the order of their keys, which takes the fewest bytes. True: in
             runs of consecutive keys, the runs with most `_information` for a byte first, which takes few
             more.
     """
-    due &= records.held
+    due &= records.known
     if not due:
         return
     ready = [packet for packet in ready if len(packet[0]) <= max_bytes and due.covers(packet[1])]
     for _, keys in ready:
         due -= keys
-    due_keys = due.numbers()
+    complete = (due & _OF_CHANNELS).shifted(-CHANNELS)
+    due_keys = (due - _OF_CHANNELS - complete).numbers()
     is_component = records.table.contains(due_keys)
     others = [records.others[key] for key in due_keys[~is_component].tolist()]
     for record in others:
         if not isinstance(record, CountersMessage):
             yield records.datagrams[record.key], Intervals.span(record.key, record.key + 1)
-    for run in _in_order(records, due_keys[is_component], ready, by_information):
+    for run in _in_order(records, [due_keys[is_component], complete.numbers()], ready, by_information):
         if isinstance(run, tuple):
             yield run
-        else:
-            for datagram, part in fitted(quantize(records.table.selected(run)), max_bytes):
-                yield datagram, Intervals.of(keys_of(part.ids))
+            continue
+        channels = int(run[0]) in complete
+        for datagram, part in fitted(quantize(records.table.selected(run)), max_bytes, channels):
+            keys = Intervals.of(keys_of(part.ids))
+            yield datagram, keys | keys.shifted(CHANNELS) if channels else keys
     for record in others:
         if isinstance(record, CountersMessage):
             yield records.datagrams[record.key], Intervals.span(record.key, record.key + 1)
 
 
 def _in_order(
-    records: Records, keys: Ints, ready: Sequence[Packet], by_information: bool
+    records: Records, groups: Sequence[Ints], ready: Sequence[Packet], by_information: bool
 ) -> list[Packet | Ints]:
-    """Ready packets, and runs of the other keys, in the order in which they are sent."""
-    runs = _runs(keys, _RUN if by_information else None)
+    """Ready packets, and runs of the keys of each group, in the order in which they are sent."""
+    runs = [run for keys in groups for run in _runs(keys, _RUN if by_information else None)]
     found: list[Packet | Ints] = [*ready, *runs]
-    members = [*(packet[1].numbers() for packet in ready), *runs]
+    members = [*((packet[1] - _OF_CHANNELS).numbers() for packet in ready), *runs]
     if by_information:
         sizes = [*(len(packet[0]) for packet in ready), *(_COMPONENT_BYTES * len(run) for run in runs)]
         worth = [float(_information(records.table.selected(one)).sum()) for one in members]

@@ -129,21 +129,22 @@ class Author:
             raise InvalidArgumentError(f"A robot supersedes its own records only; robot={self._robot}.")
         if not len(components) and not old:
             return np.zeros(0, np.int64), Intervals.empty(), []
-        values = quantize(components)
+        values = quantize(self._records.fitting(components))
+        channels = bool(values.attributes)
         order = order_of(values.places)
         first = self._numbers(len(order))
         numbered = np.arange(first, first + len(order))
         values = replace(values.arranged(order), ids=ids_of(numbered))
         # Components are added by datagrams here, too, so that all robots of a team have the same batches.
         packets: list[Packet] = []
-        written = Intervals.empty()
-        for datagram, part in fitted(values, max_bytes):
-            packets.append((datagram, self._records.add_components(part.restored(), bounded=False)))
-            written |= packets[-1][1]
+        for datagram, part in fitted(values, max_bytes, channels):
+            added = self._records.add_components(part.restored(), bounded=False, complete=channels)
+            packets.append((datagram, added))
         keys = np.empty_like(numbered)
         keys[order.numpy()] = numbered
-        superseded = self._supersede((old & self._records.held) - self._records.dead, written)
-        return keys, written | superseded, packets
+        successors = Intervals.of(numbered)
+        superseded = self._supersede((old & self._records.held) - self._records.dead, successors)
+        return keys, Intervals.union([superseded, *(keys for _, keys in packets)]), packets
 
     def publish_map(
         self, components: Components, whole: bool, max_bytes: int, moved: MovedMap | None = None
@@ -153,6 +154,7 @@ class Author:
         whole: whether the map continues those of earlier incarnations, whose records are superseded, too, if
         the map lacks them. moved: components that were published where they were before are corrected.
         """
+        components = self._records.fitting(components)
         table, own = self._records.table, self._own_components()
         published = self._published & set(own)
         earlier = [key for key in own if key not in published and key not in self.keys]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gmmtorch.linalg import pack_symmetric
-from gmmtorch.mapping import Components
+from gmmtorch.mapping import Components, rows_of
 from gmmtorch.team.sharing.messages.component_messages import counts_of
 from gmmtorch.team.sharing.messages.datagrams import matrix_of
 from gmmtorch.team.sharing.messages.record_messages import CorrectionMessage, CountersMessage, FrameMessage
@@ -113,7 +113,8 @@ class ComponentTable:
 
 
 def fingerprints(components: Components) -> list[bytes]:
-    """A hash (BLAKE2b, 16 bytes) of each component (K,), without its id, in any batch."""
+    """A hash (BLAKE2b, 16 bytes) of each component (K,), without its id, in any batch; followed by one of its
+    attributes, if it has some."""
     c = components
     flags = c.max_range.double()[:, None]
     rows = _bits(torch.cat([c.means, pack_symmetric(c.covariances), c.support[:, None], flags], 1))
@@ -121,10 +122,29 @@ def fingerprints(components: Components) -> list[bytes]:
     seen = _bits(torch.cat([c.origins[c.seen_from[order]], c.seen_count[order, None]], 1))
     ends = torch.bincount(c.seen_by, minlength=len(c)).cumsum(0).tolist()
     begins = [0, *ends][: len(ends)]
-    return [
+    found = [
         hashlib.blake2b(row.tobytes() + seen[begin:end].tobytes(), digest_size=_FINGERPRINT_BYTES).digest()
         for row, begin, end in zip(rows, begins, ends, strict=True)
     ]
+    return [own + more for own, more in zip(found, _of_attributes(c), strict=True)] if c.attributes else found
+
+
+def _of_attributes(components: Components) -> list[bytes]:
+    """A hash of the attributes of each component (K,); empty if it has none."""
+    channels = rows_of(components.attributes, components.covariances)
+    known = {name.encode() + b"\0": rows.numpy().astype("<i8") for name, rows in channels.items()}
+    found = []
+    for k in range(len(components)):
+        content = b"".join(name + rows[k].tobytes() for name, rows in known.items() if rows[k, 0])
+        found.append(hashlib.blake2b(content, digest_size=_FINGERPRINT_BYTES).digest() if content else b"")
+    return found
+
+
+def is_same(one: bytes, other: bytes) -> bool:
+    """Whether two fingerprints are of one component, whose attributes one of both may lack."""
+    geometry, attributes = slice(_FINGERPRINT_BYTES), slice(_FINGERPRINT_BYTES, None)
+    known = {one[attributes], other[attributes]} - {b""}
+    return one[geometry] == other[geometry] and len(known) < 2
 
 
 def most_viewpoints(components: Components) -> int:

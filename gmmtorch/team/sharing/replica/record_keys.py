@@ -91,6 +91,10 @@ class Intervals:
         """Begin and end (exclusive) of each interval."""
         return list(zip(self.edges[::2].tolist(), self.edges[1::2].tolist(), strict=True))
 
+    def shifted(self, by: int) -> Intervals:
+        """Each number plus `by`."""
+        return Intervals(self.edges + by)
+
     def contains(self, numbers: Ints) -> NDArray[np.bool_]:
         """Which of the numbers (N,) are in the set: those with an odd number of edges at or below them."""
         return _inside(self.edges, numbers)
@@ -191,6 +195,8 @@ MOST_RECORDS = 1 << NUMBER_BITS
 """Records of one author."""
 END = 1 << (ROBOT_BITS + SEQUENCE_BITS)
 """Keys are below it."""
+CHANNELS = -END
+"""What is added to the key of a component: the key of its channels. These keys are below zero."""
 WORLD = -1
 """The frame of records of authors that have no frame of their own; other frames have the number of their
 author."""

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+import logging
+from dataclasses import replace
 from typing import TypeVar, cast
 
 import numpy as np
 import torch
 
 from gmmtorch.errors import DataError
-from gmmtorch.mapping import Components, encode
+from gmmtorch.mapping import Attributes, Channel, Components, Labels, encode, has_channels
+from gmmtorch.scan import MOST_CHANNELS
 from gmmtorch.team.sharing.messages.component_messages import read_batch
 from gmmtorch.team.sharing.messages.record_messages import (
     RECORD_BYTES,
@@ -28,10 +31,19 @@ from gmmtorch.team.sharing.replica.materialized_view import (
     Frames,
     corrected,
     fingerprints,
+    is_same,
     most_viewpoints,
     with_gains,
 )
-from gmmtorch.team.sharing.replica.record_keys import WORLD, Intervals, Ints, authors, keys_of, robot_of
+from gmmtorch.team.sharing.replica.record_keys import (
+    CHANNELS,
+    WORLD,
+    Intervals,
+    Ints,
+    authors,
+    keys_of,
+    robot_of,
+)
 
 MOST_VIEWPOINTS = 48
 """Viewpoints of a component. One component then fits into `RECORD_BYTES`, so that every robot can send it."""
@@ -44,10 +56,13 @@ of each of 64 robots."""
 MOST_INTERVALS = 1 << 14
 """Intervals of held keys, with those that waiting supersessions may add. A team that loses datagrams has
 fewer."""
+MOST_LABELS = 256
+"""Of a channel of classes, as a view of the map has a column for each: 2 kB for each component."""
 _BATCH = 2048  # components of a stored batch
 _PIECE = 128
 """Components of a batch in the table after loading: to drop one takes time in proportion to its batch."""
 
+_log = logging.getLogger(__name__)
 _Record = TypeVar("_Record", bound=RecordMessage)
 
 
@@ -74,6 +89,9 @@ class Records:
     Attributes:
         held: keys that are or were here, and keys that are superseded: they need not be sent here.
         dead: keys of `held` whose records no longer count.
+        complete: keys of components that came with their channels; a component may have none.
+        hears_channels: whether a robot of the team knows channels.
+        unfit: names of channels that are left out; see `fitting`.
         frames: where the frames of the authors are.
         others, datagrams: records other than components that count, decoded and encoded, by key.
         version: rises with every change.
@@ -87,6 +105,10 @@ class Records:
         self._most = most_components
         self.held = Intervals.empty()
         self.dead = Intervals.empty()
+        self.complete = Intervals.empty()
+        self.hears_channels = False
+        self.unfit: set[str] = set()
+        self._channels: dict[str, tuple[int, frozenset[int]]] = {}  # columns and labels
         self.table = ComponentTable(dim or 3)
         self.counters = Counters()
         self.others: dict[int, RecordMessage] = {}
@@ -101,11 +123,52 @@ class Records:
 
     # -- adding -----------------------------------------------------------------------------------
 
-    def add_components(self, components: Components, bounded: bool = True) -> Intervals:
+    @property
+    def known(self) -> Intervals:
+        """The held keys, with those of channels if a robot of the team knows channels."""
+        return self._with_channels(self.held, self.complete | self.dead)
+
+    @property
+    def known_dead(self) -> Intervals:
+        """The dead keys, with those of channels, as `known`."""
+        return self._with_channels(self.dead, self.dead)
+
+    def _with_channels(self, keys: Intervals, of: Intervals) -> Intervals:
+        return Intervals.union([of.shifted(CHANNELS), keys]) if self.hears_channels else keys
+
+    def fitting(self, components: Components) -> Components:
+        """The components without channels of another kind than those held, or beyond `MOST_CHANNELS` and
+        `MOST_LABELS`: other robots' channels never hinder the exchange of geometry."""
+        if not components.attributes:
+            return components
+        fit: dict[str, Channel] = {}
+        for name, c in components.attributes.present().channels.items():
+            columns = 0 if isinstance(c, Labels) else c.mean.shape[1]
+            before = self._channels.get(name, (columns, frozenset()))
+            labels = before[1].union(c.labels.tolist() if isinstance(c, Labels) else ())
+            n = len(self._channels.keys() | {name})
+            if before[0] == columns and len(labels) <= MOST_LABELS and n <= MOST_CHANNELS:
+                self._channels[name], fit[name] = (columns, labels), c
+            elif name not in self.unfit and len(self.unfit) < MOST_CHANNELS:
+                self.unfit.add(name)
+                _log.warning(
+                    "Channel %r is left out of the shared map: it has other columns in another robot, or "
+                    "there are more than %d channels or %d labels.",
+                    name,
+                    MOST_CHANNELS,
+                    MOST_LABELS,
+                )
+        return replace(components, attributes=Attributes(fit))
+
+    def add_components(
+        self, components: Components, bounded: bool = True, complete: bool = False
+    ) -> Intervals:
         """Add all of the components, which the codec has rounded, or none; returns their keys.
 
-        bounded: whether the limits on memory apply. Raises `RefusedError`: "duplicate_id" (a key is held with
-        another content), "full", or "unfit" (another dimension, or more than `MOST_VIEWPOINTS` viewpoints).
+        A held component that lacks its channels gets them. bounded: whether the limits on memory apply.
+        complete: whether the components have their channels. Raises `RefusedError`: "duplicate_id" (a key is
+        held with another content), "full", or "unfit" (another dimension, or more than `MOST_VIEWPOINTS`
+        viewpoints).
         """
         keys = keys_of(components.ids)
         if not len(keys):
@@ -116,18 +179,33 @@ class Records:
                 f"map is in {self.dim or components.dim}D, and {MOST_VIEWPOINTS} viewpoints are the most."
             )
             raise RefusedError("unfit", robot_of(int(keys[0])), message)
+        components = self.fitting(components)
         fresh = ~self.held.contains(keys)
+        again = components.selected(torch.from_numpy(np.flatnonzero(~fresh)))
         if not fresh.all():
-            self._check_same(keys[~fresh], components.selected(torch.from_numpy(np.flatnonzero(~fresh))))
+            self._check_same(keys[~fresh], again)
             components = components.selected(torch.from_numpy(np.flatnonzero(fresh)))
         if bounded and len(self.table) + len(components) > self._most:
             raise _full(int(keys[0]))
-        added = Intervals.of(keys[fresh])
+        added = Intervals.of(keys)
         held = self._with(added, bounded)
         self.table.add(keys[fresh], components)
+        if complete:
+            self._complete(keys[~fresh], again)
+            self.complete |= added
+            self.hears_channels = True
         self._hold(held)
         self.dim = components.dim
-        return added if fresh.all() else Intervals.of(keys)
+        return added | added.shifted(CHANNELS) if complete else added
+
+    def _complete(self, keys: Ints, components: Components) -> None:
+        """Give held components (K,) the channels that they lack."""
+        rows = np.flatnonzero(self.table.contains(keys) & ~self.complete.contains(keys))
+        if len(rows):
+            self.table.drop(keys[rows])
+            self.table.add(keys[rows], components.selected(torch.from_numpy(rows)))
+            self._log.invalidate()
+            self.version += 1
 
     def add_record(self, record: RecordMessage, bounded: bool = True) -> Intervals:
         """Add another record; returns its key. Raises `RefusedError`, as `add_components` does."""
@@ -178,7 +256,9 @@ class Records:
     def _check_same(self, keys: Ints, again: Components) -> None:
         """Raise `RefusedError` if components with held keys (K,) have another content than before."""
         for key, print_ in zip(keys.tolist(), fingerprints(again), strict=True):
-            if key in self.others or (key in self.table and self.table.fingerprints([key]) != [print_]):
+            if key in self.others or (
+                key in self.table and not is_same(self.table.fingerprints([key])[0], print_)
+            ):
                 raise _duplicate_id(key)
 
     def _hold(self, held: Intervals) -> None:
@@ -296,9 +376,11 @@ class Records:
 
     def stored(self) -> tuple[list[bytes], list[bytes]]:
         """Codec batches of all components that count, and the datagrams of the other records that count."""
-        keys = self.table.keys()
-        parts = [keys[begin : begin + _BATCH] for begin in range(0, len(keys), _BATCH)]
-        batches = [encode(self.table.selected(part)) for part in parts]
+        keys, batches = self.table.keys(), []
+        has = self.complete.contains(keys)
+        for some, channels in ((keys[~has], False), (keys[has], True)):
+            for part in np.split(some, range(_BATCH, len(some), _BATCH)):
+                batches += [encode(self.table.selected(part), channels)] if len(part) else []
         return batches, [self.datagrams[key] for key in sorted(self.others)]
 
     def load_batch(self, data: bytes, own: int) -> None:
@@ -309,7 +391,8 @@ class Records:
         for rows in (is_own.nonzero().squeeze(1), (~is_own).nonzero().squeeze(1)):
             for piece in rows.split(_PIECE):
                 part = components.selected(piece)
-                self.add_components(part, bounded=bool((part.ids[:, 0] != own).any()))
+                bounded = bool((part.ids[:, 0] != own).any())
+                self.add_components(part, bounded=bounded, complete=has_channels(data))
 
 
 def _n_entries(record: RecordMessage) -> int:

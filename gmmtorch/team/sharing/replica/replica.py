@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -12,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
-from gmmtorch.mapping import Components, GaussianMap
+from gmmtorch.mapping import Components, GaussianMap, has_channels
 from gmmtorch.occupancy import Calibration
 from gmmtorch.pose import Pose
 from gmmtorch.scan import ArrayLike
@@ -33,6 +34,8 @@ from gmmtorch.team.sharing.replica.anti_entropy import Backlog, packets
 from gmmtorch.team.sharing.replica.authorship import Author, MovedMap, Published
 from gmmtorch.team.sharing.replica.materialized_view import Changes, Placement, robot_of_frame
 from gmmtorch.team.sharing.replica.record_keys import (
+    CHANNELS,
+    END,
     LARGEST_INCARNATION,
     LARGEST_ROBOT,
     NUMBER_BITS,
@@ -77,6 +80,7 @@ class Replica:
         incarnation: int | None = None,
         most_components: int = MOST_COMPONENTS,
         own_frame: bool = False,
+        channels: Collection[str] | None = None,
     ) -> None:
         """Args:
         robot: id of the robot, up to 1023; unique in the team.
@@ -85,6 +89,7 @@ class Replica:
             drawn.
         most_components: limit on the components; this robot's own are always added.
         own_frame: whether positions are in a frame of this robot, which `join` places, and not in `WORLD`.
+        channels: names of the channels of attributes that this robot shares; None: all of its map.
         """
         self.robot = check_whole("robot", robot, 0, LARGEST_ROBOT)
         number = drawn_incarnation() if incarnation is None else incarnation
@@ -95,6 +100,7 @@ class Replica:
         self._records = Records(dim, check_whole("most_components", most_components, 1), self._own)
         self._author = Author(self._records, self.robot, self.incarnation)
         self._backlog = Backlog(self.robot)
+        self._channels = channels
         self._max_bytes = MAX_BYTES  # of the last call of `datagrams`
         self.refused: Counter[str] = Counter()
         self.duplicates: Counter[int] = Counter()
@@ -213,7 +219,7 @@ class Replica:
         left = np.inf if budget is None else check_whole("budget", budget, 0)
         sent: list[bytes] = []
         sent_keys = Intervals.empty()
-        self._backlog.due -= self._records.dead
+        self._backlog.due -= self._records.known_dead
         due, ready = self._backlog.due, self._backlog.ready
         for datagram, keys in packets(self._records, due, ready, max_bytes, budget is not None):
             left -= len(datagram)
@@ -228,7 +234,12 @@ class Replica:
         """Datagrams that list the records of this robot. Others answer with those that it lacks."""
         check_size(max_bytes)
         self._backlog.announcing()
-        return encode_announcements(self.robot, self.incarnation, self._records.held, max_bytes)
+        records = self._records
+        found = encode_announcements(self.robot, self.incarnation, records.held, max_bytes)
+        if records.hears_channels:  # first, so that components are sent once, with their channels
+            channels = records.known & Intervals.span(CHANNELS, CHANNELS + END)
+            found = encode_announcements(self.robot, self.incarnation, channels, max_bytes, CHANNELS) + found
+        return found
 
     def receive(self, datagram: bytes, message: Message | None = None) -> bool:
         """Merge a datagram; returns whether it was valid and merged. Never raises.
@@ -257,10 +268,12 @@ class Replica:
         message = decode(datagram) if message is None else message
         if isinstance(message, AnnouncementMessage):
             self._check_sender(message)
-            self._backlog.announced(message, self._records.held, self._records.dead)
+            self._records.hears_channels |= message.begin < 0
+            self._backlog.announced(message, self._records.known, self._records.known_dead)
         elif isinstance(message, ComponentsMessage) and datagram[:1] == _QUANTIZED:
             self._check_keys(keys_of(message.components.ids))
-            self._backlog.received(self._records.add_components(message.components))
+            complete = has_channels(datagram[1:2])
+            self._backlog.received(self._records.add_components(message.components, complete=complete))
         elif isinstance(message, RecordMessage):
             self._check_keys(np.array([message.key]))
             if isinstance(message, SupersessionMessage) and message.key not in self._author.written:
@@ -354,10 +367,15 @@ class Replica:
         return self._records.held
 
     @property
+    def known(self) -> Intervals:
+        """`held`, with the keys of channels, which are below zero, if a robot of the team knows channels."""
+        return self._records.known
+
+    @property
     def missing(self) -> Intervals:
         """Keys of records that other robots have announced and that this robot lacks. Robots without a recent
-        announcement are left out: see `anti_entropy.PATIENCE`."""
-        return self._backlog.missing(self._records.held)
+        announcement are left out: see `anti_entropy.PATIENCE`. Keys of channels are below zero."""
+        return self._backlog.missing(self._records.known)
 
     @property
     def version(self) -> int:
@@ -401,6 +419,8 @@ class Replica:
             raise InvalidArgumentError(
                 f"The components are {components.dim}-dimensional; this map is in {self._records.dim}D."
             )
+        if self._channels is not None:
+            components = replace(components, attributes=components.attributes.only(self._channels))
         return components.on_cpu()
 
 

@@ -1,0 +1,114 @@
+"""Attributes that are numbers as an adaptive binary code (`range_coder`): each is predicted from the
+components before it; docs/formats.md.
+
+A row is a component: its share, A deviations, A means, and slopes, as whole numbers (`attribute_block`). The
+fused kernel does the work. This twin defines it.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import DataError
+from gmmtorch.kernels import ChanceTables, is_fused, number_coding
+from gmmtorch.mapping.codec.context_chances import OF_ATTRIBUTES
+from gmmtorch.mapping.codec.range_coder import NUMBER, RangeCoder, copied, first_chances
+
+MOST_STEPS = 1 << 40
+"""Largest mean and slope."""
+DEVIATIONS = 80
+"""Largest power of √2 of a deviation, and of its inverse."""
+WHOLE = 8
+"""Parts of a share."""
+_FIELDS = ("SHARE", "FIRST", "SECOND", "LATER", "MEAN", "OTHER", "FLAT", "TILTED", "STEEP", "STEEPER")
+_FOLLOWS = 0.6  # how far the expected mean moves to that of the last component
+_LEVEL = 64  # parts of a power, in the running mean of deviations
+_BYTES, _WIDEST = 16, 128  # of a number, usually and at most
+
+
+def write_rows(rows: Tensor, width: int) -> bytes:
+    """The rows (K, n) of a channel with `width` columns, without zeros at the end."""
+    if is_fused(rows):
+        given = rows.contiguous().clone()
+        for size in (_BYTES, _WIDEST):
+            stream = torch.zeros(64 + size * rows.numel(), dtype=torch.uint8)
+            n = number_coding(given, width, powers(), copied(first_tables()), stream, writes=True)
+            if n >= 0:
+                return stream[:n].numpy().tobytes().rstrip(b"\0")
+        raise AssertionError("numbers in range fit")
+    writer = RangeCoder(first_tables())
+    _walk(writer, rows.tolist(), width)
+    return writer.to_bytes().rstrip(b"\0")
+
+
+def read_rows(data: bytes, k: int, n: int, width: int) -> Tensor:
+    """What `write_rows` wrote of K components. Raises `DataError` for other bytes."""
+    if is_fused(torch.empty(0)):
+        rows = torch.zeros(k, n, dtype=torch.int64)
+        stream = torch.frombuffer(bytearray(data or b"\0"), dtype=torch.uint8)
+        is_good = number_coding(rows, width, powers(), copied(first_tables()), stream, writes=False) >= 0
+    else:
+        table = [[0] * n for _ in range(k)]
+        _walk(RangeCoder(first_tables(), data), table, width)
+        rows, is_good = torch.tensor(table, dtype=torch.int64).reshape(k, n), True
+    if not is_good or write_rows(rows, width) != data:
+        raise DataError("The numbers of the attributes are damaged.")
+    return rows
+
+
+@functools.cache
+def powers() -> Tensor:
+    """√2 to the powers −`DEVIATIONS` … `DEVIATIONS`, equal on all machines."""
+    powers = range(-DEVIATIONS, DEVIATIONS + 1)
+    return torch.tensor([math.ldexp(math.sqrt(2) if d % 2 else 1.0, d // 2) for d in powers]).double()
+
+
+@functools.cache
+def first_tables() -> ChanceTables:
+    """The tables before the first bit."""
+    return first_chances(OF_ATTRIBUTES, [NUMBER] * len(_FIELDS))
+
+
+def _walk(coder: RangeCoder, rows: list[list[int]], width: int) -> None:
+    """Write rows, or read them in place."""
+    field = dict(zip(_FIELDS, coder.first, strict=True))
+    power = powers().tolist()
+    level: list[int] = []
+    height: list[float] = []
+
+    def coded(row: list[int], place: int, name: str, expected: int, most: int) -> int:
+        row[place] = expected + coder.whole(field[name], row[place] - expected)
+        if abs(row[place]) > most:
+            raise DataError("A number of the attributes is too large: it is damaged.")
+        return row[place]
+
+    for row in rows:
+        if coded(row, 0, "SHARE", WHOLE, WHOLE) < 0:
+            raise DataError("A share of the attributes is negative: it is damaged.")
+        if row[0] == 0:
+            continue
+        deviation, unit = row[1 : 1 + width], [0.0] * width
+        for a in range(width):
+            expected = deviation[a - 1] if a else 0
+            if level:
+                shift = (_LEVEL * deviation[a - 1] - level[a - 1]) // 2 if a else 0
+                expected = (level[a] + shift + _LEVEL // 2) // _LEVEL
+            deviation[a] = coded(row, 1 + a, _FIELDS[1 + min(a, 2)], expected, DEVIATIONS)
+            unit[a] = power[deviation[a] + DEVIATIONS]
+        for a in range(width):
+            near = math.floor(height[a] * 2 / unit[a] + 0.5) if height else 0
+            expected = near if abs(near) < MOST_STEPS else 0
+            coded(row, 1 + width + a, "OTHER" if a else "MEAN", expected, MOST_STEPS)
+        steep = 0
+        for place in range(1 + 2 * width, len(row)):
+            steep += abs(coded(row, place, _FIELDS[6 + min(steep, 3)], 0, MOST_STEPS))
+        value = [row[1 + width + a] * unit[a] / 2 for a in range(width)]
+        if level:
+            height = [h + _FOLLOWS * (v - h) for h, v in zip(height, value, strict=True)]
+            level = [p + (_LEVEL * d - p) // 4 for p, d in zip(level, deviation, strict=True)]
+        else:
+            height, level = value, [_LEVEL * d for d in deviation]
