@@ -58,7 +58,7 @@ _FEWEST = 10  # points of a scan
 _NEAREST = 0.2  # metres from the sensor: nearer points are its own cover, which would fit any wall
 _FREE, _OCCUPIED = 0.2, 0.9  # occupancy of cells that the map is sure of,
 _CELL = 0.1  # metres, their side
-_BEAM_POINTS = 64  # of a beam, which are asked
+_BEAMS, _BEAM_POINTS = 60, 64  # of the scan, and of each beam, which are asked
 _MOST_CONTRADICTED = 1.5  # times the share that need not be explained
 
 
@@ -269,15 +269,14 @@ class Tracker:
 
     def _contradicted(self, known: GaussianMap, rows: Tensor, pose: Pose) -> tuple[float, float]:
         """Shares of the points in free space of the map, and of the beams that pass through a surface."""
-        margin = MARGIN[0] / rows.norm(dim=1) + MARGIN[1]
+        beams = rows[:_BEAMS]
+        margin = MARGIN[0] / beams.norm(dim=1) + MARGIN[1]
         parts = torch.linspace(0, 1, _BEAM_POINTS + 1).to(rows)[1:]
-        along = parts * (1 - margin).clamp_min(0)[:, None]
-        asked = torch.cat([rows[:, None], along[..., None] * rows[:, None]], 1)
-        occupancy = torch.as_tensor(known.occupancy(pose.apply(asked.flatten(0, 1)), _CELL)).view(
-            len(rows), -1
-        )
-        through = (occupancy[:, 1:] > _OCCUPIED).any(1)
-        return float((occupancy[:, 0] < _FREE).double().mean()), float(through.double().mean())
+        along = (parts * (1 - margin).clamp_min(0)[:, None])[..., None] * beams[:, None]
+        asked = pose.apply(torch.cat([rows, along.flatten(0, 1)]))
+        at_ends, on_beams = torch.as_tensor(known.occupancy(asked, _CELL)).tensor_split([len(rows)])
+        through = (on_beams.view(len(beams), -1) > _OCCUPIED).any(1)
+        return float((at_ends < _FREE).double().mean()), float(through.double().mean())
 
     def _nothing(self, predicted: Pose | None) -> Location:
         """The prediction, for a scan without points."""
