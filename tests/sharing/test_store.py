@@ -325,6 +325,7 @@ def test_flipped_bytes_are_refused_or_restored_in_part(tmp_path, caplog):
         ("DROP TABLE record", "other tables"),
         ("PRAGMA user_version = 2", "version 2"),
         ("PRAGMA application_id = 7", "no store"),
+        ("INSERT INTO fact VALUES (x'00', '1')", "facts are damaged"),
         ("UPDATE fact SET value = '{'", "facts are damaged"),
         ("UPDATE fact SET value = '7'", "robot was 7 and is 0"),
     ],
