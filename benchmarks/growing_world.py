@@ -1,10 +1,10 @@
-"""What a scan costs to learn as the world grows, and what a query after each scan costs.
+"""What a scan costs to learn as the world grows, and what a query after it costs in a city of tiles.
 
     python benchmarks/growing_world.py --only growing-world [--halls 1 4 16]
     OMP_NUM_THREADS=1 python benchmarks/growing_world.py --data $GMMTORCH_DATA
 
-`growing-world` has embedded halls side by side. `growing-map` has the scans of the folder `street`: after
-each one the map is asked about 500 points on its beams. `growing-tiles` has a city in tiles on disk.
+`growing-world` has embedded halls side by side. `growing-tiles` has a city in tiles on disk, made of the
+folder `street`. A map in memory is in growth.py.
 """
 
 from __future__ import annotations
@@ -19,11 +19,10 @@ from itertools import islice
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from gmmtorch import GaussianMap, IncrementalRule, Scan, datasets
-from gmmtorch.datasets.base import Dataset
 from gmmtorch.experiments.harness import Case, Row, cpu_seconds, recording, run
-from gmmtorch.kernels import kernels
 from gmmtorch.mapping import TiledMap
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.map_builder import resident_bytes
@@ -47,42 +46,11 @@ def milliseconds(scans: list[Scan], n_halls: int, rule: IncrementalRule) -> tupl
     return 1e3 * (time.process_time() - begin) / (n_halls * len(scans)), built.n_components
 
 
-def asked_after_each_scan(scans: Dataset, choice: str) -> Iterator[Row]:
-    """A row for every sixth of the scans."""
-    built, spent = GaussianMap(), []
-    generator = torch.Generator().manual_seed(0)
-    before = resident_bytes()
-    with kernels(choice):
-        for number, scan in enumerate(scans, 1):
-            chosen = torch.randint(len(scan.points), (N_POINTS,), generator=generator)
-            share = torch.rand(N_POINTS, 1, generator=generator, dtype=torch.float64)
-            points = scan.origin + share * (scan.points[chosen] - scan.origin)
-            begin = time.process_time()
-            built.insert(scan)
-            learned = time.process_time()
-            built.occupancy(points)
-            spent.append((learned - begin, time.process_time() - learned))
-            if number % -(-len(scans) // 6) == 0 or number == len(scans):
-                part = 1e3 * torch.tensor(spent)
-                learning, query = part.mean(0).tolist()
-                worst, memory = float(part[:, 1].max()), (resident_bytes() - before) / 1e6
-                yield choice, number, built.n_components, learning, query, worst, memory
-                spent = []
-
-
-def growing_map(options: Any) -> Iterator[Row]:
-    scans = recording(options.data, "street")
-    for choice in ("fused", "torch"):
-        yield from asked_after_each_scan(scans, choice)
-    built = GaussianMap()
-    for scan in scans:
-        built.insert(scan)
-    built.finish()
-    points = torch.cat([0.5 * (s.origin + s.points[:: len(s.points) // 88][:88]) for s in scans])[:20_000]
-    first, again = (cpu_seconds(lambda: built.occupancy(points))[0] for _ in range(2))
-    options.about = (
-        f"First query of {len(points):,} points over the whole map: {first:.2f} s; again: {again:.2f} s."
-    )
+def points_on_beams(scan: Scan, generator: torch.Generator) -> Tensor:
+    """Points (`N_POINTS`, D) anywhere on beams of a scan, as a planner asks about."""
+    chosen = torch.randint(len(scan.points), (N_POINTS,), generator=generator)
+    share = torch.rand(N_POINTS, 1, generator=generator, dtype=torch.float64)
+    return scan.origin + share * (scan.points[chosen] - scan.origin)
 
 
 def city(found: Components, n_components: int) -> Iterator[Components]:
@@ -112,9 +80,7 @@ def growing_tiles(options: Any) -> Iterator[Row]:
             tiled = TiledMap(folder, memory=options.memory)
             spent: list[tuple[float, float]] = []
             for scan in scans[:44]:
-                chosen = torch.randint(len(scan.points), (N_POINTS,), generator=generator)
-                share = torch.rand(N_POINTS, 1, generator=generator, dtype=torch.float64)
-                points = scan.origin + share * (scan.points[chosen] - scan.origin)
+                points = points_on_beams(scan, generator)
                 spent.append(
                     (
                         cpu_seconds(partial(tiled.insert, scan))[0],
@@ -136,7 +102,6 @@ def growing_world(options: Any) -> Iterator[Row]:
 
 
 COSTS = {"halls": ".0f", "components": ",.0f", "no budget": ".0f", f"{PER_HALL:,} components a hall": ".0f"}
-SPENT = ("scans", "components", "learning, ms a scan", "query, ms", "longest query, ms", "MB")
 TILED = (
     "components",
     "tiles",
@@ -153,14 +118,6 @@ CASES = (
         f"Copies of the embedded hall side by side, {N_SCANS} scans of 5,120 beams each, CPU ms a scan.",
         COSTS,
         needs_data=False,
-    ),
-    Case(
-        "growing-map",
-        growing_map,
-        "A street of 410 m, 228 scans of 19,000 points each. Each row is the mean of the scans since the row "
-        "before. MB are the memory of the process above that before the first scan.",
-        {"kernels": "", **dict.fromkeys(SPENT, ".0f")},
-        key=2,
     ),
     Case(
         "growing-tiles",

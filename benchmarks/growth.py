@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from growing_world import N_POINTS, points_on_beams
 from torch import Tensor
 
 from gmmtorch import GaussianMap, Scan
@@ -38,7 +39,7 @@ from gmmtorch.report import (
 
 ROOT = Path(__file__).parents[1]
 CELLS = {"street": 0.2, "freiburg-campus": 0.1}  # metres, of the maps of cells and of the cubes asked about
-N_POINTS, N_ROWS = 500, 12
+N_ROWS = 12
 MAPS = ("gmmtorch", "gmmtorch in tiles", "OctoMap", "Bonxai")
 
 
@@ -87,9 +88,7 @@ def growth(data: Path, recorded: str, name: str, library: str | None) -> dict[st
         made = new_map(name, side, scans[0].dim, f"{folder}/1", library)
         before = resident_bytes()
         for number, scan in enumerate(scans, 1):
-            chosen = torch.randint(len(scan.points), (N_POINTS,), generator=generator)
-            share = torch.rand(N_POINTS, 1, generator=generator, dtype=torch.float64)
-            points = scan.origin + share * (scan.points[chosen] - scan.origin)
+            points = points_on_beams(scan, generator)
             begin = time.process_time()
             made.insert(scan)
             learned = time.process_time()

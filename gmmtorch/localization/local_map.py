@@ -122,7 +122,7 @@ class LocalMap:
     def _search(self) -> PoseSearch:
         points = torch.cat([scan.points[:_SEARCHED] for scan in self._scans])
         origins = torch.cat([scan.origin.expand_as(scan.points[:_SEARCHED]) for scan in self._scans])
-        return PoseSearch(points, free_segments(origins, points, points.new_zeros(len(points)).bool()))
+        return PoseSearch(points, free_segments(origins, points))
 
     def locate(self, scan: Keyframe, expected: Expectation) -> Location:
         """The pose of a scan, whose own pose is not used; `found` if it is sure."""

@@ -272,14 +272,16 @@ def _most(bound: Tensor, least: float, most: int) -> Tensor:
     return kept if len(kept) <= most else kept[bound[kept].topk(most).indices]
 
 
-def free_segments(origins: Tensor, ends: Tensor, is_empty: Tensor) -> Tensor:
-    """The segments (B, 2, D) of free space from origins to the ends of beams (B, D): all of a beam that
-    `is_empty` (B,), because it met no surface, else the part before the margin of its surface.
+def free_segments(origins: Tensor, ends: Tensor, is_empty: Tensor | None = None) -> Tensor:
+    """The segments (B, 2, D) of free space from origins to the ends of beams (B, D): the part of each before
+    the margin of its surface, but all of a beam that `is_empty` (B,), because it met no surface.
     """
     beams = ends - origins
     ranges = beams.norm(dim=1, keepdim=True).clamp_min(1e-9)
-    part = 1 - torch.where(is_empty[:, None], 0.0, MARGIN[0] / ranges + MARGIN[1])
-    return torch.stack([origins, origins + part.clamp_min(0) * beams], 1)
+    part = (1 - MARGIN[0] / ranges - MARGIN[1]).clamp_min(0)
+    if is_empty is not None:
+        part = torch.where(is_empty[:, None], 1.0, part)
+    return torch.stack([origins, origins + part * beams], 1)
 
 
 def _divided(heading: Tensor, shift: Tensor, width: int) -> tuple[Tensor, Tensor]:

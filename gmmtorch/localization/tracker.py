@@ -27,7 +27,7 @@ from gmmtorch.localization.alignment import (
     seen_normals,
 )
 from gmmtorch.localization.location import UNSEEN, Location, continued, measured_motion, pose_covariance
-from gmmtorch.localization.pose_search import CORRELATED, MARGIN, PoseSearch
+from gmmtorch.localization.pose_search import CORRELATED, PoseSearch, free_segments
 from gmmtorch.mapping import Components, GaussianMap, Surfaces, surface_mixture
 from gmmtorch.pose import Pose
 from gmmtorch.scan import check_positions
@@ -67,8 +67,8 @@ class Tracker:
 
     A scan is aligned with the surfaces of the map (`localization.alignment`), from the pose that the last
     motion predicts. If this fails, starts around the prediction are tried, then four times as far. After
-    a lost scan, and for the first scan without a pose, the whole map is searched: all headings at the places
-    from which the map was seen.
+    a lost scan, and for the first scan without a pose, the whole map is searched: in 2D by branch and bound
+    (`localization.pose_search`), in 3D all headings at the places from which the map was seen.
 
     Args:
         surfaces: a map, its components, or (means, covariances, weights).
@@ -269,11 +269,9 @@ class Tracker:
 
     def _contradicted(self, known: GaussianMap, rows: Tensor, pose: Pose) -> tuple[float, float]:
         """Shares of the points in free space of the map, and of the beams that pass through a surface."""
-        beams = rows[:_BEAMS]
-        margin = MARGIN[0] / beams.norm(dim=1) + MARGIN[1]
-        parts = torch.linspace(0, 1, _BEAM_POINTS + 1).to(rows)[1:]
-        along = (parts * (1 - margin).clamp_min(0)[:, None])[..., None] * beams[:, None]
-        asked = pose.apply(torch.cat([rows, along.flatten(0, 1)]))
+        beams = free_segments(torch.zeros_like(rows[:_BEAMS]), rows[:_BEAMS])[:, 1]
+        parts = torch.linspace(0, 1, _BEAM_POINTS + 1).to(rows)[1:, None]
+        asked = pose.apply(torch.cat([rows, (parts * beams[:, None]).flatten(0, 1)]))
         at_ends, on_beams = torch.as_tensor(known.occupancy(asked, _CELL)).tensor_split([len(rows)])
         through = (on_beams.view(len(beams), -1) > _OCCUPIED).any(1)
         return float((at_ends < _FREE).double().mean()), float(through.double().mean())

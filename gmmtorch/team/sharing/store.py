@@ -192,8 +192,9 @@ def _check_facts(db: sqlite3.Connection, path: Path, facts: Mapping[str, Any]) -
     """Write the facts to a new file; raise `InvalidArgumentError` if those of an old one differ."""
     try:
         kept = {name: json.loads(value) for name, value in db.execute("SELECT name, value FROM fact")}
-        names = sorted({*kept, *facts})
-    except (ValueError, TypeError, RecursionError) as error:  # a name of bytes is not compared with text
+        if not all(isinstance(name, str) for name in kept):
+            raise ValueError("a name is not text")
+    except (ValueError, RecursionError) as error:
         raise DataError(
             f"{path}: its facts are damaged ({error}). Move it away; a new store is made."
         ) from error
@@ -202,7 +203,7 @@ def _check_facts(db: sqlite3.Connection, path: Path, facts: Mapping[str, Any]) -
         with transaction(db):
             rows = [(name, json.dumps(value)) for name, value in own.items()]
             db.executemany("INSERT INTO fact VALUES (?, ?)", rows)
-    elif names := [name for name in names if own.get(name) != kept.get(name)]:
+    elif names := sorted(name for name in {*own, *kept} if own.get(name) != kept.get(name)):
         shown = ", ".join(
             f"{_shown(name)} was {_shown(kept.get(name))} and is {_shown(own.get(name))}" for name in names
         )

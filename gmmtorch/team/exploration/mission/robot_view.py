@@ -238,10 +238,8 @@ class AgentMoments:
 
     def _flight(self, plan: PlanMessage, now: float) -> tuple[Tensor, Tensor]:
         """The pose (4,) of a teammate that flies a plan, and the positions (A, 3) ahead of it."""
-        step = round(
-            (now - self._agent.heard_at[plan.sender]) / plan.step
-        )  # pose k is that after k + 1 steps
-        row = min(max(step - 1, 0), len(plan.path) - 1)
+        n_steps = round((now - self._agent.heard_at[plan.sender]) / plan.step)
+        row = min(max(n_steps - 1, 0), len(plan.path) - 1)  # pose k is that after k + 1 steps
         return plan.path[row].double(), plan.path[row:, :3].double()
 
     def __call__(self, now: float) -> Moment:
