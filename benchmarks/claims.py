@@ -182,7 +182,7 @@ PEAK = (
     "hydra.run.dir=$OUT', shell=True, check=True); "
     "print('peak', resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss // 1024, 'MiB')\""
 )
-ODOMETRY = "python benchmarks/odometry.py --data $DATA --only odometry --methods mixture"
+ODOMETRY = "python benchmarks/odometry.py --data $DATA --only odometry --seeds 0 --methods"
 SEEDS = "gmmtorch-explore hydra.run.dir=$OUT experiment=fig4_4_entropy 'study.seeds=[0,1,2,3,4]' "
 
 LEARNED = {"times faster": times(2), "K": within(0), "held-out nats": within(0.02), "PSNR2 dB": within(0.5)}
@@ -277,11 +277,9 @@ RUNS = {
         *of_table("registration-hall", 1, ALIGNED),
         *of_table("registration-courtyard", 1, ALIGNED),
     ]),
-    "odometry": Run(f"{ODOMETRY} --seeds 0 1 2 3 4 --names courtyard && "
-                    f"{ODOMETRY} --seeds 0 --names street && "
-                    f"{ODOMETRY} --seeds 0 1 --names hall && "
-                    f"{ODOMETRY} --seeds 0 1 --names intel && "
-                    f"{ODOMETRY} --seeds 0 --names freiburg-101 aces",
+    "odometry": Run(f"{ODOMETRY} mixture --names intel freiburg-101 aces orebro seattle && "
+                    f"{ODOMETRY} mixture --names hall courtyard street && "
+                    f"{ODOMETRY} kiss_icp --names hall courtyard street",
                     of_table("odometry", 3, FLOWN)),
     "fig3_4": Run(OCCUPANCY + "experiment=fig3_4_auc_sparsity_2d " + INTEL, [
         Claim(FIGURES, "1 cm Monte Carlo has # […] with all beams, # […] with 70 % removed and # […] with",
