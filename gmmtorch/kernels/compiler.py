@@ -42,6 +42,9 @@ _LEAST_ITEMS = 1 << 10  # of a thread of a CPU
 _BLOCK = 64
 """Items of a block on CUDA. Few, because many kernels have some thousand items, each with much work: they
 spread over all multiprocessors."""
+_BLOCKS_OF_TEAM = 4
+"""Blocks of a team on each multiprocessor. So many are there at a time with 255 registers a thread, so none
+waits for a block that has not begun."""
 _lock = threading.RLock()
 
 CPU_LANES = 8
@@ -244,6 +247,22 @@ class FusedKernel:
         stub = f"def body(item: wp.int64, {signature}): ...\n"
         entry = f"def {self.name}({signature}):\n    body(wp.int64(wp.tid()), {', '.join(names)})\n"
         return "\n".join([*casts, self._signature[1]]), stub, entry
+
+
+class Team(NamedTuple):
+    """The workers of a launch that wait for each other, in C++ `gmm::Team`; n is the size of the launch."""
+
+    n: int
+    arrived: Tensor | None
+    rounds: int = 0
+
+    @staticmethod
+    def of(device: torch.device) -> Team:
+        """One worker on a CPU; on a GPU as many as it runs at a time."""
+        if device.type == "cpu":
+            return Team(1, None)
+        n_blocks = _BLOCKS_OF_TEAM * torch.cuda.get_device_properties(device).multi_processor_count
+        return Team(n_blocks * _BLOCK, torch.zeros(1, dtype=torch.int32, device=device))
 
 
 def _with_includes(source: Path, seen: set[Path]) -> str:

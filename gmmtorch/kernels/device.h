@@ -34,6 +34,32 @@ GMM_INLINE void add(Number* place, Number value) {
 #endif
 }
 
+// The workers of one launch, each an item, that wait for each other: a whole iteration runs on the device. A
+// worker takes every n-th piece of work, from that of its item on. On a CPU there is one worker.
+struct Team {
+    int64_t n;
+    int* arrived;  // zero at the start
+    int64_t rounds;
+};
+
+// Waits for all workers; what they wrote before can be read after. All of them call it equally often.
+GMM_INLINE void meet(Team& team) {
+#if defined(__CUDA_ARCH__)
+    __syncthreads();
+    team.rounds += 1;
+    if (threadIdx.x == 0) {
+        __threadfence();
+        atomicAdd(team.arrived, 1);
+        while (*(volatile int*)team.arrived < team.rounds * gridDim.x) {
+        }
+        __threadfence();
+    }
+    __syncthreads();
+#else
+    (void)team;
+#endif
+}
+
 // Starts to load n numbers.
 GMM_INLINE void fetch(const double* place, int n) {
 #if !defined(__CUDA_ARCH__)
