@@ -15,9 +15,10 @@ import json
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from public_work import counted, large_works, prepare, works
@@ -183,6 +184,37 @@ def against(options: Any) -> Iterator[Row]:
         yield name, before, after, before / after, *counts
 
 
+class GpuUse(NamedTuple):
+    """Of a work: the seconds in which the GPU computes, the MB that it allocates at most, and what bounds it.
+
+    launches: the GPU waits for the host for more than half of the time. Otherwise memory, if NVML counts
+    accesses to it in more than half of the time, or arithmetic.
+    """
+
+    busy: float
+    megabytes: float
+    bound: str
+
+    @staticmethod
+    def of(work: Callable[[], object], seconds: float, device: str) -> GpuUse:
+        work()
+        held = torch.cuda.memory_allocated(device)
+        torch.cuda.reset_peak_memory_stats(device)
+        with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
+            work()
+            torch.cuda.synchronize(device)
+        busy = sum(event.self_device_time_total for event in profile.key_averages()) / 1e6
+        megabytes = (torch.cuda.max_memory_allocated(device) - held) / 1e6
+        if busy < 0.5 * seconds:
+            return GpuUse(busy, megabytes, "launches")
+        shares, end = [], time.perf_counter() + 1.5  # NVML counts in periods of up to a second
+        while time.perf_counter() < end:
+            work()
+            torch.cuda.synchronize(device)
+            shares.append(torch.cuda.memory_usage(device))
+        return GpuUse(busy, megabytes, "memory" if max(shares) > 50 else "arithmetic")
+
+
 def devices(options: Any) -> Iterator[Row]:
     """The work of `public_work.py` on the CPU and on the GPU."""
     if options.device == "cpu":
@@ -198,7 +230,8 @@ def devices(options: Any) -> Iterator[Row]:
             work = listed[device][name]()
             counts = counted(work)  # and what is compiled or loaded once
             seconds.append(least_seconds(work, options.repeats, device))
-        yield name, *seconds, seconds[0] / seconds[1], "{:,} ({:,})".format(*counts)
+        use = GpuUse.of(work, seconds[1], options.device)
+        yield name, *seconds, seconds[0] / seconds[1], *use, "{:,} ({:,})".format(*counts)
 
 
 CASES = (
@@ -230,12 +263,15 @@ CASES = (
     Case(
         "devices",
         devices,
-        "In parentheses: operations that wait for the device.",
+        "Busy: seconds in which the GPU computes. In parentheses: operations that wait for the device.",
         {
             "work": "",
             "s on the CPU": "3",
             "s on the GPU": "3",
             "times faster": "3",
+            "busy": "3",
+            "MB": ".0f",
+            "bound by": "",
             "operations (waits)": "",
         },
     ),
