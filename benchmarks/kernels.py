@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from public_work import counted, large_works, prepare, works
+from public_work import counted, em, large_works, prepare, works
 from torch import Tensor
 
 from gmmtorch import GaussianMap
@@ -234,6 +234,77 @@ def devices(options: Any) -> Iterator[Row]:
         yield name, *seconds, seconds[0] / seconds[1], *use, "{:,} ({:,})".format(*counts)
 
 
+def memory_works(data: Path, device: str) -> dict[str, Callable[[int], Callable[[], object]]]:
+    """For each work the function that prepares it for n things."""
+
+    def asked(n: int) -> Callable[[], object]:
+        cones, some = map_and_points(data, "kinect", 8000, 0.05, 10_000, device)
+        points = some.repeat(n // len(some), 1)
+        return lambda: PointForm(cones, 0.05, 3.0)(points)
+
+    def cells(n: int) -> Callable[[], object]:
+        return lambda: Evidence.empty(VoxelGrid((0.0,) * 3, 0.1, (n // 10_000, 100, 100)), device)
+
+    def counted_rays(n: int) -> Callable[[], object]:
+        starts, ends, grid = rays(n, 0.2, device)
+        return lambda: Evidence.empty(grid, device).add_rays(starts, ends)
+
+    def components(n: int) -> Callable[[], object]:
+        generator = torch.Generator().manual_seed(0)
+        side = n ** (1 / 3)
+        means = side * torch.rand(n, 3, generator=generator, dtype=torch.float64)
+        spread = torch.tensor([0.3, 0.3, 0.02], dtype=torch.float64).square().diag().expand(n, 3, 3)
+        counts = torch.full((n,), 100.0, dtype=torch.float64)
+        origins = means + torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)
+        parts = [part.to(device) for part in (means, spread, origins, counts, means[:500])]
+
+        def indexed() -> object:
+            made = GaussianMap.from_components(*parts[:2], support=parts[3], origins=parts[2])
+            made.occupancy(parts[4])
+            return made
+
+        return indexed
+
+    return {
+        "a point of exact EM, K = 100": lambda n: em(n, 100, device, "exact"),
+        "a point of EM, K = 1,000": lambda n: em(n, 1000, device),
+        "a component of a map in 3D with its index": components,
+        "a point of a query": asked,
+        "a ray that is counted": counted_rays,
+        "a cell of a dense grid": cells,
+    }
+
+
+def peak_bytes(work: Callable[[], object], device: str) -> int:
+    """Bytes of tensors that a work has at most at a time, with its result, beside its input."""
+    if device != "cpu":
+        before = torch.cuda.memory_allocated(device)
+        torch.cuda.reset_peak_memory_stats(device)
+        kept = work()
+        del kept
+        return torch.cuda.max_memory_allocated(device) - before
+    with torch.profiler.profile(profile_memory=True) as profile:
+        kept = work()
+        del kept
+    events: Any = profile.profiler
+    changes = [event.nbytes() for event in events.kineto_results.events() if event.name() == "[memory]"]
+    return max(itertools.accumulate(changes))
+
+
+def memory(options: Any) -> Iterator[Row]:
+    """Of a CPU, and of a GPU if that is the device: the growth from a million things to three million."""
+    for name in memory_works(options.data, "cpu"):
+        row: list[float | None] = []
+        for device in ("cpu", "cuda"):
+            if device == "cuda" and not options.device.startswith("cuda"):
+                row.append(None)
+                continue
+            work = memory_works(options.data, device)[name]
+            few, many = (peak_bytes(work(n), device) for n in (10**6, 3 * 10**6))
+            row.append((many - few) / (2 * 10**6))
+        yield name, *row
+
+
 CASES = (
     Case(
         "kernels{gpu}",
@@ -274,6 +345,12 @@ CASES = (
             "bound by": "",
             "operations (waits)": "",
         },
+    ),
+    Case(
+        "memory",
+        memory,
+        "Bytes that each more of a million to three million takes at most, beside its input.",
+        {"": "", "bytes on the CPU": ".0f", "on the GPU": ".0f"},
     ),
 )
 
