@@ -28,6 +28,9 @@ from .mixtures.cell_sums import cell_moments as cell_moments
 from .mixtures.cell_sums import depth_cells as depth_cells
 from .mixtures.cell_sums import distinct_keys as distinct_keys
 from .mixtures.cell_sums import piece_cuts as piece_cuts
+from .mixtures.em_loops import fused_exact_em as fused_exact_em
+from .mixtures.em_loops import is_em_fused as is_em_fused
+from .mixtures.em_loops import takes_one_launch as takes_one_launch
 from .mixtures.em_steps import GroupedRows as GroupedRows
 from .mixtures.em_steps import expectation as expectation
 from .mixtures.em_steps import exponent_floor as exponent_floor
