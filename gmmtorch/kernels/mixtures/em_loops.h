@@ -3,8 +3,8 @@
 // CPU.
 #pragma once
 
-#include "e_step.h"
 #include "m_step.h"
+#include "truncated_e_step.h"
 
 namespace gmm {
 
@@ -43,7 +43,7 @@ struct Mixture {
           covariances(means + n * DIM) {}
 };
 
-enum State : int64_t { RUNNING, ENDED, IMPOSSIBLE };
+enum State : int64_t { RUNNING, ENDED, IMPOSSIBLE, PAUSED };
 
 struct ExactTables {
     double* mixtures;  // the present one and the next, in turns
@@ -169,10 +169,281 @@ GMM_KERNEL exact_em(int64_t item, Team team, const double* features, const doubl
             phase += 1;
         }
     }
-    if (item > 0) return;
+    if (item < n - 1) return;
     const double progress[6] = {(double)phase, (double)n_done,  (double)state,
                                 (double)which, (double)is_made, last};
     for (int i = 0; i < 6; ++i) after[i] = progress[i];
+}
+
+// A stable sort of n keys below n_bins, in four phases: counts of each part of the keys, the first place of
+// each part in a bin, the first place of each bin, and the places.
+struct Sort {
+    const int64_t* keys;
+    int64_t n, n_bins, n_parts;
+    int64_t *counts, *begin;
+
+    GMM_INLINE void count(int64_t item, int64_t n_items) {
+        for (int64_t part = item; part < n_parts; part += n_items) {
+            int64_t* own = counts + part * n_bins;
+            for (int64_t bin = 0; bin < n_bins; ++bin) own[bin] = 0;
+            for (int64_t i = n * part / n_parts; i < n * (part + 1) / n_parts; ++i) own[keys[i]] += 1;
+        }
+    }
+    GMM_INLINE void offset(int64_t item, int64_t n_items) {
+        int64_t* totals = counts + n_parts * n_bins;
+        for (int64_t bin = item; bin < n_bins; bin += n_items) {
+            int64_t before = 0;
+            for (int64_t part = 0; part < n_parts; ++part) {
+                const int64_t own = counts[part * n_bins + bin];
+                counts[part * n_bins + bin] = before;
+                before += own;
+            }
+            totals[bin] = before;
+        }
+    }
+    GMM_INLINE void add(int64_t item, int64_t n_items) {
+        const int64_t *totals = counts + n_parts * n_bins, stop = n_bins * (item + 1) / n_items;
+        int64_t bin = n_bins * item / n_items, before = 0;
+        if (bin == stop) return;
+        for (int64_t i = 0; i < bin; ++i) before += totals[i];
+        for (; bin < stop; before += totals[bin++]) begin[bin] = before;
+        if (stop == n_bins) begin[n_bins] = before;
+    }
+    template <typename Use>
+    GMM_INLINE void place(int64_t item, int64_t n_items, Use use) {
+        for (int64_t part = item; part < n_parts; part += n_items)
+            for (int64_t i = n * part / n_parts; i < n * (part + 1) / n_parts; ++i)
+                use(i, begin[keys[i]] + counts[part * n_bins + keys[i]]++);
+    }
+};
+
+struct TruncatedTables {
+    double* mixtures;    // the present one, that of EM's own step, and the extrapolated one
+    double* masses;      // of the last two
+    double* natural;     // about the means
+    double* statistics;  // about the means, and the two sums over all rows
+    double* last;        // statistics of the step before, and the means that they are about
+    double* partial;     // statistics of each worker, if wide; of each pair of group and candidate
+    double* norms;       // of each row, if not wide
+    double* limits;      // of the logits, if wide
+    double* scratch;
+    bool* flags;      // of each component, whether its extrapolation is trusted; and whether a step failed
+    int64_t* owner;   // of each row
+    int64_t* counts;  // of the sorts
+    double* values;   // of two sets of groups, rows and weights
+    int64_t* places;  // the rest of two sets of groups
+};
+
+// Truncated EM with its momentum; see `mixture.em.truncated`. state IMPOSSIBLE: a covariance is not positive
+// definite, and natural parameters must be given before the next launch; PAUSED: after n_stop iterations,
+// or, if it shares its rows with others, after each E-step.
+template <int DIM, bool WIDE>
+GMM_KERNEL truncated_em(int64_t item, Team team, const double* rows, const double* weight,
+                        const int64_t* first_owner, const int64_t* first_candidates, GroupSizes sizes,
+                        int64_t n_parts, double reg_covar, double tol, double previous_bound, int64_t n_iter,
+                        int64_t n_bounds, int64_t n_stop, bool is_shared, int64_t n_phases,
+                        const double* before, double* after, double* bounds, TruncatedTables t,
+                        RowSums sums) {
+    constexpr int WIDTH = n_features(DIM);
+    enum Phase : int64_t {
+        NATURAL,
+        COUNT,
+        OFFSET,
+        ADD,
+        PLACE,
+        CHOOSE,
+        MERGE,
+        PAIR_COUNT,
+        PAIR_OFFSET,
+        PAIR_ADD,
+        PAIR_PLACE,
+        ROWS,
+        SUMS,
+        GATHER,
+        DECIDE,
+        MAXIMIZE,
+        FINISH
+    };
+    const int64_t n = team.n, n_rows = sizes.n_rows, k_all = sizes.n_components, m = sizes.n_candidates;
+    const int64_t width = sizes.are_points ? DIM : WIDTH, padded = (k_all + LANES - 1) / LANES * LANES;
+    int64_t phase = (int64_t)before[0], n_done = (int64_t)before[1], state = RUNNING;
+    int64_t trying = (int64_t)before[3], accepted = (int64_t)before[4], n_sets = (int64_t)before[5];
+    int64_t left = (int64_t)before[6], age = (int64_t)before[7];  // of these groups; of the momentum
+    bool frozen = before[8] != 0.0, has_last = before[9] != 0.0, is_ahead = before[10] != 0.0;
+    bool undo = before[11] != 0.0, is_made = before[12] != 0.0, converged = before[14] != 0.0;
+    double last = n_done ? before[13] : previous_bound;
+    double *total = t.statistics + k_all * WIDTH, *last_means = t.last + k_all * WIDTH;
+    const Mixture<DIM> now(t.mixtures, k_all, 0), em(t.mixtures, k_all, 1), ahead(t.mixtures, k_all, 2);
+    bool* failed = t.flags + k_all;
+    auto set_of = [&](int64_t which) {
+        Groups set;
+        set.values = t.values + which * n_rows * (width + 1);
+        set.weight = set.values + n_rows * width;
+        set.row = t.places + which * (2 * n_rows + 2 * (k_all + 1) + 2 * k_all * m);
+        set.group_of = set.row + n_rows;
+        set.begin = set.group_of + n_rows;
+        set.candidates = set.begin + k_all + 1;
+        set.pairs = set.candidates + k_all * m;
+        set.pair_begin = set.pairs + k_all * m;
+        return set;
+    };
+    auto step_back = [&]() { undo = true, is_ahead = has_last = false, age = 0; };
+    for (int64_t more = n_phases; more > 0 && state == RUNNING; --more) {
+        const Groups set = set_of(trying);
+        Sort by_owner = {n_sets > 1 ? t.owner : first_owner, n_rows, k_all, n_parts, t.counts, set.begin};
+        Sort by_component = {set.candidates, k_all * m, k_all, n_parts, t.counts, set.pair_begin};
+        if ((phase == NATURAL || phase == FINISH) && item < k_all) {
+            const double em_mass = is_made ? sum_of_every(t.masses, 0, k_all, 1) : 1.0;
+            double mass = 1.0, trusted = 0.0, other = 0.0;
+            if (is_ahead) mass = sum_of_every(t.masses + k_all, 0, k_all, 1);
+            for (int64_t k = 0; k < k_all && is_ahead; ++k)
+                t.flags[k] ? trusted += t.masses[k_all + k] : other += t.masses[k];
+            const double whole = trusted / mass + other / em_mass;
+            for (int64_t k = item; k < k_all; k += n) {
+                const bool from_em = phase == NATURAL && undo, to_em = phase == FINISH && !is_made;
+                for (int i = 0; i < DIM && (from_em || to_em); ++i)
+                    (from_em ? now : em).means[k * DIM + i] = (from_em ? em : now).means[k * DIM + i];
+                for (int i = 0; i < DIM * DIM && (from_em || to_em); ++i)
+                    (from_em ? now : em).covariances[k * DIM * DIM + i] =
+                        (from_em ? em : now).covariances[k * DIM * DIM + i];
+                if (phase == FINISH) {
+                    em.weights[k] = is_made ? t.masses[k] / em_mass : now.weights[k];
+                    continue;
+                }
+                if (is_made) now.weights[k] = t.masses[k] / em_mass;
+                if (is_ahead)
+                    now.weights[k] = (t.flags[k] ? t.masses[k_all + k] / mass : now.weights[k]) / whole;
+                natural_parameters<DIM>(k, now.weights, nullptr, now.covariances, t.natural, failed);
+            }
+        }
+        if (phase == FINISH)
+            for (int64_t g = item; g < k_all; g += n)
+                for (int64_t i = set_of(accepted).begin[g]; i < set_of(accepted).begin[g + 1]; ++i)
+                    t.owner[set_of(accepted).row[i]] = g;
+        if (phase == COUNT) {
+            by_owner.count(item, n);
+            for (int64_t k = item; k < padded && WIDE; k += n)
+                write_limits<DIM>(k, k_all, padded, t.natural, now.means, now.covariances, t.limits);
+        }
+        if (phase == OFFSET) by_owner.offset(item, n);
+        if (phase == ADD) by_owner.add(item, n);
+        if (phase == PLACE)
+            by_owner.place(item, n, [&](int64_t row, int64_t place) {
+                for (int64_t f = 0; f < width; ++f) set.values[place * width + f] = rows[row * width + f];
+                set.weight[place] = weight[row], set.row[place] = row;
+                if (!WIDE) set.group_of[place] = by_owner.keys[row];
+            });
+        const int64_t n_choices = k_all * sizes.n_samples * m;
+        const bool is_given = k_all == m || (n_sets == 1 && first_candidates);
+        if (phase == CHOOSE && is_given) {
+            for (int64_t i = item; i < k_all * m; i += n)
+                set.candidates[i] = n_sets == 1 && first_candidates ? first_candidates[i] : i % m;
+        } else if (phase == CHOOSE && WIDE) {
+            choose_candidates<DIM>(item, n, sizes, set, padded, t.natural, now.means, t.limits, t.scratch);
+        } else if (phase == CHOOSE) {
+            for (int64_t i = item; i < k_all * sizes.n_samples; i += n)
+                choose_for_sample<DIM>(i, sizes, set, t.natural, now.means, t.scratch, t.scratch + n_choices);
+        }
+        if (phase == MERGE && !is_given)
+            for (int64_t g = item; g < k_all; g += n)
+                merge_choices(g, sizes, set, t.scratch, t.scratch + n_choices, t.scratch + 2 * n_choices);
+        if (phase == PAIR_COUNT) by_component.count(item, n);
+        if (phase == PAIR_OFFSET) by_component.offset(item, n);
+        if (phase == PAIR_ADD) by_component.add(item, n);
+        if (phase == PAIR_PLACE)
+            by_component.place(item, n, [&](int64_t pair, int64_t place) { set.pairs[place] = pair; });
+        if (phase == ROWS) {
+            double found[2] = {0.0, 0.0}, *own = t.partial + item * k_all * WIDTH;
+            int64_t* owner = left == 1 && !frozen ? t.owner : nullptr;
+            for (int64_t i = 0; i < k_all * WIDTH && WIDE; ++i) own[i] = 0.0;
+            if (WIDE)
+                group_sums<DIM>(item, n, sizes, set, t.natural, now.means, t.scratch, own, found, owner);
+            for (int64_t row = item; row < n_rows && !WIDE; row += n) {
+                t.norms[row] = row_norm<DIM>(row, sizes, set, t.natural, now.means, owner);
+                found[0] += set.weight[row] * t.norms[row];
+                found[1] += set.weight[row];
+            }
+            sums.own[item] = found[0], sums.own[n + item] = found[1];
+        }
+        if (phase == SUMS) {
+            merge(sums, item, n);
+            for (int64_t pair = item; pair < k_all * m && !WIDE; pair += n)
+                pair_sums<DIM>(pair, sizes, set, t.natural, now.means, t.norms, t.partial);
+        }
+        if (phase == GATHER) {
+            for (int64_t i = item; i < k_all * WIDTH; i += n) {
+                double sum = 0.0;
+                const int64_t k = i / WIDTH, f = i % WIDTH;
+                for (int64_t part = 0; part < n && WIDE; ++part) sum += t.partial[part * k_all * WIDTH + i];
+                for (int64_t place = set.pair_begin[k]; place < set.pair_begin[k + 1] && !WIDE; ++place)
+                    sum += t.partial[set.pairs[place] * WIDTH + f];
+                t.statistics[i] = sum;
+            }
+            for (int64_t i = item; i < 2; i += n)
+                total[i] = sum_of_every(sums.merged + i * MERGED, 0, MERGED, 1);
+        }
+        const double share = has_last ? (double)age / (double)(age + 3) : 0.0;
+        if (phase == MAXIMIZE)
+            for (int64_t k = item; k < k_all; k += n) {
+                m_step<DIM>(k, t.statistics, now.means, now.covariances, true, reg_covar,
+                            share > 0.0 ? t.last : nullptr, last_means, share, t.masses, em.means,
+                            em.covariances, t.masses + k_all, ahead.means, ahead.covariances, t.flags);
+                const Mixture<DIM>& next = share > 0.0 ? ahead : em;
+                for (int f = 0; f < WIDTH; ++f) t.last[k * WIDTH + f] = t.statistics[k * WIDTH + f];
+                for (int i = 0; i < DIM; ++i) last_means[k * DIM + i] = now.means[k * DIM + i];
+                for (int i = 0; i < DIM; ++i) now.means[k * DIM + i] = next.means[k * DIM + i];
+                for (int i = k * DIM * DIM; i < (k + 1) * DIM * DIM; ++i)
+                    now.covariances[i] = next.covariances[i];
+            }
+        if (phase != DECIDE) meet(team);
+        const double bound = total[0] / total[1];
+        if (phase == NATURAL) {
+            undo = false;
+            phase = ROWS;
+            if (left == 0 && !frozen) {
+                trying = n_sets ? 1 - accepted : 0;
+                left = n_sets < 5 ? 2 + (n_sets > 0) + (n_sets > 2) : 8;
+                n_sets += 1, phase = COUNT;
+            }
+            if (*failed) state = IMPOSSIBLE;
+        } else if (phase == (WIDE ? CHOOSE : PAIR_PLACE)) {
+            phase = n_iter ? ROWS : FINISH;
+        } else if (phase == GATHER) {
+            phase = DECIDE;
+            if (is_shared) state = PAUSED;
+        } else if (phase == DECIDE) {
+            if (n_done == 0 || !(bound < last)) {
+                accepted = trying, left -= 1, phase = MAXIMIZE;
+            } else if (is_ahead) {
+                step_back();  // the next pass tries the new groups once more from there
+                phase = NATURAL;
+            } else if (trying != accepted) {
+                trying = accepted, frozen = true, phase = ROWS;
+            } else {
+                converged = true,
+                phase = FINISH;  // EM's own step gains less than rounding or regularisation loses
+            }
+        } else if (phase == MAXIMIZE) {
+            const bool was_ahead = is_ahead, has_converged = fabs(bound - last) < tol;
+            if (item == 0) bounds[n_done % n_bounds] = bound;
+            age += has_last, has_last = true, is_ahead = share > 0.0, is_made = true;
+            last = bound, n_done += 1;
+            converged = has_converged && !was_ahead;
+            if (has_converged && was_ahead) step_back();  // decide by EM's own step
+            phase = converged || n_done == n_iter ? FINISH : NATURAL;
+            if (phase == NATURAL && n_done == n_stop) state = PAUSED;
+        } else if (phase == FINISH) {
+            state = ENDED;
+        } else {
+            phase += 1;
+        }
+    }
+    if (item < n - 1) return;
+    const double progress[15] = {
+        (double)phase,    (double)n_done, (double)state,   (double)trying, (double)accepted,
+        (double)n_sets,   (double)left,   (double)age,     (double)frozen, (double)has_last,
+        (double)is_ahead, (double)undo,   (double)is_made, last,           (double)converged};
+    for (int i = 0; i < 15; ++i) after[i] = progress[i];
 }
 
 }  // namespace gmm
