@@ -22,7 +22,7 @@ from .evidence.point_evidence import pair_evidence as pair_evidence
 from .mixtures.cell_sums import KEY_BITS as KEY_BITS
 from .mixtures.cell_sums import CutRule as CutRule
 from .mixtures.cell_sums import DepthCells as DepthCells
-from .mixtures.cell_sums import DepthView as DepthView
+from .mixtures.cell_sums import DepthViews as DepthViews
 from .mixtures.cell_sums import are_piece_cuts_fused as are_piece_cuts_fused
 from .mixtures.cell_sums import cell_moments as cell_moments
 from .mixtures.cell_sums import depth_cells as depth_cells

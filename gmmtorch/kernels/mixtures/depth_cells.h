@@ -44,15 +44,31 @@ GMM_INLINE void load_columns(const Real* row, int64_t column_step, int64_t n_lef
         }
 }
 
-// Adds the patches item, item + n_items, ... of an image, LANES side by side. An image is one item on a CPU.
+// An image and how it is seen, in a row of 20 numbers of eight bytes, as in cell_sums.py.
 template <typename Real>
-GMM_KERNEL depth_cells(int64_t item, const Real* depth, int64_t n_rows, int64_t n_columns, int64_t row_step,
-                       int64_t column_step, const double* view, double max_range, double deepest,
-                       double farthest_whole, int64_t image, int64_t n_images, int64_t n_items,
-                       int64_t max_cells, int64_t n_places, int32_t* places, int64_t* keys, double* sums,
-                       double* counts, int64_t* n_cells) {
+struct DepthImage {
+    const Real* depth;
+    int64_t n_rows;
+    int64_t n_columns;
+    int64_t row_step;
+    int64_t column_step;
+    double rays[12];
+    double max_range;
+    double deepest;
+    double farthest_whole;
+};
+
+// Adds the blocks of LANES patches item, item + n_items, ... of an image.
+template <typename Real>
+GMM_INLINE void add_image(const DepthImage<Real>& view, int64_t image, int64_t n_images, int64_t item,
+                          int64_t n_items, int64_t max_cells, int64_t n_places, int32_t* places,
+                          int64_t* keys, double* sums, double* counts, int64_t* n_cells) {
     constexpr int WIDTH = n_features(3);
-    const double *a = view, *b = view + 3, *c = view + 6, *t = view + 9;
+    const double *a = view.rays, *b = a + 3, *c = a + 6, *t = a + 9;
+    const Real* depth = view.depth;
+    const int64_t n_rows = view.n_rows, n_columns = view.n_columns;
+    const int64_t row_step = view.row_step, column_step = view.column_step;
+    const double max_range = view.max_range, deepest = view.deepest, farthest_whole = view.farthest_whole;
     double now[3] = {0.5, 0.5, 0.5};
     int64_t number = -1;
     bool overflows = *n_cells > max_cells;
@@ -185,6 +201,22 @@ GMM_KERNEL depth_cells(int64_t item, const Real* depth, int64_t n_rows, int64_t 
         }
     }
     if (overflows) *n_cells = max_cells + 1;
+}
+
+// Adds images, rows of `views`, to cells. On a CPU one item adds all of them; on CUDA n_items add each.
+template <typename Real>
+GMM_KERNEL depth_cells(int64_t item, const int64_t* views, int64_t n_images, int64_t n_items,
+                       int64_t max_cells, int64_t n_places, int32_t* places, int64_t* keys, double* sums,
+                       double* counts, int64_t* n_cells) {
+#if defined(__CUDA_ARCH__)
+    const int64_t begin = item / n_items, end = begin + 1;
+#else
+    const int64_t begin = 0, end = n_images;
+#endif
+    const DepthImage<Real>* all = (const DepthImage<Real>*)views;
+    for (int64_t image = begin; image < end; ++image)
+        add_image<Real>(all[image], image, n_images, item % n_items, n_items, max_cells, n_places, places,
+                        keys, sums, counts, n_cells);
 }
 
 }  // namespace gmm

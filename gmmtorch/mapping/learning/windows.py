@@ -451,16 +451,21 @@ def _size(scan: Scan | DepthFrame) -> int:
 
 def _mean_range(window: Sequence[Scan | DepthFrame]) -> float:
     """Mean range (m) of the returns of a window that has some."""
-    ranges = torch.cat([(scan.points - scan.origin).norm(dim=1).double() for scan in window])
-    return float(ranges.mean())
+    found = [
+        scan.ranges if isinstance(scan, DepthFrame) else (scan.points - scan.origin).norm(dim=1).double()
+        for scan in window
+    ]
+    return float(torch.cat(found).mean())
 
 
 def _beams(window: Sequence[Scan | DepthFrame], generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Origins and ends (B, D) of some returns of a scan of a window, float64."""
     scan = window[int(torch.randint(len(window), (1,), generator=generator))]
-    points = scan.points
-    if len(points):
-        points = points[torch.randint(len(points), (_BEAMS,), generator=generator).to(points.device)]
+    found = scan.pixels() if isinstance(scan, DepthFrame) else scan.points
+    if len(found):
+        chosen = torch.randint(len(found), (_BEAMS,), generator=generator)
+        found = found[chosen.to(found.device, non_blocking=True)]
+    points = scan.points_at(found) if isinstance(scan, DepthFrame) else found
     return scan.origin.double().expand_as(points), points.double()
 
 

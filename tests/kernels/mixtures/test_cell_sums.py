@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import kernels
-from gmmtorch.kernels.mixtures.cell_sums import distinct_keys
+from gmmtorch.kernels.mixtures.cell_sums import DepthViews, depth_cells, distinct_keys
 from gmmtorch.linalg import dense_ranks
 from gmmtorch.mapping.learning.fitting import DepthFrame, PooledFrames, pool_frames
 from gmmtorch.mixture.em.exact import quadratic_features, shift_features
@@ -69,6 +69,38 @@ def test_cells_hold_the_moments_of_all_points(dtype, stride):
     # A cell is a cube, or a cube and the patches of its size whose means are inside.
     variance = found.features[:, [4, 7, 9]] - found.features[:, 1:4] ** 2
     assert float(variance.max()) < SIDE**2
+
+
+@given(
+    seeds=st.lists(st.integers(0, 1000), min_size=1, max_size=5),
+    types=st.lists(st.sampled_from([torch.float32, torch.float64]), min_size=5, max_size=5),
+    stride=st.integers(1, 3),
+)
+def test_frames_together_give_the_sums_of_each_frame_alone(seeds, types, stride):
+    frames = [
+        frame(
+            noisy_depth(seed, (7 + seed % 40, 5 + seed % 50), dtype),
+            pose(0.01 * seed, (0.01 * seed, 0.0, 0.0)),
+            pixel_stride=stride,
+            max_range=1.0 + 0.01 * seed,
+        )
+        for seed, dtype in zip(seeds, types, strict=False)
+    ]
+    rays = torch.randn(len(frames), 4, 3, generator=torch.Generator().manual_seed(seeds[0])).double().cpu()
+    pitch, max_range = (torch.rand(len(frames)).double().cpu() + low for low in (0.01, 1.0))
+    views = DepthViews([one.depth for one in frames], rays, pitch, max_range)
+    with kernels("fused"):
+        together = depth_cells(views, SIDE, 5000)
+        alone = [
+            depth_cells(DepthViews(*(v[i : i + 1] for v in views)), SIDE, 5000) for i in range(len(frames))
+        ]
+    assert together is not None
+    corners, place = torch.unique(torch.cat([one.corners for one in alone]), dim=0, return_inverse=True)
+    assert torch.equal(corners, together.corners)
+    sums = torch.zeros_like(together.sums).index_add_(0, place, torch.cat([one.sums for one in alone]))
+    torch.testing.assert_close(sums, together.sums, rtol=1e-12, atol=1e-9)
+    for column, part in enumerate(torch.split(place, [len(one.sums) for one in alone])):
+        assert torch.equal(together.counts[part, column], alone[column].counts[:, 0])
 
 
 def test_ranges_are_the_distances_of_the_points():
