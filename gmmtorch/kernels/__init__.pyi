@@ -16,6 +16,7 @@ from .evidence.grid_flux import add_row_flux as add_row_flux
 from .evidence.grid_flux import whitened_rows as whitened_rows
 from .evidence.point_evidence import Lists as Lists
 from .evidence.point_evidence import PointTable as PointTable
+from .evidence.point_evidence import few_points_evidence as few_points_evidence
 from .evidence.point_evidence import listed_evidence as listed_evidence
 from .evidence.point_evidence import near_lists as near_lists
 from .evidence.point_evidence import pair_evidence as pair_evidence
@@ -24,6 +25,7 @@ from .mixtures.cell_sums import CutRule as CutRule
 from .mixtures.cell_sums import DepthCells as DepthCells
 from .mixtures.cell_sums import DepthViews as DepthViews
 from .mixtures.cell_sums import are_piece_cuts_fused as are_piece_cuts_fused
+from .mixtures.cell_sums import cell_features as cell_features
 from .mixtures.cell_sums import cell_moments as cell_moments
 from .mixtures.cell_sums import depth_cells as depth_cells
 from .mixtures.cell_sums import distinct_keys as distinct_keys

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -39,6 +40,9 @@ _DEPTHS = {
     dtype: FusedKernel("mixtures/depth_cells.h", f"depth_cells<{kind}>", shares=True)
     for dtype, kind in ((torch.float32, "float"), (torch.float64, "double"))
 }
+
+_ORDERED = FusedKernel("mixtures/depth_cells.h", "ordered_cells")
+_FEATURES = FusedKernel("mixtures/depth_cells.h", "cell_features", rounds_each=True)
 
 
 def distinct_keys(keys: Tensor) -> tuple[Tensor, Tensor]:
@@ -103,13 +107,13 @@ class DepthViews(NamedTuple):
     in cells, the ray of pixel (0, 0) at a depth of one metre, its steps from column to column and from row to
     row, and the camera, relative to the reference point. pitch (S,): the distance between the rays of
     neighbouring pixels at a depth of one metre, in cells; the larger one of rows and columns. max_range (S,):
-    pixels at or beyond it (m) are left out. All but the images are float64, on the CPU.
+    pixels at or beyond it (m) are left out.
     """
 
     depths: Sequence[Tensor]
-    rays: Tensor
-    pitch: Tensor
-    max_range: Tensor
+    rays: np.ndarray
+    pitch: np.ndarray
+    max_range: np.ndarray
 
 
 def depth_cells(views: DepthViews, side: float, max_cells: int) -> DepthCells | None:
@@ -129,11 +133,12 @@ def _fused(views: DepthViews, side: float, max_cells: int) -> DepthCells | None:
     if len({depth.dtype for depth in depths}) > 1:
         depths = [depth.double() for depth in depths]
     n, device, on_cpu = len(depths), depths[0].device, depths[0].device.type == "cpu"
-    numbers = torch.cat(
-        [views.rays.flatten(1), torch.stack([views.max_range, *_limits(views.pitch, side)], 1)], 1
-    )
-    images = torch.tensor([(depth.data_ptr(), *depth.shape, *depth.stride()) for depth in depths])
-    rows = torch.cat([images, numbers.view(torch.int64)], 1).to(device, non_blocking=True)
+    table = np.empty((n, 20))
+    table[:, 5:17], table[:, 17] = views.rays.reshape(n, 12), views.max_range
+    table[:, 18], table[:, 19] = _limits(views.pitch, side)
+    images = [(depth.data_ptr(), *depth.shape, *depth.stride()) for depth in depths]
+    table.view(np.int64)[:, :5] = images
+    rows = torch.from_numpy(table).view(torch.int64).to(device, non_blocking=True)
     n_places = 1 << (2 * max_cells).bit_length()
     places = torch.full((n_places,), -1, dtype=torch.int32) if on_cpu else None
     n_rows = max_cells if on_cpu else n_places  # on CUDA the place of a cell is its number
@@ -148,14 +153,26 @@ def _fused(views: DepthViews, side: float, max_cells: int) -> DepthCells | None:
     found = int(n_cells)
     if found > max_cells:
         return None
-    used = torch.arange(found) if on_cpu else (keys >= 0).nonzero().squeeze(1)
-    order = used[keys[used].argsort()]
-    return DepthCells(_corners(keys[order]), sums[order], counts[order])
+    order = keys[:found].argsort() if on_cpu else keys.argsort()[n_rows - found :]  # a free place holds -1
+    ordered = sums.new_empty(found, 3), sums.new_empty(found, _WIDTH), counts.new_empty(found, n)
+    _ORDERED(found, order, keys, sums, counts, n, *ordered, device=device)
+    return DepthCells(*ordered)
 
 
-def _limits(pitch: Tensor, side: float) -> tuple[Tensor, Tensor]:
+def _limits(pitch: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray]:
     """The largest difference of depth of a whole patch, and its largest depth, in metres."""
-    return torch.full_like(pitch, side), 1 / (PATCH * pitch)
+    return np.full_like(pitch, side), 1 / (PATCH * pitch)
+
+
+def cell_features(cells: DepthCells, center: Tensor, side: float) -> Tensor | None:
+    """Mean features (C, 10) of cells about a center (3,), given in cells, in metres; None without a fused
+    kernel. The twin is in `mapping.learning.fitting`, to the bit."""
+    if not is_fused(*cells, center):
+        return None
+    features = torch.empty_like(cells.sums)
+    given = cells.corners, cells.sums, center, side
+    _FEATURES(len(features), *given, features, device=features.device)
+    return features
 
 
 def _corners(keys: Tensor) -> Tensor:
@@ -168,7 +185,8 @@ def _corners(keys: Tensor) -> Tensor:
 
 def _batched(views: DepthViews, side: float, max_cells: int) -> DepthCells | None:
     """The twin."""
-    numbers = views.rays, views.max_range.tolist(), zip(*_limits(views.pitch, side), strict=True)
+    limits = zip(*(values.tolist() for values in _limits(views.pitch, side)), strict=True)
+    numbers = torch.from_numpy(views.rays), views.max_range.tolist(), limits
     placed = [_placed(*view) for view in zip(views.depths, *numbers, strict=True)]
     if not bool(torch.stack([inside for *_, inside in placed]).all()):
         return None
@@ -189,7 +207,7 @@ def _batched(views: DepthViews, side: float, max_cells: int) -> DepthCells | Non
 
 
 def _placed(
-    depth: Tensor, given: Tensor, max_range: float, limits: tuple[Tensor, Tensor]
+    depth: Tensor, given: Tensor, max_range: float, limits: tuple[float, float]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Points (N, 3) and their cells (N, 3), in cells, of all pixels; which of them are valid (N,); and
     whether all valid ones are within reach."""
@@ -206,7 +224,7 @@ def _placed(
     )
     points = z[..., None] * rays  # relative to the camera
     far, near = z.amax(1), torch.where(valid, z, torch.inf).amin(1)
-    deepest, farthest_whole = (limit.item() for limit in limits)
+    deepest, farthest_whole = limits
     is_whole = (far - near <= deepest) & (far <= farthest_whole)
     mean = points.sum(1) / valid.sum(1).clamp_min(1)[:, None]
     places = torch.where(is_whole[:, None, None], mean[:, None], points) + camera
@@ -262,11 +280,9 @@ def piece_cuts(points: Tensor, weight: Tensor, features: Tensor, rule: CutRule) 
     """
     n, width = features.shape
     most = n if rule.max_components < 0 else max(1, min(n, rule.max_components))
-    sums, halves = points.new_empty(most, width), points.new_empty(most, 6)
-    work, along = points.new_empty(most, 2 * points.shape[1] + 2), points.new_empty(n)
-    number, labels = torch.empty(most, dtype=torch.int64), torch.empty(n, dtype=torch.int64)
-    n_pieces = torch.empty(1, dtype=torch.int64)
+    sizes = most * width, most * (2 * points.shape[1] + 2), most * 6, n
+    work = points.new_empty(sum(sizes)).split(sizes)
+    number, labels, n_pieces = torch.empty(most + n + 1, dtype=torch.int64).split((most, n, 1))
     given = points.contiguous(), features.contiguous(), weight.contiguous(), n
-    made = sums, work, halves, along, number, labels, n_pieces
-    _CUTS[points.shape[1]](1, *given, *rule, *made, device=points.device)
+    _CUTS[points.shape[1]](1, *given, *rule, *work, number, labels, n_pieces, device=points.device)
     return labels, int(n_pieces)

@@ -219,4 +219,32 @@ GMM_KERNEL depth_cells(int64_t item, const int64_t* views, int64_t n_images, int
                         keys, sums, counts, n_cells);
 }
 
+// An item copies a cell to its place in `order`: its lowest corner, from its key, its sums and its counts.
+GMM_KERNEL ordered_cells(int64_t item, const int64_t* order, const int64_t* keys, const double* sums,
+                         const double* counts, int64_t n_images, double* corners, double* ordered,
+                         double* seen) {
+    constexpr int WIDTH = n_features(3);
+    const int64_t cell = order[item], key = keys[cell];
+    for (int a = 0; a < 3; ++a)
+        corners[item * 3 + a] = (double)((key >> ((2 - a) * KEY_BITS)) & ((1 << KEY_BITS) - 1)) - REACH;
+    for (int f = 0; f < WIDTH; ++f) ordered[item * WIDTH + f] = sums[cell * WIDTH + f];
+    for (int64_t i = 0; i < n_images; ++i) seen[item * n_images + i] = counts[cell * n_images + i];
+}
+
+// An item is a cell: its mean features about the center, in metres.
+GMM_KERNEL cell_features(int64_t item, const double* corners, const double* sums, const double* center,
+                         double side, double* features) {
+    constexpr int WIDTH = n_features(3);
+    const double* sum = sums + item * WIDTH;
+    double *found = features + item * WIDTH, mean[3], d[3];
+    found[0] = 1.0;
+    for (int a = 0; a < 3; ++a) {
+        mean[a] = sum[1 + a] / sum[0], d[a] = corners[item * 3 + a] - center[a];
+        found[1 + a] = (mean[a] + d[a]) * side;
+    }
+    for (int a = 0, f = 4; a < 3; ++a)
+        for (int b = a; b < 3; ++b, ++f)
+            found[f] = (sum[f] / sum[0] + mean[a] * d[b] + d[a] * mean[b] + d[a] * d[b]) * (side * side);
+}
+
 }  // namespace gmm

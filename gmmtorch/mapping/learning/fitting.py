@@ -12,12 +12,14 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
-from gmmtorch.kernels import DepthCells, DepthViews, depth_cells
+from gmmtorch.kernels import DepthCells, DepthViews, cell_features, depth_cells
+from gmmtorch.linalg import on_cpu
 from gmmtorch.mapping.attributes.moments import Attributes, learned, of_scans
 from gmmtorch.mapping.components import UNNUMBERED, Components
 from gmmtorch.mapping.learning.merging import AssignedViewpoints, AssignViewpoints
@@ -150,14 +152,13 @@ def pool_frames(frames: Sequence[DepthFrame], finest: float, max_cells: int) -> 
     octave until the limit holds, which must be 8 or more. Raises `InvalidArgumentError` for points that are
     farther away than a map stores.
     """
-    poses = Pose.stack([frame.pose for frame in frames])
-    fx, fy, cx, cy = torch.tensor([frame.camera for frame in frames], dtype=torch.float64).T[..., None]
-    across, down = poses.rotation[..., 0] / fx, poses.rotation[..., 1] / fy
-    first, reference = poses.rotation[..., 2] - cx * across - cy * down, poses.translation[0]
-    rays = torch.stack([first, across, down, poses.translation - reference], 1)
-    shortest = torch.minimum(fx, fy).squeeze(1)
-    max_range = fx.new_tensor([frame.max_range for frame in frames])
-    depths = [frame.depth for frame in frames]
+    rotation, origin = (np.stack([frame.pose.parts[i].numpy() for frame in frames]) for i in (0, 1))
+    camera = np.array([frame.camera for frame in frames])
+    fx, fy, cx, cy = camera.T[..., None]
+    across, down = rotation[..., 0] / fx, rotation[..., 1] / fy
+    first, reference = rotation[..., 2] - cx * across - cy * down, origin[0]
+    rays, shortest = np.stack([first, across, down, origin - reference], 1), camera[:, :2].min(1)
+    depths, max_range = [frame.depth for frame in frames], np.array([frame.max_range for frame in frames])
 
     def side_of(thirds: int) -> float:
         return finest * 2 ** (thirds / 3)
@@ -169,18 +170,21 @@ def pool_frames(frames: Sequence[DepthFrame], finest: float, max_cells: int) -> 
     first = pooled(0)
     if first is None:
         scans = [frame.scan() for frame in frames]  # raises for points that are too far away
-        away = [scan.points - reference.to(scan.points.device) for scan in scans if len(scan.points)]
+        away = [scan.points - scan.points.new_tensor(reference) for scan in scans if len(scan.points)]
         extent = max(float(offsets.abs().max()) for offsets in away)
         thirds, cells = coarsest_allowed(pooled, 3 * math.ceil(math.log2(extent / finest + 2)))
     else:
         thirds, cells = 0, first
     side = side_of(thirds)
-    weight = cells.sums[:, 0]
+    weight = cells.sums[:, 0].contiguous()
     total = (cells.sums[:, 1:4] + weight[:, None] * cells.corners).sum(0)
     center = total / weight.sum().clamp_min(1)
-    scale = cells.sums.new_tensor([1.0] + [side] * 3 + [side**2] * 6)
-    features = shift_features(cells.sums / weight[:, None], cells.corners - center) * scale
-    return PooledFrames(features, weight, cells.counts, center * side + reference.to(center.device))
+    features = cell_features(cells, center, side)
+    if features is None:
+        scale = weight.new_tensor([1.0] + [side] * 3 + [side**2] * 6)
+        features = shift_features(cells.sums / weight[:, None], cells.corners - center) * scale
+    shift = torch.from_numpy(reference).to(center.device, non_blocking=True)
+    return PooledFrames(features, weight, cells.counts, center * side + shift)
 
 
 def as_scans(window: Iterable[Scan | DepthFrame]) -> list[Scan]:
@@ -318,8 +322,9 @@ def fit_frames(frames: Sequence[DepthFrame], fit: SurfaceFit, viewpoints: Assign
     found = _mixture_of(cells.features, cells.weight, 3, fit)
     owner = most_likely_component(cells.features, found)
     counts = cells.counts.new_zeros(found.weights.shape[0], len(frames)).index_add_(0, owner, cells.counts)
+    counts, weights = on_cpu(counts, found.weights)
     found = found._replace(means=found.means + cells.center)
-    assigned = viewpoints(counts, found.weights, int(cells.weight.sum()))
+    assigned = viewpoints(counts, weights, int(counts.sum()))
     return _components(found, assigned, origins, max_range=False)
 
 

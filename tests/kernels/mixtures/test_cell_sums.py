@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -86,8 +87,9 @@ def test_frames_together_give_the_sums_of_each_frame_alone(seeds, types, stride)
         )
         for seed, dtype in zip(seeds, types, strict=False)
     ]
-    rays = torch.randn(len(frames), 4, 3, generator=torch.Generator().manual_seed(seeds[0])).double().cpu()
-    pitch, max_range = (torch.rand(len(frames)).double().cpu() + low for low in (0.01, 1.0))
+    draw = np.random.default_rng(seeds[0])
+    rays, pitch = draw.standard_normal((len(frames), 4, 3)), 0.01 + draw.random(len(frames))
+    max_range = 1 + draw.random(len(frames))
     views = DepthViews([one.depth for one in frames], rays, pitch, max_range)
     with kernels("fused"):
         together = depth_cells(views, SIDE, 5000)
