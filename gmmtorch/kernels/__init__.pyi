@@ -30,6 +30,7 @@ from .mixtures.cell_sums import cell_moments as cell_moments
 from .mixtures.cell_sums import depth_cells as depth_cells
 from .mixtures.cell_sums import distinct_keys as distinct_keys
 from .mixtures.cell_sums import piece_cuts as piece_cuts
+from .mixtures.cell_sums import range_sums as range_sums
 from .mixtures.em_steps import GroupedRows as GroupedRows
 from .mixtures.em_steps import expectation as expectation
 from .mixtures.em_steps import exponent_floor as exponent_floor

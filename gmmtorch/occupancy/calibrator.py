@@ -192,14 +192,16 @@ def _sigmoid(t: np.ndarray) -> np.ndarray:
 class Prediction(NamedTuple):
     """What a map knew about M places and what was then seen: hits, misses, occupied (M,), for a side (m)."""
 
-    hits: Tensor
-    misses: Tensor
-    occupied: Tensor
+    hits: Tensor | np.ndarray
+    misses: Tensor | np.ndarray
+    occupied: Tensor | np.ndarray
     side: float
 
     def on_cpu(self) -> list[np.ndarray]:
         """Hits, misses and occupied, float64."""
-        return [value.double().numpy() for value in on_cpu(self.hits, self.misses, self.occupied)]
+        given = self.hits, self.misses, self.occupied
+        tensors = on_cpu(*(value for value in given if isinstance(value, Tensor)))
+        return [np.asarray(value, np.float64) for value in tensors or given]
 
 
 def _short_count(n: int) -> int:

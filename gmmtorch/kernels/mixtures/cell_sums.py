@@ -36,9 +36,13 @@ PATCH = 4
 _WIDTH = 10  # features in 3D
 _DISTINCT = FusedKernel("mixtures/cells.h", "distinct_keys", shares=True)
 _MOMENTS = {dim: FusedKernel("mixtures/cells.h", f"cell_moments<{dim}>", shares=True) for dim in (1, 2, 3)}
+_REAL = {torch.float32: "float", torch.float64: "double"}
 _DEPTHS = {
-    dtype: FusedKernel("mixtures/depth_cells.h", f"depth_cells<{kind}>", shares=True)
-    for dtype, kind in ((torch.float32, "float"), (torch.float64, "double"))
+    dtype: FusedKernel("mixtures/depth_cells.h", f"depth_cells<{real}>", shares=True)
+    for dtype, real in _REAL.items()
+}
+_RANGES = {
+    dtype: FusedKernel("mixtures/depth_cells.h", f"range_sums<{real}>") for dtype, real in _REAL.items()
 }
 
 _ORDERED = FusedKernel("mixtures/depth_cells.h", "ordered_cells")
@@ -129,16 +133,10 @@ def depth_cells(views: DepthViews, side: float, max_cells: int) -> DepthCells | 
 
 
 def _fused(views: DepthViews, side: float, max_cells: int) -> DepthCells | None:
-    depths = views.depths
-    if len({depth.dtype for depth in depths}) > 1:
-        depths = [depth.double() for depth in depths]
-    n, device, on_cpu = len(depths), depths[0].device, depths[0].device.type == "cpu"
-    table = np.empty((n, 20))
-    table[:, 5:17], table[:, 17] = views.rays.reshape(n, 12), views.max_range
-    table[:, 18], table[:, 19] = _limits(views.pitch, side)
-    images = [(depth.data_ptr(), *depth.shape, *depth.stride()) for depth in depths]
-    table.view(np.int64)[:, :5] = images
-    rows = torch.from_numpy(table).view(torch.int64).to(device, non_blocking=True)
+    limits = np.stack([views.max_range, *_limits(views.pitch, side)], 1)
+    n, given = len(views.depths), np.concatenate([views.rays.reshape(-1, 12), limits], 1)
+    depths, rows = _rows_of(views.depths, given)
+    device, on_cpu = rows.device, rows.device.type == "cpu"
     n_places = 1 << (2 * max_cells).bit_length()
     places = torch.full((n_places,), -1, dtype=torch.int32) if on_cpu else None
     n_rows = max_cells if on_cpu else n_places  # on CUDA the place of a cell is its number
@@ -157,6 +155,29 @@ def _fused(views: DepthViews, side: float, max_cells: int) -> DepthCells | None:
     ordered = sums.new_empty(found, 3), sums.new_empty(found, _WIDTH), counts.new_empty(found, n)
     _ORDERED(found, order, keys, sums, counts, n, *ordered, device=device)
     return DepthCells(*ordered)
+
+
+def _rows_of(depths: Sequence[Tensor], given: np.ndarray) -> tuple[Sequence[Tensor], Tensor]:
+    """Images (H, W) of one type; and rows (S, 5 + n) of eight bytes for kernels: the address, shape and
+    strides of each, and the numbers `given` (S, n) for it."""
+    if len({depth.dtype for depth in depths}) > 1:
+        depths = [depth.double() for depth in depths]
+    rows = np.empty((len(depths), 5 + given.shape[1]))
+    rows.view(np.int64)[:, :5] = [(depth.data_ptr(), *depth.shape, *depth.stride()) for depth in depths]
+    rows[:, 5:] = given
+    return depths, torch.from_numpy(rows).view(torch.int64).to(depths[0].device, non_blocking=True)
+
+
+def range_sums(depths: Sequence[Tensor], camera: np.ndarray, max_range: np.ndarray) -> Tensor | None:
+    """The sum of the ranges of the pixels of S depth images (m), and their number (2,); None without a fused
+    kernel. The twin is `DepthFrame.ranges`. camera: f_x, f_y, c_x, c_y (S, 4). max_range: (S,)."""
+    if not is_fused(*depths):
+        return None
+    depths, rows = _rows_of(depths, np.concatenate([camera, max_range[:, None]], 1))
+    n_items = max(len(depth) for depth in depths)
+    sums = torch.empty(len(depths) * n_items, 2, dtype=torch.float64, device=rows.device)
+    _RANGES[depths[0].dtype](len(sums), rows, n_items, sums, device=rows.device)
+    return sums.sum(0)
 
 
 def _limits(pitch: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray]:

@@ -219,6 +219,46 @@ GMM_KERNEL depth_cells(int64_t item, const int64_t* views, int64_t n_images, int
                         keys, sums, counts, n_cells);
 }
 
+// An image and its camera, in a row of 10 numbers of eight bytes, as in cell_sums.py.
+template <typename Real>
+struct RangeImage {
+    const Real* depth;
+    int64_t n_rows;
+    int64_t n_columns;
+    int64_t row_step;
+    int64_t column_step;
+    double fx;
+    double fy;
+    double cx;
+    double cy;
+    double max_range;
+};
+
+// An item is a row of an image, of n_items at most: the sum of the ranges of its pixels, and their number.
+template <typename Real>
+GMM_KERNEL range_sums(int64_t item, const int64_t* views, int64_t n_items, double* sums) {
+    const RangeImage<Real>& view = ((const RangeImage<Real>*)views)[item / n_items];
+    const int64_t row = item % n_items;
+    double sum = 0.0, n = 0.0;
+    if (row < view.n_rows) {
+        const Real* depth = view.depth + row * view.row_step;
+        const double y = ((double)row - view.cy) / view.fy;
+        for (int64_t begin = 0; begin < view.n_columns; begin += LANES) {
+            vec z = (vec)(0.0), x = z;
+            for (int l = 0; l < LANES && begin + l < view.n_columns; ++l) {
+                set(z, l, (double)depth[(begin + l) * view.column_step]);
+                set(x, l, ((double)(begin + l) - view.cx) / view.fx);
+            }
+            const mask good = (z > 0.0) & (z < view.max_range);  // false for NaN
+            const vec length = root(x * x + y * y + 1.0);
+            const vec range = good ? z * length : (vec)(0.0);
+            const vec one = good ? (vec)(1.0) : (vec)(0.0);
+            for (int l = 0; l < LANES; ++l) sum += get(range, l), n += get(one, l);
+        }
+    }
+    sums[2 * item] = sum, sums[2 * item + 1] = n;
+}
+
 // An item copies a cell to its place in `order`: its lowest corner, from its key, its sums and its counts.
 GMM_KERNEL ordered_cells(int64_t item, const int64_t* order, const int64_t* keys, const double* sums,
                          const double* counts, int64_t n_images, double* corners, double* ordered,

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
-from gmmtorch.kernels import DepthCells, DepthViews, cell_features, depth_cells
+from gmmtorch.kernels import DepthCells, DepthViews, cell_features, depth_cells, range_sums
 from gmmtorch.linalg import on_cpu
 from gmmtorch.mapping.attributes.moments import Attributes, learned, of_scans
 from gmmtorch.mapping.components import UNNUMBERED, Components
@@ -132,6 +132,23 @@ class DepthFrame:
             return Scan(self.points, self.origin)
         except InvalidArgumentError as error:
             raise InvalidArgumentError(f"{self.name} has such points: {error}") from error
+
+
+def mean_range(window: Sequence[Scan | DepthFrame]) -> float:
+    """Mean range (m) of the returns of scans, or of frames. There must be one."""
+    frames = [frame for frame in window if isinstance(frame, DepthFrame)]
+    sums = None
+    if frames:
+        camera, reach = ([getattr(frame, name) for frame in frames] for name in ("camera", "max_range"))
+        sums = range_sums([frame.depth for frame in frames], np.array(camera), np.array(reach))
+    if sums is None:
+        found = [
+            scan.ranges if isinstance(scan, DepthFrame) else (scan.points - scan.origin).norm(dim=1).double()
+            for scan in window
+        ]
+        return float(torch.cat(found).mean())
+    total, n = sums.tolist()
+    return total / n
 
 
 class PooledFrames(NamedTuple):

@@ -35,7 +35,14 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import PassLimits, beam_passes, few_points_evidence, is_fused
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.fitting import DepthFrame, SurfaceFit, as_scans, fit_frames, fit_window
+from gmmtorch.mapping.learning.fitting import (
+    DepthFrame,
+    SurfaceFit,
+    as_scans,
+    fit_frames,
+    fit_window,
+    mean_range,
+)
 from gmmtorch.mapping.learning.merging import (
     Size,
     all_origins,
@@ -421,7 +428,7 @@ def predicted(
     if not len(ends):
         return calibrator
     if calibrator is None:
-        calibrator = Calibrator.of(_mean_range(window), len(SIDES))
+        calibrator = Calibrator.of(mean_range(window), len(SIDES))
     if not any(len(block.components.seen_by) for block in known):
         return calibrator
     share = torch.rand(len(ends), 1, generator=generator, dtype=torch.float64)
@@ -433,8 +440,7 @@ def predicted(
     for side, (hits, misses) in zip(SIDES, evidence, strict=True):
         seen = hits * (calibrator.length / side) + misses
         kept = (seen >= np.sort(seen)[(len(seen) - 1) // 2]) & (seen > 0)
-        chosen = [torch.from_numpy(values[kept]) for values in (hits, misses, occupied)]
-        predictions.append(Prediction(chosen[0], chosen[1], chosen[2], side))
+        predictions.append(Prediction(hits[kept], misses[kept], occupied[kept], side))
     due = number + _windows_between(n_pairs, sum(map(_size, window)))
     return replace(calibrator.updated(predictions, ends.shape[1]), next_window=due)
 
@@ -449,15 +455,6 @@ def _windows_between(n_pairs: int, n_points: int) -> int:
 def _size(scan: Scan | DepthFrame) -> int:
     """Number of points, or of pixels."""
     return scan.depth.numel() if isinstance(scan, DepthFrame) else len(scan.points)
-
-
-def _mean_range(window: Sequence[Scan | DepthFrame]) -> float:
-    """Mean range (m) of the returns of a window that has some."""
-    found = [
-        scan.ranges if isinstance(scan, DepthFrame) else (scan.points - scan.origin).norm(dim=1).double()
-        for scan in window
-    ]
-    return float(torch.cat(found).mean())
 
 
 def _beams(window: Sequence[Scan | DepthFrame], generator: torch.Generator) -> tuple[Tensor, Tensor]:

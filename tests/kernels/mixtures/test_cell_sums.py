@@ -16,7 +16,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import kernels
 from gmmtorch.kernels.mixtures.cell_sums import DepthViews, depth_cells, distinct_keys
 from gmmtorch.linalg import dense_ranks
-from gmmtorch.mapping.learning.fitting import DepthFrame, PooledFrames, pool_frames
+from gmmtorch.mapping.learning.fitting import DepthFrame, PooledFrames, mean_range, pool_frames
 from gmmtorch.mixture.em.exact import quadratic_features, shift_features
 from gmmtorch.mixture.em.partition import FlatnessRule, Partition, partition
 
@@ -108,6 +108,24 @@ def test_frames_together_give_the_sums_of_each_frame_alone(seeds, types, stride)
 def test_ranges_are_the_distances_of_the_points():
     one = frame(noisy_depth(1), pose(0.3, (0.1, 5.0, -2.0)), max_range=1e6)
     torch.testing.assert_close(one.ranges, (one.points - one.origin).norm(dim=1))
+
+
+@given(st.lists(st.tuples(st.integers(0, 1000), st.booleans()), min_size=1, max_size=4), st.integers(1, 3))
+def test_the_mean_range_of_frames_is_that_of_their_pixels(images, stride):
+    frames = [
+        frame(
+            noisy_depth(seed, (9 + seed % 30, 5 + seed % 60), torch.float64 if wide else torch.float32),
+            pose(),
+            pixel_stride=stride,
+            max_range=math.inf if seed % 3 else 2.0,
+        )
+        for seed, wide in images
+    ]
+    frames.append(frame(torch.full((3, 3), 2.0), pose()))
+    for one in frames:
+        one.depth[one.depth > 1e300] = math.nan  # their sum is infinite
+    twin, fused = by_both(lambda: mean_range(frames))
+    assert fused == pytest.approx(twin, rel=1e-13)
 
 
 def test_points_on_sides_of_cells_belong_to_the_cell_above():
