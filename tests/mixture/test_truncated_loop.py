@@ -134,10 +134,11 @@ def test_momentum_converges_faster_than_em(n_iter, share):
 
 
 class Spy:
-    """An E-step that records its inputs and results, and decreases the bound at given calls."""
+    """An E-step of the twin that records its inputs and results, and decreases the bound at given calls."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, failing: tuple[int, ...] = ()) -> None:
         self.failing, self.given, self.dtypes, self.sets = failing, [], [], []
+        monkeypatch.setattr(truncated, "is_m_step_fused", lambda *_: False)
         monkeypatch.setattr(truncated, "truncated_expectation", self)
 
     def __call__(self, groups, candidates, parameters, want_owner=False, *rest):

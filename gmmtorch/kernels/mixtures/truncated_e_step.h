@@ -1,63 +1,121 @@
-// E-step of truncated EM, and the choice of its candidates. An item is a part of the groups.
+// Groups of rows: those of one owner, a component, with the components that they are compared with. What
+// truncated EM does with them, LANES rows at a time on a CPU, and with a thread for each row, pair or
+// component on a GPU.
 #pragma once
 
 #include "e_step.h"
 
 namespace gmm {
 
-template <int DIM, typename Real>
-GMM_KERNEL truncated(int64_t item, const Real* features, const Real* weight, const int64_t* begin,
-                     const double* centers, int64_t n_groups, int64_t n_components, int64_t n_candidates,
-                     int64_t n_padded, int64_t n_parts, const int64_t* candidates, const double* own,
-                     const double* means, double* scratch, double* natural, double* statistics, double* value,
-                     int64_t* likeliest) {
+// values (N, D) of points, or (N, F) of cells, and weight (N,), in the order of the groups; row: where each
+// was. group_of (N,): its group. begin (K + 1,): the first row of each group. candidates (K, m). pairs (K
+// m,): the places of the candidates in the order of components, of which each begins at pair_begin (K + 1,).
+struct Groups {
+    double *values, *weight;
+    int64_t *row, *group_of, *begin, *candidates, *pairs, *pair_begin;
+};
+
+struct GroupSizes {
+    int64_t n_rows;
+    bool are_points;
+    int64_t n_components;
+    int64_t n_candidates;
+    int64_t n_samples;
+};
+
+// Features about a center, of a point, or from the features of a cell.
+template <int DIM, typename Number>
+GMM_INLINE void local_features(bool are_points, const Number* given, const double* center, Number* x) {
+    Number offset[DIM];
+    for (int i = 0; i < DIM; ++i) offset[i] = are_points ? given[i] - center[i] : (Number)(-center[i]);
+    x[0] = are_points ? (Number)(1.0) : given[0];
+    for (int i = 0, f = 1 + DIM; i < DIM; ++i) {
+        x[1 + i] = are_points ? offset[i] : given[1 + i] + given[0] * offset[i];
+        for (int n = i; n < DIM; ++n, ++f)
+            x[f] = are_points ? offset[i] * offset[n]
+                              : given[f] + given[1 + i] * offset[n]
+                                    + offset[i] * (given[1 + n] + given[0] * offset[n]);
+    }
+}
+
+// Natural parameters about a center, from those about the component's mean.
+template <int DIM>
+GMM_INLINE void local_parameters(const double* own, const double* mean, const double* center, double* w) {
+    double offset[DIM], across = 0.0;
+    for (int i = 0; i < DIM; ++i) offset[i] = mean[i] - center[i], w[1 + i] = 0.0;
+    for (int i = 0, f = 1 + DIM; i < DIM; ++i)
+        for (int n = i; n < DIM; ++n, ++f) {  // -Q_ii/2, and -Q_in for both
+            w[f] = own[f];
+            w[1 + i] -= own[f] * offset[n];
+            w[1 + n] -= own[f] * offset[i];
+        }
+    for (int i = 0; i < DIM; ++i) across += w[1 + i] * offset[i];
+    w[0] = own[0] - 0.5 * across;
+}
+
+// The logit of a row for a component, about its mean.
+template <int DIM>
+GMM_INLINE double logit_of(bool are_points, const double* given, const double* own, const double* mean,
+                           double* x) {
+    local_features<DIM>(are_points, given, mean, x);
+    double sum = x[0] * own[0];
+    for (int f = 1; f < n_features(DIM); ++f) sum = fma(x[f], own[f], sum);
+    return sum;
+}
+
+template <int DIM>
+GMM_INLINE void load_groups(const Groups& groups, bool are_points, int64_t row, int64_t last, vec* given) {
+    for (int l = 0; l < LANES; ++l) {
+        const int64_t place = minimum(row + l, last);
+        if (are_points)
+            for (int f = 0; f < DIM; ++f) set(given[f], l, groups.values[place * DIM + f]);
+        else
+            for (int f = 0; f < n_features(DIM); ++f)
+                set(given[f], l, groups.values[place * n_features(DIM) + f]);
+    }
+}
+
+CUDA_CALLABLE constexpr int64_t padded_candidates(int64_t n) { return (n + 3) / 4 * 4; }
+
+// Adds the statistics (K, F) about the components' means of the groups of an item, and its log-likelihood and
+// number of points to the two totals. owner: the most likely candidate of each row, or none.
+template <int DIM>
+GMM_INLINE void group_sums(int64_t item, int64_t n_items, GroupSizes sizes, Groups groups, const double* own,
+                           const double* means, double* scratch, double* statistics, double* totals,
+                           int64_t* owner) {
     constexpr int WIDTH = n_features(DIM);
-    const int64_t first_group = n_groups * item / n_parts, last_group = n_groups * (item + 1) / n_parts;
-    vec* logits = (vec*)scratch + item * n_padded * (WIDTH + 2);
-    vec* sums = logits + n_padded;
-    double* out = statistics + item * n_components * WIDTH;
-    vec x[WIDTH], total = (vec)(0.0);
-    for (int64_t g = first_group; g < last_group; ++g) {
-        if (begin[g] == begin[g + 1]) continue;
-        const double* center = centers + g * DIM;
+    const int64_t m = sizes.n_candidates, n_padded = padded_candidates(m), n_groups = sizes.n_components;
+    vec *logits = (vec*)scratch, *sums = logits + n_padded;
+    double* natural = (double*)(sums + n_padded * WIDTH);
+    vec given[WIDTH], x[WIDTH], total = (vec)(0.0);
+    for (int64_t g = n_groups * item / n_items; g < n_groups * (item + 1) / n_items; ++g) {
+        const int64_t stop = groups.begin[g + 1], *candidates = groups.candidates + g * m;
+        if (groups.begin[g] == stop) continue;
+        const double* center = means + g * DIM;
         for (int64_t j = 0; j < n_padded; ++j) {
-            double* w = natural + (item * n_padded + j) * WIDTH;
-            for (int f = 0; f < WIDTH; ++f) w[f] = 0.0;
-            w[0] = -1e300;
-            if (j >= n_candidates) continue;
-            const int64_t k = candidates[g * n_candidates + j];
-            const double* given = own + k * WIDTH;
-            double offset[DIM], across = 0.0;
-            for (int i = 0; i < DIM; ++i) offset[i] = means[k * DIM + i] - center[i];
-            int f = 1 + DIM;
-            for (int i = 0; i < DIM; ++i)
-                for (int n = i; n < DIM; ++n, ++f) {  // -Q_ii/2, and -Q_in for both
-                    w[f] = given[f];
-                    if (i == n) {
-                        w[1 + i] -= 2.0 * given[f] * offset[i];
-                    } else {
-                        w[1 + i] -= given[f] * offset[n];
-                        w[1 + n] -= given[f] * offset[i];
-                    }
-                }
-            for (int i = 0; i < DIM; ++i) across += w[1 + i] * offset[i];
-            w[0] = given[0] - 0.5 * across;
+            double* w = natural + j * WIDTH;
+            if (j < m) {
+                local_parameters<DIM>(own + candidates[j] * WIDTH, means + candidates[j] * DIM, center, w);
+                continue;
+            }
+            for (int f = 0; f < WIDTH; ++f) w[f] = f == 0 ? -1e300 : 0.0;
         }
         for (int64_t j = 0; j < n_padded * WIDTH; ++j) sums[j] = (vec)(0.0);
-        for (int64_t row = begin[g]; row < begin[g + 1]; row += LANES) {
-            vec norm = (vec)(0.0), p;
-            for (int l = 0; l < LANES; ++l) set(p, l, (double)weight[row + l]);
-            if (!likeliest && !any(p > 0.0)) continue;  // slots without rows
-            load_rows<WIDTH>(features, [&](int l) { return row + l; }, x);
-            const vec peak = find_logits<WIDTH>(x, natural + item * n_padded * WIDTH, n_padded, logits);
-            if (likeliest) {
+        for (int64_t row = groups.begin[g]; row < stop; row += LANES) {
+            const int64_t lane_rows = minimum((int64_t)LANES, stop - row);
+            vec norm = (vec)(0.0), p = (vec)(0.0);
+            for (int l = 0; l < lane_rows; ++l)
+                set(p, l, groups.weight[row + l]), totals[1] += groups.weight[row + l];
+            load_groups<DIM>(groups, sizes.are_points, row, stop - 1, given);
+            local_features<DIM>(sizes.are_points, given, center, x);
+            const vec peak = find_logits<WIDTH>(x, natural, n_padded, logits);
+            if (owner) {
                 vec best = (vec)(0.0);
-                for (int64_t j = n_candidates - 1; j >= 0; --j)
-                    best = logits[j] == peak ? (vec)((double)j) : best;
-                for (int l = 0; l < LANES; ++l)
-                    likeliest[row + l] = candidates[g * n_candidates + (int64_t)get(best, l)];
+                for (int64_t j = m - 1; j >= 0; --j) best = logits[j] == peak ? (vec)((double)j) : best;
+                for (int l = 0; l < lane_rows; ++l)
+                    owner[groups.row[row + l]] = candidates[(int64_t)get(best, l)];
             }
-            for (int64_t j = 0; j < n_candidates; ++j) {
+            for (int64_t j = 0; j < m; ++j) {
                 const vec under = logits[j] - peak;
                 logits[j] = (vec)(0.0);
                 if (!any(under > -SKIPPED)) continue;
@@ -65,87 +123,103 @@ GMM_KERNEL truncated(int64_t item, const Real* features, const Real* weight, con
                 norm += logits[j];
             }
             const vec share = p / norm;
-            for (int64_t j = 0; j < n_candidates; ++j) {
+            for (int64_t j = 0; j < m; ++j) {
                 if (!any(logits[j] > 0.0)) continue;
                 const vec gamma = logits[j] * share;
                 for (int f = 0; f < WIDTH; ++f) sums[j * WIDTH + f] = fused(gamma, x[f], sums[j * WIDTH + f]);
             }
             total += p * (peak + logarithm(norm));
         }
-        for (int64_t j = 0; j < n_candidates; ++j) {  // about the component's mean
-            const int64_t k = candidates[g * n_candidates + j];
-            double s[WIDTH], shift[DIM];
+        for (int64_t j = 0; j < m; ++j) {
+            const int64_t k = candidates[j];
+            double s[WIDTH], moved[WIDTH], shift[DIM];
             for (int f = 0; f < WIDTH; ++f) {
                 s[f] = 0.0;
                 for (int l = 0; l < LANES; ++l) s[f] += get(sums[j * WIDTH + f], l);
             }
-            for (int i = 0; i < DIM; ++i) shift[i] = center[i] - means[k * DIM + i];
-            int f = 1 + DIM;
-            for (int i = 0; i < DIM; ++i)
-                for (int n = i; n < DIM; ++n, ++f)
-                    s[f] += s[1 + i] * shift[n] + shift[i] * s[1 + n] + s[0] * shift[i] * shift[n];
-            for (int i = 0; i < DIM; ++i) s[1 + i] += s[0] * shift[i];
-            for (f = 0; f < WIDTH; ++f) out[k * WIDTH + f] += s[f];
+            for (int i = 0; i < DIM; ++i) shift[i] = means[k * DIM + i] - center[i];
+            local_features<DIM>(false, s, shift, moved);
+            for (int f = 0; f < WIDTH; ++f) statistics[k * WIDTH + f] += moved[f];
         }
     }
-    double sum = 0.0;
-    for (int l = 0; l < LANES; ++l) sum += get(total, l);
-    value[item] = sum;
+    for (int l = 0; l < LANES; ++l) totals[0] += get(total, l);
 }
 
-// A component is compared with the samples of a group only if an upper bound of its logits shows that it can
-// be a candidate: log(weight density at the mean) - (distance - radius)^2 / (2 variance), for the ball around
-// the samples. The candidates are exact.
-template <int DIM, typename Real>
-GMM_KERNEL candidates(int64_t item, const Real* features, const Real* weight, const int64_t* begin,
-                      const double* centers, int64_t n_groups, int64_t n_components, int64_t n_candidates,
-                      int64_t n_padded, int64_t n_parts, const int64_t* slots, int64_t n_samples,
-                      const double* natural, const double* bounds, double* scratch, double* scores,
-                      int64_t* candidates) {
+// The row of the sample `number` of a group: samples are evenly spaced, because adjacent rows of a scan are
+// adjacent in space.
+GMM_INLINE int64_t sample_of(const Groups& groups, int64_t g, int64_t number, int64_t n_samples) {
+    const int64_t begin = groups.begin[g], count = groups.begin[g + 1] - begin;
+    return begin + (2 * number + 1) * count / (2 * n_samples);
+}
+
+// What bounds the logits of a component: its mean, the logarithm of weight times density there, and √(1/2v)
+// with v = ‖Σ²‖^½, at least the largest variance. limits (D + 2, padded).
+template <int DIM>
+GMM_INLINE void write_limits(int64_t k, int64_t n_components, int64_t n_padded, const double* own,
+                             const double* means, const double* covariances, double* limits) {
+    const double* c = covariances + k * DIM * DIM;
+    double squares = 0.0;
+    for (int i = 0; i < DIM * DIM && k < n_components; ++i) {
+        double product = 0.0;
+        for (int n = 0; n < DIM; ++n) product += c[i / DIM * DIM + n] * c[n * DIM + i % DIM];
+        squares += product * product;
+    }
+    for (int i = 0; i < DIM; ++i) limits[i * n_padded + k] = k < n_components ? means[k * DIM + i] : 0.0;
+    limits[DIM * n_padded + k] = k < n_components ? own[k * n_features(DIM)] : -1e300;
+    limits[(DIM + 1) * n_padded + k] = k < n_components ? sqrt(0.5 / sqrt(sqrt(squares))) : 0.0;
+}
+
+// Chooses the most likely components for samples of each group of an item; its owner is one. A component is
+// compared with samples only if an upper bound of its logits shows that it can be a candidate: log(weight
+// density at the mean) - (distance - radius)^2 / (2 variance), for the ball around the samples. The
+// candidates are exact.
+template <int DIM>
+GMM_INLINE void choose_candidates(int64_t item, int64_t n_items, GroupSizes sizes, Groups groups,
+                                  int64_t n_padded, const double* own, const double* means,
+                                  const double* limits, double* scratch) {
     constexpr int WIDTH = n_features(DIM);
-    const int64_t first_group = n_groups * item / n_parts, last_group = n_groups * (item + 1) / n_parts;
-    vec* logits = (vec*)scratch + item * n_padded * 3;
+    const int64_t n_groups = sizes.n_components, m = sizes.n_candidates, n_samples = sizes.n_samples;
+    vec* logits = (vec*)scratch;
     double *upper = (double*)(logits + n_padded), *best = upper + n_padded;
     int64_t *listed = (int64_t*)(best + n_padded), *found = listed + n_padded;
-    double *score = scores + item * n_candidates, reach = 32.0;  // nats below the largest bound
+    double *score = (double*)(found + n_padded), reach = 32.0;  // nats below the largest bound
     for (int64_t k = 0; k < n_padded; ++k) best[k] = -HUGE_VAL;
     // Puts x of component k into a row of the largest ones, in which place `worst` is replaced next.
     auto insert = [&](double x, int64_t k, int64_t first, int64_t& n, int64_t& worst, int64_t* names) {
-        const int64_t place = n < n_candidates ? n++ : worst;
+        const int64_t place = n < m ? n++ : worst;
         if (names) names[place] = k;
         score[place] = x;
-        if (n < n_candidates) return;
+        if (n < m) return;
         worst = first;
-        for (int64_t j = first + 1; j < n_candidates; ++j)
+        for (int64_t j = first + 1; j < m; ++j)
             if (score[j] < score[worst] || (names && score[j] == score[worst] && names[j] > names[worst]))
                 worst = j;
     };
-    vec x[WIDTH];
-    for (int64_t g = first_group; g < last_group; ++g) {
-        const double* center = centers + g * DIM;
+    vec given[WIDTH], x[WIDTH];
+    for (int64_t g = n_groups * item / n_items; g < n_groups * (item + 1) / n_items; ++g) {
+        const double* center = means + g * DIM;
         int64_t n_found = 0;
-        for (int64_t sample = 0; sample < n_samples && begin[g] < begin[g + 1]; sample += LANES) {
-            const int64_t* of_group = slots + g * n_samples;
-            load_rows<WIDTH>(
-                features, [&](int l) { return of_group[minimum(sample + l, n_samples - 1)]; }, x);
+        for (int64_t sample = 0; sample < n_samples && groups.begin[g] < groups.begin[g + 1];
+             sample += LANES) {
+            for (int l = 0; l < LANES; ++l) {
+                const int64_t row = sample_of(groups, g, minimum(sample + l, n_samples - 1), n_samples);
+                const int64_t width = sizes.are_points ? DIM : WIDTH;
+                for (int64_t f = 0; f < width; ++f) set(given[f], l, groups.values[row * width + f]);
+            }
+            local_features<DIM>(sizes.are_points, given, center, x);
             vec squared = (vec)(0.0), top = (vec)(-1e300), peak = (vec)(-1e300);
             for (int i = 0; i < DIM; ++i) squared += x[1 + i] * x[1 + i];
             const double radius = sqrt(largest(squared));
-            int f = 1 + DIM;
-            for (int i = 0; i < DIM; ++i)
-                for (int n = i; n < DIM; ++n, ++f)
-                    x[f] += x[1 + i] * center[n] + center[i] * x[1 + n] + x[0] * (center[i] * center[n]);
-            for (int i = 0; i < DIM; ++i) x[1 + i] += x[0] * center[i];
             for (int64_t k = 0; k < n_padded; k += LANES) {
-                const vec* own = (const vec*)(bounds + k);
+                const vec* of = (const vec*)(limits + k);
                 vec gap = (vec)(0.0);
                 for (int i = 0; i < DIM; ++i) {
-                    const vec off = own[i * n_padded / LANES] - center[i];
+                    const vec off = of[i * n_padded / LANES] - center[i];
                     gap += off * off;
                 }
                 gap = root(gap) - radius;
-                gap = (gap > 0.0 ? gap : (vec)(0.0)) * own[(DIM + 1) * n_padded / LANES];
-                const vec most = own[DIM * n_padded / LANES] - gap * gap;
+                gap = (gap > 0.0 ? gap : (vec)(0.0)) * of[(DIM + 1) * n_padded / LANES];
+                const vec most = of[DIM * n_padded / LANES] - gap * gap;
                 *(vec*)(upper + k) = most;
                 top = most > top ? most : top;
             }
@@ -158,9 +232,13 @@ GMM_KERNEL candidates(int64_t item, const Real* features, const Real* weight, co
                     if (!any((bound >= from) & (bound < below))) continue;
                     for (int l = 0; l < LANES; ++l) {
                         if (!(upper[k + l] >= from && upper[k + l] < below)) continue;
-                        const double* w = natural + (k + l) * WIDTH;
-                        vec logit = x[0] * w[0];
-                        for (int i = 1; i < WIDTH; ++i) logit = fused(x[i], (vec)(w[i]), logit);
+                        vec logit = (vec)(-1e300);
+                        if (k + l < n_groups) {
+                            double w[WIDTH];
+                            local_parameters<DIM>(own + (k + l) * WIDTH, means + (k + l) * DIM, center, w);
+                            logit = x[0] * w[0];
+                            for (int i = 1; i < WIDTH; ++i) logit = fused(x[i], (vec)(w[i]), logit);
+                        }
                         peak = logit > peak ? logit : peak;
                         logits[n_listed] = logit;
                         listed[n_listed++] = k + l;
@@ -169,37 +247,141 @@ GMM_KERNEL candidates(int64_t item, const Real* features, const Real* weight, co
                 n_best = worst = 0;
                 for (int64_t j = 0; j < n_listed; ++j) {
                     const vec under = logits[j] - peak;
-                    if (n_best == n_candidates && !any(under > score[worst])) continue;
+                    if (n_best == m && !any(under > score[worst])) continue;
                     insert(largest(under), j, 0, n_best, worst, nullptr);
                 }
                 // No component below `from` is more likely than the worst of the candidates.
                 below = from;
-                const bool enough = n_best == n_candidates;
+                const bool enough = n_best == m;
                 from = enough ? score[worst] - largest(-peak) - 1e-6 : most - 4.0 * (most - from);
                 if (n_listed == n_padded) break;
             }
             reach = most - minimum(from, below);
             for (int64_t j = 0; j < n_listed; ++j) {
-                double& own = best[listed[j]];
-                if (own == -HUGE_VAL) found[n_found++] = listed[j];
-                own = maximum(own, largest(logits[j] - peak));
+                double& so_far = best[listed[j]];
+                if (so_far == -HUGE_VAL) found[n_found++] = listed[j];
+                so_far = maximum(so_far, largest(logits[j] - peak));
             }
         }
         if (n_found == 0)  // no rows: any candidates
-            for (int64_t k = 0; k < n_candidates; ++k) found[n_found++] = k;
-        int64_t n_chosen = 1, worst = 0;
-        int64_t* chosen = candidates + g * n_candidates;
+            for (int64_t k = 0; k < m; ++k) found[n_found++] = k;
+        int64_t n_chosen = 1, worst = 0, *chosen = groups.candidates + g * m;
         chosen[0] = g;
         for (int64_t j = 0; j < n_found; ++j) {
             const int64_t k = found[j];
-            if (k != g && n_candidates > 1 && k < n_components) {  // of equal ones, the first is taken
-                const bool first = n_chosen == n_candidates && best[k] == score[worst] && k < chosen[worst];
-                if (n_chosen < n_candidates || best[k] > score[worst] || first)
+            if (k != g && m > 1 && k < n_groups) {  // of equal ones, the first is taken
+                const bool first = n_chosen == m && best[k] == score[worst] && k < chosen[worst];
+                if (n_chosen < m || best[k] > score[worst] || first)
                     insert(best[k], k, 1, n_chosen, worst, chosen);
             }
             best[k] = -HUGE_VAL;
         }
     }
+}
+
+// -- on a GPU -------------------------------------------------------------------------------------
+
+// Of a row, the logarithm of the sum over its group's candidates. owner: gets the most likely one, unless
+// null.
+template <int DIM>
+GMM_INLINE double row_norm(int64_t row, GroupSizes sizes, Groups groups, const double* own,
+                           const double* means, int64_t* owner) {
+    constexpr int WIDTH = n_features(DIM);
+    const double* given = groups.values + row * (sizes.are_points ? DIM : WIDTH);
+    const int64_t* candidates = groups.candidates + groups.group_of[row] * sizes.n_candidates;
+    double x[WIDTH], peak = -HUGE_VAL, norm = 0.0;
+    int64_t best = candidates[0];
+    for (int64_t j = 0; j < sizes.n_candidates; ++j) {
+        const int64_t k = candidates[j];
+        const double logit = logit_of<DIM>(sizes.are_points, given, own + k * WIDTH, means + k * DIM, x);
+        if (logit > peak) {
+            norm = norm * (norm > 0.0 ? exp(peak - logit) : 0.0) + 1.0;
+            peak = logit, best = k;
+        } else if (logit - peak > -SKIPPED) {
+            norm += exp(logit - peak);
+        }
+    }
+    if (owner) owner[groups.row[row]] = best;
+    return peak + log(norm);
+}
+
+// The statistics of a pair of group and candidate, about the candidate's mean.
+template <int DIM>
+GMM_INLINE void pair_sums(int64_t pair, GroupSizes sizes, Groups groups, const double* own,
+                          const double* means, const double* norms, double* sums) {
+    constexpr int WIDTH = n_features(DIM);
+    const int64_t g = pair / sizes.n_candidates, k = groups.candidates[pair];
+    double s[WIDTH], x[WIDTH];
+    for (int f = 0; f < WIDTH; ++f) s[f] = 0.0;
+    for (int64_t row = groups.begin[g]; row < groups.begin[g + 1]; ++row) {
+        const double* given = groups.values + row * (sizes.are_points ? DIM : WIDTH);
+        const double logit = logit_of<DIM>(sizes.are_points, given, own + k * WIDTH, means + k * DIM, x);
+        const double under = logit - norms[row];
+        if (!(under > -SKIPPED)) continue;
+        const double gamma = exp(under) * groups.weight[row];
+        for (int f = 0; f < WIDTH; ++f) s[f] = fma(gamma, x[f], s[f]);
+    }
+    for (int f = 0; f < WIDTH; ++f) sums[pair * WIDTH + f] = s[f];
+}
+
+// A short list of the largest scores and what has them; of equal ones, the first.
+struct Best {
+    double *scores, *names;
+    int64_t most, n, worst;
+
+    GMM_INLINE void replace(int64_t place, double score, double name) {
+        scores[place] = score, names[place] = name;
+        if (n < most) return;
+        worst = 0;
+        for (int64_t j = 1; j < most; ++j)
+            if (scores[j] < scores[worst] || (scores[j] == scores[worst] && names[j] > names[worst]))
+                worst = j;
+    }
+    GMM_INLINE void add(double score, double name) {
+        if (n < most)
+            n += 1, replace(n - 1, score, name);
+        else if (score > scores[worst] || (score == scores[worst] && name < names[worst]))
+            replace(worst, score, name);
+    }
+};
+
+// The most likely components of one sample of a group, and how far below the likeliest they are.
+template <int DIM>
+GMM_INLINE void choose_for_sample(int64_t place, GroupSizes sizes, Groups groups, const double* own,
+                                  const double* means, double* scores, double* names) {
+    constexpr int WIDTH = n_features(DIM);
+    const int64_t g = place / sizes.n_samples, m = sizes.n_candidates;
+    if (groups.begin[g] == groups.begin[g + 1]) return;
+    const int64_t row = sample_of(groups, g, place % sizes.n_samples, sizes.n_samples);
+    const double* given = groups.values + row * (sizes.are_points ? DIM : WIDTH);
+    Best best = {scores + place * m, names + place * m, m, 0, 0};
+    double x[WIDTH], peak = -HUGE_VAL;
+    for (int64_t k = 0; k < sizes.n_components; ++k) {
+        const double logit = logit_of<DIM>(sizes.are_points, given, own + k * WIDTH, means + k * DIM, x);
+        peak = maximum(peak, logit);
+        best.add(logit, (double)k);
+    }
+    for (int64_t j = 0; j < m; ++j) best.scores[j] -= peak;
+}
+
+// The candidates of a group, from the lists of its samples. The owner is the first.
+GMM_INLINE void merge_choices(int64_t g, GroupSizes sizes, Groups groups, const double* scores,
+                              const double* names, double* scratch) {
+    const int64_t m = sizes.n_candidates, n = groups.begin[g] < groups.begin[g + 1] ? sizes.n_samples * m : 0;
+    int64_t* chosen = groups.candidates + g * m;
+    Best best = {scratch + 2 * g * m, scratch + (2 * g + 1) * m, m - 1, 0, 0};
+    for (int64_t i = g * sizes.n_samples * m; i < g * sizes.n_samples * m + n && m > 1; ++i) {
+        int64_t known = 0;
+        while (known < best.n && best.names[known] != names[i]) known += 1;
+        if (names[i] == (double)g) continue;
+        if (known == best.n)
+            best.add(scores[i], names[i]);
+        else if (scores[i] > best.scores[known])
+            best.replace(known, scores[i], names[i]);
+    }
+    chosen[0] = g;
+    for (int64_t j = 1; j < m; ++j)  // without rows, any candidates
+        chosen[j] = n ? (int64_t)best.names[j - 1] : j - (j <= g);
 }
 
 }  // namespace gmm

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError, check_number
-from gmmtorch.kernels import fused_em, in_spatial_order
+from gmmtorch.kernels import fused_em, fused_exact_em, in_spatial_order, is_em_fused, takes_one_launch
 from gmmtorch.mixture.em import by_type, exact
 from gmmtorch.mixture.em.exact import Parameters, compact, constrain, expand
 from gmmtorch.mixture.reduction import merge_pairs
@@ -27,8 +27,25 @@ State = TypeVar("State")  # what an iteration improves: `Parameters`, or a poste
 Step = Callable[[State], tuple[State, float]]
 """One EM step: from a state to an improved one, and a mean lower bound (nats)."""
 
+Run = Callable[[State, float, int, float], tuple[State, list[float]]]
+"""Several steps at once: from a state, a tolerance, the largest number of steps (1 or more) and the bound
+before them, to the last state and the bounds. No step follows one that changes the bound by less than the
+tolerance.
+"""
+
 OnIteration = Callable[[int, float], None]
-"""Called with the iteration, from 1, and its lower bound."""
+"""Called with the iteration, from 1, and its lower bound; later, if several steps are taken at once."""
+
+
+@dataclass(frozen=True)
+class Steps(Generic[State]):
+    """An EM step, of which `run` takes several before Python reads their bounds."""
+
+    run: Run[State]
+
+    def __call__(self, state: State) -> tuple[State, float]:
+        state, (bound,) = self.run(state, 0.0, 1, -math.inf)
+        return state, bound
 
 
 @dataclass(frozen=True)
@@ -66,10 +83,15 @@ def run_em(
     """
     bounds = list(lower_bounds)
     while not (converged := has_converged(bounds, tol, previous_bound)) and len(bounds) < max_iter:
-        parameters, bound = step(parameters)
-        bounds.append(bound)
-        if on_iteration is not None:
-            on_iteration(len(bounds), bound)
+        if isinstance(step, Steps):
+            last = bounds[-1] if bounds else previous_bound
+            parameters, found = step.run(parameters, tol, max_iter - len(bounds), last)
+        else:
+            parameters, *found = step(parameters)
+        for bound in found:
+            bounds.append(bound)
+            if on_iteration is not None:
+                on_iteration(len(bounds), bound)
     return EMResult(parameters, bounds, converged)
 
 
@@ -104,7 +126,7 @@ def has_converged(bounds: Sequence[float], tol: float, previous_bound: float = -
 
 def em_step(
     rows: Rows, reg_covar: float, softmax_dtype: torch.dtype, covariance_type: str = "full"
-) -> Step[Parameters]:
+) -> Steps[Parameters]:
     """EM steps on points, centred, or cells. Covariances have the shape of their type."""
     points = rows.values if rows.are_points else None
     if points is not None and points.shape[1] > 3:
@@ -113,30 +135,22 @@ def em_step(
     return in_shape_of_type(natural, covariance_type)
 
 
-def in_shape_of_type(natural: Step[Parameters], covariance_type: str) -> Step[Parameters]:
+def in_shape_of_type(natural: Steps[Parameters], covariance_type: str) -> Steps[Parameters]:
     """The steps `natural`, whose covariances are (K, D, D), for covariances in the shape of their type."""
     if covariance_type == "full":
         return natural
-    known: list[tuple[Parameters, Parameters]] = []  # the last result, in both shapes
 
-    def step(parameters: Parameters) -> tuple[Parameters, float]:
-        if known and known[0][0] is parameters:
-            given = known[0][1]
-        else:
-            given = parameters._replace(
-                covariances=expand(parameters.covariances, covariance_type, *parameters.means.shape)
-            )
-        new, bound = natural(given)
-        found = new._replace(covariances=compact(new.covariances, covariance_type))
-        known[:] = [(found, new)]
-        return found, bound
+    def run(parameters: Parameters, tol: float, n_most: int, last: float) -> tuple[Parameters, list[float]]:
+        covariances = expand(parameters.covariances, covariance_type, *parameters.means.shape)
+        found, bounds = natural.run(parameters._replace(covariances=covariances), tol, n_most, last)
+        return found._replace(covariances=compact(found.covariances, covariance_type)), bounds
 
-    return step
+    return Steps(run)
 
 
 def _typed_step(
     points: Tensor, sample_weight: Tensor, reg_covar: float, softmax_dtype: torch.dtype, kind: str
-) -> Step[Parameters]:
+) -> Steps[Parameters]:
     """EM steps with the arithmetic of the covariance type; direct ones from the first that loses digits."""
     total, direct = sample_weight.sum(), [False]
 
@@ -162,7 +176,7 @@ def _typed_step(
             )
         return found.parameters, bound
 
-    return _ahead(step, checked, 1 if points.device.type == "cpu" else _STEPS_AHEAD)
+    return Steps(_ahead(step, checked, 1 if points.device.type == "cpu" else _STEPS_AHEAD))
 
 
 def natural_step(
@@ -172,7 +186,7 @@ def natural_step(
     softmax_dtype: torch.dtype = torch.float32,
     points: Tensor | None = None,
     covariance_type: str = "full",
-) -> Step[Parameters]:
+) -> Steps[Parameters]:
     """EM steps on features (N, F), float64, of points or cells.
 
     If `points` (N, D), the points of the features, are given, a step whose natural parameters would lose
@@ -183,10 +197,6 @@ def natural_step(
 
     def gather(parameters: Parameters) -> tuple[Tensor, Tensor]:
         return exact.expectation(*rows, exact.natural_parameters(parameters), softmax_dtype)
-
-    if points is not None:
-        direct = functools.partial(by_type.direct_step, points, sample_weight, reg_covar=reg_covar)
-        return guarded_step(gather, direct, reg_covar, float(total), covariance_type)
 
     def maximized(parameters: Parameters, statistics: Tensor, value: Tensor) -> tuple[Parameters, Tensor]:
         new = of_type(exact.maximization(statistics, reg_covar, parameters), covariance_type)
@@ -199,34 +209,54 @@ def natural_step(
         new, bound = maximized(parameters, *gather(parameters))
         return new, float(bound)
 
-    return _ahead(step, checked_step, 1 if features.device.type == "cpu" else _STEPS_AHEAD)
+    if points is None:
+        checked: Step[Parameters] = checked_step
+        ahead = _ahead(step, checked_step, 1 if features.device.type == "cpu" else _STEPS_AHEAD)
+    else:
+        direct = functools.partial(by_type.direct_step, points, sample_weight, reg_covar=reg_covar)
+        checked = guarded = guarded_step(gather, direct, reg_covar, float(total), covariance_type)
+        ahead = guarded.run
+
+    def run(parameters: Parameters, tol: float, n_most: int, last: float) -> tuple[Parameters, list[float]]:
+        fits = covariance_type == "full" and takes_one_launch(len(features), len(parameters.weights))
+        if not fits or not is_em_fused(*rows, *parameters):
+            return ahead(parameters, tol, n_most, last)
+        mixture, bounds, failed = fused_exact_em(
+            *rows, parameters, reg_covar, tol, n_most, last, guarded=points is not None
+        )
+        if not failed:
+            return Parameters(*mixture), bounds
+        new, bound = checked(Parameters(*mixture))
+        return new, [*bounds, bound]
+
+    return Steps(run)
 
 
 def _ahead(
     step: Callable[[Parameters], tuple[Parameters, Tensor]], checked: Step[Parameters], n_ahead: int
-) -> Step[Parameters]:
-    """Steps of which `n_ahead` run before their bounds are read: Python then waits once for all of them.
+) -> Run[Parameters]:
+    """Up to `n_ahead` steps before their bounds are read: Python then waits once for all of them.
 
     A step whose bound is NaN is taken again by `checked`. Steps beyond the last one asked for are lost.
     """
-    ready: list[tuple[Parameters, Parameters, float]] = []  # from, to, bound: the next step last
 
-    def take(parameters: Parameters) -> tuple[Parameters, float]:
-        if not ready or ready[-1][0] is not parameters:
-            states, bounds = [parameters], []
-            for _ in range(n_ahead):
-                state, unread = step(states[-1])
-                states.append(state)
-                bounds.append(unread)
-            read = torch.stack(bounds).tolist()
-            ready[:] = reversed(list(zip(states, states[1:], read, strict=False)))
-        _, new, bound = ready.pop()
-        if math.isnan(bound):
-            ready.clear()
-            return checked(parameters)
-        return new, bound
+    def run(parameters: Parameters, tol: float, n_most: int, last: float) -> tuple[Parameters, list[float]]:
+        states, unread = [parameters], []
+        for _ in range(min(n_ahead, n_most)):
+            state, not_read = step(states[-1])
+            states.append(state)
+            unread.append(not_read)
+        bounds = torch.stack(unread).tolist()
+        for number, bound in enumerate(bounds):
+            if math.isnan(bound):
+                new, bound = checked(states[number])
+                return new, [*bounds[:number], bound]
+            if abs(bound - last) < tol:
+                return states[number + 1], bounds[: number + 1]
+            last = bound
+        return states[-1], bounds
 
-    return take
+    return run
 
 
 def guarded_step(
@@ -235,22 +265,22 @@ def guarded_step(
     reg_covar: float,
     total: float,
     covariance_type: str = "full",
-) -> Step[Parameters]:
+) -> Steps[Parameters]:
     """EM steps with an E-step `gather`: parameters → S (K, F) and Σ_n p_n log p(x_n). `total` is Σ_n p_n.
 
     If the natural parameters or S lose digits to cancellation, `direct` takes the step.
     """
 
-    def step(parameters: Parameters) -> tuple[Parameters, float]:
+    def run(parameters: Parameters, *_: float) -> tuple[Parameters, list[float]]:
         if not exact.is_ill_conditioned(parameters):
             statistics, value = gather(parameters)
             new = of_type(exact.maximization(statistics, reg_covar, parameters), covariance_type)
             if not exact.has_cancelled(statistics, new):
-                return new, float(value) / total
+                return new, [float(value) / total]
         new, value = direct(parameters)
-        return of_type(new, covariance_type), float(value) / total
+        return of_type(new, covariance_type), [float(value) / total]
 
-    return step
+    return Steps(run)
 
 
 def of_type(parameters: Parameters, covariance_type: str) -> Parameters:

@@ -21,15 +21,12 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels import (
-    GroupedRows,
+    TruncatedLimits,
     chunk_elements,
     chunked,
-    fused_candidates,
-    fused_expectation,
-    fused_natural_parameters,
-    fused_steps,
+    fused_truncated_em,
     is_m_step_fused,
-    is_truncated_e_step_fused,
+    n_sampled_rows,
 )
 from gmmtorch.linalg import argsort, largest_indices, pack_symmetric, unpack_symmetric
 from gmmtorch.mixture.em import exact as em
@@ -43,7 +40,6 @@ _AVERAGE_ROUNDING, _WORST_ROUNDING = 0.02, 0.2  # nats of float32 error above wh
 _SAMPLED_OF_A_COMPONENT = 400  # points a component in the random sample that EM starts on
 _MANY_POINTS = 1 << 19  # from this number of points on, EM starts on cells
 _POINTS_OF_A_CELL, _CELLS_OF_A_COMPONENT = 16, 32
-_SAMPLES = 64  # most rows of a group that are compared with all components
 _BUILD_ROWS = 1 << 18
 
 
@@ -90,13 +86,9 @@ class Momentum:
         share = 0.0 if last is None else self._age / (self._age + 3)
         self._age += last is not None
         self.is_extrapolated = share > 0
-        given = statistics, parameters, self._reg_covar, last if self.is_extrapolated else None, share
-        if is_m_step_fused(parameters.means.shape[1], statistics, *parameters):
-            em_step, ahead = fused_steps(*given)
-        else:
-            em_step, ahead = _steps(*given)
-        self._em_step = Parameters(*em_step)
-        return self._em_step if ahead is None else Parameters(*ahead)
+        used = last if self.is_extrapolated else None
+        self._em_step, ahead = _steps(statistics, parameters, self._reg_covar, used, share)
+        return self._em_step if ahead is None else ahead
 
     def undo(self) -> Parameters:
         """EM's own parameters of the last step. Resets the momentum."""
@@ -112,7 +104,7 @@ def _steps(
     last: tuple[Tensor, Tensor] | None,
     share: float,
 ) -> tuple[Parameters, Parameters | None]:
-    """EM's own step and the extrapolated one; the twin of `kernels.fused_steps`."""
+    """EM's own step and the extrapolated one."""
     centered = parameters._replace(means=torch.zeros_like(parameters.means))
 
     def maximized(sums: Tensor) -> Parameters:
@@ -148,7 +140,12 @@ def run_truncated(
     It starts with the owners' `candidates` (K, m), or chooses them. Returns the result of EM, and the
     owners and candidates of the last bound. The bounds never decrease: if new candidates or the
     momentum decrease the bound, the old candidates are kept and the momentum is undone.
+
+    In up to three dimensions a fused kernel computes all of it in float64. `settings.on_iteration` is called
+    when it ends, after many iterations.
     """
+    if is_m_step_fused(parameters.means.shape[1], rows.values, rows.weight, *parameters):
+        return _run_fused(rows, owner, parameters, settings, candidates)
     total = float(settings.processes.sum(rows.weight.sum()[None]))
     momentum = Momentum(settings.reg_covar)
     bounds: list[float] = []
@@ -190,6 +187,22 @@ def run_truncated(
     # EM's own parameters are certainly not worse than the last bound; extrapolated ones may be.
     parameters = momentum.undo() if momentum.is_extrapolated else parameters
     return EMResult(parameters, bounds, converged), owners_of(sets[0]), sets[1]
+
+
+def _run_fused(
+    rows: Rows, owner: Tensor, parameters: Parameters, settings: Settings, candidates: Tensor | None
+) -> tuple[EMResult[Parameters], Tensor, Tensor]:
+    """`run_truncated` by the fused kernel."""
+    limits = TruncatedLimits(settings.reg_covar, settings.tol, settings.previous_bound, settings.max_iter)
+    found = fused_truncated_em(
+        *(rows.values, rows.weight, owner, parameters, limits),
+        settings.n_candidates if candidates is None else candidates,
+        lambda mixture: centered_parameters(Parameters(*mixture)),
+        settings.processes.sum if settings.processes.size > 1 else None,
+        settings.on_iteration,
+    )
+    result = EMResult(Parameters(*found.mixture), found.bounds, found.converged)
+    return result, found.owner, found.candidates
 
 
 def _candidate_sets(
@@ -306,15 +319,6 @@ class Groups(NamedTuple):
     row: Tensor
     slot: Tensor
 
-    def rows(self) -> GroupedRows:
-        """The slots of each group, for the fused kernels."""
-        block = self.weight.shape[1]
-        n_slots = (self.n_rows + block - 1) // block * block
-        begin = torch.cat([n_slots.new_zeros(1), n_slots.cumsum(0)])
-        return GroupedRows(
-            self.features.flatten(0, 1), self.weight.flatten(), begin, self.centers.contiguous()
-        )
-
 
 def group_rows(
     rows: Rows, owner: Tensor, centers: Tensor, dtype: torch.dtype, as_points: bool = False
@@ -376,16 +380,13 @@ def choose_candidates(groups: Groups, parameters: Parameters, n_candidates: int)
     k = parameters.weights.shape[0]
     if k <= n_candidates:
         return torch.arange(k, device=groups.owner.device).expand(k, k)
-    n_samples = max(8, min(_SAMPLES, 4096 // k))
+    n_samples = n_sampled_rows(k)
     # Evenly spaced over the rows of a group, because adjacent rows of a scan are adjacent in space.
     count, steps = groups.n_rows[:, None], torch.arange(n_samples, device=groups.n_rows.device)
     place = torch.cumsum(count, 0) - count + (2 * steps + 1) * count // (2 * n_samples)
     place = place.clamp_max_(groups.slot.shape[0] - 1)  # of empty groups, whose candidates are unused
-    natural, rows = em.natural_parameters(parameters), groups.rows()
-    if is_truncated_e_step_fused(rows, natural):
-        bounds = _logit_bounds(parameters, natural)
-        return fused_candidates(rows, groups.slot[place], natural, bounds, n_candidates)
-    natural, samples = natural.T.contiguous(), rows.features[groups.slot[place]]
+    natural = em.natural_parameters(parameters).T.contiguous()
+    samples = groups.features.flatten(0, 1)[groups.slot[place]]
 
     def chosen(part: slice) -> Tensor:
         moved = em.shift_features(samples[part].double(), groups.centers[part, None])
@@ -398,15 +399,6 @@ def choose_candidates(groups: Groups, parameters: Parameters, n_candidates: int)
 
     step = max(1, 4 * chunk_elements(groups.owner.device) // (n_samples * k))
     return torch.cat(list(chunked(k, step, chosen)))
-
-
-def _logit_bounds(parameters: Parameters, natural: Tensor) -> Tensor:
-    """Means, log π_k N(μ_k | μ_k, Σ_k), and √(1/2v), (D + 2, K); v = ‖Σ²‖^½ bounds the largest variance."""
-    means, covariances = parameters.means, parameters.covariances
-    dim = means.shape[1]
-    peak = natural[:, 0] + 0.5 * (natural[:, 1 : 1 + dim] * means).sum(1)
-    variance = (covariances @ covariances).square().sum((1, 2)).pow(0.25)
-    return torch.cat([means.T, torch.stack([peak, (0.5 / variance).sqrt()])])
 
 
 # -- the E-step over candidates -------------------------------------------------------------------
@@ -436,10 +428,7 @@ def truncated_expectation(
     With `want_owner`, also returns each row's most likely candidate. `own`: the `centered_parameters`, if
     they are known.
     """
-    rows, own = groups.rows(), centered_parameters(parameters) if own is None else own
-    if is_truncated_e_step_fused(rows, own, candidates):
-        fused = fused_expectation(rows, candidates, own, parameters.means, want_owner)
-        return Expectation(fused[0], float(fused[1]), _owner_of_rows(groups, fused[2]))
+    own = centered_parameters(parameters) if own is None else own
     n_groups, m = candidates.shape
     n_blocks, block, n_features = groups.features.shape
     dtype = groups.features.dtype
@@ -478,12 +467,7 @@ def _owner_of_rows(groups: Groups, likeliest: Tensor | None) -> Tensor | None:
 
 def centered_parameters(parameters: Parameters) -> Tensor:
     """Natural parameters (K, F) of the components about their own means."""
-    weights, means, covariances = parameters
-    if is_m_step_fused(means.shape[1], *parameters):
-        found, failed = fused_natural_parameters(weights, None, covariances)
-        if not bool(failed):
-            return found
-    return em.natural_parameters(parameters._replace(means=torch.zeros_like(means)))
+    return em.natural_parameters(parameters._replace(means=torch.zeros_like(parameters.means)))
 
 
 def _local_parameters(own: Tensor, means: Tensor, centers: Tensor, candidates: Tensor) -> Tensor:

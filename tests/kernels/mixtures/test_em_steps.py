@@ -12,15 +12,6 @@ from gmmtorch.errors import NumericalError
 from gmmtorch.kernels import fused_kmeans, kernels
 from gmmtorch.kernels.mixtures import em_steps
 from gmmtorch.mixture.em.exact import Parameters, maximization, natural_parameters, quadratic_features
-from gmmtorch.mixture.em.truncated import (
-    Groups,
-    Momentum,
-    Rows,
-    centered_parameters,
-    choose_candidates,
-    group_rows,
-    truncated_expectation,
-)
 
 
 def mixture(k: int, dim: int, kind: str) -> Parameters:
@@ -129,25 +120,6 @@ def sums(dim: int, seed: int, thickness: float) -> torch.Tensor:
     return (features * weight[..., None]).sum(1)
 
 
-@given(
-    dim=st.sampled_from([1, 2, 3]),
-    seed=st.integers(0, 10_000),
-    thickness=st.sampled_from([1.0, 1e-3]),
-    far=st.sampled_from([0.0, 30.0]),
-)
-def test_steps_with_momentum_are_those_of_the_twin(dim, seed, thickness, far):
-    found = {}
-    for choice in ("torch", "fused"):
-        parameters, momentum = mixture(K, dim, "any"), Momentum(1e-6)
-        parameters = parameters._replace(means=parameters.means + far)
-        with kernels(choice):
-            for step in range(4):
-                parameters = momentum.step(sums(dim, seed + step // 2, thickness), parameters)
-            found[choice] = [*parameters, *momentum.undo()]
-    for fused, twin in zip(found["fused"], found["torch"], strict=True):
-        torch.testing.assert_close(fused, twin, rtol=1e-11, atol=1e-11)
-
-
 @given(dim=st.sampled_from([1, 2, 3]), seed=st.integers(0, 10_000), is_first=st.booleans())
 def test_the_m_step_is_that_of_the_twin(dim, seed, is_first):
     previous = None if is_first else mixture(K, dim, "any")
@@ -158,9 +130,8 @@ def test_the_m_step_is_that_of_the_twin(dim, seed, is_first):
 
 @pytest.mark.parametrize("dim", [1, 2, 3])
 @pytest.mark.parametrize("kind", ["any", "equal", "flat", "empty"])
-@pytest.mark.parametrize("function", [natural_parameters, centered_parameters])
-def test_natural_parameters_are_those_of_the_twin(dim, kind, function):
-    twin, fused = by_both(lambda: function(mixture(K, dim, kind)))
+def test_natural_parameters_are_those_of_the_twin(dim, kind):
+    twin, fused = by_both(lambda: natural_parameters(mixture(K, dim, kind)))
     scale = twin.abs().amax(1, keepdim=True).clamp(1.0, 1e20)
     assert float(((fused - twin).abs() / scale).max()) < 1e-10
 
@@ -178,64 +149,6 @@ def test_a_covariance_that_is_not_positive_is_repaired_or_named_as_by_the_twin()
     bad = Parameters(parameters.weights, parameters.means, torch.full((3, 2, 2), torch.nan).double())
     with kernels("fused"), pytest.raises(NumericalError, match="NaN"):
         natural_parameters(bad)
-
-
-def groups_of(dim: int, kind: str, dtype: torch.dtype, n: int = 900) -> tuple[Groups, Parameters]:
-    """Groups of rows; every seventh component has none."""
-    parameters = mixture(K, dim, kind)
-    generator = torch.Generator().manual_seed(dim)
-    points = 4 * torch.rand(n, dim, generator=generator, dtype=torch.float64)
-    if kind == "flat":
-        points[:, 0] = parameters.means[0, 0]  # on a plane
-    weight = torch.rand(n, generator=generator, dtype=torch.float64)
-    weight[::5] = 0.0
-    owner = torch.cdist(points, parameters.means).argmin(1)
-    owner[owner % 7 == 0] += 1
-    rows = Rows(points, weight) if kind != "empty" else Rows(quadratic_features(points), weight, False)
-    return group_rows(rows, owner.clamp_max(K - 1), parameters.means, dtype), parameters
-
-
-@pytest.mark.parametrize("dim", [1, 2, 3])
-@pytest.mark.parametrize("kind", ["any", "equal", "flat", "empty"])
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-4)])
-def test_fused_truncated_statistics_equal_the_twin(dim, kind, dtype, tolerance):
-    groups, parameters = groups_of(dim, kind, dtype)
-    tolerance *= 1e4 if kind == "flat" else 1
-    with kernels("torch"):
-        candidates = choose_candidates(groups, parameters, 7)
-    found = by_both(lambda: truncated_expectation(groups, candidates, parameters, True))
-    twin, fused = found
-    scale = float(twin.statistics.abs().max())
-    torch.testing.assert_close(fused.statistics, twin.statistics, rtol=0, atol=tolerance * scale)
-    assert fused.value == pytest.approx(twin.value, rel=10 * tolerance)
-    if kind in ("any", "empty"):
-        assert float((fused.owner != twin.owner).double().mean()) <= (0 if dtype == torch.float64 else 0.01)
-
-
-@pytest.mark.parametrize("dim", [1, 2, 3])
-@pytest.mark.parametrize("n_candidates", [1, 16])
-def test_fused_candidates_are_those_of_the_twin(dim, n_candidates):
-    groups, parameters = groups_of(dim, "any", torch.float64)
-    chosen = by_both(lambda: choose_candidates(groups, parameters, n_candidates).sort(1).values)
-    has_rows = groups.n_rows > 0
-    assert int(has_rows.sum()) > 20
-    assert torch.equal(chosen[1][has_rows], chosen[0][has_rows])
-    own = torch.arange(K)[:, None]
-    assert bool((chosen[1] == own).any(1).all())
-    assert bool((chosen[1][:, 1:] > chosen[1][:, :-1]).all())  # each component once
-
-
-def test_of_equal_components_the_first_are_candidates():
-    groups, parameters = groups_of(2, "equal", torch.float64)
-    own = torch.arange(K)[:, None]
-    first = torch.arange(5).repeat(K, 1)
-    first = torch.where((first == own).any(1, keepdim=True), first, first.index_fill(1, torch.tensor([4]), K))
-    expected = torch.where(first == K, own, first)
-    has_rows = groups.n_rows > 0
-    for choice in ("fused", "torch"):
-        with kernels(choice):
-            chosen = choose_candidates(groups, parameters, 5).sort(1).values
-        assert torch.equal(chosen[has_rows], expected[has_rows])
 
 
 # -- k-means --------------------------------------------------------------------------------------
