@@ -1,7 +1,7 @@
 // Cells cut into flat pieces, level by level.
 #pragma once
 
-#include "../device.h"
+#include "../jacobi.h"
 
 namespace gmm {
 
@@ -51,35 +51,8 @@ GMM_KERNEL piece_cuts(int64_t, const double* points, const double* features, con
             double c[DIM][DIM], v[DIM][DIM];
             for (int a = 0; a < DIM; ++a) own[a] = sum[1 + a] / count;
             for (int a = 0, f = 1 + DIM; a < DIM; ++a)
-                for (int b = a; b < DIM; ++b, ++f) {
-                    c[a][b] = c[b][a] = sum[f] / count - own[a] * own[b];
-                    v[a][b] = v[b][a] = a == b ? 1.0 : 0.0;
-                }
-            for (int sweep = 0; sweep < 30; ++sweep) {  // Jacobi's rotations
-                double off = 0.0, on = 0.0;
-                for (int a = 0; a < DIM; ++a)
-                    for (int b = 0; b < DIM; ++b) (a == b ? on : off) += c[a][b] * c[a][b];
-                if (!(off > 1e-32 * on)) break;
-                for (int a = 0; a < DIM; ++a)
-                    for (int b = a + 1; b < DIM; ++b) {
-                        if (c[a][b] == 0.0) continue;
-                        const double w = (c[b][b] - c[a][a]) / (2.0 * c[a][b]);
-                        const double t = (w < 0.0 ? -1.0 : 1.0) / (fabs(w) + sqrt(w * w + 1.0));
-                        const double cosine = 1.0 / sqrt(t * t + 1.0), sine = t * cosine;
-                        for (int k = 0; k < DIM; ++k) {
-                            const double x = c[k][a], y = c[k][b];
-                            c[k][a] = cosine * x - sine * y, c[k][b] = sine * x + cosine * y;
-                        }
-                        for (int k = 0; k < DIM; ++k) {
-                            const double x = c[a][k], y = c[b][k];
-                            c[a][k] = cosine * x - sine * y, c[b][k] = sine * x + cosine * y;
-                        }
-                        for (int k = 0; k < DIM; ++k) {
-                            const double x = v[k][a], y = v[k][b];
-                            v[k][a] = cosine * x - sine * y, v[k][b] = sine * x + cosine * y;
-                        }
-                    }
-            }
+                for (int b = a; b < DIM; ++b, ++f) c[a][b] = c[b][a] = sum[f] / count - own[a] * own[b];
+            diagonalize<DIM>(c, v);
             int longest = 0, shortest = 0, widest = 0;
             for (int a = 1; a < DIM; ++a) {
                 if (c[a][a] > c[longest][longest]) longest = a;

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -13,9 +14,9 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import kernels
-from gmmtorch.kernels.mixtures.cell_sums import distinct_keys
+from gmmtorch.kernels.mixtures.cell_sums import DepthViews, depth_cells, distinct_keys
 from gmmtorch.linalg import dense_ranks
-from gmmtorch.mapping.learning.fitting import DepthFrame, PooledFrames, pool_frames
+from gmmtorch.mapping.learning.fitting import DepthFrame, PooledFrames, mean_range, pool_frames
 from gmmtorch.mixture.em.exact import quadratic_features, shift_features
 from gmmtorch.mixture.em.partition import FlatnessRule, Partition, partition
 
@@ -71,9 +72,60 @@ def test_cells_hold_the_moments_of_all_points(dtype, stride):
     assert float(variance.max()) < SIDE**2
 
 
+@given(
+    seeds=st.lists(st.integers(0, 1000), min_size=1, max_size=5),
+    types=st.lists(st.sampled_from([torch.float32, torch.float64]), min_size=5, max_size=5),
+    stride=st.integers(1, 3),
+)
+def test_frames_together_give_the_sums_of_each_frame_alone(seeds, types, stride):
+    frames = [
+        frame(
+            noisy_depth(seed, (7 + seed % 40, 5 + seed % 50), dtype),
+            pose(0.01 * seed, (0.01 * seed, 0.0, 0.0)),
+            pixel_stride=stride,
+            max_range=1.0 + 0.01 * seed,
+        )
+        for seed, dtype in zip(seeds, types, strict=False)
+    ]
+    draw = np.random.default_rng(seeds[0])
+    rays, pitch = draw.standard_normal((len(frames), 4, 3)), 0.01 + draw.random(len(frames))
+    max_range = 1 + draw.random(len(frames))
+    views = DepthViews([one.depth for one in frames], rays, pitch, max_range)
+    with kernels("fused"):
+        together = depth_cells(views, SIDE, 5000)
+        alone = [
+            depth_cells(DepthViews(*(v[i : i + 1] for v in views)), SIDE, 5000) for i in range(len(frames))
+        ]
+    assert together is not None
+    corners, place = torch.unique(torch.cat([one.corners for one in alone]), dim=0, return_inverse=True)
+    assert torch.equal(corners, together.corners)
+    sums = torch.zeros_like(together.sums).index_add_(0, place, torch.cat([one.sums for one in alone]))
+    torch.testing.assert_close(sums, together.sums, rtol=1e-12, atol=1e-9)
+    for column, part in enumerate(torch.split(place, [len(one.sums) for one in alone])):
+        assert torch.equal(together.counts[part, column], alone[column].counts[:, 0])
+
+
 def test_ranges_are_the_distances_of_the_points():
     one = frame(noisy_depth(1), pose(0.3, (0.1, 5.0, -2.0)), max_range=1e6)
     torch.testing.assert_close(one.ranges, (one.points - one.origin).norm(dim=1))
+
+
+@given(st.lists(st.tuples(st.integers(0, 1000), st.booleans()), min_size=1, max_size=4), st.integers(1, 3))
+def test_the_mean_range_of_frames_is_that_of_their_pixels(images, stride):
+    frames = [
+        frame(
+            noisy_depth(seed, (9 + seed % 30, 5 + seed % 60), torch.float64 if wide else torch.float32),
+            pose(),
+            pixel_stride=stride,
+            max_range=math.inf if seed % 3 else 2.0,
+        )
+        for seed, wide in images
+    ]
+    frames.append(frame(torch.full((3, 3), 2.0), pose()))
+    for one in frames:
+        one.depth[one.depth > 1e300] = math.nan  # their sum is infinite
+    twin, fused = by_both(lambda: mean_range(frames))
+    assert fused == pytest.approx(twin, rel=1e-13)
 
 
 def test_points_on_sides_of_cells_belong_to_the_cell_above():
