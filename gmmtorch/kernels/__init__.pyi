@@ -45,13 +45,12 @@ from .mixtures.em_steps import softmax as softmax
 from .mixtures.lattice_rounding import LatticeConstants as LatticeConstants
 from .mixtures.lattice_rounding import lattice_restoring as lattice_restoring
 from .mixtures.lattice_rounding import lattice_rounding as lattice_rounding
-from .mixtures.matching import MOST_TESTED as MOST_TESTED
 from .mixtures.matching import AlignmentSums as AlignmentSums
 from .mixtures.matching import NearLists as NearLists
+from .mixtures.matching import Registered as Registered
 from .mixtures.matching import alignment_sums as alignment_sums
 from .mixtures.matching import explained_points as explained_points
-from .mixtures.matching import near_pairs as near_pairs
-from .mixtures.matching import overlap_sums as overlap_sums
+from .mixtures.matching import fused_registration as fused_registration
 from .mixtures.matching import raster_sums as raster_sums
 from .mixtures.small_fits import fused_em as fused_em
 from .mixtures.small_fits import fused_kmeans as fused_kmeans
