@@ -46,10 +46,13 @@ from .mixtures.lattice_rounding import LatticeConstants as LatticeConstants
 from .mixtures.lattice_rounding import lattice_restoring as lattice_restoring
 from .mixtures.lattice_rounding import lattice_rounding as lattice_rounding
 from .mixtures.matching import AlignmentSums as AlignmentSums
+from .mixtures.matching import AlignmentTable as AlignmentTable
 from .mixtures.matching import NearLists as NearLists
 from .mixtures.matching import Registered as Registered
+from .mixtures.matching import alignment_scores as alignment_scores
 from .mixtures.matching import alignment_sums as alignment_sums
 from .mixtures.matching import explained_points as explained_points
+from .mixtures.matching import fused_alignment as fused_alignment
 from .mixtures.matching import fused_registration as fused_registration
 from .mixtures.matching import raster_sums as raster_sums
 from .mixtures.small_fits import fused_em as fused_em

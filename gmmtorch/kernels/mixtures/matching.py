@@ -102,10 +102,10 @@ def fused_registration(
     )  # fmt: skip
 
 
-_PARTS_OF_POINTS = 64  # of the points of a motion; each part has its own sums
-_LEAST_POINTS = 256  # of a part on a CPU
-
-_ALIGNMENTS = {dim: FusedKernel("mixtures/point_alignment.h", f"point_alignment<{dim}>") for dim in (2, 3)}
+_AT_ONCE = 256  # motions, whose scores the twin computes
+_PARTS_OF_POINTS = 64  # of a motion on a GPU; each part has its own sums
+_ALIGNMENTS = {dim: FusedKernel("mixtures/point_alignment.h", f"alignment<{dim}>") for dim in (2, 3)}
+_SCORES = {dim: FusedKernel("mixtures/point_alignment.h", f"point_scores<{dim}>") for dim in (2, 3)}
 
 
 class NearLists(NamedTuple):
@@ -147,45 +147,69 @@ class AlignmentSums(NamedTuple):
     observed: Tensor
 
 
-def alignment_sums(
-    points: Tensor,
-    motions: tuple[Tensor, Tensor],
-    lists: NearLists,
-    target: tuple[Tensor, Tensor, Tensor],
-    limits: tuple[float, float, float, float],
-) -> AlignmentSums:
-    """The sums over N points under B motions.
+class AlignmentTable(NamedTuple):
+    """K surfaces with which a scan is aligned.
 
-    Args:
-        points: (N, D), float64. motions: rotations (B, D, D) and translations (B, D).
-        lists: of the components near each cell.
-        target: means (K, D), precisions (K, D, D) and normals (K, D) of the components, zero for those that
-            are seen from all sides.
-        limits: metres behind a component's face from which on the sensor does not see it; d² beyond which a
-            component is left out; ε; q above which a point counts as explained.
+    lists: of the components near each cell. means (K, D), precisions (K, D, D), and normals (K, D), zero for
+    those that are seen from all sides. behind: metres behind a component's face from which on the sensor does
+    not see it. farthest: d² beyond which a component is left out. outliers: ε. explained: ε + q, above which
+    a point counts as explained.
+    """
+
+    lists: NearLists
+    means: Tensor
+    precisions: Tensor
+    normals: Tensor
+    behind: float
+    farthest: float
+    outliers: float
+    explained: float
+
+
+def alignment_sums(points: Tensor, motions: tuple[Tensor, Tensor], table: AlignmentTable) -> AlignmentSums:
+    """The sums over points (N, D), float64, under motions, rotations (B, D, D) and translations (B, D)."""
+    if is_fused(points, *motions, table.means):
+        return fused_alignment(points, motions, table, 0.0, 0)[1]
+    return _batched_alignment(points, motions, table)
+
+
+def fused_alignment(
+    points: Tensor, motions: tuple[Tensor, Tensor], table: AlignmentTable, settled: float, max_steps: int
+) -> tuple[tuple[Tensor, Tensor], AlignmentSums, Tensor]:
+    """`localization.alignment.align` in one launch: the motions after at most `max_steps` steps, their sums,
+    and whether the last step moved all points by less than `settled` (m). The twin is there.
     """
     n, dim = motions[1].shape
-    behind, farthest, outliers, height = limits
-    if not is_fused(points, *motions, lists.entries, *target):
-        return _batched_alignment(points, motions, lists, target, limits)
     free = dim + dim * (dim - 1) // 2
-    on_cpu = points.device.type == "cpu"
-    n_parts = (
-        max(1, min(torch.get_num_threads(), len(points) // _LEAST_POINTS)) if on_cpu else _PARTS_OF_POINTS
-    )
-    n_triangle = free * (free + 1) // 2
-    sums = points.new_empty(n, n_parts, 2 + free + 2 * n_triangle)
-    given = [part.contiguous() for part in (points, *motions, *target)]
-    bounds = behind, farthest, outliers, outliers + height
-    sizes, moved = (len(points), n_parts), given[1:3]
+    parts = dim * dim, dim, 1, 1, free, free * free, free * free, 1  # of a result, as the kernel states them
+    n_sums = 2 + free * (free + 2)
+    width = sum(parts) + dim * dim + dim + n_sums + 2
+    n_parts = 1 if points.device.type == "cpu" else _PARTS_OF_POINTS
+    space = points.new_empty(n * (width + n_parts * n_sums))
+    given = [part.contiguous() for part in (points, *motions)]
+    team = Team.of(points.device)
     _ALIGNMENTS[dim](
-        n * n_parts, given[0], *sizes, *moved, *lists, *given[3:], *bounds, sums, device=points.device
-    )
-    score, n_explained, gradient, *triangles = sums.sum(1).split([1, 1, free, n_triangle, n_triangle], 1)
-    rows, columns = torch.triu_indices(free, free, device=points.device)
-    full = points.new_zeros(2, n, free, free)
-    full[:, :, rows, columns] = full[:, :, columns, rows] = torch.stack(triangles)
-    return AlignmentSums(score[:, 0], n_explained[:, 0], gradient, full[0], full[1])
+        team.n, *team, given[0], len(points), n_parts, n, *given[1:], *table.lists, *table[1:],
+        settled, max_steps, space, device=points.device,
+    )  # fmt: skip
+    rows = space[: n * width].view(n, width)[:, : sum(parts)]
+    turn, shift, score, n_explained, gradient, *information, is_settled = rows.split(parts, 1)
+    matrices = (matrix.unflatten(1, (free, free)) for matrix in information)
+    sums = AlignmentSums(score[:, 0], n_explained[:, 0], gradient, *matrices)
+    return (turn.unflatten(1, (dim, dim)), shift), sums, is_settled[:, 0] > 0
+
+
+def alignment_scores(points: Tensor, motions: tuple[Tensor, Tensor], table: AlignmentTable) -> Tensor:
+    """The scores (B,) of `alignment_sums`, of many motions."""
+    n, dim = motions[1].shape
+    if not is_fused(points, *motions, table.means):
+        rows = torch.arange(n, device=points.device).split(_AT_ONCE)
+        parts = [tuple(part[some] for part in motions) for some in rows]
+        return torch.cat([_batched_alignment(points, (turn, shift), table).score for turn, shift in parts])
+    scores = points.new_empty(n)
+    given = [part.contiguous() for part in (points, *motions)]
+    _SCORES[dim](n, given[0], len(points), *given[1:], *table.lists, *table[1:], scores, device=points.device)
+    return scores
 
 
 _RASTER = FusedKernel("mixtures/point_alignment.h", "raster_sums")
@@ -214,15 +238,11 @@ def raster_sums(cells: Tensor, heading: Tensor, shift: Tensor, raster: Tensor, o
 
 
 def _batched_alignment(
-    points: Tensor,
-    motions: tuple[Tensor, Tensor],
-    lists: NearLists,
-    target: tuple[Tensor, Tensor, Tensor],
-    limits: tuple[float, float, float, float],
+    points: Tensor, motions: tuple[Tensor, Tensor], table: AlignmentTable
 ) -> AlignmentSums:
     """The twin."""
-    (rotations, translations), (means, precisions, normals) = motions, target
-    behind, farthest, outliers, height = limits
+    rotations, translations = motions
+    lists, means, precisions, normals, behind, farthest, outliers, explained = table
     n, (count, dim) = len(translations), points.shape
     lever = (points @ rotations.mT).flatten(0, 1)
     moved = lever + translations.repeat_interleave(count, 0)
@@ -252,7 +272,7 @@ def _batched_alignment(
     complete, observed = (jacobian.mT @ inner @ jacobian for inner in (weight, spread))
     return AlignmentSums(
         (total / outliers).log().view(n, count).sum(1),
-        (total > outliers + height).to(lever).view(n, count).sum(1),
+        (total > explained).to(lever).view(n, count).sum(1),
         *(terms.unflatten(0, (n, count)).sum(1) for terms in (gradient, complete, observed)),
     )
 
