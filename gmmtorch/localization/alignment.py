@@ -19,7 +19,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels import AlignmentSums, Lists, NearLists, alignment_sums
+from gmmtorch.kernels import (
+    AlignmentSums,
+    AlignmentTable,
+    Lists,
+    NearLists,
+    alignment_scores,
+    alignment_sums,
+    fused_alignment,
+    is_fused,
+)
 from gmmtorch.mapping import Components
 from gmmtorch.mixture import Parameters, merge_components
 from gmmtorch.occupancy import cells_in_chunks, row_major
@@ -35,7 +44,6 @@ _SETTLED = 0.05  # of the blur: steps below this end a climb
 _SADDLE = 0.05  # of EM's information: with less curvature Newton's step is too long
 _SIDE = 2.0  # blurs of a cell of the lists
 _MOST_CELLS = 1 << 20  # of the lists, and entries
-_AT_ONCE = 256  # motions
 _RIDGE = 1e-9
 _TURNED = math.radians(10)  # between the headings of neighbouring starts, for each metre between their places
 _FLAT = 0.25  # of the next deviation: thinner components have a face
@@ -84,20 +92,19 @@ class AlignmentTarget:
         means, dim = surfaces.means, surfaces.means.shape[1]
         covariances = surfaces.covariances + blur**2 * torch.eye(dim).to(means)
         normals = torch.zeros_like(means) if normals is None else normals.to(means)
-        self.blur, self.means, self.normals = blur, means.contiguous(), normals.contiguous()
-        self.precisions = torch.linalg.inv(covariances).contiguous()  # else each sum would copy them
-        self.lists = _near_lists(means, covariances, blur) if lists is None else lists
+        self.blur = blur
+        lists = _near_lists(means, covariances, blur) if lists is None else lists
+        precisions = torch.linalg.inv(covariances).contiguous()  # else each sum would copy them
+        parts = means.contiguous(), precisions, normals.contiguous()
+        self.table = AlignmentTable(lists, *parts, blur, CUTOFF**2, _OUTLIERS, _OUTLIERS + _EXPLAINED)
 
     def sums(self, points: Tensor, motions: Pose) -> AlignmentSums:
         """ℓ of points (N, D) under each motion, and its derivatives."""
-        target = self.means, self.precisions, self.normals
-        limits = self.blur, CUTOFF**2, _OUTLIERS, _EXPLAINED
-        return alignment_sums(points, motions.parts, self.lists, target, limits)
+        return alignment_sums(points, motions.parts, self.table)
 
     def scores(self, points: Tensor, motions: Pose) -> Tensor:
-        """ℓ (B,) of points (N, D) under each of many motions, a part of them at a time."""
-        parts = torch.arange(len(motions), device=points.device).split(_AT_ONCE)
-        return torch.cat([self.sums(points, motions[part]).score for part in parts])
+        """ℓ (B,) of points (N, D) under each of many motions."""
+        return alignment_scores(points, motions.parts, self.table)
 
 
 def _near_lists(means: Tensor, covariances: Tensor, blur: float) -> NearLists:
@@ -157,7 +164,13 @@ def align(points: Tensor, target: AlignmentTarget, motions: Pose, max_steps: int
         points: (N, D), N at least 1, sensor frame, metres, float64.
         motions: world ← sensor. max_steps: evaluations of ℓ after the first one.
     """
-    dim = points.shape[1]
+    n, dim = points.shape
+    if is_fused(points, *motions.parts, target.table.means):
+        limits = _SETTLED * target.blur, max_steps
+        # Neighbours take as long: lanes of a vector do not wait for each other.
+        points = points[torch.atan2(points[:, 1], points[:, 0]).argsort()]
+        parts, sums, settled = fused_alignment(points, motions.parts, target.table, *limits)
+        return Alignment(Pose(*parts), sums.score / n, sums.n_explained / n, sums.observed, settled)
     scale = points.new_ones(dim + dim * (dim - 1) // 2)
     scale[dim:] = 1 / points.norm(dim=1).amax().clamp_min(1e-9)  # a unit moves the farthest point by a metre
     sums = target.sums(points, motions)
@@ -174,7 +187,6 @@ def align(points: Tensor, target: AlignmentTarget, motions: Pose, max_steps: int
         settled = (step / scale).norm(dim=1) < _SETTLED * target.blur
         if bool(settled.all()):
             break
-    n = len(points)
     return Alignment(motions, sums.score / n, sums.n_explained / n, sums.observed, settled)
 
 

@@ -114,7 +114,10 @@ class LocalMap:
         centered = mixture._replace(means=mixture.means - self._center)
         self._target = functools.partial(AlignmentTarget, centered, normals=seen_normals(self._components))
         first = self._target(_BLURS[self.dim][0])
-        self._targets = [first, *(self._target(blur, lists=first.lists) for blur in _BLURS[self.dim][1:])]
+        self._targets = [
+            first,
+            *(self._target(blur, lists=first.table.lists) for blur in _BLURS[self.dim][1:]),
+        ]
         poses = Pose.stack([frame.pose for frame in keyframes])
         self._space = FreeSpace([frame.points for frame in keyframes], poses)
 

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, check_whole
-from gmmtorch.kernels import MOST_TESTED, is_fused, near_pairs, overlap_sums
+from gmmtorch.kernels import Registered, fused_registration, is_fused
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.localization.alignment import chosen_rows, deviations
 from gmmtorch.mapping import Surfaces, surface_mixture, touching
@@ -120,48 +120,65 @@ def register(
     f, g = surface_mixture(source, "source"), surface_mixture(target, "target")
     _check_together(f, g)
     check_choice("weighting", weighting, ("area", "support"))
-    if weighting == "area":
-        f, g = _by_area(f), _by_area(g)
     dim = f.means.shape[1]
     for name, value in (("coarsest", coarsest), ("finest", finest), ("tolerance", tolerance)):
         if value is not None:
             check_number(name, value, above=name != "finest")
     check_whole("max_iterations", max_iterations, 1)
     start = _starts(initial, dim, f.means.device)
+    by_area, blurs, limits = weighting == "area", (coarsest, finest), (tolerance, max_iterations)
+    climb = fused_registration if is_fused(*f, *g, *start.parts) else _climbed
+    found = climb(f, g, start.parts, by_area, blurs, limits)
+    held = [width <= _WIDEST * found.radius for width in found.widths]
+    order = sorted(range(len(held)), key=lambda row: not held[row])  # first those that the surfaces hold
+    first = order[0]
+    share = [math.exp(min(found.log_scores[row] - found.own / 2, 0.0)) for row in order]
+    device, width, converged = f.means.device, found.widths[first], found.converged[first]
+    return Registration(
+        transform=found.transforms[first].to(device),
+        score=math.exp(found.log_scores[first]),
+        overlap=share[0],
+        hessian=found.hessians[first].to(device),
+        width=width,
+        n_iterations=found.n_evaluated,
+        converged=converged,
+        doubts=_doubts(share, width, found.radius, converged),
+    )
+
+
+def _climbed(
+    f: Parameters,
+    g: Parameters,
+    starts: tuple[Tensor, Tensor],
+    by_area: bool,
+    limits_of_blur: tuple[float | None, float | None],
+    limits: tuple[float, int],
+) -> Registered:
+    """The twin of `kernels.fused_registration`."""
+    if by_area:
+        f, g = _by_area(f), _by_area(g)
     # Both are centred on their means, so that numbers stay small anywhere in the world.
     (f, here), (g, there) = _centered(f), _centered(g)
-    motions = _between(start, here, there)
+    motions = _between(Pose(*starts), here, there)
     radius = min(_radius(f), _radius(g))
-    blurs = _blurs(f, g, radius, coarsest, finest)
-
+    blurs = _blurs(f, g, radius, *limits_of_blur)
     f_levels, g_levels = _levels(f, blurs), _levels(g, blurs)
     n_evaluated, climbed = 0, motions
     for number, blur in enumerate(blurs):
-        if coarsest is None and len(start) == 1 and number == _SECOND_CHANCE:
+        if limits_of_blur[0] is None and len(motions) == 1 and number == _SECOND_CHANCE:
             climbed = Pose.cat([climbed, motions])  # in case a coarser level climbed a wrong peak
-        last = number == len(blurs) - 1
+        accuracy = limits[0] if blur == blurs[-1] else max(limits[0], _COARSELY * blur)
         ascent = Ascent(f_levels[number], g_levels[number], radius)
-        accuracy = tolerance if last else max(tolerance, _COARSELY * blur)
-        climbed, found, converged = ascent.run(climbed, max_iterations, accuracy)
+        climbed, found, converged = ascent.run(climbed, limits[1], accuracy)
         n_evaluated += ascent.n_evaluated
         best = _promising(climbed, found.log_score, radius, 0.5 * ascent.thickness)
         climbed, found, converged = climbed[best], found.at(best), converged[best]
     hessian = found.information - found.scatter
-    width = _widths(hessian, ascent.scale)
-    held = (width > _WIDEST * radius).argsort(stable=True)  # first the poses that the surfaces hold
-    own = log_self_overlap(ascent.source) + log_self_overlap(ascent.target)
-    share = torch.exp((found.log_score[held] - own / 2).clamp_max(0))
-    first = int(held[0])
-    return Registration(
-        transform=_world(climbed[held[0]], here, there).matrix,
-        score=float(found.log_score[first].exp()),
-        overlap=float(share[0]),
-        hessian=hessian[first],
-        width=float(width[first]),
-        n_iterations=n_evaluated,
-        converged=bool(converged[first]),
-        doubts=_doubts(share, float(width[first]), radius, bool(converged[first])),
-    )
+    return Registered(
+        _world(climbed, here, there).matrix, found.log_score.tolist(), converged.tolist(),
+        _widths(hessian, ascent.scale).tolist(), hessian, n_evaluated, radius,
+        log_self_overlap(ascent.source) + log_self_overlap(ascent.target),
+    )  # fmt: skip
 
 
 def yaw_starts(source: Surfaces, target: Surfaces, n: int = 12) -> Tensor:
@@ -267,10 +284,10 @@ def _between(poses: Pose, here: Tensor, there: Tensor) -> Pose:
     return Pose(poses.rotation, poses.apply(here[None])[..., 0, :] - there)
 
 
-def _world(motion: Pose, here: Tensor, there: Tensor) -> Pose:
-    """The inverse of `_between` for one motion, its rotation orthonormal to rounding."""
-    turn = motion.orthonormal().rotation
-    return Pose(turn, motion.translation + there - turn @ here)
+def _world(motions: Pose, here: Tensor, there: Tensor) -> Pose:
+    """The inverse of `_between`, rotations orthonormal to rounding."""
+    turn = motions.orthonormal().rotation
+    return Pose(turn, motions.translation + there - turn @ here)
 
 
 def _promising(motions: Pose, log_score: Tensor, radius: float, apart: float) -> Tensor:
@@ -295,18 +312,18 @@ def _widths(hessian: Tensor, scale: Tensor) -> Tensor:
     return torch.where(least > 0, least.clamp_min(1e-300).rsqrt(), torch.inf)
 
 
-def _doubts(share: Tensor, width: float, radius: float, converged: bool) -> tuple[str, ...]:
-    """Reasons against a result; shares (B,) are the overlaps of the final poses, best first."""
+def _doubts(share: list[float], width: float, radius: float, converged: bool) -> tuple[str, ...]:
+    """Reasons against a result; shares are the overlaps of the final poses, best first."""
     doubts = []
     if not converged:
         doubts.append("the last step was longer than the tolerance, or no component was near another")
-    if not float(share[0]) >= _LEAST_OVERLAP:
-        doubts.append(f"the overlap {float(share[0]):.3f} is below {_LEAST_OVERLAP}: hardly a common surface")
+    if not share[0] >= _LEAST_OVERLAP:
+        doubts.append(f"the overlap {share[0]:.3f} is below {_LEAST_OVERLAP}: hardly a common surface")
     if not width <= _WIDEST * radius:
         doubts.append(f"the source can slide or turn by {width:.3g} m: the surfaces do not hold it")
-    others = share[1:].max() if len(share) > 1 else 0.0
-    if float(others) > _AMBIGUOUS * float(share[0]):
-        doubts.append(f"another pose has an overlap of {float(others):.3f}, against {float(share[0]):.3f}")
+    others = max(share[1:], default=0.0)
+    if others > _AMBIGUOUS * share[0]:
+        doubts.append(f"another pose has an overlap of {others:.3f}, against {share[0]:.3f}")
     return tuple(doubts)
 
 
@@ -344,14 +361,7 @@ class Overlap(NamedTuple):
 
 def overlap(source: Parameters, target: Parameters, motions: Pose, pairs: Pairs) -> Overlap:
     """Log score, gradient, information and scatter of each motion, over the given pairs only."""
-    if is_fused(*source, *target, *motions.parts, *pairs):
-        turned = motions.rotation[:, None]
-        levers = (turned @ source.means[..., None]).squeeze(-1)
-        moved = turned @ source.covariances @ turned.mT
-        weights = source.weights, target.weights
-        sums = overlap_sums(pairs, levers, moved, motions.translation, target[1:], weights)
-    else:
-        sums = _batched_sums(source, target, motions, pairs)
+    sums = _batched_sums(source, target, motions, pairs)
     total, first, second, squares = sums
     scale = total.clamp_min(1e-300)[:, None]
     gradient = first / scale
@@ -437,10 +447,6 @@ class Ascent:
         shapes = motions.rotation[:, None] @ self.source.covariances @ motions.rotation[:, None].mT
         # This ellipsoid contains the ellipsoid of the cutoff enlarged by the ball of the slack.
         scale, wide = 1.2 * _CUTOFF**2, 6 * self.slack**2
-        few = n * k * len(self.target.weights) <= MOST_TESTED
-        if few and is_fused(moved, *self.target, *self.source):
-            reaches = self.reach[0] + self.slack, self.reach[1]
-            return Pairs(*near_pairs(moved, shapes, reaches, *self.target[1:], scale, wide))
         moved, shapes = moved.flatten(0, 1), shapes.flatten(0, 1)
         reach = (self.reach[0] + self.slack).repeat(n)
         found = [torch.zeros(2, 0, dtype=torch.int64, device=moved.device)]

@@ -41,8 +41,10 @@ def surface_mixture(given: Surfaces, name: str) -> Parameters:
     `InvalidArgumentError` for shapes that disagree, NaN, negative weights, or a dimension other than 2 or 3;
     `NumericalError` for a covariance that is not positive definite. `name`: of the argument, for messages.
     """
-    if isinstance(given, GaussianMap):
-        given = given.components() if given.dim is not None else Components.empty(3)
+    if isinstance(given, GaussianMap):  # which has checked its components
+        made = given.components() if given.dim is not None else Components.empty(3)
+        kept = ~made.max_range & (made.support > 0)
+        return Parameters(made.support[kept], made.means[kept], made.covariances[kept])
     if isinstance(given, Components):
         solid = ~given.max_range
         parts = given.means[solid], given.covariances[solid], given.support[solid]

@@ -1,11 +1,8 @@
-"""Components matched with components or points: near pairs, overlaps, alignment of a scan, explained points;
-and a scan laid over a raster.
+"""Mixtures registered with mixtures, scans aligned with components or laid over a raster, explained points.
 
-The twins of `near_pairs` and `overlap_sums` are in `localization.registration.overlap`, and that of
-`explained_points` in `mapping.learning.novelty`. The kernel of pairs tests all of them, which is faster
-than a k-d tree for the few hundred components of a scan; it finds those of the twin, in another order. Sums
-of overlaps and of alignment differ from the twin's by at most 10⁻¹¹ of their largest entry, shares of points
-by rounding.
+The twin of `fused_registration` is in `localization.registration`, and that of `explained_points` in
+`mapping.learning.novelty`. The kernels differ from their twins by rounding: sums of alignment by at most
+10⁻¹¹ of their largest entry.
 """
 
 from __future__ import annotations
@@ -15,86 +12,100 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gmmtorch.errors import MemoryLimitError
 from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel
+from gmmtorch.kernels.compiler import FusedKernel, Team
 from gmmtorch.kernels.evidence.point_evidence import Lists
 
-MOST_TESTED = 1 << 24
-"""Pairs above which a k-d tree is faster."""
+_KEPT = 4  # motions of a result at most
+_ROW = 32  # numbers of a component in the work space, and of a climb
+_CLIMB = 256
+_PARTS = 256  # of the components of the source on a GPU; each part has its own sums
+_MOST_PAIRS = 1 << 26
+_REGISTRATIONS = {dim: FusedKernel("mixtures/registration.h", f"registration<{dim}>") for dim in (2, 3)}
 
-_PARTS_OF_PAIRS = 1024  # of the pairs; each part has its own sums
-_NEAR = {dim: FusedKernel("mixtures/pair_overlap.h", f"near_pairs<{dim}>") for dim in (2, 3)}
-_OVERLAPS = {dim: FusedKernel("mixtures/pair_overlap.h", f"pair_overlap<{dim}>") for dim in (2, 3)}
+
+class Registered(NamedTuple):
+    """The best motions of a registration (at most four), best first, on the CPU.
+
+    transforms: (B, D+1, D+1), target ← source. hessians: (B, F, F) of the log score, F = D + D(D−1)/2.
+    widths: of the peak in its loosest direction, metres. n_evaluated: evaluations of the score. radius: of
+    the smaller mixture. own: Σ log ∫ f² of both.
+    """
+
+    transforms: Tensor
+    log_scores: list[float]
+    converged: list[bool]
+    widths: list[float]
+    hessians: Tensor
+    n_evaluated: int
+    radius: float
+    own: float
 
 
-def near_pairs(
-    moved: Tensor,
-    shapes: Tensor,
-    reaches: tuple[Tensor, Tensor],
-    means: Tensor,
-    covariances: Tensor,
-    scale: float,
-    wide: float,
-) -> Tensor:
-    """Motion, source and target (3, P) of the pairs that are near.
-
-    With the difference d of their means, |d| is at most the sum of their reaches, and dᵀM⁻¹d at most 1 for
-    M = `scale` (A + Σ) + `wide` I.
+def fused_registration(
+    source: tuple[Tensor, Tensor, Tensor],
+    target: tuple[Tensor, Tensor, Tensor],
+    starts: tuple[Tensor, Tensor],
+    by_area: bool,
+    blurs: tuple[float | None, float | None],
+    limits: tuple[float, int],
+) -> Registered:
+    """`localization.register` in one launch, which waits once; the twin is there.
 
     Args:
-        moved: (B, K, D) means of the source under each motion. shapes: A (B, K, D, D).
-        reaches: of the source (K,) and of the target (J,), metres. means, covariances: of the target.
+        source, target: weights (K,), means (K, D) and covariances (K, D, D).
+        starts: rotations (B, D, D) and translations (B, D) in the world. by_area: the weights are not used.
+        blurs: the coarsest and the finest. limits: tolerance and largest number of steps of a level.
+
+    Raises `MemoryLimitError` for tens of millions of pairs.
     """
-    n, k, dim = moved.shape
-    device = moved.device
-    targets = torch.cat([means, reaches[1][:, None]], 1)
-    given = [part.contiguous() for part in (moved, shapes, reaches[0])]
-    table = targets.contiguous(), covariances.contiguous(), len(means), scale, wide
-    near = torch.empty(n, k, len(means), dtype=torch.bool, device=device)
-    _NEAR[dim](n * k, *given, k, *table, near, device=device)
-    return near.nonzero().T.contiguous()
-
-
-def overlap_sums(
-    pairs: tuple[Tensor, Tensor, Tensor],
-    levers: Tensor,
-    moved: Tensor,
-    translations: Tensor,
-    target: tuple[Tensor, Tensor],
-    weights: tuple[Tensor, Tensor],
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Sums over the pairs of each of B motions.
-
-    With s = π_i π_j N of a pair: Σ s (B,), Σ s ∂log N (B, F), Σ s times the information (B, F, F), and
-    Σ s ∂log N ∂log Nᵀ (B, F, F), F = D + D(D−1)/2.
-
-    Args:
-        pairs: rows of the motion, the source and the target, (P,) each; fastest in the order of motions.
-        levers: R μ_i (B, K, D). moved: R Σ_i Rᵀ (B, K, D, D). translations: (B, D).
-        target: means (J, D) and covariances (J, D, D). weights: π of the source (K,) and of the target (J,).
-    """
-    n, dim = translations.shape
+    device, (n_starts, dim) = starts[1].device, starts[1].shape
     free = dim + dim * (dim - 1) // 2
-    on_cpu = levers.device.type == "cpu"
-    most = torch.get_num_threads() if on_cpu else _PARTS_OF_PAIRS
-    n_parts = max(1, min(most, len(pairs[0]) // (8 * CPU_LANES)))
-    n_triangle = free * (free + 1) // 2
-    sums = levers.new_zeros(n_parts, n, 1 + free + 2 * n_triangle)
-    counts = len(pairs[0]), n_parts, n, levers.shape[1]
-    tensors = (levers, moved, translations, *target, *weights, sums)
-    given = [part.contiguous() for part in (*pairs, *tensors)]
-    _OVERLAPS[dim](n_parts, *given[:3], *counts, *given[3:], device=levers.device)
-    total, slope, *triangles = sums.sum(0).split([1, free, n_triangle, n_triangle], 1)
-    rows, columns = torch.triu_indices(free, free, device=levers.device)
-    full = levers.new_zeros(2, n, free, free)
-    full[:, :, rows, columns] = full[:, :, columns, rows] = torch.stack(triangles)
-    return total[:, 0], slope, full[0], full[1]
+    sizes = len(source[0]), len(target[0])
+    tables = [
+        value.contiguous() for weights, means, covariances in (source, target)
+        for order in (means[:, 0].argsort(),)
+        for value in (weights[order], means[order], covariances[order])
+    ]  # fmt: skip
+    n_parts = 1 if device.type == "cpu" else _PARTS
+    most = max(n_starts, _KEPT + 1)
+    n_rows = max(most * sizes[0], sizes[1])
+    capacity = min(n_rows * max(sizes), _MOST_PAIRS)
+    space = starts[1].new_empty(
+        _ROW * sum(sizes) + most * (1 + n_parts) * _CLIMB + n_rows * (dim + dim * dim)
+    )
+    whole = torch.empty(2 * sum(sizes) + n_rows, dtype=torch.int64, device=device)
+    lists = torch.empty(capacity, dtype=torch.int32, device=device)
+    parts = dim * dim + dim, (dim + 1) ** 2, 1, 1, 1, free * free  # of a motion, as the kernel states them
+    width = sum(parts)
+    found = starts[1].new_empty(_KEPT * width + 6)
+    team = Team.of(device)
+    coarsest, finest = (-1.0 if blur is None else blur for blur in blurs)
+    _REGISTRATIONS[dim](
+        team.n, *team, sizes[0], *tables[:3], sizes[1], *tables[3:], n_starts,
+        *(part.contiguous() for part in starts), by_area, coarsest, finest, *limits, n_parts, capacity,
+        space, whole, lists, found, device=device,
+    )  # fmt: skip
+    found = found.cpu()
+    n, n_evaluated, radius, *own, is_crowded = found[-6:].tolist()
+    if is_crowded:
+        raise MemoryLimitError(
+            f"mixtures of {sizes[0]} and {sizes[1]} components have too many pairs within reach of each "
+            "other; merge components first (gmmtorch.simplify)."
+        )
+    rows = found[: int(n) * width].view(int(n), width)
+    _, world, score, converged, widths, hessian = rows.split(parts, 1)
+    return Registered(
+        world.unflatten(1, (dim + 1, dim + 1)), score[:, 0].tolist(), converged[:, 0].bool().tolist(),
+        widths[:, 0].tolist(), hessian.unflatten(1, (free, free)), int(n_evaluated), radius, sum(own),
+    )  # fmt: skip
 
 
-_PARTS_OF_POINTS = 64  # of the points of a motion; each part has its own sums
-_LEAST_POINTS = 256  # of a part on a CPU
-
-_ALIGNMENTS = {dim: FusedKernel("mixtures/point_alignment.h", f"point_alignment<{dim}>") for dim in (2, 3)}
+_AT_ONCE = 256  # motions, whose scores the twin computes
+_PARTS_OF_POINTS = 64  # of a motion on a GPU; each part has its own sums
+_ALIGNMENTS = {dim: FusedKernel("mixtures/point_alignment.h", f"alignment<{dim}>") for dim in (2, 3)}
+_SCORES = {dim: FusedKernel("mixtures/point_alignment.h", f"point_scores<{dim}>") for dim in (2, 3)}
 
 
 class NearLists(NamedTuple):
@@ -136,45 +147,69 @@ class AlignmentSums(NamedTuple):
     observed: Tensor
 
 
-def alignment_sums(
-    points: Tensor,
-    motions: tuple[Tensor, Tensor],
-    lists: NearLists,
-    target: tuple[Tensor, Tensor, Tensor],
-    limits: tuple[float, float, float, float],
-) -> AlignmentSums:
-    """The sums over N points under B motions.
+class AlignmentTable(NamedTuple):
+    """K surfaces with which a scan is aligned.
 
-    Args:
-        points: (N, D), float64. motions: rotations (B, D, D) and translations (B, D).
-        lists: of the components near each cell.
-        target: means (K, D), precisions (K, D, D) and normals (K, D) of the components, zero for those that
-            are seen from all sides.
-        limits: metres behind a component's face from which on the sensor does not see it; d² beyond which a
-            component is left out; ε; q above which a point counts as explained.
+    lists: of the components near each cell. means (K, D), precisions (K, D, D), and normals (K, D), zero for
+    those that are seen from all sides. behind: metres behind a component's face from which on the sensor does
+    not see it. farthest: d² beyond which a component is left out. outliers: ε. explained: ε + q, above which
+    a point counts as explained.
+    """
+
+    lists: NearLists
+    means: Tensor
+    precisions: Tensor
+    normals: Tensor
+    behind: float
+    farthest: float
+    outliers: float
+    explained: float
+
+
+def alignment_sums(points: Tensor, motions: tuple[Tensor, Tensor], table: AlignmentTable) -> AlignmentSums:
+    """The sums over points (N, D), float64, under motions, rotations (B, D, D) and translations (B, D)."""
+    if is_fused(points, *motions, table.means):
+        return fused_alignment(points, motions, table, 0.0, 0)[1]
+    return _batched_alignment(points, motions, table)
+
+
+def fused_alignment(
+    points: Tensor, motions: tuple[Tensor, Tensor], table: AlignmentTable, settled: float, max_steps: int
+) -> tuple[tuple[Tensor, Tensor], AlignmentSums, Tensor]:
+    """`localization.alignment.align` in one launch: the motions after at most `max_steps` steps, their sums,
+    and whether the last step moved all points by less than `settled` (m). The twin is there.
     """
     n, dim = motions[1].shape
-    behind, farthest, outliers, height = limits
-    if not is_fused(points, *motions, lists.entries, *target):
-        return _batched_alignment(points, motions, lists, target, limits)
     free = dim + dim * (dim - 1) // 2
-    on_cpu = points.device.type == "cpu"
-    n_parts = (
-        max(1, min(torch.get_num_threads(), len(points) // _LEAST_POINTS)) if on_cpu else _PARTS_OF_POINTS
-    )
-    n_triangle = free * (free + 1) // 2
-    sums = points.new_empty(n, n_parts, 2 + free + 2 * n_triangle)
-    given = [part.contiguous() for part in (points, *motions, *target)]
-    bounds = behind, farthest, outliers, outliers + height
-    sizes, moved = (len(points), n_parts), given[1:3]
+    parts = dim * dim, dim, 1, 1, free, free * free, free * free, 1  # of a result, as the kernel states them
+    n_sums = 2 + free * (free + 2)
+    width = sum(parts) + dim * dim + dim + n_sums + 2
+    n_parts = 1 if points.device.type == "cpu" else _PARTS_OF_POINTS
+    space = points.new_empty(n * (width + n_parts * n_sums))
+    given = [part.contiguous() for part in (points, *motions)]
+    team = Team.of(points.device)
     _ALIGNMENTS[dim](
-        n * n_parts, given[0], *sizes, *moved, *lists, *given[3:], *bounds, sums, device=points.device
-    )
-    score, n_explained, gradient, *triangles = sums.sum(1).split([1, 1, free, n_triangle, n_triangle], 1)
-    rows, columns = torch.triu_indices(free, free, device=points.device)
-    full = points.new_zeros(2, n, free, free)
-    full[:, :, rows, columns] = full[:, :, columns, rows] = torch.stack(triangles)
-    return AlignmentSums(score[:, 0], n_explained[:, 0], gradient, full[0], full[1])
+        team.n, *team, given[0], len(points), n_parts, n, *given[1:], *table.lists, *table[1:],
+        settled, max_steps, space, device=points.device,
+    )  # fmt: skip
+    rows = space[: n * width].view(n, width)[:, : sum(parts)]
+    turn, shift, score, n_explained, gradient, *information, is_settled = rows.split(parts, 1)
+    matrices = (matrix.unflatten(1, (free, free)) for matrix in information)
+    sums = AlignmentSums(score[:, 0], n_explained[:, 0], gradient, *matrices)
+    return (turn.unflatten(1, (dim, dim)), shift), sums, is_settled[:, 0] > 0
+
+
+def alignment_scores(points: Tensor, motions: tuple[Tensor, Tensor], table: AlignmentTable) -> Tensor:
+    """The scores (B,) of `alignment_sums`, of many motions."""
+    n, dim = motions[1].shape
+    if not is_fused(points, *motions, table.means):
+        rows = torch.arange(n, device=points.device).split(_AT_ONCE)
+        parts = [tuple(part[some] for part in motions) for some in rows]
+        return torch.cat([_batched_alignment(points, (turn, shift), table).score for turn, shift in parts])
+    scores = points.new_empty(n)
+    given = [part.contiguous() for part in (points, *motions)]
+    _SCORES[dim](n, given[0], len(points), *given[1:], *table.lists, *table[1:], scores, device=points.device)
+    return scores
 
 
 _RASTER = FusedKernel("mixtures/point_alignment.h", "raster_sums")
@@ -203,15 +238,11 @@ def raster_sums(cells: Tensor, heading: Tensor, shift: Tensor, raster: Tensor, o
 
 
 def _batched_alignment(
-    points: Tensor,
-    motions: tuple[Tensor, Tensor],
-    lists: NearLists,
-    target: tuple[Tensor, Tensor, Tensor],
-    limits: tuple[float, float, float, float],
+    points: Tensor, motions: tuple[Tensor, Tensor], table: AlignmentTable
 ) -> AlignmentSums:
     """The twin."""
-    (rotations, translations), (means, precisions, normals) = motions, target
-    behind, farthest, outliers, height = limits
+    rotations, translations = motions
+    lists, means, precisions, normals, behind, farthest, outliers, explained = table
     n, (count, dim) = len(translations), points.shape
     lever = (points @ rotations.mT).flatten(0, 1)
     moved = lever + translations.repeat_interleave(count, 0)
@@ -241,7 +272,7 @@ def _batched_alignment(
     complete, observed = (jacobian.mT @ inner @ jacobian for inner in (weight, spread))
     return AlignmentSums(
         (total / outliers).log().view(n, count).sum(1),
-        (total > outliers + height).to(lever).view(n, count).sum(1),
+        (total > explained).to(lever).view(n, count).sum(1),
         *(terms.unflatten(0, (n, count)).sum(1) for terms in (gradient, complete, observed)),
     )
 

@@ -2,81 +2,137 @@
 #pragma once
 
 #include "../lanes.h"
+#include "rigid_steps.h"
 
 namespace gmm {
 
-// An item is a component of the source under one motion, tested against all of the target.
+// The components of one mixture at one level of blur. Their means are in rising order of `low`, by at most
+// `spread` (m) below the first coordinate.
+struct Level {
+    int64_t n;
+    double spread;
+    double *weights, *means, *covariances, *reaches, *thinnest, *low;
+};
+
+// R x, or R S Rᵀ.
 template <int DIM>
-GMM_KERNEL near_pairs(int64_t item, const double* moved, const double* shapes, const double* reaches,
-                      int64_t n_source, const double* targets, const double* covariances, int64_t n_target,
-                      double scale, double wide, bool* near) {
-    const double *x = moved + item * DIM, *shape = shapes + item * DIM * DIM;
-    const double reach = reaches[item % n_source];
-    bool* row = near + item * n_target;
-    for (int64_t j = 0; j < n_target; ++j) {
-        const double* other = targets + j * (DIM + 1);  // mean, reach
-        double d[DIM], square = 0.0;
-        for (int i = 0; i < DIM; ++i) {
-            d[i] = x[i] - other[i];
-            square += d[i] * d[i];
+GMM_INLINE void turned(const double* rotation, const double* x, double* y) {
+    for (int i = 0; i < DIM; ++i) {
+        y[i] = 0.0;
+        for (int j = 0; j < DIM; ++j) y[i] += rotation[i * DIM + j] * x[j];
+    }
+}
+
+template <int DIM>
+GMM_INLINE void turned_shape(const double* rotation, const double* shape, double* found) {
+    double half[DIM][DIM];  // R S
+    for (int i = 0; i < DIM; ++i)
+        for (int j = 0; j < DIM; ++j) {
+            half[i][j] = 0.0;
+            for (int k = 0; k < DIM; ++k) half[i][j] += rotation[i * DIM + k] * shape[k * DIM + j];
         }
-        const double sum = reach + other[DIM];
-        row[j] = false;
+    for (int i = 0; i < DIM; ++i)
+        for (int j = 0; j < DIM; ++j) {
+            double sum = 0.0;
+            for (int k = 0; k < DIM; ++k) sum += half[i][k] * rotation[j * DIM + k];
+            found[i * DIM + j] = sum;
+        }
+}
+
+// Lists the components of the target near a component i of the source under a motion, the first `width` of
+// them, and returns their number: with the difference d of their means, |d| is at most the sum of their
+// reaches and the slack, and d'M⁻¹d at most 1 for M = scale (A + S) + wide I. widest: of the target's
+// reaches.
+template <int DIM>
+GMM_INLINE int64_t list_near(const double* pose, const Level& source, int64_t i, const Level& target,
+                             double slack, double widest, double scale, double wide, int64_t width,
+                             int32_t* list) {
+    double x[DIM], shape[DIM * DIM];
+    turned<DIM>(pose, source.means + i * DIM, x);
+    for (int k = 0; k < DIM; ++k) x[k] += pose[DIM * DIM + k];
+    turned_shape<DIM>(pose, source.covariances + i * DIM * DIM, shape);
+    const double reach = source.reaches[i] + slack;
+    const double from = x[0] - reach - widest - target.spread, to = x[0] + reach + widest + target.spread;
+    int64_t first = 0, last = target.n, count = 0;
+    while (first < last) {  // the first one at `from` or beyond
+        const int64_t middle = (first + last) / 2;
+        if (target.low[middle] < from)
+            first = middle + 1;
+        else
+            last = middle;
+    }
+    for (int64_t j = first; j < target.n && target.low[j] <= to; ++j) {
+        const double *mean = target.means + j * DIM, *other = target.covariances + j * DIM * DIM;
+        double d[DIM], square = 0.0;
+        for (int k = 0; k < DIM; ++k) {
+            d[k] = x[k] - mean[k];
+            square += d[k] * d[k];
+        }
+        const double sum = reach + target.reaches[j];
         if (square > sum * sum) continue;
         double along = wide * square;  // d'Md: d'M⁻¹d is at least (d'd)² / d'Md
         for (int r = 0; r < DIM; ++r)
             for (int c = 0; c < DIM; ++c)
-                along += scale * d[r] * d[c] * (shape[r * DIM + c] + covariances[(j * DIM + r) * DIM + c]);
+                along += scale * d[r] * d[c] * (shape[r * DIM + c] + other[r * DIM + c]);
         if (square * square > along) continue;
-        double root_of[DIM][DIM], y[DIM], quadratic = 0.0;  // of scale (A + S) + wide I
-        for (int c = 0; c < DIM; ++c) {
-            for (int r = c; r < DIM; ++r) {
-                double rest = scale * (shape[r * DIM + c] + covariances[(j * DIM + r) * DIM + c]);
-                if (r == c) rest += wide;
-                for (int k = 0; k < c; ++k) rest -= root_of[r][k] * root_of[c][k];
-                root_of[r][c] = r == c ? sqrt(rest) : rest / root_of[c][c];
-            }
-            y[c] = d[c];
-            for (int k = 0; k < c; ++k) y[c] -= root_of[c][k] * y[k];
-            y[c] /= root_of[c][c];
-            quadratic += y[c] * y[c];
-        }
-        row[j] = quadratic <= 1.0;
+        double root_of[DIM][DIM], quadratic = 0.0;
+        for (int r = 0; r < DIM; ++r)
+            for (int c = 0; c <= r; ++c)
+                root_of[r][c] = scale * (shape[r * DIM + c] + other[r * DIM + c]) + (r == c ? wide : 0.0);
+        factorise<DIM>(root_of, 0.0);
+        solve_lower<DIM>(root_of, d);
+        for (int k = 0; k < DIM; ++k) quadratic += d[k] * d[k];
+        if (!(quadratic <= 1.0)) continue;
+        if (count < width) list[count] = (int32_t)j;
+        ++count;
     }
+    return count;
 }
 
-// An item is a part of the pairs, LANES of one motion at a time.
+CUDA_CALLABLE constexpr int n_overlap_sums(int dim) { return 1 + n_free(dim) * (n_free(dim) + 2); }
+
+// Sums over the pairs of the components begin … stop − 1 of the source under one motion: s = π_i π_j N,
+// s ∂log N, the upper triangles of s times the information, and of s ∂log N ∂log N'. lists: `width` places
+// for each component, of which `counts` are used. moved: room for R μ and R S R' of each.
 template <int DIM>
-GMM_KERNEL pair_overlap(int64_t item, const int64_t* motion, const int64_t* source, const int64_t* target,
-                        int64_t n_pairs, int64_t n_parts, int64_t n_motions, int64_t n_source,
-                        const double* levers, const double* moved, const double* translations,
-                        const double* means, const double* covariances, const double* source_weights,
-                        const double* target_weights, double* sums) {
-    constexpr int TURNS = DIM * (DIM - 1) / 2, FREE = DIM + TURNS, N_SUMS = 1 + FREE + FREE * (FREE + 1);
+GMM_INLINE void pair_sums(const double* pose, const Level& source, const Level& target, int64_t begin,
+                          int64_t stop, const int32_t* lists, int64_t width, const int64_t* counts,
+                          double* moved, double* sums) {
+    constexpr int TURNS = DIM * (DIM - 1) / 2, FREE = DIM + TURNS, N_SUMS = n_overlap_sums(DIM);
     constexpr double NORM = DIM == 2 ? 0.15915494309189535 : 0.06349363593424097;  // (2 pi)^(-DIM/2)
-    const int64_t begin = n_pairs * item / n_parts, stop = n_pairs * (item + 1) / n_parts;
+    for (int64_t i = begin; i < stop; ++i) {
+        turned<DIM>(pose, source.means + i * DIM, moved + i * n_of_pose(DIM));
+        turned_shape<DIM>(pose, source.covariances + i * DIM * DIM, moved + i * n_of_pose(DIM) + DIM);
+    }
     vec sum[N_SUMS];
     for (int s = 0; s < N_SUMS; ++s) sum[s] = (vec)(0.0);
-    for (int64_t pair = begin; pair < stop;) {
-        const int64_t b = motion[pair];
-        int64_t lanes = 0;
+    int64_t row = begin, next = 0, i = -1, j = -1;
+    while (true) {
+        bool is_any = false;
         vec l[DIM], d[DIM], a[DIM][DIM], c[DIM][DIM], weight = (vec)(0.0);
-        for (int lane = 0; lane < LANES; ++lane) {  // as many pairs of one motion; the last one repeats
-            const bool follows = pair + lane < stop && motion[pair + lane] == b;
-            if (lane == lanes && follows) ++lanes;
-            const int64_t at = pair + minimum((int64_t)lane, lanes - 1), i = source[at], j = target[at];
-            const int64_t row = b * n_source + i;
-            const double *lever = levers + row * DIM, *shape = moved + row * DIM * DIM;
+        for (int lane = 0; lane < LANES; ++lane) {  // as many pairs; the last one repeats
+            while (row < stop && next >= counts[row]) {
+                ++row;
+                next = 0;
+            }
+            if (row < stop) {
+                i = row;
+                j = lists[row * width + next++];
+                set(weight, lane, source.weights[i] * target.weights[j]);
+                is_any = true;
+            }
+            if (!is_any) break;
+            const double *lever = moved + i * n_of_pose(DIM), *shape = lever + DIM;
             for (int r = 0; r < DIM; ++r) {
                 set(l[r], lane, lever[r]);
-                set(d[r], lane, lever[r] + translations[b * DIM + r] - means[j * DIM + r]);
+                set(d[r], lane, lever[r] + pose[DIM * DIM + r] - target.means[j * DIM + r]);
                 for (int q = r; q < DIM; ++q) {
                     set(a[r][q], lane, shape[r * DIM + q]);
-                    set(c[r][q], lane, shape[r * DIM + q] + covariances[(j * DIM + r) * DIM + q]);
+                    set(c[r][q], lane, shape[r * DIM + q] + target.covariances[(j * DIM + r) * DIM + q]);
                 }
             }
-            if (lane < lanes) set(weight, lane, source_weights[i] * target_weights[j]);
         }
+        if (!is_any) break;
         vec root_of[DIM][DIM], inverse[DIM][DIM], w[DIM][DIM], scale = (vec)(1.0);
         for (int j = 0; j < DIM; ++j) {  // Cholesky's factor, and its inverse
             for (int i = j; i < DIM; ++i) {
@@ -156,13 +212,10 @@ GMM_KERNEL pair_overlap(int64_t item, const int64_t* motion, const int64_t* sour
             for (int j = i; j < FREE; ++j) sum[place++] += share * information[i][j];
         for (int i = 0; i < FREE; ++i)
             for (int j = i; j < FREE; ++j) sum[place++] += share * slope[i] * slope[j];
-        pair += lanes;
-        if (pair < stop && motion[pair] == b) continue;
-        double* out = sums + (item * n_motions + b) * N_SUMS;
-        for (int s = 0; s < N_SUMS; ++s) {
-            for (int lane = 0; lane < LANES; ++lane) out[s] += get(sum[s], lane);
-            sum[s] = (vec)(0.0);
-        }
+    }
+    for (int s = 0; s < N_SUMS; ++s) {
+        sums[s] = 0.0;
+        for (int lane = 0; lane < LANES; ++lane) sums[s] += get(sum[s], lane);
     }
 }
 

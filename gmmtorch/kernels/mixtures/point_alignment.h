@@ -1,98 +1,265 @@
 // Sums over the points of a scan that is aligned with a mixture, or laid over a raster.
 #pragma once
 
-#include "../device.h"
+#include "../lanes.h"
+#include "rigid_steps.h"
 
 namespace gmm {
 
-// An item is a part of the points under one motion.
-template <int DIM>
-GMM_KERNEL point_alignment(int64_t item, const double* points, int64_t n_points, int64_t n_parts,
-                           const double* rotations, const double* translations, const double* low,
-                           double side, const int64_t* shape, const int64_t* starts, const int32_t* entries,
-                           const double* means, const double* precisions, const double* normals,
-                           double behind, double farthest, double outliers, double explained, double* sums) {
-    constexpr int TURNS = DIM * (DIM - 1) / 2, FREE = DIM + TURNS, N_SUMS = 2 + FREE + FREE * (FREE + 1);
-    const int64_t motion = item / n_parts, part = item % n_parts;
-    const double *turn = rotations + motion * DIM * DIM, *shift = translations + motion * DIM;
-    double sum[N_SUMS] = {0.0};
-    for (int64_t n = n_points * part / n_parts; n < n_points * (part + 1) / n_parts; ++n) {
-        double lever[DIM], pull[DIM] = {0.0}, weight[DIM][DIM] = {{0.0}}, spread[DIM][DIM] = {{0.0}};
-        double total = outliers;
+constexpr double STILL = 1e-9;  // metres: a shorter step changes nothing
+
+// The surfaces that a scan is aligned with, listed by the cells of a lattice; see `NearLists` and
+// `alignment_sums`.
+struct Aligned {
+    const double* low;
+    double side;
+    const int64_t* shape;
+    const int64_t* starts;
+    const int32_t* entries;
+    const double* means;
+    const double* precisions;
+    const double* normals;
+    double behind;
+    double farthest;
+    double outliers;
+    double explained;
+};
+
+CUDA_CALLABLE constexpr int n_alignment_sums(int dim) { return 2 + n_free(dim) * (n_free(dim) + 2); }
+
+// Sums over the points begin … stop - 1 under one motion: log(1 + q/outliers), whether q is above the height
+// of an explained point, the gradient, and the upper triangles of the complete and of the observed
+// information. Without derivatives the first one alone.
+template <int DIM, bool DERIVES>
+GMM_INLINE void point_sums(const double* pose, const double* points, int64_t begin, int64_t stop,
+                           const Aligned& target, double* sums) {
+    const double* shift = pose + DIM * DIM;
+    constexpr int TURNS = n_free(DIM) - DIM, N_SUMS = DERIVES ? n_alignment_sums(DIM) : 1;
+    vec sum[N_SUMS];
+    for (int s = 0; s < N_SUMS; ++s) sum[s] = (vec)(0.0);
+    for (int64_t n = begin; n < stop; n += LANES) {
+        vec l[DIM], at[DIM], pull[DIM], weight[DIM][DIM], spread[DIM][DIM], total = (vec)(target.outliers);
         for (int i = 0; i < DIM; ++i) {
-            lever[i] = 0.0;
-            for (int j = 0; j < DIM; ++j) lever[i] += turn[i * DIM + j] * points[n * DIM + j];
+            vec x[DIM];
+            for (int j = 0; j < DIM; ++j) {
+                weight[i][j] = spread[i][j] = (vec)(0.0);
+                for (int lane = 0; lane < LANES; ++lane)
+                    set(x[j], lane, points[minimum(n + lane, stop - 1) * DIM + j]);
+            }
+            l[i] = pull[i] = (vec)(0.0);
+            for (int j = 0; j < DIM; ++j) l[i] += pose[i * DIM + j] * x[j];
+            at[i] = l[i] + shift[i];
         }
-        int64_t bucket = 0;
-        bool listed = true;
-        for (int i = 0; i < DIM; ++i) {
-            const double cell = floor((lever[i] + shift[i] - low[i]) / side);
-            listed = listed && cell >= 0.0 && cell < (double)shape[i];
-            bucket = bucket * shape[i] + (listed ? (int64_t)cell : 0);
-        }
-        const int64_t begin = listed ? starts[bucket] : 0, stop = listed ? starts[bucket + 1] : 0;
-        for (int64_t at = begin; at < stop; ++at) {
-            const double *mean = means + entries[at] * DIM, *normal = normals + entries[at] * DIM;
-            const double* precision = precisions + entries[at] * DIM * DIM;
-            double height_above = 0.0;  // of the sensor over the face
-            for (int i = 0; i < DIM; ++i) height_above += normal[i] * (shift[i] - mean[i]);
-            if (height_above < -behind) continue;
-            double d[DIM], p[DIM], square = 0.0;
-            for (int i = 0; i < DIM; ++i) d[i] = lever[i] + shift[i] - mean[i];
+        int64_t next[LANES], last[LANES], most = 0;
+        for (int lane = 0; lane < LANES; ++lane) {
+            int64_t bucket = 0;
+            bool is_listed = n + lane < stop;
             for (int i = 0; i < DIM; ++i) {
-                p[i] = 0.0;
-                for (int j = 0; j < DIM; ++j) p[i] += precision[i * DIM + j] * d[j];
+                const double cell = floor((get(at[i], lane) - target.low[i]) / target.side);
+                is_listed = is_listed && cell >= 0.0 && cell < (double)target.shape[i];
+                bucket = bucket * target.shape[i] + (is_listed ? (int64_t)cell : 0);
+            }
+            next[lane] = is_listed ? target.starts[bucket] : 0;
+            last[lane] = is_listed ? target.starts[bucket + 1] : 0;
+            most = maximum(most, last[lane] - next[lane]);
+        }
+        for (; most > 0; --most) {
+            vec mean[DIM], normal[DIM], precision[DIM][DIM], is_there = (vec)(0.0);
+            for (int lane = 0; lane < LANES; ++lane) {
+                const bool is_more = next[lane] < last[lane];
+                const int64_t k = is_more ? target.entries[next[lane]] : 0;
+                set(is_there, lane, is_more ? 1.0 : 0.0);
+                next[lane] += is_more;
+                for (int i = 0; i < DIM; ++i) {
+                    set(mean[i], lane, target.means[k * DIM + i]);
+                    set(normal[i], lane, target.normals[k * DIM + i]);
+                    for (int j = i; j < DIM; ++j)
+                        set(precision[i][j], lane, target.precisions[(k * DIM + i) * DIM + j]);
+                }
+            }
+            vec above = (vec)(0.0), square = (vec)(0.0), d[DIM], p[DIM];  // above: the sensor over the face
+            for (int i = 0; i < DIM; ++i) {
+                above += normal[i] * (shift[i] - mean[i]);
+                d[i] = at[i] - mean[i];
+            }
+            for (int i = 0; i < DIM; ++i) {
+                p[i] = (vec)(0.0);
+                for (int j = 0; j < DIM; ++j) p[i] += precision[minimum(i, j)][maximum(i, j)] * d[j];
                 square += d[i] * p[i];
             }
-            if (square > farthest) continue;
-            const double height = exp(-0.5 * square);
+            vec height = expo(-0.5 * square) * is_there;
+            height = above < -target.behind ? (vec)(0.0) : height;
+            height = square > target.farthest ? (vec)(0.0) : height;
             total += height;
-            for (int i = 0; i < DIM; ++i) {
+            for (int i = 0; i < DIM && DERIVES; ++i) {
                 pull[i] += height * p[i];
                 for (int j = i; j < DIM; ++j) {
-                    weight[i][j] += height * precision[i * DIM + j];
+                    weight[i][j] += height * precision[i][j];
                     spread[i][j] += height * p[i] * p[j];
                 }
             }
         }
-        if (total == outliers) continue;  // no component is near: all sums stay as they are
-        for (int i = 0; i < DIM; ++i) pull[i] /= total;
+        sum[0] += logarithm(total / target.outliers);
+        if (!DERIVES) continue;
+        sum[1] += total > target.explained ? (vec)(1.0) : (vec)(0.0);
+        const vec share = 1.0 / total;
+        for (int i = 0; i < DIM; ++i) {
+            pull[i] *= share;
+            sum[2 + i] -= pull[i];
+        }
         for (int i = 0; i < DIM; ++i)
             for (int j = i; j < DIM; ++j) {
-                weight[i][j] = weight[j][i] = weight[i][j] / total;
-                spread[i][j] = spread[j][i] = weight[i][j] - spread[i][j] / total + pull[i] * pull[j];
+                weight[i][j] = weight[j][i] = weight[i][j] * share;
+                spread[i][j] = spread[j][i] = weight[i][j] - spread[i][j] * share + pull[i] * pull[j];
             }
-        double jacobian[DIM][FREE] = {{0.0}};
-        for (int i = 0; i < DIM; ++i) jacobian[i][i] = 1.0;
-        for (int k = 0; k < TURNS; ++k) {  // G_k x = (-x_j, x_i) in the rows (i, j)
+        for (int k = 0; k < TURNS; ++k) {  // a point moves by G_k x = (-x_j, x_i) in the rows (i, j)
             const int i = DIM == 2 ? 0 : (k + 1) % DIM, j = DIM == 2 ? 1 : (k + 2) % DIM;
-            jacobian[i][DIM + k] = -lever[j];
-            jacobian[j][DIM + k] = lever[i];
+            sum[2 + DIM + k] += l[j] * pull[i] - l[i] * pull[j];
         }
-        sum[0] += log(total / outliers);
-        sum[1] += total > explained ? 1.0 : 0.0;
-        int place = 2;
-        for (int k = 0; k < FREE; ++k) {
-            double slope = 0.0;
-            for (int i = 0; i < DIM; ++i) slope -= jacobian[i][k] * pull[i];
-            sum[place++] += slope;
-        }
-        for (int which = 0; which < 2; ++which)
-            for (int k = 0; k < FREE; ++k) {
-                double column[DIM];
-                for (int i = 0; i < DIM; ++i) {
-                    column[i] = 0.0;
-                    for (int j = 0; j < DIM; ++j)
-                        column[i] += (which ? spread[i][j] : weight[i][j]) * jacobian[j][k];
-                }
-                for (int m = k; m < FREE; ++m) {
-                    double entry = 0.0;
-                    for (int i = 0; i < DIM; ++i) entry += jacobian[i][m] * column[i];
-                    sum[place++] += entry;
-                }
+        int place = 2 + DIM + TURNS;
+        for (int which = 0; which < 2; ++which) {
+            const auto& w = which ? spread : weight;
+            vec turned[DIM][TURNS];  // W G_k x
+            for (int k = 0; k < TURNS; ++k) {
+                const int i = DIM == 2 ? 0 : (k + 1) % DIM, j = DIM == 2 ? 1 : (k + 2) % DIM;
+                for (int r = 0; r < DIM; ++r) turned[r][k] = w[r][j] * l[i] - w[r][i] * l[j];
             }
+            for (int r = 0; r < DIM; ++r) {
+                for (int q = r; q < DIM; ++q) sum[place++] += w[r][q];
+                for (int k = 0; k < TURNS; ++k) sum[place++] += turned[r][k];
+            }
+            for (int k = 0; k < TURNS; ++k) {
+                const int i = DIM == 2 ? 0 : (k + 1) % DIM, j = DIM == 2 ? 1 : (k + 2) % DIM;
+                for (int m = k; m < TURNS; ++m) sum[place++] += turned[j][m] * l[i] - turned[i][m] * l[j];
+            }
+        }
     }
-    for (int s = 0; s < N_SUMS; ++s) sums[item * N_SUMS + s] = sum[s];
+    for (int s = 0; s < N_SUMS; ++s) {
+        sums[s] = 0.0;
+        for (int lane = 0; lane < LANES; ++lane) sums[s] += get(sum[s], lane);
+    }
+}
+
+// An item is a motion.
+template <int DIM>
+GMM_KERNEL point_scores(int64_t item, const double* points, int64_t n_points, const double* rotations,
+                        const double* translations, Aligned target, double* scores) {
+    double pose[n_of_pose(DIM)];
+    for (int i = 0; i < n_of_pose(DIM); ++i)
+        pose[i] = i < DIM * DIM ? rotations[item * DIM * DIM + i] : translations[item * DIM + i - DIM * DIM];
+    point_sums<DIM, false>(pose, points, 0, n_points, target, scores + item);
+}
+
+// The climb from one start: the motion, its sums, and whether the last step was short; then what is not a
+// result.
+template <int DIM>
+struct Aligning {
+    static constexpr int FREE = n_free(DIM), N_SUMS = n_alignment_sums(DIM);
+    double pose[n_of_pose(DIM)], score, n_explained, slope[FREE], complete[FREE][FREE], observed[FREE][FREE];
+    double settled, trial[n_of_pose(DIM)], sums[N_SUMS], share, length;
+};
+
+// Takes the trial if its score is not worse.
+template <int DIM>
+GMM_INLINE void absorb(Aligning<DIM>& climb, bool is_start, double settled) {
+    constexpr int FREE = n_free(DIM);
+    const bool is_better = is_start || climb.sums[0] >= climb.score;
+    climb.settled = !is_start && climb.length < settled;
+    if (!is_start) climb.share = is_better ? minimum(2.0 * climb.share, 1.0) : climb.share / 4.0;
+    if (!is_better) return;
+    for (int i = 0; i < n_of_pose(DIM); ++i) climb.pose[i] = climb.trial[i];
+    climb.score = climb.sums[0];
+    climb.n_explained = climb.sums[1];
+    for (int i = 0; i < FREE; ++i) climb.slope[i] = climb.sums[2 + i];
+    int place = 2 + FREE;
+    for (int i = 0; i < FREE; ++i)
+        for (int j = i; j < FREE; ++j, ++place) {
+            climb.complete[i][j] = climb.complete[j][i] = climb.sums[place];
+            climb.observed[i][j] = climb.observed[j][i] = climb.sums[place + FREE * (FREE + 1) / 2];
+        }
+}
+
+// The next trial: Newton's step, or that of EM where the observed information has too little curvature, which
+// moves no point by more than about `longest`.
+template <int DIM>
+GMM_INLINE void advance(Aligning<DIM>& climb, double farthest, double longest) {
+    constexpr int FREE = n_free(DIM);
+    constexpr double SADDLE = 0.05, RIDGE = 1e-9;
+    double root[FREE][FREE], observed[FREE][FREE], complete[FREE][FREE], step[FREE], unit[FREE], square = 0.0;
+    double ridge = 1e-12;
+    for (int i = 0; i < FREE; ++i) unit[i] = i < DIM ? 1.0 : 1.0 / farthest;
+    for (int i = 0; i < FREE; ++i)
+        for (int j = 0; j <= i; ++j) {
+            complete[i][j] = climb.complete[i][j] * unit[i] * unit[j];
+            observed[i][j] = climb.observed[i][j] * unit[i] * unit[j];
+        }
+    for (int i = 0; i < FREE; ++i) ridge = maximum(ridge, complete[i][i]);
+    for (int i = 0; i < FREE; ++i) {
+        complete[i][i] += RIDGE * ridge;
+        step[i] = climb.slope[i] * unit[i];
+        for (int j = 0; j <= i; ++j) root[i][j] = observed[i][j] - SADDLE * complete[i][j];
+    }
+    const bool is_curved = factorise<FREE>(root, 0.0);
+    for (int i = 0; i < FREE; ++i)
+        for (int j = 0; j <= i; ++j) root[i][j] = is_curved ? observed[i][j] : complete[i][j];
+    factorise<FREE>(root, 0.0);
+    solve_lower<FREE>(root, step);
+    solve_upper<FREE>(root, step);
+    for (int i = 0; i < FREE; ++i) square += step[i] * step[i];
+    const double share = longest / maximum(sqrt(square), longest) * climb.share;
+    for (int i = 0; i < FREE; ++i) step[i] *= share * unit[i];
+    climb.length = sqrt(square) * share;
+    move<DIM>(climb.pose, step, climb.trial);
+}
+
+// Climbs the score from all motions. A step that lowers it is taken back, and the next one is shorter. space:
+// an `Aligning` for each motion, of which the first part is the result, then the sums of parts of the points.
+template <int DIM>
+GMM_KERNEL alignment(int64_t item, Team team, const double* points, int64_t n_points, int64_t n_parts,
+                     int64_t n_motions, const double* rotations, const double* translations, Aligned target,
+                     double settled, int64_t max_steps, double* space) {
+    constexpr int POSE = n_of_pose(DIM), N_SUMS = n_alignment_sums(DIM);
+    Aligning<DIM>* climbs = (Aligning<DIM>*)space;
+    double *partial = (double*)(climbs + n_motions), farthest = 1e-9;
+    for (int64_t n = 0; n < n_points; ++n) {
+        double square = 0.0;
+        for (int i = 0; i < DIM; ++i) square += points[n * DIM + i] * points[n * DIM + i];
+        farthest = maximum(farthest, square);
+    }
+    farthest = maximum(sqrt(farthest), 1e-9);
+    for (int64_t b = item; b < n_motions; b += team.n) {
+        for (int i = 0; i < POSE; ++i)
+            climbs[b].trial[i] =
+                i < DIM * DIM ? rotations[b * DIM * DIM + i] : translations[b * DIM + i - DIM * DIM];
+        climbs[b].share = climbs[b].length = 1.0;
+    }
+    meet(team);
+    bool is_settled = false;
+    for (int64_t step = 0; step <= max_steps && !is_settled; ++step) {
+        for (int64_t piece = item; piece < n_motions * n_parts; piece += team.n) {
+            const int64_t b = piece / n_parts, part = piece % n_parts;
+            if (climbs[b].length >= STILL)
+                point_sums<DIM, true>(climbs[b].trial, points, n_points * part / n_parts,
+                                      n_points * (part + 1) / n_parts, target, partial + piece * N_SUMS);
+        }
+        meet(team);
+        for (int64_t piece = item; piece < n_motions * N_SUMS; piece += team.n) {
+            double sum = 0.0;
+            for (int64_t part = 0; part < n_parts; ++part)
+                sum += partial[(piece / N_SUMS * n_parts + part) * N_SUMS + piece % N_SUMS];
+            climbs[piece / N_SUMS].sums[piece % N_SUMS] = sum;
+        }
+        meet(team);
+        for (int64_t b = item; b < n_motions; b += team.n) {
+            Aligning<DIM>& climb = climbs[b];
+            if (climb.length < STILL) continue;
+            absorb<DIM>(climb, step == 0, settled);
+            advance<DIM>(climb, farthest, target.behind);
+        }
+        meet(team);
+        is_settled = true;
+        for (int64_t b = 0; b < n_motions; ++b) is_settled = is_settled && climbs[b].settled;
+    }
 }
 
 // An item is a placement of the scan: a heading and a shift in whole cells.

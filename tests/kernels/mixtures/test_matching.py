@@ -1,4 +1,4 @@
-"""Pairs, overlaps, alignment, explained points: fused kernels against twins, see also test_registration."""
+"""Registration, alignment, explained points: fused kernels against twins, see also test_registration."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kernels.twins import by_both
 
+from gmmtorch.errors import MemoryLimitError
 from gmmtorch.kernels import kernels
 from gmmtorch.kernels.compiler import compiler_failure
+from gmmtorch.kernels.mixtures import matching
 from gmmtorch.localization.alignment import AlignmentTarget
-from gmmtorch.localization.registration import Ascent, overlap
+from gmmtorch.localization.registration import register
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.novelty import count_explained
 from gmmtorch.mixture.em.exact import Parameters
@@ -39,34 +41,36 @@ def motions_of(n: int, dim: int) -> Pose:
     return Pose.identity(dim, n, device=steps.device).moved(steps)
 
 
+def given_as(mixture: Parameters) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    return mixture.means, mixture.covariances, mixture.weights
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("kind", ["any", "flat", "equal"])
-@pytest.mark.parametrize(("k", "j", "n"), [(40, 30, 3), (7, 5, 1), (1, 1, 5)])
-def test_fused_pairs_and_sums_equal_the_twin(dim, kind, k, j, n):
-    source, target, motions = mixture(k, dim, kind), mixture(j, dim, kind), motions_of(n, dim)
-    ascent, pairs, sums = Ascent(source, target, 2.0), [], []
-    for choice in ("torch", "fused"):
-        with kernels(choice):
-            pairs.append(ascent.pairs(motions))
-            sums.append(overlap(source, target, motions, pairs[0]))
-    assert sorted(zip(*(rows.tolist() for rows in pairs[0]), strict=True)) == list(
-        zip(*(rows.tolist() for rows in pairs[1]), strict=True)
+@pytest.mark.parametrize(("k", "j", "n"), [(40, 30, 3), (90, 90, 1), (17, 15, 9)])
+@pytest.mark.parametrize("options", [{}, {"coarsest": 0.4, "weighting": "support"}, {"max_iterations": 2}])
+def test_fused_registration_equals_the_twin(dim, kind, k, j, n, options):
+    scene = given_as(mixture(k + j // 2, dim, kind))  # the two share a half of the smaller one
+    source, target = (tuple(part[rows] for part in scene) for rows in (slice(k), slice(-j, None)))
+    twin, fused = by_both(lambda: register(source, target, motions_of(n, dim).matrix, **options))
+    tolerance = 1e-5 if kind == "flat" else 1e-9  # surfaces of 0.1 mm
+    assert (fused.n_iterations, fused.converged, fused.doubts) == (
+        twin.n_iterations,
+        twin.converged,
+        twin.doubts,
     )
-    tolerance = 1e-8 if kind == "flat" else 1e-11
-    for one, other in zip(*sums, strict=True):
-        like = sums[0].information if one.ndim == 3 else one[one.isfinite()]
-        scale = float(like.abs().max()) if len(pairs[0].motion) else 1.0
-        torch.testing.assert_close(other, one, rtol=0, atol=tolerance * scale)
+    torch.testing.assert_close(fused.transform, twin.transform, rtol=tolerance, atol=tolerance)
+    scale = float(twin.hessian.abs().max())
+    torch.testing.assert_close(fused.hessian, twin.hessian, rtol=0, atol=tolerance * scale)
+    assert (fused.score, fused.overlap) == pytest.approx((twin.score, twin.overlap), rel=tolerance)
+    assert fused.width == pytest.approx(twin.width, rel=1e-3)
 
 
-def test_no_pairs_give_no_overlap():
-    source, target = mixture(5, 3, "any"), mixture(4, 3, "any")
-    target = target._replace(means=target.means + 1000)
-    with kernels("fused"):
-        ascent = Ascent(source, target, 2.0)
-        pairs = ascent.pairs(motions_of(2, 3))
-        assert len(pairs.motion) == 0
-        assert overlap(source, target, motions_of(2, 3), pairs).log_score.tolist() == [-torch.inf] * 2
+def test_more_pairs_than_there_is_room_for_are_a_memory_error(monkeypatch):
+    monkeypatch.setattr(matching, "_MOST_PAIRS", 600)
+    given_mixture = given_as(mixture(40, 3, "equal"))
+    with kernels("fused"), pytest.raises(MemoryLimitError, match="simplify"):
+        register(given_mixture, given_mixture)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
