@@ -118,18 +118,22 @@ def all_equal(pairs: Iterable[tuple[Tensor, Tensor]]) -> bool:
 # -- sorting: NumPy's vectorised sorts on the CPU, torch's elsewhere ------------------------------
 
 
-def order_along_curve(places: Tensor) -> Tensor:
+def order_along_curve(places: Tensor, levels: int = 1) -> Tensor:
     """An order (N,) of finite points (N, D), D ≤ 3, at least one, in which neighbours follow each other.
 
-    It is that of a Morton curve through 32 cells along each axis of their box.
+    It is that of a Morton curve through 32^levels cells along each axis of their box; levels: 4 at most.
     """
     low, high = places.amin(0), places.amax(0)
-    cell = ((places - low) * (31.99 / (high - low).max().clamp_min(1e-300))).long().clamp_(0, 31)
+    n = 1 << 5 * levels
+    cell = ((places - low) * ((n - 0.01) / (high - low).max().clamp_min(1e-300))).long().clamp_(0, n - 1)
     dim = places.shape[1]
     spread = [sum((n >> b & 1) << (b * dim) for b in range(5)) for n in range(32)]
     bits = torch.tensor(spread, device=places.device)
-    keys = sum((bits[cell[:, axis]] << axis for axis in range(dim)), torch.zeros_like(cell[:, 0]))
-    return keys.short().argsort(stable=True)
+    keys = torch.zeros_like(cell[:, 0])
+    for level in reversed(range(levels)):
+        part = bits[cell >> 5 * level & 31]
+        keys = sum((part[:, axis] << axis for axis in range(dim)), keys << 5 * dim)
+    return (keys.short() if levels == 1 else keys).argsort(stable=True)
 
 
 def argsort(keys: Tensor) -> Tensor:

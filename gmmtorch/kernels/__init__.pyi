@@ -87,3 +87,7 @@ from .rays.ray_traversal import mark_cells_of_rays as mark_cells_of_rays
 from .rays.ray_traversal import packed_strides as packed_strides
 from .rays.ray_traversal import row_major_strides as row_major_strides
 from .rays.ray_traversal import traverse as traverse
+from .rays.triangles import TriangleTree as TriangleTree
+from .rays.triangles import first_hits as first_hits
+from .rays.triangles import nearest_triangles as nearest_triangles
+from .rays.triangles import triangle_tree as triangle_tree
