@@ -76,7 +76,9 @@ from .rays.component_casting import Seen as Seen
 from .rays.component_casting import cast_components as cast_components
 from .rays.component_casting import hidden_area as hidden_area
 from .rays.component_casting import truncated_normals as truncated_normals
-from .rays.path_clearance import Motions as Motions
+from .rays.motion_tree import MotionTree as MotionTree
+from .rays.path_clearance import FreeSpace as FreeSpace
+from .rays.path_clearance import Library as Library
 from .rays.path_clearance import motions_are_clear as motions_are_clear
 from .rays.range_views import range_views as range_views
 from .rays.ray_traversal import CHUNK_VISITS as CHUNK_VISITS
