@@ -128,16 +128,20 @@ def _morton_bits(dim: int, device: str) -> Tensor:
     return torch.tensor(spread, device=device)
 
 
-def order_along_curve(places: Tensor) -> Tensor:
+def order_along_curve(places: Tensor, levels: int = 1) -> Tensor:
     """An order (N,) of finite points (N, D), D ≤ 3, at least one, in which neighbours follow each other.
 
-    It is that of a Morton curve through 32 cells along each axis of their box.
+    It is that of a Morton curve through 32^levels cells along each axis of their box; levels: 4 at most.
     """
     low, high = places.aminmax(dim=0)
-    cell = ((places - low) * (31.99 / (high - low).max().clamp_min(1e-300))).long().clamp_(0, 31)
-    bits = _morton_bits(places.shape[1], str(places.device))
-    keys = torch.gather(bits, 0, cell).sum(1)
-    return keys.short().argsort(stable=True)
+    dim, side = places.shape[1], 1 << 5 * levels
+    cell = (places - low) * ((side - 0.01) / (high - low).max().clamp_min(1e-300))
+    cell = cell.long().clamp_(0, side - 1)
+    bits, keys = _morton_bits(dim, str(places.device)), cell[:, 0]
+    for level in reversed(range(levels)):
+        part = torch.gather(bits, 0, cell >> 5 * level & 31 if levels > 1 else cell).sum(1)
+        keys = part if level == levels - 1 else keys << 5 * dim | part
+    return (keys.short() if levels == 1 else keys).argsort(stable=True)
 
 
 def argsort(keys: Tensor) -> Tensor:

@@ -177,8 +177,8 @@ CASES = {
     "sensor point_density": Case(lambda x: DepthCameraModel().point_density(x, 0.5), SUPPORT),
     "sensor deviations": Case(lambda x: DepthCameraModel().deviations(x).along, SUPPORT),
     "ray_segments": Case(lambda x: nearness(simulation.ray_segments(ORIGINS, MEANS - ORIGINS, x)), SEGMENTS),
-    "ray_triangles": Case(
-        lambda x: nearness(simulation.ray_triangles(x, TETRAHEDRON[1:] + 0.25, TETRAHEDRON[FACES])),
+    "MeshWorld.distances": Case(
+        lambda x: nearness(simulation.MeshWorld(TETRAHEDRON[FACES]).distances(x, TETRAHEDRON[1:] + 0.25)),
         PLACES[0],
     ),
     "smooth_path": Case(lambda x: simulation.smooth_path(x), POLYGON),

@@ -82,7 +82,9 @@ from .rays.component_casting import Seen as Seen
 from .rays.component_casting import cast_components as cast_components
 from .rays.component_casting import hidden_area as hidden_area
 from .rays.component_casting import truncated_normals as truncated_normals
-from .rays.path_clearance import Motions as Motions
+from .rays.motion_tree import MotionTree as MotionTree
+from .rays.path_clearance import FreeSpace as FreeSpace
+from .rays.path_clearance import Library as Library
 from .rays.path_clearance import motions_are_clear as motions_are_clear
 from .rays.range_views import range_views as range_views
 from .rays.ray_traversal import CHUNK_VISITS as CHUNK_VISITS
@@ -93,3 +95,7 @@ from .rays.ray_traversal import mark_cells_of_rays as mark_cells_of_rays
 from .rays.ray_traversal import packed_strides as packed_strides
 from .rays.ray_traversal import row_major_strides as row_major_strides
 from .rays.ray_traversal import traverse as traverse
+from .rays.triangles import TriangleTree as TriangleTree
+from .rays.triangles import first_hits as first_hits
+from .rays.triangles import nearest_triangles as nearest_triangles
+from .rays.triangles import triangle_tree as triangle_tree

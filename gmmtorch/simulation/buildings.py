@@ -28,6 +28,7 @@ southern windows have no return. The corridor to the east is 14 m long.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -52,7 +53,8 @@ from gmmtorch.simulation.furniture import (
     table,
     uniform,
 )
-from gmmtorch.simulation.mesh_raycasting import ray_segments, ray_triangles
+from gmmtorch.simulation.mesh_world import MeshWorld
+from gmmtorch.simulation.segment_casting import ray_segments
 from gmmtorch.simulation.sensors import smooth_path
 
 _THICKNESS = 0.2
@@ -230,7 +232,11 @@ class World3D:
 
     def distances(self, origin: ArrayLike, directions: ArrayLike) -> Tensor:
         """Range (N,) in metres from the origin (3,) along unit directions (N, 3); inf without a hit."""
-        return ray_triangles(origin, directions, self.triangles)
+        return self._mesh.distances(origin, directions)
+
+    @cached_property
+    def _mesh(self) -> MeshWorld:
+        return MeshWorld(self.triangles)
 
 
 def building_3d(generator: torch.Generator) -> World3D:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
-from gmmtorch.optional_packages import load_open3d
+from gmmtorch.kernels import first_hits, nearest_triangles, triangle_tree
 
 _log = logging.getLogger(__name__)
 
@@ -33,19 +34,8 @@ def checked_triangles(triangles: Tensor, name: str = "mesh") -> Tensor:
     visible through a hole. Raises `InvalidArgumentError` for another shape, and `DataError` for a corner
     that is not finite or a mesh without any triangle that has an area.
     """
-    if triangles.ndim != 3 or triangles.shape[1:] != (3, 3):
-        raise InvalidArgumentError(
-            f"{name}: triangles have shape {tuple(triangles.shape)}; expected (T, 3, 3)."
-        )
     triangles = triangles.detach().cpu().double()
-    if len(triangles) == 0:
-        raise DataError(f"{name} has no triangles; give a mesh with faces.")
-    broken = ~torch.isfinite(triangles).flatten(1).all(1)
-    if bool(broken.any()):
-        raise DataError(
-            f"{name}: {int(broken.sum())} of {len(triangles)} triangles have a corner that is NaN or "
-            f"infinite, the first is number {int(broken.nonzero()[0])}; repair the mesh, or drop them."
-        )
+    _check_corners(triangles, name)
     solid = have_area(triangles)
     n_flat = int((~solid).sum())
     if n_flat == len(triangles):
@@ -58,6 +48,22 @@ def checked_triangles(triangles: Tensor, name: str = "mesh") -> Tensor:
     return triangles[solid]
 
 
+def _check_corners(triangles: Tensor, name: str) -> None:
+    """Raises the errors of `checked_triangles` for the shape, and for corners that are not finite."""
+    if triangles.ndim != 3 or triangles.shape[1:] != (3, 3):
+        raise InvalidArgumentError(
+            f"{name}: triangles have shape {tuple(triangles.shape)}; expected (T, 3, 3)."
+        )
+    if len(triangles) == 0:
+        raise DataError(f"{name} has no triangles; give a mesh with faces.")
+    broken = ~torch.isfinite(triangles).flatten(1).all(1)
+    if bool(broken.any()):
+        raise DataError(
+            f"{name}: {int(broken.sum())} of {len(triangles)} triangles have a corner that is NaN or "
+            f"infinite, the first is number {int(broken.nonzero()[0])}; repair the mesh, or drop them."
+        )
+
+
 def have_area(triangles: Tensor) -> Tensor:
     """Whether each triangle (T, 3, 3) has an area, so that it is not a line or a point: (T,) bool."""
     edges = triangles.roll(-1, 1) - triangles
@@ -66,47 +72,60 @@ def have_area(triangles: Tensor) -> Tensor:
 
 
 class MeshWorld:
-    """A world of triangles (T, 3, 3), metres, z up.
+    """A world of triangles (T, 3, 3), metres, z up, on the device of the triangles.
 
-    Open3D (Embree) casts the rays, in float32 relative to the centre of the mesh. Raises `GmmTorchError` if
-    Open3D does not load.
+    Attributes:
+        low, high: (3,) float64, on the CPU, the corners of its box.
+
+    Raises `InvalidArgumentError` for another shape, and `DataError` for no triangle or one not finite.
     """
 
     def __init__(self, triangles: ArrayLike) -> None:
-        open3d = load_open3d("Rays cannot be cast in a mesh")
-        corners = as_tensor(triangles, "triangles", torch.float64, "cpu").detach().reshape(-1, 3)
-        self.low, self.high = corners.amin(0), corners.amax(0)
-        self._middle = (self.low + self.high) / 2
-        self._tensor = open3d.core.Tensor
-        self._scene: Any = open3d.t.geometry.RaycastingScene()
-        faces = np.arange(corners.shape[0], dtype=np.uint32).reshape(-1, 3)
-        self._scene.add_triangles(self._tensor((corners - self._middle).float().numpy()), self._tensor(faces))
+        corners = as_tensor(triangles, "triangles", torch.float64).detach()
+        _check_corners(corners, "triangles")
+        self.low, self.high = corners.flatten(0, 1).aminmax(dim=0)
+        self.low, self.high = self.low.cpu(), self.high.cpu()
+        self._tree = triangle_tree(corners)
 
-    def distances(self, origin: ArrayLike, directions: ArrayLike, threads: int = 0) -> Tensor:
-        """Distances (N,) in metres to the first surface along unit directions (N, 3); inf if none is hit.
+    @property
+    def device(self) -> torch.device:
+        """Where rays are cast."""
+        return self._tree.boxes.device
+
+    def to(self, device: torch.device | str) -> MeshWorld:
+        """The world on a device."""
+        moved = copy(self)
+        moved._tree = self._tree.to(device)
+        return moved
+
+    def distances(self, origin: ArrayLike, directions: ArrayLike) -> Tensor:
+        """Distances (N,) to the first surface, in multiples of the directions' lengths; inf if none is hit.
+
+        A ray passes through a triangle that it meets within 10⁻¹⁴ of the distance, so no ray passes between
+        two triangles that share an edge. Both faces count. A ray in the plane of a triangle does not hit it.
 
         Args:
-            origin: (3,), or (N, 3) for one origin per ray.
-            directions: (N, 3).
-            threads: number of threads; 0 uses all cores.
+            origin: (3,), or (N, 3) for one origin per ray. directions: (N, 3).
         """
-        directions = as_tensor(directions, "directions", torch.float64, "cpu")
-        rays = torch.empty(len(directions), 6, dtype=torch.float32)
-        rays[:, :3] = as_tensor(origin, "origin", torch.float64, "cpu") - self._middle
-        rays[:, 3:] = directions
-        cast = self._scene.cast_rays(self._tensor(rays.numpy()), nthreads=threads)
-        return torch.from_numpy(cast["t_hit"].numpy()).double()
+        directions = as_tensor(directions, "directions", torch.float64, self.device)
+        origin = as_tensor(origin, "origin", torch.float64, self.device)
+        if directions.ndim != 2 or directions.shape[1] != 3:
+            raise InvalidArgumentError(f"directions has shape {tuple(directions.shape)}; expected (N, 3).")
+        if origin.shape not in ((3,), directions.shape):
+            raise InvalidArgumentError(
+                f"origin has shape {tuple(origin.shape)}; expected (3,) or {tuple(directions.shape)}, metres."
+            )
+        return first_hits(self._tree, origin, directions)
 
-    def clearance(self, points: ArrayLike, threads: int = 0) -> Tensor:
-        """Distance (N,) in metres from each point (N, 3) to the nearest surface.
-
-        `threads` is the number of threads; 0 uses all cores.
-        """
-        moved = (
-            (as_tensor(points, "points", torch.float64, "cpu") - self._middle).float().contiguous().numpy()
-        )
-        found = self._scene.compute_distance(self._tensor(moved), nthreads=threads)
-        return torch.from_numpy(found.numpy()).double()
+    def clearance(self, points: ArrayLike) -> Tensor:
+        """Distance (N,) in metres from each point (N, 3) to the nearest surface. Raises
+        `InvalidArgumentError` for points that are not finite."""
+        points = as_tensor(points, "points", torch.float64, self.device)
+        if points.ndim != 2 or points.shape[1] != 3 or not bool(torch.isfinite(points).all()):
+            raise InvalidArgumentError(
+                f"points has shape {tuple(points.shape)}; expected (N, 3), finite metres."
+            )
+        return nearest_triangles(self._tree, points)
 
     def standing_places(
         self, height: float = 1.2, clearance: float = 0.4, spacing: float = 1.0, sight: float = 30.0
@@ -145,9 +164,8 @@ class MeshWorld:
     def _is_enclosed(self, points: Tensor, sight: float) -> Tensor:
         angle = torch.arange(16, dtype=torch.float64) * (2 * math.pi / 16)
         level = torch.stack([angle.cos(), angle.sin(), 0 * angle], 1)
-        starts = points.repeat_interleave(16, 0)
-        seen = self.distances(starts, level.repeat(len(points), 1)) < sight
-        return seen.view(-1, 16).double().mean(1) >= _ENCLOSED
+        seen = self.distances(points.repeat(16, 1), level.repeat_interleave(len(points), 0)) < sight
+        return seen.view(16, -1).double().mean(0) >= _ENCLOSED
 
     def tour(self, n: int, stride: int = 2, spacing: float = 1.0, **options: float) -> Tensor:
         """`n` places (n, 3) along a path through the largest connected part of the world.

@@ -39,12 +39,6 @@ class DepthFrame:
     is_hit: Tensor
     pixel: Tensor
 
-    def to(self, device: torch.device | str) -> DepthFrame:
-        """The frame on a device."""
-        if self.ends.device == torch.device(device):
-            return self
-        return DepthFrame(*(value.to(device) for value in vars(self).values()))
-
     def scan(self) -> Scan:
         """The frame as a scan: hits, and ends of beams without return."""
         return Scan(self.ends[self.is_hit], self.origin, self.ends[~self.is_hit])
@@ -70,9 +64,9 @@ class DepthCamera(CameraOptions):
         others: ArrayLike,
         radius: float,
         generator: torch.Generator,
-        truth: Tensor | None = None,
+        beams: tuple[Tensor, Tensor] | None = None,
     ) -> DepthFrame:
-        """The frame at a pose.
+        """The frame at a pose, on the device of the world.
 
         A beam of range r and depth z has an error of standard deviation noise · z² · r/z. Readings of
         `max_range` or more become beams without return that end there. Dropped beams are absent, and so are
@@ -82,44 +76,56 @@ class DepthCamera(CameraOptions):
             pose: (4,) x, y, z in metres, yaw in radians.
             others: (M, 3) centres of the teammates' bodies, metres.
             radius: radius of a teammate's body (m).
-            truth: the `distances` from this pose, if they are known.
+            generator: of the CPU.
+            beams: the `beams` from this pose, if they are known.
         """
         pose = _finite(pose, "pose", 4)
         others = _finite(others, "others", -1, 3)
-        origin, directions = pose[:3], self._turned(float(pose[3]))
-        error = torch.randn(len(directions), generator=generator, dtype=torch.float64) * self.noise
-        kept = torch.rand(len(directions), generator=generator, dtype=torch.float64) >= self.dropout
-        truth = self.distances(world, pose) if truth is None else truth
+        n, device = self.width * self.height, world.device
+        error = torch.randn(n, generator=generator, dtype=torch.float64).mul_(self.noise).to(device)
+        kept = (torch.rand(n, generator=generator, dtype=torch.float64) >= self.dropout).to(device)
+        directions, truth = self.beams(world, pose) if beams is None else beams
         reach = truth.clamp_max(self.max_range)
-        reading = reach + error * reach.square() * self.directions[:, 0]  # z = r · directions[:, 0]
+        depth = self._directions_on(device)[:, 0]
+        reading = torch.addcmul(reach, error * reach.square(), depth)  # z = r · depth
         is_hit = (truth < self.max_range) & (reading < self.max_range)
         reading = torch.where(is_hit, reading.clamp_min(CLOSEST_READING), self.max_range)
         body = radius + _TEAMMATE_MARGIN
-        others = others[(others - origin).norm(dim=1) < self.max_range + body + _TEAMMATE_MARGIN]
+        others = others[(others - pose[:3]).norm(dim=1) < self.max_range + body + _TEAMMATE_MARGIN]
         if len(others):
-            kept &= _distance_to_spheres(others - origin, body, directions) >= reach
-        pixel = kept.nonzero().squeeze(1)
+            kept &= _distance_to_spheres((others - pose[:3]).to(device), body, directions) >= reach
+        pixel, origin = kept.nonzero().squeeze(1), pose[:3].to(device)
         ends = torch.addcmul(origin, directions[pixel], reading[pixel, None])
         return DepthFrame(origin, ends, is_hit[pixel], pixel)
 
-    def distances(self, world: MeshWorld, pose: ArrayLike) -> Tensor:
-        """Distances (height · width,), metres, to the first surface along the beams from a pose (4,)."""
+    def beams(self, world: MeshWorld, pose: ArrayLike) -> tuple[Tensor, Tensor]:
+        """Unit vectors (height · width, 3), world frame, of the beams from a pose (4,), and the distances
+        (height · width,), metres, to the first surface along them."""
         pose = _finite(pose, "pose", 4)
-        return world.distances(pose[:3], self._turned(float(pose[3])), threads=torch.get_num_threads())
+        turn = Pose.from_yaw(float(pose[3]), [0.0, 0.0, 0.0]).rotation.T.to(world.device)
+        directions = self._directions_on(world.device) @ turn
+        return directions, world.distances(pose[:3], directions)
 
     def image(self, frame: DepthFrame) -> Tensor:
         """Depth image (height, width) of a frame of this camera, metres along the optical axis.
 
         Infinite for a beam without return, NaN for a pixel without a valid reading.
         """
-        depth = torch.full((self.width * self.height,), math.nan, dtype=torch.float64)
-        reading = (frame.ends - frame.origin).norm(dim=1) * self.directions[frame.pixel, 0]
+        device = frame.ends.device
+        depth = torch.full((self.width * self.height,), math.nan, dtype=torch.float64, device=device)
+        reading = (frame.ends - frame.origin).norm(dim=1) * self._directions_on(device)[frame.pixel, 0]
         depth[frame.pixel] = torch.where(frame.is_hit, reading, math.inf)
         return depth.view(self.height, self.width)
 
-    def _turned(self, yaw: float) -> Tensor:
-        """Directions of the beams (N, 3) in the world frame."""
-        return self.directions @ Pose.from_yaw(yaw, [0.0, 0.0, 0.0]).rotation.T
+    def _directions_on(self, device: torch.device) -> Tensor:
+        """`directions` on a device, moved there once."""
+        if device not in self._moved:
+            self._moved[device] = self.directions.to(device)
+        return self._moved[device]
+
+    @cached_property
+    def _moved(self) -> dict[torch.device, Tensor]:
+        return {}
 
 
 def _distance_to_spheres(centers: Tensor, radius: float, directions: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ import pytest
 import torch
 from exploration.voxel_worlds import EVALUATOR, PRIMITIVES, Explorer, surroundings_from, task_of
 
+from gmmtorch.kernels import kernels
 from gmmtorch.team.exploration.planning.collision_checking import feasible
 from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
 from gmmtorch.team.exploration.planning.journeys import DistanceField, Goal
@@ -194,3 +195,35 @@ def test_search_at_the_start_looks_around():
     assert found.information > 0
     looks = [float(yaw) for yaw in found.views[:, 3]]
     assert max(looks) - min(0.0, *looks) > 1.5
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_fused_tree_is_that_of_its_twin(seed):
+    """With views, goals, teammates, walls, a branch to begin with, and a start in a corner or in a wall."""
+    draw = torch.Generator().manual_seed(seed)
+    passable = ROOM & (torch.rand(ROOM.shape, generator=draw) > 0.01 * (seed % 3))
+    place = (MIDDLE, (0.65, 0.65, 0.45), (0.5, 0.5, 0.3))[seed % 3]
+    peers = PeerTrajectories(
+        torch.tensor([2.0, 2.5, 1.2]).double() + torch.randn(2, 25, 3, generator=draw).double().cumsum(1) / 8
+    )
+    rule = SearchRule(depth=2 + seed % 3, n_rounds=3, n_leaves=24)
+    found = []
+    for kind in ("torch", "fused"):
+        with kernels(kind):
+            task = task_in(passable, place, seed, **({"peers": peers} if seed % 2 else {}))
+            goal = None
+            if seed % 4 > 1:
+                target = torch.tensor([[4.0, 3.0, 1.2]]).double()
+                goal = Goal(DistanceField.to(task.local_map, target), 0.3, 1.0)
+            memory = None if seed % 4 == 3 else ViewCache(task, MadeUp(seed))
+            branch = search_tree(PRIMITIVES, rule, task, memory, goal, [seed % 5, 3, 7])
+            found.append((branch, torch.rand((), generator=task.generator)))
+    (one, drawn), (other, also_drawn) = found
+    assert drawn == also_drawn
+    assert (one is None) == (other is None)
+    if one is not None and other is not None:
+        assert one.actions == other.actions
+        for name in ("path", "braking", "views"):
+            assert torch.equal(getattr(one, name), getattr(other, name))
+        for name in ("value", "information", "progress"):
+            assert getattr(one, name) == pytest.approx(getattr(other, name), rel=1e-6, abs=1e-9)

@@ -14,7 +14,6 @@ from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, M
 from gmmtorch.occupancy.voxels.cells import Box, occupied_cells
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.simulation.furniture import box
-from gmmtorch.simulation.mesh_raycasting import ray_triangles
 from gmmtorch.simulation.mesh_world import MeshWorld
 from gmmtorch.team.exploration.planning.primitives import Dynamics, Primitives
 from gmmtorch.team.exploration.world.navigable import (
@@ -272,7 +271,7 @@ def test_observable_cells_equal_dda_cells():
     for beyond, compare in ((-2e-3, torch.Tensor.__ge__), (2e-3, torch.Tensor.__le__)):
         crossed = torch.zeros(LATTICE.shape, dtype=torch.bool)
         for origin in origins:
-            length = ray_triangles(origin, directions, ROOM).clamp_max(3.0) + beyond
+            length = MeshWorld(ROOM).distances(origin, directions).clamp_max(3.0) + beyond
             ends = origin + directions * length[:, None]
             evidence = cast_evidence(
                 origin, ends, torch.ones(len(ends), dtype=torch.bool), RESOLUTION, LATTICE

@@ -119,7 +119,7 @@ def test_known_distances_give_the_same_frame():
     camera = DepthCamera(40, 30)
     here, teammate = pose(4, 3, 2), torch.tensor([[4.5, 3.5, 2.0]], dtype=torch.float64)
     one = camera.sense(ROOM, here, teammate, 0.3, seeded())
-    other = camera.sense(ROOM, here, teammate, 0.3, seeded(), camera.distances(ROOM, here))
+    other = camera.sense(ROOM, here, teammate, 0.3, seeded(), camera.beams(ROOM, here))
     assert all(torch.equal(a, b) for a, b in zip(vars(one).values(), vars(other).values(), strict=True))
 
 

@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -22,7 +23,7 @@ from gmmtorch.mapping import GaussianMap, Query
 from gmmtorch.occupancy import Calibration, CellClass, PointEvidence, SparseEvidence, classify, probability
 from gmmtorch.report import Event, OnRows, Row, ignore
 from gmmtorch.scan import Scan
-from gmmtorch.simulation import box, ray_triangles, sense, spinning_lidar
+from gmmtorch.simulation import MeshWorld, box, sense, spinning_lidar
 
 # -- a railing -----------------------------------------------------------------------------------------
 
@@ -48,9 +49,10 @@ class Railing:
 
     def distances(self, origin: Tensor, directions: Tensor) -> Tensor:
         """Range (N,) in metres from the origin (3,) along unit directions (N, 3); inf without a hit."""
-        return ray_triangles(origin, directions, self._triangles())
+        return self._mesh.distances(origin, directions)
 
-    def _triangles(self) -> Tensor:
+    @cached_property
+    def _mesh(self) -> MeshWorld:
         half = 0.5 * self.width
         parts = [
             box((-8.0, -8.0, -0.1), (8.0, 3.1, 0.0)),
@@ -58,7 +60,7 @@ class Railing:
             *(box((x - half, -half, 0.0), (x + half, half, _HEIGHT)) for x in _POSTS),
             *(box((-_HALF, -half, z - half), (_HALF, half, z + half)) for z in _BARS),
         ]
-        return torch.cat(parts)
+        return MeshWorld(torch.cat(parts))
 
     def scans(self, n_scans: int, seed: int) -> list[Scan]:
         """Scans (32 × 480 beams, range 12 m, noise 1 cm) from places along the railing."""

@@ -10,21 +10,40 @@ constexpr float REACHED = 0.05f;
 constexpr double WORTHLESS = 1e-4;
 constexpr double IMAGE_ODDS = 100.0;
 
-// An item is a view, which visits only cells that can be occupied, up to the first certain one.
+// The sum of a block in a register: on CUDA other items add to it at the same time.
+GMM_INLINE float opened(const float* sum) {
+#if defined(__CUDA_ARCH__)
+    return 0.0f;
+#else
+    return *sum;
+#endif
+}
+
+GMM_INLINE void closed(float* sum, float value) {
+#if defined(__CUDA_ARCH__)
+    add(sum, value);
+#else
+    *sum = value;
+#endif
+}
+
+// An item is `n_own` of the beams of a view: all on a CPU, one on CUDA. A beam visits only cells that can be
+// occupied, up to the first certain one.
 GMM_KERNEL information_by_block(int64_t item, const int64_t* cameras, const int64_t* yaws, int64_t nx,
-                                int64_t ny, int64_t nz, int64_t n_beams, int64_t n_templates,
+                                int64_t ny, int64_t nz, int64_t n_beams, int64_t n_own, int64_t n_templates,
                                 int64_t n_columns, int64_t n_steps, int64_t band, int64_t n_blocks,
                                 const int64_t* lengths, const int64_t* leading, const bool* ahead,
                                 const float* volumes, const float* kernel, const int32_t* offsets,
                                 const float* occupancies, const int32_t* blocks, bool is_shannon,
                                 double log_odds, float* scratch, float* gains, float* takens) {
-    const int64_t* camera = cameras + 3 * item;
+    const int64_t view = item * n_own / n_beams, begin = item * n_own % n_beams;
+    const int64_t* camera = cameras + 3 * view;
     const int64_t size[3] = {nx, ny, nz};
     for (int a = 0; a < 3; ++a)
         if (camera[a] < 0 || camera[a] >= size[a]) return;
     const int64_t base = (camera[0] * ny + camera[1]) * nz + camera[2];
-    float* gain = gains + item * n_blocks;
-    float* taken = takens + item * n_blocks;
+    float* gain = gains + view * n_blocks;
+    float* taken = takens + view * n_blocks;
     // p: first hits. v: those of the sharpened occupancy. kp, kv: upper halves of K p and K v.
     float* p = scratch + item * 6 * n_columns;
     float* v = p + n_columns;
@@ -32,8 +51,8 @@ GMM_KERNEL information_by_block(int64_t item, const int64_t* cameras, const int6
     float* kv = kp + n_columns;
     float* met = kv + n_columns;  // the occupancies, and the sharpened ones
     float* sharpened = met + n_columns;
-    for (int64_t beam = 0; beam < n_beams; ++beam) {
-        const int64_t t = yaws[item] * n_beams + beam;
+    for (int64_t beam = begin; beam < begin + n_own; ++beam) {
+        const int64_t t = yaws[view] * n_beams + beam;
         int64_t n = lengths[t];
         for (int a = 0; a < 3; ++a) {
             const int64_t wall = ahead[a * n_templates + t] ? size[a] - 1 - camera[a] : camera[a];
@@ -100,20 +119,20 @@ GMM_KERNEL information_by_block(int64_t item, const int64_t* cameras, const int6
             const int64_t next = blocks[base + offset[i]];
             if (next != block) {
                 if (block >= 0) {
-                    gain[block] = gained;
-                    taken[block] = took;
+                    closed(gain + block, gained);
+                    closed(taken + block, took);
                 }
                 block = next;
-                gained = gain[block];
-                took = taken[block];
+                gained = opened(gain + block);
+                took = opened(taken + block);
             }
             const float o = met[i], clear = 1.0f - o, resolved = clear * p[i];
             gained += resolved * volume[i] * share;
             took += minimum(clear * o, resolved / REACHED) * volume[i];
         }
         if (block >= 0) {
-            gain[block] = gained;
-            taken[block] = took;
+            closed(gain + block, gained);
+            closed(taken + block, took);
         }
     }
 }

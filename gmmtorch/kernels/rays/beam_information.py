@@ -2,8 +2,8 @@
 
 The beams of a view meet cells that templates list relative to the camera's cell. A beam's information, CSQMI
 or Shannon information, is distributed over its cells in proportion to the variance that it resolves there.
-The fused kernel computes one view in one item and visits only cells that can be occupied, up to the first
-certain one. Its twin handles a few views at a time with all cells of their beams.
+The fused kernel computes one view in one item, or one beam of it on CUDA, and visits only cells that can be
+occupied, up to the first certain one. Its twin handles a few views at a time with all cells of their beams.
 """
 
 from __future__ import annotations
@@ -85,13 +85,16 @@ def _fused(
 ) -> tuple[Tensor, Tensor]:
     n_views, device = len(cameras), cameras.device
     n_templates, n_columns = beams.volumes.shape
+    n_own = beams.per_view if device.type == "cpu" else 1
+    n_items = n_views * beams.per_view // n_own
     gain, taken = torch.zeros(2, n_views, cells.n_blocks, device=device)
     _KERNEL(
-        n_views,
+        n_items,
         cameras,
         yaw,
         *cells.shape,
         beams.per_view,
+        n_own,
         n_templates,
         n_columns,
         beams.leading.shape[-1],
@@ -107,7 +110,7 @@ def _fused(
         cells.block,
         shannon_information,
         math.log(IMAGE_ODDS),
-        torch.empty(n_views, 6, n_columns, device=device),
+        torch.empty(n_items, 6, n_columns, device=device),
         gain,
         taken,
         device=device,

@@ -14,20 +14,38 @@ from torch import Tensor
 from gmmtorch.kernels.compiler import FusedKernel
 
 
-class Motions(NamedTuple):
-    """P motions from each of N states: x, y, z, yaw and three velocities; metres, radians, seconds.
+class Library(NamedTuple):
+    """P motions: x, y, z, yaw and three velocities; metres, radians, seconds.
 
-    paths: (F, P, S, 7) float64, states of the motions from the origin with yaw 0, for F initial velocities.
+    paths: (P, P, S, 7) float64, states of the motions from the origin with yaw 0, after each of the motions.
     stops: (P, B, 7) float64, how a robot comes to rest after each motion, from the origin with yaw 0.
-    follows: (N,) int64, row of `paths` for each state. starts: (N, 7) float64. ends: (N, P, 7) float64, the
-    last states of the paths.
     """
 
+    n_motions: int
+    n_steps: int
+    n_stops: int
     paths: Tensor
     stops: Tensor
-    follows: Tensor
-    starts: Tensor
-    ends: Tensor
+
+
+class FreeSpace(NamedTuple):
+    """Where motions are safe.
+
+    passable: (nx, ny, nz) bool, cells in which the centre of a robot may be; low: (3,) int64, the lowest.
+    resolution: side of a cell (m).
+    peers: (M, T, 3) float64, metres, positions of other robots after 1, 2, …, T steps. separation: metres.
+    """
+
+    passable: Tensor
+    low: Tensor
+    nx: int
+    ny: int
+    nz: int
+    resolution: float
+    peers: Tensor
+    n_peers: int
+    n_times: int
+    separation: float
 
 
 _KERNEL = FusedKernel(
@@ -36,52 +54,38 @@ _KERNEL = FusedKernel(
 
 
 def motions_are_clear(
-    motions: Motions,
-    passable: Tensor,
-    low: Tensor,
-    resolution: float,
+    library: Library,
+    space: FreeSpace,
+    follows: Tensor,
+    starts: Tensor,
+    ends: Tensor,
     n_parts: int,
-    peers: Tensor,
     first: int,
-    separation: float,
 ) -> Tensor:
     """Which motions (N, P) are safe: see `feasible`. A motion that does not move is.
 
     Args:
-        passable: (nx, ny, nz) bool, cells in which the centre of a robot may be; low (3,) int64: the lowest.
-        resolution: side of a cell (m). n_parts: checked points on each step.
-        peers: (M, T, 3) float64, metres, positions of other robots after 1, 2, …, T steps; first: the one
-            that belongs to the first step of the motions, below T. separation: metres.
+        follows: (N,) int64, the motion before each start. starts: (N, 7) float64.
+        ends: (N, P, 7) float64, the last states of the motions.
+        n_parts: checked points on each step. first: of the peers' positions, that of the first step; below T.
 
     A motion differs from the twin's only if it meets an edge of a cell, or the separation, within rounding.
     """
-    clear = torch.empty(motions.ends.shape[:2], dtype=torch.bool, device=passable.device)
-    turns = [
-        torch.stack([poses[..., 3].cos(), poses[..., 3].sin()], -1)
-        for poses in (motions.starts, motions.ends)
-    ]
+    device = starts.device
+    clear = torch.empty(ends.shape[:2], dtype=torch.bool, device=device)
+    turns = [torch.stack([poses[..., 3].cos(), poses[..., 3].sin()], -1) for poses in (starts, ends)]
     _KERNEL(
         clear.numel(),
-        clear.shape[1],
-        motions.paths.shape[2],
-        motions.stops.shape[1],
-        motions.paths,
-        motions.stops,
-        motions.follows,
-        motions.starts.contiguous(),
+        *library,
+        *space,
+        follows,
+        starts.contiguous(),
         turns[0],
-        motions.ends.contiguous(),
+        ends.contiguous(),
         turns[1],
-        passable.contiguous(),
-        low.contiguous(),
-        *passable.shape,
-        resolution,
         n_parts,
-        peers.contiguous(),
-        *peers.shape[:2],
         first,
-        separation,
         clear,
-        device=passable.device,
+        device=device,
     )
     return clear

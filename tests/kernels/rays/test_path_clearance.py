@@ -54,18 +54,17 @@ def test_motions_are_clear_where_the_twin_says_so(seed, n_peers, length, after, 
     peers = PeerTrajectories(way)
     steps = after * LIBRARY.dynamics.n_steps
 
-    continued = LIBRARY.continued(states)
-    assert continued is not None
-    found = feasible_motions(*continued, there, peers, steps)
-
+    follows = LIBRARY.follows(states)
+    assert follows is not None
     paths = LIBRARY.rollout(states)
-    assert torch.equal(continued[0].ends, paths[:, :, -1])
+    found = feasible_motions(LIBRARY, follows, states, paths[:, :, -1], there, peers, steps)
+
     braking = LIBRARY.braking(paths[:, :, -1])
     expected = feasible(paths, braking, there, peers.later(steps), start=states[:, None])
     assert torch.equal(found, expected)
 
 
-def test_only_the_ends_of_primitives_can_be_continued():
+def test_only_the_ends_of_primitives_follow_one():
     state = torch.zeros(1, 7, dtype=torch.float64)
     state[0, 4] = 0.1
-    assert LIBRARY.continued(state) is None
+    assert LIBRARY.follows(state) is None

@@ -140,6 +140,7 @@ class Mission:
             options.coordination if options.shares else "myopic", options.n_rounds
         )
         self._network, self._score = network, score
+        self._mesh = world.mesh.to(options.device)  # where cameras see it
         self._generator = torch.Generator().manual_seed(options.seed)
         self._views_sent_at = 0.0
 
@@ -239,7 +240,7 @@ class Mission:
     def _sense(self, agent: Agent, now: float) -> None:
         others = [other.position for other in self.robots if other is not agent.robot]
         there = torch.stack(others) if others else torch.zeros(0, 3, dtype=torch.float64)
-        frame = agent.capture(self.world.mesh, there)
+        frame = agent.capture(self._mesh, there)
         update = agent.learn(frame, now)
         if self._score is not None:
             with self.watch("scoring"):

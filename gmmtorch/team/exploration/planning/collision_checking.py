@@ -14,8 +14,9 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.kernels import Motions, motions_are_clear
+from gmmtorch.kernels import FreeSpace, motions_are_clear
 from gmmtorch.team.exploration.planning.coordination import PeerTrajectories, clear_of
+from gmmtorch.team.exploration.planning.primitives import Primitives
 from gmmtorch.team.exploration.robot.mapper import LocalMap
 from gmmtorch.team.exploration.world.navigable import widened
 
@@ -151,23 +152,48 @@ def feasible(
 
 
 def feasible_motions(
-    motions: Motions, longest: Tensor, local_map: LocalMap, peers: PeerTrajectories, after: int
+    primitives: Primitives,
+    follows: Tensor,
+    states: Tensor,
+    ends: Tensor,
+    local_map: LocalMap,
+    peers: PeerTrajectories,
+    after: int,
 ) -> Tensor:
-    """`feasible` of motions, (N, P), by the fused kernel.
+    """`feasible` of all primitives, (N, P), from states (N, 7) to ends (N, P, 7) by the fused kernel.
 
-    longest: (2,), longest step (m) and largest turn (rad) in a step. after: steps of the peers before the
-    motions begin.
+    follows: (N,), the primitive that ends with the velocities of each state. after: steps of the peers before
+    the motions begin.
     """
+    longest, turn = primitives.longest[follows].amax(0).tolist()
     return motions_are_clear(
-        motions,
-        local_map.passable,
-        local_map.low,
-        local_map.resolution,
-        _points_of_a_step(float(longest[0]), float(longest[1]), _SPACING * local_map.resolution),
-        peers.paths,
+        primitives.library,
+        free_space(local_map, peers),
+        follows,
+        states,
+        ends,
+        _points_of_a_step(longest, turn, spacing_of(local_map)),
         min(after, peers.paths.shape[1] - 1),
-        peers.separation,
     )
+
+
+def free_space(local_map: LocalMap, peers: PeerTrajectories) -> FreeSpace:
+    """What the fused kernels check motions against."""
+    passable, paths = local_map.passable.contiguous(), peers.paths.contiguous()
+    (nx, ny, nz), (n_peers, n_times, _) = passable.shape, paths.shape
+    side = local_map.resolution
+    return FreeSpace(passable, local_map.low, nx, ny, nz, side, paths, n_peers, n_times, peers.separation)
+
+
+def spacing_of(local_map: LocalMap) -> float:
+    """Metres between the checked points of a path."""
+    return _SPACING * local_map.resolution
+
+
+def check_steps(primitives: Primitives, local_map: LocalMap) -> None:
+    """Raises `InvalidArgumentError` if steps of primitives are too long to be checked in a map's cells."""
+    longest, turn = primitives.longest.amax(0).tolist()
+    _points_of_a_step(longest, turn, spacing_of(local_map))
 
 
 def _covering_boxes(square: float) -> list[tuple[int, int, int]]:

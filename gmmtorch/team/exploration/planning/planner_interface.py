@@ -76,31 +76,29 @@ def options(
     dynamics = primitives.dynamics
     paths = primitives.rollout(states)
     braking = primitives.braking(paths[:, :, -1])
+    steps = after * dynamics.n_steps
+    follows = primitives.follows(states) if is_fused(task.local_map.passable, states) else None
+    if follows is not None and not (may_escape and is_stuck(task.local_map, states)):
+        ends = paths[:, :, -1]
+        return (
+            paths,
+            braking,
+            feasible_motions(primitives, follows, states, ends, task.local_map, task.peers, steps),
+        )
     safe = feasible(
         paths,
         braking,
         task.local_map,
-        task.peers.later(after * dynamics.n_steps) if after else task.peers,
+        task.peers.later(steps) if after else task.peers,
         start=states[:, None],
         radius=dynamics.radius if may_escape else None,
     )
     return paths, braking, safe
 
 
-def continuations(
-    primitives: Primitives, states: Tensor, task: PlanningTask, after: int
-) -> tuple[Tensor, Tensor]:
-    """The ends (N, P, 7) of all primitives from states (N, 7), and which primitives are feasible (N, P).
-
-    after: primitives of the robot before these states.
-    """
-    passable = task.local_map.passable
-    continued = primitives.continued(states) if is_fused(passable, states) else None
-    if continued is None:
-        paths, _, safe = options(primitives, states, task, after=after)
-        return paths[:, :, -1], safe
-    steps = after * primitives.dynamics.n_steps
-    return continued[0].ends, feasible_motions(*continued, task.local_map, task.peers, steps)
+def is_stuck(local_map: LocalMap, states: Tensor) -> bool:
+    """Whether a robot in one of the states (N, 7) is in a cell that is not passable."""
+    return not bool(local_map.is_passable(states[:, :3]).all())
 
 
 _METRES = 0.8  # largest distance of one plan

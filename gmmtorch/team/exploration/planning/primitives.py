@@ -11,7 +11,7 @@ import math
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels import Motions
+from gmmtorch.kernels import Library
 from gmmtorch.team.exploration.mission.options import Dynamics
 
 _QUADRATURE = ((0.5 - math.sqrt(0.15), 5 / 18), (0.5, 8 / 18), (0.5 + math.sqrt(0.15), 5 / 18))
@@ -22,7 +22,8 @@ class Primitives:
     """The set of primitives: arcs, climbing arcs, slow arcs, turns in place, vertical motion, and a stop.
 
     commands: (P, 3) float64, the final velocities v, v_z, ω of each primitive. stop: index of the
-    primitive that comes to rest.
+    primitive that comes to rest. library: the paths after each primitive. longest: (P, 2), the longest step
+    (m) and the largest turn (rad) in a step of these.
     """
 
     def __init__(self, dynamics: Dynamics) -> None:
@@ -39,7 +40,8 @@ class Primitives:
         ends = torch.cat([torch.zeros(len(library), 4, dtype=torch.float64), self.commands], 1)
         self._paths = self._rollout(ends)
         self._stops = self._braking(ends)
-        self._longest = self._longest_steps()
+        self.library = Library(len(library), dynamics.n_steps, self._stops.shape[1], self._paths, self._stops)
+        self.longest = self._longest_steps()
 
     def __len__(self) -> int:
         return len(self.commands)
@@ -61,7 +63,7 @@ class Primitives:
         x += v/ω (sin(ψ + ωT) − sin ψ), y += v/ω (cos ψ − cos(ψ + ωT)) to better than 10⁻⁸ m.
         """
         states = states.double()
-        follows = self._follows(states)
+        follows = self.follows(states)
         if follows is None:
             return self._rollout(states)
         return _moved(self._paths[follows], states[:, None])
@@ -69,19 +71,10 @@ class Primitives:
     def braking(self, states: Tensor) -> Tensor:
         """Return states (..., B, 7) of braking from states (..., 7); the last is at rest."""
         flat = states.double().reshape(-1, 7)
-        follows = self._follows(flat)
+        follows = self.follows(flat)
         if follows is None:
             return self._braking(states)
         return _moved(self._stops[follows], flat).view(*states.shape[:-1], *self._stops.shape[1:])
-
-    def continued(self, states: Tensor) -> tuple[Motions, Tensor] | None:
-        """Return the motions from states (N, 7) after primitives, and the longest step (m) and the largest
-        turn (rad) in a step, (2,); None if a state has velocities with which no primitive ends."""
-        follows = self._follows(states)
-        if follows is None:
-            return None
-        ends = _moved(self._paths[follows, :, -1:], states[:, None])[:, :, 0]
-        return Motions(self._paths, self._stops, follows, states, ends), self._longest[follows].amax(0)
 
     def _longest_steps(self) -> Tensor:
         """Return the longest step (m) and largest turn (rad) of the motions after each primitive, (P, 2)."""
@@ -91,7 +84,7 @@ class Primitives:
         length = step[..., :3].square().sum(-1).sqrt()
         return torch.stack([length.flatten(1).amax(1), step[..., 3].abs().flatten(1).amax(1)], 1)
 
-    def _follows(self, states: Tensor) -> Tensor | None:
+    def follows(self, states: Tensor) -> Tensor | None:
         """Return the primitive (N,) with the velocities of each state (N, 7); None if a state has none."""
         is_end = (states[:, None, 4:] == self.commands).all(-1)
         which = is_end.int().argmax(1)

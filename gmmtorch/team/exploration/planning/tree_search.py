@@ -9,8 +9,10 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from gmmtorch.kernels import MotionTree, is_fused
+from gmmtorch.team.exploration.planning.collision_checking import check_steps, free_space, spacing_of
 from gmmtorch.team.exploration.planning.journeys import Goal
-from gmmtorch.team.exploration.planning.planner_interface import PlanningTask, continuations, options
+from gmmtorch.team.exploration.planning.planner_interface import PlanningTask, options
 from gmmtorch.team.exploration.planning.primitives import Primitives
 from gmmtorch.team.exploration.planning.view_evaluator import ViewCache
 
@@ -95,7 +97,8 @@ def search_tree(
     memory: values of views; None: only the goal counts. goal: the goal; None: only views count. first:
     primitives of a branch that is tried first, such as the rest of the last plan.
     """
-    tree = _Tree(primitives, rule, task, memory, goal)
+    kind = _FusedTree if is_fused(task.local_map.passable, task.state) else _Tree
+    tree = kind(primitives, rule, task, memory, goal)
     tree.grow(first)
     return tree.best()
 
@@ -236,7 +239,8 @@ class _Tree:
         for depth in sorted({node.depth for node in nodes if not node.closed}):
             some = [node for node in nodes if node.depth == depth]
             states = self._states[torch.tensor([node.number for node in some])]
-            self._open(some, *continuations(self._primitives, states, self._task, depth))
+            flown, _, feasible = options(self._primitives, states, self._task, after=depth)
+            self._open(some, flown[:, :, -1], feasible)
 
     def _open(self, nodes: list[_Node], ends: Tensor, feasible: Tensor) -> None:
         """Store the primitives that can follow N nodes: ends (N, P, 7), and which are feasible (N, P)."""
@@ -249,3 +253,80 @@ class _Tree:
         count = feasible.sum(1).tolist()
         for node, actions, n in zip(nodes, order.tolist(), count, strict=True):
             node.untried, node.closed = actions[:n], n == 0
+
+
+class _FusedTree:
+    """The tree of one search in the tables of fused kernels; `_Tree` is its twin."""
+
+    def __init__(
+        self,
+        primitives: Primitives,
+        rule: SearchRule,
+        task: PlanningTask,
+        memory: ViewCache | None,
+        goal: Goal | None,
+    ) -> None:
+        check_steps(primitives, task.local_map)
+        self._primitives, self._rule, self._task = primitives, rule, task
+        self._memory, self._goal = memory, goal
+        start, residual = task.state.double(), task.residual[None]
+        if memory is not None:
+            residual = memory.marginal(memory.rows(start[None, :4]), residual)[1]
+        self._paths, self._braking, feasible = options(primitives, start[None], task, may_escape=True)
+        self._space, self._spacing = free_space(task.local_map, task.peers), spacing_of(task.local_map)
+        self._tree = MotionTree(
+            1 + rule.depth + rule.n_rounds * rule.n_leaves,
+            start,
+            self._paths[0, :, -1],
+            feasible[0],
+            residual[0],
+            0.0 if goal is None else float(goal.cost(start).clamp_max(_FAR)),
+            deepest=rule.depth,
+            exploration=rule.exploration,
+            widening=_WIDENING,
+            discount=rule.discount,
+            weight=0.0 if goal is None else goal.weight,
+            aims=0.0 if goal is None else 1.0,
+        )
+
+    def grow(self, first: Sequence[int]) -> None:
+        """Try the branch `first`, then the most promising leaves, round by round."""
+        orders = self._orders()
+        for action in first[: self._rule.depth]:
+            if not self._tree.choose(orders, 1, 0, action):
+                break
+            orders = self._extended(1)
+        for turn in range(1, self._rule.n_rounds + 1):
+            n = self._tree.choose(orders, self._rule.n_leaves, turn)
+            if not n:
+                break
+            orders = self._extended(n, is_last=turn == self._rule.n_rounds)
+
+    def best(self) -> Found | None:
+        """Return the branch to the node with the largest return; the first of equals."""
+        best = self._tree.best()
+        if best is None:
+            return None
+        nodes, actions, value, information, progress = best
+        path, braking = self._paths[0, actions[0]], self._braking[0, actions[0]]
+        views = self._tree.states[nodes, :4]
+        return Found(actions, path, braking, views, value, information, progress)
+
+    def _extended(self, n: int, is_last: bool = False) -> Tensor:
+        """Set the values of the n newest nodes; returns the orders of what can follow them."""
+        tree = self._tree
+        views: tuple[Tensor | None, ...] = (None, None, None)
+        if self._memory is not None:
+            rows = self._memory.rows(tree.states[tree.n_nodes - n : tree.n_nodes, :4])
+            views = rows, *self._memory.tables
+        primitives = self._primitives
+        tree.open(primitives.library, self._space, primitives.longest, self._spacing, n, is_last, views)
+        return self._orders()
+
+    def _orders(self) -> Tensor:
+        """Orders (n, P) in which the motions from the nodes opened last are tried: towards the goal first."""
+        n = self._tree.n_opened, len(self._primitives)
+        orders = torch.rand(n, generator=self._task.generator, dtype=torch.float64)
+        if self._goal is None or not len(orders):
+            return orders
+        return self._goal.cost(self._tree.ends_opened()).clamp_max(_FAR)

@@ -6,6 +6,7 @@ import math
 import weakref
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -241,14 +242,14 @@ class ViewEvaluator:
             raise InvalidArgumentError(
                 f"poses have shape {tuple(poses.shape)}; expected (V, 4): x, y, z, yaw."
             )
-        poses = poses.double()
-        place = (poses[:, :3] / self.resolution - 0.5) / self.stride
-        if not bool((place.abs() < 2**52).all() & (poses[:, 3].abs() < 2**32).all()):
+        given = poses.double().numpy()
+        place = (given[:, :3] / self.resolution - 0.5) / self.stride
+        if not ((np.abs(place) < 2**52).all() and (np.abs(given[:, 3]) < 2**32).all()):
             raise InvalidArgumentError(
                 "poses must be finite metres and radians, less than 2⁵² cells from the origin."
             )
-        yaw = (poses[:, 3:] * (self.n_yaws / (2 * math.pi))).round().long() % self.n_yaws
-        return torch.cat([place.round().long(), yaw], 1)
+        yaw = np.rint(given[:, 3:] * (self.n_yaws / (2 * math.pi))) % self.n_yaws
+        return torch.from_numpy(np.concatenate([np.rint(place), yaw], 1).astype(np.int64))
 
     def poses(self, keys: Tensor) -> Tensor:
         """Return poses (V, 4) float64 of lattice poses (V, 4), yaw in [0, 2π)."""
@@ -257,12 +258,11 @@ class ViewEvaluator:
 
     def evaluate(self, local_map: LocalMap, keys: Tensor) -> ViewValues:
         """Evaluate each view (V, 4) alone. Beams end at the map's border; a camera outside sees nothing."""
-        cells, unresolved = self._window(local_map)
-        cameras = (keys[:, :3] * self.stride - local_map.low.to(keys.device)).to(self.device)
+        cells, enough = self._window(local_map)
+        cameras = (keys[:, :3] * self.stride - local_map.low).to(self.device)
         gain, taken = information_by_block(
             self._beams, cells, cameras, keys[:, 3].to(self.device), self.information == "fsmi"
         )
-        enough = (_SATURATED * unresolved).clamp_min_(torch.finfo(torch.float32).tiny)
         measured = taken.div_(enough).clamp_max_(1)
         if self.device.type != "cpu":
             gain, measured = torch.stack([gain, measured]).cpu()
@@ -270,10 +270,13 @@ class ViewEvaluator:
 
     def residual(self, local_map: LocalMap, poses: Tensor) -> Tensor:
         """Return what views from poses (M, 4) leave of each block, (G,) float32: Π (1 − measured)."""
+        if len(poses) == 0:
+            return torch.ones(self._window(local_map)[0].n_blocks)
         return (1 - self.evaluate(local_map, self.keys(poses)).measured).prod(0)
 
     def _window(self, local_map: LocalMap) -> tuple[Cells, Tensor]:
-        """The cells of a local map, and the sum of o(1 − o) in each block (G,), for all its evaluations."""
+        """The cells of a local map, and what a view must take from each block (G,) to measure it, for all
+        evaluations of the map."""
         window = self._windows.get(local_map)
         if window is not None:
             return window
@@ -291,8 +294,9 @@ class ViewEvaluator:
         occupancy = _with_end(occupancy.view(-1))
         cells = self._empty._replace(occupancy=occupancy)
         unresolved = torch.bincount(cells.block, (1 - occupancy).mul_(occupancy), cells.n_blocks)
-        self._windows[local_map] = cells, unresolved
-        return cells, unresolved
+        enough = (_SATURATED * unresolved).clamp_min_(torch.finfo(torch.float32).tiny)
+        self._windows[local_map] = cells, enough
+        return cells, enough
 
     def _laid_out(self, shape: tuple[int, ...]) -> Cells:
         """The index tables of all local maps of a shape, without occupancy."""
@@ -337,9 +341,9 @@ class ViewCache:
                 self._row[name] = len(self._row)
                 new.append(i)
         if new:
-            values = self._evaluator.evaluate(self._local_map, keys[new])
-            self._store(len(self._row) - len(new), values)
-            self._keys.append(keys[new])
+            fresh = keys if len(new) == len(keys) else keys[new]
+            self._store(len(self._row) - len(new), self._evaluator.evaluate(self._local_map, fresh))
+            self._keys.append(fresh)
         return torch.tensor([self._row[name] for name in names], dtype=torch.int64)
 
     def _store(self, begin: int, values: ViewValues) -> None:
@@ -351,6 +355,11 @@ class ViewCache:
             self._left = torch.cat([self._left[:begin], spare])
         self._gain[begin:stop] = values.gain
         torch.sub(1, values.measured, out=self._left[begin:stop])
+
+    @property
+    def tables(self) -> tuple[Tensor, Tensor]:
+        """Gains (V, G), and what each view leaves of each block (V, G); `rows` numbers the views."""
+        return self._gain, self._left
 
     def marginal(self, rows: Tensor, residuals: Tensor) -> tuple[Tensor, Tensor]:
         """Return the gain (V,) of views given residuals (V, G), and the residuals (V, G) after them."""

@@ -254,7 +254,7 @@ class Agent:
         self._generator = torch.Generator().manual_seed(seed)
         self._local_map: LocalMap | None = None  # none is needed at rest
         self._rests = False
-        self._seen_from: tuple[Tensor, Tensor] | None = None  # the last pose, and the distances there
+        self._seen_from: tuple[Tensor, tuple[Tensor, Tensor]] | None = None  # the last pose, and its beams
         self._plan: Plan | None = None
         self._views_at = -math.inf  # when views were sent last
         self._sent_pose: Tensor | None = None  # where it rests, according to the last plan sent
@@ -283,11 +283,10 @@ class Agent:
             options = self.options
             pose = self.robot.state[:4]
             if self._seen_from is None or not torch.equal(self._seen_from[0], pose):
-                self._seen_from = pose.clone(), options.camera.distances(mesh, pose)
-            frame = options.camera.sense(
+                self._seen_from = pose.clone(), options.camera.beams(mesh, pose)
+            return options.camera.sense(
                 mesh, pose, others, options.dynamics.radius, self._generator, self._seen_from[1]
             )
-            return frame.to(options.device)
 
     def learn(self, frame: DepthFrame, now: float) -> FrameUpdate:
         """Learns from a frame, and sends what is due of the map."""

@@ -123,7 +123,7 @@ def collides(world: MeshWorld, positions: Tensor, radius: float) -> Tensor:
     robot's width, so that no step passes through a surface undetected."""
     if len(positions) == 0:
         return torch.zeros(0, dtype=torch.bool)
-    return world.clearance(positions, threads=torch.get_num_threads()) < radius
+    return world.clearance(positions) < radius
 
 
 def finely(positions: Tensor) -> Tensor:
