@@ -283,6 +283,11 @@ def _first_rows(labels: Tensor, n: int) -> Tensor:
     return rows.new_full((n,), labels.shape[0]).scatter_reduce_(0, labels, rows, "amin")
 
 
+def _unnumbered(ids: Tensor) -> Tensor:
+    """The ids (K, 2) without sequence numbers."""
+    return torch.stack([ids[:, 0], torch.full_like(ids[:, 1], UNNUMBERED)], 1)
+
+
 def compact_to_bytes(
     components: Components,
     max_bytes: int,
@@ -293,28 +298,29 @@ def compact_to_bytes(
     """Merges components until their `size` is at most `max_bytes`; origins are limited as by `limit_origins`.
 
     Beyond that size, components lose their numbers: numbered anew, in the order of space, each takes a byte
-    less.
+    less. The size, as a power of the number of components that its last two values tell, shall be a
+    thousandth below `max_bytes`, so that few sizes are measured; at first it is proportional.
 
     Raises `InvalidArgumentError` if a single component with one origin is too large.
     """
     components = limit_origins(components, max_origins, mean_origins)
-    fixed = None
-    while len(components) and (taken := size(components)) > max_bytes:
-        if len(components) == 1:
-            if components.seen_by.shape[0] == 1:
-                raise InvalidArgumentError(
-                    f"max_bytes={max_bytes} is less than the {taken} that one component takes; allow more."
-                )
+    last: tuple[int, int] | None = None
+    numbered = True
+    while (k := len(components)) and (taken := size(components)) > max_bytes:
+        if numbered:
+            numbered = False
+            if bool((components.ids[:, 1] != UNNUMBERED).any()):
+                components = replace(components, ids=_unnumbered(components.ids))
+                continue
+        if k > 1:
+            power = math.log(last[1] / taken) / math.log(last[0] / k) if last else 1.0
+            wanted = min(k - 1, int(k * (0.999 * max_bytes / taken) ** (1 / max(power, 0.25))))
+            last = k, taken
+            components = limit_origins(compact(components, max(1, wanted)), max_origins, mean_origins)
+        elif components.seen_by.shape[0] > 1:
             components = limit_origins(components, 1)
-            continue
-        if fixed is None:
-            fixed = size(Components.empty(components.dim, components.means.device))
-            robots = components.ids[:, 0]
-            components = replace(
-                components, ids=torch.stack([robots, torch.full_like(robots, UNNUMBERED)], 1)
+        else:
+            raise InvalidArgumentError(
+                f"max_bytes={max_bytes} is less than the {taken} that one component takes; allow more."
             )
-            continue
-        room = max(0, max_bytes - fixed) / max(1, taken - fixed)
-        wanted = max(1, min(len(components) - 1, int(len(components) * room)))
-        components = limit_origins(compact(components, wanted), max_origins, mean_origins)
     return components
