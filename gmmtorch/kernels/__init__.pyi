@@ -53,6 +53,8 @@ from .mixtures.matching import explained_points as explained_points
 from .mixtures.matching import near_pairs as near_pairs
 from .mixtures.matching import overlap_sums as overlap_sums
 from .mixtures.matching import raster_sums as raster_sums
+from .mixtures.pair_merges import is_pair_merges_fused as is_pair_merges_fused
+from .mixtures.pair_merges import pair_merges as pair_merges
 from .mixtures.small_fits import fused_em as fused_em
 from .mixtures.small_fits import fused_kmeans as fused_kmeans
 from .mixtures.small_fits import fused_moments as fused_moments

@@ -14,11 +14,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
 from gmmtorch.linalg import on_cpu
 from gmmtorch.mapping.attributes import moments
 from gmmtorch.mapping.components import UNNUMBERED, Components
-from gmmtorch.mixture import Parameters, merge_components, simplify
+from gmmtorch.mixture import MergedInRounds, Parameters, merge_in_rounds
 
 
 class AssignedViewpoints(NamedTuple):
@@ -172,38 +172,32 @@ def estimated_bytes(components: Components) -> int:
     return 300 + 16 * len(components) + 2 * max(0, further) + 7 * components.origins.shape[0]
 
 
-def merged(components: Components, labels: Tensor) -> Components:
-    """Merges the components of each label (K,). Moments and counts are preserved, viewpoints are united.
+def united(components: Components, found: MergedInRounds) -> Components:
+    """The components after the merges that were found for them. Viewpoints are united.
 
-    Labels are 0, 1, … without gaps. A component with a label of its own stays bit-identical. A merged
-    component is `UNNUMBERED` and has the robot of its first member.
+    A component that is not merged stays bit-identical. A merged component is `UNNUMBERED` and has the robot
+    of its first member.
     """
-    n = int(labels.max()) + 1 if labels.numel() else 0
-    members = torch.bincount(labels, minlength=n)
-    first = _first_rows(labels, n)
-    joined = merge_components(components.support, components.means, components.covariances, labels, n)
-    single = members == 1
-    ids = components.ids[first]
-    ids[~single, 1] = UNNUMBERED
-    seen_by, seen_from, seen_count = union_of_viewpoints(components, labels)
+    first, is_merged = found.first, found.members > 1
+    weights, means, covariances = found.parameters
+    robots, numbers = components.ids[first].unbind(1)
+    seen_by, seen_from, seen_count = union_of_viewpoints(components, found.labels)
     attributes = components.attributes
     if attributes:
-        rows, groups = (~single[labels]).nonzero().squeeze(1), (~single).nonzero().squeeze(1)
-        number = ((~single).cumsum(0) - 1)[labels[rows]]
-        before, after = (
-            (components.means[rows], components.covariances[rows]),
-            (joined.means[groups], joined.covariances[groups]),
-        )
+        rows, groups = is_merged[found.labels].nonzero().squeeze(1), is_merged.nonzero().squeeze(1)
+        number = (is_merged.cumsum(0) - 1)[found.labels[rows]]
+        before = components.means[rows], components.covariances[rows]
+        after = means[groups], covariances[groups]
         made = moments.merged(attributes.selected(rows), number, components.support[rows], before, after)
         attributes = attributes.selected(first).replaced(groups, made)
     return replace(
         components,
-        means=torch.where(single[:, None], components.means[first], joined.means),
-        covariances=torch.where(single[:, None, None], components.covariances[first], joined.covariances),
+        means=means,
+        covariances=covariances,
         attributes=attributes,
-        support=torch.where(single, components.support[first], joined.weights),
+        support=weights,
         max_range=components.max_range[first],
-        ids=ids,
+        ids=torch.stack([robots, torch.where(is_merged, UNNUMBERED, numbers)], 1),
         seen_by=seen_by,
         seen_from=seen_from,
         seen_count=seen_count,
@@ -230,6 +224,7 @@ def compact(
     if max_components is not None:
         check_whole("max_components", max_components, 1)
     if max_cost is not None:
+        check_number("max_cost", max_cost)
         components = _merged_by_kind(components, None, max_cost)
     if max_components is not None and len(components) > max_components:
         components = _merged_by_kind(components, max_components, None)
@@ -237,50 +232,43 @@ def compact(
 
 
 def _merged_by_kind(components: Components, limit: int | None, max_cost: float | None) -> Components:
-    labels = torch.zeros(len(components), dtype=torch.int64, device=components.means.device)
-    n_labels = 0
-    for flag, share in _shares(components.max_range, limit).items():
-        rows = (components.max_range == flag).nonzero().squeeze(1)
-        if len(rows) == 0:
-            continue
-        if share == 0:  # a budget of one component for both kinds: surfaces stay
-            surfaces = (~components.max_range).nonzero().squeeze(1)
-            return _merged_by_kind(components.selected(surfaces), limit, max_cost)
-        given = Parameters(components.support[rows], components.means[rows], components.covariances[rows])
-        if components.attributes and not flag:
-            joint = moments.joint_moments(components.attributes.selected(rows), *given)
-            given = Parameters(given.weights, *joint)
-        cost = "hellinger" if limit is None else "kullback_leibler"
-        found = simplify(given, share, max_cost, cost, most_exact=0)
-        labels[rows] = found.labels + n_labels
-        n_labels += found.parameters.weights.shape[0]
-    return merged(components, _by_first_member(labels))
-
-
-def _shares(max_range: Tensor, limit: int | None) -> dict[bool, int | None]:
-    """Number of components of each kind that are left."""
-    if limit is None:
-        return {False: None, True: None}
-    n, n_empty = max_range.shape[0], int(max_range.sum())
+    n, n_empty = len(components), int(components.max_range.sum())
     if n_empty in (0, n):
-        return {False: limit, True: limit}
-    empty = min(max(1, round(limit * n_empty / n)), limit - 1)
-    return {False: limit - empty, True: empty}
+        return united(components, _merged(components, n_empty == 0, limit, max_cost))
+    surfaces, empty = ((components.max_range == flag).nonzero().squeeze(1) for flag in (False, True))
+    if limit == 1:  # a budget of one component for both kinds: surfaces stay
+        return _merged_by_kind(components.selected(surfaces), limit, max_cost)
+    limits: tuple[int | None, int | None] = (None, None)
+    if limit is not None:  # both kinds shrink in proportion
+        share = min(max(1, round(limit * n_empty / n)), limit - 1)
+        limits = limit - share, share
+    one = _merged(components.selected(surfaces), True, limits[0], max_cost)
+    other = _merged(components.selected(empty), False, limits[1], max_cost)
+    order = torch.cat([surfaces[one.first], empty[other.first]]).argsort()
+    place = torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device))
+    labels = torch.empty_like(components.max_range, dtype=torch.int64)
+    labels[surfaces], labels[empty] = place[one.labels], place[len(one.first) + other.labels]
+    first = torch.cat([surfaces[one.first], empty[other.first]])[order]
+    parts = zip(one.parameters, other.parameters, strict=True)
+    parameters = Parameters(*(torch.cat(part)[order] for part in parts))
+    both = MergedInRounds(parameters, labels, first, torch.cat([one.members, other.members])[order])
+    return united(components, both)
 
 
-def _by_first_member(labels: Tensor) -> Tensor:
-    """Labels (K,) renumbered in the order of their first occurrence."""
-    n = int(labels.max()) + 1 if labels.numel() else 0
-    first = _first_rows(labels, n)
-    rank = torch.empty_like(first)
-    rank[first.argsort()] = torch.arange(n, device=labels.device)
-    return rank[labels]
-
-
-def _first_rows(labels: Tensor, n: int) -> Tensor:
-    """The first row (n,) of each label."""
-    rows = torch.arange(labels.shape[0], device=labels.device)
-    return rows.new_full((n,), labels.shape[0]).scatter_reduce_(0, labels, rows, "amin")
+def _merged(
+    components: Components, with_attributes: bool, limit: int | None, max_cost: float | None
+) -> MergedInRounds:
+    """Merges among components of one kind, up to one of the limits."""
+    given = Parameters(components.support, components.means, components.covariances)
+    if components.attributes and with_attributes:  # numbers among them are further dimensions
+        given = Parameters(given.weights, *moments.joint_moments(components.attributes, *given))
+    if max_cost is None:
+        found = merge_in_rounds(given, limit or 1)
+    else:
+        found = merge_in_rounds(given, 1, max_cost, "hellinger")
+    weights, means, covariances = found.parameters
+    dim = components.dim
+    return found._replace(parameters=Parameters(weights, means[:, :dim], covariances[:, :dim, :dim]))
 
 
 def _unnumbered(ids: Tensor) -> Tensor:
