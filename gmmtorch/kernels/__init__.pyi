@@ -60,6 +60,7 @@ from .mixtures.small_fits import fused_kmeans as fused_kmeans
 from .mixtures.small_fits import fused_moments as fused_moments
 from .mixtures.small_fits import is_kmeans_fused as is_kmeans_fused
 from .mixtures.small_fits import is_small as is_small
+from .mixtures.viewpoint_choice import viewpoint_choice as viewpoint_choice
 from .rays.beam_information import Beams as Beams
 from .rays.beam_information import Cells as Cells
 from .rays.beam_information import information_by_block as information_by_block

@@ -2,7 +2,7 @@
 // twin, which states the rule, is mixture/reduction.py.
 #pragma once
 
-#include "../device.h"
+#include "../selection.h"
 
 namespace gmm {
 
@@ -88,7 +88,7 @@ template <int DIM>
 struct Rounds {
     static constexpr int64_t MOST = 0x7FFFFFFFFFFFFFFF;
     static constexpr uint64_t SPREAD = 0x9E3779B97F4A7C15, BACK = 0xF1DE83E19937733D;  // their product is 1
-    static constexpr int BLOCK = 16, DIGITS = 16;  // rows of a block; digits of 8 bits of a cost and its code
+    static constexpr int BLOCK = 16;                                                   // rows
 
     Team team;
     Mixture given;
@@ -218,15 +218,6 @@ struct Rounds {
         }
     }
 
-    GMM_INLINE static int64_t bits_of(double x) {
-        union {
-            double x;
-            int64_t bits;
-        } both;
-        both.x = x;
-        return both.bits;
-    }
-
     // Of the pairs of component i that cost least for one of both, the code: a bijection, in no order.
     GMM_INLINE void encode(int64_t i) {
         for (int64_t s = 0; s < slots; ++s) {
@@ -246,45 +237,10 @@ struct Rounds {
         return pair / given.k == i && code[j] == code[i] && best[j] == best[i] ? j : -1;
     }
 
-    // The cost and the code of the pair of row i, as a number that orders pairs.
-    GMM_INLINE uint64_t part(int64_t i, int which) const {
-        return which == 0 ? (uint64_t)best[i] : (uint64_t)code[i] ^ (1ull << 63);
-    }
-
-    GMM_INLINE bool is_within(int64_t i, const uint64_t* cut) const {
-        return part(i, 0) < cut[0] || (part(i, 0) == cut[0] && part(i, 1) <= cut[1]);
-    }
-
-    // Of the pairs that both prefer, the cheaper half are up to `cut`; returns how many these are. They are
-    // found by their digits, the highest first.
-    GMM_INLINE int64_t cheaper_half(uint64_t* cut) {
-        int64_t wanted = 0, left = 0;
-        cut[0] = cut[1] = 0;
-        for (int q = 0; q < DIGITS; ++q) {
-            const int which = q / 8, shift = 56 - 8 * (q % 8);
-            int* count = counts + 256 * q;
-            for (int64_t i = item; i < given.k; i += team.n) {
-                if (partner(i) < 0 || (which == 1 && part(i, 0) != cut[0])) continue;
-                const uint64_t digits = part(i, which) >> shift;
-                if ((q % 8 == 0 ? 0 : digits >> 8) == (q % 8 == 0 ? 0 : cut[which] >> shift >> 8))
-                    add(count + (digits & 255), 1);
-            }
-            meet(team);
-            if (q == 0) {
-                for (int d = 0; d < 256; ++d) wanted += count[d];
-                left = wanted = minimum((wanted + 1) / 2, k - rule.least);
-                if (wanted == 0) return 0;
-            }
-            int digit = 0;
-            for (; left > count[digit]; ++digit) left -= count[digit];
-            cut[which] |= (uint64_t)digit << shift;
-            if (left == count[digit]) {  // all of them
-                cut[which] |= (1ull << shift) - 1;
-                if (which == 0) cut[1] = ~0ull;
-                break;
-            }
-        }
-        return wanted;
+    // The cost and the code of the pair of row i, which order pairs; whether both prefer it.
+    GMM_INLINE bool number(int64_t i, uint64_t& high, uint64_t& low) const {
+        high = (uint64_t)best[i], low = (uint64_t)code[i] ^ (1ull << 63);
+        return partner(i) >= 0;
     }
 
     GMM_INLINE void merge(int64_t a, int64_t b) {
@@ -308,12 +264,15 @@ struct Rounds {
             for (int64_t i = item; i < given.k; i += team.n)
                 if (owner[i] == i) encode(i);
             meet(team);
-            uint64_t cut[2];
-            const int64_t n_merges = cheaper_half(cut);
+            Cut cut;
+            const int64_t n_merges = select_smallest(
+                team, item, given.k, counts, cut,
+                [&](int64_t n_pairs) { return minimum((n_pairs + 1) / 2, k - rule.least); },
+                [&](int64_t i, uint64_t& high, uint64_t& low) { return number(i, high, low); });
             if (n_merges == 0) break;
             for (int64_t i = item; i < given.k; i += team.n) {
-                const int64_t j = partner(i);
-                if (j >= 0 && is_within(i, cut)) merge(i, j);
+                uint64_t high, low;
+                if (number(i, high, low) && cut.has(high, low)) merge(i, partner(i));
             }
             k -= n_merges;
         }

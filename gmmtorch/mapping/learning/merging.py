@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
+from gmmtorch.kernels import is_fused, viewpoint_choice
 from gmmtorch.linalg import on_cpu
 from gmmtorch.mapping.attributes import moments
 from gmmtorch.mapping.components import UNNUMBERED, Components
@@ -111,54 +112,45 @@ def limit_origins(components: Components, max_origins: int, mean_origins: float 
     check_whole("max_origins", max_origins, 1)
     if mean_origins is not None and not 1 <= mean_origins < math.inf:
         raise InvalidArgumentError(f"mean_origins={mean_origins} must be at least 1.")
-    kept, all_used = _kept_viewpoints(components, max_origins, mean_origins)
-    by, count, seen_from = components.seen_by, components.seen_count, components.seen_from
+    limit = len(components) * (max_origins if mean_origins is None else mean_origins)
+    by, seen_from, count = components.seen_by, components.seen_from, components.seen_count
+    given = by, seen_from, count, components.origins, components.support
+    choose = viewpoint_choice if is_fused(*given) else _choice
+    count, kept, all_used = choose(*given, max_origins, int(min(limit, len(by))))
     if kept is not None:
-        by, count, seen_from = by[kept], count[kept], seen_from[kept]
-    total = count.new_zeros(len(components)).index_add_(0, by, count)
-    share = components.support / total.clamp_min(torch.finfo(total.dtype).tiny)
-    limited = replace(components, seen_by=by, seen_from=seen_from, seen_count=count * share[by])
+        by, seen_from, count = by[kept], seen_from[kept], count[kept]
+    limited = replace(components, seen_by=by, seen_from=seen_from, seen_count=count)
     return limited if all_used else limited.with_used_origins()
 
 
-def _kept_viewpoints(
-    components: Components, max_origins: int, mean_origins: float | None
-) -> tuple[Tensor | None, bool]:
-    """The viewpoints (E′,) that `limit_origins` keeps, in rising order, None: all; and whether it is known
-    that every origin then has one.
-    """
-    by, count = components.seen_by, components.seen_count
-    n, n_rows = len(components), components.seen_by.shape[0]
-    limit = n * max_origins if mean_origins is None else int(n * mean_origins)
-    left = count > 0
-    if n == 0:
-        return None, False
-    n_origins = components.origins.shape[0]
-    per_component = by.new_zeros(n).index_add_(0, by, left.long())
-    used = by.new_zeros(n_origins).index_fill_(0, components.seen_from, 1)
-    n_left, most, n_used = torch.stack([left.sum(), per_component.max(), used.sum()]).tolist()
-    if n_left <= limit and most <= max_origins:
-        if n_left == n_rows:
-            return None, n_used == n_origins
-        return left.nonzero().squeeze(1), False
-    worth, position = count.sqrt(), components.origins[components.seen_from]
+def _choice(
+    by: Tensor, seen_from: Tensor, count: Tensor, origins: Tensor, support: Tensor, most: int, limit: int
+) -> tuple[Tensor, Tensor | None, bool]:
+    """The twin of `viewpoint_choice`."""
+    n_rows, left = len(by), count > 0
+    worth, position = count.sqrt(), origins[seen_from]
     nearest = torch.ones_like(count)  # distance to the nearest kept origin of the same component
     # A component without a viewpoint that is left chooses one more row at the end, which does not count.
     rows, left = torch.arange(n_rows, device=by.device), torch.cat([left, left.new_zeros(1)])
     gain = count.new_full((n_rows + 1,), -1.0)  # √count · distance at which a viewpoint was chosen
-    nowhere = position.new_full((1, components.dim), torch.inf)
-    for step in range(min(max_origins, most)):
+    nowhere = position.new_full((1, origins.shape[1]), torch.inf)
+    for step in range(most):
+        if not bool(left.any()):
+            break
         score = torch.where(left[:-1], worth * nearest, -1.0)
-        largest = score.new_full((n,), -1.0).scatter_reduce_(0, by, score, "amax")
+        largest = torch.full_like(support, -1.0).scatter_reduce_(0, by, score, "amax")
         best = torch.where(left[:-1] & (score == largest[by]), rows, n_rows)
-        chosen = rows.new_full((n,), n_rows).scatter_reduce_(0, by, best, "amin")
+        chosen = rows.new_full(support.shape, n_rows).scatter_reduce_(0, by, best, "amin")
         gain.scatter_(0, chosen, torch.inf if step == 0 else torch.cat([score, score[:1]])[chosen])
         left.index_fill_(0, chosen, False)
         distance = (position - torch.cat([position, nowhere])[chosen][by]).norm(dim=1)
         nearest = distance if step == 0 else torch.minimum(nearest, distance)
-    gain, kept = gain[:-1], torch.zeros_like(left[:-1])
-    kept[gain.argsort(descending=True, stable=True)[:limit]] = True
-    return (kept & (gain >= 0)).nonzero().squeeze(1), False
+    is_kept = torch.zeros_like(left[:-1])
+    is_kept[gain[:-1].argsort(descending=True, stable=True)[:limit]] = True
+    is_kept &= gain[:-1] >= 0
+    total = torch.zeros_like(support).index_add_(0, by, torch.where(is_kept, count, 0.0))
+    share = support / total.clamp_min(torch.finfo(total.dtype).tiny)
+    return count * share[by], is_kept.nonzero().squeeze(1), False
 
 
 Size = Callable[[Components], int]
