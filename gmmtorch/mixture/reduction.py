@@ -231,7 +231,7 @@ def _mutual_choices(i: Tensor, j: Tensor, costs: Tensor, k: int) -> tuple[Tensor
     No component occurs in two of these pairs, and the cheapest of all pairs is one of them.
     """
     # Of pairs with equal costs, any order will do but that of rows, in which each blocks the next one.
-    order = ((i * k + j) * _SPREAD).argsort()
+    order = (((i << 32) + j) * _SPREAD).argsort()
     order = order[costs[order].argsort(stable=True)]
     i, j = i[order], j[order]
     rank = torch.arange(len(i), device=i.device)

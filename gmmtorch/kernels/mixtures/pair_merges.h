@@ -2,6 +2,7 @@
 // twin, which states the rule, is mixture/reduction.py.
 #pragma once
 
+#include "../lanes.h"
 #include "../selection.h"
 
 namespace gmm {
@@ -88,21 +89,23 @@ template <int DIM>
 struct Rounds {
     static constexpr int64_t MOST = 0x7FFFFFFFFFFFFFFF;
     static constexpr uint64_t SPREAD = 0x9E3779B97F4A7C15, BACK = 0xF1DE83E19937733D;  // their product is 1
-    static constexpr int BLOCK = 16;                                                   // rows
+    static constexpr int BLOCK = 32;                                                   // rows
 
     Team team;
     Mixture given;
     MergeRule rule;
     Merged out;
-    int64_t item, k, slots, n_blocks;
-    double *weight, *mean, *covariance, *half, *box, *distance, *costs;
+    int64_t item, k, slots, n_blocks, stride;
+    double *place, *weight, *mean, *covariance, *half, *box, *distance, *costs;
     int64_t *owner, *members, *first, *best, *code, *near;
     int* counts;
 
-    // scratch: K (1 + D + D² + 1 + D + 2 S) numbers, and K (5 + S) whole ones, S = neighbors.
+    // scratch: (K + 2 BLOCK) (2 + 3 D + D² + 2 S) numbers, and K (5 + S) whole ones, S = neighbors. place
+    // (D, stride): means, or infinity if nothing is left in a row.
     GMM_INLINE void begin(double* scratch, int64_t* whole) {
         k = given.k, slots = rule.neighbors, n_blocks = (k + BLOCK - 1) / BLOCK;
-        weight = scratch, mean = weight + k, covariance = mean + k * DIM, half = covariance + k * DIM * DIM;
+        stride = n_blocks * BLOCK, place = scratch, weight = place + DIM * stride, mean = weight + k,
+        covariance = mean + k * DIM, half = covariance + k * DIM * DIM;
         box = half + k, distance = box + (k + BLOCK) * DIM, costs = distance + k * slots;
         owner = whole, members = owner + k, first = members + k, best = first + k, code = best + k;
         near = code + k;
@@ -158,11 +161,15 @@ struct Rounds {
         for (int64_t b = item; b < n_blocks; b += team.n) {
             double *low = box + 2 * b * DIM, *high = low + DIM;
             for (int x = 0; x < DIM; ++x) low[x] = HUGE_VAL, high[x] = -HUGE_VAL;
-            for (int64_t i = b * BLOCK; i < minimum((b + 1) * BLOCK, given.k); ++i)
-                for (int x = 0; x < DIM && owner[i] == i; ++x) {
-                    low[x] = minimum(low[x], mean[i * DIM + x]);
-                    high[x] = maximum(high[x], mean[i * DIM + x]);
+            for (int64_t i = b * BLOCK; i < (b + 1) * BLOCK; ++i) {
+                const bool is_left = i < given.k && owner[i] == i;
+                for (int x = 0; x < DIM; ++x) {
+                    const double m = is_left ? mean[i * DIM + x] : HUGE_VAL;
+                    place[x * stride + i] = m;
+                    low[x] = minimum(low[x], m);
+                    if (is_left) high[x] = maximum(high[x], m);
                 }
+            }
         }
         for (int64_t i = item; i < given.k; i += team.n) best[i] = code[i] = MOST;
         for (int64_t i = item; i < DIGITS * 256; i += team.n) counts[i] = 0;
@@ -172,30 +179,32 @@ struct Rounds {
     GMM_INLINE void search_block(int64_t i, int64_t b) {
         double* far = distance + i * slots;
         int64_t* row = near + i * slots;
+        const double *m = mean + i * DIM, *low = box + 2 * b * DIM;
         const int64_t last = slots - 1;
-        double apart = 0.0;
+        double apart = 0.0, farthest = far[last];
         for (int x = 0; x < DIM; ++x) {
-            const double m = mean[i * DIM + x], *low = box + 2 * b * DIM;
-            const double d = maximum(maximum(low[x] - m, m - low[DIM + x]), 0.0);
+            const double d = maximum(maximum(low[x] - m[x], m[x] - low[DIM + x]), 0.0);
             apart += d * d;
         }
-        if (!(apart <= far[last])) return;
-        for (int64_t j = b * BLOCK; j < minimum((b + 1) * BLOCK, given.k); ++j) {
-            if (j == i || owner[j] != j) continue;
-            double d = 0.0;
+        if (!(apart <= farthest)) return;
+        for (int64_t begin = b * BLOCK; begin < (b + 1) * BLOCK; begin += LANES) {
+            vec squares = (vec)(0.0);
             for (int x = 0; x < DIM; ++x) {
-                const double y = mean[j * DIM + x] - mean[i * DIM + x];
-                d += y * y;
+                const vec y = *(const vec*)(place + x * stride + begin) - m[x];
+                squares += y * y;
             }
-            const int64_t gap = j > i ? j - i : i - j;
-            auto is_before = [&](int64_t s) {
-                const int64_t other = row[s] > i ? row[s] - i : i - row[s];
-                return d < far[s] || (d == far[s] && (row[s] < 0 || gap < other));
-            };
-            if (!is_before(last)) continue;
-            int64_t s = last;
-            for (; s > 0 && is_before(s - 1); --s) far[s] = far[s - 1], row[s] = row[s - 1];
-            far[s] = d, row[s] = j;
+            for (int lane = 0; any(squares <= farthest) && lane < LANES; ++lane) {
+                const double d = get(squares, lane);
+                const int64_t j = begin + lane, gap = j > i ? j - i : i - j;
+                auto is_before = [&](int64_t s) {
+                    const int64_t other = row[s] > i ? row[s] - i : i - row[s];
+                    return d < far[s] || (d == far[s] && gap < other);
+                };
+                if (j == i || d == HUGE_VAL || !is_before(last)) continue;
+                int64_t s = last;
+                for (; s > 0 && is_before(s - 1); --s) far[s] = far[s - 1], row[s] = row[s - 1];
+                far[s] = d, row[s] = j, farthest = far[last];
+            }
         }
     }
 
@@ -224,7 +233,7 @@ struct Rounds {
             const int64_t j = near[i * slots + s];
             if (j < 0) continue;
             const int64_t bits = bits_of(costs[i * slots + s]);
-            const uint64_t pair = (uint64_t)(minimum(i, j) * given.k + maximum(i, j));
+            const uint64_t pair = (uint64_t)(minimum(i, j) << 32 | maximum(i, j));
             if (best[i] == bits) lower(code + i, (int64_t)(pair * SPREAD));
             if (best[j] == bits) lower(code + j, (int64_t)(pair * SPREAD));
         }
@@ -233,8 +242,8 @@ struct Rounds {
     // The partner of the lower row i of a pair that both prefer; −1 for others.
     GMM_INLINE int64_t partner(int64_t i) const {
         if (best[i] == MOST) return -1;
-        const int64_t pair = (int64_t)((uint64_t)code[i] * BACK), j = pair % given.k;
-        return pair / given.k == i && code[j] == code[i] && best[j] == best[i] ? j : -1;
+        const int64_t pair = (int64_t)((uint64_t)code[i] * BACK), j = pair & 0xFFFFFFFF;
+        return pair >> 32 == i && code[j] == code[i] && best[j] == best[i] ? j : -1;
     }
 
     // The cost and the code of the pair of row i, which order pairs; whether both prefer it.

@@ -15,7 +15,7 @@ _MERGES = {
     dim: FusedKernel("mixtures/pair_merges.h", f"pair_merges<{dim}>", shares=True, rounds_each=True)
     for dim in range(2, 7)  # with attributes up to three more than those of space
 }
-_DIGITS, _BLOCK = 16, 16  # as in the source
+_DIGITS, _BLOCK = 16, 32  # as in the source
 
 
 def is_pair_merges_fused(dim: int) -> bool:
@@ -45,7 +45,7 @@ def pair_merges(
     given = order, weights.contiguous(), means.contiguous(), covariances.contiguous()
     made = torch.empty_like(given[1]), torch.empty_like(given[2]), torch.empty_like(given[3])
     members, lead = torch.empty_like(order), torch.empty_like(order)
-    scratch = weights.new_empty((k + _BLOCK) * (2 + 2 * dim + dim**2 + 2 * neighbors))
+    scratch = weights.new_empty((k + 2 * _BLOCK) * (2 + 3 * dim + dim**2 + 2 * neighbors))
     whole = order.new_empty(k * (5 + neighbors))
     counts = torch.empty(_DIGITS * 256, dtype=torch.int32, device=order.device)
     failed = torch.zeros(1, dtype=torch.bool, device=order.device)
