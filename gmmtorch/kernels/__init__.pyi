@@ -59,11 +59,14 @@ from .mixtures.matching import explained_points as explained_points
 from .mixtures.matching import fused_alignment as fused_alignment
 from .mixtures.matching import fused_registration as fused_registration
 from .mixtures.matching import raster_sums as raster_sums
+from .mixtures.pair_merges import is_pair_merges_fused as is_pair_merges_fused
+from .mixtures.pair_merges import pair_merges as pair_merges
 from .mixtures.small_fits import fused_em as fused_em
 from .mixtures.small_fits import fused_kmeans as fused_kmeans
 from .mixtures.small_fits import fused_moments as fused_moments
 from .mixtures.small_fits import is_kmeans_fused as is_kmeans_fused
 from .mixtures.small_fits import is_small as is_small
+from .mixtures.viewpoint_choice import viewpoint_choice as viewpoint_choice
 from .rays.beam_information import Beams as Beams
 from .rays.beam_information import Cells as Cells
 from .rays.beam_information import information_by_block as information_by_block

@@ -44,9 +44,11 @@ from .gaussian_mixture import GaussianMixture as GaussianMixture
 from .prune_options import PruneOptions as PruneOptions
 from .pruning import density_share as density_share
 from .pruning import prune as prune
+from .reduction import MergedInRounds as MergedInRounds
 from .reduction import Reduction as Reduction
 from .reduction import merge as merge
 from .reduction import merge_components as merge_components
+from .reduction import merge_in_rounds as merge_in_rounds
 from .reduction import simplify as simplify
 from .streaming import Checkpoint as Checkpoint
 from .streaming import fit_stream as fit_stream

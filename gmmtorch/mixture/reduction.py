@@ -4,7 +4,8 @@ The cost of a merge is Runnalls' bound on the Kullback–Leibler divergence (IEE
 2007) or the squared Hellinger distance. Up to a few hundred components are merged greedily: always
 the cheapest of all pairs. More components are merged in rounds. A round considers pairs of near
 neighbours and merges disjoint pairs in which each component is the other's cheapest partner, as one
-batch. Except in the last round, greedy merging takes the same pairs.
+batch. Except in the last round, greedy merging takes the same pairs. A fused kernel does all rounds in one
+launch; its twin is here.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from torch import Tensor
 
 from gmmtorch.arrays import as_tensor
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, check_whole
+from gmmtorch.kernels import is_fused, is_pair_merges_fused, pair_merges
 from gmmtorch.linalg import check_symmetric, pack_symmetric, safe_cholesky
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.validation import checked_parameter
@@ -30,6 +32,20 @@ if TYPE_CHECKING:  # an estimator imports scikit-learn, which `simplify` does no
 
 _MOST_EXACT = 512  # components up to which all pairs are considered
 _PAIRS_AT_ONCE = 1 << 16
+_SPREAD = 0x9E3779B97F4A7C15 - (1 << 64)  # odd, so that products of whole numbers, modulo 2^64, are distinct
+
+
+class MergedInRounds(NamedTuple):
+    """J components, merged from K.
+
+    parameters: of the J, in the order of their first members. labels (K,): the one that each was merged into.
+    first, members (J,): row of the first member, and number of members.
+    """
+
+    parameters: Parameters
+    labels: Tensor
+    first: Tensor
+    members: Tensor
 
 
 class Reduction(NamedTuple):
@@ -86,14 +102,50 @@ def simplify(
     # Sorted by their values, so that the given order has no effect.
     columns = torch.cat([means, pack_symmetric(covariances), weights[:, None]], 1).cpu().numpy()
     order = torch.from_numpy(np.lexsort(columns.T[::-1])).to(means.device)
-    given = Gaussians.of(Parameters(weights[order], means[order], covariances[order]))
-    left, labels = _merge_in_rounds(given, max(min_components, exact), float(limit), COSTS[cost], neighbors)
+    given = Parameters(weights[order], means[order], covariances[order])
+    found = merge_in_rounds(given, max(min_components, exact), float(limit), cost, neighbors)
+    left, labels = Gaussians.of(found.parameters), found.labels
     if left.weights.shape[0] <= exact:
         left, merged = _merge_greedily(left, min_components, float(limit), COSTS[cost])
         labels = merged[labels]
-    bound = given.weights @ (left.half_log_dets[labels] - given.half_log_dets)
+    bound = given.weights @ (left.half_log_dets[labels] - Gaussians.of(given).half_log_dets)
     labels, kept = _in_order_given(torch.empty_like(labels).scatter_(0, order, labels), left.weights.shape[0])
     return Reduction(Parameters(*left.at(kept)[:3]), labels, max(0.0, float(bound)))
+
+
+def merge_in_rounds(
+    parameters: Parameters,
+    n_components: int = 1,
+    max_cost: float = math.inf,
+    cost: str = "kullback_leibler",
+    neighbors: int = 8,
+) -> MergedInRounds:
+    """The same as `simplify` with most_exact=0, of float64 parameters that are not checked.
+
+    Components at one place, or with equal costs, are merged in an order that depends on that of the rows.
+    """
+    weights, means, covariances = parameters
+    rows = torch.arange(means.shape[0], device=means.device)
+    order, lead = rows, rows
+    if n_components < means.shape[0]:
+        low, high = torch.aminmax(means, dim=0)
+        order = means.index_select(1, (high - low).argmax(0, keepdim=True))[:, 0].argsort(stable=True)
+        found = None
+        if is_fused(*parameters) and is_pair_merges_fused(means.shape[1]):
+            is_hellinger = cost == "hellinger"
+            found = pair_merges(order, *parameters, n_components, max_cost, is_hellinger, neighbors)
+        if found is not None:
+            lead, members, made = found
+            is_first = lead == rows
+            first = is_first.nonzero().squeeze(1)
+            left = Parameters(*(part[first] for part in made))
+            return MergedInRounds(left, (is_first.cumsum(0) - 1)[lead], first, members[first])
+    given = Gaussians.of(Parameters(weights[order], means[order], covariances[order]))
+    merged, labels = _merge_in_rounds(given, n_components, max_cost, COSTS[cost], neighbors)
+    labels, kept = _in_order_given(torch.empty_like(labels).scatter_(0, order, labels), len(merged.weights))
+    first = rows.new_full(kept.shape, len(rows)).scatter_reduce_(0, labels, rows, "amin")
+    members = torch.bincount(labels, minlength=len(kept))
+    return MergedInRounds(Parameters(*merged.at(kept)[:3]), labels, first, members)
 
 
 def _merge_greedily(
@@ -154,10 +206,10 @@ def _pair_costs(state: Gaussians, i: Tensor, j: Tensor, cost: Cost) -> Tensor:
 
 
 def _near_pairs(means: Tensor, neighbors: int) -> tuple[Tensor, Tensor]:
-    """Rows i < j (P,) of means (K, D) that are near neighbours, each pair once, in a fixed random order.
+    """Rows i < j (P,) of means (K, D) that are near neighbours, each pair once.
 
-    If more means coincide than the neighbour search returns, it finds only some of them. Each row is
-    therefore also paired with the next row, because rows at the same place are adjacent.
+    If more means coincide than the neighbour search returns, it finds only some of them. Each row at the
+    place of the next one is therefore also paired with that one.
     """
     from scipy.spatial import cKDTree
 
@@ -166,13 +218,10 @@ def _near_pairs(means: Tensor, neighbors: int) -> tuple[Tensor, Tensor]:
     found = cKDTree(positions).query(positions, k=min(neighbors + 1, k))[1]
     nearest = torch.as_tensor(found, device=device).reshape(k, -1)
     rows = torch.arange(k, device=device)
-    a = torch.cat([rows[:, None].expand_as(nearest).reshape(-1), rows[:-1]])
-    b = torch.cat([nearest.reshape(-1), rows[1:]])
+    same = (means[1:] == means[:-1]).all(1)
+    a = torch.cat([rows[:, None].expand_as(nearest).reshape(-1), rows[:-1][same]])
+    b = torch.cat([nearest.reshape(-1), rows[1:][same]])
     keys = torch.unique(torch.minimum(a, b)[a != b] * k + torch.maximum(a, b)[a != b])
-    # A fixed shuffle: of pairs with equal costs the earlier is chosen, and in sorted order each
-    # pair would block the next one.
-    shuffle = torch.randperm(keys.numel(), generator=torch.Generator().manual_seed(0))
-    keys = keys[shuffle.to(device)]
     return keys // k, keys % k
 
 
@@ -181,7 +230,9 @@ def _mutual_choices(i: Tensor, j: Tensor, costs: Tensor, k: int) -> tuple[Tensor
 
     No component occurs in two of these pairs, and the cheapest of all pairs is one of them.
     """
-    order = costs.argsort(stable=True)
+    # Of pairs with equal costs, any order will do but that of rows, in which each blocks the next one.
+    order = (((i << 32) + j) * _SPREAD).argsort()
+    order = order[costs[order].argsort(stable=True)]
     i, j = i[order], j[order]
     rank = torch.arange(len(i), device=i.device)
     best = rank.new_full((k,), len(i))

@@ -13,8 +13,10 @@ from torch import Tensor
 
 from gmmtorch.mapping.components import TENSORS, Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping.learning.merging import united
 from gmmtorch.mapping.learning.rules import IncrementalRule, LearningRule, WindowedRule
 from gmmtorch.mapping.learning.windows import absorb
+from gmmtorch.mixture import MergedInRounds, merge_components
 from gmmtorch.scan import Scan
 
 FINE = IncrementalRule(noise=0.01, length=0.1, cell=0.05, window=2)
@@ -23,6 +25,14 @@ FINE = IncrementalRule(noise=0.01, length=0.1, cell=0.05, window=2)
 
 def sensor(x: float, dim: int = 2) -> tuple[float, ...]:
     return (x + 2**-9, 0.1875 + 2**-9, 0.3125 + 2**-9)[:dim]
+
+
+def merged(components: Components, labels: Tensor) -> Components:
+    """The components of each label (K,) as one; labels are 0, 1, … without gaps."""
+    n = int(labels.max()) + 1
+    parameters = merge_components(components.support, components.means, components.covariances, labels, n)
+    first = torch.stack([(labels == label).nonzero()[0, 0] for label in range(n)])
+    return united(components, MergedInRounds(parameters, labels, first, torch.bincount(labels)))
 
 
 def drive(n: int, dim: int = 2) -> list[Scan]:

@@ -11,7 +11,7 @@ import pytest
 import torch
 from hypothesis import given
 from kernels.twins import by_both
-from mapping.map_cases import FINE, assert_same_components, drive, some_motion
+from mapping.map_cases import FINE, assert_same_components, drive, merged, some_motion
 from scipy.stats import multivariate_normal
 from torch import Tensor
 
@@ -26,7 +26,7 @@ from gmmtorch.mapping.codec.attribute_block import decode_attributes, encode_att
 from gmmtorch.mapping.codec.bitstream import BitWriter
 from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.merging import compact, merged
+from gmmtorch.mapping.learning.merging import compact
 from gmmtorch.mapping.tiles.tile_files import tile_files
 from gmmtorch.mapping.tiles.tiled_map import TiledMap
 from gmmtorch.mixture import Cells, merge_components, quadratic_features

@@ -9,7 +9,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from mapping.map_cases import sightings
+from mapping.map_cases import merged, sightings
 from mapping.random_components import counts_add_up, normal_components, total_moments
 from scipy.stats import chi2
 
@@ -21,7 +21,6 @@ from gmmtorch.mapping.learning.merging import (
     compact_to_bytes,
     estimated_bytes,
     limit_origins,
-    merged,
 )
 from gmmtorch.mapping.learning.novelty import count_explained
 

@@ -66,6 +66,8 @@ struct Field {
 // Walks through the components of a batch, each value in place: written, or read into arrays of zeros.
 template <int DIM, bool WRITES>
 struct Walk {
+    static constexpr int FEW = 16;
+
     Batch b;
     Scratch s;
     RangeCoder<WRITES> c;
@@ -436,6 +438,29 @@ struct Walk {
         return -1;
     }
 
+    // The places (n,), in rising order, that the origins of component i have among all by distance, and these
+    // origins. Their heap would give the same, but takes longer if there are few origins.
+    GMM_INLINE void count_places(int64_t i, const int64_t* seen, int64_t n, int64_t* place, int64_t* origin) {
+        for (int64_t t = 0; t < b.n_origins; ++t) {
+            double apart = 0.0;
+            for (int a = 0; a < DIM; ++a) {
+                const double x = (double)b.origins[t * DIM + a] * 0.00390625 - s.place[i * DIM + a];
+                apart = apart + x * x;
+            }
+            s.distance[t] = apart;
+        }
+        for (int64_t q = 0; q < n; ++q) {
+            const double own = s.distance[seen[q]];
+            int64_t nearer = 0, at = q;
+            for (int64_t t = 0; t < b.n_origins; ++t) nearer += s.distance[t] < own;
+            for (int64_t t = 0; t < seen[q]; ++t) nearer += s.distance[t] == own;
+            for (; at > 0 && place[at - 1] > nearer; --at)
+                place[at] = place[at - 1], origin[at] = origin[at - 1];
+            place[at] = nearer, origin[at] = seen[q];
+        }
+        work += level_begin[levels];
+    }
+
     // The viewpoints of component i, which begin at `begin`, nearest first; returns where they end.
     GMM_INLINE int64_t viewpoints(int64_t i, int64_t j, int64_t begin) {
         const int64_t known = i > 0 ? minimum(b.n_viewpoints[j], (int64_t)3) : 0;
@@ -450,17 +475,23 @@ struct Walk {
             if (!c.good) return begin;
             for (int64_t q = 0; q < n; ++q) s.row[seen[q]] = q + 1;
         }
+        int64_t place[FEW], origin[FEW], left = b.n_origins;
+        const bool are_few = WRITES && n <= FEW && b.n_origins <= 32 * FEW;
         n_waiting = 0;
-        wait(i, level_begin[levels] - 1);
-        int64_t left = b.n_origins;
+        if (are_few)
+            count_places(i, seen, n, place, origin);
+        else
+            wait(i, level_begin[levels] - 1);
         bool is_largest = false;  // whether a share of the largest was among them
         for (int64_t q = 0; q < n; ++q) {
             int64_t rank = 0, found = 0;
             check(left >= n - q);
-            if (WRITES)
+            if (are_few)
+                rank = place[q] - (q > 0 ? place[q - 1] + 1 : 0), found = origin[q];
+            else if (WRITES)
                 while (c.good && (found = next_origin(i)) >= 0 && s.row[found] == 0) ++rank;
             if (left > n - q) rank = c.number(slots(Field::RANK, minimum(n - q, (int64_t)4) - 1), rank);
-            check(rank < left);
+            check(rank >= 0 && rank < left);
             is_slow = work > c.out.most_steps * (c.at + 4096);
             check(!is_slow && found >= 0);
             if (!c.good) return begin;

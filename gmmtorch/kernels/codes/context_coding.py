@@ -66,13 +66,13 @@ def context_coding(batch: CodedBatch, tables: ChanceTables, stream: Tensor, writ
     k, n_origins = len(batch.count), len(batch.origins)
     result = torch.zeros(1, dtype=torch.int64)
     n_items = 8 * n_origins // 7 + 16  # of the tree
-    box = torch.empty(n_items, 2, batch.dim, dtype=torch.int64)
-    distance, waiting = torch.empty(n_items, dtype=torch.float64), torch.empty(n_items, dtype=torch.int64)
-    leaf, row = (torch.zeros(n_origins, dtype=torch.int64) for _ in range(2))
-    place, normal = (torch.zeros(k, batch.dim, dtype=torch.float64) for _ in range(2))
+    whole = torch.zeros(n_items * (1 + 2 * batch.dim) + 2 * n_origins, dtype=torch.int64)
+    waiting, box, *rows = whole.split([n_items, n_items * 2 * batch.dim, n_origins, n_origins])
+    numbers = torch.zeros(n_items + 2 * k * batch.dim, dtype=torch.float64)
+    distance, *shapes = numbers.split([n_items, k * batch.dim, k * batch.dim])
     sizes = k, n_origins, len(batch.seen_from), batch.side
     slots = (*tables[:3], len(tables.rates) - 1, tables.first_slot)
-    scratch = (*slots, leaf, box, distance, waiting, row, place, normal, batch.cells)
+    scratch = (*slots, rows[0], box, distance, waiting, rows[1], *shapes, batch.cells)
     values = list(vars(batch).values())[1:-1]  # without side and cells
     kernel = _CODINGS[batch.dim, writes]
     kernel(1, *sizes, *values, *scratch, stream, len(stream), MOST_STEPS, result, device=result.device)

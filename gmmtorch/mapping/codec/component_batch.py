@@ -49,7 +49,7 @@ from gmmtorch.mapping.codec.quantization import (
     number_after,
     quantize,
     quantize_numbered,
-    ranks,
+    ranked,
 )
 from gmmtorch.mapping.components import TENSORS, Components
 from gmmtorch.mapping.learning.rules import LearningRule, changed_options, rule_facts
@@ -201,8 +201,8 @@ def _read(data: bytes, most: int | None) -> Quantized:
     b = CodedBatch(side, **{name: torch.zeros(shape, dtype=torch.int64) for name, shape in rows.items()})
     read_batch(b, stream)
     places = Lattice(b.axis_order, b.deviation, b.shear, b.mean)
-    rank = torch.from_numpy(ranks(b.origins.numpy()))[b.seen_from]
-    order = torch.argsort(torch.arange(k).repeat_interleave(b.n_viewpoints) * n_origins + rank)
+    rank = torch.from_numpy(ranked(b.origins.numpy())[0])[b.seen_from]
+    order = torch.argsort(torch.arange(k).repeat_interleave(b.n_viewpoints) * n_origins + rank, stable=True)
     seen_from, share = b.seen_from[order], b.share[order]
     return Quantized(places, b.count, b.max_range.bool(), b.ids, b.origins, b.n_viewpoints, seen_from, share)
 
@@ -259,11 +259,13 @@ def map_bytes(components: Components, rule: LearningRule, settings: MapSettings,
 def file_size(components: Components, rule: LearningRule, settings: MapSettings, next_number: int) -> int:
     """Bytes of the file of components before they are numbered, without writing it; and room for settings
     that change while the map is built."""
-    n_new = int((components.ids[:, 1] < 0).sum())
+    components = components.on_cpu()
+    numbers = components.ids.numpy()[:, 1]
     if settings.query.prior is None:  # a map that has predicted its next window states its calibration
         known = settings.query.calibration or Calibration.prior(1.0)
         settings = replace(settings, query=replace(settings.query, calibration=known))
-    facts = _facts(rule, settings, number_after(components.ids, next_number + n_new))
+    after = max(next_number + int((numbers < 0).sum()), int(numbers.max(initial=-1)) + 1)
+    facts = _facts(rule, settings, after)
     if settings.codec == "float":
         data = _exact_file(components, facts)
     else:

@@ -93,7 +93,7 @@ def _read_means(reader: BitReader, axis_order: Tensor, deviation: Tensor, shear:
     for axis in reversed(range(dim)):
         number, cells[:, axis] = np.divmod(number, extent[axis])
     blank = Lattice(axis_order, deviation, shear, torch.zeros_like(deviation))
-    finer = exponent - ints(blank.world_exponents())
+    finer = exponent - ints(blank.by_world_axis(blank.mean_exponents()))
     width, coarser = np.maximum(finer, 0), np.maximum(-finer, 0)
     mean = (cells + np.array(least)) << width
     if (mean & ((np.int64(1) << coarser) - 1)).any():

@@ -86,10 +86,6 @@ class Lattice:
         """Values (K, D) of the axes, in the order of the world axes."""
         return torch.empty_like(values).scatter_(1, self.axes(), values)
 
-    def world_exponents(self) -> Tensor:
-        """`mean_exponents` in the order of the world axes."""
-        return self.by_world_axis(self.mean_exponents())
-
     def taken(self, rows: Tensor) -> Lattice:
         """These rows."""
         return Lattice(self.axis_order[rows], self.deviation[rows], self.shear[rows], self.mean[rows])

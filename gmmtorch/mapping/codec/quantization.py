@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
@@ -19,9 +20,11 @@ from gmmtorch.linalg import all_equal, on_cpu
 from gmmtorch.mapping.attributes.moments import Attributes
 from gmmtorch.mapping.codec import attribute_block, lattice
 from gmmtorch.mapping.codec.bitstream import Ints
-from gmmtorch.mapping.codec.lattice import PER_OCTAVE, Lattice
+from gmmtorch.mapping.codec.lattice import AXIS_ORDERS, PER_OCTAVE, PRECISION, Lattice
 from gmmtorch.mapping.components import Components
 from gmmtorch.scan import FARTHEST
+
+Floats = NDArray[np.float64]
 
 ORIGIN_STEP = 2.0**-8
 """Metres. Rounding moves an origin by at most half a step on each axis."""
@@ -38,7 +41,10 @@ COUNT_ERROR = lattice.DEVIATION_ERROR
 LEAST_SIDE, LARGEST_SIDE = -20, 6
 """log2 of the side (m) of the cells of a batch."""
 _FINEST = -10  # log2 of the side (m) of the cells that are ordered
-_KEY_BITS = 20
+_SPREAD = {  # the bits of numbers of ten bits, with room for those of the other axes
+    dim: np.bitwise_or.reduce([(np.arange(1024) >> bit & 1) << bit * dim for bit in range(10)])
+    for dim in (2, 3)
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,18 +83,23 @@ class Quantized:
 
     def reordered(self, rows: Tensor) -> Quantized:
         """The components of distinct rows (J,), in that order; all origins stay as they are."""
-        n = self.n_viewpoints[rows]
-        begins = (self.n_viewpoints.cumsum(0) - self.n_viewpoints)[rows]
-        kept = torch.repeat_interleave(begins - (n.cumsum(0) - n), n) + torch.arange(int(n.sum()))
+        order, n_before = rows.numpy(), self.n_viewpoints.numpy()
+        n = n_before[order]
+        begins = (np.cumsum(n_before) - n_before)[order]
+        kept = np.repeat(begins - (np.cumsum(n) - n), n) + np.arange(n.sum())
+
+        def taken(values: Tensor, rows: Ints = order) -> Tensor:
+            return torch.from_numpy(values.numpy()[rows])
+
         return replace(
             self,
-            places=self.places.taken(rows),
-            count=self.count[rows],
-            max_range=self.max_range[rows],
-            ids=self.ids[rows],
-            n_viewpoints=n,
-            seen_from=self.seen_from[kept],
-            share=self.share[kept],
+            places=Lattice(*(taken(value) for value in vars(self.places).values())),
+            count=taken(self.count),
+            max_range=taken(self.max_range),
+            ids=taken(self.ids),
+            n_viewpoints=torch.from_numpy(n),
+            seen_from=taken(self.seen_from, kept),
+            share=taken(self.share, kept),
             attributes=self.attributes.selected(rows),
         )
 
@@ -123,22 +134,23 @@ def quantize(components: Components) -> Quantized:
     c = components.on_cpu()
     places = lattice.nearest(c.means.double(), c.covariances.double())
     count = _support_steps(c.support.double())
-    seen_by, seen_from, seen_count = c.seen_by, c.seen_from, c.seen_count.double()
-    by, seen, counts = seen_by.numpy(), seen_from.numpy(), seen_count.numpy()
-    largest = _largest(seen_count, seen_by, len(c)).numpy()
-    kept = np.flatnonzero((counts > 0) | (largest[by] == 0))
-    kept = kept[np.argsort(by[kept], kind="stable")]
-    by, seen, counts = by[kept], seen[kept], counts[kept]
+    by, seen, counts = c.seen_by.numpy(), c.seen_from.numpy(), c.seen_count.numpy().astype(np.float64)
+    order = np.argsort(by, kind="stable")
+    order = order[(counts[order] > 0) | (_largest(counts[order], by[order]) == 0)]
+    by, seen, counts = by[order], seen[order], counts[order]
 
-    steps = _origin_steps(c.origins.double()).numpy()
-    distinct, place = _first_uses(steps)
-    used, seen = np.unique(place[seen], return_inverse=True)
-    origins = steps[distinct[used]]
+    steps = _origin_steps(c.origins.double())
+    rank, first = ranked(steps)
+    used = np.flatnonzero(np.bincount(rank[seen], minlength=len(first)))
+    used = used[np.argsort(first[used])]  # in the order of the origins
+    number = np.empty_like(first)
+    number[used] = np.arange(len(used))
     # Two origins of a component that round to the same place are one viewpoint.
-    rank = ranks(origins)
-    _, kept, pair = np.unique(by * len(origins) + rank[seen], return_index=True, return_inverse=True)
-    seen_count = torch.from_numpy(np.bincount(pair, counts, len(kept)))
-    seen_by, seen_from = torch.from_numpy(by[kept]), torch.from_numpy(seen[kept])
+    keys = by * len(first) + rank[seen]
+    order = np.argsort(keys, kind="stable")
+    begins = _begins(keys[order])
+    kept = order[begins]
+    by, counts = by[kept], np.add.reduceat(counts[order], begins) if len(kept) else counts
     attributes = c.attributes
     if attributes:
         attributes = attribute_block.rounded(attributes, c.means, *places.restored())
@@ -147,10 +159,10 @@ def quantize(components: Components) -> Quantized:
         count=count,
         max_range=c.max_range,
         ids=c.ids,
-        origins=torch.from_numpy(origins),
-        n_viewpoints=torch.from_numpy(np.bincount(by[kept], minlength=len(c))),
-        seen_from=seen_from,
-        share=_share_steps(seen_count, seen_by, count),
+        origins=torch.from_numpy(steps[first[used]]),
+        n_viewpoints=torch.from_numpy(np.bincount(by, minlength=len(c))),
+        seen_from=torch.from_numpy(number[rank[seen[kept]]]),
+        share=torch.from_numpy(np.where(count.numpy()[by] == NO_COUNT, 0, _share_steps(counts, by))),
         attributes=attributes,
     )
 
@@ -173,10 +185,10 @@ def _support_steps(support: Tensor) -> Tensor:
 
 
 def count_steps(counts: Tensor) -> Tensor:
-    """log2 of counts ≥ 0 in steps, or `NO_COUNT`."""
-    least = 2.0 ** (LEAST_COUNT / PER_OCTAVE)
-    steps = (torch.log2(counts.clamp_min(least)) * PER_OCTAVE).round().long()
-    return torch.where(counts < least / 2, NO_COUNT, steps)
+    """log2 of counts ≥ 0 in steps, or `NO_COUNT`; on the CPU."""
+    given, least = counts.numpy(), 2.0 ** (LEAST_COUNT / PER_OCTAVE)
+    steps = np.rint(np.log2(np.maximum(given, least)) * PER_OCTAVE).astype(np.int64)
+    return torch.from_numpy(np.where(given < least / 2, NO_COUNT, steps))
 
 
 def points_of(steps: Tensor) -> Tensor:
@@ -184,43 +196,46 @@ def points_of(steps: Tensor) -> Tensor:
     return torch.where(steps == NO_COUNT, 0.0, lattice.power(steps.clamp_min(LEAST_COUNT)))
 
 
-def _origin_steps(origins: Tensor) -> Tensor:
-    bad = ~(np.abs(origins.numpy()) <= FARTHEST).all(1)
+def _origin_steps(origins: Tensor) -> Ints:
+    given = origins.numpy()
+    bad = ~(np.abs(given) <= FARTHEST).all(1)
     if bad.any():
         first = int(bad.argmax())
         raise InvalidArgumentError(
             f"origins[{first}] is {origins[first].tolist()}; coordinates up to {FARTHEST:g} m can be stored."
         )
-    return (origins / ORIGIN_STEP).round().long()
+    return np.rint(given / ORIGIN_STEP).astype(np.int64)
 
 
-def _share_steps(count: Tensor, seen_by: Tensor, component_count: Tensor) -> Tensor:
-    """−log2 (E,) of each count's share of its component's largest, in steps; 0 if there is no count."""
-    share = count / _largest(count, seen_by, len(component_count))[seen_by].clamp_min(1e-300)
-    steps = (-torch.log2(share.clamp_min(1e-300)) * SHARES_PER_OCTAVE).round().long().clamp(0, LEAST_SHARE)
-    nothing = (component_count == NO_COUNT)[seen_by] | (share == 0)
-    return torch.where(nothing, 0, steps)
+def _share_steps(counts: Floats, owner: Ints) -> Ints:
+    """−log2 (E,) of each count's share of its owner's largest, in steps; 0 if there is no count."""
+    share = counts / np.maximum(_largest(counts, owner), 1e-300)
+    steps = np.rint(-np.log2(np.maximum(share, 1e-300)) * SHARES_PER_OCTAVE).astype(np.int64)
+    return np.where(share == 0, 0, np.clip(steps, 0, LEAST_SHARE))
 
 
-def _largest(values: Tensor, owner: Tensor, n: int) -> Tensor:
-    """The largest value (n,) of each owner."""
-    return values.new_zeros(n).scatter_reduce_(0, owner, values, "amax")
+def _largest(values: Floats, owner: Ints) -> Floats:
+    """For each of values (E,) the largest one of its owner; owners are sorted."""
+    begins = _begins(owner)
+    if not len(begins):
+        return values
+    return np.maximum.reduceat(values, begins).repeat(np.diff(begins, append=len(owner)))
 
 
-def _first_uses(rows: Ints) -> tuple[Ints, Ints]:
-    """The first row of each distinct value of (N, …), in order; and for each row, the number of its value."""
-    _, first, which = np.unique(rows, return_index=True, return_inverse=True, axis=0)
-    order = np.argsort(first)
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order))
-    return first[order], rank[which.reshape(-1)]
+def _begins(keys: Ints) -> Ints:
+    """The rows where the runs of equal sorted keys begin."""
+    return np.flatnonzero(np.concatenate([np.ones(min(1, len(keys)), bool), keys[1:] != keys[:-1]]))
 
 
-def ranks(rows: np.ndarray) -> Ints:
-    """The rank (N,) of each of rows (N, D) in lexicographic order; of equal ones, in the given order."""
-    found = np.empty(len(rows), np.int64)
-    found[np.lexsort(rows.T[::-1])] = np.arange(len(rows))
-    return found
+def ranked(rows: Ints) -> tuple[Ints, Ints]:
+    """For each of rows (N, D) the rank of its value among the distinct ones, in lexicographic order; and the
+    first row of each distinct value."""
+    order = np.lexsort(rows.T[::-1])
+    is_new = np.ones(len(rows), bool)
+    is_new[1:] = (rows[order[1:]] != rows[order[:-1]]).any(1)
+    rank = np.empty(len(rows), np.int64)
+    rank[order] = np.cumsum(is_new) - 1
+    return rank, order[is_new]
 
 
 def quantized_after(known: Components, rounded: Components, components: Components) -> Components:
@@ -248,16 +263,16 @@ def joined(parts: Sequence[Components]) -> Components:
     both = Components.concatenate(parts)
     if any(both is part for part in parts):
         return both
-    origins = both.origins.cpu().numpy()
-    distinct, place = (torch.from_numpy(v).to(both.means.device) for v in _first_uses(origins))
-    seen_from = place[both.seen_from]
-    rank = torch.from_numpy(ranks(origins[distinct.cpu().numpy()])).to(seen_from.device)
-    order = torch.argsort(both.seen_by * len(distinct) + rank[seen_from])
+    rank, first = ranked(both.origins.cpu().numpy())
+    in_order = np.sort(first)
+    number = np.searchsorted(in_order, first[rank])
+    kept, place, ranks = (torch.from_numpy(v).to(both.means.device) for v in (in_order, number, rank))
+    order = torch.argsort(both.seen_by * len(first) + ranks[both.seen_from])
     return replace(
         both,
-        origins=both.origins[distinct],
+        origins=both.origins[kept],
         seen_by=both.seen_by[order],
-        seen_from=seen_from[order],
+        seen_from=place[both.seen_from][order],
         seen_count=both.seen_count[order],
     )
 
@@ -300,8 +315,8 @@ def number_after(ids: Tensor, next_number: int) -> int:
 def quantize_numbered(components: Components, robot: int, first: int) -> Quantized:
     """The same as `quantize(numbered(components, robot, first)[0])`, rounding every component once."""
     values = quantize(components)
-    new = (values.ids[:, 1] < 0).nonzero().squeeze(1)
-    ids, order = _numbering(values.ids, order_of(values.places.taken(new)), robot, first)
+    new = np.flatnonzero(values.ids.numpy()[:, 1] < 0)
+    ids, order = _numbering(values.ids, order_of(values.places, new), robot, first)
     return replace(values.reordered(order), ids=ids)
 
 
@@ -309,35 +324,37 @@ def _numbering(ids: Tensor, by_place: Tensor, robot: int, first: int) -> tuple[T
     """Ids (K, 2) after numbering, and the order (K,) of the components: numbered ones, then new ones in the
     order `by_place` (J,) of these. On the CPU.
     """
-    is_new = ids[:, 1] < 0
-    order = torch.cat([(~is_new).nonzero().squeeze(1), is_new.nonzero().squeeze(1)[by_place]])
-    ids = ids[order].clone()
-    numbers = first + torch.arange(len(by_place))
-    ids[len(ids) - len(numbers) :] = torch.stack([torch.full_like(numbers, robot), numbers], 1)
-    return ids, order
+    given = ids.numpy()
+    is_new = given[:, 1] < 0
+    order = np.concatenate([np.flatnonzero(~is_new), np.flatnonzero(is_new)[by_place.numpy()]])
+    made = given[order]
+    made[len(made) - len(by_place) :, 0] = robot
+    made[len(made) - len(by_place) :, 1] = first + np.arange(len(by_place))
+    return torch.from_numpy(made), torch.from_numpy(order)
 
 
 # -- cells ----------------------------------------------------------------------------------------------
 
 
-def order_of(places: Lattice) -> Tensor:
-    """The `spatial_order` (K,) of components on the lattice: that of a Morton curve."""
-    cells = cells_of(places, _FINEST) + offset_of(_FINEST)
-    k, dim = cells.shape
-    keys = np.zeros((2, k), np.int64)  # the lower and the higher bits of the coordinates, interleaved
-    for bit in range(_KEY_BITS):
-        for axis in range(dim):
-            place = bit * dim + dim - 1 - axis
-            keys[0] |= (cells[:, axis] >> bit & 1) << place
-            keys[1] |= (cells[:, axis] >> (bit + _KEY_BITS) & 1) << place
-    return torch.from_numpy(np.lexsort(keys))
+def order_of(places: Lattice, rows: Ints | slice = slice(None)) -> Tensor:
+    """The `spatial_order` (J,) of these components on the lattice: that of a Morton curve."""
+    cells = cells_of(places, _FINEST)[rows] + offset_of(_FINEST)
+    dim = places.dim
+    spread, shift = _SPREAD[dim], np.arange(dim)[::-1]
+    # The bits of the coordinates, interleaved; those of ten levels at a time.
+    digits = [(spread[cells >> 10 * n & 1023] << shift).sum(1) for n in range(4)]
+    low, high = (digits[n] | digits[n + 1] << 10 * dim for n in (0, 2))
+    return torch.from_numpy(np.lexsort((low, high)))
 
 
 def cells_of(places: Lattice, exponent: int) -> Ints:
     """The cells (K, D) of side 2^exponent m that contain the means."""
-    mean, step = ints(places.by_world_axis(places.mean)), ints(places.world_exponents())
-    finer = exponent - step
-    return np.where(finer >= 0, mean >> np.maximum(finer, 0), mean << np.maximum(-finer, 0))
+    finer = exponent + PRECISION - ints(places.deviation) // PER_OCTAVE
+    mean = ints(places.mean)
+    cells = np.where(finer >= 0, mean >> np.maximum(finer, 0), mean << np.maximum(-finer, 0))
+    found = np.empty_like(cells)
+    np.put_along_axis(found, AXIS_ORDERS[places.dim].numpy()[ints(places.axis_order)], cells, 1)
+    return found
 
 
 def offset_of(exponent: int) -> int:

@@ -14,11 +14,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
+from gmmtorch.kernels import is_fused, viewpoint_choice
 from gmmtorch.linalg import on_cpu
 from gmmtorch.mapping.attributes import moments
 from gmmtorch.mapping.components import UNNUMBERED, Components
-from gmmtorch.mixture import Parameters, merge_components, simplify
+from gmmtorch.mixture import MergedInRounds, Parameters, merge_in_rounds
 
 
 class AssignedViewpoints(NamedTuple):
@@ -111,54 +112,45 @@ def limit_origins(components: Components, max_origins: int, mean_origins: float 
     check_whole("max_origins", max_origins, 1)
     if mean_origins is not None and not 1 <= mean_origins < math.inf:
         raise InvalidArgumentError(f"mean_origins={mean_origins} must be at least 1.")
-    kept, all_used = _kept_viewpoints(components, max_origins, mean_origins)
-    by, count, seen_from = components.seen_by, components.seen_count, components.seen_from
+    limit = len(components) * (max_origins if mean_origins is None else mean_origins)
+    by, seen_from, count = components.seen_by, components.seen_from, components.seen_count
+    given = by, seen_from, count, components.origins, components.support
+    choose = viewpoint_choice if is_fused(*given) else _choice
+    count, kept, all_used = choose(*given, max_origins, int(min(limit, len(by))))
     if kept is not None:
-        by, count, seen_from = by[kept], count[kept], seen_from[kept]
-    total = count.new_zeros(len(components)).index_add_(0, by, count)
-    share = components.support / total.clamp_min(torch.finfo(total.dtype).tiny)
-    limited = replace(components, seen_by=by, seen_from=seen_from, seen_count=count * share[by])
+        by, seen_from, count = by[kept], seen_from[kept], count[kept]
+    limited = replace(components, seen_by=by, seen_from=seen_from, seen_count=count)
     return limited if all_used else limited.with_used_origins()
 
 
-def _kept_viewpoints(
-    components: Components, max_origins: int, mean_origins: float | None
-) -> tuple[Tensor | None, bool]:
-    """The viewpoints (E′,) that `limit_origins` keeps, in rising order, None: all; and whether it is known
-    that every origin then has one.
-    """
-    by, count = components.seen_by, components.seen_count
-    n, n_rows = len(components), components.seen_by.shape[0]
-    limit = n * max_origins if mean_origins is None else int(n * mean_origins)
-    left = count > 0
-    if n == 0:
-        return None, False
-    n_origins = components.origins.shape[0]
-    per_component = by.new_zeros(n).index_add_(0, by, left.long())
-    used = by.new_zeros(n_origins).index_fill_(0, components.seen_from, 1)
-    n_left, most, n_used = torch.stack([left.sum(), per_component.max(), used.sum()]).tolist()
-    if n_left <= limit and most <= max_origins:
-        if n_left == n_rows:
-            return None, n_used == n_origins
-        return left.nonzero().squeeze(1), False
-    worth, position = count.sqrt(), components.origins[components.seen_from]
+def _choice(
+    by: Tensor, seen_from: Tensor, count: Tensor, origins: Tensor, support: Tensor, most: int, limit: int
+) -> tuple[Tensor, Tensor | None, bool]:
+    """The twin of `viewpoint_choice`."""
+    n_rows, left = len(by), count > 0
+    worth, position = count.sqrt(), origins[seen_from]
     nearest = torch.ones_like(count)  # distance to the nearest kept origin of the same component
     # A component without a viewpoint that is left chooses one more row at the end, which does not count.
     rows, left = torch.arange(n_rows, device=by.device), torch.cat([left, left.new_zeros(1)])
     gain = count.new_full((n_rows + 1,), -1.0)  # √count · distance at which a viewpoint was chosen
-    nowhere = position.new_full((1, components.dim), torch.inf)
-    for step in range(min(max_origins, most)):
+    nowhere = position.new_full((1, origins.shape[1]), torch.inf)
+    for step in range(most):
+        if not bool(left.any()):
+            break
         score = torch.where(left[:-1], worth * nearest, -1.0)
-        largest = score.new_full((n,), -1.0).scatter_reduce_(0, by, score, "amax")
+        largest = torch.full_like(support, -1.0).scatter_reduce_(0, by, score, "amax")
         best = torch.where(left[:-1] & (score == largest[by]), rows, n_rows)
-        chosen = rows.new_full((n,), n_rows).scatter_reduce_(0, by, best, "amin")
+        chosen = rows.new_full(support.shape, n_rows).scatter_reduce_(0, by, best, "amin")
         gain.scatter_(0, chosen, torch.inf if step == 0 else torch.cat([score, score[:1]])[chosen])
         left.index_fill_(0, chosen, False)
         distance = (position - torch.cat([position, nowhere])[chosen][by]).norm(dim=1)
         nearest = distance if step == 0 else torch.minimum(nearest, distance)
-    gain, kept = gain[:-1], torch.zeros_like(left[:-1])
-    kept[gain.argsort(descending=True, stable=True)[:limit]] = True
-    return (kept & (gain >= 0)).nonzero().squeeze(1), False
+    is_kept = torch.zeros_like(left[:-1])
+    is_kept[gain[:-1].argsort(descending=True, stable=True)[:limit]] = True
+    is_kept &= gain[:-1] >= 0
+    total = torch.zeros_like(support).index_add_(0, by, torch.where(is_kept, count, 0.0))
+    share = support / total.clamp_min(torch.finfo(total.dtype).tiny)
+    return count * share[by], is_kept.nonzero().squeeze(1), False
 
 
 Size = Callable[[Components], int]
@@ -172,38 +164,32 @@ def estimated_bytes(components: Components) -> int:
     return 300 + 16 * len(components) + 2 * max(0, further) + 7 * components.origins.shape[0]
 
 
-def merged(components: Components, labels: Tensor) -> Components:
-    """Merges the components of each label (K,). Moments and counts are preserved, viewpoints are united.
+def united(components: Components, found: MergedInRounds) -> Components:
+    """The components after the merges that were found for them. Viewpoints are united.
 
-    Labels are 0, 1, … without gaps. A component with a label of its own stays bit-identical. A merged
-    component is `UNNUMBERED` and has the robot of its first member.
+    A component that is not merged stays bit-identical. A merged component is `UNNUMBERED` and has the robot
+    of its first member.
     """
-    n = int(labels.max()) + 1 if labels.numel() else 0
-    members = torch.bincount(labels, minlength=n)
-    first = _first_rows(labels, n)
-    joined = merge_components(components.support, components.means, components.covariances, labels, n)
-    single = members == 1
-    ids = components.ids[first]
-    ids[~single, 1] = UNNUMBERED
-    seen_by, seen_from, seen_count = union_of_viewpoints(components, labels)
+    first, is_merged = found.first, found.members > 1
+    weights, means, covariances = found.parameters
+    robots, numbers = components.ids[first].unbind(1)
+    seen_by, seen_from, seen_count = union_of_viewpoints(components, found.labels)
     attributes = components.attributes
     if attributes:
-        rows, groups = (~single[labels]).nonzero().squeeze(1), (~single).nonzero().squeeze(1)
-        number = ((~single).cumsum(0) - 1)[labels[rows]]
-        before, after = (
-            (components.means[rows], components.covariances[rows]),
-            (joined.means[groups], joined.covariances[groups]),
-        )
+        rows, groups = is_merged[found.labels].nonzero().squeeze(1), is_merged.nonzero().squeeze(1)
+        number = (is_merged.cumsum(0) - 1)[found.labels[rows]]
+        before = components.means[rows], components.covariances[rows]
+        after = means[groups], covariances[groups]
         made = moments.merged(attributes.selected(rows), number, components.support[rows], before, after)
         attributes = attributes.selected(first).replaced(groups, made)
     return replace(
         components,
-        means=torch.where(single[:, None], components.means[first], joined.means),
-        covariances=torch.where(single[:, None, None], components.covariances[first], joined.covariances),
+        means=means,
+        covariances=covariances,
         attributes=attributes,
-        support=torch.where(single, components.support[first], joined.weights),
+        support=weights,
         max_range=components.max_range[first],
-        ids=ids,
+        ids=torch.stack([robots, torch.where(is_merged, UNNUMBERED, numbers)], 1),
         seen_by=seen_by,
         seen_from=seen_from,
         seen_count=seen_count,
@@ -230,6 +216,7 @@ def compact(
     if max_components is not None:
         check_whole("max_components", max_components, 1)
     if max_cost is not None:
+        check_number("max_cost", max_cost)
         components = _merged_by_kind(components, None, max_cost)
     if max_components is not None and len(components) > max_components:
         components = _merged_by_kind(components, max_components, None)
@@ -237,50 +224,48 @@ def compact(
 
 
 def _merged_by_kind(components: Components, limit: int | None, max_cost: float | None) -> Components:
-    labels = torch.zeros(len(components), dtype=torch.int64, device=components.means.device)
-    n_labels = 0
-    for flag, share in _shares(components.max_range, limit).items():
-        rows = (components.max_range == flag).nonzero().squeeze(1)
-        if len(rows) == 0:
-            continue
-        if share == 0:  # a budget of one component for both kinds: surfaces stay
-            surfaces = (~components.max_range).nonzero().squeeze(1)
-            return _merged_by_kind(components.selected(surfaces), limit, max_cost)
-        given = Parameters(components.support[rows], components.means[rows], components.covariances[rows])
-        if components.attributes and not flag:
-            joint = moments.joint_moments(components.attributes.selected(rows), *given)
-            given = Parameters(given.weights, *joint)
-        cost = "hellinger" if limit is None else "kullback_leibler"
-        found = simplify(given, share, max_cost, cost, most_exact=0)
-        labels[rows] = found.labels + n_labels
-        n_labels += found.parameters.weights.shape[0]
-    return merged(components, _by_first_member(labels))
-
-
-def _shares(max_range: Tensor, limit: int | None) -> dict[bool, int | None]:
-    """Number of components of each kind that are left."""
-    if limit is None:
-        return {False: None, True: None}
-    n, n_empty = max_range.shape[0], int(max_range.sum())
+    n, n_empty = len(components), int(components.max_range.sum())
     if n_empty in (0, n):
-        return {False: limit, True: limit}
-    empty = min(max(1, round(limit * n_empty / n)), limit - 1)
-    return {False: limit - empty, True: empty}
+        return united(components, _merged(components, n_empty == 0, limit, max_cost))
+    surfaces, empty = ((components.max_range == flag).nonzero().squeeze(1) for flag in (False, True))
+    if limit == 1:  # a budget of one component for both kinds: surfaces stay
+        return _merged_by_kind(components.selected(surfaces), limit, max_cost)
+    limits: tuple[int | None, int | None] = (None, None)
+    if limit is not None:  # both kinds shrink in proportion
+        share = min(max(1, round(limit * n_empty / n)), limit - 1)
+        limits = limit - share, share
+    one = _merged(components.selected(surfaces), True, limits[0], max_cost)
+    other = _merged(components.selected(empty), False, limits[1], max_cost)
+    order = torch.cat([surfaces[one.first], empty[other.first]]).argsort()
+    place = torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device))
+    labels = torch.empty_like(components.max_range, dtype=torch.int64)
+    labels[surfaces], labels[empty] = place[one.labels], place[len(one.first) + other.labels]
+    first = torch.cat([surfaces[one.first], empty[other.first]])[order]
+    parts = zip(one.parameters, other.parameters, strict=True)
+    parameters = Parameters(*(torch.cat(part)[order] for part in parts))
+    both = MergedInRounds(parameters, labels, first, torch.cat([one.members, other.members])[order])
+    return united(components, both)
 
 
-def _by_first_member(labels: Tensor) -> Tensor:
-    """Labels (K,) renumbered in the order of their first occurrence."""
-    n = int(labels.max()) + 1 if labels.numel() else 0
-    first = _first_rows(labels, n)
-    rank = torch.empty_like(first)
-    rank[first.argsort()] = torch.arange(n, device=labels.device)
-    return rank[labels]
+def _merged(
+    components: Components, with_attributes: bool, limit: int | None, max_cost: float | None
+) -> MergedInRounds:
+    """Merges among components of one kind, up to one of the limits."""
+    given = Parameters(components.support, components.means, components.covariances)
+    if components.attributes and with_attributes:  # numbers among them are further dimensions
+        given = Parameters(given.weights, *moments.joint_moments(components.attributes, *given))
+    if max_cost is None:
+        found = merge_in_rounds(given, limit or 1)
+    else:
+        found = merge_in_rounds(given, 1, max_cost, "hellinger")
+    weights, means, covariances = found.parameters
+    dim = components.dim
+    return found._replace(parameters=Parameters(weights, means[:, :dim], covariances[:, :dim, :dim]))
 
 
-def _first_rows(labels: Tensor, n: int) -> Tensor:
-    """The first row (n,) of each label."""
-    rows = torch.arange(labels.shape[0], device=labels.device)
-    return rows.new_full((n,), labels.shape[0]).scatter_reduce_(0, labels, rows, "amin")
+def _unnumbered(ids: Tensor) -> Tensor:
+    """The ids (K, 2) without sequence numbers."""
+    return torch.stack([ids[:, 0], torch.full_like(ids[:, 1], UNNUMBERED)], 1)
 
 
 def compact_to_bytes(
@@ -293,28 +278,29 @@ def compact_to_bytes(
     """Merges components until their `size` is at most `max_bytes`; origins are limited as by `limit_origins`.
 
     Beyond that size, components lose their numbers: numbered anew, in the order of space, each takes a byte
-    less.
+    less. The size, as a power of the number of components that its last two values tell, shall be a
+    thousandth below `max_bytes`, so that few sizes are measured; at first it is proportional.
 
     Raises `InvalidArgumentError` if a single component with one origin is too large.
     """
     components = limit_origins(components, max_origins, mean_origins)
-    fixed = None
-    while len(components) and (taken := size(components)) > max_bytes:
-        if len(components) == 1:
-            if components.seen_by.shape[0] == 1:
-                raise InvalidArgumentError(
-                    f"max_bytes={max_bytes} is less than the {taken} that one component takes; allow more."
-                )
+    last: tuple[int, int] | None = None
+    numbered = True
+    while (k := len(components)) and (taken := size(components)) > max_bytes:
+        if numbered:
+            numbered = False
+            if bool((components.ids[:, 1] != UNNUMBERED).any()):
+                components = replace(components, ids=_unnumbered(components.ids))
+                continue
+        if k > 1:
+            power = math.log(last[1] / taken) / math.log(last[0] / k) if last else 1.0
+            wanted = min(k - 1, int(k * (0.999 * max_bytes / taken) ** (1 / max(power, 0.25))))
+            last = k, taken
+            components = limit_origins(compact(components, max(1, wanted)), max_origins, mean_origins)
+        elif components.seen_by.shape[0] > 1:
             components = limit_origins(components, 1)
-            continue
-        if fixed is None:
-            fixed = size(Components.empty(components.dim, components.means.device))
-            robots = components.ids[:, 0]
-            components = replace(
-                components, ids=torch.stack([robots, torch.full_like(robots, UNNUMBERED)], 1)
+        else:
+            raise InvalidArgumentError(
+                f"max_bytes={max_bytes} is less than the {taken} that one component takes; allow more."
             )
-            continue
-        room = max(0, max_bytes - fixed) / max(1, taken - fixed)
-        wanted = max(1, min(len(components) - 1, int(len(components) * room)))
-        components = limit_origins(compact(components, wanted), max_origins, mean_origins)
     return components

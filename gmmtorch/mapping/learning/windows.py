@@ -177,10 +177,9 @@ def _within_budget(components: Components, rule: IncrementalRule, size: Size) ->
         components = compact(components, None, rule.max_cost)
     if rule.n_components is not None:
         components = compact(components, rule.n_components)
-    components = limit_origins(components, rule.max_origins, rule.mean_origins)
-    if rule.max_bytes is not None:
-        components = compact_to_bytes(components, rule.max_bytes, rule.max_origins, rule.mean_origins, size)
-    return components
+    if rule.max_bytes is None:
+        return limit_origins(components, rule.max_origins, rule.mean_origins)
+    return compact_to_bytes(components, rule.max_bytes, rule.max_origins, rule.mean_origins, size)
 
 
 def surface_fit(rule: IncrementalRule, dim: int) -> SurfaceFit:

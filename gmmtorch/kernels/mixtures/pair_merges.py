@@ -1,0 +1,58 @@
+"""Mixtures reduced in rounds of merges; the twin is `mixture.reduction`.
+
+One launch does all rounds. Its merges equal the twin's to the bit, if the same pairs are merged; costs differ
+by rounding.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gmmtorch.kernels.compiler import FusedKernel, Team
+
+_MERGES = {
+    dim: FusedKernel("mixtures/pair_merges.h", f"pair_merges<{dim}>", shares=True, rounds_each=True)
+    for dim in range(2, 7)  # with attributes up to three more than those of space
+}
+_DIGITS, _BLOCK = 16, 32  # as in the source
+
+
+def is_pair_merges_fused(dim: int) -> bool:
+    """Whether there is a kernel for this number of dimensions."""
+    return dim in _MERGES
+
+
+def pair_merges(
+    order: Tensor,
+    weights: Tensor,
+    means: Tensor,
+    covariances: Tensor,
+    least: int,
+    limit: float,
+    is_hellinger: bool,
+    neighbors: int,
+) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]] | None:
+    """Merge pairs of K components until `least` are left, or the cost of every pair is above `limit`.
+
+    order: (K,), their rows along an axis. weights (K,), means (K, D), covariances (K, D, D), float64.
+
+    Returns the first member (K,) of the component that each was merged into; at these rows the number of
+    members (K,), and weights, means and covariances. Returns None if a covariance, given or to be merged, is
+    not positive definite, or its determinant is beyond 10^±280.
+    """
+    k, dim = means.shape
+    given = order, weights.contiguous(), means.contiguous(), covariances.contiguous()
+    made = torch.empty_like(given[1]), torch.empty_like(given[2]), torch.empty_like(given[3])
+    members, lead = torch.empty_like(order), torch.empty_like(order)
+    scratch = weights.new_empty((k + 2 * _BLOCK) * (2 + 3 * dim + dim**2 + 2 * neighbors))
+    whole = order.new_empty(k * (5 + neighbors))
+    counts = torch.empty(_DIGITS * 256, dtype=torch.int32, device=order.device)
+    failed = torch.zeros(1, dtype=torch.bool, device=order.device)
+    team = Team.of(order.device)
+    rule = least, limit, is_hellinger, neighbors
+    _MERGES[dim](
+        team.n, *team, k, *given, *rule, *made, members, lead, failed, scratch, whole, counts,
+        device=order.device,
+    )  # fmt: skip
+    return None if bool(failed) else (lead, members, made)
