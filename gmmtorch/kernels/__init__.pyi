@@ -31,6 +31,7 @@ from .mixtures.cell_sums import depth_cells as depth_cells
 from .mixtures.cell_sums import distinct_keys as distinct_keys
 from .mixtures.cell_sums import piece_cuts as piece_cuts
 from .mixtures.cell_sums import range_sums as range_sums
+from .mixtures.cell_sums import value_sums as value_sums
 from .mixtures.em_loops import TruncatedLimits as TruncatedLimits
 from .mixtures.em_loops import fused_exact_em as fused_exact_em
 from .mixtures.em_loops import fused_truncated_em as fused_truncated_em

@@ -44,7 +44,10 @@ _DEPTHS = {
 _RANGES = {
     dtype: FusedKernel("mixtures/depth_cells.h", f"range_sums<{real}>") for dtype, real in _REAL.items()
 }
-
+_VALUES = {
+    dtype: FusedKernel("mixtures/cells.h", f"value_sums<{real}>", shares=True)
+    for dtype, real in _REAL.items()
+}
 _ORDERED = FusedKernel("mixtures/depth_cells.h", "ordered_cells")
 _FEATURES = FusedKernel("mixtures/depth_cells.h", "cell_features", rounds_each=True)
 
@@ -90,6 +93,21 @@ def cell_moments(
     rank = torch.empty_like(order)
     rank[order] = torch.arange(found)
     return sums[order], rank[member]
+
+
+def value_sums(values: Tensor, member: Tensor, n_cells: int, middle: Tensor) -> Tensor | None:
+    """Of the values (N, A) of points, less `middle` (A,), the number, the sums, and the sums of products of
+    columns i ≤ j, in each of C cells: (C, 1 + A + A(A+1)/2); None without a fused kernel. Points whose values
+    are not all finite add nothing. member: (N,) the cell of each point. The twin is in
+    `mapping.attributes.moments`; sums differ by rounding."""
+    if not is_fused(values, member, middle) or values.dtype not in _REAL:
+        return None
+    n, columns = values.shape
+    width = 1 + columns + columns * (columns + 1) // 2
+    sums = torch.zeros(n_cells, width, dtype=torch.float64, device=values.device)
+    given = values.contiguous(), columns, member.contiguous(), middle
+    _VALUES[values.dtype](n, *given, sums, device=values.device)
+    return sums
 
 
 class DepthCells(NamedTuple):

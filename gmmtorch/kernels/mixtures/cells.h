@@ -58,6 +58,23 @@ GMM_KERNEL cell_moments(int64_t, const double* points, const double* weight, int
     *n_cells = n_found;
 }
 
+// An item is a point. Adds to the sums of its cell one, its values less `middle`, and their products; nothing
+// if one of the values is not finite.
+template <typename Real>
+GMM_KERNEL value_sums(int64_t item, const Real* values, int64_t n_columns, const int64_t* member,
+                      const double* middle, double* sums) {
+    const Real* own = values + item * n_columns;
+    for (int64_t a = 0; a < n_columns; ++a)
+        if (!(fabs((double)own[a]) < HUGE_VAL)) return;
+    double* sum = sums + member[item] * (1 + n_columns + n_columns * (n_columns + 1) / 2);
+    add(sum, 1.0);
+    for (int64_t a = 0, f = 1 + n_columns; a < n_columns; ++a) {
+        const double value = own[a] - middle[a];
+        add(sum + 1 + a, value);
+        for (int64_t b = a; b < n_columns; ++b, ++f) add(sum + f, value * (own[b] - middle[b]));
+    }
+}
+
 // One item numbers all keys, in the order of their first occurrences.
 GMM_KERNEL distinct_keys(int64_t, const int64_t* keys, int64_t n_keys, int64_t* place, int64_t n_places,
                          int64_t* distinct, int64_t* number, int64_t* n_distinct) {

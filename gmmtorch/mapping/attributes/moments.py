@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.kernels import value_sums
 from gmmtorch.linalg import pack_symmetric, triangle_indices, unpack_symmetric
 from gmmtorch.mixture import Cells
 from gmmtorch.scan import LARGEST_LABEL
@@ -258,7 +259,7 @@ def learned(
 
 def _sums(group: Tensor, n: int, values: Tensor) -> Tensor:
     """The sum (n,) of the values (N,) of each group; for a few columns much faster than `index_add`."""
-    return torch.bincount(group, values, minlength=n)
+    return torch.bincount(group, values, minlength=n).to(values.dtype)  # of no values it is int64
 
 
 def _cell_sums(values: Tensor, cells: Cells) -> tuple[Tensor, Tensor]:
@@ -266,16 +267,18 @@ def _cell_sums(values: Tensor, cells: Cells) -> tuple[Tensor, Tensor]:
     (C, 1 + A + A(A+1)/2), less one of the values (A,), which is returned: squares far from zero have no
     digits left for a variance."""
     member, n = cells.member, len(cells.weight)
-    columns = list(values.T.double().contiguous())
-    known = torch.isfinite(sum(columns))
-    middle = (
-        values[known.byte().argmax()].double().nan_to_num() if len(values) else values.new_zeros(len(columns))
-    )
-    columns = [torch.where(known, column - own, 0.0) for column, own in zip(columns, middle, strict=True)]
+    known = torch.isfinite(values.sum(1, dtype=torch.float64))
+    middle = values.new_zeros(values.shape[1], dtype=torch.float64)
+    if len(values):
+        middle = values[known.byte().argmax()].double().nan_to_num()
+    sums = value_sums(values, member, n, middle)
+    if sums is not None:
+        return sums, middle
+    columns = [torch.where(known, column, 0.0) for column in (values - middle).T.contiguous()]
     rows, others = triangle_indices(len(columns))
     products = [columns[i] * columns[j] for i, j in zip(rows.tolist(), others.tolist(), strict=True)]
-    count = _sums(member, n, known.double())
-    return torch.stack([count, *(_sums(member, n, column) for column in [*columns, *products])], 1), middle
+    summed = [_sums(member, n, column) for column in [known.double(), *columns, *products]]
+    return torch.stack(summed, 1), middle
 
 
 def _label_shares(values: Tensor, cells: Cells, kept: Tensor, owner: Tensor, total: Tensor) -> Labels:

@@ -16,9 +16,10 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import kernels
 from gmmtorch.kernels.mixtures.cell_sums import DepthViews, depth_cells, distinct_keys
 from gmmtorch.linalg import dense_ranks
+from gmmtorch.mapping.attributes.moments import _cell_sums
 from gmmtorch.mapping.learning.fitting import DepthFrame, PooledFrames, mean_range, pool_frames
 from gmmtorch.mixture.em.exact import quadratic_features, shift_features
-from gmmtorch.mixture.em.partition import FlatnessRule, Partition, partition
+from gmmtorch.mixture.em.partition import Cells, FlatnessRule, Partition, partition
 
 INTRINSICS = torch.tensor([[64.0, 0, 31.5], [0, 64.0, 23.5], [0, 0, 1]], dtype=torch.float64)
 SIDE = 0.125
@@ -265,3 +266,26 @@ def test_outliers_become_pieces_of_their_own():
     points -= points.mean(0)
     rule = FlatnessRule(thickness=0.02, length=1.0, min_weight=5.0, min_weight_thick=5.0)
     assert cut_by_both(rule, points, torch.ones(51).double()).labels[-1] == 1
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("n", "columns"), [(0, 1), (1, 1), (500, 1), (500, 3), (500, 5)])
+def test_values_of_cells_are_summed_without_those_that_are_not_numbers(n, columns, dtype):
+    draw = torch.Generator().manual_seed(n + columns)
+    values = (1e4 + torch.randn(n, columns, generator=draw)).to(dtype)
+    bad = torch.tensor([math.nan, math.inf, -math.inf])[torch.randint(3, (n,), generator=draw)].to(dtype)
+    broken = torch.rand(n, generator=draw) < 0.2
+    values[:, -1] = torch.where(broken, bad, values[:, -1])
+    member = torch.randint(7, (n,), generator=draw)
+    weight = torch.ones(8, dtype=torch.float64)
+    (twin, middle), (fused, same) = by_both(
+        lambda: _cell_sums(values, Cells(torch.zeros(8, 10).double(), weight, member))
+    )
+    torch.testing.assert_close(fused, twin, rtol=1e-12, atol=1e-9)
+    torch.testing.assert_close(same, middle, rtol=0, atol=0)
+    for cell in range(8):
+        own = values[(member == cell) & ~broken].double() - middle
+        products = own.T @ own
+        rows = torch.triu_indices(columns, columns)
+        expected = torch.cat([torch.full_like(middle[:1], len(own)), own.sum(0), products[rows[0], rows[1]]])
+        torch.testing.assert_close(fused[cell], expected, rtol=1e-12, atol=1e-9)
