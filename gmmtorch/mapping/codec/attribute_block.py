@@ -57,19 +57,18 @@ class _LabelSteps(NamedTuple):
     labels: Tensor
 
 
-def rounded(
-    attributes: Attributes, means: Tensor, rounded_means: Tensor, rounded_covariances: Tensor
-) -> Attributes:
-    """The attributes after writing and reading them, for components whose geometry is rounded, on the CPU.
+def moved(attributes: Attributes, shift: Tensor) -> Attributes:
+    """The attributes of components whose means move by `shift` (K, D): numbers follow their slopes."""
+    return Attributes({name: _at(channel, shift) for name, channel in attributes.channels.items()})
 
-    means, rounded_means: (K, D), from which the means of numbers move along their slopes.
-    """
+
+def rounded(attributes: Attributes, covariances: Tensor) -> Attributes:
+    """The attributes after writing and reading them, for components with these rounded covariances (K, D, D),
+    on the CPU."""
     return Attributes(
         {
-            name: _restored(
-                name, _steps(name, _at(c, rounded_means - means), rounded_covariances), rounded_covariances
-            )
-            for name, c in attributes.channels.items()
+            name: _restored(name, _steps(name, channel, covariances), covariances)
+            for name, channel in attributes.channels.items()
         }
     )
 

@@ -57,7 +57,7 @@ class Quantized:
     n_viewpoints (K,): number of viewpoints of each component. For each viewpoint, sorted by component:
     seen_from (E,), its origin, by rising coordinates; share (E,), −log2 of its share of the component's
     largest, in steps.
-    attributes: rounded, as `attribute_block` does.
+    attributes: at the rounded means, before `attribute_block` rounds them.
     """
 
     places: Lattice
@@ -120,7 +120,7 @@ class Quantized:
             seen_by=seen_by,
             seen_from=self.seen_from,
             seen_count=weight * (support / total)[seen_by],
-            attributes=self.attributes,
+            attributes=attribute_block.rounded(self.attributes, covariances),
         )
 
 
@@ -153,7 +153,7 @@ def quantize(components: Components) -> Quantized:
     by, counts = by[kept], np.add.reduceat(counts[order], begins) if len(kept) else counts
     attributes = c.attributes
     if attributes:
-        attributes = attribute_block.rounded(attributes, c.means, *places.restored())
+        attributes = attribute_block.moved(attributes, places.restored()[0] - c.means)
     return Quantized(
         places=places,
         count=count,
