@@ -36,6 +36,7 @@ from .mixtures.em_loops import n_sampled_rows as n_sampled_rows
 from .mixtures.em_loops import takes_one_launch as takes_one_launch
 from .mixtures.em_steps import expectation as expectation
 from .mixtures.em_steps import exponent_floor as exponent_floor
+from .mixtures.em_steps import fused_label_moments as fused_label_moments
 from .mixtures.em_steps import fused_maximization as fused_maximization
 from .mixtures.em_steps import fused_natural_parameters as fused_natural_parameters
 from .mixtures.em_steps import in_spatial_order as in_spatial_order

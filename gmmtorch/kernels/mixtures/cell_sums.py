@@ -33,8 +33,12 @@ PATCH = 4
 """Side of a patch in pixels, as in `depth_cells.h`."""
 
 _WIDTH = 10  # features in 3D
+_FACTORS = torch.tensor(
+    [2 ** (-step / 3) for step in range(3 * KEY_BITS + 7)], dtype=torch.float64, device="cpu"
+)
 _DISTINCT = FusedKernel("mixtures/cells.h", "distinct_keys", shares=True)
 _MOMENTS = {dim: FusedKernel("mixtures/cells.h", f"cell_moments<{dim}>", shares=True) for dim in (1, 2, 3)}
+_SORTED = FusedKernel("mixtures/cells.h", "sorted_cells", shares=True)
 _DEPTHS = {
     dtype: FusedKernel("mixtures/depth_cells.h", f"depth_cells<{kind}>", shares=True, strided=("depth",))
     for dtype, kind in ((torch.float32, "float"), (torch.float64, "double"))
@@ -56,32 +60,32 @@ def distinct_keys(keys: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def cell_moments(
-    points: Tensor, weight: Tensor, low: Tensor, side: float, factor: float, max_cells: int
-) -> tuple[Tensor, Tensor] | None:
-    """The sums (C, F) of quadratic features over the cells of points (N, D), and the cell (N,) of each point.
+    points: Tensor, weight: Tensor, finest: float, most_along: int, max_cells: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """At most `max_cells` cells of points (N, D), in the order of their keys: mean features (C, F) and weight
+    (C,); and the cell (N,) of each point.
 
-    Cells are in the order of their keys. None if there are more than `max_cells`. The cell of a point x is
-    ⌊(x − low)/side · factor⌋.
+    Cells have side `finest`, or more if there were more than `most_along` along an axis. The side grows in
+    steps of a third of an octave until the limit holds. The cell of x is ⌊(x − low)/side · 2^(−steps/3)⌋.
 
     Args:
-        points, weight: (N, D) and (N,), float64, on the CPU. low: (D,).
+        points, weight: (N, D) and (N,), float64, on the CPU.
     """
     n, dim = points.shape
-    width = 1 + dim + dim * (dim + 1) // 2
-    most = min(n, max_cells)
+    width, most = 1 + dim + dim * (dim + 1) // 2, min(n, max_cells)
     n_places = 1 << (2 * most).bit_length()
-    places = torch.full((n_places,), -1, dtype=torch.int64)
-    keys, member = torch.empty(most, dtype=torch.int64), torch.empty(n, dtype=torch.int64)
-    sums, n_cells = points.new_zeros(most, width), torch.zeros(1, dtype=torch.int64)
-    given = points.contiguous(), weight.contiguous(), n, low.contiguous(), side, factor, max_cells, n_places
+    places, keys, member, n_cells = torch.empty(n_places + most + n + 1, dtype=torch.int64).split(
+        (n_places, most, n, 1)
+    )
+    sums = points.new_zeros(most, width)
+    given = points.contiguous(), weight.contiguous(), n, finest, most_along, _FACTORS, max_cells, n_places
     _MOMENTS[dim](1, *given, places, keys, member, sums, n_cells, device=points.device)
     found = int(n_cells)
-    if found > max_cells:
-        return None
+    made = points.new_empty(found * (width + 1))
+    features, mass = made[: found * width].view(found, width), made[found * width :]
     order = keys[:found].argsort()
-    rank = torch.empty_like(order)
-    rank[order] = torch.arange(found)
-    return sums[order], rank[member]
+    _SORTED(1, order, found, width, sums, n, places, member, features, mass, device=points.device)
+    return features, mass, member
 
 
 class DepthCells(NamedTuple):

@@ -88,7 +88,9 @@ def fused_exact_em(
     size, n_sums = k * (1 + dim + dim * dim), n_parts * padded * width
     scratch = (2 * n, n_parts * padded * CPU_LANES, n_parts * padded) if wide else (n, 0, 0)
     tables = k, padded * width, k * width + 2, n_sums * (CPU_LANES if wide else 1), *scratch, 1
-    head, mixtures, *others = _carved(features, _HEAD + n_iter, 2 * size, *tables, 2 * team.n, 2 * MERGED)
+    head, mixtures, *others = _carved(
+        features, _HEAD + n_iter, 2 * size, *tables, 2 * team.n, 2 * MERGED, MERGED
+    )
     torch.cat([part.reshape(-1) for part in start], out=mixtures[:size])
     rows = features.contiguous(), weight.contiguous(), n, k, padded, n_parts
     limits = reg_covar, tol, last_bound, n_iter, guarded
@@ -163,7 +165,7 @@ def fused_truncated_em(
     tables = 2 * k, k * width, k * width + 2, k * (width + dim), *scratch, 1 + k // CPU_LANES
     head, mixtures, *others = _carved(
         *(values, _HEAD + n_bounds, 3 * size, *tables, n, (n_parts + 1) * k, 2 * n * (columns + 1)),
-        *(2 * places, 2 * workers.n, 2 * MERGED),
+        *(2 * places, 2 * workers.n, 2 * MERGED, MERGED),
     )
     natural, statistics, flags, owners, groups = (others[i] for i in (1, 2, 8, 9, 12))
     torch.cat([part.reshape(-1) for part in start], out=mixtures[:size])

@@ -197,6 +197,9 @@ DIMENSIONS = (1, 2, 3)
 
 _NATURALS = {dim: FusedKernel("mixtures/m_step.h", f"natural_parameters<{dim}>") for dim in DIMENSIONS}
 _STEPS = {dim: FusedKernel("mixtures/m_step.h", f"m_step<{dim}>") for dim in DIMENSIONS}
+_LABELLED = {
+    dim: FusedKernel("mixtures/m_step.h", f"label_moments<{dim}>", shares=True) for dim in DIMENSIONS
+}
 
 Mixture = tuple[Tensor, Tensor, Tensor]
 """Weights (K,), means (K, D) and covariances (K, D, D)."""
@@ -232,3 +235,16 @@ def fused_maximization(statistics: Tensor, dim: int, reg_covar: float, previous:
     given = statistics.contiguous(), *kept, False, reg_covar, None, None, 0.0
     _STEPS[dim](k, *given, masses, means, covariances, *[None] * 4, device=statistics.device)
     return masses / masses.sum(), means, covariances
+
+
+def fused_label_moments(
+    rows: Tensor, weight: Tensor, labels: Tensor, n_labels: int, dim: int, reg_covar: float
+) -> Mixture:
+    """On a CPU, weight, mean and covariance of the points (N, D) or cells (N, F) of each label (N,)."""
+    k, width = n_labels, 1 + dim + dim * (dim + 1) // 2
+    made = rows.new_zeros(k * (width + 1 + dim + dim * dim))
+    sums, weights, means, covariances = made.split([k * width, k, k * dim, k * dim * dim])
+    given = rows.contiguous(), rows.shape[1] == dim, weight.contiguous(), labels.contiguous(), len(rows), k
+    results = sums, weights, means, covariances
+    _LABELLED[dim](1, *given, reg_covar, *results, device=rows.device)
+    return weights, means.view(k, dim), covariances.view(k, dim, dim)

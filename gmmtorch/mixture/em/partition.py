@@ -27,7 +27,9 @@ from gmmtorch.linalg import dense_ranks, on_cpu, unpack_symmetric
 from gmmtorch.mixture.em.exact import quadratic_features
 
 _MAX_LEVELS = 64
-_MOST_ON_CPU = 1 << 17  # cells of another device: each level of cuts waits for the one before it
+MOST_ON_CPU = 1 << 17
+"""Cells of another device that are cut on the CPU: there, each level of cuts waits for the one before it."""
+
 _THICKNESS_PRIORITY = 30.0
 """Weight of a piece's smallest variance, relative to its largest, in the priority of halving it. Thick
 pieces span several surfaces, and so put matter into free space (docs/decisions.md, "Where EM starts")."""
@@ -101,7 +103,7 @@ def partition(
     """
     n, dim = points.shape
     features = quadratic_features(points) if features is None else features
-    if points.device.type != "cpu" and n <= _MOST_ON_CPU:
+    if points.device.type != "cpu" and n <= MOST_ON_CPU:
         points_cpu, weight_cpu, features_cpu = on_cpu(points, weight, features)
         found = partition(points_cpu, weight_cpu, rule, features_cpu)
         return found._replace(labels=found.labels.to(points.device))
@@ -202,6 +204,8 @@ def pool_into_cells(points: Tensor, max_cells: int, finest: float, weight: Tenso
     weight = points.new_ones(n) if weight is None else weight
     if n <= max_cells:
         return Cells(quadratic_features(points), weight, torch.arange(n, device=points.device))
+    if points.device.type == "cpu" and is_fused(points, weight):
+        return Cells(*cell_moments(points, weight, finest, _MAX_CELLS_ALONG, max_cells))
     low = points.amin(0)
     extent = (points.amax(0) - low).max()
     side = (extent / _MAX_CELLS_ALONG).clamp_min(finest)
@@ -210,8 +214,6 @@ def pool_into_cells(points: Tensor, max_cells: int, finest: float, weight: Tenso
     def pooled(thirds: int) -> tuple[Tensor, Tensor] | None:
         """Sums and members of cells of side · 2^(thirds/3); None if there are too many cells."""
         factor = 2 ** (-thirds / 3)
-        if points.device.type == "cpu" and is_fused(points, weight):
-            return cell_moments(points, weight, low, float(side), factor, max_cells)
         return _sums_by_key(points, weight, ((points - low) / side * factor).long(), max_cells)
 
     found = pooled(0)
