@@ -24,6 +24,7 @@ from .mixtures.cell_sums import KEY_BITS as KEY_BITS
 from .mixtures.cell_sums import CutRule as CutRule
 from .mixtures.cell_sums import DepthCells as DepthCells
 from .mixtures.cell_sums import DepthViews as DepthViews
+from .mixtures.cell_sums import are_cell_moments_fused as are_cell_moments_fused
 from .mixtures.cell_sums import are_piece_cuts_fused as are_piece_cuts_fused
 from .mixtures.cell_sums import cell_features as cell_features
 from .mixtures.cell_sums import cell_moments as cell_moments

@@ -45,6 +45,8 @@ _RANGES = {
     dtype: FusedKernel("mixtures/depth_cells.h", f"range_sums<{real}>") for dtype, real in _REAL.items()
 }
 
+_MEANS = FusedKernel("mixtures/cells.h", "mean_features")
+_MOST_CELLS_ON_GPU = 1 << 18
 _ORDERED = FusedKernel("mixtures/depth_cells.h", "ordered_cells")
 _FEATURES = FusedKernel("mixtures/depth_cells.h", "cell_features", rounds_each=True)
 
@@ -63,33 +65,51 @@ def distinct_keys(keys: Tensor) -> tuple[Tensor, Tensor]:
     return distinct[: int(n_distinct)], number
 
 
+def are_cell_moments_fused(points: Tensor, weight: Tensor | None, max_cells: int) -> bool:
+    """Whether the fused kernel sums these points. On a GPU its table has at most 400 bytes a
+    cell."""
+    fits = points.device.type == "cpu" or min(len(points), max_cells) <= _MOST_CELLS_ON_GPU
+    return fits and is_fused(points, *([] if weight is None else [weight]))
+
+
 def cell_moments(
-    points: Tensor, weight: Tensor, low: Tensor, side: float, factor: float, max_cells: int
-) -> tuple[Tensor, Tensor] | None:
-    """The sums (C, F) of quadratic features over the cells of points (N, D), and the cell (N,) of each point.
+    points: Tensor,
+    weight: Tensor | None,
+    box: tuple[Tensor, Tensor],
+    finest: float,
+    most_along: int,
+    factor: float,
+    max_cells: int,
+) -> tuple[Tensor, Tensor, Tensor] | None:
+    """The mean quadratic features (C, F) of points (N, D) in cells, the weight (C,) of each cell, and the
+    cell (N,) of each point.
 
     Cells are in the order of their keys. None if there are more than `max_cells`. The cell of a point x is
-    ⌊(x − low)/side · factor⌋.
+    ⌊(x − low)/side · factor⌋, with the least side from `finest` on of which `most_along` cells hold all
+    points.
 
     Args:
-        points, weight: (N, D) and (N,), float64, on the CPU. low: (D,).
+        points, weight: (N, D) and (N,), float64; None: one. box: lowest and highest coordinates (D,).
     """
-    n, dim = points.shape
-    width = 1 + dim + dim * (dim + 1) // 2
-    most = min(n, max_cells)
+    (n, dim), device, on_cpu = points.shape, points.device, points.device.type == "cpu"
+    most, width = min(n, max_cells), 1 + dim + dim * (dim + 1) // 2
     n_places = 1 << (2 * most).bit_length()
-    places = torch.full((n_places,), -1, dtype=torch.int64)
-    keys, member = torch.empty(most, dtype=torch.int64), torch.empty(n, dtype=torch.int64)
-    sums, n_cells = points.new_zeros(most, width), torch.zeros(1, dtype=torch.int64)
-    given = points.contiguous(), weight.contiguous(), n, low.contiguous(), side, factor, max_cells, n_places
-    _MOMENTS[dim](1, *given, places, keys, member, sums, n_cells, device=points.device)
+    n_rows = most if on_cpu else n_places  # on CUDA the place of a cell is its number
+    places = torch.full((n_places,), -1, dtype=torch.int32) if on_cpu else None
+    keys = torch.empty(n_rows, dtype=torch.int64) if on_cpu else torch.full((n_rows,), -1, device=device)
+    sums = (points.new_empty if on_cpu else points.new_zeros)(n_rows, width)
+    member, rank = keys.new_empty(n), keys.new_empty(n_rows)
+    n_cells = torch.zeros(1, dtype=torch.int64, device=device)
+    given = points.contiguous(), None if weight is None else weight.contiguous(), n, *box
+    sizes = finest, most_along, factor, max_cells, n_places
+    _MOMENTS[dim](1 if on_cpu else n, *given, *sizes, places, keys, member, sums, n_cells, device=device)
     found = int(n_cells)
     if found > max_cells:
         return None
-    order = keys[:found].argsort()
-    rank = torch.empty_like(order)
-    rank[order] = torch.arange(found)
-    return sums[order], rank[member]
+    order = keys[:found].argsort() if on_cpu else keys.argsort()[n_rows - found :]  # a free place holds -1
+    features, mass = sums.new_empty(found, width), sums.new_empty(found)
+    _MEANS(found, order, sums, width, features, mass, rank, device=device)
+    return features, mass, rank[member]
 
 
 class DepthCells(NamedTuple):

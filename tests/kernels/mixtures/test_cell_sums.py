@@ -18,7 +18,7 @@ from gmmtorch.kernels.mixtures.cell_sums import DepthViews, depth_cells, distinc
 from gmmtorch.linalg import dense_ranks
 from gmmtorch.mapping.learning.fitting import DepthFrame, PooledFrames, mean_range, pool_frames
 from gmmtorch.mixture.em.exact import quadratic_features, shift_features
-from gmmtorch.mixture.em.partition import FlatnessRule, Partition, partition
+from gmmtorch.mixture.em.partition import FlatnessRule, Partition, partition, pool_into_cells
 
 INTRINSICS = torch.tensor([[64.0, 0, 31.5], [0, 64.0, 23.5], [0, 0, 1]], dtype=torch.float64)
 SIDE = 0.125
@@ -174,6 +174,27 @@ def test_points_far_apart_have_larger_cells_and_points_beyond_a_map_are_refused(
         depth[3, 3] = value
         with pytest.raises(InvalidArgumentError, match="134217728"):
             pool_frames([frame(depth, pose())], SIDE, 1000)
+
+
+@given(
+    n=st.integers(2, 600),
+    dim=st.sampled_from([1, 2, 3]),
+    seed=st.integers(0, 10_000),
+    finest=st.sampled_from([0.0, 1e-3, 0.3, 100.0]),
+    share=st.sampled_from([0.01, 0.3, 0.9]),
+    is_weighted=st.booleans(),
+)
+def test_cells_of_points_are_those_of_the_twin(n, dim, seed, finest, share, is_weighted):
+    draw = torch.Generator().manual_seed(seed)
+    points = torch.randn(n, dim, generator=draw).double() * 10.0 ** (seed % 7 - 3)
+    points[torch.randint(n, (n // 2,), generator=draw)] = points[0].clone()
+    weight = torch.randint(1, 9, (n,), generator=draw).double() if is_weighted else None
+    twin, fused = by_both(lambda: pool_into_cells(points, max(1, int(share * n)), finest, weight))
+    assert torch.equal(fused.member, twin.member)
+    torch.testing.assert_close(fused.weight, twin.weight)
+    torch.testing.assert_close(
+        fused.features, twin.features, rtol=1e-12, atol=1e-13 * float(points.abs().max())
+    )
 
 
 @pytest.mark.cpu_only
