@@ -108,15 +108,15 @@ def partition(
     """
     n, dim = points.shape
     features = quadratic_features(points) if features is None else features
-    if points.device.type != "cpu" and n <= _MOST_ON_CPU:
-        points_cpu, weight_cpu, features_cpu = on_cpu(points, weight, features)
-        found = partition(points_cpu, weight_cpu, rule, features_cpu)
-        return found._replace(labels=found.labels.to(points.device))
-    if are_piece_cuts_fused(points, weight, features):
+    if are_piece_cuts_fused(points, weight, features, rule.max_components):
         limit = -1 if rule.max_components is None else rule.max_components
         given = vars(rule) | {"n_levels": _MAX_LEVELS, "max_components": limit}
         cuts = CutRule(**given, thickness_priority=_THICKNESS_PRIORITY)
         return Partition(*piece_cuts(points, weight, features, cuts))
+    if points.device.type != "cpu" and n <= _MOST_ON_CPU:
+        points_cpu, weight_cpu, features_cpu = on_cpu(points, weight, features)
+        found = partition(points_cpu, weight_cpu, rule, features_cpu)
+        return found._replace(labels=found.labels.to(points.device))
     labels = torch.zeros(n, dtype=torch.int64, device=points.device)
     n_pieces = 1
     for _ in range(_MAX_LEVELS):

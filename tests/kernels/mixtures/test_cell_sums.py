@@ -14,7 +14,8 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import kernels
-from gmmtorch.kernels.mixtures.cell_sums import DepthViews, depth_cells, distinct_keys
+from gmmtorch.kernels.compiler import Team
+from gmmtorch.kernels.mixtures.cell_sums import CutRule, DepthViews, depth_cells, distinct_keys, piece_cuts
 from gmmtorch.linalg import dense_ranks
 from gmmtorch.mapping.learning.fitting import DepthFrame, PooledFrames, mean_range, pool_frames
 from gmmtorch.mixture.em.exact import quadratic_features, shift_features
@@ -246,7 +247,6 @@ def cut_by_both(rule: FlatnessRule, *given_: Tensor) -> Partition:
     return fused
 
 
-@pytest.mark.cpu_only
 @given(
     n=st.integers(1, 400),
     dim=st.sampled_from([1, 2, 3]),
@@ -265,12 +265,31 @@ def test_pieces_are_those_of_the_twin(n, dim, seed, limit, least, thickness):
 
 
 @pytest.mark.cpu_only
+@given(
+    n=st.integers(1, 400),
+    dim=st.sampled_from([1, 2, 3]),
+    seed=st.integers(0, 10_000),
+    limit=st.sampled_from([-1, 1, 2, 7, 60]),
+    least=st.sampled_from([0.0, 3.0, 40.0]),
+    thickness=st.sampled_from([0.0, 0.02, 0.2]),
+    n_workers=st.sampled_from([1, 7, 64, 1000]),
+    n_levels=st.sampled_from([1, 3, 64]),
+)
+def test_many_workers_cut_the_same_pieces_as_one(n, dim, seed, limit, least, thickness, n_workers, n_levels):
+    rule = CutRule(n_levels, limit, thickness, 0.5, least, 1.0, 3.0, 30.0)
+    points, weight, features = cells(n, dim, seed)
+    with kernels("fused"):
+        labels, n_pieces = piece_cuts(points, weight, features, rule)
+        shared, n_shared = piece_cuts(points, weight, features, rule, Team(n_workers, None))
+    assert n_shared == n_pieces
+    assert torch.equal(shared, labels)
+
+
 def test_pieces_without_extent_stay_whole():
     one = torch.zeros(5, 3, dtype=torch.float64)
     assert cut_by_both(FlatnessRule(thickness=0.0, min_weight=1.0), one, one[:, 0] + 1).n_pieces == 1
 
 
-@pytest.mark.cpu_only
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 def test_pieces_do_not_depend_on_the_unit(scale):
     points, weight, _ = cells(300, 3, 1)
