@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterable
 
@@ -118,17 +119,24 @@ def all_equal(pairs: Iterable[tuple[Tensor, Tensor]]) -> bool:
 # -- sorting: NumPy's vectorised sorts on the CPU, torch's elsewhere ------------------------------
 
 
+@functools.cache
+def _morton_bits(dim: int, device: str) -> Tensor:
+    """The bits (32, D) of a cell's number along each axis, at their places in the number of a curve."""
+    spread = [
+        [sum((n >> b & 1) << (b * dim + axis) for b in range(5)) for axis in range(dim)] for n in range(32)
+    ]
+    return torch.tensor(spread, device=device)
+
+
 def order_along_curve(places: Tensor) -> Tensor:
     """An order (N,) of finite points (N, D), D ≤ 3, at least one, in which neighbours follow each other.
 
     It is that of a Morton curve through 32 cells along each axis of their box.
     """
-    low, high = places.amin(0), places.amax(0)
+    low, high = places.aminmax(dim=0)
     cell = ((places - low) * (31.99 / (high - low).max().clamp_min(1e-300))).long().clamp_(0, 31)
-    dim = places.shape[1]
-    spread = [sum((n >> b & 1) << (b * dim) for b in range(5)) for n in range(32)]
-    bits = torch.tensor(spread, device=places.device)
-    keys = sum((bits[cell[:, axis]] << axis for axis in range(dim)), torch.zeros_like(cell[:, 0]))
+    bits = _morton_bits(places.shape[1], str(places.device))
+    keys = torch.gather(bits, 0, cell).sum(1)
     return keys.short().argsort(stable=True)
 
 

@@ -5,6 +5,7 @@ Camera frame: x right, y down, z forward, metres.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -70,11 +71,12 @@ def check_intrinsics(intrinsics: ArrayLike, shape: tuple[int, ...] | None = None
     Raises `InvalidArgumentError` for another matrix, such as a transposed one.
     """
     matrix = as_tensor(intrinsics, "intrinsics", torch.float64).detach()
-    if tuple(matrix.shape) != (3, 3) or not bool(torch.isfinite(matrix).all()):
+    rows = matrix.tolist() if tuple(matrix.shape) == (3, 3) else []
+    if not rows or not all(math.isfinite(value) for row in rows for value in row):
         raise InvalidArgumentError(
             f"intrinsics has shape {tuple(matrix.shape)}; expected a finite 3×3 pinhole matrix in pixels."
         )
-    (fx, skew, cx), (turn, fy, cy), last = matrix.tolist()
+    (fx, skew, cx), (turn, fy, cy), last = rows
     if last != [0, 0, 1]:
         hint = " It looks transposed." if (cx, cy) == (0, 0) else ""
         raise _wrong(matrix, f"its last row must be 0 0 1.{hint}")

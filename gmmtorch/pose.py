@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -313,12 +314,13 @@ def skew(turns: Tensor) -> Tensor:
 
 def _first_not_rigid(matrices: Tensor) -> int | None:
     """The first of matrices (…, D+1, D+1) that is not rigid; None if all are. Waits once for a device."""
-    values = matrices.detach().cpu().reshape(-1, *matrices.shape[-2:])
-    turn, eye = values[:, :-1, :-1], torch.eye(values.shape[1]).double()
-    rigid = (
-        values.isfinite().flatten(1).all(1)
-        & ((turn @ turn.mT - eye[:-1, :-1]).abs().amax((1, 2)) <= _ORTHONORMAL)
-        & (torch.linalg.det(turn) > 0)
-        & ((values[:, -1] - eye[-1]).abs().amax(1) <= _LAST_ROW)
-    )
-    return None if bool(rigid.all()) else int((~rigid).nonzero()[0])
+    values = matrices.detach().cpu().numpy().reshape(-1, *matrices.shape[-2:])
+    turn, eye = values[:, :-1, :-1], np.eye(values.shape[1])
+    with np.errstate(invalid="ignore", over="ignore"):  # numbers that are not finite
+        rigid = (
+            np.isfinite(values).all((1, 2))
+            & (np.abs(turn @ turn.transpose(0, 2, 1) - eye[:-1, :-1]).max((1, 2)) <= _ORTHONORMAL)
+            & (np.linalg.det(turn) > 0)
+            & (np.abs(values[:, -1] - eye[-1]).max(1) <= _LAST_ROW)
+        )
+    return None if rigid.all() else int(rigid.argmin())

@@ -126,10 +126,11 @@ def _is_fused(*tensors: Tensor | None) -> bool:
     return choice.is_fused(*tensors)
 
 
-def _team(device: torch.device) -> Team:
+def _team(device: torch.device, most: int | None = None) -> Team:
     if device.type == "cpu":
         return Team(1, None)
-    return Team(N_THREADS, torch.zeros(1, dtype=torch.int32, device=device))
+    n_threads = N_THREADS if most is None else min(N_THREADS, most)
+    return Team(n_threads, torch.zeros(1, dtype=torch.int32, device=device))
 
 
 @contextmanager

@@ -61,7 +61,6 @@ class FusedKernel:
         source: the file with the function, relative to this one.
         call: its name, with the arguments of its template; unique among the kernels.
         shares: whether items write to the same places. Such a launch uses one thread of a CPU.
-        strided: parameters whose tensors need not be contiguous, because the function is given their strides.
         rounds_each: whether the compiler must round every product, as tensor operations do, and not contract
             a * b + c. Results of such a kernel can equal those of tensor operations to the bit.
     """
@@ -71,11 +70,10 @@ class FusedKernel:
         source: str,
         call: str,
         shares: bool = False,
-        strided: tuple[str, ...] = (),
         rounds_each: bool = False,
     ) -> None:
         self.name = re.sub(r"\W+", "_", call).strip("_")
-        self.shares, self._strided, self._rounds_each = shares, strided, rounds_each
+        self.shares, self._rounds_each = shares, rounds_each
         self._source, self._call = (Path(__file__).parent / source).resolve(), call
         self._kernels: dict[str, Any] = {}  # of Warp, by type of device
         self._loaded: set[torch.device] = set()
@@ -85,8 +83,8 @@ class FusedKernel:
         """Run the function for the items 0 … n_items − 1.
 
         Tensors must be on `device` and of the type of their pointers; this is not checked. Raises
-        `GmmTorchError` for a tensor that is not contiguous, unless it is `strided`. On a CPU the items are
-        split over `torch.get_num_threads()` threads, unless the kernel `shares`.
+        `GmmTorchError` for a tensor that is not contiguous. On a CPU the items are split over
+        `torch.get_num_threads()` threads, unless the kernel `shares`.
         """
         if n_items == 0:
             return
@@ -148,7 +146,7 @@ class FusedKernel:
         values: list[float] = []
         for parameter, argument in zip(self._parameters, arguments, strict=True):
             if isinstance(argument, Tensor):
-                if not argument.is_contiguous() and parameter.label not in self._strided:
+                if not argument.is_contiguous():
                     raise GmmTorchError(
                         f"{parameter.label} of kernel {self.name} has shape {tuple(argument.shape)} and "
                         f"strides {argument.stride()}, which are not contiguous; pass tensor.contiguous()."
@@ -257,11 +255,13 @@ class Team(NamedTuple):
     rounds: int = 0
 
     @staticmethod
-    def of(device: torch.device) -> Team:
-        """One worker on a CPU; on a GPU as many as it runs at a time."""
+    def of(device: torch.device, most: int | None = None) -> Team:
+        """One worker on a CPU; on a GPU as many as it runs at a time, or blocks of `most` items."""
         if device.type == "cpu":
             return Team(1, None)
         n_blocks = _BLOCKS_OF_TEAM * torch.cuda.get_device_properties(device).multi_processor_count
+        if most is not None:
+            n_blocks = min(n_blocks, -(-most // _BLOCK))
         return Team(n_blocks * _BLOCK, torch.zeros(1, dtype=torch.int32, device=device))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
@@ -13,14 +14,21 @@ import torch
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike
-from gmmtorch.errors import DAMAGED_CONTENT, DataError, InvalidArgumentError, check_choice, check_whole
+from gmmtorch.errors import (
+    DAMAGED_CONTENT,
+    DataError,
+    GmmTorchError,
+    InvalidArgumentError,
+    check_choice,
+    check_whole,
+)
 from gmmtorch.files import write_bytes
 from gmmtorch.mapping.attributes.answers import Prediction, predictions
 from gmmtorch.mapping.attributes.moments import check_kinds
 from gmmtorch.mapping.codec.component_batch import CODECS, MapSettings, map_bytes, read_map
 from gmmtorch.mapping.codec.quantization import joined, quantized_after
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.fitting import DepthFrame, depth_and_pose
+from gmmtorch.mapping.learning.fitting import DepthFrame, error_of_some, whole_frames
 from gmmtorch.mapping.learning.rules import IncrementalRule, LearningRule, WindowedRule, read_rule
 from gmmtorch.mapping.learning.windows import Doubts
 from gmmtorch.mapping.map_state import MapState
@@ -209,6 +217,11 @@ class GaussianMap(MapState):
             max_range: pixels at or beyond it (m) are left out, as are pixels that are zero or not finite.
             depth_scale: metres per unit of the images, such as 0.001 for millimetres. Images of integers need
                 it; None: metres, in a floating type.
+
+        A frame without a valid pixel adds nothing. Raises `InvalidArgumentError`, or `DataError` of a file,
+        if a frame is broken: no pair, no image, or a pose that is not rigid. If others are whole, they are
+        learned before, and the error names the broken ones: frames[7]. A pixel farther away than a map
+        stores is an error that keeps the map as it is.
         """
         if not isinstance(self.learning, IncrementalRule):
             raise InvalidArgumentError(
@@ -217,17 +230,16 @@ class GaussianMap(MapState):
         check_whole("pixel_stride", pixel_stride, 1)
         if len(frames) == 0:
             return
-
-        def frame_of(index: int) -> DepthFrame:
-            given = depth_and_pose(frames, index)
-            return DepthFrame.of(*given, intrinsics, pixel_stride, max_range, depth_scale)
-
-        first = frame_of(0)
+        broken: dict[int, GmmTorchError] = {}
+        whole = whole_frames(frames, broken, intrinsics, pixel_stride, max_range, depth_scale)
+        first = next(whole, None)
+        if first is None:
+            raise broken[0]
         self._prepare(3, first.depth.device, "depth images are")
         if self.n_pending:
             self._commit(*self._upcoming())
         self.learning = self.learning.fitted([first])
-        taken = (frame_of(index).to(self._device) for index in range(len(frames)))
+        taken = (frame.to(self._device) for frame in itertools.chain([first], whole))
         calibrator, n_windows = self._calibrator, self._n_windows
 
         def predict(known: Components, window: Sequence[Scan | DepthFrame]) -> None:
@@ -239,6 +251,8 @@ class GaussianMap(MapState):
         learned = self._absorbed(taken, self.learning, float(pixel_stride**2), predict)
         self._calibrator, self._n_windows = calibrator, n_windows
         self._commit(*learned)
+        if broken:
+            raise error_of_some(broken, len(frames))
 
     def finish(self) -> None:
         """Learns from the scans of the unfinished window together, as from those of a full one."""

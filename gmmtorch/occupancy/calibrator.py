@@ -38,16 +38,11 @@ from gmmtorch.errors import DataError, check_number
 from gmmtorch.linalg import on_cpu
 
 _CENTER, _WIDTH = 0.05, math.log(10.0)  # of h/ℓ; the scale is nearly log(h/ℓ / 0.05) from 0.01 to 0.25
-_MEAN = torch.tensor(  # of the prior: constant, linear and quadratic part of the logarithm of a, ν, b and b
-    [[-0.3, -0.38, 0.14], [1.5, -0.3, 0.0], [0.35, 0.17, 0.0], [0.1, 0.12, 0.06]], dtype=torch.float64
-)
-_DEVIATION = torch.tensor(
-    [[0.4, 0.15, 0.05], [1.0, 0.3, 0.05], [0.25, 0.1, 0.05], [0.25, 0.1, 0.05]], dtype=torch.float64
-)
+# Of the prior: constant, linear and quadratic part of the logarithm of a, ν, b and b.
+_MEAN = np.array([[-0.3, -0.38, 0.14], [1.5, -0.3, 0.0], [0.35, 0.17, 0.0], [0.1, 0.12, 0.06]])
+_DEVIATION = np.array([[0.4, 0.15, 0.05], [1.0, 0.3, 0.05], [0.25, 0.1, 0.05], [0.25, 0.1, 0.05]])
 _FARTHEST = 3.0  # deviations of the prior that a coefficient of a map moves at most
-_INFORMATION = torch.tensor(  # of a predicted point about each coefficient, about
-    [[0.1, 0.1, 0.1], [0.02, 0.02, 0.02], [0.2, 0.2, 0.2], [0.2, 0.2, 0.2]], dtype=torch.float64
-)
+_INFORMATION = np.repeat([0.1, 0.02, 0.2, 0.2], 3)  # of a predicted point about each coefficient, about
 _STEPS = 2  # of Gauss and Newton, of an update
 _INDEPENDENT = 0.08  # what a prediction counts: those of one beam for several sides share their errors
 _MEMORY = 0.98  # share of what was learned that remains after another window
@@ -85,9 +80,8 @@ class Calibration(NamedTuple):
 
     def log_odds(self, hits: Tensor, misses: Tensor, side: float, dim: int) -> Tensor:
         """Log-odds of cubes of `side` (m) with hits and misses of any shape."""
-        mean = torch.tensor(self.coefficients, dtype=torch.float64)
-        at = torch.tensor(side, dtype=torch.float64)
-        weight, least, up, down = (x.item() for x in _quantities(mean, at, self.length, dim))
+        found = _quantities(np.array(self.coefficients), np.array(side), self.length, dim)
+        weight, least, up, down = map(float, found)
         z = ((hits * weight + least) / (misses + least)).log()
         return down * z + (up - down) * (torch.nn.functional.softplus(z) - _HALF)
 
@@ -106,7 +100,7 @@ class Calibration(NamedTuple):
         values = np.array([[math.log(part.length), *part.coefficients] for part in parts])
         length, *mean = (weight @ values / weight.sum()).tolist()
         n_predicted = _short_count(sum(part.n_predicted for part in parts))
-        return cls(*_rounded(math.exp(length), torch.tensor(mean, dtype=torch.float64)), n_predicted)
+        return cls(*_rounded(math.exp(length), np.array(mean)), n_predicted)
 
     def to_bytes(self) -> bytes:
         """`N_BYTES`, from which `of_bytes` makes the calibration again."""
@@ -148,8 +142,8 @@ def _length_of(mean_range: float) -> float:
     return 0.5 * check_number("mean_range", mean_range, above=True)
 
 
-def _rounded(length: float, mean: Tensor) -> tuple[float, tuple[float, ...]]:
-    return _short(length), tuple(mean.flatten().to(torch.float16).double().tolist())
+def _rounded(length: float, mean: np.ndarray) -> tuple[float, tuple[float, ...]]:
+    return _short(length), tuple(mean.astype(np.float16).flatten().tolist())
 
 
 def _short(length: float) -> float:
@@ -157,27 +151,29 @@ def _short(length: float) -> float:
     return math.exp(float(np.float16(math.log(length))))
 
 
-def _powers(ratio: Tensor) -> Tensor:
+def _powers(ratio: np.ndarray) -> np.ndarray:
     """(3, ...) powers 0, 1, 2 of the scale of h/ℓ, which has bounds: far sides lean on near ones."""
-    s = _WIDTH * torch.tanh((ratio / _CENTER).log() / _WIDTH)
-    return torch.stack([torch.ones_like(s), s, s * s])
+    s = _WIDTH * np.tanh(np.log(ratio / _CENTER) / _WIDTH)
+    return np.stack([np.ones_like(s), s, s * s])
 
 
-def _quantities(mean: Tensor, side: Tensor, length: float, dim: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _quantities(
+    mean: np.ndarray, side: np.ndarray, length: float, dim: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """w, n, and the slopes b above and below zero, for cubes of sides (m) of any shape."""
-    a, density, up, down = (mean.view(4, 3) @ _powers(side / length)).exp()
+    a, density, up, down = np.exp(mean.reshape(4, 3) @ _powers(side / length))
     return a * length / side, density * side ** (dim - 1), up, down
 
 
 def _derivatives(
-    hits: Tensor, misses: Tensor, side: Tensor, length: float, dim: int, mean: Tensor
-) -> tuple[Tensor, Tensor]:
+    hits: np.ndarray, misses: np.ndarray, side: np.ndarray, length: float, dim: int, mean: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Log-odds (M,) of cubes of sides (M,), and their derivatives (12, M) by the coefficients."""
     weight, least, up, down = _quantities(mean, side, length, dim)
     strong = hits * weight
-    z = ((strong + least) / (misses + least)).log()
-    above = torch.nn.functional.softplus(z) - _HALF
-    slope = down + (up - down) * torch.sigmoid(z)
+    z = np.log((strong + least) / (misses + least))
+    above = np.logaddexp(0.0, z) - _HALF
+    slope = down + (up - down) * _sigmoid(z)
     t = down * z + (up - down) * above
     each = [
         slope * strong / (strong + least),
@@ -185,20 +181,27 @@ def _derivatives(
         up * above,
         down * (z - above),
     ]
-    return t, (torch.stack(each)[:, None] * _powers(side / length)).flatten(0, 1)
+    return t, (np.stack(each)[:, None] * _powers(side / length)).reshape(12, -1)
+
+
+def _sigmoid(t: np.ndarray) -> np.ndarray:
+    with np.errstate(over="ignore"):  # it is then 0
+        return 1 / (1 + np.exp(-t))
 
 
 class Prediction(NamedTuple):
     """What a map knew about M places and what was then seen: hits, misses, occupied (M,), for a side (m)."""
 
-    hits: Tensor
-    misses: Tensor
-    occupied: Tensor
+    hits: Tensor | np.ndarray
+    misses: Tensor | np.ndarray
+    occupied: Tensor | np.ndarray
     side: float
 
-    def on_cpu(self) -> Prediction:
-        hits, misses, occupied = on_cpu(self.hits, self.misses, self.occupied)
-        return Prediction(hits.double(), misses.double(), occupied.double(), self.side)
+    def on_cpu(self) -> list[np.ndarray]:
+        """Hits, misses and occupied, float64."""
+        given = self.hits, self.misses, self.occupied
+        tensors = on_cpu(*(value for value in given if isinstance(value, Tensor)))
+        return [np.asarray(value, np.float64) for value in tensors or given]
 
 
 def _short_count(n: int) -> int:
@@ -228,14 +231,15 @@ class Calibrator:
     def of(cls, mean_range: float, n_sides: int) -> Calibrator:
         """Nothing is learned yet; the beams have a mean range (m)."""
         length = _length_of(mean_range)
-        return cls(length, _MEAN.flatten(), _prior_precision(), _empty_tally(n_sides))
+        mean, precision = map(torch.from_numpy, (_MEAN.flatten(), _prior_precision()))
+        return cls(length, mean, precision, _empty_tally(n_sides))
 
     @classmethod
     def continued(cls, known: Calibration, n_sides: int) -> Calibrator:
         """Goes on from a calibration, which states how much was learned, but not about which coefficient."""
         mean = torch.tensor(known.coefficients, dtype=torch.float64)
         seen = min(known.n_predicted, 1 / (1 - _MEMORY) * 50)
-        precision = _prior_precision() + torch.diag(_INDEPENDENT * seen * _INFORMATION.flatten())
+        precision = torch.from_numpy(_prior_precision() + np.diag(_INDEPENDENT * seen * _INFORMATION))
         return cls(known.length, mean, precision, _empty_tally(n_sides), known.n_predicted)
 
     @classmethod
@@ -253,7 +257,7 @@ class Calibrator:
     def calibration(self) -> Calibration:
         """The calibration so far."""
         n_predicted = _short_count(self.n_predicted)
-        return Calibration(*_rounded(self.length, self.mean), n_predicted)
+        return Calibration(*_rounded(self.length, self.mean.numpy()), n_predicted)
 
     def updated(self, predictions: Sequence[Prediction], dim: int, farthest: float = _FARTHEST) -> Calibrator:
         """After the predictions of a window, one for each of the sides of the tally.
@@ -261,42 +265,47 @@ class Calibrator:
         farthest: deviations that a coefficient may be from that of the sensor model.
         """
         each = [p.on_cpu() for p in predictions]
-        hits, misses, occupied = (torch.cat(parts) for parts in list(zip(*each, strict=True))[:3])
-        sizes = torch.tensor([len(p.hits) for p in each])
-        side = torch.tensor([p.side for p in each], dtype=torch.float64).repeat_interleave(sizes)
-        prior = _prior_precision()
-        before = prior + _MEMORY * (self.precision - prior)
-        now, precision = self.mean, before
-        room = farthest * _DEVIATION.flatten()
+        hits, misses, occupied = map(np.concatenate, zip(*each, strict=True))
+        sizes = [len(p.hits) for p in predictions]
+        side = np.repeat([p.side for p in predictions], sizes)
+        prior, mean = _prior_precision(), self.mean.numpy()
+        before = prior + _MEMORY * (self.precision.numpy() - prior)
+        now, center, room = mean, _MEAN.flatten(), farthest * _DEVIATION.flatten()
         for step in range(_STEPS):
             t, jacobian = _derivatives(hits, misses, side, self.length, dim, now)
-            theta = torch.sigmoid(t)
+            theta = _sigmoid(t)
             precision = before + _INDEPENDENT * (jacobian * (theta * (1 - theta))) @ jacobian.T
-            gradient = _INDEPENDENT * jacobian @ (occupied - theta) - before @ (now - self.mean)
+            gradient = _INDEPENDENT * jacobian @ (occupied - theta) - before @ (now - mean)
             if step == 0:
                 tally = self._tallied(theta, occupied, sizes)
-            now = now + torch.linalg.solve(precision, gradient)
-            now = torch.minimum(torch.maximum(now, _MEAN.flatten() - room), _MEAN.flatten() + room)
-        n_predicted = self.n_predicted + len(occupied)
-        return replace(self, mean=now, precision=precision, tally=tally, n_predicted=n_predicted)
+            now = np.clip(now + np.linalg.solve(precision, gradient), center - room, center + room)
+        return replace(
+            self,
+            mean=torch.from_numpy(now),
+            precision=torch.from_numpy(precision),
+            tally=torch.from_numpy(tally),
+            n_predicted=self.n_predicted + len(occupied),
+        )
 
-    def _tallied(self, theta: Tensor, occupied: Tensor, sizes: Tensor) -> Tensor:
+    def _tallied(self, theta: np.ndarray, occupied: np.ndarray, sizes: Sequence[int]) -> np.ndarray:
         """The tally with the probabilities (M,) of points, `sizes` (S,) of them for each side in turn."""
-        number = torch.arange(len(sizes)).repeat_interleave(sizes)
-        place = number * N_BINS + (theta * N_BINS).long().clamp(0, N_BINS - 1)
-        given = torch.where(occupied == 1, theta, 1 - theta)
-        loss = -given.clamp_min(_LEAST).log2()
+        number = np.repeat(np.arange(len(sizes)), sizes)
+        place = np.clip((theta * N_BINS).astype(np.int64), 0, N_BINS - 1)
+        given = np.where(occupied == 1, theta, 1 - theta)
+        loss = -np.log2(np.maximum(given, _LEAST))
         right = (given > 0.5) + 0.5 * (given == 0.5)
-        values = [torch.ones_like(theta), theta, occupied, (1 - given).square(), loss, right]
-        return self.tally.flatten(0, 1).index_add(0, place, torch.stack(values, 1)).view(self.tally.shape)
+        tally = self.tally.numpy().copy()
+        values = [np.ones_like(theta), theta, occupied, (1 - given) ** 2, loss, right]
+        np.add.at(tally, (number, place), np.stack(values, 1))
+        return tally
 
 
 def _empty_tally(n_sides: int) -> Tensor:
     return torch.zeros(n_sides, N_BINS, 6, dtype=torch.float64)
 
 
-def _prior_precision() -> Tensor:
-    return torch.diag(_DEVIATION.flatten() ** -2)
+def _prior_precision() -> np.ndarray:
+    return np.diag(_DEVIATION.flatten() ** -2)
 
 
 _FEWEST = 20  # predictions of a bin; fewer show little but chance

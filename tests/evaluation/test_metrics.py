@@ -262,7 +262,8 @@ def test_log_loss_is_one_bit_at_one_half_and_52_for_a_certain_mistake():
 def test_a_tally_of_predictions_has_the_scores_of_its_points():
     theta, labels = drawn()
     theta = (theta.round(decimals=3) + 1e-5).clamp(max=1)  # inside the bins
-    tally = Calibrator.of(10.0, 1)._tallied(theta, labels.double(), torch.tensor([len(theta)]))[0]
+    tally = Calibrator.of(10.0, 1)._tallied(theta.numpy(), labels.double().numpy(), [len(theta)])[0]
+    tally = torch.from_numpy(tally)
     found, expected = scores_of(tally), scores(theta, labels)
     assert list(found) == list(expected)
     for name, value in found.items():

@@ -96,6 +96,29 @@ def test_constants_of_the_sources_are_those_of_the_modules(tmp_path):
     torch.testing.assert_close(found, torch.tensor(values).double(), rtol=1e-7, atol=0)  # one is a float32
 
 
+@pytest.mark.parametrize("dim", [1, 2, 3])
+@pytest.mark.parametrize("kind", ["any", "needles", "equal", "diagonal", "zero"])
+def test_axes_of_a_matrix_are_those_of_the_library(dim, kind, tmp_path):
+    roots = torch.randn(200, dim, dim, generator=torch.Generator().manual_seed(dim)).double()
+    scale = {"any": 1.0, "needles": torch.logspace(-6, 3, dim), "diagonal": 0.0, "zero": 0.0}.get(kind, 1e-3)
+    given = roots * scale @ (roots * scale).mT + (
+        torch.eye(dim).double() if kind in ("equal", "diagonal") else 0
+    )
+    found = torch.cat([given, torch.zeros_like(given)], 1).contiguous()
+    body = f"diagonalize<{dim}>(*(double (*)[{dim}][{dim}])(x + {2 * dim * dim} * item), "
+    body += f"*(double (*)[{dim}][{dim}])(x + {2 * dim * dim} * item + {dim * dim}));"
+    kernel_of(tmp_path, body, FOLDER / "jacobi.h")(200, found, device=found.device)
+    values, axes = found[:, :dim].diagonal(dim1=1, dim2=2), found[:, dim:]
+    size = float(given.abs().max()) or 1.0
+    torch.testing.assert_close(
+        values.sort(1).values, torch.linalg.eigvalsh(given), rtol=1e-12, atol=1e-14 * size
+    )
+    torch.testing.assert_close(
+        axes @ torch.diag_embed(values) @ axes.mT, given, rtol=1e-12, atol=1e-14 * size
+    )
+    torch.testing.assert_close(axes @ axes.mT, torch.eye(dim).double().expand_as(given), rtol=0, atol=1e-13)
+
+
 def test_the_mills_ratio_equals_the_error_function(tmp_path):
     x = torch.cat([torch.linspace(0, 12, 2001), torch.logspace(1, 5, 199)]).double()
     found = x.clone()

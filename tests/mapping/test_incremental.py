@@ -245,6 +245,56 @@ def test_insert_depth_takes_arrays_and_asks_for_the_unit_of_whole_numbers():
         made.insert_depth([metres], INTRINSICS)
 
 
+def test_broken_frames_are_named_and_the_others_learned():
+    whole = depth_frames(5)
+    (depth, pose), lost = whole[0], torch.full((48, 64), torch.nan)
+    sheared = pose.clone()
+    sheared[0, 1] = 0.5
+    broken = {0: (depth[0], pose), 2: (depth, sheared), 5: depth, 7: (depth, pose[:3])}
+    frames = list(whole)
+    for index, bad in broken.items():
+        frames.insert(index, bad)
+    made, expected = GaussianMap(RULE), GaussianMap(RULE)
+    expected.insert_depth(whole, INTRINSICS)
+    with pytest.raises(InvalidArgumentError) as error:
+        made.insert_depth([*frames, (lost, pose)], INTRINSICS)  # a frame without a valid pixel is no error
+    text = str(error.value)
+    assert text.startswith("frames[0], frames[2], frames[5], frames[7] are not learned; the other 6 frames")
+    assert text.endswith("depth has shape (64,); expected one image (H, W) of at least one pixel.")
+    for name in ("means", "covariances", "support", "ids", "origins", "seen_by", "seen_from", "seen_count"):
+        assert torch.equal(getattr(made, name), getattr(expected, name)), name
+    with pytest.raises(InvalidArgumentError, match=r"^frames\[1\] is not learned.*pose=.* is not rigid"):
+        made.insert_depth([whole[0], (depth, sheared)], INTRINSICS)
+
+
+def test_a_frame_beyond_a_map_is_named_and_the_map_stays():
+    made, frames = GaussianMap(RULE), depth_frames(3)
+    made.insert_depth(frames, INTRINSICS)
+    before = made.components().means.clone()
+    away = frames[1][0].double()
+    away[20, 20] = 1e9
+    with pytest.raises(InvalidArgumentError, match=r"^frames\[1\] has such points: .*134217728"):
+        made.insert_depth([frames[0], (away, frames[1][1]), frames[2]], INTRINSICS)
+    assert torch.equal(made.components().means, before)
+
+
+def test_batches_of_whole_windows_give_the_map_of_all_frames():
+    frames = depth_frames(12)
+    rule = replace(RULE, window=4)
+    at_once, in_parts = GaussianMap(rule, codec="float"), GaussianMap(rule, codec="float")
+    at_once.insert_depth(frames, INTRINSICS)
+    for begin in range(0, 12, 4):
+        in_parts.insert_depth(frames[begin : begin + 4], INTRINSICS)
+    # Their numbers, which follow the order of space, are given batch by batch.
+    by_place = [made.unrounded().means[:, 0].argsort() for made in (at_once, in_parts)]
+    for name in ("means", "covariances", "support"):
+        values = [
+            getattr(made.unrounded(), name)[order]
+            for made, order in zip((at_once, in_parts), by_place, strict=True)
+        ]
+        assert torch.equal(*values), name
+
+
 # -- the map ------------------------------------------------------------------------------------------
 
 

@@ -12,6 +12,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
+from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.occupancy import calibrator as module
@@ -226,13 +227,35 @@ def test_a_sensor_that_changes_is_followed():
     assert errors[-1] < 0.4 * errors[0]
 
 
+@given(st.integers(0, 10_000), st.sampled_from([2, 3]))
+def test_derivatives_by_the_coefficients_are_those_of_automatic_differentiation(seed, dim):
+    draw = torch.Generator().manual_seed(seed)
+    hits, misses = torch.rand(2, 20, generator=draw).double() * torch.tensor([[3.0], [90.0]])
+    side = 0.01 + torch.rand(20, generator=draw).double()
+    mean = torch.from_numpy(module._MEAN.flatten()) + 0.3 * torch.randn(12, generator=draw).double()
+    length = 2.5
+
+    def log_odds(mean: Tensor) -> Tensor:
+        scale = module._WIDTH * ((side / length / module._CENTER).log() / module._WIDTH).tanh()
+        a, density, up, down = (mean.view(4, 3) @ torch.stack([scale**0, scale, scale**2])).exp()
+        least = density * side ** (dim - 1)
+        z = ((hits * a * length / side + least) / (misses + least)).log()
+        return down * z + (up - down) * (torch.nn.functional.softplus(z, threshold=100) - math.log(2))
+
+    expected = torch.autograd.functional.jacobian(log_odds, mean).T
+    given_ = (value.numpy() for value in (hits, misses, side))
+    value, found = module._derivatives(*given_, length, dim, mean.numpy())
+    np.testing.assert_allclose(value, log_odds(mean).numpy(), rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(found, expected.numpy(), rtol=1e-9, atol=1e-11)
+
+
 def test_contradictions_stay_within_the_bounds_of_the_prior():
     start = Calibrator.of(6.0, len(SIDES))
     learned = start
     for window in range(200):
         wrong = [p._replace(occupied=~p.occupied) for p in drawn(Calibration.prior(6.0), 200, window)]
         learned = learned.updated(wrong, 3)
-    moved = (learned.mean - start.mean).abs() / module._DEVIATION.flatten()
+    moved = (learned.mean - start.mean).abs() / torch.from_numpy(module._DEVIATION.flatten())
     assert float(moved.max()) <= module._FARTHEST + 1e-9
     theta = learned.calibration.probability(values(0.0, 5.0), values(0.0, 0.0), 0.1, 3)
     assert float(theta[0]) == 0.5

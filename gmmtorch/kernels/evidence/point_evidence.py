@@ -154,6 +154,42 @@ def sum_of(terms: Iterable[Tensor]) -> Tensor:
     return functools.reduce(torch.add, terms)
 
 
+_FEW_POINTS = "evidence/few_points.h"
+_NEAR_FEW = {dim: FusedKernel(_FEW_POINTS, f"few_points_near<{dim}>") for dim in (2, 3)}
+_OF_FEW = {dim: FusedKernel(_FEW_POINTS, f"few_points_evidence<{dim}>") for dim in (2, 3)}
+_VIEWS_AT_ONCE = 4096
+
+
+def few_points_evidence(
+    views: tuple[Tensor, ...], points: Tensor, sides: Sequence[float], cutoff: float, widest: float
+) -> tuple[Tensor, Tensor]:
+    """Hits and misses (S, 2, M) of the cubes of some sides (m) at a few points (M, D), float64, from all
+    viewpoints; and the number of pairs of a point and a viewpoint (), near enough to give evidence.
+
+    Needs no index. Evidence differs from that of lists by the rounding of its sums, and of the axes.
+
+    Args:
+        views: means, covariances, max_range, origins, seen_by, seen_from, seen_count, as in `Components`.
+        widest: distance (m) by which the largest cube widens a cone that it is as far away as.
+    """
+    n, dim = points.shape
+    device = points.device
+    means, covariances, max_range, origins, by, seen_from, count = (value.contiguous() for value in views)
+    counts, points = torch.empty_like(by), points.contiguous()
+    tested = means, covariances, origins, by, seen_from, points, n, widest, cutoff
+    _NEAR_FEW[dim](len(by), *tested, counts, device=device)
+    found = points.new_zeros(len(sides), 2, n)
+    lengths = torch.tensor(list(sides), dtype=torch.float64).to(device, non_blocking=True)
+    parts = 1 if device.type == "cpu" else n
+    for chosen in counts.nonzero().squeeze(1).split(_VIEWS_AT_ONCE):
+        each = points.new_empty(len(chosen), *found.shape)
+        given = means, covariances, max_range, origins, by, seen_from, count, points, n
+        rows = chosen, *given, lengths, len(sides), cutoff, parts, each
+        _OF_FEW[dim](len(chosen) * parts, *rows, device=device)
+        found += each.sum(0)
+    return found, counts.sum()
+
+
 _NEAR = {dim: FusedKernel("evidence/near_lists.h", f"near_lists<{dim}>") for dim in (2, 3)}
 _PARTS_OF_LISTS = 32  # of a list, on a device with many threads
 

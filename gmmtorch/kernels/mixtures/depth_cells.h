@@ -44,15 +44,31 @@ GMM_INLINE void load_columns(const Real* row, int64_t column_step, int64_t n_lef
         }
 }
 
-// Adds the patches item, item + n_items, ... of an image, LANES side by side. An image is one item on a CPU.
+// An image and how it is seen, in a row of 20 numbers of eight bytes, as in cell_sums.py.
 template <typename Real>
-GMM_KERNEL depth_cells(int64_t item, const Real* depth, int64_t n_rows, int64_t n_columns, int64_t row_step,
-                       int64_t column_step, const double* view, double max_range, double deepest,
-                       double farthest_whole, int64_t image, int64_t n_images, int64_t n_items,
-                       int64_t max_cells, int64_t n_places, int32_t* places, int64_t* keys, double* sums,
-                       double* counts, int64_t* n_cells) {
+struct DepthImage {
+    const Real* depth;
+    int64_t n_rows;
+    int64_t n_columns;
+    int64_t row_step;
+    int64_t column_step;
+    double rays[12];
+    double max_range;
+    double deepest;
+    double farthest_whole;
+};
+
+// Adds the blocks of LANES patches item, item + n_items, ... of an image.
+template <typename Real>
+GMM_INLINE void add_image(const DepthImage<Real>& view, int64_t image, int64_t n_images, int64_t item,
+                          int64_t n_items, int64_t max_cells, int64_t n_places, int32_t* places,
+                          int64_t* keys, double* sums, double* counts, int64_t* n_cells) {
     constexpr int WIDTH = n_features(3);
-    const double *a = view, *b = view + 3, *c = view + 6, *t = view + 9;
+    const double *a = view.rays, *b = a + 3, *c = a + 6, *t = a + 9;
+    const Real* depth = view.depth;
+    const int64_t n_rows = view.n_rows, n_columns = view.n_columns;
+    const int64_t row_step = view.row_step, column_step = view.column_step;
+    const double max_range = view.max_range, deepest = view.deepest, farthest_whole = view.farthest_whole;
     double now[3] = {0.5, 0.5, 0.5};
     int64_t number = -1;
     bool overflows = *n_cells > max_cells;
@@ -60,32 +76,13 @@ GMM_KERNEL depth_cells(int64_t item, const Real* depth, int64_t n_rows, int64_t 
     auto number_of = [&](const double* cell) {
         int64_t key = 0;
         for (int i = 0; i < 3; ++i) key = (key << KEY_BITS) | (int64_t)(cell[i] + REACH);
-#if defined(__CUDA_ARCH__)
-        // The number is the place: threads claim places of `keys`, which are -1 as long as they are free.
-        typedef unsigned long long word;
-        int64_t at = first_place(key, n_places);
-        for (int64_t tried = 0; tried < n_places; ++tried, at = (at + 1) & (n_places - 1)) {
-            const int64_t found = (int64_t)atomicCAS((word*)(keys + at), ~0ull, (word)key);
-            if (found == key) return at;
-            if (found < 0) return (int64_t)atomicAdd((word*)n_cells, 1ull) < max_cells ? at : (int64_t)-1;
-        }
-        atomicAdd((word*)n_cells, (word)max_cells + 1);
-        return (int64_t)-1;
-#else
-        // Cells are numbered in the order of their first points. A free place holds -1.
-        const int64_t at = found_place(key, places, n_places, keys);
-        if (places[at] >= 0) return (int64_t)places[at];
-        if (*n_cells >= max_cells) {
-            *n_cells = max_cells + 1;
-            return (int64_t)-1;
-        }
-        const int64_t made = (*n_cells)++;
-        places[at] = (int32_t)made;
-        keys[made] = key;
-        for (int f = 0; f < WIDTH; ++f) sums[made * WIDTH + f] = 0.0;
-        for (int64_t i = 0; i < n_images; ++i) counts[made * n_images + i] = 0.0;
-        return made;
+        const int64_t known = *n_cells;
+        const int64_t made = cell_number(key, max_cells, n_places, places, keys, n_cells, sums, WIDTH);
+#if !defined(__CUDA_ARCH__)
+        if (made >= known)  // a new one
+            for (int64_t i = 0; i < n_images; ++i) counts[made * n_images + i] = 0.0;
 #endif
+        return made;
     };
     // Adds n points in a cell, with these sums of features about its corner.
     auto add_points = [&](const double* cell, double n, const double* features) {
@@ -185,6 +182,90 @@ GMM_KERNEL depth_cells(int64_t item, const Real* depth, int64_t n_rows, int64_t 
         }
     }
     if (overflows) *n_cells = max_cells + 1;
+}
+
+// Adds images, rows of `views`, to cells. On a CPU one item adds all of them; on CUDA n_items add each.
+template <typename Real>
+GMM_KERNEL depth_cells(int64_t item, const int64_t* views, int64_t n_images, int64_t n_items,
+                       int64_t max_cells, int64_t n_places, int32_t* places, int64_t* keys, double* sums,
+                       double* counts, int64_t* n_cells) {
+#if defined(__CUDA_ARCH__)
+    const int64_t begin = item / n_items, end = begin + 1;
+#else
+    const int64_t begin = 0, end = n_images;
+#endif
+    const DepthImage<Real>* all = (const DepthImage<Real>*)views;
+    for (int64_t image = begin; image < end; ++image)
+        add_image<Real>(all[image], image, n_images, item % n_items, n_items, max_cells, n_places, places,
+                        keys, sums, counts, n_cells);
+}
+
+// An image and its camera, in a row of 10 numbers of eight bytes, as in cell_sums.py.
+template <typename Real>
+struct RangeImage {
+    const Real* depth;
+    int64_t n_rows;
+    int64_t n_columns;
+    int64_t row_step;
+    int64_t column_step;
+    double fx;
+    double fy;
+    double cx;
+    double cy;
+    double max_range;
+};
+
+// An item is a row of an image, of n_items at most: the sum of the ranges of its pixels, and their number.
+template <typename Real>
+GMM_KERNEL range_sums(int64_t item, const int64_t* views, int64_t n_items, double* sums) {
+    const RangeImage<Real>& view = ((const RangeImage<Real>*)views)[item / n_items];
+    const int64_t row = item % n_items;
+    double sum = 0.0, n = 0.0;
+    if (row < view.n_rows) {
+        const Real* depth = view.depth + row * view.row_step;
+        const double y = ((double)row - view.cy) / view.fy;
+        for (int64_t begin = 0; begin < view.n_columns; begin += LANES) {
+            vec z = (vec)(0.0), x = z;
+            for (int l = 0; l < LANES && begin + l < view.n_columns; ++l) {
+                set(z, l, (double)depth[(begin + l) * view.column_step]);
+                set(x, l, ((double)(begin + l) - view.cx) / view.fx);
+            }
+            const mask good = (z > 0.0) & (z < view.max_range);  // false for NaN
+            const vec length = root(x * x + y * y + 1.0);
+            const vec range = good ? z * length : (vec)(0.0);
+            const vec one = good ? (vec)(1.0) : (vec)(0.0);
+            for (int l = 0; l < LANES; ++l) sum += get(range, l), n += get(one, l);
+        }
+    }
+    sums[2 * item] = sum, sums[2 * item + 1] = n;
+}
+
+// An item copies a cell to its place in `order`: its lowest corner, from its key, its sums and its counts.
+GMM_KERNEL ordered_cells(int64_t item, const int64_t* order, const int64_t* keys, const double* sums,
+                         const double* counts, int64_t n_images, double* corners, double* ordered,
+                         double* seen) {
+    constexpr int WIDTH = n_features(3);
+    const int64_t cell = order[item], key = keys[cell];
+    for (int a = 0; a < 3; ++a)
+        corners[item * 3 + a] = (double)((key >> ((2 - a) * KEY_BITS)) & ((1 << KEY_BITS) - 1)) - REACH;
+    for (int f = 0; f < WIDTH; ++f) ordered[item * WIDTH + f] = sums[cell * WIDTH + f];
+    for (int64_t i = 0; i < n_images; ++i) seen[item * n_images + i] = counts[cell * n_images + i];
+}
+
+// An item is a cell: its mean features about the center, in metres.
+GMM_KERNEL cell_features(int64_t item, const double* corners, const double* sums, const double* center,
+                         double side, double* features) {
+    constexpr int WIDTH = n_features(3);
+    const double* sum = sums + item * WIDTH;
+    double *found = features + item * WIDTH, mean[3], d[3];
+    found[0] = 1.0;
+    for (int a = 0; a < 3; ++a) {
+        mean[a] = sum[1 + a] / sum[0], d[a] = corners[item * 3 + a] - center[a];
+        found[1 + a] = (mean[a] + d[a]) * side;
+    }
+    for (int a = 0, f = 4; a < 3; ++a)
+        for (int b = a; b < 3; ++b, ++f)
+            found[f] = (sum[f] / sum[0] + mean[a] * d[b] + d[a] * mean[b] + d[a] * d[b]) * (side * side);
 }
 
 }  // namespace gmm

@@ -8,16 +8,18 @@ component; the points of each scan in a component give the component's viewpoint
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike
-from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.kernels import DepthCells, DepthView, depth_cells
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
+from gmmtorch.kernels import DepthCells, DepthViews, cell_features, depth_cells, range_sums
+from gmmtorch.linalg import on_cpu
 from gmmtorch.mapping.attributes.moments import Attributes, learned, of_scans
 from gmmtorch.mapping.components import UNNUMBERED, Components
 from gmmtorch.mapping.learning.merging import AssignedViewpoints, AssignViewpoints
@@ -36,7 +38,7 @@ from gmmtorch.mixture import (
     run_em,
     shift_features,
 )
-from gmmtorch.pinhole import back_project, check_intrinsics, metric_depth
+from gmmtorch.pinhole import check_intrinsics, metric_depth
 from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 
@@ -47,15 +49,15 @@ if TYPE_CHECKING:
 @dataclass(frozen=True, eq=False)
 class DepthFrame:
     """A depth image (H, W) in metres, of which pixels at or beyond `max_range` (m), not above zero or not
-    finite are left out; its pose, world ← camera, as rotation (3, 3) and origin (3,), float64; and its
-    intrinsics (3, 3), float64, on the CPU.
+    finite are left out; its pose, world ← camera, float64, on the CPU; f_x, f_y, c_x, c_y in pixels; and its
+    name in errors.
     """
 
     depth: Tensor
-    rotation: Tensor
-    origin: Tensor
-    intrinsics: Tensor
+    pose: Pose
+    camera: tuple[float, float, float, float]
     max_range: float
+    name: str = "frame"
 
     @classmethod
     def of(
@@ -76,51 +78,77 @@ class DepthFrame:
             intrinsics: (3, 3), of the whole image.
         """
         image = metric_depth(depth, depth_scale).detach()
-        rotation, translation = Pose.checked(pose, 3, "pose", device=image.device).parts
-        scaled = check_intrinsics(intrinsics, tuple(image.shape)).to("cpu", copy=True)
-        scaled[:2] /= pixel_stride
-        taken = image[::pixel_stride, ::pixel_stride]
-        return cls(taken, rotation, translation, scaled, max_range)
+        (fx, _, cx), (_, fy, cy), _ = check_intrinsics(intrinsics, tuple(image.shape)).tolist()
+        camera = fx / pixel_stride, fy / pixel_stride, cx / pixel_stride, cy / pixel_stride
+        placed = Pose.checked(pose, 3, "pose", device="cpu")
+        return cls(image[::pixel_stride, ::pixel_stride], placed, camera, max_range)
 
     @property
     def dim(self) -> int:
         return 3
 
     def to(self, device: torch.device | str | None) -> DepthFrame:
-        """The frame on another device. None: where it is."""
-        depth, rotation, origin = (value.to(device) for value in (self.depth, self.rotation, self.origin))
-        return DepthFrame(depth, rotation, origin, self.intrinsics, self.max_range)
+        """The frame with its image on another device. None: where it is."""
+        return self if device is None else replace(self, depth=self.depth.to(device, non_blocking=True))
+
+    @property
+    def origin(self) -> Tensor:
+        """The position (3,) of the camera, on the device of the image."""
+        return self.pose.translation.to(self.depth.device, non_blocking=True)
+
+    def pixels(self) -> Tensor:
+        """The pixels (N,) that are not left out, row by row."""
+        depth = self.depth
+        valid = (depth > 0) & (depth < self.max_range) & torch.isfinite(depth)
+        return valid.flatten().nonzero().squeeze(1)
+
+    def _seen(self, pixels: Tensor) -> Tensor:
+        """x/z, y/z and z (3, N) of the points of pixels (N,), in the frame of the camera."""
+        fx, fy, cx, cy = self.camera
+        row, column = pixels // self.depth.shape[1], pixels % self.depth.shape[1]
+        x, y = (column.double() - cx) / fx, (row.double() - cy) / fy
+        return torch.stack([x, y, self.depth[row, column].double()])
+
+    def points_at(self, pixels: Tensor) -> Tensor:
+        """The points (N, 3) of pixels (N,)."""
+        x, y, depth = self._seen(pixels)
+        points = torch.stack([x * depth, y * depth, depth], 1)
+        return points @ self.pose.rotation.T.to(points.device, non_blocking=True) + self.origin
 
     @property
     def points(self) -> Tensor:
         """The points (N, 3) of all pixels that are not left out, computed at each access."""
-        valid = torch.isfinite(self.depth) & (self.depth < self.max_range)
-        points = back_project(torch.where(valid, self.depth, 0.0).double(), self.intrinsics)
-        return points @ self.rotation.T + self.origin
+        return self.points_at(self.pixels())
 
     @property
     def ranges(self) -> Tensor:
         """Distances (N,) of the points from the camera (m), without computing the points."""
-        (fx, _, cx), (_, fy, cy), _ = self.intrinsics.tolist()
-        height, width = (
-            torch.arange(n, dtype=torch.float64, device=self.depth.device) for n in self.depth.shape
-        )
-        lengths = (((width - cx) / fx).square() + ((height - cy) / fy).square()[:, None] + 1).sqrt()
-        valid = (self.depth > 0) & (self.depth < self.max_range) & torch.isfinite(self.depth)
-        return self.depth[valid].double() * lengths[valid]
+        x, y, depth = self._seen(self.pixels())
+        return depth * (x.square() + y.square() + 1).sqrt()
 
     def scan(self) -> Scan:
-        """The frame as a scan."""
-        return Scan(self.points, self.origin)
+        """The frame as a scan. Raises `InvalidArgumentError` for points farther away than a map stores."""
+        try:
+            return Scan(self.points, self.origin)
+        except InvalidArgumentError as error:
+            raise InvalidArgumentError(f"{self.name} has such points: {error}") from error
 
-    def view(self, reference: Tensor, side: float) -> DepthView:
-        """The frame in cells of `side` metres around a position (3,) on the CPU."""
-        (fx, _, cx), (_, fy, cy), _ = self.intrinsics.tolist()
-        rotation = self.rotation.cpu()
-        across, down = rotation[:, 0] / fx, rotation[:, 1] / fy
-        first = rotation[:, 2] - cx * across - cy * down
-        rays = torch.stack([first, across, down, self.origin.cpu() - reference]) / side
-        return DepthView(self.depth, rays, 1 / (min(fx, fy) * side), self.max_range)
+
+def mean_range(window: Sequence[Scan | DepthFrame]) -> float:
+    """Mean range (m) of the returns of scans, or of frames. There must be one."""
+    frames = [frame for frame in window if isinstance(frame, DepthFrame)]
+    sums = None
+    if frames:
+        camera, reach = ([getattr(frame, name) for frame in frames] for name in ("camera", "max_range"))
+        sums = range_sums([frame.depth for frame in frames], np.array(camera), np.array(reach))
+    if sums is None:
+        found = [
+            scan.ranges if isinstance(scan, DepthFrame) else (scan.points - scan.origin).norm(dim=1).double()
+            for scan in window
+        ]
+        return float(torch.cat(found).mean())
+    total, n = sums.tolist()
+    return total / n
 
 
 class PooledFrames(NamedTuple):
@@ -141,30 +169,39 @@ def pool_frames(frames: Sequence[DepthFrame], finest: float, max_cells: int) -> 
     octave until the limit holds, which must be 8 or more. Raises `InvalidArgumentError` for points that are
     farther away than a map stores.
     """
-    reference = frames[0].origin.cpu()
+    rotation, origin = (np.stack([frame.pose.parts[i].numpy() for frame in frames]) for i in (0, 1))
+    camera = np.array([frame.camera for frame in frames])
+    fx, fy, cx, cy = camera.T[..., None]
+    across, down = rotation[..., 0] / fx, rotation[..., 1] / fy
+    first, reference = rotation[..., 2] - cx * across - cy * down, origin[0]
+    rays, shortest = np.stack([first, across, down, origin - reference], 1), camera[:, :2].min(1)
+    depths, max_range = [frame.depth for frame in frames], np.array([frame.max_range for frame in frames])
 
     def side_of(thirds: int) -> float:
         return finest * 2 ** (thirds / 3)
 
     def pooled(thirds: int) -> DepthCells | None:
-        views = [frame.view(reference, side_of(thirds)) for frame in frames]
-        return depth_cells(views, side_of(thirds), max_cells)
+        side = side_of(thirds)
+        return depth_cells(DepthViews(depths, rays / side, 1 / (shortest * side), max_range), side, max_cells)
 
     first = pooled(0)
     if first is None:
         scans = [frame.scan() for frame in frames]  # raises for points that are too far away
-        away = [scan.points - reference.to(scan.points.device) for scan in scans if len(scan.points)]
+        away = [scan.points - scan.points.new_tensor(reference) for scan in scans if len(scan.points)]
         extent = max(float(offsets.abs().max()) for offsets in away)
         thirds, cells = coarsest_allowed(pooled, 3 * math.ceil(math.log2(extent / finest + 2)))
     else:
         thirds, cells = 0, first
     side = side_of(thirds)
-    weight = cells.sums[:, 0]
+    weight = cells.sums[:, 0].contiguous()
     total = (cells.sums[:, 1:4] + weight[:, None] * cells.corners).sum(0)
     center = total / weight.sum().clamp_min(1)
-    scale = cells.sums.new_tensor([1.0] + [side] * 3 + [side**2] * 6)
-    features = shift_features(cells.sums / weight[:, None], cells.corners - center) * scale
-    return PooledFrames(features, weight, cells.counts, center * side + reference.to(center.device))
+    features = cell_features(cells, center, side)
+    if features is None:
+        scale = weight.new_tensor([1.0] + [side] * 3 + [side**2] * 6)
+        features = shift_features(cells.sums / weight[:, None], cells.corners - center) * scale
+    shift = torch.from_numpy(reference).to(center.device, non_blocking=True)
+    return PooledFrames(features, weight, cells.counts, center * side + shift)
 
 
 def as_scans(window: Iterable[Scan | DepthFrame]) -> list[Scan]:
@@ -172,14 +209,34 @@ def as_scans(window: Iterable[Scan | DepthFrame]) -> list[Scan]:
     return [frame.scan() if isinstance(frame, DepthFrame) else frame for frame in window]
 
 
-def depth_and_pose(frames: Sequence[tuple[ArrayLike, ArrayLike]], index: int) -> tuple[ArrayLike, ArrayLike]:
-    """Depth and pose of frame `index`. Raises `InvalidArgumentError` for anything but a pair."""
-    frame = frames[index]
-    if not isinstance(frame, tuple | list) or len(frame) != 2:
-        raise InvalidArgumentError(
-            f"frames[{index}] is a {type(frame).__name__}; give pairs (depth (H, W), pose (4, 4))."
-        )
-    return frame[0], frame[1]
+def whole_frames(
+    frames: Sequence[tuple[ArrayLike, ArrayLike]], broken: dict[int, GmmTorchError], *options: Any
+) -> Iterator[DepthFrame]:
+    """Frames (depth, pose) that are not broken; `options` as in `DepthFrame.of`, from the intrinsics on.
+
+    `broken` receives the errors of the others, by their index.
+    """
+    for index in range(len(frames)):
+        try:
+            frame = frames[index]
+            if not isinstance(frame, tuple | list) or len(frame) != 2:
+                raise InvalidArgumentError(
+                    f"frames[{index}] is a {type(frame).__name__}; give pairs (depth (H, W), pose (4, 4))."
+                )
+            made = DepthFrame.of(*frame, *options)
+        except (InvalidArgumentError, DataError) as error:
+            broken[index] = error
+        else:
+            yield replace(made, name=f"frames[{index}]")
+
+
+def error_of_some(broken: dict[int, GmmTorchError], n: int) -> GmmTorchError:
+    """The error of the broken ones of n frames, of which the others are learned."""
+    named, first = ", ".join(f"frames[{index}]" for index in broken), next(iter(broken.values()))
+    return type(first)(
+        f"{named} {'is' if len(broken) == 1 else 'are'} not learned; the other {n - len(broken)} frames are "
+        f"in the map. The first error: {first}"
+    )
 
 
 _FEW_POINTS, _MOST_CELLS = 1_000, 50_000  # fewer points are not pooled; more cells are not worth their time
@@ -251,7 +308,8 @@ def fit_points(
     if n_points == 0:
         return Components.empty(dim, origins.device)
     points = torch.cat(list(clouds)).double()
-    scan = torch.repeat_interleave(torch.tensor(sizes, device=origins.device), output_size=n_points)
+    ends = torch.tensor(sizes).cumsum(0).to(origins.device, non_blocking=True)
+    scan = torch.bucketize(torch.arange(n_points, device=ends.device), ends, right=True)
     center = points.mean(0)
     rule = replace(fit.rule, prune="none") if max_range else fit.rule
     sensor = _measured_sensor(clouds, origins) if rule.prune == "density" else None
@@ -270,7 +328,8 @@ def fit_frames(frames: Sequence[DepthFrame], fit: SurfaceFit, viewpoints: Assign
 
     The images are summed into cells at once, without a list of their points. Components are not numbered.
     """
-    origins = torch.stack([frame.origin for frame in frames])
+    origins = torch.stack([frame.pose.translation for frame in frames])
+    origins = origins.to(frames[0].depth.device, non_blocking=True)
     if fit.rule.needs_points:
         return fit_window([frame.scan() for frame in frames], fit, viewpoints)
     if sum(frame.depth.numel() for frame in frames) <= _FEW_POINTS:
@@ -281,8 +340,9 @@ def fit_frames(frames: Sequence[DepthFrame], fit: SurfaceFit, viewpoints: Assign
     found = _mixture_of(cells.features, cells.weight, 3, fit)
     owner = most_likely_component(cells.features, found)
     counts = cells.counts.new_zeros(found.weights.shape[0], len(frames)).index_add_(0, owner, cells.counts)
+    counts, weights = on_cpu(counts, found.weights)
     found = found._replace(means=found.means + cells.center)
-    assigned = viewpoints(counts, found.weights, int(cells.weight.sum()))
+    assigned = viewpoints(counts, weights, int(counts.sum()))
     return _components(found, assigned, origins, max_range=False)
 
 

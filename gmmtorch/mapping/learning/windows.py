@@ -28,13 +28,21 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.kernels import PassLimits, beam_passes
+from gmmtorch.kernels import PassLimits, beam_passes, few_points_evidence, is_fused
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.fitting import DepthFrame, SurfaceFit, as_scans, fit_frames, fit_window
+from gmmtorch.mapping.learning.fitting import (
+    DepthFrame,
+    SurfaceFit,
+    as_scans,
+    fit_frames,
+    fit_window,
+    mean_range,
+)
 from gmmtorch.mapping.learning.merging import (
     Size,
     all_origins,
@@ -58,9 +66,8 @@ from gmmtorch.mixture import SOFTMAX_DTYPES, FlatnessRule, surface_rule
 from gmmtorch.occupancy import (
     Calibrator,
     Cones,
-    PointEvidence,
     Prediction,
-    listed_points,
+    few_point_evidence,
     spectrum_of,
     whitening,
 )
@@ -421,17 +428,18 @@ def predicted(
     if not len(ends):
         return calibrator
     if calibrator is None:
-        calibrator = Calibrator.of(_mean_range(window), len(SIDES))
+        calibrator = Calibrator.of(mean_range(window), len(SIDES))
     if not any(len(block.components.seen_by) for block in known):
         return calibrator
-    share = torch.rand(len(ends), 1, generator=generator, dtype=torch.float64).to(ends.device)
+    share = torch.rand(len(ends), 1, generator=generator, dtype=torch.float64)
+    share = share.to(ends.device, non_blocking=True)
     points = torch.cat([ends, origins + share * (ends - origins)])
-    occupied = torch.arange(len(points), device=points.device) < len(ends)
+    occupied = np.arange(len(points)) < len(ends)
     predictions = []
     evidence, n_pairs = few_points(known, points, SIDES)
     for side, (hits, misses) in zip(SIDES, evidence, strict=True):
         seen = hits * (calibrator.length / side) + misses
-        kept = (seen >= seen.median()) & (seen > 0)
+        kept = (seen >= np.sort(seen)[(len(seen) - 1) // 2]) & (seen > 0)
         predictions.append(Prediction(hits[kept], misses[kept], occupied[kept], side))
     due = number + _windows_between(n_pairs, sum(map(_size, window)))
     return replace(calibrator.updated(predictions, ends.shape[1]), next_window=due)
@@ -449,50 +457,46 @@ def _size(scan: Scan | DepthFrame) -> int:
     return scan.depth.numel() if isinstance(scan, DepthFrame) else len(scan.points)
 
 
-def _mean_range(window: Sequence[Scan | DepthFrame]) -> float:
-    """Mean range (m) of the returns of a window that has some."""
-    ranges = torch.cat([(scan.points - scan.origin).norm(dim=1).double() for scan in window])
-    return float(ranges.mean())
-
-
 def _beams(window: Sequence[Scan | DepthFrame], generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Origins and ends (B, D) of some returns of a scan of a window, float64."""
     scan = window[int(torch.randint(len(window), (1,), generator=generator))]
-    points = scan.points
-    if len(points):
-        points = points[torch.randint(len(points), (_BEAMS,), generator=generator).to(points.device)]
+    found = scan.pixels() if isinstance(scan, DepthFrame) else scan.points
+    if len(found):
+        chosen = torch.randint(len(found), (_BEAMS,), generator=generator)
+        found = found[chosen.to(found.device, non_blocking=True)]
+    points = scan.points_at(found) if isinstance(scan, DepthFrame) else found
     return scan.origin.double().expand_as(points), points.double()
 
 
-def few_points(
-    blocks: Sequence[Block], points: Tensor, sides: Sequence[float]
-) -> tuple[list[PointEvidence], int]:
-    """Evidence (M,) of cubes of several sides (m) at a few points (M, D), without an index; and the number of
-    pairs of a point and a cone that it takes. `blocks`: at least one has a viewpoint."""
+def few_points(blocks: Sequence[Block], points: Tensor, sides: Sequence[float]) -> tuple[np.ndarray, int]:
+    """Hits and misses (S, 2, M) of cubes of several sides (m) at a few points (M, D), without an index; and
+    the number of pairs of a point and a cone near it. `blocks`: at least one has a viewpoint."""
     cutoff = cutoff_for(blocks)
     blocks = [block for block in blocks if len(block.components.seen_by)]
-    low, high = evidence_boxes(*bounds_of(blocks, cutoff), max(sides), cutoff)
-    met = ((low <= points.amax(0)) & (high >= points.amin(0))).all(1).tolist()
-    near = [block.components for block, is_met in zip(blocks, met, strict=True) if is_met]
-    known = Components.concatenate(near or [blocks[0].components])
-    point, view = _near(known, points, max(sides), cutoff)
-    used, cone = torch.unique(view, return_inverse=True)
-    by = known.seen_by[used]
-    component, number = torch.unique(by, return_inverse=True)
-    origins = known.origins[known.seen_from[used]]
-    cones = Cones(
-        known.means[by], known.covariances[by], origins, known.seen_count[used], known.max_range[by]
-    )
-    axes = spectrum_of(known.covariances[component])[1][number]
-    return listed_points(cones, axes, points, (point, cone), sides, cutoff), len(point)
+    if len(blocks) > 1:
+        low, high = evidence_boxes(*bounds_of(blocks, cutoff), max(sides), cutoff)
+        met = ((low <= points.amax(0)) & (high >= points.amin(0))).all(1).tolist()
+        blocks = [block for block, is_met in zip(blocks, met, strict=True) if is_met] or blocks[:1]
+    known = Components.concatenate([block.components for block in blocks])
+    widest = max(sides) * max(0.5 * known.dim**0.5, cutoff / 12**0.5)
+    if is_fused(points, known.means):
+        views = known.means, known.covariances, known.max_range, known.origins
+        seen = known.seen_by, known.seen_from, known.seen_count
+        found, n_pairs = few_points_evidence((*views, *seen), points, sides, cutoff, widest)
+        values = torch.cat([found.flatten(), n_pairs.double()[None]]).cpu().numpy()
+        return values[:-1].reshape(found.shape), int(values[-1])
+    view = _near(known, points, widest, cutoff)
+    cones = Cones(*(part[view.unique()] for part in known.cones()))
+    axes = spectrum_of(cones.covariances)[1]
+    return few_point_evidence(cones, axes, points, sides, cutoff).cpu().numpy(), len(view)
 
 
-def _near(known: Components, points: Tensor, side: float, cutoff: float) -> tuple[Tensor, Tensor]:
-    """Pairs of a point (P,) and a viewpoint (P,) whose cone may give evidence to the cube at the point.
+def _near(known: Components, points: Tensor, widest: float, cutoff: float) -> Tensor:
+    """The viewpoint (P,) of each pair of a point and a viewpoint whose cone may give evidence to the cube.
 
-    First by boxes around the cones, then by balls around the components. Both keep every pair with evidence.
+    First by boxes around the cones, then by balls around the components. Pairs that they leave out give
+    next to no evidence.
     """
-    widest = side * max(0.5 * known.dim**0.5, cutoff / 12**0.5)
     extent = cutoff * known.covariances.diagonal(dim1=1, dim2=2).sqrt()
     by, origins = known.seen_by, known.origins[known.seen_from]
     low = torch.minimum((known.means - extent)[by], origins) - widest
@@ -515,4 +519,4 @@ def _near(known: Components, points: Tensor, side: float, cutoff: float) -> tupl
     close = (close & ((along <= 0) | (along * along <= 1.001 * ball * ball * square))) | (
         square <= widest * widest
     )
-    return point[close], view[close]
+    return view[close]

@@ -14,14 +14,13 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels import fused_label_moments, fused_moments, is_m_step_fused, is_small
-from gmmtorch.linalg import argsort, on_cpu
+from gmmtorch.linalg import argsort
 from gmmtorch.mixture.em import by_type
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.by_type import chunk_rows
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.kmeans import kmeans, mean_variance, spread_out
 from gmmtorch.mixture.em.partition import (
-    MOST_ON_CPU,
     FlatnessRule,
     partition,
     pool,
@@ -222,11 +221,7 @@ def partition_components(
 
     If there are at least twice `n_cells` points (2D, 3D), cells of side `finest` or more are partitioned.
     """
-    dim, device = points.shape[1], points.device
-    if device.type != "cpu" and points.shape[0] <= MOST_ON_CPU:
-        points, weight, *rest = on_cpu(points, weight, *(() if features is None else (features,)))
-        found, labels = partition_components(rule, points, weight, reg_covar, n_cells, finest, *rest)
-        return Parameters(*(part.to(device) for part in found)), labels.to(device)
+    dim = points.shape[1]
     exact = None
     if features is not None:
         mass, member = weight, None

@@ -97,34 +97,19 @@ def point_evidence(
     return PointForm(cones, resolution, cutoff)(points)
 
 
-def listed_points(
-    cones: Cones,
-    axes: Tensor,
-    points: Tensor,
-    lists: tuple[Tensor, Tensor],
-    resolutions: Sequence[float],
-    cutoff: float,
-) -> list[PointEvidence]:
-    """Evidence (M,) of a few points (M, D), float64, each from the cones listed for it; for cubes of several
-    sides (m). Needs no index.
+def few_point_evidence(
+    cones: Cones, axes: Tensor, points: Tensor, resolutions: Sequence[float], cutoff: float
+) -> Tensor:
+    """Hits and misses (S, 2, M) of a few points (M, D), float64, from all cones; for cubes of S sides (m).
 
-    axes: (C, D, D), see `spectrum_of`. lists: point (P,) and cone (P,) of each entry; points ascend.
+    The twin of `kernels.few_points_evidence`. axes: (C, D, D), see `spectrum_of`.
     """
-    point, cone = lists
-    tables = [_table_of(cones, axes, side) for side in resolutions]
-    if not is_fused(points, axes):
-        blocks, zeros = points.T[:, None].contiguous(), torch.zeros_like(points[:, 0])
-        each = [
-            pair_evidence(blocks, point, *table, cone, side, cutoff)
-            for table, side in zip(tables, resolutions, strict=True)
-        ]
-        return [PointEvidence(*(zeros.index_add(0, point, v[0]) for v in pairs)) for pairs in each]
-    order = torch.arange(len(points), device=points.device)
-    lists = Lists.of(torch.bincount(point, minlength=len(points)), cone.int())
-    found = points.new_zeros(len(tables), 2, len(points))
-    for table, side, values in zip(tables, resolutions, found, strict=True):
-        listed_evidence(points, order, order, lists, table.rows, side, cutoff, values)
-    return [PointEvidence(*values) for values in found]
+    blocks, every = points.T[:, :, None], torch.arange(len(axes), device=axes.device)
+    each = [
+        pair_evidence(blocks, torch.zeros_like(every), *_table_of(cones, axes, side), every, side, cutoff)
+        for side in resolutions
+    ]
+    return torch.stack([torch.stack([values.sum(1) for values in pairs]) for pairs in each])
 
 
 class PointForm:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from kernels.cones_for_kernels import cones_of
 from kernels.twins import by_both
 
 from gmmtorch.kernels import kernels
 from gmmtorch.kernels.evidence.point_evidence import Lists
+from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.learning.windows import SIDES, few_points
+from gmmtorch.mapping.query import Block
 from gmmtorch.occupancy.cone_index import Hulls
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.forms.point import PointForm
@@ -38,6 +44,29 @@ def test_fused_evidence_equals_the_twin(dim, kind, resolution, cutoff):
     for one, other in zip(*found, strict=True):
         assert torch.isfinite(other).all()
         torch.testing.assert_close(other, one, rtol=1e-10, atol=float(bound))
+
+
+@given(
+    dim=st.sampled_from([2, 3]),
+    kind=st.sampled_from(["any", "flat", "around"]),
+    seed=st.integers(0, 10_000),
+    n_points=st.integers(1, 30),
+    n_blocks=st.integers(1, 3),
+)
+def test_evidence_of_a_few_points_equals_the_twin(dim, kind, seed, n_points, n_blocks):
+    cones = cones_of(dim, kind)
+    draw = torch.Generator().manual_seed(seed)
+    seen_by, seen_from = torch.randint(60, (2, 90), generator=draw)
+    seen_count = torch.rand(90, generator=draw).double() * 100 - 5
+    parts = [cones.means, cones.covariances, cones.counts, cones.max_range, torch.zeros(60, 2).long()]
+    blocks = []
+    for number in range(n_blocks):
+        moved = [parts[0] + 30 * number, *parts[1:], cones.origins + 30 * number]
+        blocks.append(Block(Components(*moved, seen_by, seen_from, seen_count.clamp_min(0))))
+    points = points_of(cones)[torch.randint(2000, (n_points,), generator=draw).to(cones.means.device)]
+    (twin, n_twin), (fused, n_fused) = by_both(lambda: few_points(blocks, points, SIDES))
+    assert n_twin == n_fused
+    np.testing.assert_allclose(fused, twin, rtol=1e-9, atol=1e-11 * 90 * 100)
 
 
 def test_fused_evidence_does_not_depend_on_the_other_points():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -13,11 +14,12 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import kernels
-from gmmtorch.kernels.mixtures.cell_sums import distinct_keys
+from gmmtorch.kernels.compiler import Team
+from gmmtorch.kernels.mixtures.cell_sums import CutRule, DepthViews, depth_cells, distinct_keys, piece_cuts
 from gmmtorch.linalg import dense_ranks
-from gmmtorch.mapping.learning.fitting import DepthFrame, PooledFrames, pool_frames
+from gmmtorch.mapping.learning.fitting import DepthFrame, PooledFrames, mean_range, pool_frames
 from gmmtorch.mixture.em.exact import quadratic_features, shift_features
-from gmmtorch.mixture.em.partition import FlatnessRule, Partition, partition
+from gmmtorch.mixture.em.partition import FlatnessRule, Partition, partition, pool_into_cells
 
 INTRINSICS = torch.tensor([[64.0, 0, 31.5], [0, 64.0, 23.5], [0, 0, 1]], dtype=torch.float64)
 SIDE = 0.125
@@ -71,9 +73,60 @@ def test_cells_hold_the_moments_of_all_points(dtype, stride):
     assert float(variance.max()) < SIDE**2
 
 
+@given(
+    seeds=st.lists(st.integers(0, 1000), min_size=1, max_size=5),
+    types=st.lists(st.sampled_from([torch.float32, torch.float64]), min_size=5, max_size=5),
+    stride=st.integers(1, 3),
+)
+def test_frames_together_give_the_sums_of_each_frame_alone(seeds, types, stride):
+    frames = [
+        frame(
+            noisy_depth(seed, (7 + seed % 40, 5 + seed % 50), dtype),
+            pose(0.01 * seed, (0.01 * seed, 0.0, 0.0)),
+            pixel_stride=stride,
+            max_range=1.0 + 0.01 * seed,
+        )
+        for seed, dtype in zip(seeds, types, strict=False)
+    ]
+    draw = np.random.default_rng(seeds[0])
+    rays, pitch = draw.standard_normal((len(frames), 4, 3)), 0.01 + draw.random(len(frames))
+    max_range = 1 + draw.random(len(frames))
+    views = DepthViews([one.depth for one in frames], rays, pitch, max_range)
+    with kernels("fused"):
+        together = depth_cells(views, SIDE, 5000)
+        alone = [
+            depth_cells(DepthViews(*(v[i : i + 1] for v in views)), SIDE, 5000) for i in range(len(frames))
+        ]
+    assert together is not None
+    corners, place = torch.unique(torch.cat([one.corners for one in alone]), dim=0, return_inverse=True)
+    assert torch.equal(corners, together.corners)
+    sums = torch.zeros_like(together.sums).index_add_(0, place, torch.cat([one.sums for one in alone]))
+    torch.testing.assert_close(sums, together.sums, rtol=1e-12, atol=1e-9)
+    for column, part in enumerate(torch.split(place, [len(one.sums) for one in alone])):
+        assert torch.equal(together.counts[part, column], alone[column].counts[:, 0])
+
+
 def test_ranges_are_the_distances_of_the_points():
     one = frame(noisy_depth(1), pose(0.3, (0.1, 5.0, -2.0)), max_range=1e6)
     torch.testing.assert_close(one.ranges, (one.points - one.origin).norm(dim=1))
+
+
+@given(st.lists(st.tuples(st.integers(0, 1000), st.booleans()), min_size=1, max_size=4), st.integers(1, 3))
+def test_the_mean_range_of_frames_is_that_of_their_pixels(images, stride):
+    frames = [
+        frame(
+            noisy_depth(seed, (9 + seed % 30, 5 + seed % 60), torch.float64 if wide else torch.float32),
+            pose(),
+            pixel_stride=stride,
+            max_range=math.inf if seed % 3 else 2.0,
+        )
+        for seed, wide in images
+    ]
+    frames.append(frame(torch.full((3, 3), 2.0), pose()))
+    for one in frames:
+        one.depth[one.depth > 1e300] = math.nan  # their sum is infinite
+    twin, fused = by_both(lambda: mean_range(frames))
+    assert fused == pytest.approx(twin, rel=1e-13)
 
 
 def test_points_on_sides_of_cells_belong_to_the_cell_above():
@@ -122,6 +175,27 @@ def test_points_far_apart_have_larger_cells_and_points_beyond_a_map_are_refused(
         depth[3, 3] = value
         with pytest.raises(InvalidArgumentError, match="134217728"):
             pool_frames([frame(depth, pose())], SIDE, 1000)
+
+
+@given(
+    n=st.integers(2, 600),
+    dim=st.sampled_from([1, 2, 3]),
+    seed=st.integers(0, 10_000),
+    finest=st.sampled_from([0.0, 1e-3, 0.3, 100.0]),
+    share=st.sampled_from([0.01, 0.3, 0.9]),
+    is_weighted=st.booleans(),
+)
+def test_cells_of_points_are_those_of_the_twin(n, dim, seed, finest, share, is_weighted):
+    draw = torch.Generator().manual_seed(seed)
+    points = torch.randn(n, dim, generator=draw).double() * 10.0 ** (seed % 7 - 3)
+    points[torch.randint(n, (n // 2,), generator=draw)] = points[0].clone()
+    weight = torch.randint(1, 9, (n,), generator=draw).double() if is_weighted else None
+    twin, fused = by_both(lambda: pool_into_cells(points, max(1, int(share * n)), finest, weight))
+    assert torch.equal(fused.member, twin.member)
+    torch.testing.assert_close(fused.weight, twin.weight)
+    torch.testing.assert_close(
+        fused.features, twin.features, rtol=1e-12, atol=1e-13 * float(points.abs().max())
+    )
 
 
 @pytest.mark.cpu_only
@@ -173,7 +247,6 @@ def cut_by_both(rule: FlatnessRule, *given_: Tensor) -> Partition:
     return fused
 
 
-@pytest.mark.cpu_only
 @given(
     n=st.integers(1, 400),
     dim=st.sampled_from([1, 2, 3]),
@@ -192,12 +265,31 @@ def test_pieces_are_those_of_the_twin(n, dim, seed, limit, least, thickness):
 
 
 @pytest.mark.cpu_only
+@given(
+    n=st.integers(1, 400),
+    dim=st.sampled_from([1, 2, 3]),
+    seed=st.integers(0, 10_000),
+    limit=st.sampled_from([-1, 1, 2, 7, 60]),
+    least=st.sampled_from([0.0, 3.0, 40.0]),
+    thickness=st.sampled_from([0.0, 0.02, 0.2]),
+    n_workers=st.sampled_from([1, 7, 64, 1000]),
+    n_levels=st.sampled_from([1, 3, 64]),
+)
+def test_many_workers_cut_the_same_pieces_as_one(n, dim, seed, limit, least, thickness, n_workers, n_levels):
+    rule = CutRule(n_levels, limit, thickness, 0.5, least, 1.0, 3.0, 30.0)
+    points, weight, features = cells(n, dim, seed)
+    with kernels("fused"):
+        labels, n_pieces = piece_cuts(points, weight, features, rule)
+        shared, n_shared = piece_cuts(points, weight, features, rule, Team(n_workers, None))
+    assert n_shared == n_pieces
+    assert torch.equal(shared, labels)
+
+
 def test_pieces_without_extent_stay_whole():
     one = torch.zeros(5, 3, dtype=torch.float64)
     assert cut_by_both(FlatnessRule(thickness=0.0, min_weight=1.0), one, one[:, 0] + 1).n_pieces == 1
 
 
-@pytest.mark.cpu_only
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 def test_pieces_do_not_depend_on_the_unit(scale):
     points, weight, _ = cells(300, 3, 1)
