@@ -9,7 +9,6 @@ nothing is stored for a pair of a row and a component.
 With float32 exponentials a GPU computes in float32 within a block, from differences in a component's whitened
 axes, whose rounding errors have a bound. If it can exceed 2⁻¹⁰ nats for a log-density, with thin components
 and rows far apart, or with cells rather than points, the block is computed in float64.
-are float64. The twin of this form is the float64 one.
 
 The kernels of truncated EM run on the CPU and work on groups of rows. One makes the natural parameters of a
 group's candidates about its center, walks the group's rows once, and moves the sums to the components' means:
@@ -50,7 +49,6 @@ _IN_BLOCKS = {
     for dim in _WIDTHS
     for dtype, kind in _KINDS.items()
 }
-_RESTORED = {dim: FusedKernel(_E_STEP, f"restore_sums<{dim}>") for dim in _WIDTHS}
 _DIMENSIONS = {width: dim for dim, width in _WIDTHS.items()}
 
 
@@ -161,10 +159,7 @@ def _expectation_in_blocks(
     given = features.contiguous(), weight.contiguous(), n, natural, table, k, n_padded, n_parts
     n_items = n_parts * squad_size(device)
     _IN_BLOCKS[dim, dtype](n_items, *given, upper, numbers, partial, norms, device=device)
-    sums = partial.sum(0)
-    if dtype == torch.float32:
-        _RESTORED[dim](k, table, n_padded, sums, device=device)
-    return sums, torch.dot(weight, norms)
+    return partial.sum(0), torch.dot(weight, norms)
 
 
 def _batched_expectation(

@@ -90,82 +90,28 @@ GMM_KERNEL most_likely(int64_t item, const double* features, int64_t n_rows, con
     }
 }
 
-// Sums of features of points A x + t, from those of points x.
-template <int DIM>
-GMM_INLINE void move_sums(const double (&A)[DIM][DIM], const double* t, double* sums) {
-    double first[DIM], half[DIM][DIM], second[DIM][DIM];
-    for (int i = 0, f = 1 + DIM; i < DIM; ++i)
-        for (int j = i; j < DIM; ++j, ++f) second[i][j] = second[j][i] = sums[f];
-    for (int i = 0; i < DIM; ++i) {
-        first[i] = 0.0;
-        for (int j = 0; j < DIM; ++j) {
-            first[i] += A[i][j] * sums[1 + j];
-            half[i][j] = 0.0;
-            for (int p = 0; p < DIM; ++p) half[i][j] += A[i][p] * second[p][j];
-        }
-    }
-    for (int i = 0, f = 1 + DIM; i < DIM; ++i)
-        for (int j = i; j < DIM; ++j, ++f) {
-            sums[f] = first[i] * t[j] + t[i] * first[j] + sums[0] * t[i] * t[j];
-            for (int p = 0; p < DIM; ++p) sums[f] += half[i][p] * A[j][p];
-        }
-    for (int i = 0; i < DIM; ++i) sums[1 + i] = first[i] + sums[0] * t[i];
-}
-
-// A component of the table.
-template <int DIM>
-struct Whitening {
-    double constant, mean[DIM], factor[DIM][DIM];
-
-    GMM_INLINE Whitening(const double* table, int64_t n_padded, int64_t k) {
-        const double* at = table + k;
-        constant = *at;
-        for (int i = 0; i < DIM; ++i) mean[i] = *(at += n_padded);
-        for (int i = 0; i < DIM; ++i)
-            for (int j = 0; j < DIM; ++j) factor[i][j] = j < i ? 0.0 : *(at += n_padded);
-    }
-
-    // Sums of features of points x become those of W (x - mean).
-    GMM_INLINE void whiten(double* sums) const {
-        double t[DIM];
-        for (int i = 0; i < DIM; ++i) {
-            t[i] = 0.0;
-            for (int j = i; j < DIM; ++j) t[i] -= factor[i][j] * mean[j];
-        }
-        if (constant == constant) move_sums(factor, t, sums);
-    }
-
-    GMM_INLINE void restore(double* sums) const {
-        double inverse[DIM][DIM] = {};
-        for (int j = 0; j < DIM; ++j)
-            for (int i = j; i >= 0; --i) {
-                double sum = i == j ? 1.0 : 0.0;
-                for (int p = i + 1; p <= j; ++p) sum -= factor[i][p] * inverse[p][j];
-                inverse[i][j] = sum / factor[i][i];
-            }
-        if (constant == constant) move_sums(inverse, mean, sums);
-    }
-};
-
 // A row and a component of a block: in float64, features and natural parameters.
 template <int DIM, typename Real>
 struct Form {
-    static constexpr int WIDTH = n_features(DIM), N = WIDTH;
-    double w[WIDTH];
+    static constexpr int N = n_features(DIM);
+    double w[N];
 
     GMM_INLINE static void load(const double* features, const Block<DIM>&, double* x) {
-        for (int f = 0; f < WIDTH; ++f) x[f] = features[f];
+        for (int f = 0; f < N; ++f) x[f] = features[f];
     }
     GMM_INLINE void place(const Given& given, int64_t k, const Block<DIM>&, double) {
-        for (int f = 0; f < WIDTH; ++f) w[f] = given.natural[k * WIDTH + f];
+        for (int f = 0; f < N; ++f) w[f] = given.natural[k * N + f];
     }
     GMM_INLINE double logit(const double* x) const {
         double sum = x[0] * w[0];
-        for (int f = 1; f < WIDTH; ++f) sum = fma(x[f], w[f], sum);
+        for (int f = 1; f < N; ++f) sum = fma(x[f], w[f], sum);
         return sum;
     }
-    GMM_INLINE void add(double gamma, const double* x, double* sums) const {
-        for (int f = 0; f < WIDTH; ++f) sums[f] = fma(gamma, x[f], sums[f]);
+    GMM_INLINE static void add(double gamma, const double* x, double* sums) {
+        for (int f = 0; f < N; ++f) sums[f] = fma(gamma, x[f], sums[f]);
+    }
+    GMM_INLINE static void add_to(const Block<DIM>&, const double* own, double* sums) {
+        for (int f = 0; f < N; ++f) sums[f] += own[f];
     }
 };
 
@@ -176,57 +122,62 @@ struct Form {
 // of at most e_i = (DIM + 3) u (|b_i| + r_i), where r_i is the largest |W x|_i in the box. A pair counts only
 // if its logit exceeds -SKIPPED, thus |W x + b|^2 <= s = 2 (c + SKIPPED). The error of its logit is at most
 // sqrt(s) |e| + |e|^2 / 2 + 2 u (s + |c|), which `place` returns. A block in which it can exceed FAINT is
-// computed in float64.
+// computed in float64. Sums of a block, of features of x, have a relative error of at most (ROWS + 3) u more.
 constexpr double FAINT = 1.0 / 1024.0;  // nats
 
 template <int DIM>
 struct Form<DIM, float> {
-    static constexpr int WIDTH = n_features(DIM), N = DIM;
-    float c, b[DIM], w[DIM][DIM];
+    static constexpr int N = DIM;
+    float c, b[DIM], w[DIM * (DIM + 1) / 2];
 
     GMM_INLINE static void load(const double* features, const Block<DIM>& block, float* x) {
         for (int i = 0; i < DIM; ++i) x[i] = (float)(features[1 + i] - block.center[i]);
     }
     GMM_INLINE double place(const Given& given, int64_t k, const Block<DIM>& block, double reference) {
         constexpr double u = 1.0 / 16777216.0;
-        const Whitening<DIM> own(given.table, given.n_padded, k);
-        const double constant = own.constant - reference;
-        const double most = 2.0 * maximum(constant + SKIPPED, 0.0);
-        double squared = 0.0;
-        for (int i = 0; i < DIM; ++i) {
+        const double* column = given.table + k;
+        const double constant = column[0] - reference, s = 2.0 * maximum(constant + SKIPPED, 0.0);
+        double offset[DIM], squared = 0.0;
+        for (int i = 0; i < DIM; ++i) offset[i] = block.center[i] - column[(1 + i) * given.n_padded];
+        for (int i = 0, f = 0; i < DIM; ++i) {
             double at = 0.0, reach = 0.0;
-            for (int j = i; j < DIM; ++j) {
-                at += own.factor[i][j] * (block.center[j] - own.mean[j]);
-                reach += fabs(own.factor[i][j]) * block.half[j];
-                w[i][j] = (float)own.factor[i][j];
+            for (int j = i; j < DIM; ++j, ++f) {
+                const double entry = column[(1 + DIM + f) * given.n_padded];
+                at += entry * offset[j];
+                reach += fabs(entry) * block.half[j];
+                w[f] = (float)entry;
             }
             b[i] = (float)at;
             const double error = (DIM + 3) * u * (fabs(at) + reach);
             squared += error * error;
         }
         c = (float)constant;
-        return sqrt(most * squared) + 0.5 * squared + 2.0 * u * (most + fabs(constant));
-    }
-    GMM_INLINE void whitened(const float* x, float* y) const {
-        for (int i = 0; i < DIM; ++i) {
-            y[i] = b[i];
-            for (int j = i; j < DIM; ++j) y[i] = fmaf(w[i][j], x[j], y[i]);
-        }
+        return sqrt(s * squared) + 0.5 * squared + 2.0 * u * (s + fabs(constant));
     }
     GMM_INLINE float logit(const float* x) const {
-        float y[DIM], sum = 0.0f;
-        whitened(x, y);
-        for (int i = 0; i < DIM; ++i) sum = fmaf(y[i], y[i], sum);
+        float sum = 0.0f;
+        for (int i = 0, f = 0; i < DIM; ++i) {
+            float y = b[i];
+            for (int j = i; j < DIM; ++j, ++f) y = fmaf(w[f], x[j], y);
+            sum = fmaf(y, y, sum);
+        }
         return fmaf(-0.5f, sum, c);
     }
-    // Adds features of W x + b.
-    GMM_INLINE void add(float gamma, const float* x, float* sums) const {
-        float y[DIM];
-        whitened(x, y);
+    GMM_INLINE static void add(float gamma, const float* x, float* sums) {
         sums[0] += gamma;
         for (int i = 0, f = 1 + DIM; i < DIM; ++i) {
-            sums[1 + i] = fmaf(gamma, y[i], sums[1 + i]);
-            for (int j = i; j < DIM; ++j, ++f) sums[f] = fmaf(gamma * y[i], y[j], sums[f]);
+            const float part = gamma * x[i];
+            sums[1 + i] += part;
+            for (int j = i; j < DIM; ++j, ++f) sums[f] = fmaf(part, x[j], sums[f]);
+        }
+    }
+    GMM_INLINE static void add_to(const Block<DIM>& block, const float* own, double* sums) {
+        const double* at = block.center;
+        sums[0] += own[0];
+        for (int i = 0, f = 1 + DIM; i < DIM; ++i) {
+            const double first = own[1 + i] + own[0] * at[i];
+            sums[1 + i] += first;
+            for (int j = i; j < DIM; ++j, ++f) sums[f] += own[f] + at[i] * own[1 + j] + first * at[j];
         }
     }
 };
@@ -251,11 +202,11 @@ struct Tile {
 };
 
 // The E-step of a block: a thread first takes a row and all components, then a component and all rows.
-// Nothing is stored for a pair. With `whitens`, sums are those in the components' whitened coordinates.
+// Nothing is stored for a pair.
 template <int DIM, typename Real>
 GMM_INLINE void sum_block(Squad squad, Search<DIM>& search, Tile<DIM, Real>& tile, const Given& given,
                           const Block<DIM>& block, const double* upper, int64_t* listed, int64_t n_listed,
-                          double reference, bool whitens, double* sums, double* norms) {
+                          double reference, double* sums, double* norms) {
     constexpr int WIDTH = n_features(DIM), N = Form<DIM, Real>::N;
     const int n_rows = (int)(block.stop - block.begin);
     const double zero = sizeof(Real) == 4 ? reference : 0.0;  // of the logits
@@ -305,16 +256,12 @@ GMM_INLINE void sum_block(Squad squad, Search<DIM>& search, Tile<DIM, Real>& til
             if (!(under > (Real)-SKIPPED)) continue;
             form.add(exp(under) * tile.weight[r], tile.x[r], own);
         }
-        double found[WIDTH];
-        for (int f = 0; f < WIDTH; ++f) found[f] = own[f];
-        if (whitens) Whitening<DIM>(given.table, given.n_padded, k).whiten(found);
-        for (int f = 0; f < WIDTH; ++f) sums[k * WIDTH + f] += found[f];
+        Form<DIM, Real>::add_to(block, own, sums + k * WIDTH);
     }
     meet(squad);
 }
 
-// A squad takes a part of the rows, block after block, with sums of its own; for float32, in the components'
-// whitened coordinates.
+// A squad takes a part of the rows, block after block, with sums of its own.
 template <int DIM, typename Real>
 GMM_KERNEL e_step_in_blocks(int64_t item, Given given, double* scratch, int64_t* numbers, double* partial,
                             double* norms) {
@@ -336,20 +283,12 @@ GMM_KERNEL e_step_in_blocks(int64_t item, Given given, double* scratch, int64_t*
         const int64_t n = list_components(squad, search, given, upper, peak, listed);
         if constexpr (sizeof(Real) == 4) {
             if (fits_float32(squad, search, given, block, listed, n, peak)) {
-                sum_block(squad, search, tile.in_float32, given, block, upper, listed, n, peak, false, sums,
-                          norms);
+                sum_block(squad, search, tile.in_float32, given, block, upper, listed, n, peak, sums, norms);
                 continue;
             }
         }
-        sum_block(squad, search, tile.in_float64, given, block, upper, listed, n, peak, sizeof(Real) == 4,
-                  sums, norms);
+        sum_block(squad, search, tile.in_float64, given, block, upper, listed, n, peak, sums, norms);
     }
-}
-
-// Sums in whitened coordinates become those of features.
-template <int DIM>
-GMM_KERNEL restore_sums(int64_t item, const double* table, int64_t n_padded, double* sums) {
-    Whitening<DIM>(table, n_padded, item).restore(sums + item * n_features(DIM));
 }
 
 }  // namespace gmm
