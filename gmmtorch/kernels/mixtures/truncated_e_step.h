@@ -49,7 +49,8 @@ GMM_KERNEL truncated(int64_t item, const Real* features, const Real* weight, con
             for (int l = 0; l < LANES; ++l) set(p, l, (double)weight[row + l]);
             if (!likeliest && !any(p > 0.0)) continue;  // slots without rows
             load_rows<WIDTH>(features, [&](int l) { return row + l; }, x);
-            auto of = [&](int64_t j) { return natural + (item * n_padded + j) * WIDTH; };
+            const double* first = natural + item * n_padded * WIDTH;
+            auto of = [first](int64_t j) { return first + j * WIDTH; };
             const vec peak = find_logits<WIDTH>(x, n_padded, of, logits);
             if (likeliest) {
                 vec best = (vec)(0.0);
