@@ -265,6 +265,11 @@ class Team(NamedTuple):
         return Team(n_blocks * _BLOCK, torch.zeros(1, dtype=torch.int32, device=device))
 
 
+def squad_size(device: torch.device) -> int:
+    """Threads that share an item of a kernel that uses `gmm::Squad`: the launch is so many times larger."""
+    return 1 if device.type == "cpu" else _BLOCK
+
+
 def _with_includes(source: Path, seen: set[Path]) -> str:
     """The text of a source after that of the files that it includes, each once. Its hash identifies the
     compiled module in the cache."""

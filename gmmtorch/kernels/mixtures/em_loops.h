@@ -3,6 +3,7 @@
 // CPU.
 #pragma once
 
+#include "exact_e_step.h"
 #include "truncated_e_step.h"
 
 namespace gmm {
@@ -116,6 +117,7 @@ struct ExactTables {
     double* mixtures;  // the present one and the next, in turns
     double* masses;
     double* natural;
+    double* table;       // of a wide E-step that lists near components, or null
     double* statistics;  // and the two sums over all rows
     double* partial;     // statistics of each part of the rows
     double* norms;       // and peaks, if wide
@@ -137,7 +139,7 @@ GMM_KERNEL exact_em(int64_t item, Team team, const double* features, const doubl
                     double* after, double* bounds, ExactTables t, WorkerSums sums) {
     constexpr int WIDTH = n_features(DIM);
     constexpr double EPS = 2.220446049250313e-16, LOST = 1e-6;
-    enum Phase : int64_t { NATURAL, ROWS, SUMS, GATHER, MAXIMIZE, MASSES, FINISH };
+    enum Phase : int64_t { NATURAL, TABLE, ROWS, SUMS, GATHER, MAXIMIZE, MASSES, FINISH };
     int64_t phase = (int64_t)before[0], n_done = (int64_t)before[1], state = (int64_t)before[2];
     int64_t which = (int64_t)before[3], is_made = (int64_t)before[4];
     bool is_last = before[6] != 0.0;
@@ -169,8 +171,8 @@ GMM_KERNEL exact_em(int64_t item, Team team, const double* features, const doubl
                 const int64_t stop = n_rows * (item + 1) / n_parts;
                 double *own = t.partial + item * n_padded * WIDTH * LANES, *peaks = t.norms + n_rows;
                 for (int64_t i = 0; i < n_sums; ++i) own[i] = 0.0;
-                e_step<DIM>(item, features, n_rows, t.natural, n_padded, n_parts, weight, t.scratch, t.near,
-                            t.partial, peaks, t.norms);
+                const Given given = {features, weight, n_rows, t.natural, t.table, k_all, n_padded, n_parts};
+                e_step<DIM>(item, given, t.scratch, t.near, t.partial, peaks, t.norms);
                 vec both = (vec)(0.0);
                 for (int64_t row = begin; row < stop; row += LANES) {
                     vec peak = (vec)(0.0), norm = (vec)(1.0), p = (vec)(0.0);
@@ -224,6 +226,9 @@ GMM_KERNEL exact_em(int64_t item, Team team, const double* features, const doubl
                 if (EPS * second > LOST * least_eigenvalue<DIM>(covariance)) *t.lost = true;
             }
         if (phase == MASSES) merge_masses(t.masses, nullptr, k_all, item, n, sums.totals);
+        if (phase == TABLE)
+            for (int64_t k = item; k < n_padded && WIDE && t.table; k += n)
+                component_table<DIM>(k, t.natural, k_all, n_padded, t.table);
         meet(team);
         if ((phase == NATURAL || phase == MAXIMIZE) && *t.lost) {
             state = IMPOSSIBLE;
@@ -236,6 +241,8 @@ GMM_KERNEL exact_em(int64_t item, Team team, const double* features, const doubl
             last = bound, n_done += 1, which = 1 - which, is_made = 1, phase = MASSES;
         } else if (phase == MASSES) {
             phase = is_last ? FINISH : NATURAL;
+        } else if (phase == NATURAL && !WIDE) {
+            phase = ROWS;
         } else {
             phase += 1;
         }

@@ -73,6 +73,7 @@ GMM_INLINE void group_sums(int64_t item, int64_t n_items, GroupSizes sizes, Grou
     const int64_t m = sizes.n_candidates, n_padded = padded_candidates(m), n_groups = sizes.n_components;
     vec *logits = (vec*)scratch, *sums = logits + n_padded;
     double* natural = (double*)(sums + n_padded * WIDTH);
+    auto of = [natural](int64_t j) { return natural + j * WIDTH; };
     vec given[WIDTH], x[WIDTH], total = (vec)(0.0);
     for (int64_t g = n_groups * item / n_items; g < n_groups * (item + 1) / n_items; ++g) {
         const int64_t stop = groups.begin[g + 1], *candidates = groups.candidates + g * m;
@@ -94,7 +95,7 @@ GMM_INLINE void group_sums(int64_t item, int64_t n_items, GroupSizes sizes, Grou
                 set(p, l, groups.weight[row + l]), totals[1] += groups.weight[row + l];
             load_groups<DIM>(groups, sizes.are_points, row, stop - 1, given);
             local_features<DIM>(sizes.are_points, given, center, x);
-            const vec peak = find_logits<WIDTH>(x, natural, n_padded, logits);
+            const vec peak = find_logits<WIDTH>(x, n_padded, of, logits);
             if (owner) {
                 vec best = (vec)(0.0);
                 for (int64_t j = m - 1; j >= 0; --j) best = logits[j] == peak ? (vec)((double)j) : best;
