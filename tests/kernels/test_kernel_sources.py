@@ -89,8 +89,7 @@ def test_constants_of_the_sources_are_those_of_the_modules(tmp_path):
     sources = FOLDER / "mixtures/depth_cells.h", FOLDER / "rays/beam_information.h"
     sources += (FOLDER / "mixtures/em_loops.h",)
     kernel_of(tmp_path, body, *sources)(1, found, device=found.device)
-    modules = [compiler, *[cell_sums] * 3, *[beam_information] * 3, em_loops]
-    modules = [compiler, compiler, *[cell_sums] * 3, *[beam_information] * 3]
+    modules = [compiler, compiler, *[cell_sums] * 3, *[beam_information] * 3, em_loops]
     values = [
         getattr(module, {"LANES": "CPU_LANES", "BLOCK": "_BLOCK"}.get(name, name))
         for module, name in zip(modules, names, strict=True)
