@@ -1,6 +1,7 @@
 """Kernels in their form for CUDA, compiled by the C++ compiler of this machine and run by its threads.
 
-An item is a thread of a GPU, in a block of its own. The items of a team run at the same time.
+An item is a thread of a GPU, in a block of its own. The items of a team run at the same time, and so do the
+threads of a squad, which are a block.
 `with kernels_of_gpu():` inside of `with pretended_gpu():` runs what a GPU would run, Python and C++.
 """
 
@@ -26,7 +27,7 @@ from pretended_gpu import GPU, GPUTensor
 from torch import Tensor
 
 from gmmtorch.kernels import choice
-from gmmtorch.kernels.compiler import FusedKernel, Team
+from gmmtorch.kernels.compiler import _BLOCK, FusedKernel, Team
 
 N_THREADS = 3
 
@@ -36,13 +37,18 @@ _BEFORE = """
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <pthread.h>
 #include <thread>
 #include <vector>
 using std::atan2, std::ceil, std::exp, std::fabs, std::floor, std::fma, std::log, std::rint, std::sqrt;
 struct Place { unsigned x; };
 static thread_local Place threadIdx{0};
 static Place gridDim{1}, blockDim{1};
-static void __syncthreads() {}
+static pthread_barrier_t of_block;
+static bool has_squads = false;
+static void __syncthreads() {
+    if (has_squads) pthread_barrier_wait(&of_block);
+}
 static void __nanosleep(unsigned) { std::this_thread::yield(); }
 static void __threadfence() { std::atomic_thread_fence(std::memory_order_seq_cst); }
 template <typename Number>
@@ -58,14 +64,18 @@ static Number atomicCAS(Number* place, Number expected, Number value) {
     return expected;
 }
 #define CUDA_CALLABLE
+#define __shared__ static
 #define __CUDA_ARCH__ 900
 """
 
 _AFTER = """
-extern "C" void run(int64_t gmm_items, int64_t gmm_threads, const char* gmm_block) {{
+extern "C" void run(int64_t gmm_items, int64_t gmm_threads, bool gmm_squads, const char* gmm_block) {{
     gridDim.x = (unsigned)gmm_items;
+    has_squads = gmm_squads;
+    pthread_barrier_init(&of_block, nullptr, (unsigned)gmm_threads);
     {read}
     auto some = [=](int64_t gmm_first) {{
+        if (gmm_squads) threadIdx.x = (unsigned)gmm_first;
         for (int64_t item = gmm_first; item < gmm_items; item += gmm_threads) {call}
     }};
     std::vector<std::thread> threads;
@@ -103,7 +113,9 @@ def run_as_on_gpu(kernel: FusedKernel, n_items: int, *arguments: Tensor | float 
         return
     block = ctypes.create_string_buffer(kernel._packed.pack(*kernel._values(arguments)))
     n_threads = n_items if "meet(team)" in kernel._text else min(N_THREADS, n_items)
-    _compiled(kernel)(ctypes.c_int64(n_items), ctypes.c_int64(n_threads), block)
+    has_squads = "squad_of(item)" in kernel._text and n_items % _BLOCK == 0
+    n_threads = _BLOCK if has_squads else n_threads
+    _compiled(kernel)(ctypes.c_int64(n_items), ctypes.c_int64(n_threads), has_squads, block)
 
 
 def _launch(self: FusedKernel, n_items: int, *arguments: Any, device: torch.device) -> None:
@@ -127,10 +139,11 @@ def _is_fused(*tensors: Tensor | None) -> bool:
     return choice.is_fused(*tensors)
 
 
-def _team(device: torch.device) -> Team:
+def _team(device: torch.device, most: int | None = None) -> Team:
     if device.type == "cpu":
         return Team(1, None)
-    return Team(N_THREADS, torch.zeros(1, dtype=torch.int32, device=device))
+    n_threads = N_THREADS if most is None else min(N_THREADS, most)
+    return Team(n_threads, torch.zeros(1, dtype=torch.int32, device=device))
 
 
 @contextmanager

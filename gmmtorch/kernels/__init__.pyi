@@ -24,6 +24,7 @@ from .mixtures.cell_sums import KEY_BITS as KEY_BITS
 from .mixtures.cell_sums import CutRule as CutRule
 from .mixtures.cell_sums import DepthCells as DepthCells
 from .mixtures.cell_sums import DepthViews as DepthViews
+from .mixtures.cell_sums import are_cell_moments_fused as are_cell_moments_fused
 from .mixtures.cell_sums import are_piece_cuts_fused as are_piece_cuts_fused
 from .mixtures.cell_sums import cell_features as cell_features
 from .mixtures.cell_sums import cell_moments as cell_moments
@@ -40,6 +41,7 @@ from .mixtures.em_loops import n_sampled_rows as n_sampled_rows
 from .mixtures.em_loops import takes_one_launch as takes_one_launch
 from .mixtures.em_steps import expectation as expectation
 from .mixtures.em_steps import exponent_floor as exponent_floor
+from .mixtures.em_steps import fused_label_moments as fused_label_moments
 from .mixtures.em_steps import fused_maximization as fused_maximization
 from .mixtures.em_steps import fused_natural_parameters as fused_natural_parameters
 from .mixtures.em_steps import in_spatial_order as in_spatial_order

@@ -255,12 +255,19 @@ class Team(NamedTuple):
     rounds: int = 0
 
     @staticmethod
-    def of(device: torch.device) -> Team:
-        """One worker on a CPU; on a GPU as many as it runs at a time."""
+    def of(device: torch.device, most: int | None = None) -> Team:
+        """One worker on a CPU; on a GPU as many as it runs at a time, or blocks of `most` items."""
         if device.type == "cpu":
             return Team(1, None)
         n_blocks = _BLOCKS_OF_TEAM * torch.cuda.get_device_properties(device).multi_processor_count
+        if most is not None:
+            n_blocks = min(n_blocks, -(-most // _BLOCK))
         return Team(n_blocks * _BLOCK, torch.zeros(1, dtype=torch.int32, device=device))
+
+
+def squad_size(device: torch.device) -> int:
+    """Threads that share an item of a kernel that uses `gmm::Squad`: the launch is so many times larger."""
+    return 1 if device.type == "cpu" else _BLOCK
 
 
 def _with_includes(source: Path, seen: set[Path]) -> str:

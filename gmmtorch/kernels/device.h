@@ -60,6 +60,47 @@ GMM_INLINE void meet(Team& team) {
 #endif
 }
 
+// The threads that share one item: those of a block on CUDA, of which each passes its own `item`; on a CPU
+// one does the work of all.
+struct Squad {
+    int64_t item;
+    int lane, n;
+};
+
+constexpr int BLOCK = 64;
+#if defined(__CUDA_ARCH__)
+#define GMM_SHARED __shared__
+constexpr int THREADS = BLOCK;
+#else
+#define GMM_SHARED
+constexpr int THREADS = 1;
+#endif
+
+GMM_INLINE Squad squad_of(int64_t item) {
+#if defined(__CUDA_ARCH__)
+    return {item / THREADS, (int)threadIdx.x, THREADS};
+#else
+    return {item, 0, THREADS};
+#endif
+}
+
+// Waits for all threads of a squad; what they wrote before can be read after.
+GMM_INLINE void meet(const Squad&) {
+#if defined(__CUDA_ARCH__)
+    __syncthreads();
+#endif
+}
+
+// Calls combine(a, b) for pairs of n places, a power of two, until the result is in the first `left`.
+template <typename Combine>
+GMM_INLINE void reduce(const Squad& squad, int n, int left, Combine combine) {
+    meet(squad);
+    for (int half = n / 2; half >= left; half /= 2) {
+        for (int i = squad.lane; i < half; i += squad.n) combine(i, i + half);
+        meet(squad);
+    }
+}
+
 // Starts to load n numbers.
 GMM_INLINE void fetch(const double* place, int n) {
 #if !defined(__CUDA_ARCH__)

@@ -79,19 +79,19 @@ class Components:
     def empty(cls, dim: int, device: torch.device | str | None = None) -> Components:
         """No components in `dim` dimensions."""
 
-        def zeros(*shape: int, dtype: torch.dtype = torch.float64) -> Tensor:
-            return torch.zeros(*shape, dtype=dtype, device=device)
-
+        real, index, flag = (
+            torch.empty(0, dtype=dtype, device=device) for dtype in (torch.float64, torch.int64, torch.bool)
+        )
         return cls(
-            means=zeros(0, dim),
-            covariances=zeros(0, dim, dim),
-            support=zeros(0),
-            max_range=zeros(0, dtype=torch.bool),
-            ids=zeros(0, 2, dtype=torch.int64),
-            origins=zeros(0, dim),
-            seen_by=zeros(0, dtype=torch.int64),
-            seen_from=zeros(0, dtype=torch.int64),
-            seen_count=zeros(0),
+            means=real.view(0, dim),
+            covariances=real.view(0, dim, dim),
+            support=real,
+            max_range=flag,
+            ids=index.view(0, 2),
+            origins=real.view(0, dim),
+            seen_by=index,
+            seen_from=index,
+            seen_count=real,
         )
 
     @classmethod

@@ -75,8 +75,10 @@ class GaussianMixture(MixtureEstimator):
             from 48 components and 4·10⁶ pairs of point and component on, in up to eight dimensions.
         max_cells: if given, EM runs on the moments of at most this number of cells of points (see
             `cells`; 2D and 3D): much faster for many points per component, at a slightly lower likelihood.
-        dtype: of the exponentials in exact EM, whose products are always float64, and of the whole E-step
-            in truncated EM. With "float64" all computation is in float64.
+        dtype: of the exponentials in exact EM, and of the whole E-step in truncated EM, whose fused kernel
+            (up to three dimensions) computes in float64 always. With "float32" the
+            fused kernel of exact EM on a GPU computes log-densities in float32 where their error is below
+            10⁻³ nats. With "float64" all computation is in float64.
         compiled: accepted for older scripts; without effect, because the kernels are compiled anyway.
         warm_start: `fit` continues from the parameters and the lower bound of the last fit.
         verbose, verbose_interval: 1 prints every `verbose_interval`-th iteration, 2 adds time and change.

@@ -82,15 +82,16 @@ def test_every_kernel_of_a_source_is_launched_under_a_name_of_its_own():
 
 
 def test_constants_of_the_sources_are_those_of_the_modules(tmp_path):
-    names = ["LANES", "KEY_BITS", "REACH", "PATCH", "REACHED", "WORTHLESS", "IMAGE_ODDS", "MERGED"]
+    names = ["LANES", "BLOCK", "KEY_BITS", "REACH", "PATCH", "REACHED", "WORTHLESS", "IMAGE_ODDS"]
+    names.append("MERGED")
     body = " ".join(f"x[{place}] = {name};" for place, name in enumerate(names))
     found = torch.zeros(len(names)).double()
     sources = FOLDER / "mixtures/depth_cells.h", FOLDER / "rays/beam_information.h"
     sources += (FOLDER / "mixtures/em_loops.h",)
     kernel_of(tmp_path, body, *sources)(1, found, device=found.device)
-    modules = [compiler, *[cell_sums] * 3, *[beam_information] * 3, em_loops]
+    modules = [compiler, compiler, *[cell_sums] * 3, *[beam_information] * 3, em_loops]
     values = [
-        getattr(module, name.replace("LANES", "CPU_LANES"))
+        getattr(module, {"LANES": "CPU_LANES", "BLOCK": "_BLOCK"}.get(name, name))
         for module, name in zip(modules, names, strict=True)
     ]
     torch.testing.assert_close(found, torch.tensor(values).double(), rtol=1e-7, atol=0)  # one is a float32

@@ -2,7 +2,7 @@
 cells.
 
 The twins of `cell_moments` and `piece_cuts` are in `mixture.em.partition`, that of `distinct_keys` in
-`gmmtorch.linalg`; their fused kernels run on the CPU. Cells and their numbers equal the twin's; sums differ
+`gmmtorch.linalg`, whose fused kernel runs on the CPU. Cells and their numbers equal the twin's; sums differ
 by rounding. Pieces are cut for all levels in one launch. They are those of the twin, except where a decision
 depends on rounding: a point within rounding of a cut, or two directions of equal extent.
 
@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.compiler import FusedKernel
+from gmmtorch.kernels.compiler import FusedKernel, Team
 
 KEY_BITS = 20
 """Bits of one cell coordinate in a key, as in `cells.h`."""
@@ -48,6 +48,9 @@ _VALUES = {
     dtype: FusedKernel("mixtures/cells.h", f"value_sums<{real}>", shares=True)
     for dtype, real in _REAL.items()
 }
+_MEANS = FusedKernel("mixtures/cells.h", "mean_features")
+_MOST_CELLS_ON_GPU = 1 << 18
+_FACTORS = np.array([2 ** (-step / 3) for step in range(3 * KEY_BITS + 7)])
 _ORDERED = FusedKernel("mixtures/depth_cells.h", "ordered_cells")
 _FEATURES = FusedKernel("mixtures/depth_cells.h", "cell_features", rounds_each=True)
 
@@ -66,33 +69,49 @@ def distinct_keys(keys: Tensor) -> tuple[Tensor, Tensor]:
     return distinct[: int(n_distinct)], number
 
 
-def cell_moments(
-    points: Tensor, weight: Tensor, low: Tensor, side: float, factor: float, max_cells: int
-) -> tuple[Tensor, Tensor] | None:
-    """The sums (C, F) of quadratic features over the cells of points (N, D), and the cell (N,) of each point.
+def are_cell_moments_fused(points: Tensor, weight: Tensor | None, max_cells: int) -> bool:
+    """Whether the fused kernel sums these points. On a GPU its table has at most 400 bytes a
+    cell."""
+    fits = points.device.type == "cpu" or min(len(points), max_cells) <= _MOST_CELLS_ON_GPU
+    return fits and is_fused(points, *([] if weight is None else [weight]))
 
-    Cells are in the order of their keys. None if there are more than `max_cells`. The cell of a point x is
-    ⌊(x − low)/side · factor⌋.
+
+def cell_moments(
+    points: Tensor,
+    weight: Tensor | None,
+    box: tuple[Tensor, Tensor],
+    finest: float,
+    most_along: int,
+    max_cells: int,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The mean quadratic features (C, F) of points (N, D) in at most `max_cells` cells, the weight (C,) of
+    each cell, and the cell (N,) of each point.
+
+    Cells are in the order of their keys. The cell of a point x is ⌊(x − low)/side · 2^(−steps/3)⌋, with the
+    least side from `finest` on of which `most_along` cells hold all points, and as few steps as `max_cells`
+    allows.
 
     Args:
-        points, weight: (N, D) and (N,), float64, on the CPU. low: (D,).
+        points, weight: (N, D) and (N,), float64; None: one. box: lowest and highest coordinates (D,).
     """
-    n, dim = points.shape
-    width = 1 + dim + dim * (dim + 1) // 2
-    most = min(n, max_cells)
+    (n, dim), device, on_cpu = points.shape, points.device, points.device.type == "cpu"
+    most, width = min(n, max_cells), 1 + dim + dim * (dim + 1) // 2
     n_places = 1 << (2 * most).bit_length()
-    places = torch.full((n_places,), -1, dtype=torch.int64)
-    keys, member = torch.empty(most, dtype=torch.int64), torch.empty(n, dtype=torch.int64)
-    sums, n_cells = points.new_zeros(most, width), torch.zeros(1, dtype=torch.int64)
-    given = points.contiguous(), weight.contiguous(), n, low.contiguous(), side, factor, max_cells, n_places
-    _MOMENTS[dim](1, *given, places, keys, member, sums, n_cells, device=points.device)
+    n_rows = most if on_cpu else n_places  # on CUDA the place of a cell is its number
+    places = torch.empty(n_places, dtype=torch.int32) if on_cpu else None
+    whole = torch.empty(2 * n_rows + n + 1, dtype=torch.int64, device=device)
+    keys, rank, member, n_cells = whole.split((n_rows, n_rows, n, 1))
+    sums, team = points.new_zeros(n_rows, width), Team.of(device)
+    factors = torch.from_numpy(_FACTORS).to(device, non_blocking=True)
+    given = points.contiguous(), None if weight is None else weight.contiguous(), n, *box
+    sizes = finest, most_along, factors, max_cells, n_places
+    _MOMENTS[dim](team.n, *team, *given, *sizes, places, keys, member, sums, n_cells, device=device)
     found = int(n_cells)
-    if found > max_cells:
-        return None
-    order = keys[:found].argsort()
-    rank = torch.empty_like(order)
-    rank[order] = torch.arange(found)
-    return sums[order], rank[member]
+    order = keys[:found].argsort() if on_cpu else keys.argsort()[n_rows - found :]  # a free place holds -1
+    made = sums.new_empty(found * (width + 1))
+    features, mass = made[: found * width].view(found, width), made[found * width :]
+    _MEANS(found, order, sums, width, features, mass, rank, device=device)
+    return features, mass, rank[member]
 
 
 def value_sums(values: Tensor, member: Tensor, n_cells: int, middle: Tensor) -> Tensor | None:
@@ -287,6 +306,10 @@ def _features(x: Tensor) -> Tensor:
 DIMENSIONS = (1, 2, 3)
 
 _CUTS = {dim: FusedKernel("mixtures/piece_cuts.h", f"piece_cuts<{dim}>", shares=True) for dim in DIMENSIONS}
+_TEAM_CUTS = {
+    dim: FusedKernel("mixtures/piece_cuts.h", f"team_cuts<{dim}>", shares=True) for dim in DIMENSIONS
+}
+_MOST_ON_GPU = 1 << 12  # pieces: each is compared with all others
 
 
 class CutRule(NamedTuple):
@@ -303,25 +326,61 @@ class CutRule(NamedTuple):
     thickness_priority: float
 
 
-def are_piece_cuts_fused(points: Tensor, weight: Tensor, features: Tensor) -> bool:
-    """Whether the fused kernel computes with these cells."""
+def are_piece_cuts_fused(points: Tensor, weight: Tensor, features: Tensor, limit: int | None) -> bool:
+    """Whether the fused kernels compute with these cells, for at most `limit` pieces."""
     given = points, weight, features
-    fits = points.device.type == "cpu" and points.shape[1] in DIMENSIONS
+    is_small = points.device.type == "cpu" or len(points) <= _MOST_ON_GPU
+    fits = points.shape[1] in DIMENSIONS and (is_small or (limit or _MOST_ON_GPU) < _MOST_ON_GPU)
     return fits and all(tensor.dtype == torch.float64 for tensor in given) and is_fused(*given)
 
 
-def piece_cuts(points: Tensor, weight: Tensor, features: Tensor, rule: CutRule) -> tuple[Tensor, int]:
+def piece_cuts(
+    points: Tensor, weight: Tensor, features: Tensor, rule: CutRule, team: Team | None = None
+) -> tuple[Tensor, int]:
     """The piece (N,) of each cell, and the number of pieces.
 
+    On a GPU, sums are whole multiples of about 2⁻⁶⁰ times the sum of all absolute values, so that they do not
+    depend on the order of the cells.
+
     Args:
-        points (N, D), weight (N,), features (N, F): means, weights and mean features of the cells, float64,
-            on the CPU. N ≥ 1.
+        points (N, D), weight (N,), features (N, F): means, weights and mean features of the cells, float64.
+            N ≥ 1.
+        team: workers that share the cells; None: one on a CPU, many on a GPU.
     """
     n, width = features.shape
     most = n if rule.max_components < 0 else max(1, min(n, rule.max_components))
+    given = points.contiguous(), features.contiguous(), weight.contiguous(), n
+    if points.device.type != "cpu" or team is not None:
+        return _team_cuts(given, rule, most, team)
     sizes = most * width, most * (2 * points.shape[1] + 2), most * 6, n
     work = points.new_empty(sum(sizes)).split(sizes)
     number, labels, n_pieces = torch.empty(most + n + 1, dtype=torch.int64).split((most, n, 1))
-    given = points.contiguous(), features.contiguous(), weight.contiguous(), n
     _CUTS[points.shape[1]](1, *given, *rule, *work, number, labels, n_pieces, device=points.device)
     return labels, int(n_pieces)
+
+
+def _team_cuts(
+    given: tuple[Tensor, Tensor, Tensor, int], rule: CutRule, most: int, team: Team | None
+) -> tuple[Tensor, int]:
+    """`piece_cuts` by a team, whose phases are launched one by one if it cannot wait."""
+    points, features, weight, n = given
+    dim, device, width = points.shape[1], points.device, features.shape[1]
+    team = team or Team.of(device, n)
+    bound = weight @ features.abs()
+    reach = 2 * dim**0.5 * points.abs().max()
+    bound = torch.cat([bound, torch.stack([bound[0], bound[0] * reach, bound[0] * reach * reach])])
+    scales = torch.exp2(60 - bound.clamp_min(1e-200).log2().ceil())
+    reals = (most * (2 * dim + 1), most, n)
+    wholes = (most * width, most * 6, most, most, n, 4)
+    work = points.new_empty(sum(reals)).split(reals)
+    *tables, after = torch.zeros(sum(wholes), dtype=torch.int64, device=device).split(wholes)
+    before = torch.tensor([0, 0, 1, 0]).to(device, non_blocking=True)
+    is_stepped = team.arrived is None
+    while True:
+        phases = 1 if is_stepped else 1 << 62, before, after
+        rows = *team, *given, *rule, scales, *work, *tables, *phases
+        _TEAM_CUTS[dim](team.n, *rows, device=device)
+        _, _, n_pieces, is_done = after.tolist()
+        if is_done:
+            return tables[-1], n_pieces
+        before.copy_(after)

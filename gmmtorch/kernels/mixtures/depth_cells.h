@@ -76,32 +76,13 @@ GMM_INLINE void add_image(const DepthImage<Real>& view, int64_t image, int64_t n
     auto number_of = [&](const double* cell) {
         int64_t key = 0;
         for (int i = 0; i < 3; ++i) key = (key << KEY_BITS) | (int64_t)(cell[i] + REACH);
-#if defined(__CUDA_ARCH__)
-        // The number is the place: threads claim places of `keys`, which are -1 as long as they are free.
-        typedef unsigned long long word;
-        int64_t at = first_place(key, n_places);
-        for (int64_t tried = 0; tried < n_places; ++tried, at = (at + 1) & (n_places - 1)) {
-            const int64_t found = (int64_t)atomicCAS((word*)(keys + at), ~0ull, (word)key);
-            if (found == key) return at;
-            if (found < 0) return (int64_t)atomicAdd((word*)n_cells, 1ull) < max_cells ? at : (int64_t)-1;
-        }
-        atomicAdd((word*)n_cells, (word)max_cells + 1);
-        return (int64_t)-1;
-#else
-        // Cells are numbered in the order of their first points. A free place holds -1.
-        const int64_t at = found_place(key, places, n_places, keys);
-        if (places[at] >= 0) return (int64_t)places[at];
-        if (*n_cells >= max_cells) {
-            *n_cells = max_cells + 1;
-            return (int64_t)-1;
-        }
-        const int64_t made = (*n_cells)++;
-        places[at] = (int32_t)made;
-        keys[made] = key;
-        for (int f = 0; f < WIDTH; ++f) sums[made * WIDTH + f] = 0.0;
-        for (int64_t i = 0; i < n_images; ++i) counts[made * n_images + i] = 0.0;
-        return made;
+        const int64_t known = *n_cells;
+        const int64_t made = cell_number(key, max_cells, n_places, places, keys, n_cells, sums, WIDTH);
+#if !defined(__CUDA_ARCH__)
+        if (made >= known)  // a new one
+            for (int64_t i = 0; i < n_images; ++i) counts[made * n_images + i] = 0.0;
 #endif
+        return made;
     };
     // Adds n points in a cell, with these sums of features about its corner.
     auto add_points = [&](const double* cell, double n, const double* features) {

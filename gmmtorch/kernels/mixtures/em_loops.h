@@ -3,7 +3,7 @@
 // CPU.
 #pragma once
 
-#include "m_step.h"
+#include "exact_e_step.h"
 #include "truncated_e_step.h"
 
 namespace gmm {
@@ -23,15 +23,50 @@ GMM_INLINE double sum_of_every(const double* numbers, int64_t begin, int64_t sto
     return (a + b) + (c + d);
 }
 
-// Two sums over all rows, the log-likelihood and the number of points, from those of each worker.
-struct RowSums {
-    double* own;     // (2, n)
-    double* merged;  // (2, MERGED)
+// The sum of the numbers of listed pairs.
+GMM_INLINE double sum_of_pairs(const double* numbers, int64_t width, const int64_t* pairs, int64_t begin,
+                               int64_t stop) {
+    double a = 0.0, b = 0.0, c = 0.0, d = 0.0;
+    int64_t i = begin;
+    for (; i + 3 < stop; i += 4) {
+        a += numbers[pairs[i] * width], b += numbers[pairs[i + 1] * width];
+        c += numbers[pairs[i + 2] * width], d += numbers[pairs[i + 3] * width];
+    }
+    for (; i < stop; ++i) a += numbers[pairs[i] * width];
+    return (a + b) + (c + d);
+}
+
+// Sums over all workers' shares of the rows, and over the components.
+struct WorkerSums {
+    double* own;     // (2, n): the log-likelihood and the number of points of each worker
+    double* merged;  // (2, MERGED) of the same
+    double* totals;  // (4, PARTS), see merge_masses
 };
 
-GMM_INLINE void merge(RowSums sums, int64_t item, int64_t n) {
+GMM_INLINE void merge(WorkerSums sums, int64_t item, int64_t n) {
     for (int64_t i = item; i < 2 * MERGED; i += n)
         sums.merged[i] = sum_of_every(sums.own + i / MERGED * n, i % MERGED, n, MERGED);
+}
+
+// In two steps, the masses of EM's own step and of the extrapolated one; and what the components whose
+// extrapolation is trusted have of the latter, and the others of the former. masses (2, K), merged (4,
+// PARTS).
+constexpr int64_t PARTS = 64;
+
+GMM_INLINE void merge_masses(const double* masses, const bool* trusted, int64_t n_components, int64_t item,
+                             int64_t n, double* merged) {
+    for (int64_t i = item; i < (trusted ? 4 : 1) * PARTS; i += n) {
+        const int64_t which = i / PARTS;
+        const double* own = masses + (which == 1 || which == 2) * n_components;
+        double sum = 0.0;
+        for (int64_t k = i % PARTS; k < n_components; k += PARTS)
+            if (which < 2 || trusted[k] == (which == 2)) sum += own[k];
+        merged[i] = sum;
+    }
+}
+
+GMM_INLINE double merged_mass(const double* merged, int64_t which) {
+    return sum_of_every(merged, which * PARTS, (which + 1) * PARTS, 1);
 }
 
 // A mixture in memory: weights, means and covariances, one after the other.
@@ -45,10 +80,44 @@ struct Mixture {
 
 enum State : int64_t { RUNNING, ENDED, IMPOSSIBLE, PAUSED };
 
+// On a GPU, of a row of features, the logarithm of the sum over all components.
+template <int WIDTH>
+GMM_INLINE double norm_of_row(const double* row, const double* natural, int64_t n_components) {
+    double x[WIDTH];
+    LogSum sum;
+    for (int f = 0; f < WIDTH; ++f) x[f] = row[f];
+    for (int64_t k = 0; k < n_components; ++k) {
+        const double* w = natural + k * WIDTH;
+        double logit = x[0] * w[0];
+        for (int f = 1; f < WIDTH; ++f) logit = fma(x[f], w[f], logit);
+        sum.add(logit);
+    }
+    return sum.peak + log(sum.norm);
+}
+
+// On a GPU, the statistics of a component over some rows.
+template <int WIDTH>
+GMM_INLINE void sums_of_rows(const double* features, const double* weight, const double* norms, int64_t begin,
+                             int64_t stop, const double* natural, double* sums) {
+    double w[WIDTH], sum[WIDTH];
+    for (int f = 0; f < WIDTH; ++f) w[f] = natural[f], sum[f] = 0.0;
+    for (int64_t row = begin; row < stop; ++row) {
+        const double* x = features + row * WIDTH;  // the same for most threads of a warp
+        double under = x[0] * w[0];
+        for (int f = 1; f < WIDTH; ++f) under = fma(x[f], w[f], under);
+        under -= norms[row];
+        if (!(under > -SKIPPED)) continue;
+        const double gamma = exp(under) * weight[row];
+        for (int f = 0; f < WIDTH; ++f) sum[f] = fma(gamma, x[f], sum[f]);
+    }
+    for (int f = 0; f < WIDTH; ++f) sums[f] = sum[f];
+}
+
 struct ExactTables {
     double* mixtures;  // the present one and the next, in turns
     double* masses;
     double* natural;
+    double* table;       // of a wide E-step that lists near components, or null
     double* statistics;  // and the two sums over all rows
     double* partial;     // statistics of each part of the rows
     double* norms;       // and peaks, if wide
@@ -67,19 +136,20 @@ template <int DIM, bool WIDE>
 GMM_KERNEL exact_em(int64_t item, Team team, const double* features, const double* weight, int64_t n_rows,
                     int64_t n_components, int64_t n_padded, int64_t n_parts, double reg_covar, double tol,
                     double last_bound, int64_t n_iter, bool guarded, int64_t n_phases, const double* before,
-                    double* after, double* bounds, ExactTables t, RowSums sums) {
+                    double* after, double* bounds, ExactTables t, WorkerSums sums) {
     constexpr int WIDTH = n_features(DIM);
     constexpr double EPS = 2.220446049250313e-16, LOST = 1e-6;
-    enum Phase : int64_t { NATURAL, ROWS, SUMS, GATHER, MAXIMIZE, FINISH };
+    enum Phase : int64_t { NATURAL, TABLE, ROWS, SUMS, GATHER, MAXIMIZE, MASSES, FINISH };
     int64_t phase = (int64_t)before[0], n_done = (int64_t)before[1], state = (int64_t)before[2];
     int64_t which = (int64_t)before[3], is_made = (int64_t)before[4];
+    bool is_last = before[6] != 0.0;
     double last = n_done ? before[5] : last_bound;
     const int64_t n = team.n, k_all = n_components;
     double* total = t.statistics + k_all * WIDTH;
     for (int64_t left = n_phases; left > 0 && state == RUNNING; --left) {
         Mixture<DIM> now(t.mixtures, k_all, which), next(t.mixtures, k_all, 1 - which);
         if ((phase == NATURAL || phase == FINISH) && item < n_padded) {
-            const double mass = !is_made ? 1.0 : sum_of_every(t.masses, 0, k_all, 1);
+            const double mass = is_made ? merged_mass(sums.totals, 0) : 1.0;
             for (int64_t k = item; k < n_padded; k += n) {
                 double* w = t.natural + k * WIDTH;
                 if (k >= k_all) {
@@ -101,8 +171,8 @@ GMM_KERNEL exact_em(int64_t item, Team team, const double* features, const doubl
                 const int64_t stop = n_rows * (item + 1) / n_parts;
                 double *own = t.partial + item * n_padded * WIDTH * LANES, *peaks = t.norms + n_rows;
                 for (int64_t i = 0; i < n_sums; ++i) own[i] = 0.0;
-                e_step<DIM>(item, features, n_rows, t.natural, n_padded, n_parts, weight, t.scratch, t.near,
-                            t.partial, peaks, t.norms);
+                const Given given = {features, weight, n_rows, t.natural, t.table, k_all, n_padded, n_parts};
+                e_step<DIM>(item, given, t.scratch, t.near, t.partial, peaks, t.norms);
                 vec both = (vec)(0.0);
                 for (int64_t row = begin; row < stop; row += LANES) {
                     vec peak = (vec)(0.0), norm = (vec)(1.0), p = (vec)(0.0);
@@ -116,7 +186,7 @@ GMM_KERNEL exact_em(int64_t item, Team team, const double* features, const doubl
                 for (int l = 0; l < LANES; ++l) value += get(both, l);
             } else {
                 for (int64_t row = item; row < n_rows; row += n) {
-                    row_norms<DIM>(row, features, n_rows, t.natural, k_all, n_parts, t.norms, nullptr);
+                    t.norms[row] = norm_of_row<WIDTH>(features + row * WIDTH, t.natural, k_all);
                     value += weight[row] * t.norms[row];
                     points += weight[row];
                 }
@@ -126,8 +196,9 @@ GMM_KERNEL exact_em(int64_t item, Team team, const double* features, const doubl
         if (phase == SUMS) {
             merge(sums, item, n);
             for (int64_t i = item; i < n_parts * k_all && !WIDE; i += n)
-                component_sums<DIM>(i, features, n_rows, t.natural, k_all, n_parts, weight, t.norms,
-                                    t.partial);
+                sums_of_rows<WIDTH>(features, weight, t.norms, n_rows * (i / k_all) / n_parts,
+                                    n_rows * (i / k_all + 1) / n_parts, t.natural + i % k_all * WIDTH,
+                                    t.partial + i * WIDTH);
         }
         if (phase == GATHER) {
             for (int64_t i = item; i < k_all * WIDTH; i += n) {
@@ -154,6 +225,10 @@ GMM_KERNEL exact_em(int64_t item, Team team, const double* features, const doubl
                 second /= maximum(s[0], 1e-300);
                 if (EPS * second > LOST * least_eigenvalue<DIM>(covariance)) *t.lost = true;
             }
+        if (phase == MASSES) merge_masses(t.masses, nullptr, k_all, item, n, sums.totals);
+        if (phase == TABLE)
+            for (int64_t k = item; k < n_padded && WIDE && t.table; k += n)
+                component_table<DIM>(k, t.natural, k_all, n_padded, t.table);
         meet(team);
         if ((phase == NATURAL || phase == MAXIMIZE) && *t.lost) {
             state = IMPOSSIBLE;
@@ -161,18 +236,21 @@ GMM_KERNEL exact_em(int64_t item, Team team, const double* features, const doubl
             state = ENDED;
         } else if (phase == MAXIMIZE) {
             const double bound = total[0] / total[1];
-            const bool has_converged = fabs(bound - last) < tol;
+            is_last = fabs(bound - last) < tol || n_done + 1 == n_iter;
             if (item == 0) bounds[n_done] = bound;
-            last = bound, n_done += 1, which = 1 - which, is_made = 1;
-            phase = has_converged || n_done == n_iter ? FINISH : NATURAL;
+            last = bound, n_done += 1, which = 1 - which, is_made = 1, phase = MASSES;
+        } else if (phase == MASSES) {
+            phase = is_last ? FINISH : NATURAL;
+        } else if (phase == NATURAL && !WIDE) {
+            phase = ROWS;
         } else {
             phase += 1;
         }
     }
     if (item < n - 1) return;
-    const double progress[6] = {(double)phase, (double)n_done,  (double)state,
-                                (double)which, (double)is_made, last};
-    for (int i = 0; i < 6; ++i) after[i] = progress[i];
+    const double progress[7] = {(double)phase,   (double)n_done, (double)state,  (double)which,
+                                (double)is_made, last,           (double)is_last};
+    for (int i = 0; i < 7; ++i) after[i] = progress[i];
 }
 
 // A stable sort of n keys below n_bins, in four phases: counts of each part of the keys, the first place of
@@ -243,7 +321,7 @@ GMM_KERNEL truncated_em(int64_t item, Team team, const double* rows, const doubl
                         int64_t n_parts, double reg_covar, double tol, double previous_bound, int64_t n_iter,
                         int64_t n_bounds, int64_t n_stop, bool is_shared, int64_t n_phases,
                         const double* before, double* after, double* bounds, TruncatedTables t,
-                        RowSums sums) {
+                        WorkerSums sums) {
     constexpr int WIDTH = n_features(DIM);
     enum Phase : int64_t {
         NATURAL,
@@ -262,6 +340,7 @@ GMM_KERNEL truncated_em(int64_t item, Team team, const double* rows, const doubl
         GATHER,
         DECIDE,
         MAXIMIZE,
+        MASSES,
         FINISH
     };
     const int64_t n = team.n, n_rows = sizes.n_rows, k_all = sizes.n_components, m = sizes.n_candidates;
@@ -293,12 +372,9 @@ GMM_KERNEL truncated_em(int64_t item, Team team, const double* rows, const doubl
         Sort by_owner = {n_sets > 1 ? t.owner : first_owner, n_rows, k_all, n_parts, t.counts, set.begin};
         Sort by_component = {set.candidates, k_all * m, k_all, n_parts, t.counts, set.pair_begin};
         if ((phase == NATURAL || phase == FINISH) && item < k_all) {
-            const double em_mass = is_made ? sum_of_every(t.masses, 0, k_all, 1) : 1.0;
-            double mass = 1.0, trusted = 0.0, other = 0.0;
-            if (is_ahead) mass = sum_of_every(t.masses + k_all, 0, k_all, 1);
-            for (int64_t k = 0; k < k_all && is_ahead; ++k)
-                t.flags[k] ? trusted += t.masses[k_all + k] : other += t.masses[k];
-            const double whole = trusted / mass + other / em_mass;
+            const double em_mass = is_made ? merged_mass(sums.totals, 0) : 1.0;
+            const double mass = is_ahead ? merged_mass(sums.totals, 1) : 1.0;
+            const double whole = merged_mass(sums.totals, 2) / mass + merged_mass(sums.totals, 3) / em_mass;
             for (int64_t k = item; k < k_all; k += n) {
                 const bool from_em = phase == NATURAL && undo, to_em = phase == FINISH && !is_made;
                 for (int i = 0; i < DIM && (from_em || to_em); ++i)
@@ -375,8 +451,9 @@ GMM_KERNEL truncated_em(int64_t item, Team team, const double* rows, const doubl
                 double sum = 0.0;
                 const int64_t k = i / WIDTH, f = i % WIDTH;
                 for (int64_t part = 0; part < n && WIDE; ++part) sum += t.partial[part * k_all * WIDTH + i];
-                for (int64_t place = set.pair_begin[k]; place < set.pair_begin[k + 1] && !WIDE; ++place)
-                    sum += t.partial[set.pairs[place] * WIDTH + f];
+                if (!WIDE)
+                    sum = sum_of_pairs(t.partial + f, WIDTH, set.pairs, set.pair_begin[k],
+                                       set.pair_begin[k + 1]);
                 t.statistics[i] = sum;
             }
             for (int64_t i = item; i < 2; i += n)
@@ -395,6 +472,7 @@ GMM_KERNEL truncated_em(int64_t item, Team team, const double* rows, const doubl
                 for (int i = k * DIM * DIM; i < (k + 1) * DIM * DIM; ++i)
                     now.covariances[i] = next.covariances[i];
             }
+        if (phase == MASSES) merge_masses(t.masses, t.flags, k_all, item, n, sums.totals);
         if (phase != DECIDE) meet(team);
         const double bound = total[0] / total[1];
         if (phase == NATURAL) {
@@ -430,6 +508,8 @@ GMM_KERNEL truncated_em(int64_t item, Team team, const double* rows, const doubl
             last = bound, n_done += 1;
             converged = has_converged && !was_ahead;
             if (has_converged && was_ahead) step_back();  // decide by EM's own step
+            phase = MASSES;
+        } else if (phase == MASSES) {
             phase = converged || n_done == n_iter ? FINISH : NATURAL;
             if (phase == NATURAL && n_done == n_stop) state = PAUSED;
         } else if (phase == FINISH) {

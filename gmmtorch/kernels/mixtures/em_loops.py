@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel, Team
-from gmmtorch.kernels.mixtures.em_steps import DIMENSIONS, Mixture, is_m_step_fused
+from gmmtorch.kernels.mixtures.em_steps import DIMENSIONS, Mixture, is_m_step_fused, lists_near_components
 
 MERGED = 256
 """Numbers that the sums of all workers are merged into, as in `em_loops.h`."""
@@ -82,17 +82,30 @@ def fused_exact_em(
     """
     (n, width), (k, dim), device = features.shape, start[1].shape, features.device
     wide, team = device.type == "cpu" and team is None, team or Team.of(device)
-    padded = k + -k % 4 if wide else k
+    lists = wide and lists_near_components(n, k)
+    padded = k + (CPU_LANES - k % CPU_LANES if lists else -k % 4 if wide else 0)
     n_parts = team.n if wide else max(1, min(_MOST_PARTS, n // _ROWS_OF_A_PART, team.n // k))
     n_iter = max(1, min(max_iter, _PAIRS_OF_A_LAUNCH[device.type] // (n * k), _MOST_ITERATIONS))
     size, n_sums = k * (1 + dim + dim * dim), n_parts * padded * width
-    scratch = (2 * n, n_parts * padded * CPU_LANES, n_parts * padded) if wide else (n, 0, 0)
-    tables = k, padded * width, k * width + 2, n_sums * (CPU_LANES if wide else 1), *scratch, 1
-    head, mixtures, *others = _carved(features, _HEAD + n_iter, 2 * size, *tables, 2 * team.n, 2 * MERGED)
+    near = n_parts * padded
+    scratch = (2 * n, near * (CPU_LANES + 1), 2 * near) if wide else (n, 0, 0)
+    tables = (
+        k,
+        padded * width,
+        padded * width,
+        k * width + 2,
+        n_sums * (CPU_LANES if wide else 1),
+        *scratch,
+        1,
+    )
+    head, mixtures, masses, natural, table, *others = _carved(
+        features, _HEAD + n_iter, 2 * size, *tables, 2 * team.n, 2 * MERGED, MERGED
+    )
     torch.cat([part.reshape(-1) for part in start], out=mixtures[:size])
     rows = features.contiguous(), weight.contiguous(), n, k, padded, n_parts
     limits = reg_covar, tol, last_bound, n_iter, guarded
-    _launch(_EXACT[dim, wide], team, head, (*rows, *limits), (mixtures, *others))
+    made = mixtures, masses, natural, table if lists else None, *others
+    _launch(_EXACT[dim, wide], team, head, (*rows, *limits), made)
     (_, n_done, state, which, *_), bounds = _read(head)
     found = _mixture(mixtures[which * size :][:size].clone(), k, dim)
     return Run(found, bounds[:n_done], state == _IMPOSSIBLE)
@@ -163,7 +176,7 @@ def fused_truncated_em(
     tables = 2 * k, k * width, k * width + 2, k * (width + dim), *scratch, 1 + k // CPU_LANES
     head, mixtures, *others = _carved(
         *(values, _HEAD + n_bounds, 3 * size, *tables, n, (n_parts + 1) * k, 2 * n * (columns + 1)),
-        *(2 * places, 2 * workers.n, 2 * MERGED),
+        *(2 * places, 2 * workers.n, 2 * MERGED, MERGED),
     )
     natural, statistics, flags, owners, groups = (others[i] for i in (1, 2, 8, 9, 12))
     torch.cat([part.reshape(-1) for part in start], out=mixtures[:size])
@@ -210,7 +223,7 @@ def _launch(
     team: Team,
     head: Tensor,
     given: tuple[Tensor | float | None, ...],
-    tables: tuple[Tensor, ...],
+    tables: tuple[Tensor | None, ...],
 ) -> None:
     """Runs a loop to its end. head: the progress before a launch, after it, and the bounds."""
     before, after, bounds = head[:_PROGRESS], head[_PROGRESS:_HEAD], head[_HEAD:]

@@ -1,10 +1,14 @@
 """Steps of EM: the E-step of exact and of truncated EM, the M-step, natural parameters; steps of k-means.
 
-The fused kernels compute in float64 and skip responsibilities below e⁻³⁷ of the row's largest term: a far
-component costs its log-density and nothing more. Statistics differ from the twin's with float64 exponentials
-by at most 10⁻¹² of their largest entry. On a CPU one kernel works on eight rows at a time. On a GPU the first
-kernel sums over the components of each row, and the second over the rows of each component; no block of
-N × K numbers is written to memory.
+The fused kernels skip responsibilities below e⁻³⁷ of the row's largest term. Rows that follow each other are
+a block, which lists the components that can exceed this in its box: a far component costs a bound for each
+64 rows and nothing more. Statistics differ from the twin's with float64 exponentials by at most 10⁻¹² of
+their largest entry. On a CPU a kernel works on eight rows at a time. On a GPU 64 threads share a block, and
+nothing is stored for a pair of a row and a component.
+
+With float32 exponentials a GPU computes in float32 within a block, from differences in a component's whitened
+axes, whose rounding errors have a bound. If it can exceed 2⁻¹⁰ nats for a log-density, with thin components
+and rows far apart, or with cells rather than points, the block is computed in float64.
 
 The twins of the M-step (2.4)-(2.6) and of natural parameters are in `mixture.em`. The M-step differs from its
 twin by at most 10⁻¹² of the largest entry of a component, and natural parameters by this times the condition
@@ -18,21 +22,28 @@ from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.chunks import chunk_elements, chunked
-from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel
+from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel, squad_size
 from gmmtorch.linalg import order_along_curve
 
 _FEW_ROWS = 2048  # in fewer rows, their order matters little
+_FEW_COMPONENTS, _FEW_PAIRS = 64, 1 << 18
+"""For fewer components, or fewer pairs of a row and a component, a CPU does not search for the near ones."""
 _PARTS = 64  # most parts of the rows; each has its own sums, so that threads write apart
-_GPU_THREADS = 1 << 18
-"""As many as a large GPU holds at a time; each sums one component over a part of the rows."""
-_GPU_ROWS = 32  # least rows of such a part
+_SQUADS = 1056
+"""Most squads of a GPU, eight on each multiprocessor of a large one; each has its own sums."""
+_SQUAD_SUMS = 1 << 24  # most numbers of these sums, 128 MB
 
 _WIDTHS = {1: 3, 2: 6, 3: 10}
-_E_STEP = "mixtures/e_step.h"
+_E_STEP = "mixtures/exact_e_step.h"
+_TABLES = {dim: FusedKernel("mixtures/near_components.h", f"component_table<{dim}>") for dim in _WIDTHS}
 _EXPECTATION = {dim: FusedKernel(_E_STEP, f"e_step<{dim}>") for dim in _WIDTHS}
 _MOST_LIKELY = {dim: FusedKernel(_E_STEP, f"most_likely<{dim}>") for dim in _WIDTHS}
-_NORMS = {dim: FusedKernel(_E_STEP, f"row_norms<{dim}>") for dim in _WIDTHS}
-_SHARES = {dim: FusedKernel(_E_STEP, f"component_sums<{dim}>") for dim in _WIDTHS}
+_KINDS = {torch.float32: "float", torch.float64: "double"}
+_IN_BLOCKS = {
+    (dim, dtype): FusedKernel(_E_STEP, f"e_step_in_blocks<{dim}, {kind}>")
+    for dim in _WIDTHS
+    for dtype, kind in _KINDS.items()
+}
 _DIMENSIONS = {width: dim for dim, width in _WIDTHS.items()}
 
 
@@ -42,14 +53,16 @@ def expectation(
     """One E-step (2.3): sufficient statistics S (K, F) and Σ_n p_n logsumexp_k L_nk (a scalar), L = φWᵀ.
 
     Products are computed in the dtype of the features (float64, because the quadratic form cancels many
-    digits). The twin computes exponentials in `softmax_dtype`, after subtraction of the row's maximum.
+    digits), and exponentials in `softmax_dtype`, after subtraction of the row's maximum. The fused kernel
+    computes in float64 on a CPU; with float32 exponentials, it computes in float32 on a GPU (see the module).
 
     Args:
         features: φ (N, F). sample_weight: p (N,). natural: W (K, F).
     """
     if _is_e_step_fused(features, sample_weight, natural):
-        fused = _fused_expectation if features.device.type == "cpu" else _expectation_on_gpu
-        return fused(features, sample_weight, natural)
+        if features.device.type == "cpu":
+            return _fused_expectation(features, sample_weight, natural)
+        return _expectation_in_blocks(features, sample_weight, natural, softmax_dtype)
     return _batched_expectation(features, sample_weight, natural, softmax_dtype)
 
 
@@ -58,12 +71,9 @@ def most_likely(features: Tensor, natural: Tensor) -> Tensor:
     if _is_e_step_fused(features, natural):
         n, dim, device = features.shape[0], _DIMENSIONS[features.shape[1]], features.device
         likeliest = torch.empty(n, dtype=torch.int64, device=device)
-        if device.type != "cpu":
-            given = features.contiguous(), n, natural.contiguous(), natural.shape[0], 1
-            _NORMS[dim](n, *given, None, likeliest, device=device)
-            return likeliest
-        n_parts = _n_parts(features)
-        given = features.contiguous(), n, *_by_four(natural), n_parts
+        n_parts = _n_parts(features) if device.type == "cpu" else n
+        padded = _padded(natural, -len(natural) % 4)
+        given = features.contiguous(), n, padded, len(padded), n_parts
         _MOST_LIKELY[dim](n_parts, *given, likeliest, device=device)
         return likeliest
     transposed = natural.T.contiguous()
@@ -90,45 +100,65 @@ def _is_e_step_fused(*tensors: Tensor) -> bool:
     return fits and all(t.dtype == torch.float64 for t in tensors) and is_fused(*tensors)
 
 
+def lists_near_components(n_rows: int, n_components: int) -> bool:
+    """Whether a CPU searches for the components near a block of rows."""
+    return n_components >= _FEW_COMPONENTS and n_rows * n_components >= _FEW_PAIRS
+
+
 def _n_parts(features: Tensor) -> int:
     threads = torch.get_num_threads()
     return max(1, min(threads, _PARTS, features.shape[0] // (4 * CPU_LANES)))
 
 
-def _by_four(natural: Tensor) -> tuple[Tensor, int]:
-    """W with rows of impossible components added, so that four make a step; and the number of rows."""
-    missing = -natural.shape[0] % 4
-    if missing:
-        none = natural.new_zeros(missing, natural.shape[1])
-        none[:, 0] = -1e300
-        natural = torch.cat([natural, none])
-    return natural.contiguous(), natural.shape[0]
+def _padded(natural: Tensor, missing: int) -> Tensor:
+    """W with rows of impossible components added, so that those of a step are complete."""
+    if missing == 0:
+        return natural.contiguous()
+    none = natural.new_zeros(missing, natural.shape[1])
+    none[:, 0] = -1e300
+    return torch.cat([natural, none])
+
+
+def _table(natural: Tensor, n_padded: int) -> Tensor:
+    """What bounds the components' logits (F, n_padded): see `component_table`."""
+    table = natural.new_empty(natural.shape[1], n_padded)
+    dim = _DIMENSIONS[natural.shape[1]]
+    _TABLES[dim](n_padded, natural, natural.shape[0], n_padded, table, device=natural.device)
+    return table
 
 
 def _fused_expectation(features: Tensor, weight: Tensor, natural: Tensor) -> tuple[Tensor, Tensor]:
-    n, width = features.shape
-    padded, k = _by_four(natural)
-    n_parts = _n_parts(features)
-    n_scratch = n_parts * k * CPU_LANES
+    (n, width), k = features.shape, natural.shape[0]
+    lists = lists_near_components(n, k)
+    padded, n_parts = _padded(natural, CPU_LANES - k % CPU_LANES if lists else -k % 4), _n_parts(features)
+    n_padded = len(padded)
+    n_scratch = n_parts * n_padded * (CPU_LANES + 1)
     work = features.new_empty(n_scratch + 2 * n)
     scratch, peaks, norms = work[:n_scratch], work[n_scratch : n_scratch + n], work[n_scratch + n :]
-    near = torch.empty(n_parts, k, dtype=torch.int64)
-    partial = features.new_zeros(n_parts, k, width, CPU_LANES)
-    arguments = (weight.contiguous(), scratch, near, partial, peaks, norms)
-    rows = features.contiguous(), n, padded, k, n_parts
-    _EXPECTATION[_DIMENSIONS[width]](n_parts, *rows, *arguments, device=features.device)
-    return partial.sum((0, 3))[: natural.shape[0]], torch.dot(weight, peaks + norms.log())
+    numbers = torch.empty(n_parts, 2, n_padded, dtype=torch.int64)
+    partial = features.new_zeros(n_parts, n_padded, width, CPU_LANES)
+    table = _table(padded, n_padded) if lists else None
+    given = features.contiguous(), weight.contiguous(), n, padded, table, k, n_padded, n_parts
+    results = scratch, numbers, partial, peaks, norms
+    _EXPECTATION[_DIMENSIONS[width]](n_parts, *given, *results, device=features.device)
+    return partial.sum((0, 3))[:k], torch.dot(weight, peaks + norms.log())
 
 
-def _expectation_on_gpu(features: Tensor, weight: Tensor, natural: Tensor) -> tuple[Tensor, Tensor]:
+def _expectation_in_blocks(
+    features: Tensor, weight: Tensor, natural: Tensor, dtype: torch.dtype
+) -> tuple[Tensor, Tensor]:
+    """The form for a GPU, on any device."""
     (n, width), k = features.shape, natural.shape[0]
     dim, device = _DIMENSIONS[width], features.device
-    n_parts = max(1, min(_GPU_THREADS // k, n // _GPU_ROWS))
-    rows = features.contiguous(), n, natural.contiguous(), k, n_parts
-    norms = torch.empty_like(weight, memory_format=torch.contiguous_format)
-    partial = features.new_empty(n_parts, k, width)
-    _NORMS[dim](n, *rows, norms, None, device=device)
-    _SHARES[dim](n_parts * k, *rows, weight.contiguous(), norms, partial, device=device)
+    n_parts = max(1, min(_SQUADS, n // 64, _SQUAD_SUMS // (k * width)))
+    n_padded = k + -k % CPU_LANES
+    natural, table = natural.contiguous(), _table(natural.contiguous(), n_padded)
+    upper, norms = features.new_empty(n_parts, n_padded), features.new_empty(n)
+    numbers = torch.empty(n_parts, n_padded, dtype=torch.int64, device=device)
+    partial = features.new_zeros(n_parts, k, width)
+    given = features.contiguous(), weight.contiguous(), n, natural, table, k, n_padded, n_parts
+    n_items = n_parts * squad_size(device)
+    _IN_BLOCKS[dim, dtype](n_items, *given, upper, numbers, partial, norms, device=device)
     return partial.sum(0), torch.dot(weight, norms)
 
 
@@ -197,6 +227,9 @@ DIMENSIONS = (1, 2, 3)
 
 _NATURALS = {dim: FusedKernel("mixtures/m_step.h", f"natural_parameters<{dim}>") for dim in DIMENSIONS}
 _STEPS = {dim: FusedKernel("mixtures/m_step.h", f"m_step<{dim}>") for dim in DIMENSIONS}
+_LABELLED = {
+    dim: FusedKernel("mixtures/m_step.h", f"label_moments<{dim}>", shares=True) for dim in DIMENSIONS
+}
 
 Mixture = tuple[Tensor, Tensor, Tensor]
 """Weights (K,), means (K, D) and covariances (K, D, D)."""
@@ -232,3 +265,16 @@ def fused_maximization(statistics: Tensor, dim: int, reg_covar: float, previous:
     given = statistics.contiguous(), *kept, False, reg_covar, None, None, 0.0
     _STEPS[dim](k, *given, masses, means, covariances, *[None] * 4, device=statistics.device)
     return masses / masses.sum(), means, covariances
+
+
+def fused_label_moments(
+    rows: Tensor, weight: Tensor, labels: Tensor, n_labels: int, dim: int, reg_covar: float
+) -> Mixture:
+    """On a CPU, weight, mean and covariance of the points (N, D) or cells (N, F) of each label (N,)."""
+    k, width = n_labels, 1 + dim + dim * (dim + 1) // 2
+    made = rows.new_zeros(k * (width + 1 + dim + dim * dim))
+    sums, weights, means, covariances = made.split([k * width, k, k * dim, k * dim * dim])
+    given = rows.contiguous(), rows.shape[1] == dim, weight.contiguous(), labels.contiguous(), len(rows), k
+    results = sums, weights, means, covariances
+    _LABELLED[dim](1, *given, reg_covar, *results, device=rows.device)
+    return weights, means.view(k, dim), covariances.view(k, dim, dim)

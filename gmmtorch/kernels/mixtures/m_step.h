@@ -129,4 +129,53 @@ GMM_KERNEL m_step(int64_t item, const double* statistics, const double* means, c
     for (int f = 0; f < DIM * DIM; ++f) covariance[f] = em_covariance[f];
 }
 
+// Features about a center, of a point, or from the features of a cell.
+template <int DIM, typename Number>
+GMM_INLINE void local_features(bool are_points, const Number* given, const double* center, Number* x) {
+    Number offset[DIM];
+    for (int i = 0; i < DIM; ++i) offset[i] = are_points ? given[i] - center[i] : (Number)(-center[i]);
+    x[0] = are_points ? (Number)(1.0) : given[0];
+    for (int i = 0, f = 1 + DIM; i < DIM; ++i) {
+        x[1 + i] = are_points ? offset[i] : given[1 + i] + given[0] * offset[i];
+        for (int n = i; n < DIM; ++n, ++f)
+            x[f] = are_points ? offset[i] * offset[n]
+                              : given[f] + given[1 + i] * offset[n]
+                                    + offset[i] * (given[1 + n] + given[0] * offset[n]);
+    }
+}
+
+// One item: weight, mean and covariance of the rows of each label. Second moments are about the label's mean,
+// because pieces may be thin and far apart.
+template <int DIM>
+GMM_KERNEL label_moments(int64_t, const double* rows, bool are_points, const double* weight,
+                         const int64_t* labels, int64_t n_rows, int64_t n_labels, double reg_covar,
+                         double* sums, double* weights, double* means, double* covariances) {
+    constexpr int WIDTH = n_features(DIM);
+    const int64_t width = are_points ? DIM : WIDTH;
+    double x[WIDTH], total = 0.0;
+    const double origin[DIM] = {};
+    for (int64_t i = 0; i < n_rows; ++i) {
+        const int64_t k = labels[i];
+        local_features<DIM>(are_points, rows + i * width, origin, x);
+        weights[k] += weight[i] * x[0];
+        for (int a = 0; a < DIM; ++a) means[k * DIM + a] += weight[i] * x[1 + a];
+    }
+    for (int64_t i = 0; i < n_labels * DIM; ++i) means[i] /= maximum(weights[i / DIM], 1e-300);
+    for (int64_t i = 0; i < n_rows; ++i) {
+        const int64_t k = labels[i];
+        local_features<DIM>(are_points, rows + i * width, means + k * DIM, x);
+        for (int f = 0; f < WIDTH; ++f) sums[k * WIDTH + f] += weight[i] * x[f];
+    }
+    for (int64_t k = 0; k < n_labels; ++k) {
+        double* mean = means + k * DIM;
+        double offset[DIM];
+        for (int a = 0; a < DIM; ++a) offset[a] = mean[a];
+        m_step<DIM>(k, sums, nullptr, nullptr, false, reg_covar, nullptr, nullptr, 0.0, weights, means,
+                    covariances, nullptr, nullptr, nullptr, nullptr);
+        for (int a = 0; a < DIM; ++a) mean[a] += offset[a];
+        total += weights[k];
+    }
+    for (int64_t k = 0; k < n_labels; ++k) weights[k] /= total;
+}
+
 }  // namespace gmm

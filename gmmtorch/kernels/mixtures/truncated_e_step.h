@@ -4,6 +4,7 @@
 #pragma once
 
 #include "e_step.h"
+#include "m_step.h"
 
 namespace gmm {
 
@@ -22,21 +23,6 @@ struct GroupSizes {
     int64_t n_candidates;
     int64_t n_samples;
 };
-
-// Features about a center, of a point, or from the features of a cell.
-template <int DIM, typename Number>
-GMM_INLINE void local_features(bool are_points, const Number* given, const double* center, Number* x) {
-    Number offset[DIM];
-    for (int i = 0; i < DIM; ++i) offset[i] = are_points ? given[i] - center[i] : (Number)(-center[i]);
-    x[0] = are_points ? (Number)(1.0) : given[0];
-    for (int i = 0, f = 1 + DIM; i < DIM; ++i) {
-        x[1 + i] = are_points ? offset[i] : given[1 + i] + given[0] * offset[i];
-        for (int n = i; n < DIM; ++n, ++f)
-            x[f] = are_points ? offset[i] * offset[n]
-                              : given[f] + given[1 + i] * offset[n]
-                                    + offset[i] * (given[1 + n] + given[0] * offset[n]);
-    }
-}
 
 // Natural parameters about a center, from those about the component's mean.
 template <int DIM>
@@ -87,6 +73,7 @@ GMM_INLINE void group_sums(int64_t item, int64_t n_items, GroupSizes sizes, Grou
     const int64_t m = sizes.n_candidates, n_padded = padded_candidates(m), n_groups = sizes.n_components;
     vec *logits = (vec*)scratch, *sums = logits + n_padded;
     double* natural = (double*)(sums + n_padded * WIDTH);
+    auto of = [natural](int64_t j) { return natural + j * WIDTH; };
     vec given[WIDTH], x[WIDTH], total = (vec)(0.0);
     for (int64_t g = n_groups * item / n_items; g < n_groups * (item + 1) / n_items; ++g) {
         const int64_t stop = groups.begin[g + 1], *candidates = groups.candidates + g * m;
@@ -108,7 +95,7 @@ GMM_INLINE void group_sums(int64_t item, int64_t n_items, GroupSizes sizes, Grou
                 set(p, l, groups.weight[row + l]), totals[1] += groups.weight[row + l];
             load_groups<DIM>(groups, sizes.are_points, row, stop - 1, given);
             local_features<DIM>(sizes.are_points, given, center, x);
-            const vec peak = find_logits<WIDTH>(x, natural, n_padded, logits);
+            const vec peak = find_logits<WIDTH>(x, n_padded, of, logits);
             if (owner) {
                 vec best = (vec)(0.0);
                 for (int64_t j = m - 1; j >= 0; --j) best = logits[j] == peak ? (vec)((double)j) : best;
@@ -281,6 +268,20 @@ GMM_INLINE void choose_candidates(int64_t item, int64_t n_items, GroupSizes size
 
 // -- on a GPU -------------------------------------------------------------------------------------
 
+// The sum of exponentials, relative to the largest one.
+struct LogSum {
+    double peak = -HUGE_VAL, norm = 0.0;
+
+    GMM_INLINE bool add(double logit) {
+        const double above = logit - peak;
+        if (!(above > -SKIPPED)) return false;
+        const double term = exp(above > 0.0 ? -above : above);
+        norm = above > 0.0 ? norm * term + 1.0 : norm + term;
+        peak = above > 0.0 ? logit : peak;
+        return above > 0.0;
+    }
+};
+
 // Of a row, the logarithm of the sum over its group's candidates. owner: gets the most likely one, unless
 // null.
 template <int DIM>
@@ -289,20 +290,15 @@ GMM_INLINE double row_norm(int64_t row, GroupSizes sizes, Groups groups, const d
     constexpr int WIDTH = n_features(DIM);
     const double* given = groups.values + row * (sizes.are_points ? DIM : WIDTH);
     const int64_t* candidates = groups.candidates + groups.group_of[row] * sizes.n_candidates;
-    double x[WIDTH], peak = -HUGE_VAL, norm = 0.0;
+    double x[WIDTH];
+    LogSum sum;
     int64_t best = candidates[0];
     for (int64_t j = 0; j < sizes.n_candidates; ++j) {
         const int64_t k = candidates[j];
-        const double logit = logit_of<DIM>(sizes.are_points, given, own + k * WIDTH, means + k * DIM, x);
-        if (logit > peak) {
-            norm = norm * (norm > 0.0 ? exp(peak - logit) : 0.0) + 1.0;
-            peak = logit, best = k;
-        } else if (logit - peak > -SKIPPED) {
-            norm += exp(logit - peak);
-        }
+        if (sum.add(logit_of<DIM>(sizes.are_points, given, own + k * WIDTH, means + k * DIM, x))) best = k;
     }
     if (owner) owner[groups.row[row]] = best;
-    return peak + log(norm);
+    return sum.peak + log(sum.norm);
 }
 
 // The statistics of a pair of group and candidate, about the candidate's mean.

@@ -308,7 +308,8 @@ def fit_points(
     if n_points == 0:
         return Components.empty(dim, origins.device)
     points = torch.cat(list(clouds)).double()
-    scan = torch.repeat_interleave(torch.tensor(sizes, device=origins.device), output_size=n_points)
+    ends = torch.tensor(sizes).cumsum(0).to(origins.device, non_blocking=True)
+    scan = torch.bucketize(torch.arange(n_points, device=ends.device), ends, right=True)
     center = points.mean(0)
     rule = replace(fit.rule, prune="none") if max_range else fit.rule
     sensor = _measured_sensor(clouds, origins) if rule.prune == "density" else None

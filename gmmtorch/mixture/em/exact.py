@@ -159,13 +159,15 @@ def is_ill_conditioned(parameters: Parameters, natural: Tensor | None = None) ->
 def has_cancelled(statistics: Tensor, parameters: Parameters) -> bool:
     """Whether Σγxxᵀ/N − μμᵀ lost digits that the smallest variance, or the next step, needs.
 
-    Accepts covariances that are not positive definite: nothing is factorised.
+    The variance is that of the inverse trace, 1 to 1/D of the smallest. Covariances that are not positive
+    definite have lost digits.
     """
     alive = parameters.weights > 0
-    variance = torch.linalg.eigvalsh(parameters.covariances)[:, 0]
+    factors, info = torch.linalg.cholesky_ex(parameters.covariances)
+    variance = 1 / inverse_factor(factors).square().sum((1, 2))
     second = statistics[:, 1:].abs().amax(1) / statistics[:, 0].clamp_min(1e-300)
-    lost = torch.finfo(variance.dtype).eps * second > 1e-6 * variance
-    return bool((lost & alive).any())
+    kept = torch.finfo(variance.dtype).eps * second <= 1e-6 * variance
+    return bool(((info != 0) | ~kept).logical_and_(alive).any())
 
 
 def log_joint(points: Tensor, parameters: Parameters) -> Tensor:

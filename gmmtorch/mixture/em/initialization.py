@@ -13,14 +13,20 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels import fused_moments, is_small
+from gmmtorch.kernels import fused_label_moments, fused_moments, is_m_step_fused, is_small
 from gmmtorch.linalg import argsort
 from gmmtorch.mixture.em import by_type
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.by_type import chunk_rows
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.kmeans import kmeans, mean_variance, spread_out
-from gmmtorch.mixture.em.partition import FlatnessRule, partition, pool, pool_into_cells, surface_rule
+from gmmtorch.mixture.em.partition import (
+    FlatnessRule,
+    partition,
+    pool,
+    pool_into_cells,
+    surface_rule,
+)
 
 _FEWEST_CELLS, _CELLS_OF_A_COMPONENT = 4096, 8  # lower limits of the cells for flat pieces
 _FINEST_CELLS = 1 << 14  # along the longest side
@@ -184,7 +190,8 @@ def flat_pieces(
         0.0, 0.0, min_weight=0.0, min_weight_thick=0.0, max_components=n_components, outlier_gap=0.0
     )
     n_cells = max(_FEWEST_CELLS, _CELLS_OF_A_COMPONENT * n_components)
-    finest = float((points.amax(0) - points.amin(0)).max()) / _FINEST_CELLS
+    low, high = points.aminmax(dim=0)
+    finest = float((high - low).max()) / _FINEST_CELLS
     return partition_components(rule, points, weight, reg_covar, n_cells, finest, features)
 
 
@@ -241,6 +248,9 @@ def moments_of(
     their products lack.
     """
     dim = em.feature_dimension(features.shape[1])
+    if features.device.type == "cpu" and is_m_step_fused(dim, features, weight):
+        rows = features if points is None else points
+        return Parameters(*fused_label_moments(rows, weight, labels, n_components, dim, reg_covar))
     sums = pool(features[:, : 1 + dim], weight, labels, n_components)
     means = sums[:, 1:] / sums[:, :1].clamp_min(1e-300)
     # Second moments are taken about each piece's own mean, because pieces may be thin and far apart.

@@ -22,7 +22,14 @@ from typing import NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels import KEY_BITS, CutRule, are_piece_cuts_fused, cell_moments, is_fused, piece_cuts
+from gmmtorch.kernels import (
+    KEY_BITS,
+    CutRule,
+    are_cell_moments_fused,
+    are_piece_cuts_fused,
+    cell_moments,
+    piece_cuts,
+)
 from gmmtorch.linalg import dense_ranks, on_cpu, unpack_symmetric
 from gmmtorch.mixture.em.exact import quadratic_features
 
@@ -101,15 +108,15 @@ def partition(
     """
     n, dim = points.shape
     features = quadratic_features(points) if features is None else features
-    if points.device.type != "cpu" and n <= _MOST_ON_CPU:
-        points_cpu, weight_cpu, features_cpu = on_cpu(points, weight, features)
-        found = partition(points_cpu, weight_cpu, rule, features_cpu)
-        return found._replace(labels=found.labels.to(points.device))
-    if are_piece_cuts_fused(points, weight, features):
+    if are_piece_cuts_fused(points, weight, features, rule.max_components):
         limit = -1 if rule.max_components is None else rule.max_components
         given = vars(rule) | {"n_levels": _MAX_LEVELS, "max_components": limit}
         cuts = CutRule(**given, thickness_priority=_THICKNESS_PRIORITY)
         return Partition(*piece_cuts(points, weight, features, cuts))
+    if points.device.type != "cpu" and n <= _MOST_ON_CPU:
+        points_cpu, weight_cpu, features_cpu = on_cpu(points, weight, features)
+        found = partition(points_cpu, weight_cpu, rule, features_cpu)
+        return found._replace(labels=found.labels.to(points.device))
     labels = torch.zeros(n, dtype=torch.int64, device=points.device)
     n_pieces = 1
     for _ in range(_MAX_LEVELS):
@@ -199,27 +206,23 @@ def pool_into_cells(points: Tensor, max_cells: int, finest: float, weight: Tenso
     not pooled. `weight` (N,): number of points that each row stands for, above zero; default one.
     """
     n = points.shape[0]
-    weight = points.new_ones(n) if weight is None else weight
     if n <= max_cells:
+        weight = points.new_ones(n) if weight is None else weight
         return Cells(quadratic_features(points), weight, torch.arange(n, device=points.device))
-    low = points.amin(0)
-    extent = (points.amax(0) - low).max()
-    side = (extent / _MAX_CELLS_ALONG).clamp_min(finest)
-    side = torch.where(side > 0, side, 1.0)  # equal points share one cell
+    low, high = points.aminmax(dim=0)
+    if are_cell_moments_fused(points, weight, max_cells):
+        return Cells(*cell_moments(points, weight, (low, high), finest, _MAX_CELLS_ALONG, max_cells))
 
-    def pooled(thirds: int) -> tuple[Tensor, Tensor] | None:
-        """Sums and members of cells of side · 2^(thirds/3); None if there are too many cells."""
-        factor = 2 ** (-thirds / 3)
-        if points.device.type == "cpu" and is_fused(points, weight):
-            return cell_moments(points, weight, low, float(side), factor, max_cells)
-        return _sums_by_key(points, weight, ((points - low) / side * factor).long(), max_cells)
+    def pooled(thirds: int) -> tuple[Tensor, Tensor, Tensor] | None:
+        """Cells of side · 2^(thirds/3); None if there are too many."""
+        return _moments_by_key(points, weight, (low, high), finest, 2 ** (-thirds / 3), max_cells)
 
     found = pooled(0)
     if found is None:
-        one_cell = 3 * math.ceil(math.log2(float(extent / side) + 2))
-        found = coarsest_allowed(pooled, one_cell)[1]
-    sums, member = found
-    return Cells(sums / sums[:, :1], sums[:, 0].clone(), member)
+        extent = float((high - low).max())
+        side = max(extent / _MAX_CELLS_ALONG, finest)
+        found = coarsest_allowed(pooled, 3 * math.ceil(math.log2(extent / side + 2)))[1]
+    return Cells(*found)
 
 
 def coarsest_allowed(pooled: Callable[[int], T | None], enough: int) -> tuple[int, T]:
@@ -237,17 +240,27 @@ def coarsest_allowed(pooled: Callable[[int], T | None], enough: int) -> tuple[in
     return enough, best
 
 
-def _sums_by_key(
-    points: Tensor, weight: Tensor, cells: Tensor, max_cells: int
-) -> tuple[Tensor, Tensor] | None:
-    """The twin of `kernels.cell_moments`: sums (C, F) over equal cells, and each point's cell."""
+def _moments_by_key(
+    points: Tensor,
+    weight: Tensor | None,
+    box: tuple[Tensor, Tensor],
+    finest: float,
+    factor: float,
+    max_cells: int,
+) -> tuple[Tensor, Tensor, Tensor] | None:
+    """The twin of `kernels.cell_moments`."""
+    low, high = box
+    side = ((high - low).max() / _MAX_CELLS_ALONG).clamp_min(finest)
+    side = torch.where(side > 0, side, 1.0)  # equal points share one cell
+    cells = ((points - low) / side * factor).long()
     key = cells[:, 0]
     for axis in range(1, cells.shape[1]):
         key = key << KEY_BITS | cells[:, axis]
     member, n_cells = dense_ranks(key)
     if n_cells > max_cells:
         return None
+    weight = points.new_ones(len(points)) if weight is None else weight
     sums = points.new_zeros(n_cells, quadratic_features(points[:1]).shape[1])
     for part, cell, p in zip(*(t.split(_CHUNK_POINTS) for t in (points, member, weight)), strict=True):
         sums.index_add_(0, cell, quadratic_features(part) * p[:, None])
-    return sums, member
+    return sums / sums[:, :1], sums[:, 0].clone(), member

@@ -49,8 +49,8 @@ class Settings:
 
     reg_covar: added to each variance (m²). tol: EM stops when the bound increases by less (nats a
     point). max_iter: largest number of iterations. dtype: of the E-step; float32 is replaced by float64
-    where its error is too large. n_candidates: components that each row is compared with.
-    on_iteration: called with the iteration, from 1, and the bound. processes: processes that share the
+    where its error is too large, and in the fused kernel. n_candidates: components that each row is
+    compared with. on_iteration: called with the iteration, from 1, and the bound. processes: processes that share the
     fit, each with its own rows. previous_bound: bound of the fit that this one continues.
     """
 
@@ -239,7 +239,8 @@ def fit_truncated(
     bounds still never decrease. Bounds on a sample do not bound the whole cloud and are left out.
     """
     n, n_components = rows.weight.shape[0], parameters.weights.shape[0]
-    n_all = int(settings.processes.sum(rows.weight.new_tensor([n])))  # so that all processes decide equally
+    shared = settings.processes.size > 1  # then all processes decide equally
+    n_all = int(settings.processes.sum(rows.weight.new_tensor([n]))) if shared else n
     n_cells = max(n_all // _POINTS_OF_A_CELL, _CELLS_OF_A_COMPONENT * n_components)
     many = rows.are_points and n_all >= max(_MANY_POINTS, 4 * n_cells)
     if not many or rows.values.shape[1] > 3 or settings.max_iter < 2:

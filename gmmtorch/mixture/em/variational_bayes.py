@@ -19,7 +19,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels import fused_em, is_small
+from gmmtorch.kernels import fused_em, in_spatial_order, is_small
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.mixture.em import by_type, loop
 from gmmtorch.mixture.em import exact as em
@@ -241,7 +241,7 @@ def variational_step(
     The bound (nats per point) is that of the returned posterior. Covariances of the points of a component
     include `reg_covar` (m²).
     """
-    features = em.quadratic_features(points) if points.shape[1] <= 3 else None
+    rows = in_spatial_order(em.quadratic_features(points), sample_weight) if points.shape[1] <= 3 else None
     total = float(sample_weight.sum())
     kind = covariance_type
 
@@ -267,14 +267,14 @@ def variational_step(
                     moved.entropy[0] + log_evidence(of_prior(len(log_weight)), new, total, kind)
                 ) / total
         factors = by_type.Factors(gaussians, kind)
-        if features is None:
+        if rows is None:
             found, value = _typed_moments(
                 points, sample_weight, log_weight, factors, reg_covar, softmax_dtype
             )
         else:
             matrices = expand(gaussians.covariances, kind, *gaussians.means.shape)
             given = log_weight, gaussians._replace(covariances=matrices), reg_covar, softmax_dtype
-            found, value = _expected_moments(features, points, sample_weight, *given)
+            found, value = _expected_moments(rows, points, sample_weight, *given)
             found = by_type.compacted(found, kind)
         new = update(prior, found, process, kind)
         plain = found.covariances.clone()
@@ -287,7 +287,7 @@ def variational_step(
 
 
 def _expected_moments(
-    features: Tensor,
+    rows: tuple[Tensor, Tensor],
     points: Tensor,
     sample_weight: Tensor,
     log_weight: Tensor,
@@ -297,14 +297,15 @@ def _expected_moments(
 ) -> tuple[Parameters, Tensor]:
     """Moments of γ_nk ∝ exp(ω_k) N(x_n | m_k, Σ_k), and Σ_n p_n times the log of their normaliser.
 
-    Computed as two products with `features`, or directly from `points` if the products would cancel.
+    Computed as two products with `rows`, features and weights in any order, or directly from `points` if the
+    products would cancel.
     """
     weights = torch.exp(log_weight - log_weight.max())
     unnormalised = gaussians._replace(weights=weights)
     if not em.is_ill_conditioned(unnormalised):
         natural = em.natural_parameters(gaussians)
         natural[:, 0] += log_weight
-        sums, value = em.expectation(features, sample_weight, natural, softmax_dtype)
+        sums, value = em.expectation(*rows, natural, softmax_dtype)
         found = em.maximization(sums, reg_covar)._replace(weights=sums[:, 0])
         if not em.has_cancelled(sums, found._replace(weights=(sums[:, 0] > 1e-9).to(sums))):
             return found, value

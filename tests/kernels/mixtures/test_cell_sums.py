@@ -14,12 +14,13 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import kernels
-from gmmtorch.kernels.mixtures.cell_sums import DepthViews, depth_cells, distinct_keys
+from gmmtorch.kernels.compiler import Team
+from gmmtorch.kernels.mixtures.cell_sums import CutRule, DepthViews, depth_cells, distinct_keys, piece_cuts
 from gmmtorch.linalg import dense_ranks
 from gmmtorch.mapping.attributes.moments import _cell_sums
 from gmmtorch.mapping.learning.fitting import DepthFrame, PooledFrames, mean_range, pool_frames
 from gmmtorch.mixture.em.exact import quadratic_features, shift_features
-from gmmtorch.mixture.em.partition import Cells, FlatnessRule, Partition, partition
+from gmmtorch.mixture.em.partition import Cells, FlatnessRule, Partition, partition, pool_into_cells
 
 INTRINSICS = torch.tensor([[64.0, 0, 31.5], [0, 64.0, 23.5], [0, 0, 1]], dtype=torch.float64)
 SIDE = 0.125
@@ -177,6 +178,27 @@ def test_points_far_apart_have_larger_cells_and_points_beyond_a_map_are_refused(
             pool_frames([frame(depth, pose())], SIDE, 1000)
 
 
+@given(
+    n=st.integers(2, 600),
+    dim=st.sampled_from([1, 2, 3]),
+    seed=st.integers(0, 10_000),
+    finest=st.sampled_from([0.0, 1e-3, 0.3, 100.0]),
+    share=st.sampled_from([0.01, 0.3, 0.9]),
+    is_weighted=st.booleans(),
+)
+def test_cells_of_points_are_those_of_the_twin(n, dim, seed, finest, share, is_weighted):
+    draw = torch.Generator().manual_seed(seed)
+    points = torch.randn(n, dim, generator=draw).double() * 10.0 ** (seed % 7 - 3)
+    points[torch.randint(n, (n // 2,), generator=draw)] = points[0].clone()
+    weight = torch.randint(1, 9, (n,), generator=draw).double() if is_weighted else None
+    twin, fused = by_both(lambda: pool_into_cells(points, max(1, int(share * n)), finest, weight))
+    assert torch.equal(fused.member, twin.member)
+    torch.testing.assert_close(fused.weight, twin.weight)
+    torch.testing.assert_close(
+        fused.features, twin.features, rtol=1e-12, atol=1e-13 * float(points.abs().max())
+    )
+
+
 @pytest.mark.cpu_only
 @pytest.mark.parametrize("kind", ["few", "many", "equal", "extreme", "strided"])
 def test_hashed_ranks_equal_the_sorted_ones(kind):
@@ -226,7 +248,6 @@ def cut_by_both(rule: FlatnessRule, *given_: Tensor) -> Partition:
     return fused
 
 
-@pytest.mark.cpu_only
 @given(
     n=st.integers(1, 400),
     dim=st.sampled_from([1, 2, 3]),
@@ -245,12 +266,31 @@ def test_pieces_are_those_of_the_twin(n, dim, seed, limit, least, thickness):
 
 
 @pytest.mark.cpu_only
+@given(
+    n=st.integers(1, 400),
+    dim=st.sampled_from([1, 2, 3]),
+    seed=st.integers(0, 10_000),
+    limit=st.sampled_from([-1, 1, 2, 7, 60]),
+    least=st.sampled_from([0.0, 3.0, 40.0]),
+    thickness=st.sampled_from([0.0, 0.02, 0.2]),
+    n_workers=st.sampled_from([1, 7, 64, 1000]),
+    n_levels=st.sampled_from([1, 3, 64]),
+)
+def test_many_workers_cut_the_same_pieces_as_one(n, dim, seed, limit, least, thickness, n_workers, n_levels):
+    rule = CutRule(n_levels, limit, thickness, 0.5, least, 1.0, 3.0, 30.0)
+    points, weight, features = cells(n, dim, seed)
+    with kernels("fused"):
+        labels, n_pieces = piece_cuts(points, weight, features, rule)
+        shared, n_shared = piece_cuts(points, weight, features, rule, Team(n_workers, None))
+    assert n_shared == n_pieces
+    assert torch.equal(shared, labels)
+
+
 def test_pieces_without_extent_stay_whole():
     one = torch.zeros(5, 3, dtype=torch.float64)
     assert cut_by_both(FlatnessRule(thickness=0.0, min_weight=1.0), one, one[:, 0] + 1).n_pieces == 1
 
 
-@pytest.mark.cpu_only
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 def test_pieces_do_not_depend_on_the_unit(scale):
     points, weight, _ = cells(300, 3, 1)

@@ -25,9 +25,14 @@ from gmmtorch.mixture.em.truncated import (
 )
 
 TEAMS = [None, Team(1, None), Team(13, None), Team(700, None)]
-"""The worker of a CPU; otherwise the phases of a GPU, with few or many workers."""
+"""The worker of a CPU; otherwise the phases of a GPU with few or many workers, one by one on a CPU."""
 
-pytestmark = pytest.mark.cpu_only
+
+@pytest.fixture(params=TEAMS, ids=["own", "1", "13", "700"])
+def team(request, device):
+    if device != "cpu" and request.param is not None:
+        pytest.skip("a GPU has workers that wait")
+    return request.param
 
 
 @given(
@@ -37,10 +42,11 @@ pytestmark = pytest.mark.cpu_only
     k=st.integers(1, 9),
     tol=st.sampled_from([0.0, 1e-4, 1e-2]),
     max_iter=st.integers(1, 20),
-    team=st.sampled_from(TEAMS),
+    workers=st.sampled_from(TEAMS),
     guarded=st.booleans(),
 )
-def test_a_run_of_exact_em_is_that_of_the_twin(seed, n, dim, k, tol, max_iter, team, guarded):
+def test_a_run_of_exact_em_is_that_of_the_twin(device, seed, n, dim, k, tol, max_iter, workers, guarded):
+    team = workers if device == "cpu" else None
     features, weight = quadratic_features(cloud(n, dim, seed)), random_weight(n, seed)
     start = random_parameters(k, dim, seed)
     with kernels("torch"):
@@ -53,7 +59,6 @@ def test_a_run_of_exact_em_is_that_of_the_twin(seed, n, dim, k, tol, max_iter, t
         torch.testing.assert_close(mine, other, rtol=1e-6, atol=1e-8)
 
 
-@pytest.mark.parametrize("team", TEAMS)
 def test_a_run_ends_before_what_it_cannot_compute(team):
     points, weight = cloud(200, 2), random_weight(200)
     start = random_parameters(3, 2)
@@ -113,11 +118,12 @@ def truncated_run(rows: Rows, owner, start, settings: Settings, team, candidates
     tol=st.sampled_from([1e-5, 1e-3, 1e-2]),
     max_iter=st.integers(0, 30),
     are_points=st.booleans(),
-    team=st.sampled_from(TEAMS),
+    workers=st.sampled_from(TEAMS),
 )
 def test_a_run_of_truncated_em_is_that_of_the_twin(
-    seed, n, dim, k, n_candidates, tol, max_iter, are_points, team
+    device, seed, n, dim, k, n_candidates, tol, max_iter, are_points, workers
 ):
+    team = workers if device == "cpu" else None
     points, weight, start = cloud(n, dim, seed), random_weight(n, seed), random_parameters(k, dim, seed)
     rows, owner = rows_of(points, weight, are_points), nearest(points, start.means)
     settings = Settings(1e-3, tol, max_iter, torch.float64, n_candidates)
@@ -137,7 +143,6 @@ def test_a_run_of_truncated_em_is_that_of_the_twin(
     assert torch.equal(found.candidates.sort(1).values[own], candidates.sort(1).values[own])
 
 
-@pytest.mark.parametrize("team", TEAMS)
 @pytest.mark.parametrize("n_candidates", [1, 6, 16])
 def test_candidates_are_the_most_likely_components(team, n_candidates):
     points, start = 3 * cloud(4000, 2), random_parameters(90, 2)  # with rows that are no samples
@@ -153,7 +158,6 @@ def test_candidates_are_the_most_likely_components(team, n_candidates):
     assert bool((found[:, 1:] > found[:, :-1]).all())
 
 
-@pytest.mark.parametrize("team", TEAMS)
 def test_of_equal_components_the_first_are_candidates(team):
     points, one = cloud(900, 2), random_parameters(1, 2)
     start = Parameters(
@@ -165,7 +169,6 @@ def test_of_equal_components_the_first_are_candidates(team):
         assert candidates == sorted([own, *[k for k in range(5) if k != own][:4]])
 
 
-@pytest.mark.parametrize("team", TEAMS)
 def test_a_covariance_without_a_factor_is_repaired_or_named(team):
     points, start = cloud(300, 2), random_parameters(3, 2)
     start.covariances[1] = 1.0  # singular
@@ -186,7 +189,6 @@ def test_a_covariance_without_a_factor_is_repaired_or_named(team):
         truncated_run(rows, owner, start, settings, team)
 
 
-@pytest.mark.parametrize("team", TEAMS)
 def test_runs_in_several_launches_and_runs_that_share_rows_are_those_of_one_launch(team, monkeypatch):
     points, start, seen = cloud(500, 3), random_parameters(12, 3), []
     rows, owner, settings = (
