@@ -49,6 +49,7 @@ static bool has_squads = false;
 static void __syncthreads() {
     if (has_squads) pthread_barrier_wait(&of_block);
 }
+static void __nanosleep(unsigned) { std::this_thread::yield(); }
 static void __threadfence() { std::atomic_thread_fence(std::memory_order_seq_cst); }
 template <typename Number>
 static Number atomicAdd(Number* place, Number value) {
