@@ -31,7 +31,7 @@ from gmmtorch.kernels import kernels
 from gmmtorch.kernels.mixtures.em_steps import expectation
 from gmmtorch.kernels.rays.ray_traversal import traverse
 from gmmtorch.mapping.learning.rules import IncrementalRule
-from gmmtorch.mixture.em.exact import quadratic_features
+from gmmtorch.mixture.em.exact import natural_of_precisions, quadratic_features
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.forms.flux import flux_evidence
@@ -116,8 +116,10 @@ def map_work(data: Path, n_points: int, device: str) -> Iterator[Work]:
 
 
 def small_work(device: str) -> Iterator[tuple[str, Callable[[], object]]]:
+    means = torch.rand(1000, 3, dtype=torch.float64)
+    precisions = 400.0 * torch.eye(3, dtype=torch.float64).expand(1000, 3, 3)
+    natural = natural_of_precisions(precisions, means, torch.zeros_like(means[:, 0]))
     rows = quadratic_features(torch.rand(100_000, 3, dtype=torch.float64))
-    natural = torch.randn(1000, 10, dtype=torch.float64)
     parts = [part.to(device) for part in (rows, torch.ones(len(rows)).double(), natural)]
     yield "E-step, 10⁵ rows, 1,000 components", lambda: expectation(*parts)
     starts, ends, grid = rays(100_000, 0.2, device)
