@@ -9,6 +9,7 @@ operations and synchronisations. To measure another version, set PYTHONPATH to i
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import time
 from collections.abc import Callable
@@ -191,6 +192,28 @@ def registration(data: Path, device: str) -> Work:
     return lambda: gt.register(made[1], made[0], start)
 
 
+def planning(device: str) -> Work:
+    """Three robots plan, one after the other, and send their plans, after ten seconds of a mission."""
+    from gmmtorch.team.exploration.mission import mission as missions
+    from gmmtorch.team.exploration.mission.options import TeamOptions
+    from gmmtorch.team.exploration.mission.trials import assemble
+    from gmmtorch.team.exploration.world.world import open_world
+
+    world = open_world("warehouse", size=(20.0, 16.0, 5.0))
+    made = assemble(world, TeamOptions(size=3, duration=10.0, device=device))
+    while not made.is_over:
+        made.tick(made.elapsed)
+    seconds = itertools.count(made.elapsed + 2, 2)
+
+    def plan() -> None:
+        now, generator = next(seconds), torch.Generator().manual_seed(0)
+        with torch.inference_mode():
+            number = round(now / 2)
+            missions.plan_together(made.agents, made.coordination, made.options, now, number, generator)
+
+    return plan
+
+
 def works(data: Path, device: str = "cpu") -> dict[str, Callable[[], Work]]:
     return {
         "rays through 0.2 m, counted, dense": lambda: rays(0.2, device),
@@ -206,6 +229,7 @@ def works(data: Path, device: str = "cpu") -> dict[str, Callable[[], Work]]:
         "20,000 queries by flux, hall in 26 kB": lambda: queries(data, "hall", device, method="flux"),
         "flux, kinect in 8 kB, cells of 0.1 m": lambda: flux(device),
         "registration of two scans of hall": lambda: registration(data, device),
+        "a planning step of three robots": lambda: planning(device),
     }
 
 

@@ -103,7 +103,7 @@ class Truth:
         """Metres, by measure; those `across` (N,) are known."""
         some = cloud[:: max(1, len(cloud) // SAMPLE)]
         return {
-            "off_surface": self._mesh.clearance(torch.from_numpy(some), threads=1).numpy(),
+            "off_surface": self._mesh.clearance(torch.from_numpy(some)).numpy(),
             "across": across,
             "to_cloud": cKDTree(cloud).query(self.points)[0],
             "from_cloud": self._tree.query(some)[0],

@@ -40,7 +40,8 @@ _BEFORE = """
 #include <pthread.h>
 #include <thread>
 #include <vector>
-using std::atan2, std::ceil, std::exp, std::fabs, std::floor, std::fma, std::log, std::rint, std::sqrt;
+using std::atan2, std::ceil, std::cos, std::exp, std::fabs, std::floor, std::fma, std::log, std::pow;
+using std::rint, std::sin, std::sqrt;
 struct Place { unsigned x; };
 static thread_local Place threadIdx{0};
 static Place gridDim{1}, blockDim{1};

@@ -6,8 +6,8 @@
 #include <cmath>
 #include <cstdint>
 #define CUDA_CALLABLE
-using std::atan2, std::ceil, std::cos, std::exp, std::fabs, std::floor, std::fma, std::log, std::pow, std::rint,
-    std::sin, std::sqrt;
+using std::atan2, std::ceil, std::cos, std::exp, std::fabs, std::floor, std::fma, std::log, std::pow,
+    std::rint, std::sin, std::sqrt;
 #endif
 
 #define GMM_INLINE CUDA_CALLABLE inline __attribute__((always_inline))

@@ -14,6 +14,7 @@ import pytest
 import torch
 from exploration.replays import FakeTime, Together
 from exploration.rooms import SHELF, SMALL, room, small_room, without_seconds
+from kernels_of_gpu import kernels_of_gpu
 from mapping.map_cases import assert_same_components
 from pretended_gpu import GPUTensor, pretended_gpu
 
@@ -250,6 +251,17 @@ def test_missions_on_a_gpu_give_the_results_of_the_cpu(world: World, options: di
             assert torch.equal(_coverage(there), _coverage(mission))
         assert gpu.waits
         assert row == without_seconds(mission_row(mission, 1.0))
+    for one, other in zip(mission.trajectories, there.trajectories, strict=True):
+        assert torch.equal(torch.stack(one), torch.stack(other))
+
+
+@pytest.mark.slow
+def test_a_mission_runs_the_kernels_of_a_gpu(world: World) -> None:
+    mission = flown(world, replace(SMALL, duration=2.0))
+    with pretended_gpu(), kernels_of_gpu():
+        there = flown(world, replace(SMALL, duration=2.0, device="cuda"))
+        bits = there.score.union.entropy_bits
+    assert bits == pytest.approx(mission.score.union.entropy_bits, rel=1e-6)
     for one, other in zip(mission.trajectories, there.trajectories, strict=True):
         assert torch.equal(torch.stack(one), torch.stack(other))
 

@@ -128,18 +128,18 @@ class ViewLibrary:
     def add(self, poses: Tensor, values: Tensor, now: float, least: float, most: int = 8) -> list[int]:
         """Add the best `most` of views (N, 4) with values (N,) of at least `least`; return their keys."""
         added: list[int] = []
-        rows, worth = quantized_poses(poses), values.detach().cpu().double().numpy()
+        rows, worth = quantized_poses(poses).numpy(), values.detach().cpu().double().numpy()
         order = np.argsort(-worth, kind="stable")
         order = order[worth[order] >= max(least, 1e-6)]
-        near = self.candidates().poses
+        near = self.candidates().poses.numpy()
         for row in order.tolist():
             if len(added) == most:
                 break
-            if bool(_is_near(rows[row], near, self.spacing, _TURN).any()):
+            if _is_near(rows[row], near, self.spacing, _TURN).any():
                 continue
             if self._n == MOST_RECORDS:
                 raise InvalidArgumentError(f"{MOST_RECORDS} views are the most of one incarnation.")
-            near = torch.cat([near, rows[row][None]])
+            near = np.concatenate([near, rows[row][None]])
             x, y, z, yaw = rows[row].tolist()
             added.append(self._first + self._n)
             self._n += 1
@@ -176,8 +176,8 @@ class ViewLibrary:
     def visit(self, poses: Tensor, now: float) -> None:
         """Remove the views near poses (N, 4), from which a robot has just observed."""
         known = self.candidates()
-        seen = _is_near(poses[:, None], known.poses, *_VISITED).any(0)
-        self.remove([known.keys[row] for row in seen.nonzero()[:, 0].tolist()], now)
+        seen = _is_near(poses[:, None].cpu().numpy(), known.poses.numpy(), *_VISITED).any(0)
+        self.remove([known.keys[row] for row in np.flatnonzero(seen).tolist()], now)
 
     def covered(self, is_near: Callable[[Tensor], Tensor], now: float, most: int) -> list[int]:
         """At most `most` views where `is_near`, of places (V, 3), whose value is no longer fresh, the oldest
@@ -342,8 +342,9 @@ def _in_ticks(seconds: float) -> float:
     return round(seconds * STAMP_TICKS) / STAMP_TICKS
 
 
-def _is_near(one: Tensor, others: Tensor, spacing: float, turn: float) -> Tensor:
+def _is_near(one: np.ndarray, others: np.ndarray, spacing: float, turn: float) -> np.ndarray:
     """Which of poses (…, 4) are nearer than `spacing` metres and `turn` radians."""
-    apart = (one[..., :3] - others[..., :3]).norm(dim=-1)
-    angle = torch.remainder(one[..., 3] - others[..., 3] + math.pi, 2 * math.pi) - math.pi
-    return (apart < spacing) & (angle.abs() < turn)
+    step = one[..., :3] - others[..., :3]
+    angle = (one[..., 3] - others[..., 3] + math.pi) % (2 * math.pi) - math.pi
+    near: np.ndarray = ((step * step).sum(-1) < spacing**2) & (np.abs(angle) < turn)
+    return near

@@ -191,10 +191,11 @@ def depth_of(tree) -> int:
         nodes, depth = tree.children.cpu()[inner], depth + 1
 
 
-def test_hostile_meshes_make_no_deep_tree():
-    nested = box((-1, -1, -1), (1, 1, 1))[0] * 2.0 ** torch.arange(-300, 300).double()[:, None, None]
-    equal = box((0, 0, 0), (1, 1, 1))[:1].expand(5000, 3, 3)
-    row = box((0, 0, 0), (1, 1, 1))[:1] + torch.arange(4096).double()[:, None, None]
+def test_hostile_meshes_make_no_deep_tree(device):
+    one = box((0, 0, 0), (1, 1, 1))[:1].to(device)
+    nested = one * 2.0 ** torch.arange(-300, 300).double()[:, None, None]
+    equal = one.expand(5000, 3, 3)
+    row = one + torch.arange(4096).double()[:, None, None]
     for triangles in (nested, equal, row):
         tree = triangle_tree(triangles)
         assert len(tree.boxes) == len(triangles) - 1

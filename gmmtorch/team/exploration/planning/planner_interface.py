@@ -73,18 +73,12 @@ def options(
 
     may_escape: a robot whose own cell is no longer passable may leave it, see `collision_checking.feasible`.
     """
-    dynamics = primitives.dynamics
-    paths = primitives.rollout(states)
-    braking = primitives.braking(paths[:, :, -1])
+    dynamics, here = primitives.dynamics, task.local_map
+    paths, braking, follows = primitives.flights(states)
     steps = after * dynamics.n_steps
-    follows = primitives.follows(states) if is_fused(task.local_map.passable, states) else None
-    if follows is not None and not (may_escape and is_stuck(task.local_map, states)):
-        ends = paths[:, :, -1]
-        return (
-            paths,
-            braking,
-            feasible_motions(primitives, follows, states, ends, task.local_map, task.peers, steps),
-        )
+    if follows is not None and is_fused(here.passable) and not (may_escape and is_stuck(here, states)):
+        safe = feasible_motions(primitives, follows, states, paths[:, :, -1], here, task.peers, steps)
+        return paths, braking, safe
     safe = feasible(
         paths,
         braking,

@@ -76,6 +76,15 @@ class Primitives:
             return self._braking(states)
         return _moved(self._stops[follows], flat).view(*states.shape[:-1], *self._stops.shape[1:])
 
+    def flights(self, states: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return `rollout` of states (N, 7), `braking` at its ends, and `follows`."""
+        follows = self.follows(states)
+        if follows is None:
+            paths = self._rollout(states)
+            return paths, self.braking(paths[:, :, -1]), None
+        paths = _moved(self._paths[follows], states[:, None])
+        return paths, _moved(self._stops, paths[:, :, -1]), follows
+
     def _longest_steps(self) -> Tensor:
         """Return the longest step (m) and largest turn (rad) of the motions after each primitive, (P, 2)."""
         rest = _moved(self._stops.expand(len(self), *self._stops.shape), self._paths[:, :, -1])
@@ -86,9 +95,8 @@ class Primitives:
 
     def follows(self, states: Tensor) -> Tensor | None:
         """Return the primitive (N,) with the velocities of each state (N, 7); None if a state has none."""
-        is_end = (states[:, None, 4:] == self.commands).all(-1)
-        which = is_end.int().argmax(1)
-        return which if bool(is_end.any(1).all()) else None
+        is_end = (states[:, None, 4:] == self.commands).all(-1).numpy()
+        return torch.from_numpy(is_end.argmax(1)) if is_end.any(1).all() else None
 
     def _rollout(self, states: Tensor) -> Tensor:
         return _integrated(states[:, None], self.commands, self.dynamics, self.dynamics.n_steps)

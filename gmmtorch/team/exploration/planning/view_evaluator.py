@@ -253,8 +253,9 @@ class ViewEvaluator:
 
     def poses(self, keys: Tensor) -> Tensor:
         """Return poses (V, 4) float64 of lattice poses (V, 4), yaw in [0, 2π)."""
-        place = (keys[:, :3] * self.stride + 0.5).double() * self.resolution
-        return torch.cat([place, keys[:, 3:].double() * (2 * math.pi / self.n_yaws)], 1)
+        given = keys.numpy().astype(np.float64)
+        place = (given[:, :3] * self.stride + 0.5) * self.resolution
+        return torch.from_numpy(np.concatenate([place, given[:, 3:] * (2 * math.pi / self.n_yaws)], 1))
 
     def evaluate(self, local_map: LocalMap, keys: Tensor) -> ViewValues:
         """Evaluate each view (V, 4) alone. Beams end at the map's border; a camera outside sees nothing."""
@@ -416,8 +417,8 @@ class InformationDiscount:
 
 def _keys(local_map: LocalMap) -> Tensor:
     """Return world-fixed keys (G,) of the local map's blocks, in row-major order."""
-    first = local_map.low.cpu() // BLOCK
+    first = local_map.low.cpu().numpy() // BLOCK
     x, y, z = (
-        (torch.arange(-(-n // BLOCK)) + low) % _EXTENT for n, low in zip(local_map.shape, first, strict=True)
+        (np.arange(-(-n // BLOCK)) + low) % _EXTENT for n, low in zip(local_map.shape, first, strict=True)
     )
-    return ((x[:, None, None] * _EXTENT + y[:, None]) * _EXTENT + z).reshape(-1)
+    return torch.from_numpy(((x[:, None, None] * _EXTENT + y[:, None]) * _EXTENT + z).reshape(-1))

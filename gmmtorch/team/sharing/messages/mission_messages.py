@@ -296,16 +296,16 @@ def _pose_steps(name: str, poses: Tensor) -> Ints:
     """Poses (N, 4) in steps, yaw from 0 to 255."""
     if poses.ndim != 2 or poses.shape[1] != 4:
         raise InvalidArgumentError(f"{name} has shape {tuple(poses.shape)}; expected (N, 4): x, y, z, yaw.")
-    rows = poses.detach().double().cpu()
-    bad = ~((rows[:, :3].abs() <= FARTHEST).all(1) & rows[:, 3].isfinite())
-    if bool(bad.any()):
-        first = int(bad.nonzero()[0])
+    rows = poses.detach().double().cpu().numpy()
+    good = (np.abs(rows[:, :3]) <= FARTHEST).all(1) & np.isfinite(rows[:, 3])
+    if not good.all():
+        first = int(good.argmin())
         raise InvalidArgumentError(
             f"{name}[{first}] is {rows[first].tolist()}; positions reach {FARTHEST:g} m, and yaw is finite."
         )
-    scaled = rows * rows.new_tensor([STEPS_PER_METRE] * 3 + [YAW_STEPS / (2 * math.pi)])
-    scaled[:, 3] = scaled[:, 3].remainder(YAW_STEPS)
-    steps = scaled.round().long().numpy()
+    scaled = rows * np.array([STEPS_PER_METRE] * 3 + [YAW_STEPS / (2 * math.pi)])
+    scaled[:, 3] %= YAW_STEPS
+    steps: Ints = np.rint(scaled).astype(np.int64)
     steps[:, 3] %= YAW_STEPS
     return steps
 
@@ -373,10 +373,10 @@ def _read_moves(reader: BitReader, n: int) -> Ints:
 
 def _ticks(name: str, seconds: Tensor, ticks: int = TICKS) -> Ints:
     """Times (N,) in ticks, so many a second, of times in seconds."""
-    times = seconds.detach().double().cpu()
-    if times.ndim != 1 or not bool((times.abs() <= LATEST).all()):
+    times = seconds.detach().double().cpu().numpy()
+    if times.ndim != 1 or not (np.abs(times) <= LATEST).all():
         raise InvalidArgumentError(f"{name} must be a row of times (s) of at most {LATEST:g}, and finite.")
-    return (times * ticks).round().long().numpy()
+    return np.rint(times * ticks).astype(np.int64)
 
 
 def _seconds_of(steps: Ints, ticks: int = TICKS) -> Tensor:
