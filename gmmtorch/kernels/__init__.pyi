@@ -53,6 +53,7 @@ from .mixtures.matching import alignment_scores as alignment_scores
 from .mixtures.matching import alignment_sums as alignment_sums
 from .mixtures.matching import explained_points as explained_points
 from .mixtures.matching import fused_alignment as fused_alignment
+from .mixtures.matching import fused_box_lists as fused_box_lists
 from .mixtures.matching import fused_registration as fused_registration
 from .mixtures.matching import raster_sums as raster_sums
 from .mixtures.small_fits import fused_em as fused_em

@@ -7,6 +7,7 @@ The twin of `fused_registration` is in `localization.registration`, and that of 
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -129,6 +130,28 @@ class NearLists(NamedTuple):
         for axis, column in enumerate(torch.where(inside[:, None], at, 0.0).long().unbind(1)):
             cell = cell * self.shape[axis] + column
         return torch.where(inside, cell, -1)
+
+
+_STRIPS = 16  # of the cells of each first coordinate on a GPU, which one worker fills
+_BOXES = {dim: FusedKernel("mixtures/point_alignment.h", f"box_lists<{dim}>") for dim in (2, 3)}
+
+
+def fused_box_lists(first: Tensor, last: Tensor, sizes: list[int], n_entries: int) -> Lists:
+    """For each of the cells of a lattice of `sizes` (D), row-major, the boxes that hold it, in order.
+
+    The boxes are `first` to `last` (K, D) with `n_entries` cells in all. The twin is in
+    `localization.alignment`.
+    """
+    n_strips = 1 if first.device.type == "cpu" else _STRIPS
+    totals = torch.empty(sizes[0] * n_strips, dtype=torch.int64, device=first.device)
+    starts = torch.empty(math.prod(sizes) + 1, dtype=torch.int64, device=first.device)
+    entries = torch.empty(n_entries, dtype=torch.int32, device=first.device)
+    team, boxes = Team.of(first.device), (first.contiguous(), last.contiguous(), len(first))
+    high = sizes[2] if len(sizes) == 3 else 1
+    _BOXES[first.shape[1]](
+        team.n, *team, *boxes, *sizes[:2], high, n_strips, totals, starts, entries, device=first.device
+    )
+    return Lists(starts, entries)
 
 
 class AlignmentSums(NamedTuple):

@@ -25,6 +25,44 @@ struct Aligned {
     double explained;
 };
 
+// Lists the boxes that hold each cell of a lattice. A worker lists those of its pieces, which are strips
+// along the second axis of the cells of one first coordinate.
+template <int DIM>
+GMM_KERNEL box_lists(int64_t item, Team team, const int64_t* first, const int64_t* last, int64_t n_boxes,
+                     int64_t n_x, int64_t n_y, int64_t high, int64_t n_strips, int64_t* totals,
+                     int64_t* starts, int32_t* entries) {
+    const int64_t n_pieces = n_x * n_strips;
+    for (int fills = 0; fills < 2; ++fills) {
+        for (int64_t piece = item; piece < n_pieces; piece += team.n) {
+            const int64_t x = piece / n_strips, strip = piece % n_strips;
+            const int64_t from = n_y * strip / n_strips, to = n_y * (strip + 1) / n_strips;
+            int64_t* ends = starts + 1 + x * n_y * high;  // of the lists of these cells; first, their lengths
+            int64_t total = 0;
+            for (int64_t before = 0; before < piece && fills; ++before) total += totals[before];
+            for (int64_t cell = from * high; cell < to * high; ++cell) {
+                const int64_t length = ends[cell];
+                ends[cell] = total;
+                total += fills ? length : 0;
+            }
+            for (int64_t k = 0; k < n_boxes; ++k) {
+                const int64_t *lowest = first + k * DIM, *highest = last + k * DIM;
+                if (x < lowest[0] || x > highest[0]) continue;
+                const int64_t bottom = DIM == 3 ? lowest[DIM - 1] : 0, top = DIM == 3 ? highest[DIM - 1] : 0;
+                for (int64_t y = maximum(from, lowest[1]); y < to && y <= highest[1]; ++y)
+                    for (int64_t z = bottom; z <= top; ++z) {
+                        int64_t& end = ends[y * high + z];
+                        if (fills) entries[end] = (int32_t)k;
+                        ++end;
+                        ++total;
+                    }
+            }
+            if (!fills) totals[piece] = total;
+        }
+        meet(team);
+    }
+    if (item == 0) starts[0] = 0;
+}
+
 CUDA_CALLABLE constexpr int n_alignment_sums(int dim) { return 2 + n_free(dim) * (n_free(dim) + 2); }
 
 // Sums over the points begin … stop - 1 under one motion: log(1 + q/outliers), whether q is above the height
