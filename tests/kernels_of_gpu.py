@@ -97,7 +97,7 @@ def _compiled(kernel: FusedKernel) -> Any:
 
 
 def run_as_on_gpu(kernel: FusedKernel, n_items: int, *arguments: Tensor | float | None) -> None:
-    """Launch a kernel with these arguments, tensors of the CPU, as `kernel(n_items, ...)` would on a GPU."""
+    """Launch a kernel as `kernel(n_items, ...)` would on a GPU."""
     if n_items == 0:
         return
     block = ctypes.create_string_buffer(kernel._packed.pack(*kernel._values(arguments)))
@@ -112,7 +112,7 @@ def _launch(self: FusedKernel, n_items: int, *arguments: Any, device: torch.devi
     if device.type == "cpu":
         _launch_on_cpu(self, n_items, *arguments, device=device)
         return
-    run_as_on_gpu(self, n_items, *(a.held if isinstance(a, GPUTensor) else a for a in arguments))
+    run_as_on_gpu(self, n_items, *arguments)
 
 
 _launch_on_cpu = FusedKernel.__call__

@@ -58,6 +58,9 @@ class GPUTensor(Tensor):
     is_cuda = property(lambda self: True)
     is_meta = property(lambda self: False)
 
+    def data_ptr(self) -> int:
+        return self.held.data_ptr()
+
     def __repr__(self, **options: Any) -> str:
         return f"GPUTensor({self.held})"
 
