@@ -113,8 +113,9 @@ def run_as_on_gpu(kernel: FusedKernel, n_items: int, *arguments: Tensor | float 
     if n_items == 0:
         return
     block = ctypes.create_string_buffer(kernel._packed.pack(*kernel._values(arguments)))
-    n_threads = n_items if "meet(team)" in kernel._text else min(N_THREADS, n_items)
-    has_squads = "squad_of(item)" in kernel._text and n_items % _BLOCK == 0
+    is_team = any(parameter.label == "arrived" for parameter in kernel._parameters)
+    n_threads = n_items if is_team else min(N_THREADS, n_items)
+    has_squads = not is_team and "squad_of(item)" in kernel._text and n_items % _BLOCK == 0
     n_threads = _BLOCK if has_squads else n_threads
     _compiled(kernel)(ctypes.c_int64(n_items), ctypes.c_int64(n_threads), has_squads, block)
 

@@ -55,11 +55,14 @@ from .mixtures.lattice_rounding import lattice_rounding as lattice_rounding
 from .mixtures.matching import AlignmentSums as AlignmentSums
 from .mixtures.matching import AlignmentTable as AlignmentTable
 from .mixtures.matching import NearLists as NearLists
+from .mixtures.matching import Prior as Prior
 from .mixtures.matching import Registered as Registered
 from .mixtures.matching import alignment_scores as alignment_scores
 from .mixtures.matching import alignment_sums as alignment_sums
 from .mixtures.matching import explained_points as explained_points
 from .mixtures.matching import fused_alignment as fused_alignment
+from .mixtures.matching import fused_bounds as fused_bounds
+from .mixtures.matching import fused_box_lists as fused_box_lists
 from .mixtures.matching import fused_registration as fused_registration
 from .mixtures.matching import raster_sums as raster_sums
 from .mixtures.pair_merges import is_pair_merges_fused as is_pair_merges_fused

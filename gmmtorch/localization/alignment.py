@@ -27,6 +27,7 @@ from gmmtorch.kernels import (
     alignment_scores,
     alignment_sums,
     fused_alignment,
+    fused_box_lists,
     is_fused,
 )
 from gmmtorch.mapping import Components
@@ -116,9 +117,12 @@ def _near_lists(means: Tensor, covariances: Tensor, blur: float) -> NearLists:
         first, last = (((means + way * half - low) / side).floor().clamp_min(0).long() for way in (-1, 1))
         shape = last.amax(0) + 1
         sizes = shape.tolist()
-        if math.prod(sizes) <= _MOST_CELLS and int((last - first + 1).prod(1).sum()) <= _MOST_CELLS:
+        n_entries = int((last - first + 1).prod(1).sum())
+        if math.prod(sizes) <= _MOST_CELLS and n_entries <= _MOST_CELLS:
             break
         side *= 1.5
+    if is_fused(means):
+        return NearLists(low, side, shape, *fused_box_lists(first, last, sizes, n_entries))
     component, cells = next(cells_in_chunks(first, last - first + 1, _MOST_CELLS))  # in one chunk
     cell = row_major(cells.unbind(), tuple(sizes))
     lengths = torch.bincount(cell, minlength=math.prod(sizes))
@@ -215,7 +219,9 @@ def _steps(sums: AlignmentSums, scale: Tensor, longest: float) -> Tensor:
 def differences(some: Pose, others: Pose, distance: float, angle: float) -> Tensor:
     """How different motions are (A, B): the larger of the shift in `distance` and the turn in `angle`."""
     shift = torch.cdist(some.translation, others.translation)
-    turn = torch.linalg.matrix_norm(some.rotation[:, None] - others.rotation) / math.sqrt(2)
+    mode = "donot_use_mm_for_euclid_dist"  # which is exact
+    chord = torch.cdist(some.rotation.flatten(1), others.rotation.flatten(1), compute_mode=mode)
+    turn = chord / math.sqrt(2)
     return torch.maximum(shift / distance, turn / angle)
 
 

@@ -105,19 +105,15 @@ class LocalMap:
         self._center = keyframes[-1].pose.translation
         # One mixture of all points: where many scans overlap, a sum of their mixtures would outweigh the
         # surfaces that only one of them saw, and pull the next scan back.
-        self._scans = [
-            Scan(frame.points, torch.zeros(self.dim)).transformed(frame.pose.matrix) for frame in keyframes
-        ]
+        self._scans = [Scan(pose.apply(points), pose.translation) for points, pose in keyframes]
         self._rule = rule
         self._components = learn_window(self._scans, rule, torch.Generator().manual_seed(0))
         mixture = surface_mixture(self._components, "the local map")
         centered = mixture._replace(means=mixture.means - self._center)
         self._target = functools.partial(AlignmentTarget, centered, normals=seen_normals(self._components))
         first = self._target(_BLURS[self.dim][0])
-        self._targets = [
-            first,
-            *(self._target(blur, lists=first.table.lists) for blur in _BLURS[self.dim][1:]),
-        ]
+        lists = first.table.lists
+        self._targets = [first, *(self._target(blur, lists=lists) for blur in _BLURS[self.dim][1:])]
         poses = Pose.stack([frame.pose for frame in keyframes])
         self._space = FreeSpace([frame.points for frame in keyframes], poses)
 
@@ -224,8 +220,8 @@ class LocalMap:
         slid = align(points, targets[-1], _slid(found, points), _SLIDE_STEPS)
         slid_total, slid_view = self._total(slid, points, expected)
         # A place whose own direction stays open would lose to any pose of a wider search without a doubt.
-        is_open = [pose_covariance(one, points)[1] > _LOOSEST for one in slid.information]
-        slid_total = torch.where(torch.tensor(is_open), -torch.inf, slid_total)
+        is_open = pose_covariance(slid.information, points)[1] > _LOOSEST
+        slid_total = torch.where(is_open, -torch.inf, slid_total)
         order = slid_total.argsort(descending=True, stable=True)
         if float(slid_total[order[0]] - total[0]) > _DECISIVE:
             found, total, view = slid.at(order), slid_total[order], slid_view.at(order)
@@ -248,7 +244,8 @@ class LocalMap:
         rivals = is_apart & (total >= total[0] - _ALIKE)
         chosen = rivals | (torch.arange(len(total)) == 0)
         best = int(torch.where(chosen, expected.unlikely(poses), torch.inf).argmin())
-        covariance, loosest = pose_covariance(found.information[best], points)
+        covariance, deviation = pose_covariance(found.information[best], points)
+        loosest = float(deviation)
         contradicted = float(view.in_free_space[best] + view.looked_through[best])
         seen = 1 - float(view.unknown[best])
         share, doubts = min(float(found.explained[best]) / max(seen, _LEAST_SEEN), 1.0), []
@@ -303,7 +300,7 @@ def _slid(found: Alignment, points: Tensor) -> Pose:
     scale = torch.ones(len(covariance)).double()
     scale[points.shape[1] :] = 1 / points.norm(dim=1).median().clamp_min(1e-3)
     axis = torch.linalg.eigh(covariance / scale[:, None] / scale)[1][:, -1] * scale
-    steps = torch.linspace(-1, 1, _SLIDES).double() * min(2 * loosest, _SLIDE)
+    steps = torch.linspace(-1, 1, _SLIDES).double() * min(2 * float(loosest), _SLIDE)
     return found.motions[[0] * _SLIDES].moved(steps[:, None] * axis)
 
 

@@ -40,15 +40,15 @@ class Location:
         return not self.doubts
 
 
-def pose_covariance(information: Tensor, rows: Tensor) -> tuple[Tensor, float]:
-    """The covariance (F, F) of a pose, and the largest standard deviation (m) at the median range."""
+def pose_covariance(information: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Covariances (…, F, F) of poses, and the largest standard deviations (…), m, at the median range."""
     dim = rows.shape[1]
-    scale = information.new_ones(len(information))
+    scale = information.new_ones(information.shape[-1])
     scale[dim:] = 1 / rows.norm(dim=1).median().clamp_min(1e-3)
     values, axes = torch.linalg.eigh(information * scale[:, None] * scale)
     variances = CORRELATED / values.clamp_min(CORRELATED / UNSEEN**2)
-    inner = axes @ (variances[:, None] * axes.mT)
-    return inner * scale[:, None] * scale, float(variances.max().sqrt())
+    inner = axes @ (variances[..., None] * axes.mT)
+    return inner * scale[:, None] * scale, variances.amax(-1).sqrt()
 
 
 def composed(first: Location, then: Location) -> Location:

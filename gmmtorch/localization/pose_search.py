@@ -16,7 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels import count_in_grid, raster_sums
+from gmmtorch.kernels import Prior, count_in_grid, fused_bounds, is_fused, raster_sums
 from gmmtorch.localization.alignment import distinct
 from gmmtorch.mapping import Components
 from gmmtorch.pose import Pose
@@ -30,6 +30,7 @@ HIT, UNKNOWN, FREE = 8.0, 4.0, -8.0
 _CELLS = 1 << 18  # of a raster at most
 _FINEST = 0.1  # metres of a cell
 _BLUR = 1.5  # cells of standard deviation of a surface
+_ROUNDING = 1e-6  # radians
 _TAIL = 2.0  # nats: beyond, the prior falls as a power of the deviation
 NEVER = 1e4
 """Nats against a pose that is farther from the expected poses than the sensor moves."""
@@ -77,7 +78,7 @@ class Expectation(NamedTuple):
         """Nats (N,) by shifts (N, B) and turns (N, B). Far from an expected pose the nats grow with the
         logarithm of the deviation: a robot that stops or turns does not follow any prediction.
         """
-        is_near = (shift <= self.max_step) & (turned <= self.max_turn + 1e-6)
+        is_near = (shift <= self.max_step) & (turned <= self.max_turn + _ROUNDING)
         square = (shift / self.distance).square() + (turned / self.angle).square()
         nats = _TAIL * torch.log1p(square.amin(1) / (2 * _TAIL))
         return nats + torch.where(is_near.any(1), 0.0, NEVER)
@@ -219,12 +220,20 @@ class PoseSearch:
 
     def _scored(self, tried: _Tried, heading: Tensor, shift: Tensor, level: int) -> Tensor:
         """Upper bounds (S,) of the scores in squares of poses, nats; the scores themselves on level 0."""
-        width = 1 << level
+        width, expected = 1 << level, tried.expected
+        places = expected.poses.translation
+        if is_fused(tried.cells, places, tried.off):
+            prior = Prior(
+                places.contiguous(), tried.off.contiguous(), len(places), tried.share, self.cell, width,
+                expected.distance, expected.angle, expected.max_step, expected.max_turn + _ROUNDING,
+                _TAIL, NEVER,
+            )  # fmt: skip
+            return fused_bounds(tried.cells, heading, shift, self._levels[level], UNKNOWN, prior)
         sums = raster_sums(tried.cells, heading, shift, self._levels[level], UNKNOWN)
         away = (width - 1) * self.cell / math.sqrt(2)
         middles = self._middle(tried, shift, width)
-        gap = (torch.cdist(middles, tried.expected.poses.translation) - away).clamp_min(0)
-        return tried.share * sums - tried.expected.against(gap, tried.off[heading])
+        gap = (torch.cdist(middles, places) - away).clamp_min(0)
+        return tried.share * sums - expected.against(gap, tried.off[heading])
 
     def _middle(self, tried: _Tried, shift: Tensor, width: int) -> Tensor:
         """The middle (S, 2) of squares, metres."""

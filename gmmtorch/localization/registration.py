@@ -477,7 +477,7 @@ def log_self_overlap(mixture: Parameters) -> float:
 def _batched_sums(
     source: Parameters, target: Parameters, motions: Pose, pairs: Pairs
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The twin of `kernels.overlap_sums`."""
+    """Sums over the pairs of each motion: Σ s, Σ s ∂log N, and s times the information and ∂log N ∂log Nᵀ."""
     n, dim = motions.translation.shape
     n_free = dim + dim * (dim - 1) // 2
     lever = torch.einsum("bij,kj->ibk", motions.rotation, source.means).flatten(1)

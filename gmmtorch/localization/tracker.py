@@ -242,7 +242,8 @@ class Tracker:
         return starts[order[:_CLIMBED]]
 
     def _location(self, rows: Tensor, found: Alignment, is_tracked: bool) -> Location:
-        covariance, loosest = pose_covariance(found.information[0], rows)
+        covariance, deviation = pose_covariance(found.information[0], rows)
+        loosest = float(deviation)
         doubts = []
         if not bool(found.converged[0]):
             doubts.append("the last step was longer than the tolerance")

@@ -115,6 +115,24 @@ def test_fused_sums_over_a_raster_equal_the_twin(shape):
     torch.testing.assert_close(*sums)
 
 
+@pytest.mark.parametrize("level", [0, 2])
+def test_fused_bounds_with_a_prior_equal_the_twin(level):
+    draw = torch.Generator().manual_seed(level)
+    search = PoseSearch(4 * torch.rand(200, 2, generator=draw).double(), cell=0.1)
+    poses = Pose.from_yaw([0.1, -0.4], 2 * torch.rand(2, 2, generator=draw).double())
+    tried = search._tried(
+        torch.rand(90, 2, generator=draw).double(), Expectation(poses, 0.3, 0.2, 0.9, 1.0, 2.0)
+    )
+    heading = torch.randint(len(tried.angles), (80,), generator=draw)
+    shift = torch.cat([torch.randint(-30, 30, (80, 2), generator=draw), torch.zeros(80, 1).long()], 1)
+    bounds = []
+    for choice in ("torch", "fused"):
+        with kernels(choice):
+            bounds.append(search._scored(tried, heading, shift, level))
+    torch.testing.assert_close(*bounds)
+    assert bounds[0].min() < -1000 < 0 < bounds[0].max()
+
+
 def test_the_prior_falls_slowly_and_ends_at_the_largest_motion():
     expected = Expectation(Pose.from_yaw([0.0], [0.0, 0.0]), 0.5, 0.3, 0.9, 4.0, 1.0)
     places = Pose.from_yaw(torch.tensor([0.0, 0.0, 0.0, 0.0, 0.9, 1.1]), torch.zeros(6, 2).double())

@@ -7,7 +7,8 @@ The twin of `fused_registration` is in `localization.registration`, and that of 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -131,6 +132,28 @@ class NearLists(NamedTuple):
         return torch.where(inside, cell, -1)
 
 
+_STRIPS = 16  # of the cells of each first coordinate on a GPU, which one worker fills
+_BOXES = {dim: FusedKernel("mixtures/point_alignment.h", f"box_lists<{dim}>") for dim in (2, 3)}
+
+
+def fused_box_lists(first: Tensor, last: Tensor, sizes: list[int], n_entries: int) -> Lists:
+    """For each of the cells of a lattice of `sizes` (D), row-major, the boxes that hold it, in order.
+
+    The boxes are `first` to `last` (K, D) with `n_entries` cells in all. The twin is in
+    `localization.alignment`.
+    """
+    n_strips = 1 if first.device.type == "cpu" else _STRIPS
+    totals = torch.empty(sizes[0] * n_strips, dtype=torch.int64, device=first.device)
+    starts = torch.empty(math.prod(sizes) + 1, dtype=torch.int64, device=first.device)
+    entries = torch.empty(n_entries, dtype=torch.int32, device=first.device)
+    team, boxes = Team.of(first.device), (first.contiguous(), last.contiguous(), len(first))
+    high = sizes[2] if len(sizes) == 3 else 1
+    _BOXES[first.shape[1]](
+        team.n, *team, *boxes, *sizes[:2], high, n_strips, totals, starts, entries, device=first.device
+    )
+    return Lists(starts, entries)
+
+
 class AlignmentSums(NamedTuple):
     """Of each of B motions, with q_n = Σ_k exp(−½ d_nk²) over the components listed for point n:
 
@@ -213,6 +236,30 @@ def alignment_scores(points: Tensor, motions: tuple[Tensor, Tensor], table: Alig
 
 
 _RASTER = FusedKernel("mixtures/point_alignment.h", "raster_sums")
+_NO_PRIOR = None, None, 0, *[0.0] * 9
+
+
+class Prior(NamedTuple):
+    """Where a scan is expected, for `fused_bounds`.
+
+    places: (B, 2), the last one that of the shift zero; metres. turned: (H, B), rad, from their headings to
+    those of the scan. distance, angle: standard deviations. share: of the sum. cell: metres. width: of a
+    square of placements, cells. max_step, max_turn: to the nearest place, at most, or `never` is subtracted.
+    tail: see `localization.pose_search.Expectation.against`.
+    """
+
+    places: Tensor
+    turned: Tensor
+    n_places: int
+    share: float
+    cell: float
+    width: float
+    distance: float
+    angle: float
+    max_step: float
+    max_turn: float
+    tail: float
+    never: float
 
 
 def raster_sums(cells: Tensor, heading: Tensor, shift: Tensor, raster: Tensor, outside: float) -> Tensor:
@@ -224,15 +271,27 @@ def raster_sums(cells: Tensor, heading: Tensor, shift: Tensor, raster: Tensor, o
 
     The fused kernel differs from its twin by rounding.
     """
-    if not is_fused(cells, heading, shift, raster):
-        at = cells[heading] + shift[:, None]
-        size = torch.tensor(raster.shape, device=at.device)
-        is_inside = ((at >= 0) & (at < size)).all(2)
-        x, y, z = at.clamp_min(0).minimum(size - 1).unbind(2)
-        return torch.where(is_inside, raster[x, y, z].double(), outside).sum(1)
+    if is_fused(cells, heading, shift, raster):
+        return fused_bounds(cells, heading, shift, raster, outside, _NO_PRIOR)
+    at = cells[heading] + shift[:, None]
+    size = torch.tensor(raster.shape, device=at.device)
+    is_inside = ((at >= 0) & (at < size)).all(2)
+    x, y, z = at.clamp_min(0).minimum(size - 1).unbind(2)
+    return torch.where(is_inside, raster[x, y, z].double(), outside).sum(1)
+
+
+def fused_bounds(
+    cells: Tensor,
+    heading: Tensor,
+    shift: Tensor,
+    raster: Tensor,
+    outside: float,
+    prior: Prior | tuple[Any, ...],
+) -> Tensor:
+    """`raster_sums` less the nats against placements by a prior. `localization.pose_search` has the twin."""
     sums = torch.empty(len(heading), dtype=torch.float64, device=cells.device)
     given = [part.contiguous() for part in (heading, shift, raster)]
-    counts = *raster.shape, outside
+    counts = *raster.shape, outside, *prior
     _RASTER(len(heading), cells.contiguous(), cells.shape[1], *given, *counts, sums, device=cells.device)
     return sums
 

@@ -25,6 +25,44 @@ struct Aligned {
     double explained;
 };
 
+// Lists the boxes that hold each cell of a lattice. A worker lists those of its pieces, which are strips
+// along the second axis of the cells of one first coordinate.
+template <int DIM>
+GMM_KERNEL box_lists(int64_t item, Team team, const int64_t* first, const int64_t* last, int64_t n_boxes,
+                     int64_t n_x, int64_t n_y, int64_t high, int64_t n_strips, int64_t* totals,
+                     int64_t* starts, int32_t* entries) {
+    const int64_t n_pieces = n_x * n_strips;
+    for (int fills = 0; fills < 2; ++fills) {
+        for (int64_t piece = item; piece < n_pieces; piece += team.n) {
+            const int64_t x = piece / n_strips, strip = piece % n_strips;
+            const int64_t from = n_y * strip / n_strips, to = n_y * (strip + 1) / n_strips;
+            int64_t* ends = starts + 1 + x * n_y * high;  // of the lists of these cells; first, their lengths
+            int64_t total = 0;
+            for (int64_t before = 0; before < piece && fills; ++before) total += totals[before];
+            for (int64_t cell = from * high; cell < to * high; ++cell) {
+                const int64_t length = ends[cell];
+                ends[cell] = total;
+                total += fills ? length : 0;
+            }
+            for (int64_t k = 0; k < n_boxes; ++k) {
+                const int64_t *lowest = first + k * DIM, *highest = last + k * DIM;
+                if (x < lowest[0] || x > highest[0]) continue;
+                const int64_t bottom = DIM == 3 ? lowest[DIM - 1] : 0, top = DIM == 3 ? highest[DIM - 1] : 0;
+                for (int64_t y = maximum(from, lowest[1]); y < to && y <= highest[1]; ++y)
+                    for (int64_t z = bottom; z <= top; ++z) {
+                        int64_t& end = ends[y * high + z];
+                        if (fills) entries[end] = (int32_t)k;
+                        ++end;
+                        ++total;
+                    }
+            }
+            if (!fills) totals[piece] = total;
+        }
+        meet(team);
+    }
+    if (item == 0) starts[0] = 0;
+}
+
 CUDA_CALLABLE constexpr int n_alignment_sums(int dim) { return 2 + n_free(dim) * (n_free(dim) + 2); }
 
 // Sums over the points begin … stop - 1 under one motion: log(1 + q/outliers), whether q is above the height
@@ -262,19 +300,60 @@ GMM_KERNEL alignment(int64_t item, Team team, const double* points, int64_t n_po
     }
 }
 
-// An item is a placement of the scan: a heading and a shift in whole cells.
+// Where a scan is expected; see `Prior`.
+struct Expected {
+    const double* places;
+    const double* turned;
+    int64_t n;
+    double share;
+    double cell;
+    double width;
+    double distance;
+    double angle;
+    double max_step;
+    double max_turn;
+    double tail;
+    double never;
+};
+
+GMM_INLINE double raster_value(const int64_t* cell, const int64_t* shift, const float* raster,
+                               const int64_t (&size)[3], double outside) {
+    const uint64_t x = cell[0] + shift[0], y = cell[1] + shift[1], z = cell[2] + shift[2];
+    const bool inside = x < (uint64_t)size[0] && y < (uint64_t)size[1] && z < (uint64_t)size[2];
+    return inside ? (double)raster[(x * size[1] + y) * size[2] + z] : outside;
+}
+
+// An item is a placement of the scan: a heading and a shift in whole cells. Without an expected place the
+// bound is the sum.
 GMM_KERNEL raster_sums(int64_t item, const int64_t* cells, int64_t n_points, const int64_t* heading,
                        const int64_t* shift, const float* raster, int64_t nx, int64_t ny, int64_t nz,
-                       double outside, double* sums) {
+                       double outside, Expected prior, double* bounds) {
     const int64_t* cell = cells + heading[item] * n_points * 3;
-    const int64_t x0 = shift[3 * item], y0 = shift[3 * item + 1], z0 = shift[3 * item + 2];
-    double sum = 0.0;
-    for (int64_t n = 0; n < n_points; ++n, cell += 3) {
-        const int64_t x = cell[0] + x0, y = cell[1] + y0, z = cell[2] + z0;
-        const bool inside = x >= 0 && x < nx && y >= 0 && y < ny && z >= 0 && z < nz;
-        sum += inside ? (double)raster[(x * ny + y) * nz + z] : outside;
+    const int64_t *at = shift + 3 * item, size[3] = {nx, ny, nz};
+    double sums[4] = {0.0};  // which do not wait for each other
+    int64_t n = 0;
+    for (; n + 4 <= n_points; n += 4)
+        for (int i = 0; i < 4; ++i) sums[i] += raster_value(cell + 3 * (n + i), at, raster, size, outside);
+    for (; n < n_points; ++n) sums[0] += raster_value(cell + 3 * n, at, raster, size, outside);
+    const double sum = sums[0] + sums[1] + sums[2] + sums[3];
+    bounds[item] = sum;
+    if (!prior.n) return;
+    const double half = 0.5 * (prior.width - 1.0), away = (prior.width - 1.0) * prior.cell * sqrt(0.5);
+    double least = INFINITY;
+    bool is_near = false;
+    for (int64_t b = 0; b < prior.n; ++b) {
+        double square = 0.0;
+        for (int i = 0; i < 2; ++i) {
+            const double middle = prior.places[2 * prior.n - 2 + i] + (at[i] + half) * prior.cell;
+            square += (middle - prior.places[2 * b + i]) * (middle - prior.places[2 * b + i]);
+        }
+        const double gap = maximum(sqrt(square) - away, 0.0), off = prior.turned[heading[item] * prior.n + b];
+        is_near = is_near || (gap <= prior.max_step && off <= prior.max_turn);
+        const double shifted = gap / prior.distance, turned = off / prior.angle;
+        least = minimum(least, shifted * shifted + turned * turned);
     }
-    sums[item] = sum;
+    bounds[item] = prior.share * sum - prior.tail * log(1.0 + least / (2.0 * prior.tail));
+    if (!is_near) bounds[item] -= prior.never;
 }
 
 }  // namespace gmm

@@ -16,7 +16,6 @@ constexpr double SLACK = 0.5;      // thicknesses that components may move befor
 constexpr double LEAST_CURVATURE = 0.05;
 constexpr double LONGEST = 1.0;  // step, in Mahalanobis distances,
 constexpr double THICKNESSES = 4.0;
-constexpr int ROW = 32;  // numbers of a component in the work space
 
 // A mixture as it is given, and its components about its mean.
 struct Given {

@@ -12,7 +12,7 @@ from gmmtorch.errors import MemoryLimitError
 from gmmtorch.kernels import kernels
 from gmmtorch.kernels.compiler import compiler_failure
 from gmmtorch.kernels.mixtures import matching
-from gmmtorch.localization.alignment import AlignmentTarget
+from gmmtorch.localization.alignment import AlignmentTarget, align
 from gmmtorch.localization.registration import register
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.novelty import count_explained
@@ -89,6 +89,20 @@ def test_fused_sums_equal_the_twin(dim, kind, k, n_points, n, threads):
         torch.set_num_threads(before)
     for twin, fused in zip(*sums, strict=True):
         torch.testing.assert_close(fused, twin, rtol=0, atol=1e-11 * (1 + float(twin.abs().max())))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("kind", ["any", "flat", "equal"])
+def test_fused_climbs_and_lists_equal_those_of_the_twin(dim, kind):
+    points = 4 * torch.rand(60, dim, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+
+    def climbed() -> tuple[torch.Tensor, ...]:
+        target = AlignmentTarget(mixture(25, dim, kind), 0.2)
+        found = align(points, target, motions_of(4, dim), 8)
+        return *target.table.lists, *found.motions.parts, *found[1:]
+
+    for twin, fused in zip(*by_both(climbed), strict=True):
+        torch.testing.assert_close(fused, twin, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("choice", ["torch", "fused"])
