@@ -15,12 +15,13 @@ import json
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
-from public_work import counted, large_works, prepare, works
+from public_work import counted, em, large_works, prepare, works
 from torch import Tensor
 
 from gmmtorch import GaussianMap
@@ -183,6 +184,37 @@ def against(options: Any) -> Iterator[Row]:
         yield name, before, after, before / after, *counts
 
 
+class GpuUse(NamedTuple):
+    """Of a work: the seconds in which the GPU computes, the MB that it allocates at most, and what bounds it.
+
+    launches: the GPU waits for the host for more than half of the time. Otherwise memory, if NVML counts
+    accesses to it in more than half of the time, or arithmetic.
+    """
+
+    busy: float
+    megabytes: float
+    bound: str
+
+    @staticmethod
+    def of(work: Callable[[], object], seconds: float, device: str) -> GpuUse:
+        work()
+        held = torch.cuda.memory_allocated(device)
+        torch.cuda.reset_peak_memory_stats(device)
+        with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
+            work()
+            torch.cuda.synchronize(device)
+        busy = sum(event.self_device_time_total for event in profile.key_averages()) / 1e6
+        megabytes = (torch.cuda.max_memory_allocated(device) - held) / 1e6
+        if busy < 0.5 * seconds:
+            return GpuUse(busy, megabytes, "launches")
+        shares, end = [], time.perf_counter() + 1.5  # NVML counts in periods of up to a second
+        while time.perf_counter() < end:
+            work()
+            torch.cuda.synchronize(device)
+            shares.append(torch.cuda.memory_usage(device))
+        return GpuUse(busy, megabytes, "memory" if max(shares) > 50 else "arithmetic")
+
+
 def devices(options: Any) -> Iterator[Row]:
     """The work of `public_work.py` on the CPU and on the GPU."""
     if options.device == "cpu":
@@ -198,7 +230,79 @@ def devices(options: Any) -> Iterator[Row]:
             work = listed[device][name]()
             counts = counted(work)  # and what is compiled or loaded once
             seconds.append(least_seconds(work, options.repeats, device))
-        yield name, *seconds, seconds[0] / seconds[1], "{:,} ({:,})".format(*counts)
+        use = GpuUse.of(work, seconds[1], options.device)
+        yield name, *seconds, seconds[0] / seconds[1], *use, "{:,} ({:,})".format(*counts)
+
+
+def memory_works(data: Path, device: str) -> dict[str, Callable[[int], Callable[[], object]]]:
+    """For each work the function that prepares it for n things."""
+
+    def asked(n: int) -> Callable[[], object]:
+        cones, some = map_and_points(data, "kinect", 8000, 0.05, 10_000, device)
+        points = some.repeat(n // len(some), 1)
+        return lambda: PointForm(cones, 0.05, 3.0)(points)
+
+    def cells(n: int) -> Callable[[], object]:
+        return lambda: Evidence.empty(VoxelGrid((0.0,) * 3, 0.1, (n // 10_000, 100, 100)), device)
+
+    def counted_rays(n: int) -> Callable[[], object]:
+        starts, ends, grid = rays(n, 0.2, device)
+        return lambda: Evidence.empty(grid, device).add_rays(starts, ends)
+
+    def components(n: int) -> Callable[[], object]:
+        generator = torch.Generator().manual_seed(0)
+        side = n ** (1 / 3)
+        means = side * torch.rand(n, 3, generator=generator, dtype=torch.float64)
+        spread = torch.tensor([0.3, 0.3, 0.02], dtype=torch.float64).square().diag().expand(n, 3, 3)
+        counts = torch.full((n,), 100.0, dtype=torch.float64)
+        origins = means + torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)
+        parts = [part.to(device) for part in (means, spread, origins, counts, means[:500])]
+
+        def indexed() -> object:
+            made = GaussianMap.from_components(*parts[:2], support=parts[3], origins=parts[2])
+            made.occupancy(parts[4])
+            return made
+
+        return indexed
+
+    return {
+        "a point of exact EM, K = 100": lambda n: em(n, 100, device, "exact"),
+        "a point of EM, K = 1,000": lambda n: em(n, 1000, device),
+        "a component of a map in 3D with its index": components,
+        "a point of a query": asked,
+        "a ray that is counted": counted_rays,
+        "a cell of a dense grid": cells,
+    }
+
+
+def peak_bytes(work: Callable[[], object], device: str) -> int:
+    """Bytes of tensors that a work has at most at a time, with its result, beside its input."""
+    if device != "cpu":
+        before = torch.cuda.memory_allocated(device)
+        torch.cuda.reset_peak_memory_stats(device)
+        kept = work()
+        del kept
+        return torch.cuda.max_memory_allocated(device) - before
+    with torch.profiler.profile(profile_memory=True) as profile:
+        kept = work()
+        del kept
+    events: Any = profile.profiler
+    changes = [event.nbytes() for event in events.kineto_results.events() if event.name() == "[memory]"]
+    return max(itertools.accumulate(changes))
+
+
+def memory(options: Any) -> Iterator[Row]:
+    """Of a CPU, and of a GPU if that is the device: the growth from a million things to three million."""
+    for name in memory_works(options.data, "cpu"):
+        row: list[float | None] = []
+        for device in ("cpu", "cuda"):
+            if device == "cuda" and not options.device.startswith("cuda"):
+                row.append(None)
+                continue
+            work = memory_works(options.data, device)[name]
+            few, many = (peak_bytes(work(n), device) for n in (10**6, 3 * 10**6))
+            row.append((many - few) / (2 * 10**6))
+        yield name, *row
 
 
 CASES = (
@@ -230,14 +334,23 @@ CASES = (
     Case(
         "devices",
         devices,
-        "In parentheses: operations that wait for the device.",
+        "Busy: seconds in which the GPU computes. In parentheses: operations that wait for the device.",
         {
             "work": "",
             "s on the CPU": "3",
             "s on the GPU": "3",
             "times faster": "3",
+            "busy": "3",
+            "MB": ".0f",
+            "bound by": "",
             "operations (waits)": "",
         },
+    ),
+    Case(
+        "memory",
+        memory,
+        "Bytes that each more of a million to three million takes at most, beside its input.",
+        {"": "", "bytes on the CPU": ".0f", "on the GPU": ".0f"},
     ),
 )
 

@@ -108,9 +108,10 @@ def exact_em(device: str, n: int = 100_000) -> Work:
     return lambda: gt.GaussianMixture(1000, algorithm="exact", max_iter=5, tol=0.0, **start).fit(points)
 
 
-def em(n: int, k: int, device: str) -> Work:
+def em(n: int, k: int, device: str, algorithm: str = "auto") -> Work:
     points = room(n).to(device)
-    return lambda: gt.GaussianMixture(k, tol=2e-3, reg_covar=1e-5, random_state=0).fit(points)
+    options = {"algorithm": algorithm, "tol": 2e-3, "reg_covar": 1e-5, "random_state": 0}
+    return lambda: gt.GaussianMixture(k, **options).fit(points)
 
 
 def frames(data: Path) -> tuple[list[tuple[Tensor, Tensor]], Tensor]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 
 if TYPE_CHECKING:
+    import torch
     from torch import Tensor
 
 KERNELS = ("auto", "fused", "torch")
@@ -29,7 +30,7 @@ def use_kernels(choice: str) -> None:
     """
     _check(choice, "kernels")
     if choice == "fused":
-        _require_compiler()
+        _require_compiler(None)
     _chosen[:] = [choice]
 
 
@@ -78,9 +79,9 @@ def is_fused(*tensors: Tensor | None) -> bool:
     if device is None or device.type not in ("cpu", "cuda"):
         return False
     if choice == "fused":
-        _require_compiler()
+        _require_compiler(device)
         return True
-    return _compiler_works()
+    return _compiler_works(device)
 
 
 def _check(choice: str, name: str) -> None:
@@ -88,10 +89,15 @@ def _check(choice: str, name: str) -> None:
         raise InvalidArgumentError(f"{name}={choice!r} is not one of {', '.join(KERNELS)}.")
 
 
-def _require_compiler() -> None:
+def _failure(device: torch.device | None) -> str | None:
+    """Of the kernels on this device; None: on the CPU."""
     from gmmtorch.kernels.compiler import compiler_failure
 
-    failure = compiler_failure()
+    return compiler_failure() if device is None or device.type == "cpu" else compiler_failure(device)
+
+
+def _require_compiler(device: torch.device | None) -> None:
+    failure = _failure(device)
     if failure is not None:
         raise GmmTorchError(
             f"kernels=fused needs the kernel compiler, but {failure}; install it with "
@@ -99,10 +105,8 @@ def _require_compiler() -> None:
         )
 
 
-def _compiler_works() -> bool:
-    from gmmtorch.kernels.compiler import compiler_failure
-
-    failure = compiler_failure()
+def _compiler_works(device: torch.device) -> bool:
+    failure = _failure(device)
     if failure is not None and failure not in _reported:
         _reported.add(failure)
         logger.info("Tensor operations replace fused kernels, because %s.", failure)

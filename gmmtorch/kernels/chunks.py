@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import re
 from collections.abc import Callable, Iterator
@@ -15,15 +16,24 @@ CHUNK_ELEMENTS = 1 << 17
 """Entries of a block on a CPU: small enough for the cache of a core."""
 
 DEVICE_ELEMENTS = 1 << 25
-"""Entries of a block on another device: each launch costs microseconds, so blocks are large."""
+"""Most entries of a block on another device: each launch costs microseconds, so blocks are large."""
+
+_SHARE = 64  # of a GPU's memory for one tensor of a chunk, of which a computation holds several
 
 T = TypeVar("T")
 logger = logging.getLogger(__name__)
 
 
 def chunk_elements(device: torch.device) -> int:
-    """Entries of the largest tensor of a chunk on this device."""
-    return CHUNK_ELEMENTS if device.type == "cpu" else DEVICE_ELEMENTS
+    """Entries (of eight bytes) of the largest tensor of a chunk on this device."""
+    return CHUNK_ELEMENTS if device.type == "cpu" else _elements_of_device(device)
+
+
+@functools.cache
+def _elements_of_device(device: torch.device) -> int:
+    if device.type != "cuda" or not torch.cuda.is_available():
+        return DEVICE_ELEMENTS
+    return min(DEVICE_ELEMENTS, torch.cuda.get_device_properties(device).total_memory // (8 * _SHARE))
 
 
 def chunked(n: int, size: int, compute: Callable[[slice], T]) -> Iterator[T]:

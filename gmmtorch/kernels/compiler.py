@@ -362,15 +362,23 @@ if hasattr(os, "register_at_fork"):
 _PROBE = FusedKernel("probe.h", "probe")
 
 
+_CPU = torch.device("cpu")
+
+
 @functools.cache
-def compiler_failure() -> str | None:
-    """Why the kernel compiler does not work, or None. The first call compiles a small kernel and runs it."""
-    value = torch.zeros(1, dtype=torch.int64)
+def compiler_failure(device: torch.device = _CPU) -> str | None:
+    """Why no kernel runs on the device, or None: no compiler works, or a GPU's driver is too old.
+
+    The first call for a device compiles a small kernel and runs it.
+    """
+    value = torch.zeros(1, dtype=torch.int64, device=device)
     try:
-        _PROBE(1, value, device=value.device)
+        _PROBE(1, value, device=device)
     except GmmTorchError as error:
         return str(error)
-    return None if int(value) == 1 else "a kernel gives a wrong result"
+    except Exception as error:  # Warp raises several types for a driver that it cannot use
+        return f"no kernel runs on {device} ({error})"
+    return None if int(value) == 1 else f"a kernel gives a wrong result on {device}"
 
 
 @functools.cache

@@ -117,7 +117,7 @@ def test_a_launcher_that_is_not_installed_names_its_extra(launcher, has_other_pl
 
 @pytest.mark.parametrize("command", ["fit", "map", "ros"])
 def test_fused_kernels_without_a_compiler_are_refused_by_the_name_of_the_option(command, run, monkeypatch):
-    monkeypatch.setattr(compiler, "compiler_failure", lambda: "the package warp-lang does not load (test)")
+    monkeypatch.setattr(compiler, "compiler_failure", lambda *_: "the package warp-lang does not load (test)")
     line = refused(run(command, "runtime.kernels=fused"))
     assert "runtime.kernels=fused needs the kernel compiler" in line
     assert "pip install 'gmmtorch[fast]', or choose runtime.kernels=auto or runtime.kernels=torch." in line

@@ -21,7 +21,7 @@ ONE = torch.ones(1)
 
 @pytest.fixture
 def no_compiler(monkeypatch):
-    monkeypatch.setattr(compiler, "compiler_failure", lambda: "the package warp-lang does not load (test)")
+    monkeypatch.setattr(compiler, "compiler_failure", lambda *_: "the package warp-lang does not load (test)")
     monkeypatch.setattr(choice, "_reported", set())
 
 
@@ -144,3 +144,26 @@ def test_a_forked_process_makes_its_own_threads():
     if child == 0:
         os._exit(compiler._threads.cache_info().currsize)
     assert os.waitpid(child, 0)[1] == 0
+
+
+def test_a_driver_that_is_too_old_gives_tensor_operations_and_one_line_of_log(monkeypatch, caplog):
+    probe = compiler._PROBE
+
+    def refused(*arguments, device):
+        if device.type != "cpu":
+            raise RuntimeError("CUDA driver version is insufficient")
+        probe(*arguments, device=device)
+
+    monkeypatch.setattr(choice, "_reported", set())
+    monkeypatch.setattr(compiler, "_PROBE", refused)
+    monkeypatch.setattr(compiler, "compiler_failure", compiler.compiler_failure.__wrapped__)
+    made = torch.zeros
+    monkeypatch.setattr(torch, "zeros", lambda *size, device, **rest: made(*size, **rest))  # no GPU is needed
+    caplog.set_level(logging.INFO)
+    assert not choice._compiler_works(torch.device("cuda", 0))
+    assert not choice._compiler_works(torch.device("cuda", 0))
+    assert [record.message for record in caplog.records if "driver version" in record.message] == [
+        "Tensor operations replace fused kernels, because no kernel runs on cuda:0 "
+        "(CUDA driver version is insufficient)."
+    ]
+    assert choice._compiler_works(torch.device("cpu"))
