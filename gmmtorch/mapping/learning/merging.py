@@ -289,8 +289,9 @@ def compact_to_bytes(
     """Merges components until their `size` is at most `max_bytes`; origins are limited as by `limit_origins`.
 
     Beyond that size, components lose their numbers: numbered anew, in the order of space, each takes a byte
-    less. The size, as a power of the number of components that its last two values tell, shall be a
-    thousandth below `max_bytes`, so that few sizes are measured; at first it is proportional.
+    less. Few sizes are measured, because each predicts the next number of components: the size is taken for
+    a power of that number, which the last two sizes tell (the first alone: proportional to it), and aims at
+    a thousandth below `max_bytes`.
 
     Raises `InvalidArgumentError` if a single component with one origin is too large.
     """
