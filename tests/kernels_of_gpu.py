@@ -60,6 +60,13 @@ static Number atomicAdd(Number* place, Number value) {
     return old;
 }
 template <typename Number>
+static Number atomicMin(Number* place, Number value) {
+    Number old = *place;
+    while (value < old)
+        if (__atomic_compare_exchange(place, &old, &value, false, __ATOMIC_SEQ_CST, __ATOMIC_SEQ_CST)) break;
+    return old;
+}
+template <typename Number>
 static Number atomicCAS(Number* place, Number expected, Number value) {
     __atomic_compare_exchange_n(place, &expected, value, false, __ATOMIC_SEQ_CST, __ATOMIC_SEQ_CST);
     return expected;

@@ -16,12 +16,14 @@ struct Mixture {
     const double* covariances;
 };
 
-// When merging ends, and where a component looks for partners: among its nearest `neighbors`.
+// When merging ends, and where a component looks for partners: among its nearest `neighbors`. block: rows
+// that have a common box, a multiple of eight.
 struct MergeRule {
     int64_t least;
     double limit;
     bool is_hellinger;
     int64_t neighbors;
+    int64_t block;
 };
 
 // At the first given row of each component that is left, its values and the number of its members. lead (K,):
@@ -89,24 +91,24 @@ template <int DIM>
 struct Rounds {
     static constexpr int64_t MOST = 0x7FFFFFFFFFFFFFFF;
     static constexpr uint64_t SPREAD = 0x9E3779B97F4A7C15, BACK = 0xF1DE83E19937733D;  // their product is 1
-    static constexpr int BLOCK = 32;                                                   // rows
 
     Team team;
     Mixture given;
     MergeRule rule;
     Merged out;
-    int64_t item, k, slots, n_blocks, stride;
-    double *place, *weight, *mean, *covariance, *half, *box, *distance, *costs;
+    int64_t item, k, slots, block, n_blocks, stride;
+    double *place, *weight, *mean, *covariance, *half, *reach, *box, *distance, *costs;
     int64_t *owner, *members, *first, *best, *code, *near;
     int* counts;
 
-    // scratch: (K + 2 BLOCK) (2 + 3 D + D² + 2 S) numbers, and K (5 + S) whole ones, S = neighbors. place
+    // scratch: (K + 2 blocks) (3 + 3 D + D² + 2 S) numbers, and K (5 + S) whole ones, S = neighbors. place
     // (D, stride): means, or infinity if nothing is left in a row.
     GMM_INLINE void begin(double* scratch, int64_t* whole) {
-        k = given.k, slots = rule.neighbors, n_blocks = (k + BLOCK - 1) / BLOCK;
-        stride = n_blocks * BLOCK, place = scratch, weight = place + DIM * stride, mean = weight + k,
+        k = given.k, slots = rule.neighbors, block = rule.block;
+        n_blocks = (k + block - 1) / block;
+        stride = n_blocks * block, place = scratch, weight = place + DIM * stride, mean = weight + k,
         covariance = mean + k * DIM, half = covariance + k * DIM * DIM;
-        box = half + k, distance = box + (k + BLOCK) * DIM, costs = distance + k * slots;
+        reach = half + k, box = reach + k, distance = box + (k + block) * DIM, costs = distance + k * slots;
         owner = whole, members = owner + k, first = members + k, best = first + k, code = best + k;
         near = code + k;
         for (int64_t i = item; i < k; i += team.n) {
@@ -115,6 +117,7 @@ struct Rounds {
             for (int x = 0; x < DIM; ++x) mean[i * DIM + x] = given.means[row * DIM + x];
             for (int x = 0; x < DIM * DIM; ++x)
                 covariance[i * DIM * DIM + x] = given.covariances[row * DIM * DIM + x];
+            reach[i] = HUGE_VAL;
             measure(i);
         }
     }
@@ -161,7 +164,7 @@ struct Rounds {
         for (int64_t b = item; b < n_blocks; b += team.n) {
             double *low = box + 2 * b * DIM, *high = low + DIM;
             for (int x = 0; x < DIM; ++x) low[x] = HUGE_VAL, high[x] = -HUGE_VAL;
-            for (int64_t i = b * BLOCK; i < (b + 1) * BLOCK; ++i) {
+            for (int64_t i = b * block; i < (b + 1) * block; ++i) {
                 const bool is_left = i < given.k && owner[i] == i;
                 for (int x = 0; x < DIM; ++x) {
                     const double m = is_left ? mean[i * DIM + x] : HUGE_VAL;
@@ -175,51 +178,58 @@ struct Rounds {
         for (int64_t i = item; i < DIGITS * 256; i += team.n) counts[i] = 0;
     }
 
-    // Of equally near ones, those whose rows are near: many components at one place then have many partners.
-    GMM_INLINE void search_block(int64_t i, int64_t b) {
-        double* far = distance + i * slots;
-        int64_t* row = near + i * slots;
-        const double *m = mean + i * DIM, *low = box + 2 * b * DIM;
-        const int64_t last = slots - 1;
-        double apart = 0.0, farthest = far[last];
-        for (int x = 0; x < DIM; ++x) {
-            const double d = maximum(maximum(low[x] - m[x], m[x] - low[DIM + x]), 0.0);
-            apart += d * d;
-        }
-        if (!(apart <= farthest)) return;
-        for (int64_t begin = b * BLOCK; begin < (b + 1) * BLOCK; begin += LANES) {
-            vec squares = (vec)(0.0);
+    GMM_INLINE static int64_t gap(int64_t i, int64_t j) { return j > i ? j - i : i - j; }
+
+    // The nearest components of component i within reach, in no order; returns their number. Of equally near
+    // ones those whose rows are near: many components at one place then have many partners.
+    GMM_INLINE int64_t nearest(int64_t i) {
+        double *far = distance + i * slots, farthest = reach[i];  // of those found, once there are enough
+        const double* m = mean + i * DIM;
+        int64_t *row = near + i * slots, n = 0, last = 0;  // where the farthest one is
+        const int64_t own = i / block;
+        for (int64_t step = 0; step < 2 * n_blocks; ++step) {
+            const int64_t b = own + (step % 2 ? (step + 1) / 2 : -step / 2);
+            if (b < 0 || b >= n_blocks) continue;
+            const double* low = box + 2 * b * DIM;
+            double apart = 0.0;
             for (int x = 0; x < DIM; ++x) {
-                const vec y = *(const vec*)(place + x * stride + begin) - m[x];
-                squares += y * y;
+                const double d = maximum(maximum(low[x] - m[x], m[x] - low[DIM + x]), 0.0);
+                apart += d * d;
             }
-            for (int lane = 0; any(squares <= farthest) && lane < LANES; ++lane) {
-                const double d = get(squares, lane);
-                const int64_t j = begin + lane, gap = j > i ? j - i : i - j;
-                auto is_before = [&](int64_t s) {
-                    const int64_t other = row[s] > i ? row[s] - i : i - row[s];
-                    return d < far[s] || (d == far[s] && gap < other);
-                };
-                if (j == i || d == HUGE_VAL || !is_before(last)) continue;
-                int64_t s = last;
-                for (; s > 0 && is_before(s - 1); --s) far[s] = far[s - 1], row[s] = row[s - 1];
-                far[s] = d, row[s] = j, farthest = far[last];
+            if (!(apart <= farthest)) continue;
+            for (int64_t begin = b * block; begin < (b + 1) * block; begin += LANES) {
+                vec squares = (vec)(0.0);
+                for (int x = 0; x < DIM; ++x) {
+                    const vec y = *(const vec*)(place + x * stride + begin) - m[x];
+                    squares += y * y;
+                }
+                if (!any(squares <= farthest)) continue;
+                for (int lane = 0; lane < LANES; ++lane) {
+                    const double d = get(squares, lane);
+                    const int64_t j = begin + lane;
+                    if (!(d <= farthest) || j == i || d == HUGE_VAL) continue;
+                    if (n == slots && d == farthest && gap(i, j) >= gap(i, row[last])) continue;
+                    const int64_t at = n < slots ? n++ : last;
+                    far[at] = d, row[at] = j;
+                    if (n < slots) continue;
+                    last = 0;
+                    for (int64_t s = 1; s < slots; ++s)
+                        if (far[s] > far[last] || (far[s] == far[last] && gap(i, row[s]) > gap(i, row[last])))
+                            last = s;
+                    farthest = far[last];
+                }
             }
         }
+        for (int64_t s = n; s < slots; ++s) row[s] = -1;
+        if (n == slots) reach[i] = 1.5 * farthest;  // of the next round, most probably
+        return n;
     }
 
-    // The partners of component i, its nearest ones, and what merges with them cost.
+    // The partners of component i, and what merges with them cost.
     GMM_INLINE void search(int64_t i) {
-        int64_t* row = near + i * slots;
-        for (int64_t s = 0; s < slots; ++s) distance[i * slots + s] = HUGE_VAL, row[s] = -1;
-        const int64_t own = i / BLOCK, most = maximum(own, n_blocks - 1 - own);
-        search_block(i, own);
-        for (int64_t step = 1; step <= most; ++step) {
-            if (own + step < n_blocks) search_block(i, own + step);
-            if (own >= step) search_block(i, own - step);
-        }
-        for (int64_t s = 0; s < slots; ++s) {
-            if (row[s] < 0) continue;
+        int64_t *row = near + i * slots, n = 0;
+        while ((n = nearest(i)) < slots && reach[i] < HUGE_VAL) reach[i] = HUGE_VAL;
+        for (int64_t s = 0; s < n; ++s) {
             const double c = cost(minimum(i, row[s]), maximum(i, row[s]));
             costs[i * slots + s] = c;
             if (!(c <= rule.limit)) row[s] = -1;

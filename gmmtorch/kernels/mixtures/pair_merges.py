@@ -6,6 +6,8 @@ by rounding.
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -15,7 +17,7 @@ _MERGES = {
     dim: FusedKernel("mixtures/pair_merges.h", f"pair_merges<{dim}>", shares=True, rounds_each=True)
     for dim in range(2, 7)  # with attributes up to three more than those of space
 }
-_DIGITS, _BLOCK = 16, 32  # as in the source
+_COUNTS = 16 * 256  # as in selection.h
 
 
 def is_pair_merges_fused(dim: int) -> bool:
@@ -45,12 +47,13 @@ def pair_merges(
     given = order, weights.contiguous(), means.contiguous(), covariances.contiguous()
     made = torch.empty_like(given[1]), torch.empty_like(given[2]), torch.empty_like(given[3])
     members, lead = torch.empty_like(order), torch.empty_like(order)
-    scratch = weights.new_empty((k + 2 * _BLOCK) * (2 + 3 * dim + dim**2 + 2 * neighbors))
+    block = 8 * max(4, math.isqrt(k) // 8)  # about as many blocks as rows in each
+    scratch = weights.new_empty((k + 2 * block) * (3 + 3 * dim + dim**2 + 2 * neighbors))
     whole = order.new_empty(k * (5 + neighbors))
-    counts = torch.empty(_DIGITS * 256, dtype=torch.int32, device=order.device)
+    counts = torch.empty(_COUNTS, dtype=torch.int32, device=order.device)
     failed = torch.zeros(1, dtype=torch.bool, device=order.device)
     team = Team.of(order.device)
-    rule = least, limit, is_hellinger, neighbors
+    rule = least, limit, is_hellinger, neighbors, block
     _MERGES[dim](
         team.n, *team, k, *given, *rule, *made, members, lead, failed, scratch, whole, counts,
         device=order.device,

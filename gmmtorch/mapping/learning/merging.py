@@ -127,30 +127,41 @@ def _choice(
     by: Tensor, seen_from: Tensor, count: Tensor, origins: Tensor, support: Tensor, most: int, limit: int
 ) -> tuple[Tensor, Tensor | None, bool]:
     """The twin of `viewpoint_choice`."""
-    n_rows, left = len(by), count > 0
-    worth, position = count.sqrt(), origins[seen_from]
+    n_rows, is_kept = len(by), count > 0
+    of_each = torch.zeros_like(support).index_add_(0, by, is_kept.to(support))
+    is_used = torch.zeros_like(origins[:, 0]).index_fill_(0, seen_from, 1.0)
+    sizes = torch.stack([is_kept.sum(), of_each.amax() if len(support) else is_kept.sum(), is_used.sum()])
+    n_left, most_left, n_used = sizes.tolist()
+    fits = n_left <= limit and most_left <= most
+    if not fits:
+        gain = _gains(by, count, origins[seen_from], len(support), int(min(most, most_left)))
+        largest = gain.argsort(descending=True, stable=True)[:limit]
+        is_kept = torch.zeros_like(is_kept).index_fill_(0, largest, True) & (gain >= 0)
+    total = torch.zeros_like(support).index_add_(0, by, torch.where(is_kept, count, 0.0))
+    scaled = count * (support / total.clamp_min(torch.finfo(total.dtype).tiny))[by]
+    if fits and n_left == n_rows:
+        return scaled, None, n_used == len(origins)
+    return scaled, is_kept.nonzero().squeeze(1), False
+
+
+def _gains(by: Tensor, count: Tensor, position: Tensor, n: int, most: int) -> Tensor:
+    """√count · distance (E,) at which a viewpoint was chosen; ∞: the first of a component; −1: not chosen."""
+    worth = count.sqrt()
     nearest = torch.ones_like(count)  # distance to the nearest kept origin of the same component
     # A component without a viewpoint that is left chooses one more row at the end, which does not count.
-    rows, left = torch.arange(n_rows, device=by.device), torch.cat([left, left.new_zeros(1)])
-    gain = count.new_full((n_rows + 1,), -1.0)  # √count · distance at which a viewpoint was chosen
-    nowhere = position.new_full((1, origins.shape[1]), torch.inf)
+    n_rows, left = len(by), torch.cat([count > 0, count.new_zeros(1, dtype=torch.bool)])
+    rows, gain = torch.arange(n_rows, device=by.device), count.new_full((n_rows + 1,), -1.0)
+    nowhere = position.new_full((1, position.shape[1]), torch.inf)
     for step in range(most):
-        if not bool(left.any()):
-            break
         score = torch.where(left[:-1], worth * nearest, -1.0)
-        largest = torch.full_like(support, -1.0).scatter_reduce_(0, by, score, "amax")
+        largest = score.new_full((n,), -1.0).scatter_reduce_(0, by, score, "amax")
         best = torch.where(left[:-1] & (score == largest[by]), rows, n_rows)
-        chosen = rows.new_full(support.shape, n_rows).scatter_reduce_(0, by, best, "amin")
+        chosen = rows.new_full((n,), n_rows).scatter_reduce_(0, by, best, "amin")
         gain.scatter_(0, chosen, torch.inf if step == 0 else torch.cat([score, score[:1]])[chosen])
         left.index_fill_(0, chosen, False)
         distance = (position - torch.cat([position, nowhere])[chosen][by]).norm(dim=1)
         nearest = distance if step == 0 else torch.minimum(nearest, distance)
-    is_kept = torch.zeros_like(left[:-1])
-    is_kept[gain[:-1].argsort(descending=True, stable=True)[:limit]] = True
-    is_kept &= gain[:-1] >= 0
-    total = torch.zeros_like(support).index_add_(0, by, torch.where(is_kept, count, 0.0))
-    share = support / total.clamp_min(torch.finfo(total.dtype).tiny)
-    return count * share[by], is_kept.nonzero().squeeze(1), False
+    return gain[:-1]
 
 
 Size = Callable[[Components], int]
@@ -278,8 +289,9 @@ def compact_to_bytes(
     """Merges components until their `size` is at most `max_bytes`; origins are limited as by `limit_origins`.
 
     Beyond that size, components lose their numbers: numbered anew, in the order of space, each takes a byte
-    less. The size, as a power of the number of components that its last two values tell, shall be a
-    thousandth below `max_bytes`, so that few sizes are measured; at first it is proportional.
+    less. Few sizes are measured, because each predicts the next number of components: the size is taken for
+    a power of that number, which the last two sizes tell (the first alone: proportional to it), and aims at
+    a thousandth below `max_bytes`.
 
     Raises `InvalidArgumentError` if a single component with one origin is too large.
     """

@@ -25,7 +25,7 @@ def mixture(k: int, dim: int, seed: int, far: float, thin: float, device: str) -
     return Parameters(*(part.to(device) for part in parts))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     k=st.integers(1, 300),
     dim=st.sampled_from([2, 3, 4]),

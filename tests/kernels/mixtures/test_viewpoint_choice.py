@@ -11,7 +11,7 @@ from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.merging import limit_origins
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     k=st.integers(0, 60),
     n_origins=st.integers(1, 20),
