@@ -45,6 +45,7 @@ _RANGES = {
     dtype: FusedKernel("mixtures/depth_cells.h", f"range_sums<{real}>") for dtype, real in _REAL.items()
 }
 
+_CURVE = {dim: FusedKernel("mixtures/cells.h", f"curve_keys<{dim}>", rounds_each=True) for dim in (1, 2, 3)}
 _MEANS = FusedKernel("mixtures/cells.h", "mean_features")
 _MOST_CELLS_ON_GPU = 1 << 18
 _ORDERED = FusedKernel("mixtures/depth_cells.h", "ordered_cells")
@@ -63,6 +64,14 @@ def distinct_keys(keys: Tensor) -> tuple[Tensor, Tensor]:
     n_distinct = torch.zeros(1, dtype=torch.int64)
     _DISTINCT(1, keys, n, place, n_places, distinct, number, n_distinct, device=keys.device)
     return distinct[: int(n_distinct)], number
+
+
+def curve_keys(points: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """The places (N,), int16, of points (N, D), float64, D ≤ 3, on a curve through the box from `low` to
+    `high` (D,). The twin is in `gmmtorch.linalg`, to the bit."""
+    keys = torch.empty(len(points), dtype=torch.int16, device=points.device)
+    _CURVE[points.shape[1]](len(points), points.contiguous(), low, high, keys, device=points.device)
+    return keys
 
 
 def are_cell_moments_fused(points: Tensor, weight: Tensor | None, max_cells: int) -> bool:
