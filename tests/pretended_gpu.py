@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from types import SimpleNamespace
 from typing import Any
 from unittest import mock
 
@@ -56,6 +57,9 @@ class GPUTensor(Tensor):
     device = property(lambda self: GPU)
     is_cuda = property(lambda self: True)
     is_meta = property(lambda self: False)
+
+    def data_ptr(self) -> int:
+        return self.held.data_ptr()
 
     def __repr__(self, **options: Any) -> str:
         return f"GPUTensor({self.held})"
@@ -223,6 +227,8 @@ def pretended_gpu() -> Iterator[PretendedGPU]:
         stack.enter_context(mock.patch.object(torch, "inference_mode", torch.no_grad))
         for name, value in (("is_available", True), ("device_count", 1), ("_lazy_init", None)):
             stack.enter_context(mock.patch.object(torch.cuda, name, lambda value=value: value))
+        properties = SimpleNamespace(total_memory=1 << 36, multi_processor_count=1)
+        stack.enter_context(mock.patch.object(torch.cuda, "get_device_properties", return_value=properties))
         stack.enter_context(_Dispatch(gpu))
         stack.enter_context(_Functions(gpu))
         yield gpu

@@ -353,7 +353,7 @@ class FreeSpace:
         """How a scan's points (N, D) agree with the space that was seen, at poses (B)."""
         free, unknown = _counted(points, poses, (self._nearest, self._farthest), self._inverse)
         nearest, farthest = range_image(points)
-        still = Pose.identity(poses.dim, 1)
+        still = Pose.identity(poses.dim, 1, device=points.device)
         through, hidden = _counted(self._points, poses.inverse(), (nearest[None], farthest[None]), still)
         share = through / (len(self._points) - hidden).clamp_min(_KEPT_POINTS // 4)
         return View(free / len(points), unknown / len(points), share)

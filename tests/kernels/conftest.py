@@ -1,13 +1,16 @@
-"""Every test of a kernel runs on the CPU, and once more on a GPU where there is one."""
+"""Every test of a kernel runs on the CPU, and once more on a GPU, or (slow) on the pretended one."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from contextlib import ExitStack
 from typing import Any
 
 import pytest
 import torch
+from kernels_of_gpu import kernels_of_gpu
+from pretended_gpu import pretended_gpu
 from torch.overrides import TorchFunctionMode
 
 _MAKE_TENSORS = {
@@ -30,7 +33,10 @@ class _TensorsOnGPU(TorchFunctionMode):
         return made.to("cuda") if from_a_test else made
 
 
-@pytest.fixture(autouse=True, params=["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"])
+_GPU = "cuda" if torch.cuda.is_available() else pytest.param("pretended", marks=pytest.mark.slow)
+
+
+@pytest.fixture(autouse=True, params=["cpu", _GPU])
 def device(request: pytest.FixtureRequest) -> Iterator[str]:
     """The device of tensors for which a test names none; tests marked `cpu_only` skip the GPU."""
     if request.param == "cpu":
@@ -38,5 +44,9 @@ def device(request: pytest.FixtureRequest) -> Iterator[str]:
     elif request.node.get_closest_marker("cpu_only"):
         pytest.skip("computes on the CPU, or chooses its devices itself")
     else:
-        with _TensorsOnGPU():
+        with ExitStack() as stack:
+            if request.param == "pretended":
+                stack.enter_context(pretended_gpu())
+                stack.enter_context(kernels_of_gpu())
+            stack.enter_context(_TensorsOnGPU())
             yield "cuda"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from kernels.cones_for_kernels import cones_of
+from kernels_of_gpu import kernels_of_gpu
 from pretended_gpu import GPUTensor, pretended_gpu
 
 import gmmtorch as gt
@@ -237,3 +238,15 @@ def test_work_goes_on_in_smaller_chunks_where_the_memory_of_the_gpu_ends(work, m
     assert "chunks of" in caplog.text
     for one, other in zip(found, expected, strict=True):
         torch.testing.assert_close(one.held, other, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.slow  # a C++ compiler takes seconds for each kernel
+@pytest.mark.parametrize("work", [*WORK, list_visits, exact_grid_flux, truncated_e_step])
+def test_the_kernels_of_a_gpu_give_the_results_of_the_cpu(work):
+    with kernels("torch"):
+        expected = work("cpu")
+    with pretended_gpu(), kernels_of_gpu():
+        found = work("cuda")
+        assert all(isinstance(part, GPUTensor) for part in found)
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one.held, other, rtol=1e-5, atol=1e-5, check_dtype=False)

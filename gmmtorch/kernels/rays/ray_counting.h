@@ -72,8 +72,9 @@ GMM_INLINE void count_rays(int64_t item, [[maybe_unused]] int64_t n_rays, const 
 #endif
 }
 
-GMM_KERNEL count_rays_in_grid(int64_t item, int64_t n_rays, Rays rays, const double* weights,
-                              double* counts) {
+template <typename Number>
+GMM_KERNEL count_rays_in_grid(int64_t item, int64_t n_rays, Rays rays, const Number* weights,
+                              Number* counts) {
     count_rays(item, n_rays, rays, weights, counts,
                [](auto voxel) { return [=](int l) { return get(voxel, l); }; });
 }

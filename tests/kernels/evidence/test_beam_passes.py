@@ -57,9 +57,9 @@ def test_passes_equal_a_count_along_the_beams(dim):
             end = beam - means[k]
             if square.min() >= 1:
                 continue
-            n_returned += int(hit and end @ precisions[k] @ end < LIMITS.explained)
+            n_returned += int(hit and (end * (precisions[k] @ end)).sum() < LIMITS.explained)
             unit = beam / beam.norm()
-            along = (unit @ precisions[k] @ unit).rsqrt()
+            along = (unit * (precisions[k] @ unit)).sum().rsqrt()
             thinnest = torch.linalg.eigvalsh(covariances[k])[0].sqrt()
             clear = inside.min() > 0 and (1 - inside.max()) * beam.norm() > LIMITS.margin
             n_passed += int(clear and along <= 4 * thinnest)

@@ -36,7 +36,7 @@ def motions_of(n: int, dim: int) -> Pose:
     steps = (
         0.2 * torch.randn(n, dim + dim * (dim - 1) // 2, generator=torch.Generator().manual_seed(1)).double()
     )
-    return Pose.identity(dim, n).moved(steps)
+    return Pose.identity(dim, n, device=steps.device).moved(steps)
 
 
 @pytest.mark.parametrize("dim", [2, 3])

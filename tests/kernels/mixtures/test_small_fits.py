@@ -18,6 +18,8 @@ from gmmtorch.kernels.mixtures import small_fits
 from gmmtorch.mixture.em.by_type import moments_of_labels
 from gmmtorch.mixture.em.exact import COVARIANCE_TYPES, type_shape
 
+pytestmark = pytest.mark.cpu_only
+
 kinds = pytest.mark.parametrize("kind", COVARIANCE_TYPES)
 
 

@@ -57,6 +57,6 @@ def test_counts_equal_those_of_a_loop_over_points_and_images():
 def test_points_without_a_number_or_beyond_all_numbers_are_unknown():
     points = torch.tensor([[math.nan, 0.0], [1e200, 1e200], [math.inf, -1.0]]).double()
     image = torch.ones(1, 8).double()
-    still = Pose.identity(2, 1).parts
+    still = Pose.identity(2, 1, device=points.device).parts
     free, unknown = range_views(points, still, still, (image, image), (8, 1), (math.pi / 4, 0.1, 0.0))
     assert (float(free), float(unknown)) == (0, 3)
