@@ -126,7 +126,7 @@ def _is_fused(*tensors: Tensor | None) -> bool:
     return choice.is_fused(*tensors)
 
 
-def _team(device: torch.device) -> Team:
+def _team(device: torch.device, most: int | None = None) -> Team:
     if device.type == "cpu":
         return Team(1, None)
     return Team(N_THREADS, torch.zeros(1, dtype=torch.int32, device=device))
