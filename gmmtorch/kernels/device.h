@@ -50,8 +50,7 @@ GMM_INLINE void meet(Team& team) {
     if (threadIdx.x == 0) {
         __threadfence();
         atomicAdd(team.arrived, 1);
-        while (*(volatile int*)team.arrived < team.rounds * gridDim.x) {
-        }
+        while (*(volatile int*)team.arrived < team.rounds * gridDim.x) __nanosleep(32);
         __threadfence();
     }
     __syncthreads();
