@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Iterable
 
@@ -11,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
-from gmmtorch.kernels import distinct_keys, is_fused
+from gmmtorch.kernels import curve_keys, distinct_keys, is_fused
 
 _MANY_KEYS = 1 << 12  # from here on a hash table is faster than sorting
 _JITTERS = (1e-12, 1e-10, 1e-8, 1e-6)  # relative to the mean of the diagonal
@@ -119,28 +118,21 @@ def all_equal(pairs: Iterable[tuple[Tensor, Tensor]]) -> bool:
 # -- sorting: NumPy's vectorised sorts on the CPU, torch's elsewhere ------------------------------
 
 
-@functools.cache
-def _morton_bits(dim: int, device: str) -> Tensor:
-    """The bits (32, D) of a cell's number along each axis, at their places in the number of a curve."""
-    spread = [
-        [sum((n >> b & 1) << (b * dim + axis) for b in range(5)) for axis in range(dim)] for n in range(32)
-    ]
-    return torch.tensor(spread, device=device)
-
-
 def order_along_curve(places: Tensor, levels: int = 1) -> Tensor:
     """An order (N,) of finite points (N, D), D ≤ 3, at least one, in which neighbours follow each other.
 
     It is that of a Morton curve through 32^levels cells along each axis of their box; levels: 4 at most.
     """
     low, high = places.aminmax(dim=0)
+    if levels == 1 and places.dtype == torch.float64 and is_fused(places):
+        return curve_keys(places, low, high).argsort(stable=True)
     dim, side = places.shape[1], 1 << 5 * levels
     cell = (places - low) * ((side - 0.01) / (high - low).max().clamp_min(1e-300))
     cell = cell.long().clamp_(0, side - 1)
-    bits, keys = _morton_bits(dim, str(places.device)), cell[:, 0]
+    spread = [[sum((n >> b & 1) << (b * dim + a) for b in range(5)) for a in range(dim)] for n in range(32)]
+    bits, keys = torch.tensor(spread, device=places.device), torch.zeros_like(cell[:, 0])
     for level in reversed(range(levels)):
-        part = torch.gather(bits, 0, cell >> 5 * level & 31 if levels > 1 else cell).sum(1)
-        keys = part if level == levels - 1 else keys << 5 * dim | part
+        keys = keys << 5 * dim | torch.gather(bits, 0, cell >> 5 * level & 31).sum(1)
     return (keys.short() if levels == 1 else keys).argsort(stable=True)
 
 

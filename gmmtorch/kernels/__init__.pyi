@@ -28,6 +28,7 @@ from .mixtures.cell_sums import are_cell_moments_fused as are_cell_moments_fused
 from .mixtures.cell_sums import are_piece_cuts_fused as are_piece_cuts_fused
 from .mixtures.cell_sums import cell_features as cell_features
 from .mixtures.cell_sums import cell_moments as cell_moments
+from .mixtures.cell_sums import curve_keys as curve_keys
 from .mixtures.cell_sums import depth_cells as depth_cells
 from .mixtures.cell_sums import distinct_keys as distinct_keys
 from .mixtures.cell_sums import piece_cuts as piece_cuts

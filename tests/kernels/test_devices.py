@@ -122,6 +122,24 @@ def truncated_e_step(device):
     return found.statistics, found.owner
 
 
+def learn_depth_images(device):
+    """Two windows of images of a wavy wall, and the predictions of the second."""
+    row, column = torch.meshgrid(torch.arange(48.0), torch.arange(64.0), indexing="ij")
+    frames = []
+    for number in range(4):
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[0, 3] = 0.3 * number
+        depth = 2 + 0.3 * torch.sin(0.1 * column + 0.07 * row + 0.2 * number)
+        depth[:4, number::7] = torch.nan
+        frames.append((depth.to(device), pose))
+    built = gt.GaussianMap(gt.IncrementalRule(noise=0.01, length=0.3, cell=0.05, window=2), codec="float")
+    built.insert_depth(frames, [[50.0, 0.0, 32.0], [0.0, 50.0, 24.0], [0.0, 0.0, 1.0]], pixel_stride=1)
+    found = built.unrounded()
+    order = found.means[:, 0].argsort()
+    coefficients = torch.tensor(built.query_options.calibration.coefficients, device=device)
+    return found.means[order], found.covariances[order], found.support[order], coefficients
+
+
 WORK = [
     add_rays,
     add_sparse_rays,
@@ -131,6 +149,7 @@ WORK = [
     fit_mixture,
     pytest.param(build_and_ask_a_map, marks=pytest.mark.slow),
     pytest.param(colour_a_map, marks=pytest.mark.slow),
+    pytest.param(learn_depth_images, marks=pytest.mark.slow),
 ]
 
 

@@ -48,6 +48,7 @@ _VALUES = {
     dtype: FusedKernel("mixtures/cells.h", f"value_sums<{real}>", shares=True)
     for dtype, real in _REAL.items()
 }
+_CURVE = {dim: FusedKernel("mixtures/cells.h", f"curve_keys<{dim}>", rounds_each=True) for dim in (1, 2, 3)}
 _MEANS = FusedKernel("mixtures/cells.h", "mean_features")
 _MOST_CELLS_ON_GPU = 1 << 18
 _FACTORS = np.array([2 ** (-step / 3) for step in range(3 * KEY_BITS + 7)])
@@ -67,6 +68,14 @@ def distinct_keys(keys: Tensor) -> tuple[Tensor, Tensor]:
     n_distinct = torch.zeros(1, dtype=torch.int64)
     _DISTINCT(1, keys, n, place, n_places, distinct, number, n_distinct, device=keys.device)
     return distinct[: int(n_distinct)], number
+
+
+def curve_keys(points: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """The places (N,), int16, of points (N, D), float64, D ≤ 3, on a curve through the box from `low` to
+    `high` (D,). The twin is in `gmmtorch.linalg`, to the bit."""
+    keys = torch.empty(len(points), dtype=torch.int16, device=points.device)
+    _CURVE[points.shape[1]](len(points), points.contiguous(), low, high, keys, device=points.device)
+    return keys
 
 
 def are_cell_moments_fused(points: Tensor, weight: Tensor | None, max_cells: int) -> bool:

@@ -133,6 +133,22 @@ GMM_KERNEL value_sums(int64_t item, const Real* values, int64_t n_columns, const
     }
 }
 
+// An item is a point: the number of its cell, of 32 along each axis of the box, on a Morton curve.
+template <int DIM>
+GMM_KERNEL curve_keys(int64_t item, const double* points, const double* low, const double* high,
+                      int16_t* keys) {
+    double side = 1e-300;
+    for (int a = 0; a < DIM; ++a) side = maximum(side, high[a] - low[a]);
+    const double scale = 31.99 * (1.0 / side);
+    int64_t key = 0;
+    for (int a = 0; a < DIM; ++a) {
+        const int64_t cell = (int64_t)((points[item * DIM + a] - low[a]) * scale);
+        const int64_t within = minimum(maximum(cell, (int64_t)0), (int64_t)31);
+        for (int b = 0; b < 5; ++b) key |= (within >> b & 1) << (b * DIM + a);
+    }
+    keys[item] = (int16_t)key;
+}
+
 // One item numbers all keys, in the order of their first occurrences.
 GMM_KERNEL distinct_keys(int64_t, const int64_t* keys, int64_t n_keys, int64_t* place, int64_t n_places,
                          int64_t* distinct, int64_t* number, int64_t* n_distinct) {

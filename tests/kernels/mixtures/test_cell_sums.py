@@ -16,7 +16,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import kernels
 from gmmtorch.kernels.compiler import Team
 from gmmtorch.kernels.mixtures.cell_sums import CutRule, DepthViews, depth_cells, distinct_keys, piece_cuts
-from gmmtorch.linalg import dense_ranks
+from gmmtorch.linalg import dense_ranks, order_along_curve
 from gmmtorch.mapping.attributes.moments import _cell_sums
 from gmmtorch.mapping.learning.fitting import DepthFrame, PooledFrames, mean_range, pool_frames
 from gmmtorch.mixture.em.exact import quadratic_features, shift_features
@@ -213,6 +213,18 @@ def test_hashed_ranks_equal_the_sorted_ones(kind):
     found = by_both(lambda: dense_ranks(keys))
     assert torch.equal(found[0][0], found[1][0])
     assert found[0][1] == found[1][1] == keys.unique().numel()
+
+
+@given(
+    n=st.integers(1, 200),
+    dim=st.sampled_from([1, 2, 3]),
+    seed=st.integers(0, 10_000),
+    scale=st.sampled_from([0.0, 1e-305, 1e-3, 1.0, 1e8]),
+)
+def test_the_order_along_a_curve_is_that_of_the_twin(n, dim, seed, scale):
+    places = torch.randn(n, dim, generator=torch.Generator().manual_seed(seed)).double() * scale
+    twin, fused = by_both(lambda: order_along_curve(places))
+    assert torch.equal(fused, twin)
 
 
 @pytest.mark.cpu_only
