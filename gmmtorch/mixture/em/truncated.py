@@ -50,8 +50,8 @@ class Settings:
     reg_covar: added to each variance (m²). tol: EM stops when the bound increases by less (nats a
     point). max_iter: largest number of iterations. dtype: of the E-step; float32 is replaced by float64
     where its error is too large, and in the fused kernel. n_candidates: components that each row is
-    compared with. on_iteration: called with the iteration, from 1, and the bound. processes: processes that share the
-    fit, each with its own rows. previous_bound: bound of the fit that this one continues.
+    compared with. on_iteration: called with the iteration, from 1, and the bound. processes: those that share
+    the fit, each with its own rows. previous_bound: bound of the fit that this one continues.
     """
 
     reg_covar: float = 1e-6
