@@ -74,13 +74,9 @@ def painted(components: Components, seed: int = 0, n_labels: int = 3) -> Compone
     def numbers(share: Tensor, width: int, scale: float) -> Numbers:
         noise = scale * (uniform(k, width, width) - 0.5)
         covariance = noise @ noise.mT + 1e-4 * scale**2 * torch.eye(width, dtype=torch.float64)
-        parts = (uniform(k, width), uniform(k, width, dim) - 0.5, covariance)
-        has = (share > 0).double()
-        return Numbers(
-            share,
-            *(scale * p * has.view(-1, *[1] * (p.ndim - 1)) for p in parts[:2]),
-            parts[2] * has[:, None, None],
-        )
+        mean, slope = uniform(k, width), uniform(k, width, dim) - 0.5
+        has = (share > 0).double()[:, None]
+        return Numbers(share, scale * mean * has, scale * slope * has[..., None], covariance * has[..., None])
 
     classes = torch.softmax(8 * uniform(k, n_labels), 1)
     channels = {

@@ -223,7 +223,7 @@ def exponent_floor(dtype: torch.dtype) -> float:
     return -80.0 if dtype == torch.float32 else -700.0
 
 
-DIMENSIONS = (1, 2, 3)
+DIMENSIONS: tuple[int, ...] = (1, 2, 3)
 
 _NATURALS = {dim: FusedKernel("mixtures/m_step.h", f"natural_parameters<{dim}>") for dim in DIMENSIONS}
 _STEPS = {dim: FusedKernel("mixtures/m_step.h", f"m_step<{dim}>") for dim in DIMENSIONS}
