@@ -175,6 +175,7 @@ def against(options: Any) -> Iterator[Row]:
     for _ in range(options.repeats):  # in turn, because the load of a shared machine changes
         for folder in (other, this):
             command = [sys.executable, str(this / "benchmarks/public_work.py"), "--data", str(options.data)]
+            command += ["--only", *options.works] if options.works else []
             environment = {**os.environ, "PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1"}
             done = subprocess.run(command, cwd=folder, env=environment, check=True, stdout=subprocess.PIPE)
             for name, result in json.loads(done.stdout.splitlines()[-1]).items():
@@ -364,5 +365,5 @@ if __name__ == "__main__":
         rays={"type": int, "default": 1_000_000},
         points={"type": int, "default": 200_000},
         repeats={"type": int, "default": 3},
-        works={"nargs": "*", "help": "of the devices: parts of names"},
+        works={"nargs": "*", "help": "of against and devices: parts of names"},
     )

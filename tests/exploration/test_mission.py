@@ -193,7 +193,7 @@ def test_no_coordination_collides(world: World, coordination: str) -> None:
 
 HERE = (2.0, 2.0, 1.3, 0.0)
 BAD: dict[str, dict[str, Any]] = {
-    r"start\[1\].*is in a solid": {"start": (HERE, (4.8, 4.0, 1.3, 0.0))},
+    r"start\[1\].*is in a solid": {"start": (HERE, (8.0, 6.0, 0.55, 0.0))},
     r"start\[1\].*outside": {"start": (HERE, (-4.0, 4.0, 1.3, 0.0))},
     r"start\[1\].*not finite": {"start": (HERE, (float("nan"), 4.0, 1.3, 0.0))},
     "start has shape": {"start": (HERE,)},

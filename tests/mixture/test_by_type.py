@@ -230,7 +230,9 @@ def test_variational_moments_of_a_type_are_those_of_features(kind, dim):
     )
     log_weight = torch.tensor([-1.0, -3.0, -0.5], dtype=torch.float64)
     given = (points, points.new_ones(200), log_weight, full, 1e-3, torch.float64)
-    expected, value = variational_bayes._expected_moments(em.quadratic_features(points), *given)
+    expected, value = variational_bayes._expected_moments(
+        (em.quadratic_features(points), points.new_ones(200)), *given
+    )
     factors = by_type.Factors(parameters._replace(weights=full.weights), kind)
     found, same = variational_bayes._typed_moments(*given[:3], factors, 1e-3, torch.float64)
     projected = by_type.compacted(expected, kind).covariances
