@@ -7,8 +7,9 @@ Only the robot's yaw rotates the camera.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -126,6 +127,10 @@ class DepthCamera(CameraOptions):
     @cached_property
     def _moved(self) -> dict[torch.device, Tensor]:
         return {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a pickle keeps: the fields, without tensors that were computed from them, maybe on a GPU."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
 def _distance_to_spheres(centers: Tensor, radius: float, directions: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import pickle
 
 import pytest
 import torch
@@ -215,3 +216,11 @@ def test_sense_rejects_poses_and_teammates_that_are_not_finite():
         EXACT.sense(ROOM, pose(math.nan, 0, 0), NO_TEAMMATES, 0.3, seeded())
     with pytest.raises(InvalidArgumentError, match="others="):
         EXACT.sense(ROOM, pose(1, 1, 1), NO_TEAMMATES.new_full((1, 3), math.inf), 0.3, seeded())
+
+
+def test_a_pickled_camera_has_no_tensors_that_it_computed():
+    camera = DepthCamera(40, 30)
+    before = pickle.dumps(camera)
+    camera.beams(ROOM, pose(4.0, 3.0, 1.0))
+    assert pickle.dumps(camera) == before
+    assert torch.equal(pickle.loads(before).directions, camera.directions)
