@@ -304,10 +304,10 @@ def _slid(found: Alignment, points: Tensor) -> Pose:
     return found.motions[[0] * _SLIDES].moved(steps[:, None] * axis)
 
 
-def nowhere(dim: int) -> Tensor:
-    """The covariance (F, F) of a pose that no scan confirms."""
-    deviations = torch.full((dim * (dim + 1) // 2,), LOST[1]).double()
-    deviations[:dim] = LOST[0]
+def nowhere(dim: int, shift: float = LOST[0], turn: float = LOST[1]) -> Tensor:
+    """The covariance (F, F) of a pose that no scan confirms, with these deviations (m, rad)."""
+    deviations = torch.full((dim * (dim + 1) // 2,), turn).double()
+    deviations[:dim] = shift
     return torch.diag(deviations.square())
 
 

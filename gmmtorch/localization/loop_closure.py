@@ -53,8 +53,9 @@ def closed(
     parts: Tensor,
     least_explained: float,
     rule: WindowedRule,
-) -> Edges:
-    """The edges of a pose graph, with those of the loop closures that can be found.
+) -> tuple[Pose, Edges]:
+    """Poses near those that agree best, and the edges of a pose graph, with those of the loop closures that
+    can be found.
 
     Args:
         poses: (N), world ← sensor. edges: of odometry.
@@ -62,8 +63,11 @@ def closed(
             the sensor was lost, and the poses of one relative to the other are a guess.
     """
     tried: set[tuple[int, int]] = set()
+    closures: list[_Closure] = []
+    numbers = torch.tensor([number for number, _ in places])
+    begins = numbers[1:][parts[1:] != parts[:-1]]
     for _ in range(_ROUNDS):
-        at = poses.translation[[number for number, _ in places]]
+        at = poses.translation[numbers]
         pairs = [pair for pair in _candidates(at, parts=parts) if pair not in tried]
         found = [
             edge
@@ -73,9 +77,24 @@ def closed(
         tried.update(pairs)
         if not found:
             break
+        closures += found
         edges = edges.joined(_edges(found))
-        poses = optimised(poses, edges, with_covariances=False).poses
-    return edges
+        poses = optimised(_put_together(poses, closures, begins), edges, with_covariances=False).poses
+    return poses, edges
+
+
+def _put_together(poses: Pose, closures: Sequence[_Closure], begins: Tensor) -> Pose:
+    """The poses (N), with each part of them moved to where most of its closures with earlier ones agree: a
+    pose graph does not find it from far away. begins: (P − 1,) first poses of the parts but the first one."""
+    part = torch.bucketize(torch.arange(len(poses)), begins, right=True)
+    for number in range(1, len(begins) + 1):
+        across = [c for c in closures if part[c.source] < number == part[c.target]]
+        if not across:
+            continue
+        best = max(across, key=lambda one: sum(_agree(poses, one, other) for other in across))
+        moved = poses[best.source] @ best.motion @ poses[best.target].inverse()
+        poses = Pose.cat([poses[part < number], moved @ poses[part >= number]])
+    return poses
 
 
 class LoopCloser:
@@ -154,7 +173,7 @@ def _candidates(
     """Pairs (old, new) of rows of keyframes that may be at one place: for each new one, the nearest.
 
     at: positions (K, D) of the keyframes. rows: new ones; None: every third. parts: (K,), see `closed`: of
-    other parts, keyframes may be nearer in time.
+    other parts, keyframes may be nearer in time, but a part of one or two is no map to search in.
     """
     if not len(at):
         return []
@@ -165,7 +184,7 @@ def _candidates(
     reach = (_REACH + _DRIFT * (path[new, None] - path)).clamp_max(_FARTHEST)
     is_apart = new[:, None] - order >= _APART
     if parts is not None:
-        is_other = parts[new, None] > parts
+        is_other = (parts[new, None] > parts) & (torch.bincount(parts)[parts] >= _SPACING)
         is_apart |= is_other
         reach = torch.where(is_other, _FROM_LOST, reach)
     allowed = is_apart & (gap <= reach)
@@ -192,12 +211,13 @@ def _closure(
     around_old = [row for row in around if row != old and (parts is None or parts[row] == parts[old])]
     order = [*around_old, old]  # the last one is the centre of a local map
     is_lost = parts is not None and bool(parts[old] != parts[new])
-    reach = (_FARTHEST, math.pi) if is_lost else (_REACH, 3 * _ANGLE)
+    reach = (_FROM_LOST, math.pi) if is_lost else (_REACH, 3 * _ANGLE)
     local = LocalMap(
         [places[row][1]._replace(pose=poses[places[row][0]]) for row in order], least_explained, rule
     )
     source, target = places[old][0], places[new][0]
-    expected = Expectation(poses[[target]], _REACH / 2, _ANGLE, _MOST_EXPLAINED, *reach)
+    width = (_FROM_LOST, math.pi) if is_lost else (_REACH / 2, _ANGLE)
+    expected = Expectation(poses[[target]], *width, _MOST_EXPLAINED, *reach)
     location = local.locate(places[new][1], expected)
     if not location.found or location.explained < _MOST_EXPLAINED:
         return None

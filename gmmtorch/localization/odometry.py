@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -32,6 +33,8 @@ _KEYFRAMES = 10  # in the local map,
 _MANY_KEYFRAMES = 80  # or of a sensor that looks in one direction
 _NARROW = 0.8  # length of the mean direction of its points; 0.64 for a half circle, 0.9 for a cone of 70°
 _GIVEN_UP = 3  # lost scans in a row, after which the next one begins a new local map
+_ANYWHERE = 100.0, math.pi  # deviations (m, rad) of a map that begins, from the one before
+_LEAST_CLOSURES = 2  # that join two maps: one alone may be wrong
 _APART = "the sensor was lost before, and no place that it saw later is known from before"
 _LONGEST_GAP = 2  # steps that a sensor may have moved since the last pose that was found, at most
 _FEWEST = 10  # returns of a scan that can be located
@@ -219,7 +222,7 @@ class Odometry:
         if loops:
             places = list(zip(self._frames, self.keyframes, strict=True))
             parts = torch.bucketize(torch.arange(len(places)), torch.tensor(self._parts), right=True)
-            edges = closed(poses, edges, places, parts, self.least_explained, self.rule)
+            poses, edges = closed(poses, edges, places, parts, self.least_explained, self.rule)
         best = optimised(poses, edges)
         used = edges.is_closure & (best.weights > 0.5)
         doubts = tuple("; ".join(location.doubts) for location in self._locations)
@@ -328,6 +331,9 @@ class Odometry:
         is_new = begins or (location.found and self._is_new(pose))
         if is_new and len(scan.points) >= _FEWEST:
             if begins:
+                if self._edges:  # a closure decides where the new map is, not the guess
+                    anywhere = replace(location, covariance=nowhere(pose.dim, *_ANYWHERE))
+                    self._edges[-1] = (*self._edges[-1][:2], information_of(anywhere))
                 self._parts.append(len(self.keyframes))
                 self._lost, self._last_found = [], number
             self._last_frame = number
@@ -369,11 +375,12 @@ class Odometry:
         return bool(off.translation.norm() >= self.distance) or bool(off.chord() >= self.angle)
 
     def _is_apart(self, closures: Edges) -> Tensor:
-        """Whether the map of each scan (N,) is joined with the first one by no closure, directly or not."""
+        """Whether the map of each scan (N,) is not joined with the first one by closures, directly or not."""
         begins = torch.tensor([self._frames[row] for row in self._parts[1:]], dtype=torch.int64)
         n, part = len(begins) + 1, torch.bucketize(torch.arange(len(self._poses)), begins, right=True)
         ends = part[closures.source].numpy(), part[closures.target].numpy()
-        links = coo_matrix((torch.ones(len(closures.source)).numpy(), ends), shape=(n, n))
+        links = coo_matrix((torch.ones(len(closures.source)).numpy(), ends), shape=(n, n)).tocsr()
+        links = links + links.T >= _LEAST_CLOSURES
         _, group = connected_components(links, directed=False)
         return torch.from_numpy(group != group[0])[part]
 

@@ -13,6 +13,9 @@ from scipy.optimize import least_squares
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.localization import Odometry, loop_closure
+from gmmtorch.localization.local_map import nowhere
+from gmmtorch.localization.loop_closure import _Closure, _edges, _put_together
+from gmmtorch.localization.odometry import _ANYWHERE
 from gmmtorch.localization.pose_graph import Edges, _moved, optimised, residuals
 from gmmtorch.pose import Pose
 
@@ -188,3 +191,30 @@ def test_scans_that_are_no_keyframes_are_not_searched_for():
         odometry.add(points(message))
         assert not odometry.close_loops()
     assert len(odometry.keyframes) == 1
+
+
+@pytest.mark.parametrize(("right", "wrong"), [(2, 0), (1, 0), (2, 1), (1, 1)])
+def test_two_closures_that_agree_move_a_map_that_began_after_the_sensor_was_lost(right, wrong):
+    true = Pose.from_yaw(0.2 * torch.arange(8).double(), 2.0 * torch.arange(16).double().view(8, 2))
+    off = Pose.from_yaw(torch.tensor(math.radians(97)).double(), torch.tensor([13.0, -6.0]).double())
+    guess = Pose.cat([true[:4], off @ true[4:]])  # the sensor was lost between poses 3 and 4
+    source, target = torch.arange(7), torch.arange(1, 8)
+    sure = torch.linalg.inv(nowhere(2, 0.02, 0.005))
+    information = sure.repeat(7, 1, 1)
+    information[3] = torch.linalg.inv(nowhere(2, *_ANYWHERE))
+    edges = Edges(source, target, guess[source].inverse() @ guess[target], information, source < 0)
+    found = [
+        _Closure(one, other, true[one].inverse() @ true[other], sure)
+        for one, other in [(1, 6), (2, 5)][:right]
+    ]
+    found += [_Closure(0, 7, Pose.from_yaw(3.0, torch.tensor([1.0, 2.0]).double()), sure)][:wrong]
+    edges = edges.joined(_edges(found))
+    best = optimised(_put_together(guess, found, torch.tensor([4])), edges)
+    odometry = Odometry()
+    odometry._poses, odometry._frames = [guess[row] for row in range(8)], list(range(8))
+    odometry._parts = [0, 4]
+    used = edges.is_closure & (best.weights > 0.5)
+    is_joined = right == 2
+    assert odometry._is_apart(edges.at(used)).tolist() == [False] * 4 + [not is_joined] * 4
+    if is_joined:
+        assert float((best.poses.translation - true.translation).norm(dim=1).max()) < 0.01
