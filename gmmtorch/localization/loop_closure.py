@@ -64,7 +64,7 @@ def closed(
     """
     tried: set[tuple[int, int]] = set()
     closures: list[_Closure] = []
-    numbers = torch.tensor([number for number, _ in places])
+    numbers = torch.tensor([number for number, _ in places], dtype=torch.int64)
     begins = numbers[1:][parts[1:] != parts[:-1]]
     for _ in range(_ROUNDS):
         at = poses.translation[numbers]
