@@ -30,7 +30,9 @@ def use_kernels(choice: str) -> None:
     """
     _check(choice, "kernels")
     if choice == "fused":
-        _require_compiler(None)
+        import torch
+
+        _require_compiler(torch.device("cpu"))
     _chosen[:] = [choice]
 
 
@@ -89,15 +91,10 @@ def _check(choice: str, name: str) -> None:
         raise InvalidArgumentError(f"{name}={choice!r} is not one of {', '.join(KERNELS)}.")
 
 
-def _failure(device: torch.device | None) -> str | None:
-    """Of the kernels on this device; None: on the CPU."""
+def _require_compiler(device: torch.device) -> None:
     from gmmtorch.kernels.compiler import compiler_failure
 
-    return compiler_failure() if device is None or device.type == "cpu" else compiler_failure(device)
-
-
-def _require_compiler(device: torch.device | None) -> None:
-    failure = _failure(device)
+    failure = compiler_failure(device)
     if failure is not None:
         raise GmmTorchError(
             f"kernels=fused needs the kernel compiler, but {failure}; install it with "
@@ -106,7 +103,9 @@ def _require_compiler(device: torch.device | None) -> None:
 
 
 def _compiler_works(device: torch.device) -> bool:
-    failure = _failure(device)
+    from gmmtorch.kernels.compiler import compiler_failure
+
+    failure = compiler_failure(device)
     if failure is not None and failure not in _reported:
         _reported.add(failure)
         logger.info("Tensor operations replace fused kernels, because %s.", failure)

@@ -365,8 +365,6 @@ if hasattr(os, "register_at_fork"):
 
 
 _PROBE = FusedKernel("probe.h", "probe")
-
-
 _CPU = torch.device("cpu")
 
 

@@ -22,10 +22,11 @@ GMM_INLINE int64_t bits_of(double x) {
 }
 
 constexpr int DIGITS = 16;  // of 8 bits
+constexpr int SELECTION_COUNTS = 256 * DIGITS;
 
 // Finds the cut up to which there are as many numbers as `wanted(their count)`; returns how many that are.
 // number(i, x, y): whether item i of n has a number, and its two halves; no number occurs twice. counts
-// (DIGITS, 256): zeros. All workers call it, and have met before.
+// (SELECTION_COUNTS,): zeros. All workers call it, and have met before.
 template <typename Wanted, typename Number>
 GMM_INLINE int64_t select_smallest(Team& team, int64_t item, int64_t n, int* counts, Cut& cut, Wanted wanted,
                                    Number number) {

@@ -211,12 +211,13 @@ def _closure(
     around_old = [row for row in around if row != old and (parts is None or parts[row] == parts[old])]
     order = [*around_old, old]  # the last one is the centre of a local map
     is_lost = parts is not None and bool(parts[old] != parts[new])
-    reach = (_FROM_LOST, math.pi) if is_lost else (_REACH, 3 * _ANGLE)
     local = LocalMap(
         [places[row][1]._replace(pose=poses[places[row][0]]) for row in order], least_explained, rule
     )
     source, target = places[old][0], places[new][0]
-    width = (_FROM_LOST, math.pi) if is_lost else (_REACH / 2, _ANGLE)
+    width, reach = (_REACH / 2, _ANGLE), (_REACH, 3 * _ANGLE)
+    if is_lost:
+        width = reach = _FROM_LOST, math.pi
     expected = Expectation(poses[[target]], *width, _MOST_EXPLAINED, *reach)
     location = local.locate(places[new][1], expected)
     if not location.found or location.explained < _MOST_EXPLAINED:

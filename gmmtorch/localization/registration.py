@@ -361,8 +361,7 @@ class Overlap(NamedTuple):
 
 def overlap(source: Parameters, target: Parameters, motions: Pose, pairs: Pairs) -> Overlap:
     """Log score, gradient, information and scatter of each motion, over the given pairs only."""
-    sums = _batched_sums(source, target, motions, pairs)
-    total, first, second, squares = sums
+    total, first, second, squares = _batched_sums(source, target, motions, pairs)
     scale = total.clamp_min(1e-300)[:, None]
     gradient = first / scale
     scatter = squares / scale[:, None] - gradient[:, :, None] * gradient[:, None]

@@ -18,7 +18,7 @@ import gmmtorch.kernels
 from gmmtorch.errors import GmmTorchError
 from gmmtorch.kernels import compiler
 from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel
-from gmmtorch.kernels.mixtures import cell_sums, em_loops
+from gmmtorch.kernels.mixtures import cell_sums, em_loops, pair_merges
 from gmmtorch.kernels.rays import beam_information
 
 pytestmark = pytest.mark.cpu_only
@@ -83,13 +83,13 @@ def test_every_kernel_of_a_source_is_launched_under_a_name_of_its_own():
 
 def test_constants_of_the_sources_are_those_of_the_modules(tmp_path):
     names = ["LANES", "BLOCK", "KEY_BITS", "REACH", "PATCH", "REACHED", "WORTHLESS", "IMAGE_ODDS"]
-    names.append("MERGED")
+    names += ["MERGED", "SELECTION_COUNTS"]
     body = " ".join(f"x[{place}] = {name};" for place, name in enumerate(names))
     found = torch.zeros(len(names)).double()
     sources = FOLDER / "mixtures/depth_cells.h", FOLDER / "rays/beam_information.h"
-    sources += (FOLDER / "mixtures/em_loops.h",)
+    sources += FOLDER / "mixtures/em_loops.h", FOLDER / "selection.h"
     kernel_of(tmp_path, body, *sources)(1, found, device=found.device)
-    modules = [compiler, compiler, *[cell_sums] * 3, *[beam_information] * 3, em_loops]
+    modules = [compiler, compiler, *[cell_sums] * 3, *[beam_information] * 3, em_loops, pair_merges]
     values = [
         getattr(module, {"LANES": "CPU_LANES", "BLOCK": "_BLOCK"}.get(name, name))
         for module, name in zip(modules, names, strict=True)

@@ -1,7 +1,7 @@
 // M-step of EM with its extrapolation, and natural parameters. An item is a component.
 #pragma once
 
-#include "../device.h"
+#include "../jacobi.h"
 
 namespace gmm {
 
@@ -49,34 +49,12 @@ GMM_KERNEL natural_parameters(int64_t item, const double* weights, const double*
     w[0] = log_weight - half_log_det - 0.5 * (DIM * 1.8378770664093453 + across);
 }
 
-// By Jacobi's rotations.
 template <int DIM>
 GMM_INLINE double least_eigenvalue(const double* matrix) {
-    double x[DIM][DIM];
+    double x[DIM][DIM], axes[DIM][DIM];
     for (int a = 0; a < DIM; ++a)
         for (int b = 0; b < DIM; ++b) x[a][b] = matrix[a * DIM + b];
-    for (int sweep = 0; sweep < 30; ++sweep) {
-        double off = 0.0, on = 0.0;
-        for (int a = 0; a < DIM; ++a)
-            for (int b = 0; b < DIM; ++b) (a == b ? on : off) += x[a][b] * x[a][b];
-        if (!(off > 1e-32 * on)) break;
-        for (int a = 0; a < DIM; ++a)
-            for (int b = a + 1; b < DIM; ++b) {
-                if (x[a][b] == 0.0) continue;
-                const double w = (x[b][b] - x[a][a]) / (2.0 * x[a][b]);
-                const double t = (w < 0.0 ? -1.0 : 1.0) / (fabs(w) + sqrt(w * w + 1.0));
-                const double cosine = 1.0 / sqrt(t * t + 1.0), sine = t * cosine;
-                const double turn = t * x[a][b];
-                x[a][a] -= turn, x[b][b] += turn;
-                x[a][b] = x[b][a] = 0.0;
-                for (int k = 0; k < DIM; ++k) {
-                    if (k == a || k == b) continue;
-                    const double y = x[k][a], z = x[k][b];
-                    x[k][a] = x[a][k] = cosine * y - sine * z;
-                    x[k][b] = x[b][k] = sine * y + cosine * z;
-                }
-            }
-    }
+    diagonalize<DIM>(x, axes);
     double least = x[0][0];
     for (int a = 1; a < DIM; ++a) least = minimum(least, x[a][a]);
     return least;

@@ -17,7 +17,8 @@ _MERGES = {
     dim: FusedKernel("mixtures/pair_merges.h", f"pair_merges<{dim}>", shares=True, rounds_each=True)
     for dim in range(2, 7)  # with attributes up to three more than those of space
 }
-_COUNTS = 16 * 256  # as in selection.h
+SELECTION_COUNTS = 16 * 256
+"""Counts by which a team finds the smallest numbers, as in `selection.h`."""
 
 
 def is_pair_merges_fused(dim: int) -> bool:
@@ -50,7 +51,7 @@ def pair_merges(
     block = 8 * max(4, math.isqrt(k) // 8)  # about as many blocks as rows in each
     scratch = weights.new_empty((k + 2 * block) * (3 + 3 * dim + dim**2 + 2 * neighbors))
     whole = order.new_empty(k * (5 + neighbors))
-    counts = torch.empty(_COUNTS, dtype=torch.int32, device=order.device)
+    counts = torch.empty(SELECTION_COUNTS, dtype=torch.int32, device=order.device)
     failed = torch.zeros(1, dtype=torch.bool, device=order.device)
     team = Team.of(order.device)
     rule = least, limit, is_hellinger, neighbors, block

@@ -281,12 +281,7 @@ GMM_KERNEL alignment(int64_t item, Team team, const double* points, int64_t n_po
                                       n_points * (part + 1) / n_parts, target, partial + piece * N_SUMS);
         }
         meet(team);
-        for (int64_t piece = item; piece < n_motions * N_SUMS; piece += team.n) {
-            double sum = 0.0;
-            for (int64_t part = 0; part < n_parts; ++part)
-                sum += partial[(piece / N_SUMS * n_parts + part) * N_SUMS + piece % N_SUMS];
-            climbs[piece / N_SUMS].sums[piece % N_SUMS] = sum;
-        }
+        add_parts(item, team, n_motions, n_parts, partial, climbs);
         meet(team);
         for (int64_t b = item; b < n_motions; b += team.n) {
             Aligning<DIM>& climb = climbs[b];

@@ -2,6 +2,7 @@
 // workers need to decide, such as sums over components, each computes for itself: they need not wait.
 #pragma once
 
+#include "../jacobi.h"
 #include "pair_overlap.h"
 
 namespace gmm {
@@ -57,7 +58,7 @@ GMM_INLINE double extents(const double* covariance, double* least, double* large
     double a[DIM][DIM], axes[DIM][DIM], all = 1.0;
     for (int i = 0; i < DIM; ++i)
         for (int j = 0; j < DIM; ++j) a[i][j] = covariance[maximum(i, j) * DIM + minimum(i, j)];
-    diagonalise<DIM>(a, axes);
+    diagonalize<DIM>(a, axes);
     int thin = 0;
     *largest = 0.0;
     for (int i = 0; i < DIM; ++i) {
@@ -217,7 +218,7 @@ GMM_INLINE void propose(Climb<DIM>& climb, double radius, double thickness) {
                     missing[j][i] = pass ? missing[i][j] : other;
                 }
         }
-        diagonalise<FREE>(missing, axes);
+        diagonalize<FREE>(missing, axes);
         solve_lower<FREE>(root, slope);
         double part[FREE], moves = 0.0;
         for (int k = 0; k < FREE; ++k) {
@@ -391,12 +392,7 @@ GMM_KERNEL registration(int64_t item, Team team, int64_t n_source, const double*
                                    moved + row * POSE, partial + piece * N_SUMS);
             }
             meet(team);
-            for (int64_t piece = item; piece < n * N_SUMS; piece += team.n) {
-                double sum = 0.0;
-                for (int64_t part = 0; part < n_parts; ++part)
-                    sum += partial[(piece / N_SUMS * n_parts + part) * N_SUMS + piece % N_SUMS];
-                climbs[piece / N_SUMS].sums[piece % N_SUMS] = sum;
-            }
+            add_parts(item, team, n, n_parts, partial, climbs);
             meet(team);
             for (int64_t b = item; b < n; b += team.n) {
                 State& climb = climbs[b];
@@ -450,7 +446,7 @@ GMM_KERNEL registration(int64_t item, Team team, int64_t n_source, const double*
                         rest[3 + i * FREE + j] = hessian[i][j];
                         hessian[i][j] /= (i < DIM ? 1.0 : radius) * (j < DIM ? 1.0 : radius);
                     }
-                diagonalise<FREE>(hessian, axes);
+                diagonalize<FREE>(hessian, axes);
                 for (int i = 0; i < FREE; ++i) least = minimum(least, hessian[i][i]);
                 rest[2] = least > 0.0 ? 1.0 / sqrt(least) : INFINITY;
             }

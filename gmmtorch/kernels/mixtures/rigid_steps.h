@@ -1,4 +1,4 @@
-// Small symmetric matrices, and steps on rigid motions, for searches of the best motion.
+// Factors of small matrices, and steps on rigid motions, for searches of the best motion.
 #pragma once
 
 #include "../device.h"
@@ -10,38 +10,6 @@ CUDA_CALLABLE constexpr int n_of_pose(int dim) { return dim * dim + dim; }
 
 // Degrees of freedom: a shift and a turn.
 CUDA_CALLABLE constexpr int n_free(int dim) { return dim + dim * (dim - 1) / 2; }
-
-// Makes a matrix diagonal by Jacobi's rotations; the columns of axes are its eigenvectors.
-template <int N>
-GMM_INLINE void diagonalise(double (&a)[N][N], double (&axes)[N][N]) {
-    for (int i = 0; i < N; ++i)
-        for (int j = 0; j < N; ++j) axes[i][j] = i == j ? 1.0 : 0.0;
-    for (int sweep = 0; sweep < 30; ++sweep) {
-        double off = 0.0, on = 0.0;
-        for (int i = 0; i < N; ++i)
-            for (int j = i; j < N; ++j) (i == j ? on : off) += a[i][j] * a[i][j];
-        if (off <= 1e-34 * on) break;
-        for (int p = 0; p < N; ++p)
-            for (int q = p + 1; q < N; ++q) {
-                if (a[p][q] == 0.0) continue;
-                const double ratio = (a[q][q] - a[p][p]) / (2.0 * a[p][q]);
-                const double t = (ratio < 0.0 ? -1.0 : 1.0) / (fabs(ratio) + sqrt(ratio * ratio + 1.0));
-                const double c = 1.0 / sqrt(t * t + 1.0), s = t * c;
-                for (int k = 0; k < N; ++k) {
-                    const double left = a[k][p], right = a[k][q], x = axes[k][p], y = axes[k][q];
-                    a[k][p] = c * left - s * right;
-                    a[k][q] = s * left + c * right;
-                    axes[k][p] = c * x - s * y;
-                    axes[k][q] = s * x + c * y;
-                }
-                for (int k = 0; k < N; ++k) {
-                    const double upper = a[p][k], lower = a[q][k];
-                    a[p][k] = c * upper - s * lower;
-                    a[q][k] = s * upper + c * lower;
-                }
-            }
-    }
-}
 
 // The lower Cholesky factor of a matrix, in its place; false if a pivot is not above `least`, which then
 // stands for it.
@@ -72,6 +40,19 @@ GMM_INLINE void solve_upper(const double (&root)[N][N], double (&b)[N]) {
     for (int i = N - 1; i >= 0; --i) {
         for (int k = i + 1; k < N; ++k) b[i] -= root[k][i] * b[k];
         b[i] /= root[i][i];
+    }
+}
+
+// Adds up the sums of the parts of each of n motions.
+template <typename Climb>
+GMM_INLINE void add_parts(int64_t item, const Team& team, int64_t n, int64_t n_parts, const double* partial,
+                          Climb* climbs) {
+    constexpr int N_SUMS = Climb::N_SUMS;
+    for (int64_t piece = item; piece < n * N_SUMS; piece += team.n) {
+        double sum = 0.0;
+        for (int64_t part = 0; part < n_parts; ++part)
+            sum += partial[(piece / N_SUMS * n_parts + part) * N_SUMS + piece % N_SUMS];
+        climbs[piece / N_SUMS].sums[piece % N_SUMS] = sum;
     }
 }
 

@@ -6,12 +6,12 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels.compiler import FusedKernel, Team
+from gmmtorch.kernels.mixtures.pair_merges import SELECTION_COUNTS
 
 _CHOICES = {
     dim: FusedKernel("mixtures/viewpoint_choice.h", f"viewpoint_choice<{dim}>", shares=True, rounds_each=True)
     for dim in (2, 3)
 }
-_COUNTS = 16 * 256  # as in selection.h
 
 
 def viewpoint_choice(
@@ -28,10 +28,10 @@ def viewpoint_choice(
     given = [part.contiguous() for part in (by.argsort(stable=True), by, seen_from, count, origins)]
     gain, nearest, scaled = torch.empty(3, e, dtype=count.dtype, device=device)
     flags = torch.zeros(e + n_origins, dtype=torch.bool, device=device)
-    counts = torch.zeros(_COUNTS + 2, dtype=torch.int32, device=device)
+    counts = torch.zeros(SELECTION_COUNTS + 2, dtype=torch.int32, device=device)
     team, is_kept = Team.of(device), flags[:e]
-    choice = gain, nearest, scaled, is_kept, flags[e:], counts[_COUNTS:]
+    choice = gain, nearest, scaled, is_kept, flags[e:], counts[SELECTION_COUNTS:]
     sizes, table = (len(support), e), (n_origins, support.contiguous())
     _CHOICES[dim](team.n, *team, *sizes, *given, *table, *choice, most, limit, counts, device=device)
-    n_kept, n_used = counts[_COUNTS:].tolist()
+    n_kept, n_used = counts[SELECTION_COUNTS:].tolist()
     return scaled, None if n_kept == e else is_kept.nonzero().squeeze(1), n_used == n_origins

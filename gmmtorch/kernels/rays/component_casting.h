@@ -1,6 +1,7 @@
 // Evidence of components in the cells of a box, from rays that are drawn from them and cast.
 #pragma once
 
+#include "../jacobi.h"
 #include "ray_walk.h"
 
 namespace gmm {
@@ -68,34 +69,11 @@ GMM_INLINE double hidden_area(const double* sigma, const double* mean, const dou
     return area * scale * sqrt(determinant) / (resolution * resolution);
 }
 
-// Eigenvector of the smallest eigenvalue of a covariance, by Jacobi rotations.
+// Eigenvector of the smallest eigenvalue of a covariance.
 GMM_INLINE void find_thinnest(const double* sigma, double* thinnest) {
-    double m[3][3], e[3][3] = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}};
+    double m[3][3], e[3][3];
     for (int i = 0; i < 9; ++i) m[i / 3][i % 3] = sigma[i];
-    for (int sweep = 0; sweep < 12; ++sweep) {
-        const double off = fabs(m[0][1]) + fabs(m[0][2]) + fabs(m[1][2]);
-        if (off == 0.0) break;
-        for (int i = 0; i < 2; ++i)
-            for (int j = i + 1; j < 3; ++j) {
-                if (m[i][j] == 0.0) continue;
-                const double theta = (m[j][j] - m[i][i]) / (2.0 * m[i][j]);
-                const double t = (theta < 0.0 ? -1.0 : 1.0) / (fabs(theta) + sqrt(theta * theta + 1.0));
-                const double c = 1.0 / sqrt(t * t + 1.0), s = t * c;
-                for (int k = 0; k < 3; ++k) {
-                    const double p = m[k][i], q = m[k][j];
-                    m[k][i] = c * p - s * q;
-                    m[k][j] = s * p + c * q;
-                }
-                for (int k = 0; k < 3; ++k) {
-                    const double p = m[i][k], q = m[j][k], u = e[k][i], w = e[k][j];
-                    m[i][k] = c * p - s * q;
-                    m[j][k] = s * p + c * q;
-                    e[k][i] = c * u - s * w;
-                    e[k][j] = s * u + c * w;
-                }
-                m[i][j] = m[j][i] = 0.0;
-            }
-    }
+    diagonalize<3>(m, e);
     const int least_of_two = m[1][1] < m[0][0] ? 1 : 0;
     const int column = m[2][2] < m[least_of_two][least_of_two] ? 2 : least_of_two;
     for (int k = 0; k < 3; ++k) thinnest[k] = e[k][column];

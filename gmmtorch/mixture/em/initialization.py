@@ -20,13 +20,7 @@ from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.by_type import chunk_rows
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.kmeans import kmeans, mean_variance, spread_out
-from gmmtorch.mixture.em.partition import (
-    FlatnessRule,
-    partition,
-    pool,
-    pool_into_cells,
-    surface_rule,
-)
+from gmmtorch.mixture.em.partition import FlatnessRule, partition, pool, pool_into_cells, surface_rule
 
 _FEWEST_CELLS, _CELLS_OF_A_COMPONENT = 4096, 8  # lower limits of the cells for flat pieces
 _FINEST_CELLS = 1 << 14  # along the longest side
