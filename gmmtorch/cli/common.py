@@ -67,8 +67,9 @@ class Runtime(Memory):
 
     dtype: str = option(
         "float32",
-        "type of the exponentials in EM (map=incremental always computes in float32; fused exact EM on a CPU "
-        "in float64, on a GPU in float32 where its error is below 0.001 nats); float64: all computations",
+        "type of the exponentials in EM; fused EM in up to three dimensions computes them in float64 (on a "
+        "GPU exact EM in float32, where that errs by less than 0.001 nats). float64: all computations, "
+        "except those of map=incremental",
     )
     compile: bool = option(
         False,
