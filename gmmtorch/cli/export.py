@@ -55,10 +55,8 @@ class ExportOptions:
         None, "lowest height (m); both null: for map_server, between the floor and the ceiling of a 3D map"
     )
     z_max: float | None = option(None, "highest height (m)")
-    occupied_thresh: float = option(0.65, "cells above this probability are occupied")
-    free_thresh: float = option(0.196, "cells below this probability are free; others are unknown")
-    n_points: float | None = option(
-        None, "number of points from which a mixture without support (GIRA) was learned"
+    occupied_thresh: float = option(
+        0.65, "cells above this probability are occupied; those below 0.196, as in ROS, are free"
     )
     report: common.Progress = group(common.Progress)
     runtime: common.Memory = group(common.Memory)

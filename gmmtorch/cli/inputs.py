@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -131,10 +132,6 @@ def read_scans(dataset: Dataset, indices: Sequence[int], device: str, on_event: 
 # -- maps ------------------------------------------------------------------------------------------
 
 
-_OF_SCANS = {"per_scan": {"max_origins": 1}}
-"""What a map with a mixture for each scan has beside `window=1`: each component was seen from one place."""
-
-
 def limits(config: DictConfig) -> dict[str, Any]:
     """Arguments of every map from `runtime.*` and the seed."""
     runtime = config.runtime
@@ -178,7 +175,7 @@ def new_map(
     is_continued: whether a map in the folder goes on. Raises `InvalidArgumentError` for another map in it.
     """
     memory = config.map.memory
-    target = map_factory(config, resolution=config.resolution, memory=None)()
+    target = _empty_map(config, config.resolution)
     if memory is None:
         return target
     options: dict[str, Any] = {"memory": int(check_number("map.memory", memory, least=1)), "device": device}
@@ -214,35 +211,33 @@ def chosen_map(given: Any, group: str) -> dict[str, Any]:
 def map_factory(
     config: DictConfig, resolution: float = 0.1, group: str = "map", **changes: Any
 ) -> Callable[[], GaussianMap]:
-    """A factory of empty maps with the options `map.*`; `changes` replaces some of them.
+    """A factory of empty maps with the options `map.*`; see `_empty_map`."""
+    if (memory := changes.get("memory", config.map.get("memory"))) is not None:
+        raise InvalidArgumentError(
+            f"{group}.memory={memory} is for gmmtorch-map; here maps are in memory: leave it out."
+        )
+    make = functools.partial(_empty_map, config, resolution, group, **changes)
+    make()  # an invalid option fails here, before any map is built
+    return make
+
+
+def _empty_map(config: DictConfig, resolution: float, group: str = "map", **changes: Any) -> GaussianMap:
+    """An empty map with the options `map.*`; `changes` replaces some of them.
 
     Args:
         resolution: of queries without one (m).
         group: what errors call the options.
     """
-    dtype = config.runtime.dtype
-    check_choice("runtime.dtype", dtype, SOFTMAX_DTYPES)  # an incremental map does not use it
+    check_choice("runtime.dtype", config.runtime.dtype, SOFTMAX_DTYPES)  # an incremental map does not use it
     options = {**common.as_options(config.map), **changes}
-    if options.get("memory") is not None:
-        raise InvalidArgumentError(
-            f"{group}.memory={options['memory']} is for gmmtorch-map; here maps are in memory: leave it out."
-        )
     query = {item.name: options[item.name] for item in fields(QueryOptions) if item.name in options}
-    with schema.naming({f"map.{name}": f"{group}.{name}" for name in options}):
-        rule = _rule(config, options["name"], changes, dtype)
-
-    def make() -> GaussianMap:
-        with schema.naming({name: f"{group}.{name}" for name in options}):
-            return GaussianMap(rule, resolution=resolution, codec=options["codec"], **query, **limits(config))
-
-    make()  # an invalid option fails here, before any map is built
-    return make
-
-
-def _rule(config: DictConfig, name: str, changes: dict[str, Any], dtype: str) -> LearningRule:
-    """The learning rule of the options `map.*`."""
-    cls: type[LearningRule] = IncrementalRule if name == "incremental" else WindowedRule
+    cls: type[LearningRule] = IncrementalRule if options["name"] == "incremental" else WindowedRule
     others = {item.name: changes[item.name] for item in fields(cls) if item.name in changes}
     if cls is WindowedRule:
-        others |= {"dtype": dtype, **_OF_SCANS.get(name, {})}
-    return schema.build(cls, config, "map", **others)
+        others["dtype"] = config.runtime.dtype
+    if options["name"] == "per_scan":  # each component was seen from one place
+        others["max_origins"] = 1
+    names = {name: f"{group}.{name}" for name in options}
+    with schema.naming(names | {f"map.{name}": option for name, option in names.items()}):
+        rule = schema.build(cls, config, "map", **others)
+        return GaussianMap(rule, resolution=resolution, **query, **limits(config))

@@ -51,15 +51,11 @@ class LocalizeOptions:
         "constant: as between the last two scans; dataset: as between the poses of the data set, such as an "
         "odometry's; imu: with the rotation of the IMU of a ROS bag",
     )
-    n_points: int = option(1000, "points of a scan that are used at most")
     least_explained: float = option(
         0.9, "share of the points that must lie on surfaces of the map; less where much has changed"
     )
-    truth: str | None = option("none", "true poses, for scores: dataset, none, or a TUM or KITTI file")
-    align: str = option(
-        "none",
-        "before scoring. none: the truth is in the frame of the map; first: the first poses coincide; rigid: "
-        "least squares",
+    truth: str | None = option(
+        "none", "true poses in the frame of the map, for scores: dataset, none, or a TUM or KITTI file"
     )
     report: common.Report = group(common.Report)
     runtime: common.Memory = group(common.Memory)
@@ -87,12 +83,11 @@ def run(config: DictConfig) -> None:
     """Run the command."""
     from gmmtorch.cli import inputs
     from gmmtorch.cli.reporting import localization_outputs
-    from gmmtorch.localization import ALIGNMENTS, MOTIONS, Tracker
+    from gmmtorch.localization import MOTIONS, Tracker
 
     if not config.map.path:
         raise InvalidArgumentError("map is not set; give map=FILE, a map file or a run directory.")
     check_choice("motion", config.motion, MOTIONS)
-    check_choice("align", config.align, ALIGNMENTS)
     common.use_runtime(config.runtime)
     folder = common.run_dir()
     built = inputs.open_map(Path(config.map.path).expanduser(), config.runtime, config.bounds)
@@ -102,7 +97,6 @@ def run(config: DictConfig) -> None:
         tracker = Tracker(
             built,
             localization_outputs.first_pose(config, dataset, built.dim or 3),
-            n_points=config.n_points,
             least_explained=config.least_explained,
         )
         with ProgressBars(enabled=config.report.progress) as bars:

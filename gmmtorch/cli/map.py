@@ -53,7 +53,6 @@ class MapOptions(ViewOptions):
     tile: float = option(
         100.0, "side (m) of the tiles of map.memory, and of those into which the maps of inputs are merged"
     )
-    tile_bytes: int | None = option(None, "bytes of a tile's file, at most; null: no limit")
     workers: int = option(1, "processes of this machine that map inputs; more than one needs Ray")
     cluster: str | None = option(
         None, "address of a Ray cluster that maps inputs, such as ray://head:10001; null: this machine"
@@ -82,7 +81,7 @@ def run(config: DictConfig) -> None:
 
     device, folder = common.set_up(config), common.run_dir()
     check_resolution(config.resolution)
-    map_outputs.check_exports(config)
+    map_outputs.check_exports(config.export)
     if config.check:
         from gmmtorch.cli.reporting import recording_check
 

@@ -193,7 +193,7 @@ def _merge(
         bars(stage, n_done, n_total)
         memory.append(resident_bytes())
 
-    tiled = merge(folder / "tiles", [TiledMap(place) for place in places], config.tile_bytes, note)
+    tiled = merge(folder / "tiles", [TiledMap(place) for place in places], on_event=note)
     mapped = [row for row in rows if not row["error"]]
     metres = sum(row["metres"] for row in mapped)
     return {

@@ -53,9 +53,6 @@ class PageOptions(PageAddress):
     """Options of gmmtorch-view."""
 
     path: str | None = option(None, "map file, run directory of gmmtorch-map, or folder of tiles")
-    trajectory: str | None = option(
-        None, "TUM or KITTI file; null: trajectory.tum next to the map and of each recording"
-    )
     bounds: list[float] | None = option(None, BOUNDS)
     html: str | None = option(None, "file to write, .html, instead of serving a page")
     shape: str = option("splats", "splats, ellipsoids (2σ), surfaces (the mesh, in 3D) or none")
@@ -113,7 +110,7 @@ def run(config: DictConfig) -> None:
     common.use_runtime(config.runtime)
     path = Path(config.path).expanduser()
     shown = inputs.open_map(path, config.runtime, config.bounds)
-    trajectories = map_outputs.trajectories(path, config.trajectory, shown.dim or 3)
+    trajectories = map_outputs.trajectories(path, shown.dim or 3)
     look = {"shape": config.shape, "colour": config.colour}
     if config.html:
         written = write_page(config.html, shown, trajectories, **look)

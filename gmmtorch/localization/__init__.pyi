@@ -14,7 +14,6 @@ from .tracker import Tracker as Tracker
 from .tracker import clock_faults as clock_faults
 from .tracker import locate_scans as locate_scans
 from .tracker import scan_times as scan_times
-from .trajectory_errors import ALIGNMENTS as ALIGNMENTS
 from .trajectory_errors import UNSCORED as UNSCORED
 from .trajectory_errors import absolute_trajectory_error as absolute_trajectory_error
 from .trajectory_errors import aligned as aligned

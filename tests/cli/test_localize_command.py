@@ -71,7 +71,7 @@ def test_the_pose_may_be_given_and_the_truth_a_file(run, scans, tmp_path):
     poses = torch.stack([scans.pose(number) for number in range(N)])
     write_tum(tmp_path / "truth.tum", torch.arange(N).double(), poses)
     pose = f"pose=[{x + 0.2:.3f},{y - 0.2:.3f},{yaw + 0.1:.3f}]"
-    done = succeeded(run(pose, f"truth={tmp_path / 'truth.tum'}", "motion=dataset", "align=rigid", *QUIET))
+    done = succeeded(run(pose, f"truth={tmp_path / 'truth.tum'}", "motion=dataset", *QUIET))
     assert done.results()["rows"][0]["n_scored"] == N
     assert done.results()["rows"][0]["ate"] < 0.05
 
@@ -141,7 +141,6 @@ def test_errors_are_one_line(run, monkeypatch, tmp_path, saved):
     assert "pose=here is not a pose" in refused(run("pose=here"))
     assert "motion='wheels' is not one of constant, dataset" in refused(run("motion=wheels"))
     assert "motion=imu cannot be used: it needs the IMU of a ROS bag" in refused(run("motion=imu"))
-    assert "align='scale' is not one of" in refused(run("align=scale"))
     assert "truth=none.tum does not exist" in refused(run("truth=none.tum"))
     (tmp_path / "late.tum").write_text("1000 0 0 0 0 0 0 1\n1001 0 0 0 0 0 0 1\n")
     assert "has no pose at the time of a scan" in refused(run(f"truth={tmp_path / 'late.tum'}"))

@@ -76,9 +76,9 @@ def write_components(config: DictConfig) -> str:
 
 def _components(config: DictConfig) -> PlainMixture:
     """The mixture in a file of any supported format; the surface components of a map."""
-    path, n_points = Path(config.path), config.n_points
+    path = Path(config.path)
     if path.suffix == ".csv":
-        return read_gira_csv(path, n_points)
+        return read_gira_csv(path)
     if path.suffix == ".npz":
         return read_npz(path)
     try:
@@ -93,8 +93,7 @@ def _components(config: DictConfig) -> PlainMixture:
         mixture = mixtures.GaussianMixture.load(path)
     except DataError as error:
         raise DataError(f"{path} contains no components to export. {no_map} {error}") from error
-    support = None if n_points is None else mixture.weights * n_points
-    return PlainMixture(mixture.weights, mixture.means, mixture.covariances, support)
+    return PlainMixture(mixture.weights, mixture.means, mixture.covariances)
 
 
 # -- space ----------------------------------------------------------------------------------------
@@ -118,7 +117,7 @@ def open_source(config: DictConfig) -> Source:
 
 def write_space(config: DictConfig, source: Source, on_event: Event) -> str:
     """Write the space of a map: probabilities of cells, distances or surfaces; returns a message."""
-    output, rule = Path(config.output), Thresholds(config.free_thresh, config.occupied_thresh)
+    output, rule = Path(config.output), Thresholds(occupied=config.occupied_thresh)
     space = _Space(config, source)
     if config.format == "map_server":
         about = space.choose_band()

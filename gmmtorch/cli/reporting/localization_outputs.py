@@ -111,13 +111,13 @@ def result_row(
         "deviation": float(torch.tensor(deviations).median()) if deviations else None,
         "seconds": seconds,
         "scans_per_second": len(located) / max(seconds, 1e-9),
-        **_scores(config, found, truth),
+        **_scores(found, truth),
         "messages": _messages(located, lost, faults),
     }
 
 
-def _scores(config: DictConfig, found: Sequence[ScanLocation], truth: Truth | None) -> dict[str, Any]:
-    """ATE and RPE of the found scans whose true pose is known; None where they cannot be computed."""
+def _scores(found: Sequence[ScanLocation], truth: Truth | None) -> dict[str, Any]:
+    """ATE and RPE of the found scans whose true pose is known; None without one."""
     scores: dict[str, Any] = dict(UNSCORED)
     used = [scan for scan in found if truth is not None and bool(truth.known[scan.number])]
     scores["n_scored"] = len(used)
@@ -125,11 +125,7 @@ def _scores(config: DictConfig, found: Sequence[ScanLocation], truth: Truth | No
         return scores
     estimate = torch.stack([scan.location.pose for scan in used])
     true = truth.poses[[scan.number for scan in used]]
-    try:
-        scores |= absolute_trajectory_error(estimate, true, config.align).scores("ate")
-    except InvalidArgumentError as error:
-        if "rigid" not in str(error) or config.align != "rigid":
-            raise
+    scores |= absolute_trajectory_error(estimate, true, "none").scores("ate")
     if len(used) > 1:
         scores |= relative_pose_error(estimate, true).scores("rpe")
     return scores

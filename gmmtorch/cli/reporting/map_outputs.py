@@ -20,7 +20,6 @@ from gmmtorch.errors import (
     GmmTorchError,
     InvalidArgumentError,
     MemoryLimitError,
-    MissingDataError,
     check_number,
 )
 from gmmtorch.export import write_pose_table, write_tum
@@ -44,14 +43,12 @@ _MOST_CELLS = 1600  # along a side of a picture
 _STANDING = 1.0  # m of a path, below which bytes a metre say nothing
 
 
-def check_exports(config: DictConfig) -> None:
+def check_exports(names: Sequence[str]) -> None:
     """Raises `InvalidArgumentError` for an unknown export, `GmmTorchError` if its package is missing."""
-    for name in config.export:
+    for name in names:
         if name not in EXPORTS:
-            raise InvalidArgumentError(
-                f"export={list(config.export)}: {name!r} is not one of {', '.join(EXPORTS)}."
-            )
-    if "octomap" in config.export:
+            raise InvalidArgumentError(f"export={list(names)}: {name!r} is not one of {', '.join(EXPORTS)}.")
+    if "octomap" in names:
         load_pyoctomap()
 
 
@@ -141,16 +138,8 @@ def write_estimated_poses(dataset: Dataset, estimated: localization.Trajectory, 
     write_pose_table(folder / POSE_TABLE, localization.scan_times(dataset), estimated.poses, spread, columns)
 
 
-def trajectories(run: Path, given: str | None, dim: int) -> list[Tensor]:
-    """The sensor positions (S, D) of each recording of a map: in the file `given`, or next to the map.
-
-    run: the run directory, or a file in it. Raises `MissingDataError` if the file `given` does not exist.
-    """
-    if given is not None:
-        file = Path(given).expanduser()
-        if not file.is_file():
-            raise MissingDataError(f"trajectory={file} does not exist; give a TUM or KITTI file, or null.")
-        return [positions(file, dim)]
+def trajectories(run: Path, dim: int) -> list[Tensor]:
+    """The sensor positions (S, D) of each recording of a map. run: the run directory, or a file in it."""
     folder = run if run.is_dir() else run.parent
     files = [folder / TRAJECTORY, *sorted(folder.glob(f"{RECORDINGS}/*/{TRAJECTORY}"))]
     return [positions(file, dim) for file in files if file.is_file()]
