@@ -7,7 +7,7 @@ import functools
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -32,17 +32,13 @@ from gmmtorch.scan import Scan
 _WITHOUT_POSES = ("scan_folder", "rosbag")  # data sets that `dataset.poses=standing` reads without poses
 
 
-class OpenedDataset(NamedTuple):
-    """A data set; with `dataset.odometry`, also its trajectory, and the facts of it for results.json."""
-
-    dataset: Dataset
-    trajectory: localization.Trajectory | None
-    odometry: Row | None
+OpenedDataset = tuple[Dataset, localization.Trajectory | None, Row | None]
+"""A data set; with `dataset.odometry`, also its trajectory, and the facts of it for results.json."""
 
 
 def open_dataset(config: DictConfig, group: str = "dataset") -> Dataset:
     """The data set that the options `dataset.*` describe. group: their name."""
-    return open_with_trajectory(config, group).dataset
+    return open_with_trajectory(config, group)[0]
 
 
 def open_with_trajectory(config: DictConfig, group: str = "dataset") -> OpenedDataset:
@@ -71,7 +67,7 @@ def _opened(config: DictConfig) -> OpenedDataset:
     try:
         found = datasets.load(name, options.pop("path", None), **options)
         if method == "none" or (method == "auto" and found.pose(0) is not None):
-            return OpenedDataset(found, None, None)
+            return found, None, None
         has_truth = options.get("poses") != "standing"
     except DataError:
         if method == "none" or name not in _WITHOUT_POSES:
@@ -95,7 +91,7 @@ def _with_odometry(source: Dataset, method: str, motion: str, has_truth: bool) -
     if facts["ate"] is not None:
         text += f"; ATE {facts['ate']:.3f} m, RPE {facts['rpe']:.3f} m against the poses of the data set"
     print(text)
-    return OpenedDataset(posed, trajectory, facts)
+    return posed, trajectory, facts
 
 
 def _trajectory_scores(posed: Reposed, trajectory: localization.Trajectory, has_truth: bool) -> Row:

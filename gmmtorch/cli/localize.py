@@ -26,20 +26,15 @@ TABLE = "dataset n_scans n_found n_lost_runs ate rpe ate_degrees deviation scans
 
 
 @dataclass
-class SavedMap:
-    """A saved map."""
-
-    path: str | None = option(
-        None, "map file, run directory of gmmtorch-map, or folder of tiles; map=FILE is short for it"
-    )
-
-
-@dataclass
 class LocalizeOptions:
     """Options of gmmtorch-localize."""
 
     dataset: Any = option(MISSING, "where the scans come from")
-    map: SavedMap = group(SavedMap)
+    map_path: str | None = option(
+        None,
+        "map file, run directory of gmmtorch-map, or folder of tiles; map=FILE is short for it",
+        name="map.path",
+    )
     bounds: list[float] | None = option(None, BOUNDS)
     pose: Any = option(
         None,

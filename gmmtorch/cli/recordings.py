@@ -41,12 +41,8 @@ _SUMS = ("n_scans", "n_skipped", "n_points", "metres", "seconds", "cpu_seconds")
 TABLE = "dataset n_recordings n_failed n_scans n_points metres n_tiles n_components nbytes cpu_seconds"
 
 
-class Mapped(NamedTuple):
-    """The files and the row of results.json of a recording; or its error."""
-
-    files: dict[str, bytes]
-    row: Row
-    error: str | None
+Mapped = tuple[dict[str, bytes], Row, str | None]
+"""The files and the row of results.json of a recording; or its error."""
 
 
 def run(config: DictConfig) -> None:
@@ -132,12 +128,10 @@ def _finished(folder: Path, facts: dict[str, Any]) -> Row | None:
 
 def _keep(outcome: Outcome, facts: dict[str, Any], folder: Path) -> Row:
     """Writes the files of a recording, and returns its row."""
-    mapped = outcome.result
-    if mapped is None:
-        mapped = Mapped({}, {}, outcome.error)
-    row = {"input": facts["input"], "error": mapped.error, "n_lost": outcome.n_lost, **mapped.row}
-    if mapped.error is None:
-        for name, data in mapped.files.items():
+    files, row, error = outcome.result or ({}, {}, outcome.error)
+    row = {"input": facts["input"], "error": error, "n_lost": outcome.n_lost, **row}
+    if error is None:
+        for name, data in files.items():
             write_bytes(folder / name, data)
         write_json(folder / _DONE, {"run": facts, "row": row})
     return row
@@ -151,9 +145,9 @@ def map_recording(facts: dict[str, Any], options: dict[str, Any]) -> Mapped:
         with local_copy(facts["input"]) as path:
             return _mapped(config, path)
     except GmmTorchError as error:
-        return Mapped({}, {}, str(error))
+        return {}, {}, str(error)
     except Exception as error:
-        return Mapped({}, {}, f"{traceback.format_exc()}{type(error).__name__}: {error!s}")
+        return {}, {}, f"{traceback.format_exc()}{type(error).__name__}: {error!s}"
 
 
 def _mapped(config: DictConfig, path: Path) -> Mapped:
@@ -180,7 +174,7 @@ def _mapped(config: DictConfig, path: Path) -> Mapped:
         files |= {file.name: file.read_bytes() for file in folder.iterdir() if file.suffix}
         row = map_outputs.result_row(dataset.name, builder, config, odometry)
     row |= {"cpu_seconds": time.process_time() - begin, "worker": f"{platform.node()}:{os.getpid()}"}
-    return Mapped(files, row, None)
+    return files, row, None
 
 
 def _merge(

@@ -6,6 +6,7 @@ import functools
 import operator
 import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, make_dataclass
 from types import UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -226,18 +227,15 @@ def _parent(node: Any, place: str) -> tuple[Any, str]:
     return (OmegaConf.select(node, path) if path else node), last
 
 
-class naming:  # noqa: N801  # a context manager, as those of contextlib
+@contextmanager
+def naming(names: Mapping[str, str]) -> Iterator[None]:
     """Errors that are raised inside name the options that the user gave. names: the option of an argument."""
-
-    def __init__(self, names: Mapping[str, str]) -> None:
-        self._names = names
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
-        if isinstance(error, GmmTorchError) and (told := error.told(self._names)).args != error.args:
+    try:
+        yield
+    except GmmTorchError as error:
+        if (told := error.told(names)).args != error.args:
             raise told from error
+        raise
 
 
 def _converted(hint: Any, value: Any, name: str) -> Any:

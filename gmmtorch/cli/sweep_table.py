@@ -47,7 +47,8 @@ class SweepTable(Callback):
         jobs = read_jobs(folder, self._begin - _CLOCK_STEP)
         if not jobs:  # the command writes no folders
             return
-        rows, columns = joint_rows(jobs, _columns(self._module))
+        table = str(getattr(importlib.import_module(self._module), "TABLE", ""))
+        rows, columns = joint_rows(jobs, table.split())
         print(f"\n{len(jobs)} jobs in {folder}\n{format_table(rows, columns)}")
         print(f"\nresults   {folder}/*/results.json\nbrowse    tensorboard --logdir {folder}")
         if failed := [job.name for job in jobs if job.error]:
@@ -92,16 +93,9 @@ def joint_rows(jobs: Sequence[Job], columns: Sequence[str]) -> tuple[list[dict[s
         rows += [{**row, **head} for row in job.rows] or [{**head, "error": job.error}]
     shown = [name for name in columns if any(name in row for row in rows)]
     if len(shown) < 3:  # rows of a study have columns of their own
-        found = dict.fromkeys(name for row in rows for name, value in row.items() if not _is_long(value))
+        found = dict.fromkeys(
+            k for row in rows for k, value in row.items() if not isinstance(value, list | dict)
+        )
         shown = [name for name in found if name not in ("job", "error", *swept)]
     error = ["error"] if any(job.error for job in jobs) else []
     return rows, ["job", *swept, *(name for name in shown if name not in swept), *error]
-
-
-def _is_long(value: Any) -> bool:
-    return isinstance(value, list | dict)
-
-
-def _columns(module: str) -> list[str]:
-    """The columns of a command's own table."""
-    return str(getattr(importlib.import_module(module), "TABLE", "")).split()

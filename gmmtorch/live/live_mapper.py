@@ -42,6 +42,7 @@ class LiveMapper:
 
     Attributes:
         n_corrections: how often closed loops have moved the map.
+        nbytes: bytes of the map that was published last; 0 before.
     """
 
     def __init__(
@@ -65,7 +66,7 @@ class LiveMapper:
         self._content = 0  # of the team's map, when it was published last
         self._thread = ThreadPoolExecutor(1, "publication")
         self._publication: Future[int] | None = None
-        self._nbytes = 0
+        self.nbytes = 0
         self._begin = self._next_publication = time.monotonic()
 
     def step(self, timeout: float = 0.1) -> bool:
@@ -93,11 +94,6 @@ class LiveMapper:
         self._end_publication()
         self._thread.shutdown()
         self._report(is_last=True)
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of the map that was published last; 0 before."""
-        return self._nbytes
 
     def snapshot(self, codec: str = "float") -> GaussianMap:
         """A copy of the map that does not grow; of the team's map, if it is shared."""
@@ -167,7 +163,7 @@ class LiveMapper:
     def _end_publication(self) -> None:
         if self._publication is None:
             return
-        self._nbytes = self._publication.result()
+        self.nbytes = self._publication.result()
         self._publication = None
         now, end = self._node.now(), time.monotonic()
         for stamp in self._published:
@@ -179,7 +175,7 @@ class LiveMapper:
         if self.diagnostics.is_due() or is_last:
             built = self.builder.map
             n_components = built.n_final if built.dim is not None else 0
-            self.diagnostics.publish(len(record.indices), n_components, self._nbytes)
+            self.diagnostics.publish(len(record.indices), n_components, self.nbytes)
 
 
 def handle_messages(node: Node, timeout: float) -> None:

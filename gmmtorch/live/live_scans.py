@@ -108,6 +108,8 @@ class LiveScans(Dataset):
         self._conversion: ScanConversion | None = None
         self._candidate: tuple[list[str], float] = ([], 0.0)
         self._odometry = odometry_of(options.poses) if options.poses in METHODS else None
+        self.has_odometry = self._odometry is not None
+        """Whether poses are estimated from the scans."""
         self._start: Location | None = None  # of odometry in the map of an earlier run
         self._tracker: Tracker | None = None  # of the map of an earlier run
         self._posed: list[int] = []  # numbers of the scans in odometry, which also has those left out
@@ -340,11 +342,6 @@ class LiveScans(Dataset):
         self._is_corrected = False
         poses = self._odometry.poses[self._posed]
         return (poses if self._start is None else self._start.pose @ poses), self._first
-
-    @property
-    def has_odometry(self) -> bool:
-        """Whether poses are estimated from the scans."""
-        return self._odometry is not None
 
     def continue_in(self, known: GaussianMap) -> None:
         """Odometry begins where the next scan is found in a map; scans that are not found are left out."""

@@ -96,11 +96,11 @@ def _view(frame: Frame) -> dict[str, Any]:
 
 def _ellipsoids(components: Components, solid: Solid, frame: Frame) -> dict[str, Any]:
     """Place, turn (x, y, z, w), standard deviations and uncertainty of each component, and colours."""
-    balls = viewer_scene.instances(solid)
+    wxyz, positions, scales = viewer_scene.instances(solid)
     places = np.zeros((len(solid.rows), 3, 4))
-    places[:, 0, :3] = balls.positions - frame.shift.numpy()
-    places[:, 1] = balls.wxyz[:, [1, 2, 3, 0]]
-    places[:, 2, :3] = balls.scales / viewer_scene.N_SIGMA
+    places[:, 0, :3] = positions - frame.shift.numpy()
+    places[:, 1] = wxyz[:, [1, 2, 3, 0]]
+    places[:, 2, :3] = scales / viewer_scene.N_SIGMA
     places[:, 2, 3] = viewer_scene.uncertainty(solid)
     colours = {}
     for by in viewer_scene.colour_choices(components):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -37,13 +37,6 @@ _MOST_ELLIPSOIDS = 1000
 _SPHERE, _DELETE_ALL = 2, 3
 
 
-class _Grid(NamedTuple):
-    """A 2D grid and its cells (n_y, n_x), int8: 0 free, 100 occupied, −1 unknown."""
-
-    grid: VoxelGrid
-    cells: np.ndarray
-
-
 class MapPublisher:
     """Publishes a map on the topics map, map_updates, cloud and ellipsoids of a node.
 
@@ -69,7 +62,7 @@ class MapPublisher:
         self._band = None if z_min is None and z_max is None else (z_min, z_max)
         self._rule = Thresholds()
         self._evidence = KeptEvidence(resolution)
-        self._last: _Grid | None = None
+        self._last: tuple[VoxelGrid, np.ndarray] | None = None
         self._published_at = 0.0
         self._send_grid = node.publisher("map", "nav_msgs/msg/OccupancyGrid")
         self._send_update = node.publisher("map_updates", "map_msgs/msg/OccupancyGridUpdate")
@@ -85,7 +78,7 @@ class MapPublisher:
         grid, theta = self._probabilities(shown)
         if grid is not None:
             flat = grid, theta if grid.dim == 2 else highest_in_band(grid, theta)[1]
-            self._publish_grid(_cells(*flat, self._rule), header, stamp)
+            self._publish_grid(*_cells(*flat, self._rule), header, stamp)
         if self._cloud == "cells" and grid is not None:
             cells = CellCloud.of_grid(grid, theta).above(self._rule.occupied)
             known = shown.attributes(cells.centers).get(COLOUR)
@@ -128,41 +121,41 @@ class MapPublisher:
             high[2] = high[2] if top is None else max(low[2], min(high[2], top) - 1e-6)
         return low, high
 
-    def _publish_grid(self, new: _Grid, header: dict[str, Any], stamp: int) -> None:
+    def _publish_grid(self, grid: VoxelGrid, cells: np.ndarray, header: dict[str, Any], stamp: int) -> None:
         """Publishes what has changed, or the whole grid: if its place or much of it changed, or it is old."""
         old, now = self._last, time.monotonic()
         changed = None
-        if old is not None and old.grid == new.grid and now - self._published_at < _FULL_AFTER:
-            changed = np.argwhere(old.cells != new.cells)
+        if old is not None and old[0] == grid and now - self._published_at < _FULL_AFTER:
+            changed = np.argwhere(old[1] != cells)
             if len(changed) == 0:
                 return
-        self._last = new
+        self._last = grid, cells
         if changed is not None:
             (y0, x0), (y1, x1) = changed.min(0).tolist(), (changed.max(0) + 1).tolist()
-            if 2 * (y1 - y0) * (x1 - x0) <= new.cells.size:
+            if 2 * (y1 - y0) * (x1 - x0) <= cells.size:
                 window = {"x": x0, "y": y0, "width": x1 - x0, "height": y1 - y0}
-                part = new.cells[y0:y1, x0:x1].ravel()
+                part = cells[y0:y1, x0:x1].ravel()
                 self._send_update({**header, **window, "data": part}, stamp)
                 return
         self._published_at = now
-        origin = dict(zip("xyz", (*new.grid.origin, 0.0), strict=True))
+        origin = dict(zip("xyz", (*grid.origin, 0.0), strict=True))
         info = {
-            "resolution": new.grid.resolution,
-            "width": new.cells.shape[1],
-            "height": new.cells.shape[0],
+            "resolution": grid.resolution,
+            "width": cells.shape[1],
+            "height": cells.shape[0],
             "origin": {"position": origin, "orientation": {"w": 1.0}},
         }
-        self._send_grid({**header, "info": info, "data": new.cells.ravel()}, stamp)
+        self._send_grid({**header, "info": info, "data": cells.ravel()}, stamp)
 
 
-def _cells(grid: VoxelGrid, theta: Tensor, rule: Thresholds) -> _Grid:
-    """Occupied, free and unknown cells of a 2D map; rows run along x, as in ROS."""
+def _cells(grid: VoxelGrid, theta: Tensor, rule: Thresholds) -> tuple[VoxelGrid, np.ndarray]:
+    """The 2D grid of a map, and its cells (n_y, n_x), int8, as in ROS: 0 free, 100 occupied, −1 unknown."""
     classes = rule.classify(theta)
     values = torch.full(classes.shape, -1, dtype=torch.int8)
     values[classes == CellClass.FREE] = 0
     values[classes == CellClass.OCCUPIED] = 100
     flat = grid if grid.dim == 2 else VoxelGrid(grid.origin[:2], grid.resolution, grid.shape[:2])
-    return _Grid(flat, np.ascontiguousarray(values.T.numpy()))
+    return flat, np.ascontiguousarray(values.T.numpy())
 
 
 def _table(points: np.ndarray, colours: Tensor | None = None) -> np.ndarray:
@@ -186,11 +179,9 @@ def _markers(shown: GaussianMap, header: dict[str, Any]) -> list[dict[str, Any]]
     made: list[dict[str, Any]] = [{"header": header, "action": _DELETE_ALL}]
     if not len(kept):
         return made
-    balls, colours = viewer_scene.instances(solid), viewer_scene.colours(components, solid, "height").rgb
-    rows = zip(
-        balls.wxyz.tolist(), balls.positions.tolist(), balls.scales.tolist(), colours / 255, strict=True
-    )
-    for number, (turn, position, radii, rgb) in enumerate(rows):
+    colours = viewer_scene.colours(components, solid, "height").rgb
+    balls = (part.tolist() for part in viewer_scene.instances(solid))
+    for number, (turn, position, radii, rgb) in enumerate(zip(*balls, colours / 255, strict=True)):
         pose = {
             "position": dict(zip("xyz", position, strict=True)),
             "orientation": dict(zip("wxyz", turn, strict=True)),

@@ -61,14 +61,6 @@ class Solid(NamedTuple):
     support: Tensor
 
 
-class Instances(NamedTuple):
-    """Ellipsoids as copies of the unit sphere: quaternions wxyz (K, 4), positions and scales (K, 3), m."""
-
-    wxyz: np.ndarray
-    positions: np.ndarray
-    scales: np.ndarray
-
-
 class Slice(NamedTuple):
     """A picture of occupancy in a plane: RGBA (rows, columns, 4) uint8, highest y first. In 3D unknown is
     clear, and free is translucent. middle (3,), world frame, and size (2,), metres."""
@@ -120,11 +112,11 @@ def sphere(n_components: int) -> tuple[Tensor, Tensor]:
     return unit_sphere(next(vertices for most, vertices in _SPHERES if n_components <= most))
 
 
-def instances(solid: Solid) -> Instances:
-    """The 2σ ellipsoids."""
+def instances(solid: Solid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The 2σ ellipsoids as copies of a unit sphere: quaternions wxyz (K, 4), places and scales (K, 3), m."""
     deviations, axes = principal_axes(solid.covariances)
     turned = Pose(axes, solid.means).quaternion()[:, [3, 0, 1, 2]]
-    return Instances(turned.numpy(), solid.means.numpy(), N_SIGMA * deviations.numpy())
+    return turned.numpy(), solid.means.numpy(), N_SIGMA * deviations.numpy()
 
 
 class Colours(NamedTuple):
@@ -375,15 +367,15 @@ def add_lights(scene: Any, distance: float) -> None:
 
 def add_ellipsoids(scene: Any, solid: Solid, colours: np.ndarray) -> Any:
     """Components in the scene's frame as 2σ ellipsoids with colours (K, 3) uint8."""
-    balls = instances(solid)
+    wxyz, positions, scales = (part.astype(np.float32) for part in instances(solid))
     vertices, faces = sphere(len(colours))
     return scene.add_batched_meshes_simple(
         "/components",
         vertices.float().numpy(),
         faces.numpy().astype(np.uint32),
-        balls.wxyz.astype(np.float32),
-        balls.positions.astype(np.float32),
-        batched_scales=balls.scales.astype(np.float32),
+        wxyz,
+        positions,
+        batched_scales=scales,
         batched_colors=colours,
         lod="off",
         **_UNSHADED,

@@ -58,11 +58,11 @@ def test_instances_are_the_two_sigma_ellipsoids(dim, maps):
 
     components = maps[dim][0].components()
     solid = viewer_scene.surfaces(components)
-    balls = viewer_scene.instances(solid)
+    wxyz, positions, scales = viewer_scene.instances(solid)
     sphere = unit_sphere(20)[0].numpy()
     for k in range(0, len(solid.means), 50):
-        turn = Rotation.from_quat(balls.wxyz[k, [1, 2, 3, 0]]).as_matrix()
-        offset = (sphere * balls.scales[k]) @ turn.T
+        turn = Rotation.from_quat(wxyz[k, [1, 2, 3, 0]]).as_matrix()
+        offset = (sphere * scales[k]) @ turn.T
         covariance = components.covariances[solid.rows[k]].numpy()
         # Points at two deviations have a squared Mahalanobis distance of 4; in 2D those of the equator.
         level = np.abs(offset[:, 2]) if dim == 2 else np.zeros(len(offset))
@@ -73,7 +73,7 @@ def test_instances_are_the_two_sigma_ellipsoids(dim, maps):
         else:
             assert distance.max() <= 4 + 1e-6
             assert level.max() <= 0.011
-    np.testing.assert_allclose(balls.positions[:, :dim], components.means[solid.rows].numpy())
+    np.testing.assert_allclose(positions[:, :dim], components.means[solid.rows].numpy())
 
 
 def test_surfaces_leave_out_free_ends_and_what_is_above(maps):

@@ -35,6 +35,8 @@ class DdsMiddleware:
     interface: name or address of the network interface; 127.0.0.1: only this machine, without multicast.
     peers: addresses of machines that are contacted besides this one.
 
+    Callbacks run in its threads. `ZenohMiddleware` has the same methods.
+
     Raises `InvalidArgumentError` if the domain or interface cannot be used, and `GmmTorchError` if cyclonedds
     is not installed.
     """
@@ -66,6 +68,7 @@ class DdsMiddleware:
             ) from error
 
     def publisher(self, topic: str, message_type: str, quality: Quality) -> Callable[[bytes], None]:
+        """Declares a publisher; the result sends a message in CDR."""
         from cyclonedds.pub import DataWriter
 
         qos = _policies(quality, encoded=True)
@@ -83,6 +86,7 @@ class DdsMiddleware:
     def subscribe(
         self, topic: str, message_type: str, quality: Quality, on_message: Callable[[bytes], None]
     ) -> None:
+        """Declares a subscriber, whose messages go to the callback."""
         from cyclonedds.core import Listener
         from cyclonedds.sub import DataReader
 
@@ -102,6 +106,7 @@ class DdsMiddleware:
         self._entities += [reader, listener]
 
     def endpoints(self) -> list[Endpoint]:
+        """All known publishers and subscribers of ROS topics."""
         from cyclonedds.core import InstanceState
 
         found = []
@@ -118,6 +123,7 @@ class DdsMiddleware:
         return found
 
     def close(self) -> None:
+        """Leaves the network."""
         for entity in self._entities:
             if hasattr(entity, "set_listener"):
                 entity.set_listener(None)

@@ -18,7 +18,6 @@ from gmmtorch.live.ros.topics import (
     MAX_MESSAGE_BYTES,
     Endpoint,
     MessageTypes,
-    Middleware,
     Quality,
     TopicNames,
     mismatch,
@@ -114,7 +113,7 @@ class Node:
         self.names = TopicNames(name, namespace, remap)
         self.types = MessageTypes()
         number = _environment_domain() if domain is None else domain
-        self._middleware: Middleware = (
+        self._middleware = (
             dds.DdsMiddleware(self.types, number, interface, peers)
             if middleware == "dds"
             else zenoh_middleware.ZenohMiddleware(self.types, number, self.names, router)

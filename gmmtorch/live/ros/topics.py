@@ -1,11 +1,11 @@
-"""ROS 2 topics: their names, types and quality of service, and what a node needs of a wire protocol."""
+"""ROS 2 topics: their names, types and quality of service, and endpoints."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from gmmtorch.datasets import MessageDecoder
 from gmmtorch.errors import InvalidArgumentError
@@ -186,21 +186,3 @@ class Endpoint(NamedTuple):
     type: str
     quality: Quality
     is_publisher: bool
-
-
-class Middleware(Protocol):
-    """Carries CDR messages by topic. Callbacks run in threads of the middleware."""
-
-    def publisher(self, topic: str, message_type: str, quality: Quality) -> Callable[[bytes], None]:
-        """Declares a publisher; the result sends a message."""
-
-    def subscribe(
-        self, topic: str, message_type: str, quality: Quality, on_message: Callable[[bytes], None]
-    ) -> None:
-        """Declares a subscriber, whose messages go to the callback."""
-
-    def endpoints(self) -> list[Endpoint]:
-        """All known publishers and subscribers of ROS topics."""
-
-    def close(self) -> None:
-        """Leaves the network."""
