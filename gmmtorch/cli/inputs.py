@@ -155,12 +155,16 @@ def open_map(
     tiled = TiledMap(folders[0], runtime.device, memory_limit=runtime.memory_limit)
     if bounds is None:
         return tiled.open(resolution=resolution)
-    if len(bounds) != 2 * tiled.dim:
+    return tiled.open(*corners(bounds, tiled.dim), resolution)
+
+
+def corners(bounds: Sequence[float], dim: int) -> tuple[list[float], list[float]]:
+    """The lowest and the highest corner (m) of the option `bounds`. Raises `InvalidArgumentError`."""
+    if len(bounds) != 2 * dim:
         raise InvalidArgumentError(
-            f"bounds={list(bounds)} must be {2 * tiled.dim} numbers in {tiled.dim}D: the lowest corner, then "
-            "the highest."
+            f"bounds={list(bounds)} must be {2 * dim} numbers in {dim}D: the lowest corner, then the highest."
         )
-    return tiled.open(list(bounds[: tiled.dim]), list(bounds[tiled.dim :]), resolution)
+    return list(bounds[:dim]), list(bounds[dim:])
 
 
 def new_map(

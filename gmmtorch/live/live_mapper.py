@@ -34,7 +34,6 @@ class LiveMapper:
 
     Args:
         node: receives the messages of `scans`.
-        scans: the scans.
         target: the map.
         publisher: publishes the map; None: it is not published.
         period: seconds between two publications, at least.
@@ -211,10 +210,7 @@ class LiveLocalizer:
 
     Args:
         node: receives the messages of `scans`.
-        scans: the scans.
-        known: the map.
         has_motion: whether the poses of scans are those of TF.
-        device: of the computation.
 
     Attributes:
         poses, times: of the scans that were found: (D+1, D+1) map ← sensor, and seconds.

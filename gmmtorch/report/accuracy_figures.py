@@ -30,7 +30,6 @@ def roc_figure(
 
     Args:
         curves: by method: false positive rates (T,), true positive rates (T,) and the area under the curve.
-        title: title of the figure.
     """
     figure = style.new_figure(5.8, 5.6)
     axes = figure.subplots()

@@ -66,7 +66,6 @@ def map_figure(
         trajectories: sensor positions (S, D) of each drive in order, world metres.
         truth: true positions (S, D), drawn beside the trajectories.
         lost: positions (S, D) near which a scan was not localised.
-        title: title of the figure.
 
     Raises `InvalidArgumentError` without a panel, and for panels and trajectories of different dimensions.
     """

@@ -261,10 +261,8 @@ def map_scene_figure(
     Args:
         points: (N, 3) measured points, world metres.
         trajectory: (S, 3) sensor origins, world metres.
-        maps: the maps.
         resolution: side (m) of the cells; a multiple if more than two million cells would be asked.
         components: surfaces of the map; None: the panel of the components is left out.
-        title: of the figure.
     """
     hidden = _Hidden(components)
     cloud = points[style.even_sample(len(points), _MAX_POINTS)].double().cpu()

@@ -41,7 +41,6 @@ FIT_FIELDS = {
     "nbytes",
 }  # fmt: skip
 STRATEGIES = ["experiment=strategies", "method=[em,hierarchical,scikit_learn]", "max_points=150"]
-CARMEN_LOG = "FLASER 3 1.0 2.0 1.5 {x} 0 0 {x} 0 0 0.1 host 0.1\n"
 
 
 @pytest.fixture
@@ -92,12 +91,6 @@ def test_results_have_the_documented_fields(whole_run):
     for row in results["rows"]:
         assert fields <= row.keys()
         assert all(isinstance(value, str | int | float | bool | None) for value in row.values())
-
-
-def test_only_grids_have_no_components(occupancy_run):
-    rows = {row["method"]: row for row in occupancy_run.results()["rows"]}
-    assert rows["occupancy_grid"]["n_components"] is None
-    assert rows["point"]["n_components"] > 0
 
 
 def test_run_directory_contains_results_figures_events_and_configuration(whole_run):
@@ -214,14 +207,6 @@ def test_every_share_resolution_and_method_has_a_row_and_a_saved_map(run, tmp_pa
         assert kind.load(path).nbytes == row["nbytes"] == path.stat().st_size
 
 
-def test_a_carmen_log_can_be_mapped(monkeypatch, tmp_path):
-    log = tmp_path / "own.log"
-    log.write_text("".join(CARMEN_LOG.format(x=0.1 * i) for i in range(6)))
-    options = [*QUIET, "map.n_samples=20000", "dataset=carmen", f"dataset.path={log}"]
-    done = succeeded(run_here(monkeypatch, "occupancy", tmp_path / "run", *options))
-    assert {row["dataset"] for row in done.results()["rows"]} == {"own"}
-
-
 # -- experiments ----------------------------------------------------------------------------------
 
 
@@ -299,15 +284,6 @@ def test_the_number_of_components_can_be_automatic(run):
     assert done.results()["rows"][0]["n_components"] == 1
 
 
-def test_a_mesh_can_be_fitted(monkeypatch, tmp_path):
-    mesh = tmp_path / "triangle.obj"
-    mesh.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    options = [*QUIET, "dataset=mesh", f"dataset.path={mesh}", "dataset.n_points=300", "dataset.noise=0.01"]
-    done = succeeded(run_here(monkeypatch, "fit", tmp_path / "run", "mixture.n_components=4", *options))
-    assert done.results()["rows"][0]["dataset"] == "triangle"
-    assert done.results()["rows"][0]["n_points"] == 270
-
-
 # -- errors ---------------------------------------------------------------------------------------
 
 
@@ -375,13 +351,6 @@ def test_an_invalid_fit_option_gives_a_one_line_error(options, words, run):
 def test_a_missing_path_names_the_expected_files(command, options, words, monkeypatch, tmp_path):
     line = refused(run_here(monkeypatch, command, tmp_path / "run", *QUIET, *options.split()))
     assert all(word in line for word in words.split()), line
-
-
-def test_a_damaged_file_is_named(monkeypatch, tmp_path):
-    log = tmp_path / "broken.log.gz"
-    log.write_bytes(b"\x1f\x8b broken")
-    options = [*QUIET, "dataset=carmen", f"dataset.path={log}"]
-    assert str(log) in refused(run_here(monkeypatch, "occupancy", tmp_path / "run", *options))
 
 
 @pytest.mark.slow

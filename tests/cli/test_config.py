@@ -31,8 +31,6 @@ from gmmtorch.experiments.evaluation import methods
 from gmmtorch.experiments.evaluation.fits import ESTIMATORS
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
-from gmmtorch.simulation.mine import tunnels
-from gmmtorch.simulation.warehouses import warehouse
 from gmmtorch.team.cli.from_options import missions
 from gmmtorch.team.exploration.mission.options import FRAMEWORKS, THESIS, TeamOptions
 from gmmtorch.team.exploration.mission.trials import WorldOptions
@@ -133,23 +131,6 @@ def test_every_experiment_of_teams_composes_and_gives_its_trials(name, tmp_path)
         composed("explore", f"experiment={name}", "study.nonsense=1")
 
 
-@pytest.mark.parametrize(
-    ("world", "team", "planner"),
-    [
-        ("warehouse", "gmm_shared", "mcts"),
-        ("tunnels", "grid_shared", "frontier"),
-        ("mesh", "grid_isolated", "random"),
-        ("warehouse", "gmm_thesis", "mcts"),
-    ],
-)
-def test_worlds_teams_and_planners_compose(world, team, planner, tmp_path):
-    path = ["world.path=mine.ply"] if world == "mesh" else []
-    config = composed("explore", f"world={world}", f"team={team}", f"planner={planner}", *path)
-    trial = missions.trial_of(config, tmp_path)
-    assert (trial.world.name, trial.team.framework, trial.team.planner) == (world, team, planner)
-    assert trial.world.path == ("mine.ply" if path else None)
-
-
 def test_the_file_of_the_thesis_team_has_its_options():
     config = composed("explore", "team=gmm_thesis")
     assert config.codec == THESIS["codec"]
@@ -164,24 +145,9 @@ def test_options_that_are_not_of_the_thesis_team_are_refused():
         missions.variants_of(composed("explore", "team=gmm_thesis", "experiment=deviations"))
 
 
-@pytest.mark.parametrize("world", ["warehouse", "tunnels"])
-def test_a_generated_world_can_have_the_size_of_its_file(world):
-    options = composed("explore", f"world={world}").world
-    draw = {"warehouse": warehouse, "tunnels": tunnels}[world]
-    assert draw(options.seed, tuple(options.size)).shape[1:] == (3, 3)
-
-
 def test_every_team_and_planner_has_its_file():
     assert choices("team") == sorted(FRAMEWORKS)
     assert choices("planner") == sorted(PLANNERS)
-
-
-@pytest.mark.parametrize(
-    ("command", "name"), [("fit", "strategies"), ("occupancy", "fig3_6_auc_sparsity_3d")]
-)
-def test_an_experiment_can_run_on_another_data_set(command, name):
-    for dataset in ("carmen", "mesh_scans"):
-        assert composed(command, f"experiment={name}", f"dataset={dataset}").dataset.name == dataset
 
 
 @pytest.mark.parametrize("command", CONFIGURED[: CONFIGURED.index("export")])
@@ -197,23 +163,6 @@ def test_results_go_to_a_folder_in_outputs(command):
             assert re.fullmatch(rf"outputs/{command}/[-_\d]{{19}}({number})?", place)
         assert node.run.dir.endswith(number)
         assert node.sweep.subdir == f"3{number}"
-
-
-@pytest.mark.parametrize(
-    "override",
-    [
-        "evaluation.test_every=often",
-        "evaluation.kept=0.5",
-        "map.noise=loud",
-        "method=monte_carlo",
-        "evaluation.tests_every=3",
-        "map=nonsense",
-    ],
-)
-def test_wrong_types_and_names_raise_and_are_named(override):
-    name = override.split("=")[0]
-    with pytest.raises(ConfigCompositionException, match=name.split(".")[-1]):
-        composed("occupancy", override)
 
 
 # -- one set of defaults --------------------------------------------------------------------------

@@ -121,7 +121,7 @@ def test_a_run_has_the_pictures_of_its_map_and_the_paths_of_its_recordings(whole
     assert any(name.startswith("tensorboard/events") for name in whole.files())
     merged = whole.results()["rows"][-1]
     assert merged["metres"] == pytest.approx(3 * 0.3 * (N_SCANS - 1), rel=0.01)
-    paths = map_outputs.trajectories(whole.folder, None, 2)
+    paths = map_outputs.trajectories(whole.folder, 2)
     assert [tuple(path.shape) for path in paths] == [(N_SCANS, 2)] * 3
     (first, last) = paths[0][0], paths[2][-1]
     torch.testing.assert_close(first, torch.tensor([1.0, 2.0], dtype=torch.float64))

@@ -86,12 +86,19 @@ def assert_shown(done: Finished, pictures: set[str], *tags: str) -> None:
     assert set(tags) <= {*found["scalars"], *single}
 
 
-def test_auc_against_sparsity_in_2d(run):
-    done = succeeded(run("fig3_4_auc_sparsity_2d"))
-    rows = done.results()["rows"]
-    methods = ["occupancy_grid", "hilbert", "cone", "flux", "monte_carlo", "point"]
-    assert [(row["kept"], row["method"]) for row in rows] == [(k, m) for k in (1.0, 0.5) for m in methods]
+@pytest.mark.parametrize(
+    ("name", "shares", "resolution", "methods"),
+    [
+        ("fig3_4_auc_sparsity_2d", (1.0, 0.5), 0.5, "occupancy_grid hilbert cone flux monte_carlo point"),
+        ("fig3_6_auc_sparsity_3d", (1.0, 0.1), 0.25, "occupancy_grid monte_carlo point"),
+    ],
+)
+def test_auc_against_sparsity(name, shares, resolution, methods, run):
+    rows = succeeded(run(name)).results()["rows"]
+    expected = [(share, method) for share in shares for method in methods.split()]
+    assert [(row["kept"], row["method"]) for row in rows] == expected
     assert all(0 < row["auc_low"] <= row["auc"] <= row["auc_high"] <= 1 for row in rows)
+    assert {row["resolution"] for row in rows} == {resolution}
 
 
 def test_maps_in_2d_with_magnified_regions(run):
@@ -99,13 +106,6 @@ def test_maps_in_2d_with_magnified_regions(run):
     assert "map_0.5m.png" in done.files()
     first, second = ((done.folder / f"map_0.5m_region_{number}.png").read_bytes() for number in (1, 2))
     assert first != second
-
-
-def test_auc_against_sparsity_in_3d(run):
-    rows = succeeded(run("fig3_6_auc_sparsity_3d")).results()["rows"]
-    methods = ["occupancy_grid", "monte_carlo", "point"]
-    assert [(row["kept"], row["method"]) for row in rows] == [(k, m) for k in (1.0, 0.1) for m in methods]
-    assert {row["resolution"] for row in rows} == {0.25}
 
 
 @pytest.mark.slow

@@ -1,4 +1,7 @@
-"""One belief: whatever shows or writes a map's probabilities gets them from its evidence by one formula."""
+"""One belief: whatever shows a map's probabilities gets them from its evidence by one formula.
+
+The tests of gmmtorch-export compare what it writes with the answers of the map.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from command_runs import as_it_was, run_here, succeeded
-from export.map_examples import read_map_image
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from gmmtorch.datasets import load
@@ -28,12 +28,6 @@ from gmmtorch.report.map_images import MapPanel
 SIDE = 0.25
 UNUSUAL = Calibration.of_bytes(np.array([1, 8, 1, 0, 0, -1, 0, 0, -0.5, 0, 0, 0.5, 0, 0], "<f2").tobytes())
 """A calibration far from the sensor model's, so that a consumer that ignores it shows."""
-
-
-@pytest.fixture(autouse=True)
-def hydra_as_it_was():
-    with as_it_was():
-        yield
 
 
 @pytest.fixture(scope="module", params=[2, 3])
@@ -84,66 +78,6 @@ def test_answers_of_a_map_its_file_and_its_tiles(built, file, tmp_path):
         found = torch.as_tensor(answers.occupancy(points, SIDE))
         torch.testing.assert_close(found, theta, rtol=0, atol=1e-6)
     torch.testing.assert_close(built.evidence(grid).probability().flatten(), theta, rtol=0, atol=1e-6)
-
-
-def exported(monkeypatch: pytest.MonkeyPatch, file: Path, output: str, *options: str) -> Path:
-    monkeypatch.chdir(file.parent)
-    given = [f"path={file}", f"output={output}", f"resolution={SIDE}", "report.progress=false", *options]
-    succeeded(run_here(monkeypatch, "export", file.parent, *given))
-    return file.parent / output
-
-
-def test_the_image_of_map_server(built, file, monkeypatch):
-    band = ["z_min=0.3", "z_max=0.4"] if built.dim == 3 else []
-    found = read_map_image(exported(monkeypatch, file, "floor.yaml", *band))
-    grid = found.grid
-    if built.dim == 3:
-        grid = VoxelGrid((*grid.origin, 0.25), SIDE, (*grid.shape, 1))
-    theta = believed(built, grid).view(found.grid.shape)
-    assert float((found.probability - theta).abs().max()) <= 1 / 255
-
-
-def test_the_log_odds_of_octomap(built, file, monkeypatch):
-    pyoctomap = pytest.importorskip("pyoctomap")
-    if built.dim == 2:
-        pytest.skip("an octree of a 2D map is a layer of the same cells")
-    tree = pyoctomap.OcTree(SIDE).read(str(exported(monkeypatch, file, "map.ot")))
-    grid = around(built)
-    theta = believed(built, grid).flatten()
-    nodes = [tree.search(center) for center in grid.centers().numpy()]
-    known = [row for row, node in enumerate(nodes) if node is not None]
-    assert len(known) > 200
-    odds = torch.tensor([nodes[row].getLogOdds() for row in known], dtype=torch.float64)
-    torch.testing.assert_close(odds, torch.logit(theta[known], eps=1e-6), rtol=0, atol=2e-3)
-
-
-def test_the_distance_field(built, file, monkeypatch):
-    band = ["z_min=0.3", "z_max=0.7"] if built.dim == 3 else []
-    with np.load(exported(monkeypatch, file, "field.npz", "format=distance_field", *band)) as field:
-        origin, distance = field["origin"], field["distance"]
-    grid = VoxelGrid(tuple(origin.tolist()), SIDE, distance.shape)
-    occupied = Thresholds().classify(believed(built, grid).view(distance.shape)).numpy() == 1
-    expected = distance_transform_edt(~occupied, sampling=SIDE)
-    outside = ~occupied
-    assert occupied.any()
-    np.testing.assert_allclose(distance[outside], expected[outside], atol=1e-5)
-
-
-def test_the_cells_of_a_cloud(built, file, monkeypatch):
-    import open3d
-
-    cloud = np.asarray(
-        open3d.io.read_point_cloud(str(exported(monkeypatch, file, "c.ply", "format=ply"))).points
-    )
-    points = torch.from_numpy(cloud)[:, : built.dim]
-    corner = tuple(((points.amin(0) / SIDE).floor() * SIDE).tolist())
-    size = tuple(((points.amax(0) - torch.tensor(corner)) / SIDE + 1).long().tolist())
-    grid = VoxelGrid(corner, SIDE, size)
-    occupied = believed(built, grid).flatten() > Thresholds().occupied
-    place = ((points - torch.tensor(corner)) / SIDE).floor().long()
-    seen = torch.zeros(size, dtype=torch.bool)
-    seen[tuple(place.T)] = True
-    assert torch.equal(seen.flatten(), occupied)
 
 
 def test_the_viewer(built, monkeypatch):

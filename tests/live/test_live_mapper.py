@@ -141,15 +141,14 @@ def test_the_grid_has_the_layout_of_ros_and_updates_where_it_changed():
     markers = user.take("ellipsoids")[0]["markers"]
     assert markers[0]["action"] == 3
     assert len(markers) == 1 + int((~first.components().max_range).sum())
-    last = publisher._last
-    assert last is not None
-    changed = last.cells.copy()
+    assert publisher._last is not None
+    last, changed = publisher._last[0], publisher._last[1].copy()
     changed[1:3, 2] = 100 - changed[1:3, 2].clip(0)
-    publisher._publish_grid(last._replace(cells=changed), {}, 6)
+    publisher._publish_grid(last, changed, {}, 6)
     (update,) = user.take("map_updates")
     assert (update["x"], update["y"], update["width"], update["height"]) == (2, 1, 1, 2)
     assert np.array_equal(update["data"], changed[1:3, 2])
-    publisher._publish_grid(last._replace(cells=changed), {}, 7)
+    publisher._publish_grid(last, changed, {}, 7)
     assert len(user.take("map_updates")) == 1  # nothing has changed
 
 
@@ -166,8 +165,8 @@ def test_the_grid_of_a_growing_map_is_that_of_all_its_components(tmp_path, kind)
         alone.publish(GaussianMap.of(target.components()), "map", 0)
         assert publisher._last is not None
         assert alone._last is not None
-        assert publisher._last.grid == alone._last.grid
-        assert np.array_equal(publisher._last.cells, alone._last.cells)
+        assert publisher._last[0] == alone._last[0]
+        assert np.array_equal(publisher._last[1], alone._last[1])
         band, theta = publisher._probabilities(target)
         assert band is not None
         expected = torch.as_tensor(target.occupancy(publisher._evidence.centers(band), 0.1))

@@ -236,12 +236,7 @@ class _Space:
         low, high = self._extent()
         dim, bounds = len(low), self._config.bounds
         if bounds is not None:
-            if len(bounds) != 2 * dim:
-                raise InvalidArgumentError(
-                    f"bounds={list(bounds)} must be {2 * dim} numbers in {dim}D: the lowest corner, then the "
-                    "highest."
-                )
-            low, high = list(bounds[:dim]), list(bounds[dim:])
+            low, high = inputs.corners(bounds, dim)
             if not all(a < b for a, b in zip(low, high, strict=True)):
                 raise InvalidArgumentError(
                     f"bounds={list(bounds)}: the lowest corner {low} must be below the highest {high} along "
