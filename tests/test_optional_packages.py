@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import re
 import subprocess
 import sys
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -38,102 +40,49 @@ IMPORTED = {
 """Import names of the optional packages that gmmtorch imports."""
 
 
-def bag(folder: Path) -> object:
-    from gmmtorch.export.bag import write_bag
-
-    drive = gt.datasets.load("synthetic_building_2d", n_scans=1)
-    return write_bag(folder / "a.mcap", [drive[0]], [drive.pose(0)])
-
-
-def las(folder: Path) -> object:
-    from gmmtorch.datasets.point_files.las_files import LasRows
-
-    return LasRows(folder / "a.las")
+def of(name: str) -> Any:
+    """An object of the package by its dotted name, imported when it is used."""
+    module, _, last = name.rpartition(".")
+    return getattr(importlib.import_module(f"gmmtorch.{module}"), last)
 
 
-def viewer(folder: Path) -> object:
-    from gmmtorch.live.map_viewer import MapViewer
-
-    return MapViewer(gt.GaussianMap())
+def drive() -> Any:
+    return gt.datasets.load("synthetic_building_2d", n_scans=2)
 
 
-def recording(folder: Path) -> object:
-    from gmmtorch.team.report.mission_maps import load_rerun
-
-    return load_rerun()
-
-
-def codec(name: str) -> Callable[[Path], object]:
-    from gmmtorch.team.sharing.point_codecs import bytes_of_points
-
-    return lambda folder: bytes_of_points(torch.rand(50, 3), 0.1, 0.01, names=(name,))
+def points_coded_by(name: str) -> Callable[[Path], object]:
+    points = torch.rand(50, 3)
+    return lambda folder: of("team.sharing.point_codecs.bytes_of_points")(points, 0.1, 0.01, names=(name,))
 
 
 def key(folder: Path) -> object:
-    from gmmtorch.team.sharing.transport.security import TeamKey
-    from gmmtorch.team.sharing.transport.udp import UdpTransport
-
-    file = folder / "team.key"
-    file.touch(0o600)
-    file.write_text("ab" * 32)
-    return UdpTransport.unicast(0, key=TeamKey.from_file(file))
+    (folder / "team.key").touch(0o600)
+    (folder / "team.key").write_text("ab" * 32)
+    found = of("team.sharing.transport.security.TeamKey").from_file(folder / "team.key")
+    return of("team.sharing.transport.udp.UdpTransport").unicast(0, key=found)
 
 
-def zenoh(folder: Path) -> object:
-    from gmmtorch.team.sharing.transport.zenoh_transport import load_zenoh
-
-    return load_zenoh()
+def write_bag(folder: Path) -> object:
+    return of("export.bag.write_bag")(folder / "a.mcap", [drive()[0]], [drive().pose(0)])
 
 
-def node(middleware: str) -> Callable[[Path], object]:
-    def start(folder: Path) -> object:
-        from gmmtorch.live.ros import Node
-
-        return Node("a", middleware=middleware)
-
-    return start
-
-
-def odometry(folder: Path) -> object:
-    from gmmtorch.localization.odometry import with_odometry
-
-    return with_odometry(gt.datasets.load("synthetic_building_2d", n_scans=2), "kiss_icp")
-
-
-def workers(folder: Path) -> object:
-    from gmmtorch.optional_packages import load_ray
-
-    return load_ray()
-
-
-def fused(folder: Path) -> object:
-    from gmmtorch.kernels import use_kernels
-
-    return use_kernels("fused")
-
-
-def octomap(folder: Path) -> object:
-    tree = gt.baselines.OctoMapMap(0.1)
-    tree.insert(gt.Scan([[1.0, 0.0, 0.0]], [0.0, 0.0, 0.0]))
-    return tree
-
-
-CASES = [
-    ("rosbags", "bags", bag),
-    ("laspy", "formats", las),
-    ("viser", "viewer", viewer),
-    ("rerun", "viewer", recording),
-    ("pyoctomap", "baselines", octomap),
-    ("DracoPy", "baselines", codec("draco")),
-    ("zstandard", "baselines", codec("octree")),
+SCAN = gt.Scan([[1.0, 0.0, 0.0]], [0.0, 0.0, 0.0])
+CASES: list[tuple[str, str, Callable[[Path], object]]] = [
+    ("rosbags", "bags", write_bag),
+    ("laspy", "formats", lambda folder: of("datasets.point_files.las_files.LasRows")(folder / "a.las")),
+    ("viser", "viewer", lambda _: of("live.map_viewer.MapViewer")(gt.GaussianMap())),
+    ("rerun", "viewer", lambda _: of("team.report.mission_maps.load_rerun")()),
+    ("pyoctomap", "baselines", lambda _: gt.baselines.OctoMapMap(0.1).insert(SCAN)),
+    ("DracoPy", "baselines", points_coded_by("draco")),
+    ("zstandard", "baselines", points_coded_by("octree")),
     ("cryptography", "network", key),
-    ("zenoh", "zenoh", zenoh),
-    ("cyclonedds", "ros", node("dds")),
-    ("zenoh", "ros", node("zenoh")),
-    ("rosbags", "ros", node("dds")),
-    ("kiss_icp", "odometry", odometry),
-    ("ray", "cluster", workers),
-    ("warp", "fast", fused),
+    ("zenoh", "zenoh", lambda _: of("team.sharing.transport.zenoh_transport.load_zenoh")()),
+    ("cyclonedds", "ros", lambda _: of("live.ros.Node")("a", middleware="dds")),
+    ("zenoh", "ros", lambda _: of("live.ros.Node")("a", middleware="zenoh")),
+    ("rosbags", "ros", lambda _: of("live.ros.Node")("a", middleware="dds")),
+    ("kiss_icp", "odometry", lambda _: of("localization.odometry.with_odometry")(drive(), "kiss_icp")),
+    ("ray", "cluster", lambda _: of("optional_packages.load_ray")()),
+    ("warp", "fast", lambda _: of("kernels.use_kernels")("fused")),
 ]
 
 

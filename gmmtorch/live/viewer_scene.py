@@ -107,11 +107,6 @@ def first_hidden(solid: Solid, resolution: float) -> int:
     return math.ceil(100 * int(unsure.sum()) / max(len(unsure), 1))
 
 
-def sphere(n_components: int) -> tuple[Tensor, Tensor]:
-    """Vertices (V, 3) and faces (F, 3) of each drawn ellipsoid; fewer where there are many components."""
-    return unit_sphere(next(vertices for most, vertices in _SPHERES if n_components <= most))
-
-
 def instances(solid: Solid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The 2σ ellipsoids as copies of a unit sphere: quaternions wxyz (K, 4), places and scales (K, 3), m."""
     deviations, axes = principal_axes(solid.covariances)
@@ -368,7 +363,7 @@ def add_lights(scene: Any, distance: float) -> None:
 def add_ellipsoids(scene: Any, solid: Solid, colours: np.ndarray) -> Any:
     """Components in the scene's frame as 2σ ellipsoids with colours (K, 3) uint8."""
     wxyz, positions, scales = (part.astype(np.float32) for part in instances(solid))
-    vertices, faces = sphere(len(colours))
+    vertices, faces = unit_sphere(next(n for most, n in _SPHERES if len(colours) <= most))
     return scene.add_batched_meshes_simple(
         "/components",
         vertices.float().numpy(),

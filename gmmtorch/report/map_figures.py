@@ -66,20 +66,9 @@ def map_figure(
         trajectories: sensor positions (S, D) of each drive in order, world metres.
         truth: true positions (S, D), drawn beside the trajectories.
         lost: positions (S, D) near which a scan was not localised.
-
-    Raises `InvalidArgumentError` without a panel, and for panels and trajectories of different dimensions.
     """
-    if not panels:
-        raise InvalidArgumentError("panels is empty; give at least one map to show.")
     dim = panels[0].dim
-    paths = [style.as_array(path) for path in trajectories]
-    beside = [style.as_array(path) for path in (truth, lost) if path is not None]
-    if any(panel.dim != dim for panel in panels) or any(p.shape[1:] != (dim,) for p in paths + beside):
-        raise InvalidArgumentError(
-            f"panels are of dimensions {[panel.dim for panel in panels]} and trajectories have shapes "
-            f"{[path.shape for path in paths]}; all must be 2D, or all 3D."
-        )
-    paths = [path for path in paths if len(path)]
+    paths = [style.as_array(path) for path in trajectories if len(path)]
     flown = np.concatenate(paths) if paths else None
     n_bands = math.ceil(len(panels) / _MAX_COLUMNS)
     n_columns = math.ceil(len(panels) / n_bands)

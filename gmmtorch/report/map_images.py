@@ -12,7 +12,6 @@ import torch
 from matplotlib.axes import Axes
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.occupancy import check_resolution
 from gmmtorch.report.style import as_array
 from gmmtorch.scan import ArrayLike
@@ -50,8 +49,6 @@ def robust_bounds(
     A few stray points far away do not enlarge the box.
     """
     cloud = _finite(points)
-    if not 0 < share <= 1:
-        raise InvalidArgumentError(f"share={share} must lie in (0, 1].")
     corners = []
     if len(cloud):
         corners.append(np.quantile(cloud.numpy(), [(1 - share) / 2, (1 + share) / 2], axis=0))
@@ -107,8 +104,6 @@ class MapPanel:
         occupancy: probability (M,) at the points (M, D), float64 world metres; ½ is unknown.
         resolution: side (m) of a cell; one pixel, unless the region is too large for that.
         low, high: corners (D,) of the region, world metres; D is 2 or 3.
-
-    Raises `InvalidArgumentError` for corners that span no region.
     """
 
     title: str
@@ -121,13 +116,6 @@ class MapPanel:
         object.__setattr__(self, "resolution", check_resolution(self.resolution))
         for name in ("low", "high"):
             object.__setattr__(self, name, corner_of(getattr(self, name)))
-        low, high = self.low, self.high
-        valid = len(low) == len(high) and len(low) in (2, 3)
-        if not valid or not all(-math.inf < a < b < math.inf for a, b in zip(low, high, strict=True)):
-            raise InvalidArgumentError(
-                f"low={low}, high={high} span no region; give two corners of 2 or 3 finite coordinates (m), "
-                "low below high."
-            )
 
     @property
     def dim(self) -> int:
@@ -211,16 +199,11 @@ def height_image(panel: MapPanel, max_pixels: int = MAX_PIXELS, max_queries: int
 def highest_occupancy(probability: ArrayLike, low: ArrayLike, resolution: float) -> MapImage:
     """Returns the highest occupancy of the known cells in each column; ½ where none is known.
 
-    probability (nx, ny, nz): within 0.02 of ½ is unknown; truth values are accepted. low (3,): corner of the
-    lowest cell, world metres. Raises `InvalidArgumentError` for other shapes, and without a layer of cells.
+    probability (nx, ny, nz), nz ≥ 1: within 0.02 of ½ is unknown; truth values are accepted. low (3,): corner
+    of the lowest cell, world metres.
     """
-    theta, corner = torch.as_tensor(probability).detach().cpu().double(), as_array(low)
-    if theta.ndim != 3 or corner.shape != (3,) or theta.shape[2] == 0:
-        raise InvalidArgumentError(
-            f"probability has shape {tuple(theta.shape)} and low {corner.shape}; expected (nx, ny, nz) "
-            "with at least one layer of cells, and (3,)."
-        )
-    x, y, bottom = corner.tolist()
+    theta = torch.as_tensor(probability).detach().cpu().double()
+    x, y, bottom = as_array(low).tolist()
     highest = torch.where(is_unknown(theta), -1.0, theta).amax(2)
     image = torch.where(highest < 0, 0.5, highest)
     return MapImage(image, (x, y), resolution, (bottom, bottom + theta.shape[2] * resolution))
@@ -288,10 +271,4 @@ def _is_occupied(theta: Tensor) -> Tensor:
 
 def _query(panel: MapPanel, points: Tensor) -> Tensor:
     answers = [torch.as_tensor(panel.occupancy(part)) for part in points.split(_BATCH)]
-    theta = torch.cat(answers).detach().cpu().double()
-    if theta.shape != (len(points),):
-        raise InvalidArgumentError(
-            f"occupancy of the panel {panel.title!r} returned shape {tuple(theta.shape)} for {len(points)} "
-            "points; it must return one probability for each point."
-        )
-    return theta
+    return torch.cat(answers).detach().cpu().double()

@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.report import style
 from gmmtorch.report.ellipsoids import (
     checked_components,
@@ -70,10 +69,6 @@ def mixture_figure(
     mean, covariance = (value.cpu() for value in checked_components(means, covariances))
     dim = mean.shape[1]
     cloud, weight = style.as_array(points).reshape(-1, dim), style.as_array(weights)
-    if weight.shape != (len(mean),):
-        raise InvalidArgumentError(
-            f"weights has shape {weight.shape}; expected ({len(mean)},), one per component."
-        )
     places = checked_rows("seen_from", seen_from, mean)
     limit = max_components or (MAX_ELLIPSES if dim == 2 else MAX_ELLIPSOIDS)
     shown = torch.from_numpy(np.sort(np.argsort(-weight, kind="stable")[:limit]))

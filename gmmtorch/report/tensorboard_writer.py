@@ -17,7 +17,7 @@ import torch
 from matplotlib.colors import to_rgb
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, OutputError
+from gmmtorch.errors import OutputError
 from gmmtorch.report.ellipsoids import checked_components, ellipsoid_mesh
 from gmmtorch.report.style import as_array, colour, even_sample, picture
 from gmmtorch.report.text import format_value
@@ -85,10 +85,6 @@ class Board:
         """Writes the precision-recall curve of probabilities (M,) for labels (M,), 1 occupied and 0 free,
         and a figure of the ROC curve (tag/roc) if both labels occur."""
         truth, theta = as_array(labels) > 0.5, as_array(probabilities)
-        if truth.shape != theta.shape or truth.ndim != 1:
-            raise InvalidArgumentError(
-                f"labels has shape {truth.shape} and probabilities {theta.shape}; both must be (M,)."
-            )
         if len(truth) == 0:
             return
         self._events.add("pr_curve", tag, truth, theta, step=0)
@@ -115,17 +111,8 @@ class Board:
     def cloud(self, tag: str, points: ArrayLike, colors: ArrayLike | None = None, step: int = 0) -> None:
         """Writes points (N, D), metres, with colours (N, 3) from 0 to 255; writes nothing for no points."""
         cloud = torch.as_tensor(points).detach().cpu()
-        if cloud.ndim != 2 or cloud.shape[1] not in (2, 3):
-            raise InvalidArgumentError(f"points has shape {tuple(cloud.shape)}; expected (N, 2) or (N, 3).")
         kept = torch.from_numpy(even_sample(len(cloud), _MAX_POINTS))
-        colour = None
-        if colors is not None:
-            colour = torch.as_tensor(colors).detach().cpu()
-            if colour.shape != (len(cloud), 3):
-                raise InvalidArgumentError(
-                    f"colors has shape {tuple(colour.shape)}; expected ({len(cloud)}, 3), 0 to 255."
-                )
-            colour = colour[kept]
+        colour = None if colors is None else torch.as_tensor(colors).detach().cpu()[kept]
         if len(cloud):
             flat = cloud.new_zeros(len(kept), 3 - cloud.shape[1])
             self._add_mesh(tag, torch.cat([cloud[kept], flat], 1), colour, None, step)

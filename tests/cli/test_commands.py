@@ -319,6 +319,8 @@ def test_an_invalid_map_option_gives_a_one_line_error(options, words, run):
     [
         ("method=[kmeans]", "method='kmeans' em scikit_learn"),
         ("method=[]", "method"),
+        ("dataset=carmen", "dataset.path is not set FLASER"),
+        ("dataset=scan_folder dataset.path=/no/where", "dataset.path=/no/where does not exist poses.txt"),
         ("scans=[99]", "scans=[99] 0 39"),
         ("max_points=0", "max_points=0"),
         ("mixture.n_components=9999", "n_components=9999"),
@@ -334,22 +336,6 @@ def test_an_invalid_map_option_gives_a_one_line_error(options, words, run):
 )
 def test_an_invalid_fit_option_gives_a_one_line_error(options, words, run):
     line = refused(run("fit", *options.split()))
-    assert all(word in line for word in words.split()), line
-
-
-@pytest.mark.parametrize(
-    ("command", "options", "words"),
-    [
-        ("occupancy", "dataset=carmen", "dataset.path is not set FLASER"),
-        (
-            "fit",
-            "dataset=scan_folder dataset.path=/no/where",
-            "dataset.path=/no/where does not exist poses.txt",
-        ),
-    ],
-)
-def test_a_missing_path_names_the_expected_files(command, options, words, monkeypatch, tmp_path):
-    line = refused(run_here(monkeypatch, command, tmp_path / "run", *QUIET, *options.split()))
     assert all(word in line for word in words.split()), line
 
 

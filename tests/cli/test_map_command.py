@@ -21,6 +21,11 @@ from gmmtorch.mapping.tiles.tiled_map import TiledMap
 from gmmtorch.report import Board
 
 Run = Callable[..., Finished]
+NO_POSES = (
+    "dataset.motion={} predicts the poses of odometry, but dataset.odometry=none estimates no poses; use "
+    "dataset.odometry=mixture, or dataset.motion=constant"
+)
+WHEELS = "dataset.motion='wheels' is not one of constant, dataset, imu"
 SMALL = ["dataset=synthetic_building_2d", "dataset.n_scans=10", "map.window=4", "resolution=0.2"]
 
 
@@ -112,18 +117,28 @@ def test_a_map_larger_than_its_memory_grows_in_tiles_and_continues(monkeypatch, 
     assert "has a map" in third.stderr
 
 
-def test_options_of_a_map_in_tiles_are_checked(run, monkeypatch, tmp_path):
-    assert "map.memory" in refused(run("map.memory=0"))
-    assert "with map.memory, use gmmtorch-view" in refused(run("map.memory=1e6", "view=true"))
-    assert "budget" in refused(run("map.memory=1e6", "map.max_bytes=1000"))
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("export=[mesch]", "'mesch' is not one of map_server"),
+        ("resolution=0", "resolution=0"),
+        ("map.memory=0", "map.memory"),
+        ("map.memory=1e6 view=true", "with map.memory, use gmmtorch-view"),
+        ("map.memory=1e6 map.max_bytes=1000", "budget"),
+        ("dataset.motion=dataset", NO_POSES.format("dataset")),
+        ("dataset.motion=imu", NO_POSES.format("imu")),
+        ("dataset.motion=wheels", WHEELS),
+        ("dataset.odometry=auto dataset.motion=wheels", WHEELS),
+        ("dataset.odometry=mixture dataset.motion=wheels", WHEELS),
+    ],
+)
+def test_wrong_options_are_refused_before_any_work(options, words, run):
+    assert words in refused(run(*options.split()))
+
+
+def test_only_gmmtorch_map_grows_a_map_in_tiles(monkeypatch, tmp_path):
     options = [*SMALL[:2], *QUIET, "map.memory=1e6"]
     assert "map.memory" in refused(run_here(monkeypatch, "occupancy", tmp_path / "other", *options))
-
-
-def test_a_wrong_export_is_refused_before_any_work(run):
-    error = refused(run("export=[mesch]"))
-    assert "'mesch' is not one of map_server" in error
-    assert "resolution=0" in refused(run("resolution=0"))
 
 
 def test_an_export_whose_package_is_missing_is_refused_before_any_work(run, monkeypatch):
@@ -166,20 +181,6 @@ def test_scans_of_a_bag_that_cannot_be_used_are_counted_and_printed(monkeypatch,
         bag.cloud("/points", 0.0, "lidar", room[:0])
     empty = run_here(monkeypatch, "map", tmp_path / "empty", *bag_options, *QUIET)
     assert "a: no scan of 1 can be used: message without a valid point" in refused(empty)
-
-
-@pytest.mark.parametrize("motion", ["dataset", "imu"])
-def test_a_motion_without_odometry_is_refused(monkeypatch, tmp_path, motion):
-    text = refused(run_here(monkeypatch, "map", tmp_path / "run", f"dataset.motion={motion}", *QUIET))
-    assert f"dataset.motion={motion} predicts the poses of odometry, but dataset.odometry=none" in text
-    assert "use dataset.odometry=mixture, or dataset.motion=constant" in text
-
-
-@pytest.mark.parametrize("odometry", ["none", "auto", "mixture"])
-def test_an_unknown_motion_lists_the_choices(monkeypatch, tmp_path, odometry):
-    options = [f"dataset.odometry={odometry}", "dataset.motion=wheels", *QUIET]
-    text = refused(run_here(monkeypatch, "map", tmp_path / "run", *options))
-    assert "dataset.motion='wheels' is not one of constant, dataset, imu" in text
 
 
 @pytest.fixture

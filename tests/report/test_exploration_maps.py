@@ -170,9 +170,6 @@ def test_map_errors_name_the_argument():
         team_map_figure([])
     with pytest.raises(InvalidArgumentError, match="owners has shape"):
         team_map_figure([TeamSnapshot(0.0, world, [], *components(3), owners=[0])])
-    for shape in ((2, 2, 0), (2, 2)):
-        with pytest.raises(InvalidArgumentError, match=r"probability has shape .* at least one layer"):
-            highest_occupancy(torch.zeros(shape), (0, 0, 0), 1.0)
 
 
 # -- in space -------------------------------------------------------------------------------------
