@@ -167,7 +167,7 @@ def dense_ranks(keys: Tensor) -> tuple[Tensor, int]:
     if keys.device.type != "cpu":
         unique, number = torch.unique(keys, return_inverse=True)
         return number, unique.numel()
-    if _by_hash(keys):
+    if keys.dtype == torch.int64 and len(keys) >= _MANY_KEYS and is_fused(keys):
         distinct, place = distinct_keys(keys)
         rank = torch.empty_like(distinct)
         rank[argsort(distinct)] = torch.arange(len(distinct))
@@ -183,8 +183,3 @@ def ragged_index(lengths: Tensor) -> tuple[Tensor, Tensor]:
     """
     row = torch.repeat_interleave(lengths)
     return row, torch.arange(len(row), device=row.device) - (lengths.cumsum(0) - lengths)[row]
-
-
-def _by_hash(keys: Tensor) -> bool:
-    """Whether a hash table replaces sorting: for many keys, if fused kernels run."""
-    return keys.dtype == torch.int64 and keys.shape[0] >= _MANY_KEYS and is_fused(keys)

@@ -177,14 +177,11 @@ def groups_of(command: str) -> dict[str, list[str]]:
 
 def help_text(command: str, overrides: Sequence[str] = ()) -> str:
     """The help of a command: its purpose, examples, groups, and a line on each option."""
-    config = configuration(command, overrides)
-    lines = [_line(option) for option in options_of(config)]
+    config, lines = configuration(command, overrides), []
+    for option in options_of(config):
+        head = f"{option.name}={text_of_value(option.value)}"
+        lines.append(f"{head:<{_VALUES}}  {_brief(option.about)}".rstrip())
     return Template(config.hydra.help.template).safe_substitute(CONFIG="\n".join(lines))
-
-
-def _line(option: Option) -> str:
-    head = f"{option.name}={text_of_value(option.value)}"
-    return f"{head:<{_VALUES}}  {_brief(option.about)}".rstrip()
 
 
 def text_of_value(value: Any) -> str:

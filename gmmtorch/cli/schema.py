@@ -217,14 +217,10 @@ def _selected(config: Any, place: str) -> Any:
     """The plain value of an option; `MISSING` if the configuration does not have it."""
     node = config if OmegaConf.is_config(config) else OmegaConf.create(config)
     value = OmegaConf.select(node, place, default=MISSING, throw_on_missing=False)
-    if value is None and OmegaConf.is_missing(*_parent(node, place)):
+    path, _, last = place.rpartition(".")
+    if value is None and OmegaConf.is_missing(OmegaConf.select(node, path) if path else node, last):
         return MISSING
     return OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
-
-
-def _parent(node: Any, place: str) -> tuple[Any, str]:
-    path, _, last = place.rpartition(".")
-    return (OmegaConf.select(node, path) if path else node), last
 
 
 @contextmanager

@@ -35,6 +35,9 @@ class Board:
         with Board("outputs/run/tensorboard") as board:
             board.scalars({"auc": 0.97}, prefix="occupancy", step=0)
 
+    It is written in the thread of the caller, to whom a full disk is an error; torch's SummaryWriter has a
+    thread whose errors nobody can catch.
+
     Args:
         directory: folder of the event file; created if missing.
 
@@ -42,8 +45,16 @@ class Board:
     """
 
     def __init__(self, directory: str | Path) -> None:
-        self.directory = Path(directory)
-        self._events = _EventFile(self.directory)
+        from tensorboard.compat.proto.event_pb2 import Event
+        from tensorboard.summary.writer.record_writer import RecordWriter
+
+        self._directory, self._is_full, self._event = Path(directory), False, Event
+        name = f"events.out.tfevents.{time.time():017.6f}.{socket.gethostname()}.{os.getpid()}"
+        with self._errors():
+            self._directory.mkdir(parents=True, exist_ok=True)
+            self._file = (self._directory / name).open("xb")
+            self._records = RecordWriter(self._file)
+        self._append(Event(wall_time=time.time(), file_version="brain.Event:2"))
         self._first: dict[tuple[str, str], tuple[float, int, float] | None] = {}
         """Value, step and time of a tag's first value; None once the tag is a curve."""
 
@@ -65,7 +76,7 @@ class Board:
                 self._first[tag] = now
                 continue
             for number, at, moment in (first, now) if first is not None else (now,):
-                self._events.add("scalar", "/".join(filter(None, tag)), number, step=at, moment=moment)
+                self._add("scalar", "/".join(filter(None, tag)), number, step=at, moment=moment)
             self._first[tag] = None
 
     def _write_results(self) -> None:
@@ -78,7 +89,7 @@ class Board:
         for name in dict.fromkeys(name for _, name in single):
             values = (single.get((prefix, name)) for prefix in prefixes)
             lines.append([name, *("" if value is None else format_value(name, value) for value in values)])
-        self._events.add("text", "results", "\n".join(f"| {' | '.join(line)} |" for line in lines))
+        self._add("text", "results", "\n".join(f"| {' | '.join(line)} |" for line in lines))
         self._first = {}
 
     def curve(self, tag: str, labels: ArrayLike, probabilities: ArrayLike) -> None:
@@ -87,7 +98,7 @@ class Board:
         truth, theta = as_array(labels) > 0.5, as_array(probabilities)
         if len(truth) == 0:
             return
-        self._events.add("pr_curve", tag, truth, theta, step=0)
+        self._add("pr_curve", tag, truth, theta, step=0)
         if truth.all() or not truth.any():
             return
         from sklearn.metrics import roc_auc_score, roc_curve
@@ -106,7 +117,7 @@ class Board:
         # summary.image would need the pixels, only to make such a file of them.
         width, height = struct.unpack_from(">II", png, 16)
         image = Summary.Image(height=height, width=width, colorspace=4, encoded_image_string=png)
-        self._events.write(Summary(value=[Summary.Value(tag=tag, image=image)]))
+        self._write(Summary(value=[Summary.Value(tag=tag, image=image)]))
 
     def cloud(self, tag: str, points: ArrayLike, colors: ArrayLike | None = None, step: int = 0) -> None:
         """Writes points (N, D), metres, with colours (N, 3) from 0 to 255; writes nothing for no points."""
@@ -149,14 +160,15 @@ class Board:
         }
         results = {key: float(value) for key, value in metrics.items() if _is_number(value)}
         for summary in hparams({**settings, **results}, {}):
-            self._events.write(summary)
+            self._write(summary)
 
     def close(self) -> None:
         """Writes pending events and closes the file."""
         try:
             self._write_results()
         finally:
-            self._events.close()
+            with suppress(OSError) if self._is_full else self._errors():  # of a full disk the caller knows
+                self._file.close()
 
     def __enter__(self) -> Board:
         return self
@@ -167,7 +179,7 @@ class Board:
     def _add_mesh(
         self, tag: str, vertices: Tensor, colors: Tensor | None, faces: Tensor | None, step: int
     ) -> None:
-        self._events.add(
+        self._add(
             "mesh",
             tag,
             vertices.float()[None],
@@ -177,39 +189,16 @@ class Board:
             step=step,
         )
 
-
-class _EventFile:
-    """The event file of a run. It is written in the thread of the caller, to whom a full disk is an error;
-    torch's SummaryWriter has a thread whose errors nobody can catch."""
-
-    def __init__(self, directory: Path) -> None:
-        from tensorboard.compat.proto.event_pb2 import Event
-        from tensorboard.summary.writer.record_writer import RecordWriter
-
-        self._directory, self._is_full, self._event = directory, False, Event
-        name = f"events.out.tfevents.{time.time():017.6f}.{socket.gethostname()}.{os.getpid()}"
-        with self._errors():
-            directory.mkdir(parents=True, exist_ok=True)
-            self._file = (directory / name).open("xb")
-            self._records = RecordWriter(self._file)
-        self._append(Event(wall_time=time.time(), file_version="brain.Event:2"))
-
-    def add(
+    def _add(
         self, kind: str, *content: Any, step: int = 0, moment: float | None = None, **options: Any
     ) -> None:
         """Adds what the function `kind` of torch.utils.tensorboard.summary makes of a tag and its content."""
         from torch.utils.tensorboard import summary
 
-        self.write(getattr(summary, kind)(*content, **options), step, moment)
+        self._write(getattr(summary, kind)(*content, **options), step, moment)
 
-    def write(self, summary: Any, step: int = 0, moment: float | None = None) -> None:
-        """Adds a summary."""
+    def _write(self, summary: Any, step: int = 0, moment: float | None = None) -> None:
         self._append(self._event(summary=summary, step=int(step), wall_time=moment or time.time()))
-
-    def close(self) -> None:
-        """Closes the file."""
-        with suppress(OSError) if self._is_full else self._errors():  # of a full disk the caller knows
-            self._file.close()
 
     def _append(self, event: Any) -> None:
         if self._is_full:

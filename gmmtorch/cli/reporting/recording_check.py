@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import datetime
 import logging
+import sys
 import textwrap
 from collections.abc import Iterator, Mapping
+from logging.handlers import BufferingHandler
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +61,7 @@ def check(config: DictConfig) -> bool:
             f"{', '.join(others)} would not be read; dataset.topic chooses a topic, or a list of several "
             "sensors of the robot",
         )
-    for text in dict.fromkeys(warnings):
+    for text in dict.fromkeys(record.getMessage() for record in warnings):
         if facts is None or not facts.damage or facts.damage not in text:  # it is printed already
             _print_wrapped("note       ", text)
     if share:
@@ -82,21 +84,11 @@ def _unread(facts: BagFacts | None, found: Dataset | None) -> list[str]:
     return [name for name in sensors if name not in read]
 
 
-class _Notes(logging.Handler):
-    """Keeps the texts of a log."""
-
-    def __init__(self, level: int) -> None:
-        super().__init__(level)
-        self.texts: list[str] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.texts.append(record.getMessage())
-
-
 @contextlib.contextmanager
-def _noted_warnings() -> Iterator[list[str]]:
+def _noted_warnings() -> Iterator[list[logging.LogRecord]]:
     """Collects the warnings of readers, which the console would have between the lines of the table."""
-    logger, notes = logging.getLogger("gmmtorch"), _Notes(logging.WARNING)
+    logger, notes = logging.getLogger("gmmtorch"), BufferingHandler(sys.maxsize)
+    notes.setLevel(logging.WARNING)
     consoles = {
         handler: handler.level
         for handler in logging.getLogger().handlers
@@ -106,7 +98,7 @@ def _noted_warnings() -> Iterator[list[str]]:
     for handler in consoles:
         handler.setLevel(logging.ERROR)
     try:
-        yield notes.texts
+        yield notes.buffer
     finally:
         logger.removeHandler(notes)
         for handler, level in consoles.items():
