@@ -10,16 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gmmtorch import export
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, arg, check_choice
-from gmmtorch.export import (
-    CellCloud,
-    cloud_fields,
-    colour_bytes,
-    highest_in_band,
-    odometry_fields,
-    of_components,
-    transform_fields,
-)
 from gmmtorch.live import viewer_scene
 from gmmtorch.live.live_scans import SETTLING, LiveScan, LiveScans
 from gmmtorch.live.ros import Node
@@ -77,18 +69,18 @@ class MapPublisher:
         header = {"header": {"frame_id": frame}}
         grid, theta = self._probabilities(shown)
         if grid is not None:
-            flat = grid, theta if grid.dim == 2 else highest_in_band(grid, theta)[1]
+            flat = grid, theta if grid.dim == 2 else export.highest_in_band(grid, theta)[1]
             self._publish_grid(*_cells(*flat, self._rule), header, stamp)
         if self._cloud == "cells" and grid is not None:
-            cells = CellCloud.of_grid(grid, theta).above(self._rule.occupied)
+            cells = export.CellCloud.of_grid(grid, theta).above(self._rule.occupied)
             known = shown.attributes(cells.centers).get(COLOUR)
             colours = None if known is None else known.mean
-            self._send_cloud(cloud_fields(frame, _table(cells.positions(), colours)), stamp)
+            self._send_cloud(export.cloud_fields(frame, _table(cells.positions(), colours)), stamp)
         elif self._cloud == "means":
             solid = viewer_scene.surfaces(shown.components())
             channel = shown.components().attributes.channels.get(COLOUR)
             colours = channel.mean.cpu()[solid.rows] if isinstance(channel, Numbers) else None
-            self._send_cloud(cloud_fields(frame, _table(solid.means.numpy(), colours)), stamp)
+            self._send_cloud(export.cloud_fields(frame, _table(solid.means.numpy(), colours)), stamp)
         if self._send_ellipsoids is not None:
             self._send_ellipsoids({"markers": _markers(shown, header["header"])}, stamp)
 
@@ -116,7 +108,7 @@ class MapPublisher:
         low: list[float] = points.amin(0).tolist()
         high: list[float] = points.amax(0).tolist()
         if found.dim == 3:
-            bottom, top = self._band or of_components(found, self._resolution).band(self._resolution)
+            bottom, top = self._band or export.of_components(found, self._resolution).band(self._resolution)
             low[2] = low[2] if bottom is None else max(low[2], bottom)
             high[2] = high[2] if top is None else max(low[2], min(high[2], top) - 1e-6)
         return low, high
@@ -163,7 +155,7 @@ def _table(points: np.ndarray, colours: Tensor | None = None) -> np.ndarray:
     linear RGB (N, 3), as RViz and Foxglove expect."""
     columns = [np.ascontiguousarray(points, "<f4")]
     if colours is not None:
-        red, green, blue = colour_bytes(colours).astype("<u4").T
+        red, green, blue = export.colour_bytes(colours).astype("<u4").T
         columns.append((red << 16 | green << 8 | blue).astype("<u4").view("<f4")[:, None])
     names = ("x", "y", "z", "rgb")[: 2 + len(columns)]
     return np.concatenate(columns, 1).view([(name, "<f4") for name in names]).reshape(-1)
@@ -225,12 +217,12 @@ class PosePublisher:
         below: child ← sensor, in 3D.
         """
         pose = Pose.from_matrix(location.pose.cpu()).in_space()
-        fields = odometry_fields(self._frame, newest.frame, pose.matrix)
+        fields = export.odometry_fields(self._frame, newest.frame, pose.matrix)
         fields["pose"]["covariance"] = _covariance(location.covariance.cpu())
         self._send_pose(fields, newest.stamp)
         if child != self._frame:  # TF of somebody else has a frame of this name
             above = (pose @ below.inverse()).matrix
-            self._send_transform(transform_fields({(self._frame, child): above}), newest.stamp)
+            self._send_transform(export.transform_fields({(self._frame, child): above}), newest.stamp)
 
     def publish_odometry(self, location: Location, newest: LiveScan) -> None:
         """Publishes a pose, and the transform to the robot's frame: the root of those fixed to the sensor.

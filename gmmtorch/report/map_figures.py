@@ -26,18 +26,8 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.files import write_atomically
 from gmmtorch.mapping import GaussianMap
-from gmmtorch.report import style
+from gmmtorch.report import map_images, style
 from gmmtorch.report.ellipsoids import ellipse_outlines
-from gmmtorch.report.map_images import (
-    HEADROOM,
-    OCCUPIED_ABOVE,
-    Corners,
-    MapPanel,
-    height_image,
-    robust_bounds,
-    roof_above,
-    slice_image,
-)
 from gmmtorch.scan import ArrayLike
 
 _MAX_COLUMNS = 4
@@ -48,7 +38,7 @@ _TRUE, _LOST = style.PALETTE[5], style.PALETTE[3]
 
 
 def map_figure(
-    panels: Sequence[MapPanel],
+    panels: Sequence[map_images.MapPanel],
     trajectories: Sequence[ArrayLike] = (),
     *,
     truth: ArrayLike | None = None,
@@ -88,8 +78,8 @@ def map_figure(
     if dim == 3:
         views = [band[1] for band in bands]
         # One ceiling for all: panels that are cut at different heights cannot be compared.
-        has_roof = flown is not None and any(roof_above(panel, flown) for panel in panels)
-        top = height + HEADROOM if has_roof else math.inf
+        has_roof = flown is not None and any(map_images.roof_above(panel, flown) for panel in panels)
+        top = height + map_images.HEADROOM if has_roof else math.inf
         _draw_heights(figure, views, panels, paths, top, shown_pixels)
     for axes in bands[-1][:, len(panels) - (n_bands - 1) * n_columns :].flat:
         axes.set_visible(False)
@@ -105,11 +95,11 @@ def map_figure(
 
 
 def _draw_slice(
-    axes: Axes, panel: MapPanel, paths: list[np.ndarray], height: float, shown_pixels: int
+    axes: Axes, panel: map_images.MapPanel, paths: list[np.ndarray], height: float, shown_pixels: int
 ) -> None:
     """Draws θ of the cells in 2D, or of those at z = `height` (m) in 3D, and the sensor paths."""
     cells = f"cells of {style.metres(panel.resolution)}"
-    image = slice_image(panel, height, shown_pixels=shown_pixels)
+    image = map_images.slice_image(panel, height, shown_pixels=shown_pixels)
     # Colours are resampled, not probabilities: the mean of free and occupied would look unknown.
     image.draw(axes, occupancy_colours()(np.ma.masked_invalid(image.image.numpy())), "antialiased")
     _draw_paths(axes, panel, paths)
@@ -120,14 +110,14 @@ def _draw_slice(
 def _draw_heights(
     figure: Figure,
     bands: list[np.ndarray],
-    panels: Sequence[MapPanel],
+    panels: Sequence[map_images.MapPanel],
     paths: list[np.ndarray],
     top: float,
     shown_pixels: int,
 ) -> None:
     """Draws the views from above, of the cells below z = `top` (m), with a colour bar for each band."""
     cut = [_below(panel, top) for panel in panels]
-    images = [height_image(panel, shown_pixels) for panel in cut]
+    images = [map_images.height_image(panel, shown_pixels) for panel in cut]
     known = torch.cat([image.image[image.image.isfinite()] for image in images])
     colours = matplotlib.colormaps[style.HEIGHTS].with_extremes(bad=_NONE)
     heights = ScalarMappable(style.height_scale(known), colours)
@@ -135,12 +125,14 @@ def _draw_heights(
         image.draw(axes, heights.to_rgba(np.ma.masked_invalid(image.image.numpy())))
         _draw_paths(axes, panel, paths)
         below = f" below z = {style.metres(panel.high[2])}" if panel.high[2] < whole.high[2] else ""
-        style.label_axes(axes, f"highest cell with θ > {OCCUPIED_ABOVE:g}{below}")
+        style.label_axes(axes, f"highest cell with θ > {map_images.OCCUPIED_ABOVE:g}{below}")
     for band in bands:
         style.colour_bar(figure, heights, band.tolist(), "height z [m]", extend="both")
 
 
-def _sheet(panels: Sequence[MapPanel], n_columns: int, n_rows: int) -> tuple[Figure, np.ndarray, int]:
+def _sheet(
+    panels: Sequence[map_images.MapPanel], n_columns: int, n_rows: int
+) -> tuple[Figure, np.ndarray, int]:
     """Returns a figure with panels of the shape of the region, its axes (rows, columns), and the number of
     pixels along the longer side of a panel."""
     sides = np.array([[p.high[a] - p.low[a] for a in range(2)] for p in panels])
@@ -157,7 +149,7 @@ def occupancy_colours() -> Colormap:
     return greys.with_extremes(bad=style.UNKNOWN)
 
 
-def _draw_paths(axes: Axes, panel: MapPanel, paths: Sequence[np.ndarray]) -> None:
+def _draw_paths(axes: Axes, panel: map_images.MapPanel, paths: Sequence[np.ndarray]) -> None:
     """Draws the sensor paths, and limits the axes to the region of the panel."""
     axes.set(xlim=(panel.low[0], panel.high[0]), ylim=(panel.low[1], panel.high[1]))
     size = 8 if len(paths) == 1 else 5
@@ -182,7 +174,7 @@ def _legend_beside(truth: ArrayLike | None, lost: ArrayLike | None) -> list[Arti
     return [line for line, given in ((true, truth), (mark, lost)) if given is not None]
 
 
-def _below(panel: MapPanel, ceiling: float) -> MapPanel:
+def _below(panel: map_images.MapPanel, ceiling: float) -> map_images.MapPanel:
     """Cuts the panel at the layer boundary nearest to the ceiling, but keeps at least one layer."""
     if ceiling >= panel.high[2]:
         return panel
@@ -244,7 +236,7 @@ def save_growth(
     last = frames[-1]
     solid = last.shown.components()
     means = solid.means[~solid.max_range].cpu()
-    box = robust_bounds(means, last.path, share=0.995, margin=0.8)
+    box = map_images.robust_bounds(means, last.path, share=0.995, margin=0.8)
     pictures = [_picture(frame, last.n_scans, box, resolution) for frame in frames]
     durations = [round(1000 * period)] * (len(pictures) - 1) + [_LAST_FRAME]
 
@@ -258,7 +250,7 @@ def save_growth(
     return write_atomically(path, write)
 
 
-def _picture(frame: GrowthFrame, n_total: int, box: Corners, resolution: float) -> Image.Image:
+def _picture(frame: GrowthFrame, n_total: int, box: map_images.Corners, resolution: float) -> Image.Image:
     """One frame as a picture; all frames have the same layout."""
     (left, bottom), (right, top) = box
     side = _WIDTH - 0.2
@@ -276,14 +268,16 @@ def _picture(frame: GrowthFrame, n_total: int, box: Corners, resolution: float) 
     return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
 
 
-def _draw_map(axes: Axes, frame: GrowthFrame, box: Corners, resolution: float) -> None:
+def _draw_map(axes: Axes, frame: GrowthFrame, box: map_images.Corners, resolution: float) -> None:
     """Draws occupancy, 2σ ellipses, the path, and the sensor with the beams of its newest scan."""
     shown = frame.shown
 
     def answer(points: Tensor) -> Tensor:
         return shown.occupancy(points, resolution)  # type: ignore[return-value]
 
-    image = slice_image(MapPanel("", answer, resolution, *box), shown_pixels=round(_WIDTH * _DPI))
+    image = map_images.slice_image(
+        map_images.MapPanel("", answer, resolution, *box), shown_pixels=round(_WIDTH * _DPI)
+    )
     theta = np.ma.masked_invalid(image.image.numpy())
     image.draw(axes, occupancy_colours()(theta), "antialiased")
     components = shown.components()

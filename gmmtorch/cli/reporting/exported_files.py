@@ -9,33 +9,11 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
+from gmmtorch import export
 from gmmtorch import mixture as mixtures  # whose estimators wait a second for scikit-learn
 from gmmtorch.cli import inputs
 from gmmtorch.datasets import read_trajectory
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
-from gmmtorch.export import (
-    CellCloud,
-    PlainMixture,
-    Splats,
-    checked,
-    distance_field,
-    highest_in_band,
-    of_components,
-    of_grid,
-    read_gira_csv,
-    read_npz,
-    surface_mesh,
-    write_distance_field,
-    write_gira_csv,
-    write_kitti,
-    write_map_server,
-    write_mesh,
-    write_npz,
-    write_octomap,
-    write_pcd,
-    write_ply,
-    write_splats,
-)
 from gmmtorch.mapping import GaussianMap
 from gmmtorch.occupancy import OccupancyGrid, Thresholds, VoxelGrid, check_resolution, rasterize
 from gmmtorch.report import Event
@@ -49,7 +27,7 @@ def write_poses(path: Path, output: Path) -> str:
     if not path.is_file():
         raise MissingDataError(f"path={path} does not exist; format=kitti needs a trajectory file.")
     matrices = read_trajectory(path).poses.matrix
-    write_kitti(output, matrices)
+    export.write_kitti(output, matrices)
     return f"{_size(output)}: {len(matrices):,} poses"
 
 
@@ -60,31 +38,33 @@ def write_components(config: DictConfig) -> str:
     """Write weights, means and covariances, or splats; returns a message."""
     output = Path(config.output)
     if config.format == "splats":
-        splats = Splats.of(inputs.open_map(Path(config.path), config.runtime, config.bounds).components())
-        write_splats(output, splats)
+        splats = export.Splats.of(
+            inputs.open_map(Path(config.path), config.runtime, config.bounds).components()
+        )
+        export.write_splats(output, splats)
         return f"{_size(output)}: {len(splats.means):,} splats"
-    mixture = checked(_components(config))
+    mixture = export.checked(_components(config))
     if config.format == "csv":
-        write_gira_csv(output, mixture)
+        export.write_gira_csv(output, mixture)
     elif config.format == "npz":
-        write_npz(output, mixture)
+        export.write_npz(output, mixture)
     else:
         mixtures.GaussianMixture.from_parameters(*mixture[:3]).save(output)
     k, dim = mixture.means.shape
     return f"{_size(output)}: {k:,} components in {dim}D"
 
 
-def _components(config: DictConfig) -> PlainMixture:
+def _components(config: DictConfig) -> export.PlainMixture:
     """The mixture in a file of any supported format; the surface components of a map."""
     path = Path(config.path)
     if path.suffix == ".csv":
-        return read_gira_csv(path)
+        return export.read_gira_csv(path)
     if path.suffix == ".npz":
-        return read_npz(path)
+        return export.read_npz(path)
     try:
         found = inputs.open_map(path, config.runtime, config.bounds).components()
         surface = ~found.max_range
-        return PlainMixture.of_support(
+        return export.PlainMixture.of_support(
             found.means[surface], found.covariances[surface], found.support[surface]
         )
     except DataError as error:
@@ -93,7 +73,7 @@ def _components(config: DictConfig) -> PlainMixture:
         mixture = mixtures.GaussianMixture.load(path)
     except DataError as error:
         raise DataError(f"{path} contains no components to export. {no_map} {error}") from error
-    return PlainMixture(mixture.weights, mixture.means, mixture.covariances)
+    return export.PlainMixture(mixture.weights, mixture.means, mixture.covariances)
 
 
 # -- space ----------------------------------------------------------------------------------------
@@ -123,12 +103,12 @@ def write_space(config: DictConfig, source: Source, on_event: Event) -> str:
         about = space.choose_band()
         grid, theta = space.dense(on_event)
         if grid.dim == 3:
-            grid, theta = highest_in_band(grid, theta)  # `dense` returns only the band
-        written = write_map_server(output, grid, theta, rule)
+            grid, theta = export.highest_in_band(grid, theta)  # `dense` returns only the band
+        written = export.write_map_server(output, grid, theta, rule)
         return "\n".join(map(_size, written)) + f": {_cells(grid)}{about}"
     if config.format == "distance_field":
         grid, theta = space.dense(on_event)
-        write_distance_field(output, grid, distance_field(grid, theta, rule))
+        export.write_distance_field(output, grid, export.distance_field(grid, theta, rule))
         return f"{_size(output)}: {_cells(grid)}"
     if config.format == "mesh":
         if not isinstance(source, GaussianMap):
@@ -137,21 +117,21 @@ def write_space(config: DictConfig, source: Source, on_event: Event) -> str:
             )
         on_event("mesh", 0, None)
         side = space.resolution
-        mesh = surface_mesh(source.components(), side, memory_limit=config.runtime.memory_limit)
+        mesh = export.surface_mesh(source.components(), side, memory_limit=config.runtime.memory_limit)
         if space.is_limited:
             mesh = mesh.inside(*space.box())
-        write_mesh(output, mesh, _colours(source, mesh.vertices))
+        export.write_mesh(output, mesh, _colours(source, mesh.vertices))
         return f"{_size(output)}: {len(mesh.faces):,} triangles, cells of {side:g} m"
     cells = space.cloud(on_event)
     if config.format == "octomap":
         colours = _colours(source, cells.centers) if output.suffix == ".ot" else None
-        write_octomap(output, cells, rule, colours)
+        export.write_octomap(output, cells, rule, colours)
     else:
         cells = cells.above(rule.occupied)
         if config.format == "ply":
-            write_ply(output, cells, _colours(source, cells.centers))
+            export.write_ply(output, cells, _colours(source, cells.centers))
         else:
-            write_pcd(output, cells)
+            export.write_pcd(output, cells)
     return f"{_size(output)}: {len(cells):,} cells of {cells.resolution:g} m"
 
 
@@ -197,22 +177,22 @@ class _Space:
         if isinstance(source, GaussianMap):
             found = source.components()
             if found.dim == 3 and len(found):
-                levels = of_components(found, side)
+                levels = export.of_components(found, side)
         elif (evidence := source.evidence()).dim == 3 and evidence.n_blocks:
-            levels = of_grid(source, self._config.occupied_thresh)
+            levels = export.of_grid(source, self._config.occupied_thresh)
         if levels is None:
             return ""
         self.band = levels.band(side)
         return f"\nz_min={self.band[0]:.2f} z_max={self.band[1]:.2f} (m) were chosen: {levels.about()}"
 
-    def cloud(self, on_event: Event) -> CellCloud:
+    def cloud(self, on_event: Event) -> export.CellCloud:
         """The observed cells with their probabilities; all cells of the box for a `GaussianMap`."""
         if isinstance(self._source, GaussianMap) or self.is_limited:
-            return CellCloud.of_grid(*self.dense(on_event))
-        observed = CellCloud.of_blocks(self._source.evidence())
+            return export.CellCloud.of_grid(*self.dense(on_event))
+        observed = export.CellCloud.of_blocks(self._source.evidence())
         # By the grid's rule: counts or log-odds.
         theta = torch.as_tensor(self._source.occupancy(observed.centers))
-        return CellCloud(observed.centers, theta, observed.resolution)
+        return export.CellCloud(observed.centers, theta, observed.resolution)
 
     def dense(self, on_event: Event) -> tuple[VoxelGrid, Tensor]:
         """All cells of the box within the height band, and their probabilities, with the grid's shape."""

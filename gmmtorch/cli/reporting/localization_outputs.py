@@ -12,19 +12,12 @@ import torch
 from omegaconf import DictConfig, ListConfig
 from torch import Tensor
 
+from gmmtorch import localization
 from gmmtorch.cli import common, schema
 from gmmtorch.cli.reporting import map_outputs
 from gmmtorch.datasets import Dataset, read_trajectory, to_nanoseconds
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.export import write_pose_table, write_tum
-from gmmtorch.localization import (
-    UNSCORED,
-    ScanLocation,
-    absolute_trajectory_error,
-    clock_faults,
-    relative_pose_error,
-    scan_times,
-)
 from gmmtorch.mapping import GaussianMap
 from gmmtorch.pose import Pose
 from gmmtorch.report import Board, Row, map_figure
@@ -78,7 +71,7 @@ def true_poses(config: DictConfig, dataset: Dataset, dim: int) -> Truth | None:
         with schema.naming({"poses": "truth"}):
             trajectory = read_trajectory(config.truth, len(dataset))
         is_timed = bool((trajectory.times >= len(trajectory)).any()) or len(trajectory) != len(dataset)
-        times = to_nanoseconds(scan_times(dataset).numpy()) if is_timed else trajectory.times
+        times = to_nanoseconds(localization.scan_times(dataset).numpy()) if is_timed else trajectory.times
         found = trajectory.at(times)
         true = found.poses if dim == 3 else found.poses.in_plane()
         truth, known = Truth(true.matrix, torch.from_numpy(found.known)), list(found.known.nonzero()[0])
@@ -91,14 +84,14 @@ def true_poses(config: DictConfig, dataset: Dataset, dim: int) -> Truth | None:
 
 
 def result_row(
-    config: DictConfig, dataset: Dataset, located: Sequence[ScanLocation], truth: Truth | None
+    config: DictConfig, dataset: Dataset, located: Sequence[localization.ScanLocation], truth: Truth | None
 ) -> Row:
     """The row of results.json. `messages`: what the user must know, one sentence each."""
     found = [scan for scan in located if scan.location.found]
     dim = located[0].location.pose.shape[0] - 1 if located else 3
     deviations = [float(s.location.covariance[:dim, :dim].trace().sqrt()) for s in found]
     lost = _lost_runs(located)
-    faults = clock_faults(scan_times(dataset))
+    faults = localization.clock_faults(localization.scan_times(dataset))
     seconds = sum(scan.seconds for scan in located)
     return {
         "dataset": dataset.name,
@@ -116,22 +109,22 @@ def result_row(
     }
 
 
-def _scores(found: Sequence[ScanLocation], truth: Truth | None) -> dict[str, Any]:
+def _scores(found: Sequence[localization.ScanLocation], truth: Truth | None) -> dict[str, Any]:
     """ATE and RPE of the found scans whose true pose is known; None without one."""
-    scores: dict[str, Any] = dict(UNSCORED)
+    scores: dict[str, Any] = dict(localization.UNSCORED)
     used = [scan for scan in found if truth is not None and bool(truth.known[scan.number])]
     scores["n_scored"] = len(used)
     if truth is None or not used:
         return scores
     estimate = torch.stack([scan.location.pose for scan in used])
     true = truth.poses[[scan.number for scan in used]]
-    scores |= absolute_trajectory_error(estimate, true, "none").scores("ate")
+    scores |= localization.absolute_trajectory_error(estimate, true, "none").scores("ate")
     if len(used) > 1:
-        scores |= relative_pose_error(estimate, true).scores("rpe")
+        scores |= localization.relative_pose_error(estimate, true).scores("rpe")
     return scores
 
 
-def _lost_runs(located: Sequence[ScanLocation]) -> list[dict[str, Any]]:
+def _lost_runs(located: Sequence[localization.ScanLocation]) -> list[dict[str, Any]]:
     """Runs of scans that were not found: first and last number, and the reasons of the first."""
     runs = []
     for is_found, group in itertools.groupby(located, lambda scan: scan.location.found):
@@ -143,7 +136,9 @@ def _lost_runs(located: Sequence[ScanLocation]) -> list[dict[str, Any]]:
 
 
 def _messages(
-    located: Sequence[ScanLocation], lost: Sequence[dict[str, Any]], faults: Sequence[tuple[int, str]]
+    located: Sequence[localization.ScanLocation],
+    lost: Sequence[dict[str, Any]],
+    faults: Sequence[tuple[int, str]],
 ) -> list[str]:
     messages = []
     for run in lost[:_SHOWN]:
@@ -166,7 +161,7 @@ def _messages(
 def write(
     config: DictConfig,
     built: GaussianMap,
-    located: Sequence[ScanLocation],
+    located: Sequence[localization.ScanLocation],
     truth: Truth | None,
     row: Row,
     folder: Path,
@@ -199,7 +194,9 @@ def write(
     common.show(config, folder, lambda: {"path": _figure(built, located, truth, row)}, write_board)
 
 
-def _figure(built: GaussianMap, located: Sequence[ScanLocation], truth: Truth | None, row: Row) -> Any:
+def _figure(
+    built: GaussianMap, located: Sequence[localization.ScanLocation], truth: Truth | None, row: Row
+) -> Any:
     """The map with the path of the scans that were found, the true path, and places of lost scans."""
     path, lost, true = _positions(located, truth)
     shown = [positions for positions in (path, true) if positions is not None and len(positions)]
@@ -214,7 +211,7 @@ def _figure(built: GaussianMap, located: Sequence[ScanLocation], truth: Truth | 
     )
 
 
-def _scalars(scan: ScanLocation, truth: Truth | None) -> dict[str, float]:
+def _scalars(scan: localization.ScanLocation, truth: Truth | None) -> dict[str, float]:
     """Numbers of a scan for TensorBoard."""
     location, dim = scan.location, scan.location.pose.shape[0] - 1
     numbers = {
@@ -225,11 +222,13 @@ def _scalars(scan: ScanLocation, truth: Truth | None) -> dict[str, float]:
     }
     if truth is not None and location.found and bool(truth.known[scan.number]):
         pose, true = location.pose[None], truth.poses[scan.number][None]
-        numbers["error"] = absolute_trajectory_error(pose, true, "none").rmse
+        numbers["error"] = localization.absolute_trajectory_error(pose, true, "none").rmse
     return numbers
 
 
-def _positions(located: Sequence[ScanLocation], truth: Truth | None) -> tuple[Tensor, Tensor, Tensor | None]:
+def _positions(
+    located: Sequence[localization.ScanLocation], truth: Truth | None
+) -> tuple[Tensor, Tensor, Tensor | None]:
     """Positions (S, D) of the found scans, of the lost ones, and the true ones. A lost scan is shown at its
     true position, or without one at the last that was found."""
     dim = located[0].location.pose.shape[0] - 1 if located else 3
