@@ -10,17 +10,15 @@ import sys
 from collections.abc import Iterator
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any
 
 import pytest
 from command_runs import CHECKOUT, COMMANDS, CONF, as_it_was, composed, register_schemas, run_python
 from hydra import compose, initialize_config_dir
-from hydra.core.config_store import ConfigStore
 from hydra.errors import ConfigCompositionException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
 from gmmtorch import datasets
-from gmmtorch.cli import common, export, inputs, localize
+from gmmtorch.cli import common, export, inputs, localize, options_help
 from gmmtorch.cli.inputs import open_dataset
 from gmmtorch.errors import InvalidArgumentError, MissingDataError
 from gmmtorch.experiments.cli import methods_of_options
@@ -49,27 +47,15 @@ def choices(group: str) -> list[str]:
     return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
 
 
-def listed(command: str) -> dict[str, list[str]]:
-    """The choices of every group that a command's help names."""
-    template = (CONF / f"{command}.yaml").read_text(encoding="utf-8")
-    if "== Configuration groups ==" not in template:
-        return {}
-    section = template.split("== Configuration groups ==")[1].split("== Options")[0]
-    groups = re.split(r"(\w+):", section)[1:]
-    return {name: re.findall(r"\w+", text) for name, text in zip(groups[::2], groups[1::2], strict=True)}
-
-
-EXPERIMENTS = [(command, name) for command in SCORED for name in listed(command)["experiment"]]
+EXPERIMENTS = [
+    (command, name) for command in SCORED for name in options_help.groups_of(command)["experiment"]
+]
 
 
 @pytest.fixture(autouse=True)
 def hydra_as_it_was() -> Iterator[None]:
     with as_it_was():
         yield
-
-
-def plain(node: DictConfig) -> dict[str, Any]:
-    return {str(key): None if OmegaConf.is_missing(node, key) else node[key] for key in node}
 
 
 # -- composition ----------------------------------------------------------------------------------
@@ -113,7 +99,7 @@ def test_every_study_has_an_experiment():
     assert STUDIES.keys() == {name for cases in study_cases.STUDIES.values() for name in cases}
 
 
-@pytest.mark.parametrize("name", listed("explore")["experiment"])
+@pytest.mark.parametrize("name", options_help.groups_of("explore")["experiment"])
 def test_every_experiment_of_teams_composes_and_gives_its_trials(name, tmp_path):
     config = composed("explore", f"experiment={name}", "duration=4")
     assert config.duration == 4
@@ -166,13 +152,6 @@ def test_results_go_to_a_folder_in_outputs(command):
 
 
 # -- one set of defaults --------------------------------------------------------------------------
-
-
-def stored(*path: str) -> Any:
-    """The node with this group and name in Hydra's store."""
-    register_schemas()
-    folder = ["schema"] if len(path) > 1 else []
-    return ConfigStore.instance().load("/".join([*folder, *path]) + ".yaml").node
 
 
 def test_files_in_conf_have_no_value_that_is_the_default():
@@ -397,7 +376,7 @@ def test_help_is_shown_without_heavy_imports(commands, tmp_path):
     for command, shown in found.items():
         assert f"gmmtorch-{command}" in shown
         assert "Examples:" in shown
-        for group in {"dataset", "world", "team", "planner"} & listed(command).keys():
+        for group in {"dataset", "world", "team", "planner"} & options_help.groups_of(command).keys():
             assert all(choice in shown for choice in choices(group))
     formats = (*export._OF_SPACE, *export._OF_COMPONENTS) if "export" in found else ()
     assert all(name in found["export"] for name in formats)
@@ -419,7 +398,7 @@ def test_the_examples_of_the_help_compose(command):
 def test_help_names_every_choice_of_every_group():
     """Each experiment is named by the command that runs it, and by no other."""
     of_occupancy, of_fit, of_map, of_explore, *of_robots = map(
-        listed, CONFIGURED[: CONFIGURED.index("export")]
+        options_help.groups_of, CONFIGURED[: CONFIGURED.index("export")]
     )
     assert of_occupancy.keys() == {"dataset", "map", "experiment"}
     assert of_fit.keys() == {"dataset", "experiment"}

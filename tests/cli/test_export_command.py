@@ -13,7 +13,6 @@ import torch
 from command_runs import Finished, as_it_was, refused, run_here, succeeded
 from export.map_examples import read_map_image
 
-from gmmtorch.cli import common
 from gmmtorch.cli.reporting import exported_files
 from gmmtorch.datasets import load
 from gmmtorch.export.mixture_formats import read_gira_csv, read_npz
@@ -23,7 +22,6 @@ from gmmtorch.mixture import GaussianMixture
 from gmmtorch.occupancy.occupancy_grid import LogOdds, OccupancyGrid
 from gmmtorch.scan import Scan
 
-CONF = Path(common.conf_dir())
 Run = Callable[..., Finished]
 
 
