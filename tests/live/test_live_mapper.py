@@ -32,6 +32,7 @@ from gmmtorch.live.ros.topics import LATCHED
 from gmmtorch.mapping import Attributes, Numbers
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.map_builder import MapBuilder
+from gmmtorch.scan import Scan
 from gmmtorch.team.sharing import Replica
 from gmmtorch.team.sharing.shared_map import SharedMap
 from gmmtorch.team.sharing.transport.simulated_network import Network
@@ -82,8 +83,6 @@ def test_a_played_recording_gives_the_map_of_the_recording(node, tmp_path):
 
 def pillar(x: float) -> GaussianMap:
     scan_points = torch.tensor([[x, y / 10] for y in range(-10, 10)], dtype=torch.float64)
-    from gmmtorch.scan import Scan
-
     made = GaussianMap()
     made.insert(Scan(scan_points, torch.zeros(2, dtype=torch.float64)))
     return made

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from gmmtorch.datasets import load
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
@@ -24,6 +25,8 @@ from gmmtorch.scan import display_colours
 
 pytest.importorskip("viser")
 from viser_client import Client
+
+from gmmtorch.live.map_viewer import MapViewer, admits
 
 
 @pytest.fixture(scope="module")
@@ -42,8 +45,6 @@ def maps() -> dict[int, tuple[GaussianMap, list[torch.Tensor]]]:
 
 @pytest.fixture
 def viewer(maps) -> Iterator:
-    from gmmtorch.live.map_viewer import MapViewer
-
     made = MapViewer(*maps[3], port=8391)
     yield made
     made.stop()
@@ -54,8 +55,6 @@ def viewer(maps) -> Iterator:
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_instances_are_the_two_sigma_ellipsoids(dim, maps):
-    from scipy.spatial.transform import Rotation
-
     components = maps[dim][0].components()
     solid = viewer_scene.surfaces(components)
     wxyz, positions, scales = viewer_scene.instances(solid)
@@ -259,8 +258,6 @@ def test_html_is_one_file_without_references_to_a_network(viewer, tmp_path):
 
 
 def test_a_growing_map_is_shown_from_its_first_components(maps):
-    from gmmtorch.live.map_viewer import MapViewer
-
     made = MapViewer(GaussianMap(), port=8393)
     try:
         assert not made._nodes
@@ -281,8 +278,6 @@ OWN, PROXY = f"127.0.0.1:{PORT}", "https://map.example.org"
 
 @pytest.fixture(scope="module")
 def guarded(maps) -> Iterator:
-    from gmmtorch.live.map_viewer import MapViewer
-
     made = MapViewer(*maps[2], port=PORT, origins=[PROXY])
     yield made
     made.stop()
@@ -338,8 +333,6 @@ def test_a_foreign_page_gets_no_connection(guarded):
 
 
 def test_origins_are_checked(maps):
-    from gmmtorch.live.map_viewer import MapViewer
-
     wrong = ["map.example.org", "ftp://map.example.org", "https://map.example.org/page", "http://[map"]
     for origin in [*wrong, "https://me@map.example.org", "http://map.example.org:99999", "https://:8080"]:
         with pytest.raises(InvalidArgumentError, match=r"origins=.* is not the origin of a page"):
@@ -348,8 +341,6 @@ def test_origins_are_checked(maps):
 
 def test_a_server_that_cannot_be_guarded_is_not_used(monkeypatch):
     import viser
-
-    from gmmtorch.live.map_viewer import MapViewer
 
     monkeypatch.setattr(viser, "ViserServer", lambda *_, **__: None)
     with pytest.raises(GmmTorchError, match="foreign pages"):
@@ -372,8 +363,6 @@ def test_the_viewer_survives_a_thousand_connections(guarded):
 
 
 def test_an_origin_with_the_default_port_is_that_without():
-    from gmmtorch.live.map_viewer import admits
-
     for scheme, port in (("https", 443), ("http", 80)):
         sent, named = f"{scheme}://map.example.org", f"{scheme}://Map.example.org:{port}/"
         for host in ("127.0.0.1:8080", "map.example.org"):  # a proxy may keep the name of the page or not
@@ -382,8 +371,6 @@ def test_an_origin_with_the_default_port_is_that_without():
 
 
 def test_the_address_of_an_ipv6_server_can_be_opened():
-    from gmmtorch.live.map_viewer import MapViewer
-
     try:
         socket.create_server(("::1", 0), family=socket.AF_INET6).close()
     except OSError:
