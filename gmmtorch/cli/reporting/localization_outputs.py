@@ -152,8 +152,8 @@ def _messages(
         messages.append(f"lost      {len(lost) - _SHOWN} more times; {ALL} has the reasons")
     if lost and len(lost) == 1 and lost[0]["last"] - lost[0]["first"] + 1 == len(located):
         messages.append(
-            "No scan was found: give the map of this place, a first pose (pose=) within distance= and "
-            "angle= of the truth, or a lower least_explained= where much has changed."
+            "No scan was found: give the map of this place, a first pose (pose=) within 0.5 m and 0.175 rad "
+            "of the truth, or a lower least_explained= where much has changed."
         )
     return messages + [f"clock     scan {scan}: {text}" for scan, text in faults[:_SHOWN]]
 
