@@ -233,7 +233,7 @@ def map_factory(
 
     def make() -> GaussianMap:
         with schema.naming({name: f"{group}.{name}" for name in options}):
-            return GaussianMap(rule, resolution=resolution, codec=options["codec"], **query, **limits(config))
+            return GaussianMap(rule, resolution=resolution, **query, **limits(config))
 
     make()  # an invalid option fails here, before any map is built
     return make

@@ -294,7 +294,6 @@ class MapOptions:
     """Options of every map, beside those of its rule and of its queries."""
 
     name: str = option("???", "name of the choice")
-    codec: str = option("quantized", "quantized: 6 to 8 bytes for each component; float: exact numbers")
     memory: float | None = option(
         None,
         "of gmmtorch-map: the map grows in tiles on disk, of which these bytes are open at most; null: in "

@@ -27,6 +27,9 @@ SAMPLINGS: tuple[str, ...] = get_args(Sampling)
 class QueryOptions:
     """How a map answers queries. No option changes what the map stores.
 
+    cutoff: Mahalanobis distance at which a component ends. None: 3 if components have many points (the median
+        support is at least 50), so that tails do not claim unseen space; otherwise 5, because few points do
+        not show where a surface ends.
     sampling: "sobol", "stratified" or "plain".
     random_state: seed of the rays.
     memory_limit: largest number of bytes of evidence.
@@ -39,12 +42,7 @@ class QueryOptions:
         "null: calibrated probabilities; a number N_p: those of counts, θ = (H + N_p)/(H + M + 2N_p), as in "
         "the thesis (3.9)",
     )
-    cutoff: float | None = option(
-        None,
-        "Mahalanobis distance at which a component ends. null: 3 if components have many points (the median "
-        "support is at least 50), so that tails do not claim unseen space; otherwise 5, because few points "
-        "do not show where a surface ends",
-    )
+    cutoff: float | None = None
     n_samples: int = option(1_000_000, "Monte Carlo rays, drawn from the whole map")
     sampling: Sampling = "sobol"
     random_state: int = 0

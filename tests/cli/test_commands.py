@@ -319,7 +319,6 @@ def test_a_mesh_can_be_fitted(monkeypatch, tmp_path):
         ("evaluation.kept=[0]", "evaluation.kept=0.0 share"),
         ("evaluation.pose_noise=[0.1]", "evaluation.pose_noise=[0.1]"),
         ("map.noise=0", "map.noise=0.0"),
-        ("map.codec=zip", "codec='zip' quantized float"),
         ("map.max_bytes=10 method=[point]", "max_bytes=10"),
         ("map.novelty={resolutoin:1}", "map.novelty resolutoin threshold"),
         ("map.novelty={threshold:-1}", "map.novelty.threshold=-1"),

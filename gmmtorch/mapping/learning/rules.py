@@ -16,7 +16,7 @@ from gmmtorch.errors import (
     check_resolution,
     check_whole,
 )
-from gmmtorch.mixture import PruneOptions
+from gmmtorch.mixture import Prune, PruneOptions
 
 if TYPE_CHECKING:
     from gmmtorch.mapping.learning.fitting import DepthFrame
@@ -70,21 +70,18 @@ class NoveltyRule:
 class MixtureRule(PruneOptions):
     """How the mixture of a window is learned. Components of no-return beams are not pruned.
 
+    learner: "flat_pieces", EM that starts from flat pieces, or "hierarchical", the leaves of a tree of
+        mixtures (thesis 2.1.2).
     planarity: the tree does not split a node whose smallest variance is a smaller share of the sum of its
         variances (2.9). None: it does not split a node that is at most as thick as a flat piece.
+    free_points: number of points at equal distances on each beam with a return, from which components of free
+        space are learned, as from the ends of no-return beams (thesis 3.5).
     """
 
-    learner: LearnerName = option(
-        "flat_pieces",
-        "flat_pieces: EM that starts from flat pieces; hierarchical: the leaves of a tree of mixtures "
-        "(thesis 2.1.2)",
-    )
+    prune: Prune = "none"
+    learner: LearnerName = "flat_pieces"
     planarity: float | None = None
-    free_points: int = option(
-        0,
-        "points at equal distances on each beam with a return, from which components of free space are "
-        "learned, as from the ends of no-return beams (thesis 3.5)",
-    )
+    free_points: int = 0
     forget: int | float | str = option(
         FORGET_OFF,
         "what leaves the map. off: nothing; contradiction: surfaces that later beams pass through; a number: "
