@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from mapping.random_components import estimated_bytes
 from occupancy.protocol_contract import RESOLUTION, move, open_scan, wall_scan
 from torch import Tensor
 
@@ -56,7 +57,7 @@ def built(scans: list[Scan], learning: LearningRule | None = None, **options: An
 
 def absorbed(components: Components, scans: Sequence[Scan], rule: IncrementalRule) -> Components:
     """The components with scans added."""
-    return absorb(components, scans, rule)[0]
+    return absorb(components, scans, rule, estimated_bytes)[0]
 
 
 def given_parts(dim: int = 2, k: int = 4, seed: int = 0) -> dict[str, Tensor]:

@@ -20,8 +20,7 @@ from gmmtorch.files import pack_tensors, read_tensors
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.tiles import tiled_map
-from gmmtorch.mapping.tiles.tile_files import tile_files
-from gmmtorch.mapping.tiles.tile_index import INDEX
+from gmmtorch.mapping.tiles.tile_files import INDEX, tile_files
 from gmmtorch.mapping.tiles.tiled_map import TiledMap, merge
 from gmmtorch.scan import Scan
 

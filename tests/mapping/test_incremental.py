@@ -11,7 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapping.map_cases import FINE, absorbed, assert_same_components, built, drive, names, open_drive
-from mapping.random_components import counts_add_up
+from mapping.random_components import counts_add_up, estimated_bytes
 from occupancy.protocol_contract import WALL, dims, empty_scan, lattice, open_scan, points, shifted, wall_scan
 from torch import Tensor
 
@@ -21,7 +21,7 @@ from gmmtorch.experiments.evaluation import metrics, queries
 from gmmtorch.mapping.components import TENSORS, Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.fitting import DepthFrame
-from gmmtorch.mapping.learning.merging import UNNUMBERED, estimated_bytes
+from gmmtorch.mapping.learning.merging import UNNUMBERED
 from gmmtorch.mapping.learning.novelty import entropy_reduction
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
 from gmmtorch.mapping.learning.windows import absorb
@@ -150,7 +150,7 @@ def test_only_beams_that_contribute_free_space_ask_where_components_were_seen_fr
 
 def absorb_depth(components, frames, intrinsics, rule, pixel_stride=4, max_range=torch.inf):
     scans = (DepthFrame.of(*frame, intrinsics, pixel_stride, max_range) for frame in frames)
-    return absorb(components, scans, rule, weight=float(pixel_stride**2))[0]
+    return absorb(components, scans, rule, estimated_bytes, float(pixel_stride**2))[0]
 
 
 def depth_frames(n: int = 3) -> list[tuple[Tensor, Tensor]]:

@@ -277,7 +277,7 @@ def test_blocks_answer_as_one_form_of_all_cones_however_the_components_change(di
         if step % 3 == 1 and len(changed):
             changed.seen_count[: 1 + len(changed) // 3] *= 2  # `selected` copies
         recent = [every.selected(torch.arange(step, step + 2))] if step % 2 else []
-        answers = answers.replaced([changed], options, recent)
+        answers = Query([changed], options, recent, answers)
         cones = Cones(*map(torch.cat, zip(*(c.cones() for c in (changed, *recent)), strict=True)))
         expected = point_form.PointForm(cones, 0.1, 4.0)(asked)
         found = answers.evidence_at(asked, 0.1, "point")

@@ -59,7 +59,7 @@ class _LabelSteps(NamedTuple):
 
 def moved(attributes: Attributes, shift: Tensor) -> Attributes:
     """The attributes of components whose means move by `shift` (K, D): numbers follow their slopes."""
-    return Attributes({name: _at(channel, shift) for name, channel in attributes.channels.items()})
+    return attributes.with_numbers(lambda c: c._replace(mean=c.mean + (c.slope @ shift[:, :, None])[:, :, 0]))
 
 
 def rounded(attributes: Attributes, covariances: Tensor) -> Attributes:
@@ -96,11 +96,8 @@ def encode_attributes(attributes: Attributes, covariances: Tensor) -> bytes:
                 )
             writer.number(0)
             writer.number(len(steps.labels))
-            writer.column(steps.labels.numpy())
-            writer.column(steps.share.numpy())
-            writer.column(steps.first.numpy())
-            writer.column(steps.rest.numpy())
-            writer.column(steps.second[steps.rest > 0].numpy())
+            for column in (steps.labels, steps.share, steps.first, steps.rest, steps.second[steps.rest > 0]):
+                writer.column(column.numpy())
     return bytes([BLOCK_VERSION]) + writer.to_bytes()
 
 
@@ -203,13 +200,6 @@ def _bounded(value: int, name: str, least: int, largest: int) -> int:
 
 
 # -- rounding --------------------------------------------------------------------------------------------
-
-
-def _at(channel: Channel, shift: Tensor) -> Channel:
-    """The channel with the mean at another place of each component, `shift` (K, D) away."""
-    if isinstance(channel, Labels):
-        return channel
-    return channel._replace(mean=channel.mean + (channel.slope @ shift[:, :, None])[:, :, 0])
 
 
 def _steps(name: str, channel: Channel, covariances: Tensor) -> _NumberSteps | _LabelSteps:

@@ -357,18 +357,10 @@ def _components(
     kept, support, seen_by, seen_from, seen_count = (part.to(origins.device) for part in assigned)
     ids = torch.zeros(support.shape[0], 2, dtype=torch.int64, device=origins.device)
     ids[:, 1] = UNNUMBERED
-    return Components(
-        means=found.means[kept],
-        covariances=found.covariances[kept],
-        support=support,
-        max_range=torch.full_like(ids[:, 0], max_range, dtype=torch.bool),
-        ids=ids,
-        origins=origins.double(),
-        seen_by=seen_by,
-        seen_from=seen_from,
-        seen_count=seen_count,
-        attributes=Attributes() if attributes is None else attributes.selected(kept),
-    )
+    flags = torch.full_like(ids[:, 0], max_range, dtype=torch.bool)
+    shapes, viewpoints = (found.means[kept], found.covariances[kept]), (seen_by, seen_from, seen_count)
+    known = Attributes() if attributes is None else attributes.selected(kept)
+    return Components(*shapes, support, flags, ids, origins.double(), *viewpoints, attributes=known)
 
 
 def _points_before(scan: Scan, n: int) -> Tensor:
@@ -410,17 +402,9 @@ class _Window(NamedTuple):
         return counts.index_add_(0, pair, counts.new_ones(1).expand(len(pair))).view(-1, n_scans)
 
 
-class _Learned(NamedTuple):
-    """mixture; counts (K, S): its points in each scan, of which each belongs to its most likely component;
-    n_points: number of points that pruning leaves. cells: of the points; owner: their component (C,), −1 if
-    it is pruned.
-    """
-
-    mixture: Parameters
-    counts: Tensor
-    n_points: float
-    cells: Cells
-    owner: Tensor
+_Learned = tuple[Parameters, Tensor, float, Cells, Tensor]
+"""A mixture; its points in each scan (K, S), of which each belongs to its most likely component; the number
+of points that pruning leaves; the cells of the points; and their component (C,), −1 if it is pruned."""
 
 
 def _from_flat_pieces(window: _Window, fit: SurfaceFit) -> _Learned:
@@ -431,7 +415,7 @@ def _from_flat_pieces(window: _Window, fit: SurfaceFit) -> _Learned:
     counts = window.counts(owner[cells.member], mixture.weights.shape[0])
     n_points, rule = len(window.points), fit.rule
     if rule.prune == "none":
-        return _Learned(mixture, counts, n_points, cells, owner)
+        return mixture, counts, n_points, cells, owner
     support = mixture.weights * n_points
     if window.sensor is None:
         kept = support >= rule.min_support
@@ -443,7 +427,7 @@ def _from_flat_pieces(window: _Window, fit: SurfaceFit) -> _Learned:
     weights = mixture.weights[kept]
     left = Parameters(weights / weights.sum(), mixture.means[kept], mixture.covariances[kept])
     number = torch.where(kept, kept.cumsum(0) - 1, -1)
-    return _Learned(left, counts[kept], float(support[kept].sum()), cells, number[owner])
+    return left, counts[kept], float(support[kept].sum()), cells, number[owner]
 
 
 def _from_tree(window: _Window, fit: SurfaceFit) -> _Learned:
@@ -471,7 +455,7 @@ def _from_tree(window: _Window, fit: SurfaceFit) -> _Learned:
     mixture = Parameters(grown.weights[leaves], grown.means[leaves], grown.covariances[leaves])
     owner = most_likely_component(cells.features, mixture)
     counts = window.counts(owner[cells.member], len(leaves))
-    return _Learned(mixture, counts, len(window.points), cells, owner)
+    return mixture, counts, len(window.points), cells, owner
 
 
 _LEARNERS: dict[str, Callable[[_Window, SurfaceFit], _Learned]] = {

@@ -35,6 +35,7 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import PassLimits, beam_passes, few_points_evidence, is_fused
 from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.learning import merging
 from gmmtorch.mapping.learning.fitting import (
     DepthFrame,
     SurfaceFit,
@@ -42,15 +43,6 @@ from gmmtorch.mapping.learning.fitting import (
     fit_frames,
     fit_window,
     mean_range,
-)
-from gmmtorch.mapping.learning.merging import (
-    Size,
-    all_origins,
-    compact,
-    compact_to_bytes,
-    estimated_bytes,
-    limit_origins,
-    sampled_origins,
 )
 from gmmtorch.mapping.learning.novelty import count_explained, explained_within, novel_beams
 from gmmtorch.mapping.learning.rules import (
@@ -61,7 +53,7 @@ from gmmtorch.mapping.learning.rules import (
     NoveltyRule,
     WindowedRule,
 )
-from gmmtorch.mapping.query import Block, bounds_of, cutoff_for, evidence_boxes
+from gmmtorch.mapping.query import Block, boxes_of, cutoff_for
 from gmmtorch.mixture import SOFTMAX_DTYPES, FlatnessRule, surface_rule
 from gmmtorch.occupancy import (
     Calibrator,
@@ -84,7 +76,7 @@ def absorb(
     components: Components,
     scans: Iterable[Scan | DepthFrame],
     rule: IncrementalRule,
-    size: Size = estimated_bytes,
+    size: merging.Size,
     weight: float = 1.0,
     doubts: Doubts | None = None,
     before: BeforeWindow | None = None,
@@ -119,13 +111,13 @@ def _absorb_window(
     components: Components,
     window: Sequence[Scan | DepthFrame],
     rule: IncrementalRule,
-    size: Size,
+    size: merging.Size,
     weight: float,
     doubts: Doubts,
 ) -> tuple[Components, Doubts]:
     frames = [frame for frame in window if isinstance(frame, DepthFrame)]
     if rule.novelty is None and len(frames) == len(window):
-        learned = fit_frames(frames, surface_fit(rule, components.dim), all_origins(weight))
+        learned = fit_frames(frames, surface_fit(rule, components.dim), merging.all_origins(weight))
     else:
         scans = as_scans(window)
         if rule.novelty is not None:
@@ -146,7 +138,7 @@ def _learned(
         rule = rule.fitted([Scan(scan.no_return, scan.origin) for scan in scans])
     fit = surface_fit(rule, scans[0].dim)
     return fit_window(
-        scans, fit if iterations is None else replace(fit, iterations=iterations), all_origins(weight)
+        scans, fit if iterations is None else replace(fit, iterations=iterations), merging.all_origins(weight)
     )
 
 
@@ -172,14 +164,14 @@ def _explain(
     return components, remaining
 
 
-def _within_budget(components: Components, rule: IncrementalRule, size: Size) -> Components:
+def _within_budget(components: Components, rule: IncrementalRule, size: merging.Size) -> Components:
     if rule.max_cost is not None:
-        components = compact(components, None, rule.max_cost)
+        components = merging.compact(components, None, rule.max_cost)
     if rule.n_components is not None:
-        components = compact(components, rule.n_components)
+        components = merging.compact(components, rule.n_components)
     if rule.max_bytes is None:
-        return limit_origins(components, rule.max_origins, rule.mean_origins)
-    return compact_to_bytes(components, rule.max_bytes, rule.max_origins, rule.mean_origins, size)
+        return merging.limit_origins(components, rule.max_origins, rule.mean_origins)
+    return merging.compact_to_bytes(components, rule.max_bytes, rule.max_origins, rule.mean_origins, size)
 
 
 def surface_fit(rule: IncrementalRule, dim: int) -> SurfaceFit:
@@ -212,7 +204,7 @@ def learn_part(scans: Sequence[Scan], rule: LearningRule, generator: torch.Gener
     if isinstance(rule, WindowedRule):
         return learn_window(scans, replace(rule, iterations=1), generator)
     quick = replace(rule, window_components=max(1, rule.window_components // 2))
-    return limit_origins(_learned(scans, quick, 1.0, 0), rule.max_origins, rule.mean_origins)
+    return merging.limit_origins(_learned(scans, quick, 1.0, 0), rule.max_origins, rule.mean_origins)
 
 
 def learns_in_parts(rule: LearningRule) -> bool:
@@ -245,7 +237,7 @@ def learn_window(scans: Sequence[Scan], rule: WindowedRule, generator: torch.Gen
         partition_by_moments=False,
         rule=rule,
     )
-    return fit_window(scans, fit, sampled_origins(rule.max_origins, generator))
+    return fit_window(scans, fit, merging.sampled_origins(rule.max_origins, generator))
 
 
 def flatness_rule(rule: WindowedRule, dim: int) -> FlatnessRule:
@@ -473,7 +465,7 @@ def few_points(blocks: Sequence[Block], points: Tensor, sides: Sequence[float]) 
     cutoff = cutoff_for(blocks)
     blocks = [block for block in blocks if len(block.components.seen_by)]
     if len(blocks) > 1:
-        low, high = evidence_boxes(*bounds_of(blocks, cutoff), max(sides), cutoff)
+        low, high = boxes_of(blocks, max(sides), cutoff)
         met = ((low <= points.amax(0)) & (high >= points.amin(0))).all(1).tolist()
         blocks = [block for block, is_met in zip(blocks, met, strict=True) if is_met] or blocks[:1]
     known = Components.concatenate([block.components for block in blocks])
