@@ -231,12 +231,10 @@ def of_scans(scans: Sequence[Mapping[str, Tensor]], sizes: Sequence[int]) -> dic
 def learned(
     channels: Mapping[str, Tensor], cells: Cells, owner: Tensor, means: Tensor, covariances: Tensor
 ) -> Attributes:
-    """The attributes of K components, from the values of points that are summed into C cells.
+    """The attributes of K components, from the channels of points that are summed into C cells.
 
-    Args:
-        channels: of the points, as in `Scan`.
-        owner: (C,) the component of each cell, −1 for those without one.
-        means, covariances: of the components, in the frame of the cells.
+    owner (C,): the component of each cell, −1 for those without one. means, covariances: of the components,
+    in the frame of the cells.
     """
     kept = (owner >= 0).nonzero().squeeze(1)
     owner = owner[kept]
@@ -289,13 +287,7 @@ def _label_shares(values: Tensor, cells: Cells, kept: Tensor, owner: Tensor, tot
 
 
 def _regression(
-    sums: Tensor,
-    width: int,
-    places: Tensor,
-    owner: Tensor,
-    means: Tensor,
-    covariances: Tensor,
-    total: Tensor,
+    sums: Tensor, width: int, places: Tensor, owner: Tensor, means: Tensor, covariances: Tensor, total: Tensor
 ) -> Numbers:
     """The regression of values on the positions of the points of each component.
 
@@ -359,9 +351,7 @@ def merged(
 ) -> Attributes:
     """The attributes of components that are merged by label (K,), whose joint moments are preserved.
 
-    Args:
-        weights: (K,) supports.
-        before, after: means and covariances, before and after the merge.
+    weights (K,): supports. before, after: means and covariances, before and after the merge.
     """
     n = len(after[0])
 

@@ -312,7 +312,12 @@ def fit_points(
     scan = torch.bucketize(torch.arange(n_points, device=ends.device), ends, right=True)
     center = points.mean(0)
     rule = replace(fit.rule, prune="none") if max_range else fit.rule
-    sensor = _measured_sensor(clouds, origins) if rule.prune == "density" else None
+    sensor = None
+    if rule.prune == "density":  # with the spacing of the beams of the largest scan
+        from gmmtorch.mixture import measured_sensor
+
+        largest = sizes.index(max(sizes))
+        sensor = measured_sensor(clouds[largest], origins[largest])
     window = _Window(points.sub_(center), scan, origins.double() - center, sensor)
     learn = _LEARNERS[rule.learner]
     found, counts, n_learned, cells, owner = learn(window, replace(fit, rule=rule))
@@ -330,10 +335,8 @@ def fit_frames(frames: Sequence[DepthFrame], fit: SurfaceFit, viewpoints: Assign
     """
     origins = torch.stack([frame.pose.translation for frame in frames])
     origins = origins.to(frames[0].depth.device, non_blocking=True)
-    if fit.rule.needs_points:
+    if fit.rule.needs_points or sum(frame.depth.numel() for frame in frames) <= _FEW_POINTS:
         return fit_window([frame.scan() for frame in frames], fit, viewpoints)
-    if sum(frame.depth.numel() for frame in frames) <= _FEW_POINTS:
-        return fit_points([frame.scan().points for frame in frames], origins, fit, viewpoints)
     cells = pool_frames(frames, fit.cell, fit.max_cells or _MOST_CELLS)
     if cells.weight.shape[0] == 0:
         return Components.empty(3, origins.device)
@@ -368,14 +371,6 @@ def _points_before(scan: Scan, n: int) -> Tensor:
     shares = (torch.arange(n, dtype=torch.float64, device=scan.points.device) + 0.5) / n
     origin = scan.origin.double()
     return (origin + shares[:, None, None] * (scan.points.double() - origin)).flatten(0, 1)
-
-
-def _measured_sensor(clouds: Sequence[Tensor], origins: Tensor) -> SensorModel:
-    """A sensor with the spacing of the beams of the largest scan."""
-    from gmmtorch.mixture import measured_sensor
-
-    largest = max(range(len(clouds)), key=lambda number: len(clouds[number]))
-    return measured_sensor(clouds[largest], origins[largest])
 
 
 class _Window(NamedTuple):

@@ -259,11 +259,7 @@ def _merged(
 
 
 def compact_to_bytes(
-    components: Components,
-    max_bytes: int,
-    max_origins: int,
-    mean_origins: float | None,
-    size: Size,
+    components: Components, max_bytes: int, max_origins: int, mean_origins: float | None, size: Size
 ) -> Components:
     """Merges components until their `size` is at most `max_bytes`; origins are limited as by `limit_origins`.
 

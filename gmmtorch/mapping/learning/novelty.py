@@ -221,12 +221,7 @@ def count_explained(
 
 
 def _shared_out(
-    components: Components,
-    points: Tensor,
-    inverse: Tensor,
-    limit: float,
-    near: Tensor,
-    frees: Tensor | None,
+    components: Components, points: Tensor, inverse: Tensor, limit: float, near: Tensor, frees: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     """`explained_points` in tensor operations; inverse (K, D, D)."""
     means = components.means.double()

@@ -55,14 +55,7 @@ from gmmtorch.mapping.learning.rules import (
 )
 from gmmtorch.mapping.query import Block, boxes_of, cutoff_for
 from gmmtorch.mixture import SOFTMAX_DTYPES, FlatnessRule, surface_rule
-from gmmtorch.occupancy import (
-    Calibrator,
-    Cones,
-    Prediction,
-    few_point_evidence,
-    spectrum_of,
-    whitening,
-)
+from gmmtorch.occupancy import Calibrator, Cones, Prediction, few_point_evidence, spectrum_of, whitening
 from gmmtorch.scan import Scan
 
 BeforeWindow = Callable[[Components, Sequence[Scan | DepthFrame]], None]
@@ -88,13 +81,11 @@ def absorb(
     changed are not numbered (`UNNUMBERED`). Scans without beams add nothing.
 
     Args:
-        components: of the map so far.
-        scans: of the dimension of the components; or frames, whose pixels are then summed into cells at once.
+        scans: or frames, whose pixels are summed into cells at once.
         rule: if it is not complete, it is fitted to all scans, which are then read at once.
-        size: number of bytes of given components, for `rule.max_bytes`.
+        size: for `rule.max_bytes`.
         weight: number of measured points for which each point of the scans stands.
         doubts: before these scans; None: none.
-        before: is called before each window is learned.
     """
     if None in (rule.noise, rule.length, rule.cell, rule.window):
         scans = as_scans(scans)
@@ -313,11 +304,8 @@ def joined(
 
     Components without a number are not in doubt: their test begins with the next window.
 
-    Args:
-        rule: its noise must be set if a scan has a return.
-        doubts: before the window.
-
-    Raises `InvalidArgumentError` for a half-life if a scan has no time.
+    The noise of the rule must be set if a scan has a return. Raises `InvalidArgumentError` for a half-life if
+    a scan has no time.
     """
     if rule.forget == FORGET_OFF:
         return Components.concatenate([known, learned]), doubts
@@ -407,10 +395,8 @@ def predicted(
     evidence are left out, and those with less than half of the others: they lie where the map has only begun,
     and later it is asked mostly about places that it knows well.
 
-    Args:
-        known: the components before the window.
-        calibrator: before the window; None: the ranges of the window give one.
-        number: of the window; chooses the beams, and the side of the cubes.
+    known, calibrator: before the window; without a calibrator the ranges of the window give one.
+    number: of the window; chooses the beams.
     """
     if calibrator is not None and number < calibrator.next_window:
         return calibrator
@@ -432,20 +418,16 @@ def predicted(
         seen = hits * (calibrator.length / side) + misses
         kept = (seen >= np.sort(seen)[(len(seen) - 1) // 2]) & (seen > 0)
         predictions.append(Prediction(hits[kept], misses[kept], occupied[kept], side))
-    due = number + _windows_between(n_pairs, sum(map(_size, window)))
+    due = number + _windows_between(n_pairs, window)
     return replace(calibrator.updated(predictions, ends.shape[1]), next_window=due)
 
 
-def _windows_between(n_pairs: int, n_points: int) -> int:
+def _windows_between(n_pairs: int, window: Sequence[Scan | DepthFrame]) -> int:
     """Windows from one prediction to the next, so that predictions take a small share of the time."""
+    n_points = sum(s.depth.numel() if isinstance(s, DepthFrame) else len(s.points) for s in window)
     predicting = _PREDICTING[0] + _PREDICTING[1] * n_pairs
     learning = _LEARNING[0] + _LEARNING[1] * min(n_points, _MOST)
     return max(1, round(predicting / (_SHARE * learning)))
-
-
-def _size(scan: Scan | DepthFrame) -> int:
-    """Number of points, or of pixels."""
-    return scan.depth.numel() if isinstance(scan, DepthFrame) else len(scan.points)
 
 
 def _beams(window: Sequence[Scan | DepthFrame], generator: torch.Generator) -> tuple[Tensor, Tensor]:
