@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 from mapping.random_components import estimated_bytes
-from occupancy.protocol_contract import RESOLUTION, move, open_scan, wall_scan
+from occupancy.protocol_contract import RESOLUTION, move, open_scan, shifted, wall_scan
 from torch import Tensor
 
 from gmmtorch.mapping.components import TENSORS, Components
@@ -44,6 +44,13 @@ def drive(n: int, dim: int = 2) -> list[Scan]:
 def open_drive(n: int, dim: int = 2) -> list[Scan]:
     """`drive` with some no-return beams."""
     return [replace(scan, no_return=open_scan(dim).no_return[i::10]) for i, scan in enumerate(drive(n, dim))]
+
+
+def rooms(n: int, dim: int, apart: float) -> list[Scan]:
+    """n scans of rooms, three of each, `apart` metres from one to the next."""
+    near = open_drive(3, dim)
+    places = [shifted(dim, (apart * (number // 3), 0.0, 0.0)) for number in range(n)]
+    return [near[number % 3].transformed(place) for number, place in enumerate(places)]
 
 
 def built(scans: list[Scan], learning: LearningRule | None = None, **options: Any) -> GaussianMap:
