@@ -45,6 +45,7 @@ _REPLACED = {
     "free_thresh": "cells below 0.196 are free; map_server's YAML file can state another free_thresh.",
     "trajectory": "trajectory.tum beside the map is shown; in Python, MapViewer and write_page show others.",
     "tile_bytes": "in Python, gmmtorch.mapping.merge has it.",
+    "map.cutoff": _CONSTANT % "an argument of `GaussianMap`",
     "map.noise": "map.side is the side (m) of the cells of an octree that is as exact.",
     "map@log.map": _LOG_MAP,
     "log.every": "use log.dataset.stride.",
@@ -70,7 +71,8 @@ _REPLACED_GROUPS = (
         "map.",
         "cell iterations length max_cells max_origins mean_origins planarity min_density_share min_points "
         "min_support sampling window_components components distance distance_for hits_per_ray novelty_block "
-        "observed rays shell threshold update_at update_every update_novel update_stride",
+        "observed rays shell threshold update_at update_every update_novel update_stride prune learner "
+        "free_points",
         _CONSTANT % "a field of the learning rule, of `QueryOptions` or of `FrameRule`; a study may vary it",
     ),
     ("mixture.", "max_cells min_density_share min_support reg_covar", _CONSTANT % "the estimator has it"),

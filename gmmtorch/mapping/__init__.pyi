@@ -66,7 +66,7 @@ from .surfaces import collision_probability as collision_probability
 from .surfaces import expected_returns as expected_returns
 from .surfaces import surface_mixture as surface_mixture
 from .surfaces import touching as touching
+from .tiles.tile_files import INDEX as INDEX
 from .tiles.tile_files import tile_files as tile_files
-from .tiles.tile_index import INDEX as INDEX
 from .tiles.tiled_map import TiledMap as TiledMap
 from .tiles.tiled_map import merge as merge

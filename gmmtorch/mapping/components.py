@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -17,8 +17,9 @@ from gmmtorch.mapping.attributes.moments import Attributes
 from gmmtorch.occupancy import Cones
 from gmmtorch.scan import check_positions, extent
 
-_DTYPES = dict.fromkeys(("ids", "seen_by", "seen_from"), torch.int64) | {"max_range": torch.bool}
+DTYPES = dict.fromkeys(("ids", "seen_by", "seen_from"), torch.int64) | {"max_range": torch.bool}
 _PER_COMPONENT = ("means", "covariances", "support", "max_range", "ids")
+_PER_VIEWPOINT = ("seen_by", "seen_from", "seen_count")
 
 UNNUMBERED = -1
 """Sequence number, in `ids`, of a component that is new or changed. The owner of the map numbers it."""
@@ -56,7 +57,7 @@ class Components:
 
     def __post_init__(self) -> None:
         for name, given in self.tensors().items():
-            value = as_tensor(given, name, _DTYPES.get(name, torch.float64))
+            value = as_tensor(given, name, DTYPES.get(name, torch.float64))
             if value is not given:
                 object.__setattr__(self, name, value)
 
@@ -78,21 +79,11 @@ class Components:
     @classmethod
     def empty(cls, dim: int, device: torch.device | str | None = None) -> Components:
         """No components in `dim` dimensions."""
-
         real, index, flag = (
             torch.empty(0, dtype=dtype, device=device) for dtype in (torch.float64, torch.int64, torch.bool)
         )
-        return cls(
-            means=real.view(0, dim),
-            covariances=real.view(0, dim, dim),
-            support=real,
-            max_range=flag,
-            ids=index.view(0, 2),
-            origins=real.view(0, dim),
-            seen_by=index,
-            seen_from=index,
-            seen_count=real,
-        )
+        places, ids = real.view(0, dim), index.view(0, 2)
+        return cls(places, real.view(0, dim, dim), real, flag, ids, places, index, index, real)
 
     @classmethod
     def given(
@@ -153,8 +144,11 @@ class Components:
                 return self
             if torch.device(device).type == "cpu":
                 return self.on_cpu()
-            moved = {name: value.to(device) for name, value in self.tensors().items()}
-            return Components(**moved, attributes=self.attributes.changed(lambda value: value.to(device)))
+            return self.changed(lambda value: value.to(device))
+
+    def changed(self, change: Callable[[Tensor], Tensor]) -> Components:
+        """The components with `change` applied to each tensor."""
+        return Components(*map(change, self.tensors().values()), attributes=self.attributes.changed(change))
 
     def on_cpu(self) -> Components:
         """The components on the CPU, without gradients."""
@@ -184,24 +178,15 @@ class Components:
         kept = (place[self.seen_by] >= 0).nonzero().squeeze(1)
         kept = kept[argsort(place[self.seen_by[kept]])]
         chosen = {name: getattr(self, name)[rows] for name in _PER_COMPONENT}
-        return replace(
-            self,
-            **chosen,
-            seen_by=place[self.seen_by[kept]],
-            seen_from=self.seen_from[kept],
-            seen_count=self.seen_count[kept],
-            attributes=self.attributes.selected(rows),
-        )
+        chosen["seen_by"] = place[self.seen_by[kept]]
+        return replace(self.with_viewpoints(kept), **chosen, attributes=self.attributes.selected(rows))
 
     def split(self, ends: Sequence[int]) -> list[Components]:
         """The components up to each of the rising rows `ends`, from the one before, with all origins. Parts
         share memory with this, if its viewpoints are sorted by component."""
         by, each = self.seen_by, self
         if not bool((by[1:] >= by[:-1]).all()):
-            order = argsort(by)
-            each = replace(
-                self, seen_by=by[order], seen_from=self.seen_from[order], seen_count=self.seen_count[order]
-            )
+            each = self.with_viewpoints(argsort(by))
         begins, found = [0, *ends[:-1]], []
         places = torch.searchsorted(each.seen_by, by.new_tensor([begins, list(ends)])).tolist()
         for begin, end, first, last in zip(begins, ends, *places, strict=True):
@@ -212,6 +197,10 @@ class Components:
                 replace(each, **part, seen_by=each.seen_by[first:last] - begin, attributes=attributes)
             )
         return found
+
+    def with_viewpoints(self, rows: Tensor) -> Components:
+        """The components with these viewpoints (E′,), in that order."""
+        return replace(self, **{name: getattr(self, name)[rows] for name in _PER_VIEWPOINT})
 
     def with_used_origins(self) -> Components:
         """The components without the origins that have no viewpoint."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
 import torch
@@ -33,12 +33,7 @@ from gmmtorch.mapping.learning.rules import IncrementalRule, LearningRule, Windo
 from gmmtorch.mapping.learning.windows import Doubts
 from gmmtorch.mapping.map_state import MapState
 from gmmtorch.mapping.query import Block, Query
-from gmmtorch.mapping.query_options import (
-    MapOptions,
-    QueryOptions,
-    Sampling,
-    check_method,
-)
+from gmmtorch.mapping.query_options import QueryOptions, Sampling, check_method
 from gmmtorch.occupancy import Calibration, Evidence, VoxelGrid, check_queries, check_resolution, check_scan
 from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan, as_time, extent
@@ -47,10 +42,9 @@ from gmmtorch.scan import Scan, as_time, extent
 class GaussianMap(MapState):
     """A map that learns Gaussian components from windows of neighbouring scans.
 
-    The components are attributes: means, covariances, support, max_range, ids, origins, seen_by, seen_from,
-    seen_count; see `Components` for shapes. They include the components of the unfinished window; those in
-    the `state_dict` do not. Queries and files use the components as the codec rounds them
-    (`components()`), so a loaded map gives the same answers as the saved one.
+    The components are attributes: means, covariances and the other fields of `Components`, with those of the
+    unfinished window; the `state_dict` has them without. Queries and files use the components as the
+    codec rounds them (`components()`), so a loaded map gives the same answers as the saved one.
 
     Args:
         learning: how scans become components. `IncrementalRule` (the default) merges components, under a
@@ -67,7 +61,8 @@ class GaussianMap(MapState):
         prior: None: probabilities are calibrated: the map predicts each window before it learns from it, see
             `occupancy.calibrator`. A number N_p: they follow from counts, as in the thesis (3.9).
         cutoff: Mahalanobis distance at which a component ends. None: 3 if components have many points (a
-            median of at least 50 for each viewpoint), otherwise 5.
+            median of at least 50 for each viewpoint), so that tails do not claim unseen space; otherwise 5,
+            because few points do not show where a surface ends.
         n_samples: number of rays of method "monte_carlo", drawn from the whole map.
         sampling: sequence of these rays, "sobol", "stratified" or "plain".
         memory_limit: largest number of bytes of the evidence of a grid, and of Monte Carlo evidence.
@@ -114,14 +109,7 @@ class GaussianMap(MapState):
             )
         rule = rule if window is None else replace(rule, window=window)
         query = QueryOptions(
-            prior=prior,
-            cutoff=cutoff,
-            n_samples=n_samples,
-            sampling=sampling,
-            random_state=random_state,
-            memory_limit=memory_limit,
-            compiled=compiled,
-            calibration=calibration,
+            prior, cutoff, n_samples, sampling, random_state, memory_limit, compiled, calibration
         )
         number = check_whole("robot", robot, 0)
         settings = MapSettings(check_resolution(resolution), method, codec, number, query)
@@ -147,7 +135,7 @@ class GaussianMap(MapState):
         support: ArrayLike,
         origins: ArrayLike | Sequence[Sequence[tuple[ArrayLike, float]]],
         max_range: ArrayLike | None = None,
-        **options: Unpack[MapOptions],
+        **options: Any,
     ) -> GaussianMap:
         """A map of given components.
 
@@ -162,21 +150,21 @@ class GaussianMap(MapState):
         return cls.of(Components.given(means, covariances, support, origins, max_range, robot), **options)
 
     @classmethod
-    def of(cls, components: Components, **options: Unpack[MapOptions]) -> GaussianMap:
+    def of(cls, components: Components, **options: Any) -> GaussianMap:
         """A map of components as they are, with their ids; `options` as for `from_components`."""
         options.setdefault("codec", "float")
         made = cls(**options)
         made._commit(components.checked())
         return made
 
-    def snapshot(self, components: Components | None = None, **options: Unpack[MapOptions]) -> GaussianMap:
+    def snapshot(self, components: Components | None = None, **options: Any) -> GaussianMap:
         """A map that answers like this one and does not grow with it.
 
         Args:
             components: others than those of this map.
             options: those that differ; the default `codec` is "float".
         """
-        own: Any = {**asdict(self.query_options), "resolution": self.resolution, "method": self.method}
+        own = {**vars(self.query_options), "resolution": self.resolution, "method": self.method}
         return GaussianMap.of(self.components() if components is None else components, **{**own, **options})
 
     # -- learning -------------------------------------------------------------------------------------
@@ -361,8 +349,9 @@ class GaussianMap(MapState):
         self._is_asked = True
         if self._query is None or self._is_stale:
             parts = self._window_parts()
-            asked = self._rounded_parts(parts is None), self.query_options, parts or ()
-            self._query = Query(*asked) if self._query is None else self._query.replaced(*asked)
+            self._query = Query(
+                self._rounded_parts(parts is None), self.query_options, parts or (), self._query
+            )
             self._is_stale = False
         return self._query
 

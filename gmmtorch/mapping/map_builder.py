@@ -87,7 +87,6 @@ class MapBuilder(Generic[AnyMap]):
     from its own files: scans that are in them are read again, but not learned from.
 
     Attributes:
-        map: the map.
         poses: (S, D+1, D+1) sensor poses of the scans in the map, world ← sensor, metres. The rotation is the
             identity if the data set states none.
         times: (S,) their times in seconds, float64; their indices if the data set states none.
@@ -163,16 +162,9 @@ class MapBuilder(Generic[AnyMap]):
     def progress(self) -> BuildProgress:
         """The present state."""
         record = self.record
-        return BuildProgress(
-            record.n_read,
-            len(self._dataset),
-            sum(self.skipped.values()),
-            record.n_points,
-            self.map.n_final,
-            record.metres,
-            record.seconds,
-            record.history[-1]["nbytes"] if record.history else 0,
-        )
+        counts = record.n_read, len(self._dataset), sum(self.skipped.values()), record.n_points
+        nbytes = record.history[-1]["nbytes"] if record.history else 0
+        return BuildProgress(*counts, self.map.n_final, record.metres, record.seconds, nbytes)
 
     def _insert(self, index: int) -> None:
         record, before = self.record, self._dataset.skipped

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, Self, cast
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -16,20 +16,9 @@ from gmmtorch.mapping.attributes.moments import Attributes
 from gmmtorch.mapping.codec.component_batch import MapSettings, file_size
 from gmmtorch.mapping.codec.quantization import number_after, numbered
 from gmmtorch.mapping.components import TENSORS, Components
+from gmmtorch.mapping.learning import windows
 from gmmtorch.mapping.learning.fitting import DepthFrame, as_scans
 from gmmtorch.mapping.learning.rules import LearningRule, WindowedRule, read_rule, rule_facts
-from gmmtorch.mapping.learning.windows import (
-    SIDES,
-    BeforeWindow,
-    Doubts,
-    absorb,
-    joined,
-    keeps_components,
-    learn_part,
-    learn_window,
-    learns_in_parts,
-    predicted,
-)
 from gmmtorch.mapping.query import Block, Query, in_blocks
 from gmmtorch.mapping.query_options import QueryOptions
 from gmmtorch.occupancy import Calibrator
@@ -40,22 +29,13 @@ _LONGEST_WINDOW = 40  # scans, if no scan yet shows how many points it holds
 _STATE = "_extra_state"  # torch's name of it in a state dict
 
 
-def _field(name: str, about: str) -> Any:
-    """A property: a field of all components, not rounded, those of the unfinished window included."""
-
-    def read(self: MapState) -> Tensor:
-        if self.dim is None:
-            raise AttributeError(name)  # `__getattr__` explains it
-        return cast(Tensor, getattr(self.unrounded(), name))
-
-    return property(read, doc=f"{about} Not rounded; with the components of the unfinished window.")
-
-
 class MapState(DeviceModule):
     """The final components of a map, the pending scans of its unfinished window, and its settings.
 
     Components are in blocks. If the rule keeps components, the end of a window changes the last block only,
     so its cost does not depend on the size of the map; otherwise there is one block.
+
+    The fields of `Components` are attributes: those of all components, not rounded.
 
     Args:
         learning: how scans become components.
@@ -67,29 +47,20 @@ class MapState(DeviceModule):
         resolution, method, codec, robot, query_options: the settings.
     """
 
-    means = _field("means", "(K, D) in metres.")
-    covariances = _field("covariances", "(K, D, D) in m².")
-    support = _field("support", "(K,) points that each component stands for.")
-    max_range = _field("max_range", "(K,) bool: components of no-return beams.")
-    ids = _field("ids", "(K, 2): robot, sequence number.")
-    origins = _field("origins", "(S, D) sensor positions, metres.")
-    seen_by = _field("seen_by", "(E,) the component of each viewpoint.")
-    seen_from = _field("seen_from", "(E,) the origin of each viewpoint.")
-    seen_count = _field("seen_count", "(E,) points of each viewpoint.")
-
     def __init__(self, learning: LearningRule, settings: MapSettings, random_state: int) -> None:
         super().__init__()
         self.resolution, self.method, self.codec = settings.resolution, settings.method, settings.codec
         self.robot, self._query_options = settings.robot, settings.query
         known = settings.query.calibration
-        self._calibrator = None if known is None else Calibrator.continued(known, len(SIDES))
+        self._calibrator = None if known is None else Calibrator.continued(known, len(windows.SIDES))
         self.learning = learning
         self._random_state = random_state
         self._blocks: list[Block] = []  # the final components
         self._pending: list[Scan] = []
         self._n_windows = 0
         self._next_number = 0  # of the next new component
-        self._doubts = self._next_doubts = Doubts.none()  # of the final components; after the pending scans
+        self._doubts = windows.Doubts.none()  # of the final components
+        self._next_doubts = self._doubts  # after the pending scans
         self._learned: tuple[Components, int] | None = None  # the last block with those of pending scans
         self._parts: dict[tuple[int, int], Components] = {}  # learned from these pending scans
         self._all_rounded: Components | None = None
@@ -99,9 +70,11 @@ class MapState(DeviceModule):
         self._is_asked = False  # there was a query since the last scan
 
     def __getattr__(self, name: str) -> Any:
-        if name in TENSORS:
+        if name not in TENSORS:
+            return super().__getattr__(name)
+        if self.dim is None:
             raise AttributeError(f"{name}: the map is empty; insert a scan first.")
-        return super().__getattr__(name)
+        return getattr(self.unrounded(), name)
 
     @property
     def dim(self) -> int | None:
@@ -137,7 +110,7 @@ class MapState(DeviceModule):
             return {}
         return {
             side: tally
-            for side, tally in zip(SIDES, self._calibrator.tally, strict=True)
+            for side, tally in zip(windows.SIDES, self._calibrator.tally, strict=True)
             if float(tally[:, 0].sum())
         }
 
@@ -184,20 +157,18 @@ class MapState(DeviceModule):
         scan makes the next query learn from few beams. None: the window is learned as a whole, if it is small
         or already learned."""
         sizes = [scan.n_beams for scan in self._pending]
-        if self._learned is not None or sum(sizes) <= _PART or not learns_in_parts(self.learning):
+        if self._learned is not None or sum(sizes) <= _PART or not windows.learns_in_parts(self.learning):
             return None
         found, begin, size = {}, 0, 0
         for end, n_beams in enumerate(sizes, 1):
             size += n_beams
             if size >= _PART or end == len(sizes):
-                found[begin, end] = self._parts.get((begin, end)) or self._part(begin, end)
+                rule, scans = self.learning.fitted(self._pending[:end]), self._pending[begin:end]
+                known = self._parts.get((begin, end))
+                found[begin, end] = known or windows.learn_part(scans, rule, self._generator())
                 begin, size = end, 0
         self._parts = found
         return list(found.values())
-
-    def _part(self, begin: int, end: int) -> Components:
-        rule = self.learning.fitted(self._pending[:end])
-        return learn_part(self._pending[begin:end], rule, self._generator())
 
     def _generator(self) -> torch.Generator:
         """Random numbers for the unfinished window."""
@@ -208,7 +179,7 @@ class MapState(DeviceModule):
         scans: Iterable[Scan | DepthFrame],
         rule: LearningRule,
         weight: float = 1.0,
-        before: BeforeWindow | None = None,
+        before: windows.BeforeWindow | None = None,
     ) -> tuple[Components, int]:
         """`_upcoming`, with the components of scans, or of frames whose points each stand for `weight`.
 
@@ -217,11 +188,12 @@ class MapState(DeviceModule):
         known = self._last
         if isinstance(rule, WindowedRule):
             window = as_scans(scans)
-            new = learn_window(window, rule, self._generator())
-            learned, self._next_doubts = joined(known, new, window, rule, self._doubts)
+            new = windows.learn_window(window, rule, self._generator())
+            learned, self._next_doubts = windows.joined(known, new, window, rule, self._doubts)
         else:
             size = partial(file_size, rule=rule, settings=self.settings, next_number=self._next_number)
-            learned, self._next_doubts = absorb(known, scans, rule, size, weight, self._doubts, before)
+            options = rule, size, weight, self._doubts, before
+            learned, self._next_doubts = windows.absorb(known, scans, *options)
         return numbered(learned, self.robot, self._next_number)
 
     def _add(self, scan: Scan) -> None:
@@ -251,7 +223,7 @@ class MapState(DeviceModule):
         """`predicted`, unless probabilities follow from counts."""
         if self._query_options.prior is not None:
             return None
-        return predicted(known, window, calibrator, number)
+        return windows.predicted(known, window, calibrator, number)
 
     def _prepare(self, dim: int, device: torch.device, what: str) -> None:
         """Gives an empty map its dimension. Raises if the map has another one."""
@@ -276,7 +248,7 @@ class MapState(DeviceModule):
 
     def _set(self, components: Components, before: Sequence[Block] = ()) -> None:
         """Replaces all components by those of the blocks `before`, and these."""
-        parts = in_blocks(components) if keeps_components(self.learning) else [components]
+        parts = in_blocks(components) if windows.keeps_components(self.learning) else [components]
         self._blocks = [*before, *map(Block, parts)]
         self._forget()
 
@@ -336,7 +308,7 @@ class MapState(DeviceModule):
             missing_keys += [prefix + name for name in missing]
             return
         try:
-            extra = None if state is None else _read_extra(state)
+            extra = {} if state is None else _read_extra(state)
             components = None
             if not missing:
                 known = Attributes.of((state or {}).get("attributes", {}))
@@ -345,28 +317,23 @@ class MapState(DeviceModule):
             raise DataError(f"The state of the map is damaged ({error}).") from error
         device = self._device
         self._blocks, self._pending, self._parts = [], [], {}
-        if extra is not None:
-            self.learning, self._pending, self._n_windows, self._next_number, self._doubts = extra[:5]
-            self._calibrator = extra[5]
-            self._next_doubts = self._doubts
+        vars(self).update(extra)
         if components is not None:
-            tensors = {n: v.detach().clone().to(device) for n, v in components.tensors().items()}
-            known = components.attributes.changed(lambda value: value.detach().clone().to(device))
-            self._set(Components(**tensors, attributes=known))
+            self._set(components.changed(lambda value: value.detach().clone().to(device)))
             self._next_number = number_after(components.ids, self._next_number)
             self._pending = [scan.to(self._device) for scan in self._pending]
         self._forget()
 
 
-def _read_extra(
-    state: dict[str, Any],
-) -> tuple[LearningRule, list[Scan], int, int, Doubts, Calibrator | None]:
-    """The values of `get_extra_state`. Raises an error of any kind if the state is damaged."""
-    return (
-        read_rule(**state["learning"]),
-        [Scan(**scan) for scan in state["pending"]],
-        check_whole("n_windows", state["n_windows"], 0),
-        check_whole("n_numbered", state["n_numbered"], 0),
-        Doubts.read(state["doubts"]) if "doubts" in state else Doubts.none(),
-        Calibrator.restored(state["calibrator"]) if state.get("calibrator") else None,
-    )
+def _read_extra(state: dict[str, Any]) -> dict[str, Any]:
+    """The attributes of a map with this extra state. Raises an error of any kind if it is damaged."""
+    doubts = windows.Doubts.read(state["doubts"]) if "doubts" in state else windows.Doubts.none()
+    return {
+        "learning": read_rule(**state["learning"]),
+        "_pending": [Scan(**scan) for scan in state["pending"]],
+        "_n_windows": check_whole("n_windows", state["n_windows"], 0),
+        "_next_number": check_whole("n_numbered", state["n_numbered"], 0),
+        "_doubts": doubts,
+        "_next_doubts": doubts,
+        "_calibrator": Calibrator.restored(state["calibrator"]) if state.get("calibrator") else None,
+    }

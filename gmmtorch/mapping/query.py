@@ -184,10 +184,10 @@ def cutoff_for(blocks: Iterable[Block]) -> float:
     return cutoff_of(*map(sum, zip((0, 0), *(block.counts for block in blocks), strict=True)))
 
 
-def bounds_of(blocks: Sequence[Block], cutoff: float) -> tuple[Tensor, Tensor, Tensor]:
-    """low, high (B, D), distance (B,): the first arguments of `evidence_boxes`, of at least one block."""
+def boxes_of(blocks: Sequence[Block], side: float, cutoff: float) -> tuple[Tensor, Tensor]:
+    """`evidence_boxes` of at least one block."""
     low, high, distance = map(torch.stack, zip(*(block.box(cutoff) for block in blocks), strict=True))
-    return low, high, distance
+    return evidence_boxes(low, high, distance, side, cutoff)
 
 
 class Query:
@@ -200,6 +200,7 @@ class Query:
         parts: components of the map.
         options: how queries are answered.
         recent: more components, such as those of the parts of an unfinished window. They are one block.
+        former: answers about other components, whose lists are kept where it is possible.
     """
 
     def __init__(
@@ -209,9 +210,9 @@ class Query:
         recent: Sequence[Components] = (),
         former: Query | None = None,
     ) -> None:
-        """former: a query of other components, whose lists are kept where it is possible."""
         self.parts, self.options = parts, options
         self.dim, self._device = parts[0].dim, parts[0].means.device
+        former = former if former is not None and former.dim == self.dim else None
         every = [one for part in parts for one in (in_blocks(part) if len(part) > 2 * _BLOCK else [part])]
         self._blocks: list[Block] = _replaced(former._blocks if former else [], every)
         some = [part for part in recent if len(part.seen_by)]
@@ -220,13 +221,7 @@ class Query:
         self.rule = rule_of(options, [*parts, *recent])
         self.cutoff = options.cutoff or cutoff_for([*self._blocks, *self._recent])
         self._lattices: dict[float, SparseEvidence] = {}
-        self._bounds: tuple[Tensor, Tensor, Tensor] | None = None
-
-    def replaced(
-        self, parts: Sequence[Components], options: QueryOptions, recent: Sequence[Components] = ()
-    ) -> Query:
-        """The answers about other components; arguments as for `Query`. Blocks that did not change stay."""
-        return Query(parts, options, recent, self if parts[0].dim == self.dim else None)
+        self._boxes: dict[float, tuple[Tensor, Tensor]] = {}  # for each side
 
     def prepare(self, former: Query) -> None:
         """Makes what the first query at the resolutions that `former` was asked for would make."""
@@ -247,9 +242,9 @@ class Query:
         if len(blocks) <= 1:
             yield from ((block, None) for block in blocks)
             return
-        if self._bounds is None:
-            self._bounds = bounds_of(blocks, self.cutoff)
-        low, high = evidence_boxes(*self._bounds, side, self.cutoff)
+        if side not in self._boxes:
+            self._boxes[side] = boxes_of(blocks, side, self.cutoff)
+        low, high = self._boxes[side]
         fixed = points.detach().to(low)
         finite = torch.where(torch.isfinite(fixed), fixed, torch.nan)
         if not len(points):

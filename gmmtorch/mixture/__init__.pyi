@@ -41,6 +41,7 @@ from .estimators.sliced_wasserstein import (
 from .estimators.tree_growth import grow as grow
 from .estimators.variational import VariationalGaussianMixture as VariationalGaussianMixture
 from .gaussian_mixture import GaussianMixture as GaussianMixture
+from .prune_options import Prune as Prune
 from .prune_options import PruneOptions as PruneOptions
 from .pruning import density_share as density_share
 from .pruning import prune as prune

@@ -65,7 +65,7 @@ def mixtures(folder: Path, points: torch.Tensor) -> dict[str, Target]:
 
 def maps(folder: Path, scans: list[Any]) -> dict[str, Target]:
     """Maps, their tiles, checkpoints and grids: each changed as a whole, and behind its checksums."""
-    from gmmtorch.mapping.tiles.tile_index import read_index
+    from gmmtorch.mapping.tiles.tile_files import read_index
     from gmmtorch.occupancy import OccupancyGrid
 
     built = gt.GaussianMap()

@@ -92,6 +92,7 @@ def test_a_log_call_with_wrong_arguments_ends_no_command(monkeypatch, tmp_path):
         ("robot", "log.map.window=5", "log.map.window is no longer an option: give;log.map={name: windowed"),
         ("map", "map.hit_length=2", "map.hit_length is no longer an option: map.prior=1"),
         ("localize", "align=rigid", "align is no longer an option: the truth is in the frame of the map"),
+        ("map", "map.cutoff=2", "map.cutoff is no longer an option: it is a constant;`GaussianMap`"),
         ("map", "map.min_points=2", "map.min_points is no longer an option: it is a constant;learning rule"),
         ("explore", "checkpoint.every=60", "checkpoint.every is no longer;continues;hydra.run.dir=RUN"),
     ],

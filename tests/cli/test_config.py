@@ -182,13 +182,12 @@ def test_a_map_of_the_options_has_the_default_rule_and_answers(name):
 )
 def test_the_map_has_the_options_of_its_group(name, more, expected):
     options = ["map.noise=0.02", "map.prior=0.5", "runtime.dtype=float64", "seed=7"]
-    options += ["map.cutoff=4", "map.n_samples=1000"]
+    options += ["map.n_samples=1000"]
     made = inputs.map_factory(composed("occupancy", f"map={name}", *more.split(), *options))()
     assert made.learning.noise == 0.02
     assert {option: getattr(made.learning, option) for option in expected} == expected
     how = made.query_options
     assert (how.n_samples, how.prior, how.random_state) == (1000, 0.5, 7)
-    assert how.cutoff == 4
 
 
 def test_an_exploration_of_the_options_is_the_default_one(tmp_path):

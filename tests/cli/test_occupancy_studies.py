@@ -202,7 +202,7 @@ def test_variance_threshold_of_a_data_set_in_2d(run):
         ("fig3_3_approximation_error", "study.name=errors", "study.name='errors' auc_memory pose_correction"),
         ("pose_correction", "map=incremental", "map=per_scan"),
         ("fig3_8_variance_threshold", "study.railing=0", "study.railing=0"),
-        ("pruning", "study.variants.support.prune=weight", "map.prune='weight' density"),
+        ("pruning", "study.variants.support.prune=weight", "prune='weight' density"),
         ("pruning", "+study.variants.support.novel=1", "study.variants.support.novel map=incremental"),
         ("pruning", "study.variants.support=1", "study.variants={support: prune: support"),
     ],

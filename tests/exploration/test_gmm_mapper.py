@@ -232,9 +232,7 @@ def test_counts_are_sent_once_they_have_grown_enough(update_at: float) -> None:
         sensed = one.sense(view)
         for max_range in (False, True) if len(before) else ():
             ends = view.ends[~sensed.novel & (view.is_hit != max_range)]
-            counted = count_explained(
-                counted, ends, view.origin, NOVELTY.distance, max_range=max_range
-            ).components
+            counted, _ = count_explained(counted, ends, view.origin, NOVELTY.distance, max_range=max_range)
         ids = [tuple(key) for key in before.ids.tolist()]
         supports = dict(zip(ids, before.support.tolist(), strict=True))
         explained.update(dict(zip(ids, (counted.support - before.support).tolist(), strict=True)))

@@ -24,8 +24,5 @@ FIRST_VERSION = {
         "0R{j7000000000000000001BWAOIi$00000000000000000000005%-0W<",
         "cae66941d9efbd404e4d88758ea67670",
     ),
-    "one": (
-        "0R#dB0000000w{q0s+&2g1~?P00KY&004jh002N7OxXETL;3)m0JgD}1p",
-        "a9d2bb542e9f8557cec1dccd0d1e63c5",
-    ),
+    "one": ("0R#dB0000000w{q0s+&2g1~?P00KY&004jh002N7OxXETL;3)m0JgD}1p", "a9d2bb542e9f8557cec1dccd0d1e63c5"),
 }

@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 import torch
-from occupancy.protocol_contract import RESOLUTION, move, open_scan, wall_scan
+from mapping.random_components import estimated_bytes
+from occupancy.protocol_contract import RESOLUTION, move, open_scan, shifted, wall_scan
 from torch import Tensor
 
 from gmmtorch.mapping.components import TENSORS, Components
@@ -45,6 +46,13 @@ def open_drive(n: int, dim: int = 2) -> list[Scan]:
     return [replace(scan, no_return=open_scan(dim).no_return[i::10]) for i, scan in enumerate(drive(n, dim))]
 
 
+def rooms(n: int, dim: int, apart: float) -> list[Scan]:
+    """n scans of rooms, three of each, `apart` metres from one to the next."""
+    near = open_drive(3, dim)
+    places = [shifted(dim, (apart * (number // 3), 0.0, 0.0)) for number in range(n)]
+    return [near[number % 3].transformed(place) for number, place in enumerate(places)]
+
+
 def built(scans: list[Scan], learning: LearningRule | None = None, **options: Any) -> GaussianMap:
     """A map of these scans, by default windowed, with the float codec and few rays."""
     options = {"resolution": RESOLUTION, "n_samples": 20_000, "codec": "float", **options}
@@ -56,7 +64,7 @@ def built(scans: list[Scan], learning: LearningRule | None = None, **options: An
 
 def absorbed(components: Components, scans: Sequence[Scan], rule: IncrementalRule) -> Components:
     """The components with scans added."""
-    return absorb(components, scans, rule)[0]
+    return absorb(components, scans, rule, estimated_bytes)[0]
 
 
 def given_parts(dim: int = 2, k: int = 4, seed: int = 0) -> dict[str, Tensor]:

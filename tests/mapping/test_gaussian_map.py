@@ -18,24 +18,14 @@ from torch import Tensor
 from gmmtorch.datasets import load
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MemoryLimitError
 from gmmtorch.mapping.codec.quantization import quantized
-from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.components import TENSORS, Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
 from gmmtorch.occupancy.grid import VoxelGrid
 from gmmtorch.occupancy.occupancy_grid import OccupancyGrid
 from gmmtorch.scan import Scan
 
-BUFFERS = [
-    "covariances",
-    "ids",
-    "max_range",
-    "means",
-    "origins",
-    "seen_by",
-    "seen_count",
-    "seen_from",
-    "support",
-]
+BUFFERS = sorted(TENSORS)
 
 
 # -- learning by windows ---------------------------------------------------------------------------------
@@ -52,9 +42,8 @@ def test_components_have_the_moments_of_the_points(dim, learning):
     np.testing.assert_allclose(support.sum(), len(cloud), rtol=1e-6)
     np.testing.assert_allclose(mean, cloud.mean(0), atol=2e-3)
     offset = parts.means.numpy() - mean
-    spread = np.einsum("k,ki,kj->ij", support, offset, offset) + np.einsum(
-        "k,kij->ij", support, parts.covariances.numpy()
-    )
+    spread = np.einsum("k,ki,kj->ij", support, offset, offset)
+    spread += np.einsum("k,kij->ij", support, parts.covariances.numpy())
     expected = np.cov(cloud.T, ddof=0) + 0.01**2 * np.eye(dim)
     np.testing.assert_allclose(spread / support.sum(), expected, rtol=1e-2, atol=1e-4)
 
@@ -285,6 +274,7 @@ def test_an_empty_map_has_no_evidence_nor_components():
 def test_module_dtype_and_device_changes_keep_components_and_pending_scans_exact(change):
     made = built(drive(3), FINE)
     assert sorted(made.state_dict()) == ["_extra_state", *BUFFERS]
+    assert {"means", "covariances", "support", "origins"} < {*BUFFERS}
     buffers, answers = committed(made), made.occupancy(lattice(2))
     if change == "deepcopy":
         other = copy.deepcopy(made)
@@ -370,29 +360,25 @@ def test_a_damaged_state_is_refused_and_changes_nothing():
 # -- the contract of occupancy maps -----------------------------------------------------------------------
 
 
-class TestGaussianMapWindowed(OccupancyMapContract):
-    """With pending and with closed windows, and one origin for each component, as in the thesis."""
-
+class MapContract(OccupancyMapContract):
     shift_tolerance = 1e-3
     turn_tolerance = 0.05
+
+
+class TestGaussianMapWindowed(MapContract):
+    """With pending and with closed windows, and one origin for each component, as in the thesis."""
 
     def make(self) -> GaussianMap:
         return GaussianMap(WindowedRule(window=2, max_origins=1), resolution=RESOLUTION, n_samples=20_000)
 
 
-class TestGaussianMapIncremental(OccupancyMapContract):
+class TestGaussianMapIncremental(MapContract):
     """The default map."""
-
-    shift_tolerance = 1e-3
-    turn_tolerance = 0.05
 
     def make(self) -> GaussianMap:
         return GaussianMap(resolution=RESOLUTION, n_samples=20_000)
 
 
-class TestGaussianMapUnderABudget(OccupancyMapContract):
-    shift_tolerance = 1e-3
-    turn_tolerance = 0.05
-
+class TestGaussianMapUnderABudget(MapContract):
     def make(self) -> GaussianMap:
         return GaussianMap(IncrementalRule(window=2, max_bytes=1000), resolution=RESOLUTION)

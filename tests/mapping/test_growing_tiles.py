@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from mapping.map_cases import FINE, open_drive
+from mapping.map_cases import FINE, rooms
 from mapping.random_components import random_components
 from mapping.test_tiles import SETTINGS, SIDE, contents, moved, recording, written
 
@@ -20,21 +20,14 @@ from gmmtorch.files import pack_tensors, read_tensors
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.tiles import tiled_map
-from gmmtorch.mapping.tiles.tile_files import tile_files
-from gmmtorch.mapping.tiles.tile_index import INDEX
+from gmmtorch.mapping.tiles.tile_files import INDEX, tile_files
 from gmmtorch.mapping.tiles.tiled_map import TiledMap, merge
 from gmmtorch.scan import Scan
 
 RULE = replace(FINE, window=3, mean_origins=None)
 
 
-def street(n: int, dim: int) -> list[Scan]:
-    """Scans of rooms, each 15 m after the one before."""
-    found = []
-    for number, scan in enumerate(open_drive(3, dim) * -(-n // 3)):
-        shift = torch.eye(dim, dtype=torch.float64)[0] * (number // 3 * 15.0)
-        found.append(Scan(scan.points + shift, scan.origin + shift, scan.no_return + shift))
-    return found[:n]
+street = partial(rooms, apart=15.0)
 
 
 def around(scans: list[Scan]) -> torch.Tensor:
@@ -86,30 +79,30 @@ def test_a_map_that_grows_in_tiles_answers_as_one_in_memory(dim, codec, tmp_path
 def test_a_map_that_is_stopped_at_any_write_opens_with_all_finished_windows(tmp_path, monkeypatch):
     monkeypatch.setattr(tiled_map, "_RECENT", 40)
     scans, write = street(15, 2), tiled_map.write_bytes
-    asked = around(scans)
-    for stop in range(1, 40):
-        folder, n_written = tmp_path / str(stop), 0
+    asked, left = around(scans), 0
 
-        def full(path: Path, data: bytes, stop: int = stop) -> None:
-            nonlocal n_written
-            n_written += 1
-            if n_written == stop:
-                raise OutputError(f"{path} cannot be written: No space left on device")
-            write(path, data)
+    def full(path: Path, data: bytes) -> None:
+        nonlocal left
+        left -= 1
+        if left < 0:  # the disk takes half of a file
+            half = path.with_name(f".{path.stem}.0123456789abcdef{path.suffix}")
+            half.parent.mkdir(exist_ok=True)
+            half.write_bytes(data[: len(data) // 2])
+            raise OutputError(f"{path} cannot be written: No space left on device")
+        write(path, data)
 
+    for n_written in range(40):
+        folder, left = tmp_path / str(n_written), n_written
         monkeypatch.setattr(tiled_map, "write_bytes", full)
-        if stop == 1:
+        if n_written < 2:  # the first file of recent components, and the index
             with pytest.raises(OutputError):
-                grown(folder, scans)
+                TiledMap.create(folder, GaussianMap(RULE), 2, SIDE)
             continue
-        made = TiledMap.create(folder, GaussianMap(RULE), 2, SIDE) if stop > 2 else None
-        if made is None:
-            continue
-        n_final, before = 0, None
+        made, n_final, before = TiledMap.create(folder, GaussianMap(RULE), 2, SIDE), 0, None
         try:
             for scan in scans:
-                before = TiledMap(folder).occupancy(asked)
-                n_final = made.n_components
+                if made.n_pending == 2:  # the next scan is written
+                    n_final, before = made.n_components, TiledMap(folder).occupancy(asked)
                 made.insert(scan)
         except OutputError:
             monkeypatch.setattr(tiled_map, "write_bytes", write)
@@ -117,17 +110,15 @@ def test_a_map_that_is_stopped_at_any_write_opens_with_all_finished_windows(tmp_
             assert opened.n_components == n_final
             assert torch.equal(opened.occupancy(asked), before)
             made.finish()  # the disk has room again: nothing is lost
-            assert TiledMap(folder).n_components == made.n_components > n_final
-            opened_again = TiledMap(folder)
-            torch.testing.assert_close(
-                opened_again.occupancy(asked), made.occupancy(asked), rtol=0, atol=1e-9
-            )
-            opened_again.insert(scans[-1])
-            opened_again.finish()
-            assert opened_again.n_components > made.n_components
+            again = TiledMap(folder)
+            assert again.n_components == made.n_components > n_final
+            torch.testing.assert_close(again.occupancy(asked), made.occupancy(asked), rtol=0, atol=1e-9)
+            again.insert(scans[-1])
+            again.finish()
+            assert again.n_components > made.n_components
         else:
             break
-    assert stop > 12
+    assert n_written > 11
 
 
 def test_a_damaged_tile_is_named_and_the_rest_answers(tmp_path, monkeypatch):
@@ -142,6 +133,9 @@ def test_a_damaged_tile_is_named_and_the_rest_answers(tmp_path, monkeypatch):
     with pytest.raises(DataError, match=tile.name):
         damaged.occupancy(scans[0].origin[None])
     assert torch.equal(damaged.occupancy(around(scans[-3:])[:-2]), expected)
+    tile.unlink()
+    with pytest.raises(MissingDataError, match=tile.name):
+        damaged.occupancy(scans[0].origin[None])
     recent = next(folder.glob("recent_*"))
     recent.write_bytes(recent.read_bytes()[:-1])
     with pytest.raises(DataError, match=recent.name):
@@ -319,7 +313,7 @@ def test_a_map_of_added_components_answers_the_same_once_reopened(n_recent, tmp_
 def test_monte_carlo_draws_the_share_of_each_tile_as_the_map_grows(tmp_path, monkeypatch):
     monkeypatch.setattr(tiled_map, "_RECENT", 10)
     scans = street(12, 2)
-    made = TiledMap.create(tmp_path / "map", GaussianMap(RULE, cutoff=4.0), 2, SIDE)
+    made = TiledMap.create(tmp_path / "map", GaussianMap(RULE, cutoff=4.0, n_samples=20_000), 2, SIDE)
     for scan in scans:
         made.insert(scan)
         made.occupancy(around(scans[:3])[::9], 0.3, "monte_carlo")

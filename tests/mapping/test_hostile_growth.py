@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 from mapping.map_cases import FINE, built, given_parts, open_drive
 from mapping.test_growing_tiles import around, street
+from occupancy.protocol_contract import shifted
 from torch import Tensor
 
-from gmmtorch.errors import MissingDataError, OutputError
 from gmmtorch.mapping import query as map_query
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule
@@ -83,7 +82,7 @@ def test_a_robot_that_jumps_a_million_metres_is_answered_at_both_places(monkeypa
     monkeypatch.setattr(map_query, "_BLOCK", 20)
     near = open_drive(6, 2)
     shift = torch.tensor([1e6, -1e6]).double()
-    far = [Scan(s.points + shift, s.origin + shift, s.no_return + shift) for s in near]
+    far = [scan.transformed(shifted(2, (1e6, -1e6))) for scan in near]
     rule = replace(FINE, window=3)
     made = built([*near[:3], *far, *near[3:]], rule, codec="quantized")
     alone = built(near, rule, codec="quantized")
@@ -108,53 +107,3 @@ def test_places_outside_all_tiles_are_unknown_and_open_none(tmp_path, monkeypatc
     assert (opened.occupancy(outside) == 0.5).all()
     assert opened.n_read == 0
     assert (opened.occupancy(torch.cat([around(scans), outside]))[-4:] == 0.5).all()
-
-
-def test_a_missing_tile_is_named_and_the_rest_answers(tmp_path, monkeypatch):
-    monkeypatch.setattr(tiled_map, "_RECENT", 10)
-    scans = street(30, 2)
-    made = TiledMap.create(tmp_path, GaussianMap(replace(FINE, window=3, mean_origins=None)), 2, 30.0)
-    for scan in scans:
-        made.insert(scan)
-    last = around(scans[-3:])[:-2]
-    expected = TiledMap(tmp_path).occupancy(last)
-    tile = tmp_path / made._name(made.near(*[scans[0].origin] * 2)[0])
-    tile.unlink()
-    opened = TiledMap(tmp_path)
-    with pytest.raises(MissingDataError, match=tile.name):
-        opened.occupancy(scans[0].origin[None])
-    assert torch.equal(opened.occupancy(last), expected)
-
-
-@pytest.mark.parametrize("kind", ["tile_", "recent_", "index"])
-def test_a_disk_that_fills_in_a_write_leaves_the_map_before_it(kind, tmp_path, monkeypatch):
-    """The disk takes half of a file; the map is the one before the write, and goes on when there is room."""
-    monkeypatch.setattr(tiled_map, "_RECENT", 10)
-    scans = street(12, 2)
-    made = TiledMap.create(tmp_path, GaussianMap(replace(FINE, window=3)), 2, 30.0)
-    for scan in scans[:6]:
-        made.insert(scan)
-    before, n = TiledMap(tmp_path).occupancy(around(scans)), made.n_components
-    monkeypatch.setattr(tiled_map, "write_bytes", _filling(kind, tmp_path, tiled_map.write_bytes))
-    left = iter(scans[6:])
-    with pytest.raises(OutputError, match="space"):
-        all(made.insert(scan) is None for scan in left)
-    assert torch.equal(TiledMap(tmp_path).occupancy(around(scans)), before)
-    monkeypatch.undo()
-    made.finish()
-    opened = TiledMap(tmp_path)
-    assert opened.n_components == made.n_components > n
-    torch.testing.assert_close(
-        opened.occupancy(around(scans)), made.occupancy(around(scans)), rtol=0, atol=1e-9
-    )
-
-
-def _filling(kind: str, folder: Path, write):  # type: ignore[no-untyped-def]
-    def full(path: Path, data: bytes) -> None:
-        if not path.name.startswith(kind):
-            write(path, data)
-            return
-        path.with_name(f".{path.stem}.0123456789abcdef{path.suffix}").write_bytes(data[: len(data) // 2])
-        raise OutputError(f"{path} cannot be written: No space left on device")
-
-    return full

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import pytest
 import torch
@@ -16,6 +16,7 @@ from mapping.map_cases import (
     drive,
     given_parts,
     open_drive,
+    rooms,
 )
 from occupancy.protocol_contract import RESOLUTION, SENSOR, WALL, dims, lattice, points, shifted, wall_scan
 
@@ -31,7 +32,6 @@ from gmmtorch.occupancy.calibrator import Calibration
 from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.forms import point as point_form
 from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.scan import Scan
 
 methods = pytest.mark.parametrize("method", METHODS)
 
@@ -221,22 +221,15 @@ def test_the_default_cutoff_follows_the_support_of_the_components():
 # -- a map that is asked while it grows ------------------------------------------------------------------
 
 
-def corridor(n: int, dim: int) -> list[Scan]:
-    """Scans of walls every 4 m, each from another place."""
-    shift = torch.tensor([4.0, 0, 0][:dim], dtype=torch.float64)
-    near = open_drive(3, dim)
-    return [
-        Scan(
-            s.points + number // 3 * shift, s.origin + number // 3 * shift, s.no_return + number // 3 * shift
-        )
-        for number in range(n)
-        for s in [near[number % 3]]
-    ]
+corridor = partial(rooms, apart=4.0)
 
 
 @dims
-@pytest.mark.parametrize("method", ["point", "flux", "cone"])
-@pytest.mark.parametrize(("codec", "block"), [("quantized", 8192), ("float", 8192), ("quantized", 5)])
+@pytest.mark.parametrize(
+    ("method", "codec", "block"),
+    [("point", "quantized", 8192), ("flux", "float", 8192)]
+    + [(method, "quantized", 25) for method in ("point", "flux", "cone")],
+)
 def test_a_map_asked_after_each_scan_answers_like_a_new_one(dim, method, codec, block, monkeypatch):
     for module in (point_form, cone_index):
         monkeypatch.setattr(module, "_FEW_PAIRS", 0)
@@ -264,7 +257,7 @@ def test_a_map_asked_after_each_scan_answers_like_a_new_one(dim, method, codec, 
 def test_blocks_answer_as_one_form_of_all_cones_however_the_components_change(dim, few_pairs, monkeypatch):
     for module in (point_form, cone_index):
         monkeypatch.setattr(module, "_FEW_PAIRS", few_pairs)
-    monkeypatch.setattr(map_query, "_BLOCK", 7)
+    monkeypatch.setattr(map_query, "_BLOCK", 20)
     every = built(corridor(9, dim), FINE).components()
     asked = torch.cat([lattice(dim), lattice(dim) + torch.tensor([4.0, 0, 0][:dim])])
     asked = torch.cat([asked, torch.full_like(asked[:1], torch.inf), 1e7 + asked[:1]])
@@ -277,7 +270,7 @@ def test_blocks_answer_as_one_form_of_all_cones_however_the_components_change(di
         if step % 3 == 1 and len(changed):
             changed.seen_count[: 1 + len(changed) // 3] *= 2  # `selected` copies
         recent = [every.selected(torch.arange(step, step + 2))] if step % 2 else []
-        answers = answers.replaced([changed], options, recent)
+        answers = Query([changed], options, recent, answers)
         cones = Cones(*map(torch.cat, zip(*(c.cones() for c in (changed, *recent)), strict=True)))
         expected = point_form.PointForm(cones, 0.1, 4.0)(asked)
         found = answers.evidence_at(asked, 0.1, "point")
@@ -325,7 +318,7 @@ def test_a_map_that_is_asked_between_scans_learns_when_they_are_inserted(dim, mo
 
 
 @dims
-@pytest.mark.parametrize("block", [8192, 5])
+@pytest.mark.parametrize("block", [8192, 25])
 def test_components_that_are_replaced_give_no_evidence(dim, block, monkeypatch):
     for module in (point_form, cone_index):
         monkeypatch.setattr(module, "_FEW_PAIRS", 0)

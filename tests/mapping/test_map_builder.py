@@ -21,7 +21,7 @@ from mapping.map_cases import (
     sightings,
     some_motion,
 )
-from occupancy.protocol_contract import dims, lattice, move, quarter_turn, shifted, wall_scan
+from occupancy.protocol_contract import dims, lattice, quarter_turn, shifted, wall_scan
 from torch import Tensor
 
 from gmmtorch.datasets import Dataset, Ranges, load
@@ -400,37 +400,6 @@ def test_a_pose_correction_equals_learning_from_the_corrected_scans(dim):
     right = expected.occupancy(lattice(dim))
     torch.testing.assert_close(made.occupancy(lattice(dim)), right, rtol=0, atol=1e-5)
     assert float((wrong - right).abs().max()) > 0.1
-
-
-@pytest.mark.parametrize(("dim", "codec"), [(2, "float"), (3, "quantized")])
-def test_the_occupancy_of_an_incremental_map_moves_with_it(dim, codec):
-    made = built(drive(3, dim), FINE, codec=codec)
-    before, ids = made.occupancy(lattice(dim)), made.components().ids
-    matrix = quarter_turn(dim, (0.37, -1.21, 0.3))  # the cube at a point has the axes of the world
-    made.transform(matrix)
-    assert torch.equal(made.ids, ids)
-    moved = made.occupancy(move(matrix, lattice(dim)))
-    if codec == "float":
-        torch.testing.assert_close(moved, before, rtol=0, atol=1e-6)
-    assert float((moved - before).abs().mean()) < 0.02  # quantized again at the new position
-    assert float((made.occupancy(lattice(dim)) - before).abs().max()) > 0.1
-
-
-@pytest.mark.parametrize("codec", ["quantized", "float"])
-def test_the_inverse_motion_restores_the_map(codec):
-    made = built(drive(3), window=2, codec=codec)
-    before = made.occupancy(lattice(2))
-    made.transform(quarter_turn(2))
-    assert not torch.equal(made.occupancy(lattice(2)), before)
-    made.transform(torch.linalg.inv(quarter_turn(2)))
-    torch.testing.assert_close(made.occupancy(lattice(2)), before, rtol=0, atol=1e-15)
-
-
-def test_a_distant_motion_is_exact_to_10_nm():
-    parts, matrix = given_parts(), shifted(2, (500_000.0, 4_000_000.0))
-    made = GaussianMap.from_components(**parts)
-    made.transform(matrix)
-    torch.testing.assert_close(made.means, move(matrix, parts["means"]), rtol=0, atol=1e-8)
 
 
 @pytest.mark.parametrize("learning", [WindowedRule(window=20), FINE])

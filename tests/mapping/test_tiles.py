@@ -19,8 +19,7 @@ from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.query_options import QueryOptions
-from gmmtorch.mapping.tiles.tile_files import canonical, tile_files
-from gmmtorch.mapping.tiles.tile_index import INDEX
+from gmmtorch.mapping.tiles.tile_files import INDEX, canonical, tile_files
 from gmmtorch.mapping.tiles.tiled_map import TiledMap, merge
 from gmmtorch.occupancy.calibrator import Calibration
 

@@ -118,19 +118,18 @@ class Attributes:
     @classmethod
     def concatenate(cls, parts: Sequence[Attributes], sizes: Sequence[int]) -> Attributes:
         """The attributes of parts with these numbers of components. A part without a channel has share 0."""
-        found: dict[str, Channel] = {}
-        for name in dict.fromkeys(name for part in parts for name in part.channels):
-            given = [part.channels.get(name) for part in parts]
-            found[name] = _joined(name, given, sizes)
-        return cls(found)
+        names = dict.fromkeys(name for part in parts for name in part.channels)
+        check_kinds(part.channels for part in parts)
+        return cls({name: _joined([part.channels.get(name) for part in parts], sizes) for name in names})
 
     def turned(self, rotation: Tensor) -> Attributes:
         """The attributes of components turned by a rotation (D, D), or by one each (K, D, D)."""
+        return self.with_numbers(lambda c: c._replace(slope=c.slope @ rotation.mT))
+
+    def with_numbers(self, change: Callable[[Numbers], Numbers]) -> Attributes:
+        """The attributes with `change` applied to each channel of numbers."""
         return Attributes(
-            {
-                name: c._replace(slope=c.slope @ rotation.mT) if isinstance(c, Numbers) else c
-                for name, c in self.channels.items()
-            }
+            {name: change(c) if isinstance(c, Numbers) else c for name, c in self.channels.items()}
         )
 
     def replaced(self, rows: Tensor, other: Attributes) -> Attributes:
@@ -189,13 +188,11 @@ def check_kinds(parts: Iterable[Mapping[str, Channel | Tensor]]) -> None:
             )
 
 
-def _joined(name: str, given: Sequence[Channel | None], sizes: Sequence[int]) -> Channel:
-    """One channel of several parts."""
-    known = [c for c in given if c is not None]
-    first = known[0]
-    check_kinds({name: c} for c in known)
+def _joined(given: Sequence[Channel | None], sizes: Sequence[int]) -> Channel:
+    """One channel of several parts; None: of a part that does not have it."""
+    first = next(c for c in given if c is not None)
     if isinstance(first, Labels):
-        labels = torch.unique(torch.cat([c.labels for c in known if isinstance(c, Labels)]))
+        labels = torch.unique(torch.cat([c.labels for c in given if isinstance(c, Labels)]))
         shares = []
         for c, n in zip(given, sizes, strict=True):
             share = first.share.new_zeros(n, len(labels))
@@ -234,12 +231,10 @@ def of_scans(scans: Sequence[Mapping[str, Tensor]], sizes: Sequence[int]) -> dic
 def learned(
     channels: Mapping[str, Tensor], cells: Cells, owner: Tensor, means: Tensor, covariances: Tensor
 ) -> Attributes:
-    """The attributes of K components, from the values of points that are summed into C cells.
+    """The attributes of K components, from the channels of points that are summed into C cells.
 
-    Args:
-        channels: of the points, as in `Scan`.
-        owner: (C,) the component of each cell, −1 for those without one.
-        means, covariances: of the components, in the frame of the cells.
+    owner (C,): the component of each cell, −1 for those without one. means, covariances: of the components,
+    in the frame of the cells.
     """
     kept = (owner >= 0).nonzero().squeeze(1)
     owner = owner[kept]
@@ -292,13 +287,7 @@ def _label_shares(values: Tensor, cells: Cells, kept: Tensor, owner: Tensor, tot
 
 
 def _regression(
-    sums: Tensor,
-    width: int,
-    places: Tensor,
-    owner: Tensor,
-    means: Tensor,
-    covariances: Tensor,
-    total: Tensor,
+    sums: Tensor, width: int, places: Tensor, owner: Tensor, means: Tensor, covariances: Tensor, total: Tensor
 ) -> Numbers:
     """The regression of values on the positions of the points of each component.
 
@@ -362,9 +351,7 @@ def merged(
 ) -> Attributes:
     """The attributes of components that are merged by label (K,), whose joint moments are preserved.
 
-    Args:
-        weights: (K,) supports.
-        before, after: means and covariances, before and after the merge.
+    weights (K,): supports. before, after: means and covariances, before and after the merge.
     """
     n = len(after[0])
 

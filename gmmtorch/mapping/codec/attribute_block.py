@@ -31,21 +31,6 @@ _LIGHTNESS = torch.tensor([[1.0, 1.0, 1.0], [1.0, 0.0, -1.0], [1.0, -2.0, 1.0]],
 _LIGHTNESS = _LIGHTNESS / _LIGHTNESS.norm(dim=1, keepdim=True)
 
 
-class _NumberSteps(NamedTuple):
-    """Of the components with values: share (K,) in eighths of all; then deviation, mean (J, A), and slope
-    (J, A, D−1)."""
-
-    share: Tensor
-    deviation: Tensor
-    mean: Tensor
-    slope: Tensor
-
-    def rows(self) -> Tensor:
-        """(K, n), as `number_model` codes them."""
-        own = torch.cat([self.deviation, self.mean, self.slope.flatten(1)], 1)
-        return _spread(self.share, own)
-
-
 class _LabelSteps(NamedTuple):
     """share (K,) in eighths; of the components with labels, the rows of the first and the second label (J,),
     and the share of the second in eighths; labels (C,)."""
@@ -59,7 +44,7 @@ class _LabelSteps(NamedTuple):
 
 def moved(attributes: Attributes, shift: Tensor) -> Attributes:
     """The attributes of components whose means move by `shift` (K, D): numbers follow their slopes."""
-    return Attributes({name: _at(channel, shift) for name, channel in attributes.channels.items()})
+    return attributes.with_numbers(lambda c: c._replace(mean=c.mean + (c.slope @ shift[:, :, None])[:, :, 0]))
 
 
 def rounded(attributes: Attributes, covariances: Tensor) -> Attributes:
@@ -67,8 +52,10 @@ def rounded(attributes: Attributes, covariances: Tensor) -> Attributes:
     on the CPU."""
     return Attributes(
         {
-            name: _restored(name, _steps(name, channel, covariances), covariances)
-            for name, channel in attributes.channels.items()
+            name: _numbers_of(name, _number_steps(name, c, covariances), covariances)
+            if isinstance(c, Numbers)
+            else _labels_of(_label_steps(c))
+            for name, c in attributes.channels.items()
         }
     )
 
@@ -82,13 +69,14 @@ def encode_attributes(attributes: Attributes, covariances: Tensor) -> bytes:
     writer.number(n)
     for name, channel in attributes.channels.items():
         _write_name(writer, name)
-        steps = _steps(name, channel, covariances)
-        if isinstance(steps, _NumberSteps):
-            data = write_rows(steps.rows(), steps.mean.shape[1])
-            writer.number(steps.mean.shape[1])
+        if isinstance(channel, Numbers):
+            width = channel.mean.shape[1]
+            data = write_rows(_number_steps(name, channel, covariances), width)
+            writer.number(width)
             writer.number(len(data))
             writer.fixed(np.frombuffer(data, np.uint8).astype(np.int64), 8)
         else:
+            steps = _label_steps(channel)
             if channel.share.numel() > _MOST_SHARES:
                 raise InvalidArgumentError(
                     f"attributes[{name!r}]: {len(steps.share)} components with {len(steps.labels)} labels "
@@ -96,11 +84,8 @@ def encode_attributes(attributes: Attributes, covariances: Tensor) -> bytes:
                 )
             writer.number(0)
             writer.number(len(steps.labels))
-            writer.column(steps.labels.numpy())
-            writer.column(steps.share.numpy())
-            writer.column(steps.first.numpy())
-            writer.column(steps.rest.numpy())
-            writer.column(steps.second[steps.rest > 0].numpy())
+            for column in (steps.labels, steps.share, steps.first, steps.rest, steps.second[steps.rest > 0]):
+                writer.column(column.numpy())
     return bytes([BLOCK_VERSION]) + writer.to_bytes()
 
 
@@ -109,10 +94,10 @@ def rows_of(attributes: Attributes, covariances: Tensor) -> dict[str, Tensor]:
     of a component do not depend on the others."""
     found = {}
     for name, channel in sorted(attributes.channels.items()):
-        steps = _steps(name, channel, covariances)
-        if isinstance(steps, _NumberSteps):
-            found[name] = steps.rows()
+        if isinstance(channel, Numbers):
+            found[name] = _number_steps(name, channel, covariances)
         else:
+            steps = _label_steps(channel)
             second = torch.where(steps.rest > 0, steps.labels[steps.second], 0)
             own = torch.stack([steps.labels[steps.first], steps.rest, second], 1)
             found[name] = _spread(steps.share, own)
@@ -141,12 +126,16 @@ def decode_attributes(data: bytes, covariances: Tensor, most: int | None = None)
     for _ in range(_bounded(reader.number(), "channels", 0, MOST_CHANNELS)):
         name = _read_name(reader)
         width = _bounded(reader.number(), "columns", 0, MOST_COLUMNS)
-        if width and most is not None:
+        if not width:
+            found[name] = _labels_of(_read_labels(reader, k, left))
+            left -= 0 if most is None else sum(value.numel() for value in found[name])
+            continue
+        if most is not None:
             left -= k * (1 + width * (1 + dim + width))
             _bounded(most - left, "values", 0, most)
-        steps = _read_numbers(reader, k, width, dim) if width else _read_labels(reader, k, left)
-        found[name] = _restored(name, steps, covariances)
-        left -= 0 if width or most is None else sum(value.numel() for value in found[name])
+        packed = reader.fixed(_bounded(reader.number(), "bytes", 0, reader.left // 8), 8)
+        rows = read_rows(packed.astype(np.uint8).tobytes(), k, 1 + width * (dim + 1), width)
+        found[name] = _numbers_of(name, rows, covariances)
     reader.finish()
     try:
         return Attributes(found).checked(k, dim)
@@ -165,15 +154,6 @@ def _write_name(writer: BitWriter, name: str) -> None:
 def _read_name(reader: BitReader) -> str:
     letters = reader.fixed(_bounded(reader.number(), "letters", 1, LONGEST_NAME), 8)
     return letters.astype(np.uint8).tobytes().decode("utf-8", errors="replace")
-
-
-def _read_numbers(reader: BitReader, k: int, width: int, dim: int) -> _NumberSteps:
-    n_bytes = _bounded(reader.number(), "bytes", 0, reader.left // 8)
-    data = reader.fixed(n_bytes, 8).astype(np.uint8).tobytes()
-    rows = read_rows(data, k, 1 + width * (dim + 1), width)
-    own = rows[rows[:, 0] > 0, 1:]
-    deviation, mean, slope = own.split([width, width, width * (dim - 1)], 1)
-    return _NumberSteps(rows[:, 0], deviation, mean, slope.reshape(len(own), width, dim - 1))
 
 
 def _read_labels(reader: BitReader, k: int, most: int) -> _LabelSteps:
@@ -205,16 +185,8 @@ def _bounded(value: int, name: str, least: int, largest: int) -> int:
 # -- rounding --------------------------------------------------------------------------------------------
 
 
-def _at(channel: Channel, shift: Tensor) -> Channel:
-    """The channel with the mean at another place of each component, `shift` (K, D) away."""
-    if isinstance(channel, Labels):
-        return channel
-    return channel._replace(mean=channel.mean + (channel.slope @ shift[:, :, None])[:, :, 0])
-
-
-def _steps(name: str, channel: Channel, covariances: Tensor) -> _NumberSteps | _LabelSteps:
-    if isinstance(channel, Labels):
-        return _label_steps(channel)
+def _number_steps(name: str, channel: Numbers, covariances: Tensor) -> Tensor:
+    """Rows (K, n) of `number_model`: the share in eighths; deviations and means (A), slopes (A, D−1)."""
     share = _share_steps(channel.share)
     rows = share > 0
     basis = _basis(name, channel.mean)
@@ -233,7 +205,8 @@ def _steps(name: str, channel: Channel, covariances: Tensor) -> _NumberSteps | _
     unit = _power(deviation)
     along = (basis @ channel.slope[rows]) @ _factors(covariances[rows])[:, :, :-1]
     steps = (given / unit * _MEAN_STEPS).round(), (along / unit[:, :, None] * _SLOPE_STEPS).round()
-    return _NumberSteps(share, deviation, *(values.clamp(-MOST_STEPS, MOST_STEPS).long() for values in steps))
+    mean, slope = (values.clamp(-MOST_STEPS, MOST_STEPS).long() for values in steps)
+    return _spread(share, torch.cat([deviation, mean, slope.flatten(1)], 1))
 
 
 def _share_steps(share: Tensor) -> Tensor:
@@ -260,26 +233,28 @@ def _label_steps(channel: Labels) -> _LabelSteps:
     return _LabelSteps(share, first, second, rest, channel.labels)
 
 
-def _restored(name: str, steps: _NumberSteps | _LabelSteps, covariances: Tensor) -> Channel:
-    k, dim = covariances.shape[:2]
+def _labels_of(steps: _LabelSteps) -> Labels:
     share, rows = steps.share.double() / WHOLE, (steps.share > 0).nonzero().squeeze(1)
-    if isinstance(steps, _LabelSteps):
-        rest = steps.rest.double() / WHOLE
-        table = share.new_zeros(k, len(steps.labels))
-        table.index_put_((rows, steps.second), share[rows] * rest, accumulate=True)
-        table.index_put_((rows, steps.first), share[rows] * (1 - rest), accumulate=True)
-        return Labels(table, steps.labels)
-    width = steps.mean.shape[1]
-    unit = _power(steps.deviation)
+    rest, table = steps.rest.double() / WHOLE, share.new_zeros(len(share), len(steps.labels))
+    table.index_put_((rows, steps.second), share[rows] * rest, accumulate=True)
+    table.index_put_((rows, steps.first), share[rows] * (1 - rest), accumulate=True)
+    return Labels(table, steps.labels)
+
+
+def _numbers_of(name: str, steps: Tensor, covariances: Tensor) -> Numbers:
+    k, dim = covariances.shape[:2]
+    width, rows = (steps.shape[1] - 1) // (dim + 1), (steps[:, 0] > 0).nonzero().squeeze(1)
+    deviation, mean, slope = steps[rows, 1:].split([width, width, width * (dim - 1)], 1)
+    unit = _power(deviation)
     along = torch.zeros(len(rows), width, dim, dtype=torch.float64)
-    along[:, :, :-1] = steps.slope * (unit / _SLOPE_STEPS)[:, :, None]
+    along[:, :, :-1] = slope.reshape(len(rows), width, dim - 1) * (unit / _SLOPE_STEPS)[:, :, None]
     basis = _basis(name, unit)
-    slope = basis.T @ torch.linalg.solve(_factors(covariances[rows]), along, left=False)
-    mean = (steps.mean * unit / _MEAN_STEPS) @ basis
-    noise = basis.T @ torch.diag_embed(unit.square()) @ basis
-    found = Numbers(share, *(share.new_zeros(k, *v.shape[1:]) for v in (mean, slope, noise)))
-    for whole, own in zip(found[1:], (mean, slope, noise), strict=True):
-        whole[rows] = own
+    own_slope = basis.T @ torch.linalg.solve(_factors(covariances[rows]), along, left=False)
+    own = (mean * unit / _MEAN_STEPS) @ basis, own_slope, basis.T @ torch.diag_embed(unit.square()) @ basis
+    share = steps[:, 0].double() / WHOLE
+    found = Numbers(share, *(share.new_zeros(k, *values.shape[1:]) for values in own))
+    for whole, values in zip(found[1:], own, strict=True):
+        whole[rows] = values
     return found
 
 

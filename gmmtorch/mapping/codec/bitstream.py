@@ -6,9 +6,6 @@ loop over numbers.
 
 from __future__ import annotations
 
-from enum import IntEnum
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,16 +18,10 @@ MAX_WIDTH = 62
 MAX_BYTES = 1 << 28
 """Largest length of a stream, about 25 million components. A reader expands every bit to a byte."""
 _BLOCK = 1 << 16  # numbers processed at a time; their bits take up to 24 bytes each
-_CANDIDATES = np.array([-1, 0, 1])  # offsets of the low bits that a Rice code tries
 _GROUP = 7  # bits in a group of a single number
-
-
-class Code(IntEnum):
-    """The code of a column."""
-
-    FIXED = 0  # each number minus the smallest, in the width of the largest difference
-    RICE = 1  # each number minus the smallest, in a Rice code
-    DIFFERENCES = 2  # the first number, then differences, zigzag, in a Rice code
+_FIXED, _RICE, _DIFFERENCES = range(3)
+"""Codes of a column: each number minus the smallest, in the width of the largest difference; the same in a
+Rice code; the first number, then differences, zigzag, in a Rice code."""
 
 
 def zigzag(values: Ints) -> Ints:
@@ -43,49 +34,36 @@ def unzigzag(codes: Ints) -> Ints:
     return (codes >> 1) ^ -(codes & 1)
 
 
-class Coding(NamedTuple):
-    """The code of a column, its parameter (width, or number of low bits), its base, and its size in bits."""
-
-    code: Code
-    parameter: int
-    base: int
-    n_bits: float
-
-
-def best_code(values: Ints) -> Coding:
-    """The shortest code of these whole numbers."""
+def _shortest_code(values: Ints) -> tuple[int, int, int]:
+    """The shortest code of a column, its parameter (width, or number of low bits), and its base."""
     if not len(values):
-        return Coding(Code.FIXED, 0, 0, 0.0)
+        return _FIXED, 0, 0
     base, largest = int(values.min()), int(values.max())
     extent = largest - base
     if extent >> (MAX_WIDTH - 1) or (extent + abs(base)) >> MAX_WIDTH:
         raise InvalidArgumentError(f"Numbers from {base} to {largest} take more than {MAX_WIDTH} bits.")
     if base == largest:
-        return Coding(Code.FIXED, 0, base, 0.0)
-    codings = [
-        Coding(
-            code, int(parameter[0]), int(values[0]) if code is Code.DIFFERENCES else base, float(n_bits[0])
-        )
-        for code, (parameter, n_bits) in _codings(values[None]).items()
-        if code is not Code.DIFFERENCES or _path_length(values) < 2.0**MAX_WIDTH
-    ]
-    return min(codings, key=lambda coding: coding.n_bits)
+        return _FIXED, 0, base
+    width, (low, n_bits), steps = extent.bit_length(), _rice_code(values - base), np.diff(values)
+    found = [(width * float(len(values)), _FIXED, width, base), (n_bits, _RICE, low, base)]
+    # The reader limits this sum.
+    if abs(float(values[0])) + float(np.abs(steps.astype(np.float64)).sum()) < 2.0**MAX_WIDTH:
+        low, n_bits = _rice_code(zigzag(steps))
+        found.append((n_bits, _DIFFERENCES, low, int(values[0])))
+    return min(found)[1:]
 
 
-def _path_length(values: Ints) -> float:
-    """|first number| plus all absolute differences: the reader limits this sum."""
-    return abs(float(values[0])) + float(np.abs(np.diff(values).astype(np.float64)).sum())
-
-
-def _codings(rows: Ints) -> dict[Code, tuple[Ints, NDArray[np.float64]]]:
-    """Parameters (T,) of each code for rows (T, N), N > 0, and the sizes in bits (T,)."""
-    base = rows.min(1)
-    width = np.array([extent.bit_length() for extent in (rows.max(1) - base).tolist()])
-    return {
-        Code.FIXED: (width, width * float(rows.shape[1])),
-        Code.RICE: _rice_codes(rows - base[:, None]),
-        Code.DIFFERENCES: _rice_codes(zigzag(rows[:, 1:] - rows[:, :-1])),
-    }
+def _rice_code(values: Ints) -> tuple[int, float]:
+    """Low bits of the shortest Rice code of numbers (N,) ≥ 0, and its size in bits: a float, which does not
+    overflow."""
+    n = len(values)
+    if not n:
+        return 0, 0.0
+    about = int(np.log2(values.sum(dtype=np.float64) / n + 1))
+    lows = [min(max(about + more, 0), MAX_WIDTH - 1) for more in (-1, 0, 1)]
+    n_bits = [float((values >> low).sum(dtype=np.float64)) + (low + 1.0) * n for low in lows]
+    best = int(np.argmin(n_bits))
+    return lows[best], n_bits[best]
 
 
 class BitWriter:
@@ -103,15 +81,10 @@ class BitWriter:
             )
         return data
 
-    def fixed(self, values: Ints, widths: Ints | int) -> None:
-        """Writes each number ≥ 0 in its width of bits."""
+    def fixed(self, values: Ints, width: int) -> None:
+        """Writes each number ≥ 0 in `width` bits."""
         for begin in range(0, len(values), _BLOCK):
-            block = values[begin : begin + _BLOCK]
-            if isinstance(widths, int):
-                bits = block[:, None] >> _shifts(widths)
-            else:
-                which, shift = _bit_places(widths[begin : begin + _BLOCK])
-                bits = block[which] >> shift
+            bits = values[begin : begin + _BLOCK, None] >> _shifts(width)
             self._parts.append((bits & 1).astype(np.uint8).reshape(-1))
 
     def one(self, value: int, width: int) -> None:
@@ -119,7 +92,7 @@ class BitWriter:
         bits = [(value >> shift) & 1 for shift in range(width - 1, -1, -1)]
         self._parts.append(np.array(bits, np.uint8))
 
-    def rice(self, values: Ints, low: Ints | int) -> None:
+    def rice(self, values: Ints, low: int) -> None:
         """Writes each number ≥ 0: the part above its `low` bits in unary (zeros, then a one); then all low
         bits."""
         ends = np.cumsum((values >> low) + 1)
@@ -141,21 +114,19 @@ class BitWriter:
             code = more
 
     def column(self, values: Ints) -> None:
-        """Writes whole numbers in their shortest `Code`: code, parameter, base, numbers."""
-        coding = best_code(values)
-        self.one(coding.code, 2)
-        self.one(coding.parameter, 6)
-        self.number(coding.base)
-        if coding.code is Code.FIXED:
-            self.fixed(values - coding.base, coding.parameter)
-        elif coding.code is Code.RICE:
-            self.rice(values - coding.base, coding.parameter)
+        """Writes whole numbers in their shortest code: code, parameter, base, numbers."""
+        code, parameter, base = _shortest_code(values)
+        self.one(code, 2)
+        self.one(parameter, 6)
+        self.number(base)
+        if code == _FIXED:
+            self.fixed(values - base, parameter)
         else:
-            self.rice(zigzag(np.diff(values)), coding.parameter)
+            self.rice(zigzag(np.diff(values)) if code == _DIFFERENCES else values - base, parameter)
 
     def rice_column(self, values: Ints) -> None:
         """Writes numbers ≥ 0 in a Rice code, after its low bits: at least one bit for each number."""
-        low = int(_rice_codes(values[None])[0][0])
+        low, _ = _rice_code(values)
         self.one(low, 6)
         self.rice(values, low)
 
@@ -257,11 +228,11 @@ class BitReader:
         """Reads n whole numbers, |x| < 2⁶²."""
         code, parameter = self.one(2), self.one(6)
         base = self.number()
-        if code == Code.FIXED:
+        if code == _FIXED:
             return _shifted_by(base, self.fixed(n, parameter))
-        if code == Code.RICE:
+        if code == _RICE:
             return _shifted_by(base, self.rice(n, parameter))
-        if code != Code.DIFFERENCES:
+        if code != _DIFFERENCES:
             raise DataError(f"A column has the unknown code {code}: it is damaged.")
         steps = np.append(np.int64(base), unzigzag(self.rice(max(n - 1, 0), parameter)))
         if float(np.abs(steps.astype(np.float64)).sum()) >= 2.0**MAX_WIDTH:
@@ -300,23 +271,3 @@ def _shifted_by(base: int, above: Ints) -> Ints:
     if len(above) and int(above.max()) + abs(base) >= 1 << MAX_WIDTH:
         raise DataError("A column's numbers are too large: it is damaged.")
     return above + base
-
-
-def _rice_codes(rows: Ints) -> tuple[Ints, NDArray[np.float64]]:
-    """Low bits (T,) of the shortest Rice codes of rows (T, N) of numbers ≥ 0, and sizes in bits (T,).
-
-    Sizes are floats, which do not overflow.
-    """
-    t, n = rows.shape
-    if not n:
-        return np.zeros(t, np.int64), np.zeros(t)
-    about = np.log2(_sums(rows) / n + 1).astype(np.int64)
-    low = np.minimum(np.maximum(about[:, None] + _CANDIDATES, 0), MAX_WIDTH - 1)
-    size = _sums(rows[:, None] >> low[:, :, None]) + (low + 1.0) * n
-    best = (np.arange(t), np.argmin(size, axis=1))
-    return low[best], size[best]
-
-
-def _sums(values: Ints) -> NDArray[np.float64]:
-    """Sums over the last axis, float64."""
-    return np.add.reduce(values, axis=-1, dtype=np.float64)

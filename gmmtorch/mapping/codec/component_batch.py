@@ -51,7 +51,7 @@ from gmmtorch.mapping.codec.quantization import (
     quantize_numbered,
     ranked,
 )
-from gmmtorch.mapping.components import TENSORS, Components
+from gmmtorch.mapping.components import DTYPES, TENSORS, Components
 from gmmtorch.mapping.learning.rules import LearningRule, changed_options, rule_facts
 from gmmtorch.mapping.query_options import QueryOptions, check_method
 from gmmtorch.occupancy import Calibration
@@ -74,16 +74,12 @@ def encode_quantized(values: Quantized, channels: bool = False) -> bytes:
 
     channels: whether it has their attributes, those that a component has.
     """
-    if not channels:
-        return _sealed(_geometry(values))
-    _, covariances = values.places.restored()
-    geometry, block = _geometry(values), encode_attributes(values.attributes.present(), covariances)
-    size = BitWriter()
-    size.number(len(geometry))
-    return _sealed(bytes([CHANNELS_VERSION]) + size.to_bytes() + geometry + block)
-
-
-def _sealed(body: bytes) -> bytes:
+    body = _geometry(values)
+    if channels:
+        size = BitWriter()
+        size.number(len(body))
+        block = encode_attributes(values.attributes.present(), values.places.restored()[1])
+        body = bytes([CHANNELS_VERSION]) + size.to_bytes() + body + block
     return body + zlib.crc32(body).to_bytes(_CHECKSUM_BYTES, "little")
 
 
@@ -116,7 +112,12 @@ def decode(data: bytes, most: int | None = None) -> Components:
     to the length of the data, for any numbers in them.
     """
     try:
-        return _components(data, most)
+        geometry, block = _parts(data)
+        found = _values(geometry, most).restored()
+        if block is not None:
+            limit = None if most is None else _VALUES_EACH * most
+            found = replace(found, attributes=decode_attributes(block, found.covariances, limit))
+        return found.checked()
     except DataError:
         raise
     except GmmTorchError as error:
@@ -126,15 +127,6 @@ def decode(data: bytes, most: int | None = None) -> Components:
 def ids_of_batch(data: bytes) -> Tensor:
     """The ids (K, 2) of the components of a batch. Raises as `decode` does, but does not check the rest."""
     return _values(_parts(data)[0]).ids
-
-
-def _components(data: bytes, most: int | None) -> Components:
-    geometry, block = _parts(data)
-    found = _values(geometry, most).restored()
-    if block is not None:
-        limit = None if most is None else _VALUES_EACH * most
-        found = replace(found, attributes=decode_attributes(block, found.covariances, limit))
-    return found.checked()
 
 
 def _parts(data: bytes) -> tuple[bytes, bytes | None]:
@@ -273,19 +265,13 @@ def file_size(components: Components, rule: LearningRule, settings: MapSettings,
     return len(data) + _ROOM_FOR_SETTINGS
 
 
-def read_map(path: str | Path) -> tuple[Components, dict[str, Any]]:
-    """Components and settings of a map file. Raises `DataError` for a damaged or foreign file."""
-    return _content(*read_tensors(path, FILE_KIND, FILE_VERSION), path)
-
-
-def read_map_bytes(data: bytes, path: str | Path) -> tuple[Components, dict[str, Any]]:
-    """`read_map` of bytes that were read from `path`."""
-    return _content(*unpack_tensors(data, path, FILE_KIND, FILE_VERSION), path)
-
-
-def _content(
-    tensors: dict[str, Tensor], facts: dict[str, Any], path: str | Path
-) -> tuple[Components, dict[str, Any]]:
+def read_map(path: str | Path, data: bytes | None = None) -> tuple[Components, dict[str, Any]]:
+    """Components and settings of a map file; `data`: its bytes, if they are read already. Raises `DataError`
+    for a damaged or foreign file."""
+    if data is None:
+        tensors, facts = read_tensors(path, FILE_KIND, FILE_VERSION)
+    else:
+        tensors, facts = unpack_tensors(data, path, FILE_KIND, FILE_VERSION)
     facts = {"cutoff": FILE_OPTIONS.cutoff, **_with_calibration(facts, path)}
     if tensors.keys() >= {*TENSORS}:
         return _exact(tensors, path), facts
@@ -371,13 +357,8 @@ def _exact(tensors: dict[str, Tensor], path: str | Path) -> Components:
         if name.startswith(f"{_ATTRIBUTES}.")
     }
     tensors = {name: tensors[name] for name in TENSORS}
-    whole = dict.fromkeys(("ids", "seen_by", "seen_from"), torch.int64) | {"max_range": torch.bool}
     for name, tensor in tensors.items():
-        require(tensors, name, (None,) * tensor.ndim, whole.get(name, torch.float64), path)
-    if tensors["means"].ndim != 2 or tensors["means"].shape[1] not in (2, 3):
-        raise DataError(
-            f"{path}: means has shape {tuple(tensors['means'].shape)}; expected (K, 2) or (K, 3)."
-        )
+        require(tensors, name, (None,) * tensor.ndim, DTYPES.get(name, torch.float64), path)
     try:
         return Components(**tensors, attributes=Attributes.of(known)).checked()
     except GmmTorchError as error:

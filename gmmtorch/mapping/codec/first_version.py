@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from gmmtorch.errors import DataError
@@ -24,13 +23,7 @@ from gmmtorch.mapping.codec.lattice import (
     Lattice,
     shear_exponents,
 )
-from gmmtorch.mapping.codec.quantization import (
-    LARGEST_COUNT,
-    LEAST_SHARE,
-    NO_COUNT,
-    Quantized,
-    ints,
-)
+from gmmtorch.mapping.codec.quantization import LARGEST_COUNT, LEAST_SHARE, NO_COUNT, Quantized, ints
 from gmmtorch.scan import FARTHEST
 
 _ORDER_BITS = {2: 1, 3: 3}
@@ -107,7 +100,8 @@ def _read_means(reader: BitReader, axis_order: Tensor, deviation: Tensor, shear:
 def _read_viewpoints(reader: BitReader, k: int, n_origins: int) -> tuple[Ints, Ints, Ints]:
     n_viewpoints = within(reader.column(k), "viewpoints", 0, n_origins)
     reader.require(int(n_viewpoints.sum(dtype=np.float64)) - k)  # shares take at least a bit each
-    is_first = _firsts(n_viewpoints)
+    is_first = np.zeros(int(n_viewpoints.sum()), np.bool_)  # of their component
+    is_first[(np.cumsum(n_viewpoints) - n_viewpoints)[n_viewpoints > 0]] = True
     first = reader.column(int(is_first.sum()))
     step = np.zeros(len(is_first), np.int64)
     step[~is_first] = within(reader.column(int((~is_first).sum())), "steps", -n_origins, n_origins)
@@ -119,10 +113,3 @@ def _read_viewpoints(reader: BitReader, k: int, n_origins: int) -> tuple[Ints, I
     share = np.zeros(len(seen_from), np.int64)
     share[several] = within(reader.rice_column(int(several.sum())), "shares", 0, LEAST_SHARE)
     return n_viewpoints, seen_from, share
-
-
-def _firsts(n_viewpoints: Ints) -> NDArray[np.bool_]:
-    """Which viewpoints (E,) are the first of their component."""
-    first = np.zeros(int(n_viewpoints.sum()), np.bool_)
-    first[(np.cumsum(n_viewpoints) - n_viewpoints)[n_viewpoints > 0]] = True
-    return first

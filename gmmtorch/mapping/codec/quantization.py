@@ -285,12 +285,8 @@ def spatial_order(components: Components) -> Tensor:
 
     Use it before components are numbered: ids take few bits only if they are consecutive.
     """
-    return _order(*on_cpu(components.means, components.covariances)).to(components.means.device)
-
-
-def _order(means: Tensor, covariances: Tensor) -> Tensor:
-    """`spatial_order` of means (K, D) and covariances (K, D, D) on the CPU."""
-    return order_of(lattice.nearest(means.double(), covariances.double()))
+    means, covariances = on_cpu(components.means, components.covariances)
+    return order_of(lattice.nearest(means.double(), covariances.double())).to(components.means.device)
 
 
 def numbered(components: Components, robot: int, first: int) -> tuple[Components, int]:
@@ -300,8 +296,8 @@ def numbered(components: Components, robot: int, first: int) -> tuple[Components
     New components come last, in their spatial order.
     """
     ids, *shapes = on_cpu(components.ids, components.means, components.covariances)
-    new = (ids[:, 1] < 0).nonzero().squeeze(1)
-    ids, order = _numbering(ids, _order(*(part[new] for part in shapes)), robot, first)
+    means, covariances = (part[ids[:, 1] < 0].double() for part in shapes)
+    ids, order = _numbering(ids, order_of(lattice.nearest(means, covariances)), robot, first)
     device = components.ids.device
     arranged = replace(components.rearranged(order.to(device)), ids=ids.to(device))
     return arranged, number_after(ids, first)

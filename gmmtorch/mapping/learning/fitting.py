@@ -312,7 +312,12 @@ def fit_points(
     scan = torch.bucketize(torch.arange(n_points, device=ends.device), ends, right=True)
     center = points.mean(0)
     rule = replace(fit.rule, prune="none") if max_range else fit.rule
-    sensor = _measured_sensor(clouds, origins) if rule.prune == "density" else None
+    sensor = None
+    if rule.prune == "density":  # with the spacing of the beams of the largest scan
+        from gmmtorch.mixture import measured_sensor
+
+        largest = sizes.index(max(sizes))
+        sensor = measured_sensor(clouds[largest], origins[largest])
     window = _Window(points.sub_(center), scan, origins.double() - center, sensor)
     learn = _LEARNERS[rule.learner]
     found, counts, n_learned, cells, owner = learn(window, replace(fit, rule=rule))
@@ -330,10 +335,8 @@ def fit_frames(frames: Sequence[DepthFrame], fit: SurfaceFit, viewpoints: Assign
     """
     origins = torch.stack([frame.pose.translation for frame in frames])
     origins = origins.to(frames[0].depth.device, non_blocking=True)
-    if fit.rule.needs_points:
+    if fit.rule.needs_points or sum(frame.depth.numel() for frame in frames) <= _FEW_POINTS:
         return fit_window([frame.scan() for frame in frames], fit, viewpoints)
-    if sum(frame.depth.numel() for frame in frames) <= _FEW_POINTS:
-        return fit_points([frame.scan().points for frame in frames], origins, fit, viewpoints)
     cells = pool_frames(frames, fit.cell, fit.max_cells or _MOST_CELLS)
     if cells.weight.shape[0] == 0:
         return Components.empty(3, origins.device)
@@ -357,18 +360,10 @@ def _components(
     kept, support, seen_by, seen_from, seen_count = (part.to(origins.device) for part in assigned)
     ids = torch.zeros(support.shape[0], 2, dtype=torch.int64, device=origins.device)
     ids[:, 1] = UNNUMBERED
-    return Components(
-        means=found.means[kept],
-        covariances=found.covariances[kept],
-        support=support,
-        max_range=torch.full_like(ids[:, 0], max_range, dtype=torch.bool),
-        ids=ids,
-        origins=origins.double(),
-        seen_by=seen_by,
-        seen_from=seen_from,
-        seen_count=seen_count,
-        attributes=Attributes() if attributes is None else attributes.selected(kept),
-    )
+    flags = torch.full_like(ids[:, 0], max_range, dtype=torch.bool)
+    shapes, viewpoints = (found.means[kept], found.covariances[kept]), (seen_by, seen_from, seen_count)
+    known = Attributes() if attributes is None else attributes.selected(kept)
+    return Components(*shapes, support, flags, ids, origins.double(), *viewpoints, attributes=known)
 
 
 def _points_before(scan: Scan, n: int) -> Tensor:
@@ -376,14 +371,6 @@ def _points_before(scan: Scan, n: int) -> Tensor:
     shares = (torch.arange(n, dtype=torch.float64, device=scan.points.device) + 0.5) / n
     origin = scan.origin.double()
     return (origin + shares[:, None, None] * (scan.points.double() - origin)).flatten(0, 1)
-
-
-def _measured_sensor(clouds: Sequence[Tensor], origins: Tensor) -> SensorModel:
-    """A sensor with the spacing of the beams of the largest scan."""
-    from gmmtorch.mixture import measured_sensor
-
-    largest = max(range(len(clouds)), key=lambda number: len(clouds[number]))
-    return measured_sensor(clouds[largest], origins[largest])
 
 
 class _Window(NamedTuple):
@@ -410,17 +397,9 @@ class _Window(NamedTuple):
         return counts.index_add_(0, pair, counts.new_ones(1).expand(len(pair))).view(-1, n_scans)
 
 
-class _Learned(NamedTuple):
-    """mixture; counts (K, S): its points in each scan, of which each belongs to its most likely component;
-    n_points: number of points that pruning leaves. cells: of the points; owner: their component (C,), −1 if
-    it is pruned.
-    """
-
-    mixture: Parameters
-    counts: Tensor
-    n_points: float
-    cells: Cells
-    owner: Tensor
+_Learned = tuple[Parameters, Tensor, float, Cells, Tensor]
+"""A mixture; its points in each scan (K, S), of which each belongs to its most likely component; the number
+of points that pruning leaves; the cells of the points; and their component (C,), −1 if it is pruned."""
 
 
 def _from_flat_pieces(window: _Window, fit: SurfaceFit) -> _Learned:
@@ -431,7 +410,7 @@ def _from_flat_pieces(window: _Window, fit: SurfaceFit) -> _Learned:
     counts = window.counts(owner[cells.member], mixture.weights.shape[0])
     n_points, rule = len(window.points), fit.rule
     if rule.prune == "none":
-        return _Learned(mixture, counts, n_points, cells, owner)
+        return mixture, counts, n_points, cells, owner
     support = mixture.weights * n_points
     if window.sensor is None:
         kept = support >= rule.min_support
@@ -443,7 +422,7 @@ def _from_flat_pieces(window: _Window, fit: SurfaceFit) -> _Learned:
     weights = mixture.weights[kept]
     left = Parameters(weights / weights.sum(), mixture.means[kept], mixture.covariances[kept])
     number = torch.where(kept, kept.cumsum(0) - 1, -1)
-    return _Learned(left, counts[kept], float(support[kept].sum()), cells, number[owner])
+    return left, counts[kept], float(support[kept].sum()), cells, number[owner]
 
 
 def _from_tree(window: _Window, fit: SurfaceFit) -> _Learned:
@@ -471,7 +450,7 @@ def _from_tree(window: _Window, fit: SurfaceFit) -> _Learned:
     mixture = Parameters(grown.weights[leaves], grown.means[leaves], grown.covariances[leaves])
     owner = most_likely_component(cells.features, mixture)
     counts = window.counts(owner[cells.member], len(leaves))
-    return _Learned(mixture, counts, len(window.points), cells, owner)
+    return mixture, counts, len(window.points), cells, owner
 
 
 _LEARNERS: dict[str, Callable[[_Window, SurfaceFit], _Learned]] = {

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,17 +20,9 @@ from gmmtorch.mapping.attributes import moments
 from gmmtorch.mapping.components import UNNUMBERED, Components
 from gmmtorch.mixture import MergedInRounds, Parameters, merge_in_rounds
 
-
-class AssignedViewpoints(NamedTuple):
-    """kept (K′,): rows of the components that keep at least one viewpoint; their support (K′,); and
-    seen_by, seen_from, seen_count (E,) of their viewpoints, as in `Components`. On the CPU."""
-
-    kept: Tensor
-    support: Tensor
-    seen_by: Tensor
-    seen_from: Tensor
-    seen_count: Tensor
-
+AssignedViewpoints = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+"""kept (K′,): rows of the components that keep at least one viewpoint; their support (K′,); and seen_by,
+seen_from, seen_count (E,) of their viewpoints, as in `Components`. On the CPU."""
 
 AssignViewpoints = Callable[[Tensor, Tensor, float], AssignedViewpoints]
 """From the points (K, S) of each component in each scan, the weights (K,) and the number of points.
@@ -53,7 +44,7 @@ def all_origins(weight: float = 1.0) -> AssignViewpoints:
         support = support * (n_points * weight / support.sum())
         counts *= (support / counts.sum(1))[:, None]
         seen_by, seen_from = (counts > 0).nonzero(as_tuple=True)
-        return AssignedViewpoints(kept, support, seen_by, seen_from, counts[seen_by, seen_from])
+        return kept, support, seen_by, seen_from, counts[seen_by, seen_from]
 
     return assign
 
@@ -79,7 +70,7 @@ def sampled_origins(max_origins: int, generator: torch.Generator) -> AssignViewp
         has_one = (share > 0).any(1)
         number = torch.cumsum(has_one.long(), 0) - 1
         kept, seen_count = has_one.nonzero().squeeze(1), share[seen_by, seen_from]
-        return AssignedViewpoints(kept, support[kept], number[seen_by], seen_from, seen_count)
+        return kept, support[kept], number[seen_by], seen_from, seen_count
 
     return assign
 
@@ -166,13 +157,6 @@ def _gains(by: Tensor, count: Tensor, position: Tensor, n: int, most: int) -> Te
 
 Size = Callable[[Components], int]
 """Number of bytes of the file of given components."""
-
-
-def estimated_bytes(components: Components) -> int:
-    """Estimate of the file size: 16 bytes a component, 2 a viewpoint beyond the first, 7 an origin, 300 in
-    all."""
-    further = components.seen_by.shape[0] - len(components)
-    return 300 + 16 * len(components) + 2 * max(0, further) + 7 * components.origins.shape[0]
 
 
 def united(components: Components, found: MergedInRounds) -> Components:
@@ -274,17 +258,8 @@ def _merged(
     return found._replace(parameters=Parameters(weights, means[:, :dim], covariances[:, :dim, :dim]))
 
 
-def _unnumbered(ids: Tensor) -> Tensor:
-    """The ids (K, 2) without sequence numbers."""
-    return torch.stack([ids[:, 0], torch.full_like(ids[:, 1], UNNUMBERED)], 1)
-
-
 def compact_to_bytes(
-    components: Components,
-    max_bytes: int,
-    max_origins: int,
-    mean_origins: float | None = None,
-    size: Size = estimated_bytes,
+    components: Components, max_bytes: int, max_origins: int, mean_origins: float | None, size: Size
 ) -> Components:
     """Merges components until their `size` is at most `max_bytes`; origins are limited as by `limit_origins`.
 
@@ -302,7 +277,9 @@ def compact_to_bytes(
         if numbered:
             numbered = False
             if bool((components.ids[:, 1] != UNNUMBERED).any()):
-                components = replace(components, ids=_unnumbered(components.ids))
+                robots = components.ids[:, 0]
+                unnumbered = torch.stack([robots, torch.full_like(robots, UNNUMBERED)], 1)
+                components = replace(components, ids=unnumbered)
                 continue
         if k > 1:
             power = math.log(last[1] / taken) / math.log(last[0] / k) if last else 1.0

@@ -5,11 +5,9 @@ Association adds the points that a map explains to the counts of components (the
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -34,6 +32,7 @@ from gmmtorch.occupancy import (
 from gmmtorch.scan import Scan
 
 _CHUNK_BEAMS = 1 << 14
+_QUANTILES = {2: 5.991464547107979, 3: 7.814727903251179}  # 95 % of χ² with this many degrees of freedom
 
 
 def entropy_reduction(components: Components, scan: Scan, rule: NoveltyRule) -> tuple[Tensor, Tensor]:
@@ -177,13 +176,6 @@ _PAIRS_AT_ONCE = 1 << 20
 _POINTS_AT_ONCE = 512  # neighbouring points that few components can explain
 
 
-class Explained(NamedTuple):
-    """components: with the new counts; explained (N,) bool: the points that are counted."""
-
-    components: Components
-    explained: Tensor
-
-
 def count_explained(
     components: Components,
     points: Tensor,
@@ -193,13 +185,14 @@ def count_explained(
     max_range: bool = False,
     weight: float = 1.0,
     frees: Tensor | None = None,
-) -> Explained:
+) -> tuple[Components, Tensor]:
     """Adds points (N, D), observed from `origin` (D,), to the counts of the components that explain them.
 
     A component explains a point if d = (z − μ)ᵀ Σ⁻¹ (z − μ) < `explained`, and if one of its origins is
     within `distance` (m) of the sensor: then it also explains the free space before the point. The components
     share the point in proportion to 1/d, N_k += Σ_n w_nk; each share goes to the origin nearest to the
-    sensor. Means and covariances do not change.
+    sensor. Means and covariances do not change. Returns the components with the new counts, and which points
+    (N,) bool are counted.
 
     Args:
         explained: squared Mahalanobis distance; None: the 95 % quantile of χ² with D degrees of freedom.
@@ -214,7 +207,7 @@ def count_explained(
     is_candidate = components.max_range == max_range
     rows = (is_candidate & near if frees is None else is_candidate).nonzero().squeeze(1)
     if n == 0 or len(rows) == 0:
-        return Explained(components, found)
+        return components, found
     limit = explained_within(components.dim, explained)
     inverse, _ = whitening(components.covariances[rows])
     means = components.means[rows].double()
@@ -224,16 +217,11 @@ def count_explained(
         gained, found = _shared_out(components.selected(rows), points, inverse, limit, near[rows], frees)
     gain = components.support.new_zeros(k).index_copy_(0, rows, gained * weight)
     counts = components.seen_count.index_add(0, nearest[rows], gain[rows])
-    return Explained(replace(components, support=components.support + gain, seen_count=counts), found)
+    return replace(components, support=components.support + gain, seen_count=counts), found
 
 
 def _shared_out(
-    components: Components,
-    points: Tensor,
-    inverse: Tensor,
-    limit: float,
-    near: Tensor,
-    frees: Tensor | None,
+    components: Components, points: Tensor, inverse: Tensor, limit: float, near: Tensor, frees: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     """`explained_points` in tensor operations; inverse (K, D, D)."""
     means = components.means.double()
@@ -255,15 +243,7 @@ def _shared_out(
 
 def explained_within(dim: int, explained: float | None) -> float:
     """The squared Mahalanobis distance within which components explain points; see `count_explained`."""
-    return _quantile(dim) if explained is None else explained
-
-
-@functools.cache
-def _quantile(dim: int) -> float:
-    """The 95 % quantile of χ² with `dim` degrees of freedom."""
-    from scipy.stats import chi2
-
-    return float(chi2.ppf(0.95, dim))
+    return _QUANTILES[dim] if explained is None else explained
 
 
 def box_around(components: Components, squared: float) -> tuple[Tensor, Tensor]:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 from gmmtorch.declarations import option
 from gmmtorch.errors import (
@@ -16,7 +15,7 @@ from gmmtorch.errors import (
     check_resolution,
     check_whole,
 )
-from gmmtorch.mixture import PruneOptions
+from gmmtorch.mixture import Prune, PruneOptions
 
 if TYPE_CHECKING:
     from gmmtorch.mapping.learning.fitting import DepthFrame
@@ -70,21 +69,18 @@ class NoveltyRule:
 class MixtureRule(PruneOptions):
     """How the mixture of a window is learned. Components of no-return beams are not pruned.
 
+    learner: "flat_pieces", EM that starts from flat pieces, or "hierarchical", the leaves of a tree of
+        mixtures (thesis 2.1.2).
     planarity: the tree does not split a node whose smallest variance is a smaller share of the sum of its
         variances (2.9). None: it does not split a node that is at most as thick as a flat piece.
+    free_points: number of points at equal distances on each beam with a return, from which components of free
+        space are learned, as from the ends of no-return beams (thesis 3.5).
     """
 
-    learner: LearnerName = option(
-        "flat_pieces",
-        "flat_pieces: EM that starts from flat pieces; hierarchical: the leaves of a tree of mixtures "
-        "(thesis 2.1.2)",
-    )
+    prune: Prune = "none"
+    learner: LearnerName = "flat_pieces"
     planarity: float | None = None
-    free_points: int = option(
-        0,
-        "points at equal distances on each beam with a return, from which components of free space are "
-        "learned, as from the ends of no-return beams (thesis 3.5)",
-    )
+    free_points: int = 0
     forget: int | float | str = option(
         FORGET_OFF,
         "what leaves the map. off: nothing; contradiction: surfaces that later beams pass through; a number: "
@@ -143,14 +139,13 @@ class WindowedRule(MixtureRule):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("noise", "length"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise InvalidArgumentError(f"{name}={getattr(self, name)} must be above zero metres.")
+            check_number(name, getattr(self, name), above=True)
         for name in ("max_origins", "iterations", "max_cells", "window"):
             check_whole(name, getattr(self, name), 1)
         if self.n_components is not None:
             check_whole("n_components", self.n_components, 1)
-        if self.min_points is not None and not 1 <= self.min_points < math.inf:
-            raise InvalidArgumentError(f"min_points={self.min_points} must be at least 1, or null.")
+        if self.min_points is not None:
+            check_number("min_points", self.min_points, least=1)
         check_choice("dtype", self.dtype, SOFTMAX_DTYPES)
 
     def fitted(self, scans: Sequence[Scan | DepthFrame]) -> WindowedRule:
@@ -201,16 +196,15 @@ class IncrementalRule(MixtureRule):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("noise", "length", "cell"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise InvalidArgumentError(f"{name}={value} must be above zero metres, or null.")
+            if getattr(self, name) is not None:
+                check_number(name, getattr(self, name), above=True)
         for name in ("window_components", "iterations", "max_origins"):
             check_whole(name, getattr(self, name), 1)
         for name in ("window", "n_components", "max_bytes"):
             if getattr(self, name) is not None:
                 check_whole(name, getattr(self, name), 1)
-        if self.mean_origins is not None and not 1 <= self.mean_origins < math.inf:
-            raise InvalidArgumentError(f"mean_origins={self.mean_origins} must be at least 1, or null.")
+        if self.mean_origins is not None:
+            check_number("mean_origins", self.mean_origins, least=1)
         if self.max_cost is not None and not 0 <= self.max_cost < 1:
             raise InvalidArgumentError(
                 f"max_cost={self.max_cost} must be at least 0 (equal) and below 1 (no overlap)."
@@ -236,17 +230,13 @@ class IncrementalRule(MixtureRule):
         ranges = [distances for distances in found if len(distances)]
         if not ranges:
             return self
-        scale = _SCALES[scans[0].dim]
         r = max(float(torch.cat(ranges).median()), _LEAST_RANGE)
+        fractions, window_points = _SCALES[scans[0].dim]
+        # Three digits take few bytes in a file.
+        derived: dict[str, Any] = {name: float(f"{r * share:.3g}") for name, share in fractions.items()}
         points_per_scan = sum(map(len, ranges)) / len(ranges)
-        window = max(8, min(40, round(scale.points / points_per_scan)))
-        return replace(
-            self,
-            noise=_three_digits(r * scale.noise) if self.noise is None else self.noise,
-            length=_three_digits(r * scale.length) if self.length is None else self.length,
-            cell=_three_digits(r * scale.cell) if self.cell is None else self.cell,
-            window=window if self.window is None else self.window,
-        )
+        derived["window"] = max(8, min(40, round(window_points / points_per_scan)))
+        return replace(self, **{n: value for n, value in derived.items() if getattr(self, n) is None})
 
 
 LearningRule = WindowedRule | IncrementalRule
@@ -273,19 +263,9 @@ def changed_options(options: Any, defaults: Any, leave_out: Sequence[str] = ()) 
     return {k: v for k, v in asdict(options).items() if v != plain[k] and k not in leave_out}
 
 
-class _Scale(NamedTuple):
-    """Noise, length and cell as fractions of the median range; points of a window."""
-
-    noise: float
-    length: float
-    cell: float
-    points: float
-
-
-_SCALES = {2: _Scale(1 / 175, 1 / 12, 1 / 175, 5e3), 3: _Scale(1 / 350, 1 / 4, 1 / 40, 2e5)}
+_SCALES = {
+    2: ({"noise": 1 / 175, "length": 1 / 12, "cell": 1 / 175}, 5e3),
+    3: ({"noise": 1 / 350, "length": 1 / 4, "cell": 1 / 40}, 2e5),
+}
+"""Lengths as fractions of the median range, and points of a window."""
 _LEAST_RANGE = 0.01  # metres
-
-
-def _three_digits(length: float) -> float:
-    """A length rounded to three digits, which take few bytes in a file."""
-    return float(f"{length:.3g}")

@@ -35,6 +35,7 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import PassLimits, beam_passes, few_points_evidence, is_fused
 from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.learning import merging
 from gmmtorch.mapping.learning.fitting import (
     DepthFrame,
     SurfaceFit,
@@ -42,15 +43,6 @@ from gmmtorch.mapping.learning.fitting import (
     fit_frames,
     fit_window,
     mean_range,
-)
-from gmmtorch.mapping.learning.merging import (
-    Size,
-    all_origins,
-    compact,
-    compact_to_bytes,
-    estimated_bytes,
-    limit_origins,
-    sampled_origins,
 )
 from gmmtorch.mapping.learning.novelty import count_explained, explained_within, novel_beams
 from gmmtorch.mapping.learning.rules import (
@@ -61,16 +53,9 @@ from gmmtorch.mapping.learning.rules import (
     NoveltyRule,
     WindowedRule,
 )
-from gmmtorch.mapping.query import Block, bounds_of, cutoff_for, evidence_boxes
+from gmmtorch.mapping.query import Block, boxes_of, cutoff_for
 from gmmtorch.mixture import SOFTMAX_DTYPES, FlatnessRule, surface_rule
-from gmmtorch.occupancy import (
-    Calibrator,
-    Cones,
-    Prediction,
-    few_point_evidence,
-    spectrum_of,
-    whitening,
-)
+from gmmtorch.occupancy import Calibrator, Cones, Prediction, few_point_evidence, spectrum_of, whitening
 from gmmtorch.scan import Scan
 
 BeforeWindow = Callable[[Components, Sequence[Scan | DepthFrame]], None]
@@ -84,7 +69,7 @@ def absorb(
     components: Components,
     scans: Iterable[Scan | DepthFrame],
     rule: IncrementalRule,
-    size: Size = estimated_bytes,
+    size: merging.Size,
     weight: float = 1.0,
     doubts: Doubts | None = None,
     before: BeforeWindow | None = None,
@@ -96,13 +81,11 @@ def absorb(
     changed are not numbered (`UNNUMBERED`). Scans without beams add nothing.
 
     Args:
-        components: of the map so far.
-        scans: of the dimension of the components; or frames, whose pixels are then summed into cells at once.
+        scans: or frames, whose pixels are summed into cells at once.
         rule: if it is not complete, it is fitted to all scans, which are then read at once.
-        size: number of bytes of given components, for `rule.max_bytes`.
+        size: for `rule.max_bytes`.
         weight: number of measured points for which each point of the scans stands.
         doubts: before these scans; None: none.
-        before: is called before each window is learned.
     """
     if None in (rule.noise, rule.length, rule.cell, rule.window):
         scans = as_scans(scans)
@@ -119,13 +102,13 @@ def _absorb_window(
     components: Components,
     window: Sequence[Scan | DepthFrame],
     rule: IncrementalRule,
-    size: Size,
+    size: merging.Size,
     weight: float,
     doubts: Doubts,
 ) -> tuple[Components, Doubts]:
     frames = [frame for frame in window if isinstance(frame, DepthFrame)]
     if rule.novelty is None and len(frames) == len(window):
-        learned = fit_frames(frames, surface_fit(rule, components.dim), all_origins(weight))
+        learned = fit_frames(frames, surface_fit(rule, components.dim), merging.all_origins(weight))
     else:
         scans = as_scans(window)
         if rule.novelty is not None:
@@ -146,7 +129,7 @@ def _learned(
         rule = rule.fitted([Scan(scan.no_return, scan.origin) for scan in scans])
     fit = surface_fit(rule, scans[0].dim)
     return fit_window(
-        scans, fit if iterations is None else replace(fit, iterations=iterations), all_origins(weight)
+        scans, fit if iterations is None else replace(fit, iterations=iterations), merging.all_origins(weight)
     )
 
 
@@ -172,14 +155,14 @@ def _explain(
     return components, remaining
 
 
-def _within_budget(components: Components, rule: IncrementalRule, size: Size) -> Components:
+def _within_budget(components: Components, rule: IncrementalRule, size: merging.Size) -> Components:
     if rule.max_cost is not None:
-        components = compact(components, None, rule.max_cost)
+        components = merging.compact(components, None, rule.max_cost)
     if rule.n_components is not None:
-        components = compact(components, rule.n_components)
+        components = merging.compact(components, rule.n_components)
     if rule.max_bytes is None:
-        return limit_origins(components, rule.max_origins, rule.mean_origins)
-    return compact_to_bytes(components, rule.max_bytes, rule.max_origins, rule.mean_origins, size)
+        return merging.limit_origins(components, rule.max_origins, rule.mean_origins)
+    return merging.compact_to_bytes(components, rule.max_bytes, rule.max_origins, rule.mean_origins, size)
 
 
 def surface_fit(rule: IncrementalRule, dim: int) -> SurfaceFit:
@@ -212,7 +195,7 @@ def learn_part(scans: Sequence[Scan], rule: LearningRule, generator: torch.Gener
     if isinstance(rule, WindowedRule):
         return learn_window(scans, replace(rule, iterations=1), generator)
     quick = replace(rule, window_components=max(1, rule.window_components // 2))
-    return limit_origins(_learned(scans, quick, 1.0, 0), rule.max_origins, rule.mean_origins)
+    return merging.limit_origins(_learned(scans, quick, 1.0, 0), rule.max_origins, rule.mean_origins)
 
 
 def learns_in_parts(rule: LearningRule) -> bool:
@@ -245,7 +228,7 @@ def learn_window(scans: Sequence[Scan], rule: WindowedRule, generator: torch.Gen
         partition_by_moments=False,
         rule=rule,
     )
-    return fit_window(scans, fit, sampled_origins(rule.max_origins, generator))
+    return fit_window(scans, fit, merging.sampled_origins(rule.max_origins, generator))
 
 
 def flatness_rule(rule: WindowedRule, dim: int) -> FlatnessRule:
@@ -321,11 +304,8 @@ def joined(
 
     Components without a number are not in doubt: their test begins with the next window.
 
-    Args:
-        rule: its noise must be set if a scan has a return.
-        doubts: before the window.
-
-    Raises `InvalidArgumentError` for a half-life if a scan has no time.
+    The noise of the rule must be set if a scan has a return. Raises `InvalidArgumentError` for a half-life if
+    a scan has no time.
     """
     if rule.forget == FORGET_OFF:
         return Components.concatenate([known, learned]), doubts
@@ -415,10 +395,8 @@ def predicted(
     evidence are left out, and those with less than half of the others: they lie where the map has only begun,
     and later it is asked mostly about places that it knows well.
 
-    Args:
-        known: the components before the window.
-        calibrator: before the window; None: the ranges of the window give one.
-        number: of the window; chooses the beams, and the side of the cubes.
+    known, calibrator: before the window; without a calibrator the ranges of the window give one.
+    number: of the window; chooses the beams.
     """
     if calibrator is not None and number < calibrator.next_window:
         return calibrator
@@ -440,20 +418,16 @@ def predicted(
         seen = hits * (calibrator.length / side) + misses
         kept = (seen >= np.sort(seen)[(len(seen) - 1) // 2]) & (seen > 0)
         predictions.append(Prediction(hits[kept], misses[kept], occupied[kept], side))
-    due = number + _windows_between(n_pairs, sum(map(_size, window)))
+    due = number + _windows_between(n_pairs, window)
     return replace(calibrator.updated(predictions, ends.shape[1]), next_window=due)
 
 
-def _windows_between(n_pairs: int, n_points: int) -> int:
+def _windows_between(n_pairs: int, window: Sequence[Scan | DepthFrame]) -> int:
     """Windows from one prediction to the next, so that predictions take a small share of the time."""
+    n_points = sum(s.depth.numel() if isinstance(s, DepthFrame) else len(s.points) for s in window)
     predicting = _PREDICTING[0] + _PREDICTING[1] * n_pairs
     learning = _LEARNING[0] + _LEARNING[1] * min(n_points, _MOST)
     return max(1, round(predicting / (_SHARE * learning)))
-
-
-def _size(scan: Scan | DepthFrame) -> int:
-    """Number of points, or of pixels."""
-    return scan.depth.numel() if isinstance(scan, DepthFrame) else len(scan.points)
 
 
 def _beams(window: Sequence[Scan | DepthFrame], generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -473,7 +447,7 @@ def few_points(blocks: Sequence[Block], points: Tensor, sides: Sequence[float]) 
     cutoff = cutoff_for(blocks)
     blocks = [block for block in blocks if len(block.components.seen_by)]
     if len(blocks) > 1:
-        low, high = evidence_boxes(*bounds_of(blocks, cutoff), max(sides), cutoff)
+        low, high = boxes_of(blocks, max(sides), cutoff)
         met = ((low <= points.amax(0)) & (high >= points.amin(0))).all(1).tolist()
         blocks = [block for block, is_met in zip(blocks, met, strict=True) if is_met] or blocks[:1]
     known = Components.concatenate([block.components for block in blocks])

@@ -2,11 +2,10 @@
 
 A component belongs to the tile that contains its mean. Its evidence reaches into other tiles, because its
 rays start at the sensor. The index therefore states for each tile a box outside which its components give
-no evidence, and a query opens exactly the tiles whose box contains it. Evidence of components adds up, so
-the answers are those of the whole map, up to the rounding of sums.
+no evidence. Evidence of components adds up, so the answers are those of the whole map, up to the rounding of
+sums.
 
-`tile_files` makes the files from components; `merge` merges the tiles of several recordings.
-`TiledMap.create` makes a map that grows in its folder: one more file has the components of recent windows.
+A map that grows has one more file, with the components of recent windows.
 Files are never changed: new ones have other names, and count once the index names them. So a map that is
 stopped at any moment opens with all finished windows. The next write removes what an interrupted one left.
 One object writes at a time: it locks the folder from its first scan to `finish`, or to its end.
@@ -40,21 +39,24 @@ from gmmtorch.errors import (
     check_whole,
 )
 from gmmtorch.files import FileLock, write_bytes
-from gmmtorch.mapping.codec.component_batch import read_map_bytes, read_settings, settings_facts
+from gmmtorch.mapping.codec.component_batch import read_map, read_settings
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.windows import keeps_components
 from gmmtorch.mapping.query import Query, count_many, cutoff_of, mean_range, rule_of
 from gmmtorch.mapping.query_options import check_method
 from gmmtorch.mapping.tiles.tile_files import (
+    INDEX,
     SIDE,
+    TileIndex,
     by_tile,
     calibrated,
-    index_file,
+    check_side,
+    read_index,
     tile_file,
+    tile_name,
     with_calibration,
 )
-from gmmtorch.mapping.tiles.tile_index import INDEX, TileIndex, check_side, read_index, tile_name
 from gmmtorch.occupancy import (
     CUTOFF,
     Calibration,
@@ -152,12 +154,10 @@ class TiledMap:
             )
         check_side("side", side)
         target._prepare(dim, torch.device("cpu"), "dim is")
-        index = TileIndex.joined([], dim)
-        settings = replace(target.settings, robot=0)
-        data = target._file()
+        data, settings = target._file(), replace(target.settings, robot=0)
         write_bytes(folder / _recent_name(zlib.crc32(data)), data)
-        facts = settings_facts(settings) | {"recent": zlib.crc32(data)}
-        write_bytes(folder / INDEX, index.to_bytes(side=float(side), **facts))
+        index = TileIndex.joined([], dim).to_bytes(side, settings, recent=zlib.crc32(data))
+        write_bytes(folder / INDEX, index)
         made = cls(folder, **options)
         made._recent = target.to(made.device)
         return made
@@ -269,8 +269,8 @@ class TiledMap:
         data = recent._file(found.selected(left).with_used_origins())
         crc32 = zlib.crc32(data)
         write_bytes(self.folder / _recent_name(crc32), data)
-        facts = settings_facts(settings) | {"recent": crc32, "n_scans": self._n_inserted}
-        write_bytes(self.folder / INDEX, index.to_bytes(side=self.side, **facts))
+        facts = {"recent": crc32, "n_scans": self._n_inserted}
+        write_bytes(self.folder / INDEX, index.to_bytes(self.side, settings, **facts))
         self.index, self.settings, self._crc32, self.n_scans = index, settings, crc32, self._n_inserted
         if n_old:
             recent.revise(lambda components: components.selected(left).with_used_origins())
@@ -306,10 +306,7 @@ class TiledMap:
         """Number of components without those of an unfinished window."""
         return int(self.index.n_components.sum()) + (self._recent.n_final if self._recent else 0)
 
-    @property
-    def n_final(self) -> int:
-        """As `n_components`."""
-        return self.n_components
+    n_final = n_components
 
     @property
     def predictions(self) -> dict[float, Tensor]:
@@ -319,10 +316,8 @@ class TiledMap:
     @property
     def nbytes(self) -> int:
         """Bytes of all files, the index included."""
-        files = [self.folder / INDEX] + (
-            [] if self._recent is None else [self.folder / _recent_name(self._crc32)]
-        )
-        return int(self.index.n_bytes.sum()) + sum(path.stat().st_size for path in files)
+        names = [INDEX] if self._recent is None else [INDEX, _recent_name(self._crc32)]
+        return int(self.index.n_bytes.sum()) + sum((self.folder / name).stat().st_size for name in names)
 
     # -- queries --------------------------------------------------------------------------------------
 
@@ -355,10 +350,8 @@ class TiledMap:
             inside = ((points >= low[row]) & (points <= high[row])).all(1).nonzero().squeeze(1)
             if len(inside):
                 found = self._query(row).evidence_at(points[inside], resolution, method)
-                hits, misses = (
-                    hits.index_add(0, inside, found.hits),
-                    misses.index_add(0, inside, found.misses),
-                )
+                hits = hits.index_add(0, inside, found.hits)
+                misses = misses.index_add(0, inside, found.misses)
         return PointEvidence(hits, misses)
 
     def near(self, low: ArrayLike, high: ArrayLike, resolution: float | None = None) -> list[int]:
@@ -389,10 +382,8 @@ class TiledMap:
         far = torch.full((self.dim,), math.inf)
         rows = self.near(-far if low is None else low, far if high is None else high, resolution)
         recent = [] if self._recent is None else [self._recent.components().on_cpu()]
-        n, limit = (
-            int(self.index.n_components[rows].sum()) + sum(map(len, recent)),
-            self.query_options.memory_limit,
-        )
+        n = int(self.index.n_components[rows].sum()) + sum(map(len, recent))
+        limit = self.query_options.memory_limit
         if n * _BYTES_EACH > limit:
             raise MemoryLimitError(
                 f"{len(rows)} tiles with {n:,} components need about {n * _BYTES_EACH:,} bytes, more than "
@@ -401,9 +392,8 @@ class TiledMap:
         found = Components.concatenate([Components.empty(self.dim), *map(self.components, rows), *recent])
         numbers = torch.stack([torch.zeros(n, dtype=torch.int64), torch.arange(n)], 1)
         options = {**vars(self.query_options), "resolution": self.resolution, "method": self.method}
-        return GaussianMap.of(replace(found, ids=numbers), codec=self.settings.codec, **options).to(
-            self.device
-        )
+        opened = GaussianMap.of(replace(found, ids=numbers), codec=self.settings.codec, **options)
+        return opened.to(self.device)
 
     def components(self, row: int) -> Components:
         """The components of the tile in a row of the index, on the CPU.
@@ -416,7 +406,7 @@ class TiledMap:
         n_bytes, crc32 = int(self.index.n_bytes[row]), int(self.index.crc32[row])
         if path.stat().st_size != n_bytes or zlib.crc32(data := path.read_bytes()) != crc32:
             raise DataError(f"{path} is not the file that {INDEX} lists; {_REMEDY}.")
-        found, _ = read_map_bytes(data, path)
+        found, _ = read_map(path, data)
         if found.dim != self.dim or len(found) != int(self.index.n_components[row]):
             raise DataError(f"{path} has other components than {INDEX} states; {_REMEDY}.")
         self.n_read += 1
@@ -433,7 +423,7 @@ class TiledMap:
             self._open[name] = Query([components], options), len(components) * _BYTES_EACH
         known, n_bytes = self._open[name]
         if known.options.n_samples != n_samples:  # other tiles have grown
-            self._open[name] = known.replaced(known.parts, options), n_bytes
+            self._open[name] = Query(known.parts, options, (), known), n_bytes
         self._open.move_to_end(name)
         while len(self._open) > 1 and sum(n_bytes for _, n_bytes in self._open.values()) > self.memory:
             self._open.popitem(last=False)
@@ -511,6 +501,6 @@ def merge(
         rows.append(row)
         if on_event is not None:
             on_event("merging tiles", done, len(owners))
-    write_bytes(folder / INDEX, index_file(rows, first.dim, settings, first.side))
+    write_bytes(folder / INDEX, TileIndex.joined(rows, first.dim).to_bytes(first.side, settings))
     lock.release()
     return TiledMap(folder, first.device)
