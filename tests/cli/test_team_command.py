@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 from sharing.replica_histories import everything
 
 from gmmtorch.team.cli import team
-from gmmtorch.team.cli.from_options.robots import facts_of
+from gmmtorch.team.cli.from_options import facts_of
 from gmmtorch.team.cli.team import RobotProcess
 from gmmtorch.team.sharing.replica.replica import Replica
 from gmmtorch.team.sharing.store import Store
@@ -248,12 +248,7 @@ def test_a_signal_ends_all_robots(before, name, run, robots, monkeypatch):
     [
         ("id=1", "id=1 gmmtorch-robot"),
         ("link.listen=127.0.0.1:7400", "link.listen gmmtorch-robot"),
-        (
-            "transport=zenoh link.connect_endpoints=[tcp/127.0.0.1:7447]",
-            "link.connect_endpoints gmmtorch-robot",
-        ),
-        ("clock=sun", "clock=sun"),
-        ("clock=lockstep", "clock=lockstep clock=wall speed=2"),
+        ("transport=zenoh link.peers=[tcp/127.0.0.1:7447]", "link.peers gmmtorch-robot"),
         ("speed=0", "speed=0.0"),
         ("settle=-1", "settle=-1.0"),
         ("team.size=40", "team.size=40"),

@@ -40,7 +40,7 @@ from gmmtorch.team.cli.explorations import warn_of_robots_at_their_start
         ("sensor.rate=0.7", "sensor.rate=0.7 dynamics.duration"),
         ("duration=-1", "duration=-1.0"),
         ("network.loss=1", "network.loss=1.0"),
-        ("network.delay=-1", "network.delay=-1.0 time"),
+        ("network.reach=-1", "network.reach=-1.0 metres"),
         ("network.partitions=[{begin:2,end:1,groups:[[0]]}]", "network.partitions[0]= begin end"),
         ("network.partitions=[{begin:0,end:1,groups:[[0,2]]}]", "network.partitions[0].groups= 2"),
         ("network.partitions=[{begin:0,end:1,groups:[[0,1]]}]", "network.partitions[0].groups= leave it out"),
