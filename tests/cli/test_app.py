@@ -92,8 +92,8 @@ def test_a_log_call_with_wrong_arguments_ends_no_command(monkeypatch, tmp_path):
         ("robot", "log.map.window=5", "log.map.window is no longer an option: give;log.map={name: windowed"),
         ("map", "map.hit_length=2", "map.hit_length is no longer an option: map.prior=1"),
         ("map", "map.min_points=2", "map.min_points is no longer an option: it is a constant;learning rule"),
-        ("robot", "link.listen_endpoints=[]", "link.listen_endpoints is no longer an option: give link.listen"),
-        ("explore", "network.jitter=1", "network.jitter is no longer an option: it is a constant;TeamOptions"),
+        ("robot", "link.listen_endpoints=[]", "is no longer an option: give link.listen"),
+        ("explore", "network.jitter=1", "is no longer an option: it is a constant;TeamOptions"),
         ("explore", "checkpoint.every=60", "checkpoint.every is no longer;continues;hydra.run.dir=RUN"),
     ],
 )

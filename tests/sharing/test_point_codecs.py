@@ -183,7 +183,7 @@ def test_invalid_codec_options_are_refused():
         (lambda: QuantizedPoints(-1.0), "resolution"),
         (lambda: DepthImage(step=0.0), "step=0.0"),
         (lambda: DepthImage(step=math.nan), "step=nan"),
-        (lambda: point_codec("zip", 0.2, 0.1), "'zip' is not a point codec"),
+        (lambda: point_codec("zip", 0.2, 0.1), "'zip' is not one of raw"),
     ):
         with pytest.raises(InvalidArgumentError, match=message):
             make()

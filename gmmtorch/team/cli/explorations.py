@@ -277,7 +277,6 @@ class MissionRecorder:
                 [self._snapshot(mission, snapshot, paths) for snapshot in self.snapshots.chosen()],
                 belief=mission.score.union.rule,
             ),
-            "profile": report.profile_figure([row]),
         }
         if row["bytes_sent"]:
             figures["bandwidth"] = report.bandwidth_figure([row], draco_error=mission.options.frame.noise)
@@ -303,7 +302,7 @@ def save_comparison(config: DictConfig, rows: list[dict[str, Any]], folder: Path
     shown, _ = _by_first(on_first, THESIS)
 
     def figures() -> dict[str, Any]:
-        found: dict[str, Any] = {"profile": report.profile_figure(shown)}
+        found: dict[str, Any] = {}
         if on_several:
             found["loss"] = report.loss_figure(on_several)
         if len(shown) < len(on_first):

@@ -44,13 +44,6 @@ TABLE = "robot n_components n_records bytes_sent wire_bytes datagrams digest"
 
 
 @dataclass
-class JournalOptions:
-    """The store of a robot's map, which is restored at the next start."""
-
-    folder: str | None = option(None, "folder of the store, to restore from; null: the run's folder")
-
-
-@dataclass
 class LogOptions:
     """The replay of recorded scans."""
 
@@ -77,7 +70,9 @@ class RobotCommand(team_schema.MissionCommand):
     settle: float = option(10.0, "seconds without news after the last work, until the robot stops")
     transport: str = option("udp", "udp or zenoh")
     link: team_schema.LinkOptions = group(team_schema.LinkOptions)
-    journal: JournalOptions = group(JournalOptions)
+    journal: str | None = option(
+        None, "folder of the robot's store, to restore from; null: the run's folder", "journal.folder"
+    )
     log: LogOptions = group(LogOptions)
     report: Report = group(Report)
     runtime: Memory = group(Memory)

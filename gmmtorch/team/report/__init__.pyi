@@ -1,5 +1,4 @@
 from .mission_bars import deviations_figure as deviations_figure
-from .mission_bars import profile_figure as profile_figure
 from .mission_bars import summary_bars as summary_bars
 from .mission_curves import bandwidth_figure as bandwidth_figure
 from .mission_curves import entropy_figure as entropy_figure

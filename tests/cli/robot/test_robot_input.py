@@ -30,7 +30,7 @@ from gmmtorch.team.sharing import KEY_VARIABLE, Store
         ("link.group=239.71.77.7:0", "link.group='239.71.77.7:0'"),
         ("link.peers=[10.0.0.2:7400]", "link.peers= link.listen= 0.0.0.0"),
         ("link.key_file=/nowhere/team.key", "/nowhere/team.key openssl"),
-        ("transport=zenoh", "link.listen=[] link.peers=[]"),
+        ("transport=zenoh link.listen=null", "link.listen=[] link.peers=[]"),
         ("transport=zenoh link.listen=tcp/10.0.0.3:7447", "link.listen='tcp/10.0.0.3:7447' link.key_file"),
         ("transport=zenoh link.peers=[10.0.0.3:7447]", "link.peers='tcp/10.0.0.3:7447' link.key_file"),
     ],

@@ -152,11 +152,8 @@ def _are_groups(value: Any) -> bool:
     if not (_is_list(value) and value and all(_is_list(group) and group for group in value)):
         return False
     robots: list[Any] = [robot for group in value for robot in group]
-    return all(map(_is_robot, robots)) and len(set(robots)) == len(robots)
-
-
-def _is_robot(value: Any) -> bool:
-    return _is_number(value) and isinstance(value, numbers.Integral) and int(value) >= 0
+    are_ids = all(_is_number(one) and isinstance(one, numbers.Integral) and int(one) >= 0 for one in robots)
+    return are_ids and len(set(robots)) == len(robots)
 
 
 def _is_list(value: Any) -> bool:

@@ -276,8 +276,6 @@ class OwnIdWatch:
         return heard.n_fresh >= FRESH_FRAMES and now - heard.since >= FRESH_SECONDS
 
 
-__all__ = ["REFUSALS", "Opener", "Sealer", "TeamKey"]
-
 FRAME_VERSION = 1
 MAX_SENDER = (1 << 16) - 1
 SESSION_BYTES = 8
