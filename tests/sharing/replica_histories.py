@@ -11,7 +11,7 @@ import torch
 from sharing.schedules import act
 
 from gmmtorch.mapping.components import Components
-from gmmtorch.team.sharing.messages.component_messages import ComponentsMessage
+from gmmtorch.team.sharing.messages.component_messages import ComponentsMessage, counts_of
 from gmmtorch.team.sharing.messages.message_registry import decode
 from gmmtorch.team.sharing.messages.record_messages import (
     CorrectionMessage,
@@ -68,6 +68,15 @@ def replica_of(datagrams: list[bytes], robot: int = 1000) -> Replica:
     return replica
 
 
+def told_twice(sent: list[bytes], order: random.Random) -> tuple[Replica, Replica]:
+    """Equal replicas: one received the datagrams in order, the other in any order, and half of them twice."""
+    again = [*sent, *order.sample(sent, len(sent) // 2)]
+    order.shuffle(again)
+    one, other = replica_of(sent), replica_of(again)
+    assert one.digest() == other.digest()
+    return one, other
+
+
 def everything(replica: Replica) -> list[bytes]:
     """All records, as a replica sends them to a robot that has none."""
     newcomer, copy = Replica(1000), Replica(replica.robot)
@@ -85,6 +94,11 @@ def motion(x: float = 0.0, yaw: float = 0.0) -> torch.Tensor:
     cos, sin = math.cos(yaw), math.sin(yaw)
     made[:2, :2] = torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64)
     return made
+
+
+def same_attributes(one: Components, other: Components) -> bool:
+    a, b = (c.attributes.present().tensors() for c in (one, other))
+    return a.keys() == b.keys() and all(torch.allclose(a[name], b[name], atol=1e-12) for name in a)
 
 
 def rows(components: Components) -> dict[int, tuple]:
@@ -143,7 +157,9 @@ class Model:
         largest: dict[int, float] = {}
         for record in self.counting().values():
             if isinstance(record, CountersMessage):
-                for component, total in zip(record.components.tolist(), record.points.tolist(), strict=True):
+                for component, total in zip(
+                    record.components.tolist(), counts_of(record.steps).tolist(), strict=True
+                ):
                     if component == key:
                         life = record.key >> 28
                         largest[life] = max(largest.get(life, 0.0), total)

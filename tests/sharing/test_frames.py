@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from mapping.map_cases import assert_same_components
 from mapping.random_components import random_components
 from sharing.message_examples import sealed
-from sharing.replica_histories import exchange, motion, replica_of, rows, told
+from sharing.replica_histories import exchange, motion, replica_of, rows, told, told_twice
 from sharing.schedules import act, components
 
 from gmmtorch.errors import DataError, InvalidArgumentError
@@ -157,29 +157,6 @@ def test_batches_equal_datagrams_at_all_robots():
         assert_same_components(mine, sent)
 
 
-def test_counters_of_unknown_components_wait_for_them():
-    one, other = Replica(0), Replica(1)
-    ids = [tuple(row) for row in one.add(random_components(3, k=3)).tolist()]
-    shapes = one.datagrams()
-    one.count({ids[0]: 64.0, ids[1]: 8.0})
-    for datagram in one.datagrams():
-        other.receive(datagram)
-    assert len(other.changes().gained) == 0
-    for datagram in shapes:
-        other.receive(datagram)
-    new = other.changes()
-    assert len(new.added) == 1
-    gained = {
-        tuple(row): float(gain) for row, gain in zip(new.gained.ids.tolist(), new.gained.support, strict=True)
-    }
-    assert gained == {ids[0]: 64.0, ids[1]: 8.0}
-    assert float(new.gained.seen_count.sum()) == pytest.approx(72.0)
-    one.count({ids[1]: 8.0})
-    for datagram in one.datagrams():
-        other.receive(datagram)
-    assert [float(gain) for gain in other.changes().gained.support] == [8.0]
-
-
 def test_a_component_without_points_gains_them_evenly():
     one = Replica(0)
     bare = random_components(3, k=1, seed=3, n_origins=4, max_sightings=1)
@@ -215,19 +192,6 @@ def test_only_changes_of_known_components_demand_a_rebuild():
     for datagram in one.datagrams():  # components arrive superseded and corrected
         late.receive(datagram)
     assert late.digest() == one.digest()
-
-
-def test_components_that_arrive_after_their_correction_are_corrected():
-    one, other, follower = Replica(0), Replica(1), Follower()
-    ids = one.add(random_components(3, k=4))
-    shapes = one.datagrams()
-    one.correct(0, motion(2.0), ids)
-    follower.follow(other)
-    for datagram in [*one.datagrams(), *shapes]:
-        other.receive(datagram)
-        follower.follow(other)
-    assert not follower.rebuilt
-    assert follower.agrees(other)
 
 
 def test_falling_counters_demand_a_rebuild():
@@ -300,13 +264,8 @@ class Model:
 @settings(max_examples=8, deadline=None)
 @given(seed=seeds, order=st.randoms(use_true_random=False))
 def test_order_and_repetition_do_not_matter(seed, order):
-    said = joined_history(seed)
-    again = [*said, *order.sample(said, len(said) // 2)]
-    order.shuffle(again)
-    one, other = replica_of(said), replica_of(again)
-    assert one.digest() == other.digest()
-    frames = {one.placement.root, *(7 | robot << 24 for robot in range(3))}
-    for frame in frames:
+    one, other = told_twice(joined_history(seed), order)
+    for frame in {one.placement.root, *(7 | robot << 24 for robot in range(3))}:
         assert_same_components(one.components(frame), other.components(frame))
 
 

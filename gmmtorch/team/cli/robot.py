@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from gmmtorch.cli import (
     Memory,
@@ -123,11 +123,9 @@ def check_options(config: DictConfig) -> None:
         raise InvalidArgumentError(
             f"network.loss={config.network.loss} must be a share of the datagrams in [0, 1)."
         )
-    if not config.evaluation.every > 0:
-        raise InvalidArgumentError(f"evaluation.every={config.evaluation.every} must be above zero seconds.")
-    rate = config.sensor.rate if config.source == "world" else config.log.rate
-    check_number("sensor.rate" if config.source == "world" else "log.rate", rate, above=True)
-    check_number("speed", config.speed, above=True)
+    rate = "sensor.rate" if config.source == "world" else "log.rate"
+    for name in ("evaluation.every", rate, "speed"):
+        check_number(name, OmegaConf.select(config, name), above=True)
     check_number("settle", config.settle)
     if config.source == "log" and config.log.dataset is None:
         raise InvalidArgumentError(

@@ -77,7 +77,7 @@ def test_the_run_directory_holds_figures_events_and_map(mission):
     assert {"results.json", "map.safetensors", "trajectories.npz", ".hydra/overrides.yaml"} <= files
     assert any(name.startswith("trials/") and name.endswith("/row.json") for name in files)
     pictures = {name for name in files if name.endswith(".png")}
-    names = "bandwidth entropy mixture profile team_map trajectories"
+    names = "bandwidth entropy mixture team_map trajectories"
     assert pictures == {f"{name}.png" for name in names.split()}
     for name in pictures:
         assert (mission.folder / name).read_bytes().startswith(b"\x89PNG")

@@ -72,7 +72,6 @@ def test_a_single_robot_flies_and_reports(run, tmp_path):
     results = done.results()
     (row,) = results["rows"]
     assert results["command"] == "robot"
-    assert results["config"]["clock"] == "wall"
     assert row["n_components"] > 0
     assert row["collisions"] == 0
     assert (row["robot"], row["ticks_late"], row["stopped"], row["unkept"]) == (
@@ -100,14 +99,6 @@ def test_a_single_robot_flies_and_reports(run, tmp_path):
     assert row["digest"] in done.stdout
     assert "browse    tensorboard" in done.stdout
     assert "cannot be restarted" not in done.stdout
-
-
-def test_a_robot_works_without_listeners(run):
-    done = succeeded(run(*LOG, "link.peers=[127.0.0.1:9]", "log.rate=50"))
-    (row,) = done.results()["rows"]
-    assert row["scans"] == row["n_scans"] == 6
-    assert row["n_components"] > 0
-    assert row["refused"] == {}
 
 
 @pytest.mark.parametrize("options", ["team=grid_shared", "codec=thesis"])
@@ -258,7 +249,9 @@ def test_frames_of_an_earlier_session_are_no_duplicate_id(run, tmp_path):
 
 def test_frames_with_another_key_are_counted_and_logged_once(run, tmp_path):
     (here,) = from_options.free_addresses(1)
-    own = TeamKey.generate().save(tmp_path / "own.key")
+    own = tmp_path / "own.key"
+    own.touch(0o600)
+    own.write_text(bytes(range(32)).hex())
     with chatter(1, here, TeamKey.generate()) as other:
         options = [f"link.listen={here}", f"link.key_file={own}", "report.progress=true", "log.rate=4"]
         done = succeeded(run(*LOG, *options, "team.size=2"))

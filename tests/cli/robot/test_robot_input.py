@@ -109,14 +109,6 @@ def test_a_store_of_another_log_is_rejected(run, tmp_path):
     assert said not in again.stdout
 
 
-def test_a_store_of_another_world_is_rejected(run, tmp_path):
-    kept = f"journal.folder={tmp_path / 'kept'}"
-    succeeded(run(*LOG, "log.rate=50", kept))
-    line = refused(run(kept, name="flying"))
-    assert f"{kept.split('=')[0]}=" in line
-    assert "source" in line
-
-
 def test_a_store_in_use_is_named_by_its_option(run, tmp_path):
     with Store(tmp_path / "robot_0.sqlite", 0, {}):
         line = refused(run(*LOG, f"journal.folder={tmp_path}"))
