@@ -7,10 +7,12 @@ import random
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import pytest
 import torch
 from sharing.schedules import act
 
 from gmmtorch.mapping.components import Components
+from gmmtorch.team.sharing.broadcast import Broadcast
 from gmmtorch.team.sharing.messages.component_messages import ComponentsMessage, counts_of
 from gmmtorch.team.sharing.messages.message_registry import decode
 from gmmtorch.team.sharing.messages.record_messages import (
@@ -118,6 +120,53 @@ def rows(components: Components) -> dict[int, tuple]:
             tuple(seen),
         )
     return found
+
+
+class Follower:
+    """A map made of changes: mean, support and counts by origin of each component."""
+
+    def __init__(self) -> None:
+        self.shapes: dict[int, tuple] = {}
+        self.support: dict[int, float] = {}
+        self.counts: dict[tuple, float] = {}
+        self.rebuilt = 0
+        self.batches: list[Components] = []
+
+    def follow(self, replica: Replica | Broadcast) -> None:
+        new = replica.changes()
+        if new.rebuilt:
+            assert not new.added
+            assert not len(new.gained)
+            self.shapes, self.support, self.counts = {}, {}, {}
+            self.rebuilt += 1
+            self._enter(replica.components())
+            return
+        for batch in new.added:
+            assert len(batch)
+            assert not rows(batch).keys() & self.shapes.keys()  # no component is added twice
+            self._enter(batch)
+        self.batches += new.added
+        assert (new.gained.support > 0).all()
+        for key, (mean, _, gain, _, seen) in rows(new.gained).items():
+            assert self.shapes[key][0] == mean
+            self.support[key] += gain
+            for origin, count in seen:
+                self.counts[key, origin] += count
+
+    def _enter(self, batch: Components) -> None:
+        for key, (mean, covariance, support, flag, seen) in rows(batch).items():
+            self.shapes[key], self.support[key] = (mean, covariance, flag), support
+            self.counts |= {(key, origin): count for origin, count in seen}
+
+    def agrees(self, replica: Replica | Broadcast) -> bool:
+        expected = rows(replica.components())
+        counts = {(key, origin): n for key, row in expected.items() for origin, n in row[4]}
+        return (
+            self.shapes
+            == {key: (mean, covariance, flag) for key, (mean, covariance, _, flag, _) in expected.items()}
+            and self.support == pytest.approx({key: row[2] for key, row in expected.items()}, rel=1e-9)
+            and self.counts == pytest.approx(counts, rel=1e-9, abs=1e-12)
+        )
 
 
 class Model:

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from mapping.map_cases import assert_same_components
 from mapping.random_components import random_components
 from sharing.message_examples import sealed
-from sharing.replica_histories import exchange, motion, replica_of, rows, told, told_twice
+from sharing.replica_histories import Follower, exchange, motion, replica_of, rows, told, told_twice
 from sharing.schedules import act, components
 
 from gmmtorch.errors import DataError, InvalidArgumentError
@@ -34,53 +34,6 @@ from gmmtorch.team.sharing.replica.replica import Replica
 from gmmtorch.team.sharing.store import Store
 
 seeds = st.integers(0, 10**6)
-
-
-class Follower:
-    """A map made of changes: mean, support and counts by origin of each component."""
-
-    def __init__(self) -> None:
-        self.shapes: dict[int, tuple] = {}
-        self.support: dict[int, float] = {}
-        self.counts: dict[tuple, float] = {}
-        self.rebuilt = 0
-        self.batches: list[Components] = []
-
-    def follow(self, replica: Replica) -> None:
-        new = replica.changes()
-        if new.rebuilt:
-            assert not new.added
-            assert not len(new.gained)
-            self.shapes, self.support, self.counts = {}, {}, {}
-            self.rebuilt += 1
-            self._enter(replica.components())
-            return
-        for batch in new.added:
-            assert len(batch)
-            assert not rows(batch).keys() & self.shapes.keys()  # no component is added twice
-            self._enter(batch)
-        self.batches += new.added
-        assert (new.gained.support > 0).all()
-        for key, (mean, _, gain, _, seen) in rows(new.gained).items():
-            assert self.shapes[key][0] == mean
-            self.support[key] += gain
-            for origin, count in seen:
-                self.counts[key, origin] += count
-
-    def _enter(self, batch: Components) -> None:
-        for key, (mean, covariance, support, flag, seen) in rows(batch).items():
-            self.shapes[key], self.support[key] = (mean, covariance, flag), support
-            self.counts |= {(key, origin): count for origin, count in seen}
-
-    def agrees(self, replica: Replica) -> bool:
-        expected = rows(replica.components())
-        counts = {(key, origin): n for key, row in expected.items() for origin, n in row[4]}
-        return (
-            self.shapes
-            == {key: (mean, covariance, flag) for key, (mean, covariance, _, flag, _) in expected.items()}
-            and self.support == pytest.approx({key: row[2] for key, row in expected.items()}, rel=1e-9)
-            and self.counts == pytest.approx(counts, rel=1e-9, abs=1e-12)
-        )
 
 
 def growth(seed: int, n_acts: int = 14) -> list[bytes]:

@@ -217,19 +217,13 @@ class MissionRecorder:
             self._board.hparams(chosen_options(self._config), numbers)
             self._board.close()
         if self._config.report.recording:
+            period = mission.tick_seconds
+            maps = {snapshot.tick * period: snapshot.content for snapshot in self.snapshots.taken}
             report.record_rerun(
                 self._folder / "mission.rrd",
                 paths,
-                period=mission.tick_seconds,
-                maps=[
-                    report.RecordedMap(
-                        snapshot.tick * mission.tick_seconds,
-                        snapshot.content["cells"],
-                        snapshot.content.get("means", ()),
-                        snapshot.content.get("covariances", ()),
-                    )
-                    for snapshot in self.snapshots.taken
-                ],
+                period=period,
+                maps=maps,
                 resolution=self._world.resolution,
                 row=row,
             )

@@ -5,7 +5,6 @@ from .mission_curves import entropy_figure as entropy_figure
 from .mission_curves import loss_figure as loss_figure
 from .mission_curves import planner_comparison_figure as planner_comparison_figure
 from .mission_curves import team_run_figure as team_run_figure
-from .mission_maps import RecordedMap as RecordedMap
 from .mission_maps import TeamSnapshot as TeamSnapshot
 from .mission_maps import load_rerun as load_rerun
 from .mission_maps import record_rerun as record_rerun
