@@ -306,10 +306,7 @@ def replaying(config: DictConfig, transport: FramedTransport, stack: ExitStack) 
     chosen = list(shard_indices(len(scans), config.id, config.team.size, _PART))
     is_free = config.log.start == "unknown" and bool(chosen)
     frame = start_frame(scans, chosen[0]) if is_free else None
-    replica = Replica(config.id, own_frame=is_free)
-    store.restore(replica)
-    if frame is not None and replica.earlier_frames:  # the log begins where it began before
-        replica.join(replica.earlier_frames[0], torch.eye(len(frame)))
+    replica = _restored(store, config.id, is_free)
     mission = ReplayMission(
         replica,
         DatasetShard(scans, chosen, None if frame is None else Pose.from_matrix(frame).inverse().matrix),
@@ -336,6 +333,15 @@ def _opened_store(config: DictConfig, transport: FramedTransport, stack: ExitSta
         logger.warning("Set journal.folder to another folder.")
     transport.disown(store.begin_session(transport.session))
     return store
+
+
+def _restored(store: Store, robot: int, is_free: bool) -> Replica:
+    """The team's map as the robot had it. Its own frame, if it has one, is where it was before."""
+    replica = Replica(robot, own_frame=is_free)
+    store.restore(replica)
+    if is_free and replica.earlier_frames and replica.n_components:
+        replica.join(replica.earlier_frames[0], torch.eye(replica.components().dim + 1))
+    return replica
 
 
 def facts_of(config: DictConfig) -> dict[str, Any]:
@@ -381,18 +387,14 @@ def shared_map(config: DictConfig, stack: ExitStack) -> SharedMap | None:
     robot = check_whole("id", config.id, 0)
     if config.transport is None:
         return None
-    transport = open_link(config, robot)
-    stack.callback(transport.close)
+    transport = stack.enter_context(open_link(config, robot))
     with naming({"share": "network.loss"}):
         transport.lose(config.network.loss, config.seed + robot)
     facts = {"source": "ros", "start": config.start, "frame": config.sensor.frame}
     store = stack.enter_context(Store(run_dir() / f"robot_{robot}.sqlite", robot, facts))
     transport.disown(store.begin_session(transport.session))
     is_free = config.start == "unknown"
-    replica = Replica(robot, own_frame=is_free)
-    store.restore(replica)
-    if is_free and replica.earlier_frames and replica.n_components:  # the fixed frame is where it was before
-        replica.join(replica.earlier_frames[0], torch.eye(replica.components().dim + 1))
+    replica = _restored(store, robot, is_free)
     with naming({"announce_every": "network.announce", "budget": "network.budget"}):
         return SharedMap(
             replica,
@@ -418,8 +420,7 @@ def listener(
         return lambda is_last: None
     number = config.team.size
     own: Any = OmegaConf.merge(config, OmegaConf.from_dotlist(list(link)))
-    transport = open_link(own, number)
-    stack.callback(transport.close)
+    transport = stack.enter_context(open_link(own, number))
 
     def received() -> tuple[str, float]:
         return RECEIVED, transport.books(number)["wire_bytes_received"] / 1e3

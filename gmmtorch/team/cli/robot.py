@@ -97,8 +97,8 @@ def run(config: DictConfig) -> None:
     check_options(config)
     folder = run_dir()
     with ExitStack() as stack:
-        transport = from_options.open_link(config, config.id, is_alone=config.team.size == 1)
-        stack.callback(transport.close)
+        link = from_options.open_link(config, config.id, is_alone=config.team.size == 1)
+        transport = stack.enter_context(link)
         transport.lose(config.network.loss, config.seed + config.id)
         make = from_options.flying if config.source == "world" else from_options.replaying
         mission, view = make(config, transport, stack)
