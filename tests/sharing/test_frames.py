@@ -31,7 +31,6 @@ from gmmtorch.team.sharing.messages.record_messages import (
 from gmmtorch.team.sharing.replica import authorship
 from gmmtorch.team.sharing.replica.record_keys import WORLD, Intervals, first_key
 from gmmtorch.team.sharing.replica.replica import Replica
-from gmmtorch.team.sharing.store import Store
 
 seeds = st.integers(0, 10**6)
 
@@ -348,27 +347,6 @@ def test_a_restarted_robot_goes_on_in_its_earlier_frame():
     found = zero.components()
     is_old = (found.ids[:, 0] == 1) & (found.ids[:, 1] >> 28 == 7)
     assert torch.allclose(found.means[is_old], old + torch.tensor([1.0, 0, 0]).double())
-
-
-def test_a_store_keeps_the_frame(tmp_path):
-    before = Replica(1, own_frame=True)
-    with Store(tmp_path / "s", 1) as store:
-        store.restore(before)
-        before.add(random_components(3, k=2))
-        assert store.keep(before.datagrams())
-    again = Replica(1, own_frame=True)
-    with Store(tmp_path / "s", 1) as store:
-        assert store.restore(again).n_refused == 0
-        (earlier,) = again.earlier_frames
-        again.join(earlier, torch.eye(4))
-        again.add(random_components(3, k=1, seed=5))
-        assert store.keep(again.datagrams())
-    assert len(again.components()) == 3
-    last = Replica(1, own_frame=True)
-    with Store(tmp_path / "s", 1) as store:
-        store.restore(last)
-    assert len(last.earlier_frames) == 2
-    assert len(last.components(earlier)) == 3
 
 
 def test_robots_join_lower_ids_only():

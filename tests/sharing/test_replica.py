@@ -86,23 +86,6 @@ def test_a_changed_map_sends_only_its_changes():
     )
 
 
-def test_superseded_components_stay_until_all_successors_arrive():
-    one = Replica(0)
-    old = one.add(random_components(3, k=5, seed=1))
-    first = one.datagrams()
-    one.add(random_components(3, k=4, seed=2), supersedes=old[:2])
-    second = one.datagrams()
-    supersession = [datagram for datagram in second if datagram[0] == 0x1B]
-    successors = [datagram for datagram in second if datagram[0] == 0x11]
-    assert len(supersession) == len(successors) == 1
-    other = replica_of([*first, *supersession])
-    assert other.n_components == 5
-    assert other.receive(successors[0])
-    assert other.n_components == 7
-    assert other.digest() == one.digest()
-    assert replica_of([*second, *first]).digest() == one.digest()
-
-
 def test_counter_records_stay_few():
     one, other = Replica(0), Replica(1)
     ids = [tuple(row) for row in one.add(random_components(3, k=60)).tolist()]

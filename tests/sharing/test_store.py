@@ -239,24 +239,6 @@ def test_acknowledged_records_survive_a_kill_at_any_time():
     assert kills["lost"] == kills["unequal"] == kills["refused"] == kills["failed"] == 0
 
 
-def test_a_restart_loads_few_more_bytes_than_the_replica_has(tmp_path, monkeypatch):
-    replica, loaded, load = Replica(0), [], Replica.load
-    with Store(tmp_path / "s", 0) as store:
-        store.restore(replica)
-        replica.add(random_components(3, k=3000))
-        store.keep(replica.datagrams())
-    reopened(tmp_path / "s")
-
-    def counted(again: Replica, batches: list[bytes], datagrams: list[bytes]) -> int:
-        loaded.append(sum(map(len, [*batches, *datagrams])))
-        return load(again, batches, datagrams)
-
-    monkeypatch.setattr(Replica, "load", counted)
-    assert reopened(tmp_path / "s")[0].digest() == replica.digest()
-    batches, datagrams = replica.stored()
-    assert loaded[0] <= 1.2 * sum(map(len, [*batches, *datagrams]))
-
-
 # -- damage ----------------------------------------------------------------------------------------
 
 

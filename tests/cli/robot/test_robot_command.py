@@ -232,21 +232,6 @@ def test_a_duplicate_id_ends_the_robot_with_the_remedy(run):
     assert "own id" in said
 
 
-def test_frames_of_an_earlier_session_are_no_duplicate_id(run, tmp_path):
-    kept = f"journal.folder={tmp_path / 'kept'}"
-    succeeded(run(*LOG, "log.rate=50", "settle=0", kept))
-    with sqlite3.connect(tmp_path / "kept" / "robot_0.sqlite") as db:
-        ((session,),) = db.execute("SELECT id FROM session").fetchall()
-    db.close()
-    (here,) = from_options.free_addresses(1)
-    with chatter(0, here) as recorded:
-        recorded._sealer.session = session  # as if its frames were replayed
-        again = run(*LOG, "settle=7", kept, f"link.listen={here}", name="again")
-    (row,) = succeeded(again).results()["rows"]
-    assert row["refused"]["duplicate_id"] > 100
-    assert row["namesakes"] == {}
-
-
 def test_frames_with_another_key_are_counted_and_logged_once(run, tmp_path):
     (here,) = from_options.free_addresses(1)
     own = tmp_path / "own.key"
