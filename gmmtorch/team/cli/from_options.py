@@ -287,16 +287,9 @@ def log_map(config: DictConfig) -> Callable[[], GaussianMap]:
     """A factory of empty maps with the options `log.map`, on the CPU."""
     runtime = {"memory_limit": config.runtime.memory_limit, "compile": False, "dtype": "float64"}
     with naming({"map": "log.map"}):
-        return map_factory(
-            OmegaConf.create(
-                {
-                    "map": chosen_map(config.log.map, "log.map"),
-                    "runtime": runtime,
-                    "seed": config.seed,
-                }
-            ),
-            group="log.map",
-        )
+        chosen = chosen_map(config.log.map, "log.map")
+        options = OmegaConf.create({"map": chosen, "runtime": runtime, "seed": config.seed})
+        return map_factory(options, group="log.map")
 
 
 def replaying(config: DictConfig, transport: FramedTransport, stack: ExitStack) -> tuple[Drivable, RobotView]:
@@ -370,7 +363,8 @@ def _facts_of_log(config: DictConfig) -> dict[str, Any]:
     return {
         "source": "log",
         **{f"log.dataset.{name}": value for name, value in dataset.items()},
-        "log.every": 1,  # of earlier versions, which wrote the same file; and so is the next
+        # Options of earlier versions, whose stores have them.
+        "log.every": 1,
         "log.part": _PART,
         **({"log.start": "unknown"} if config.log.start == "unknown" else {}),
         "team.size": config.team.size,
