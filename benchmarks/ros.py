@@ -62,15 +62,16 @@ def played(
 
     The recording is played again until `seconds` have passed.
     """
-    node = [f"node.middleware={middleware}", "node.domain=91", "wait=60"]
+    node = [f"node.middleware={middleware}", "wait=60"]
+    apart = {**os.environ, "ROS_DOMAIN_ID": "91"}
     receive = [*node, "node.use_sim_time=true", *more]
-    mapper = subprocess.Popen(command("ros", folder / "mapper", *receive))
+    mapper = subprocess.Popen(command("ros", folder / "mapper", *receive), env=apart)
     play = command("ros", folder / "player", *node, f"play={bag}")
-    player, end = subprocess.Popen(play), time.monotonic() + seconds
+    player, end = subprocess.Popen(play, env=apart), time.monotonic() + seconds
     usage: Usage | None = None
     while player.poll() is None or time.monotonic() < end:
         if player.poll() is not None:
-            player = subprocess.Popen(play)
+            player = subprocess.Popen(play, env=apart)
         time.sleep(0.5)
         started = any((folder / "mapper").glob("ros.log"))
         usage = Usage(mapper) if usage is None and started else usage

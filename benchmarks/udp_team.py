@@ -28,7 +28,7 @@ from typing import Any
 from gmmtorch.experiments.harness import Case, Row, run
 from gmmtorch.mapping.codec.quantization import quantized
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.team.cli.from_options.links import free_addresses
+from gmmtorch.team.cli.from_options import free_addresses
 from gmmtorch.team.sharing.replica.materialized_view import fingerprints
 
 _PAUSE = 0.1
@@ -116,7 +116,6 @@ def _start(
         "source=log",
         f"dataset@log.dataset={options.dataset}",
         f"log.rate={options.rate}",
-        f"log.part={options.part}",
         f"settle={options.settle}",
         f"seed={seed}",
         f"network.loss={options.loss}",
@@ -209,6 +208,5 @@ if __name__ == "__main__":
         dataset={"default": "synthetic_building_2d"},
         path={},
         scans={"type": int, "help": "of a synthetic log, in all"},
-        part={"default": "consecutive"},
         seed={"type": int, "default": 0},
     )

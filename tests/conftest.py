@@ -79,8 +79,8 @@ def steps(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 @pytest.fixture
-def ros_domain() -> Iterator[int]:
-    """A ROS domain that no other process of the tests uses meanwhile."""
+def ros_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+    """A ROS domain that no other process of the tests uses meanwhile; also that of commands."""
     fcntl = pytest.importorskip("fcntl", reason="needs locks of files, which Windows has not")
     for number in range(1, 100):
         with open(Path(tempfile.gettempdir()) / f"gmmtorch-test-domain-{number}", "w") as lock:
@@ -88,6 +88,7 @@ def ros_domain() -> Iterator[int]:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
                 continue
+            monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
             yield number
             return
     pytest.fail("all domains are in use")

@@ -441,16 +441,13 @@ def _sensors(node: Node, name: str | None) -> list[Sensor]:
     ]
 
 
-def open_scans(
-    node: Node, sensor: Sensor, ranges: Ranges, options: LiveOptions, camera_info: str | None = None
-) -> LiveScans:
+def open_scans(node: Node, sensor: Sensor, ranges: Ranges, options: LiveOptions) -> LiveScans:
     """The scans of a sensor, with the subscriptions that they need."""
     scans = LiveScans(sensor, node.transforms, ranges, options)
     if options.poses != "standing":
         node.listen_to_transforms()
     if sensor.is_camera and options.intrinsics is None:
-        info = camera_info or _camera_info(node, sensor.topic.name)
-        node.subscribe(info, INFO_TYPE, reading(scans.note_camera))
+        node.subscribe(_camera_info(node, sensor.topic.name), INFO_TYPE, reading(scans.note_camera))
     node.subscribe(
         sensor.topic.name,
         sensor.topic.type,
@@ -464,8 +461,8 @@ def _camera_info(node: Node, image: str) -> str:
     best = nearest_names(infos, image) if infos else []
     if len(best) != 1:
         raise InvalidArgumentError(
-            f"{arg('camera_info')} is not clear for the images of {image}; topics of type CameraInfo are "
-            f"{', '.join(infos) or 'none'}. Choose one, or state {arg('intrinsics')}=[fx,fy,cx,cy] in "
-            "pixels, without distortion."
+            f"The camera parameters of the images of {image} are not clear; topics of type CameraInfo are "
+            f"{', '.join(infos) or 'none'}. State {arg('intrinsics')}=[fx,fy,cx,cy] in pixels, without "
+            "distortion."
         )
     return best[0]

@@ -29,7 +29,7 @@ from gmmtorch.experiments.evaluation import methods
 from gmmtorch.experiments.evaluation.fits import ESTIMATORS
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
-from gmmtorch.team.cli.from_options import missions
+from gmmtorch.team.cli import from_options
 from gmmtorch.team.exploration.mission.options import FRAMEWORKS, THESIS, TeamOptions
 from gmmtorch.team.exploration.mission.trials import WorldOptions
 from gmmtorch.team.exploration.planning.planners import PLANNERS
@@ -104,8 +104,8 @@ def test_every_experiment_of_teams_composes_and_gives_its_trials(name, tmp_path)
     config = composed("explore", f"experiment={name}", "duration=4")
     assert config.duration == 4
     assert not OmegaConf.missing_keys(config)
-    variants = missions.variants_of(config)
-    trials = [missions.trial_of(config, tmp_path, variant, 7) for variant in variants]
+    variants = from_options.variants_of(config)
+    trials = [from_options.trial_of(config, tmp_path, variant, 7) for variant in variants]
     assert len({trial.folder for trial in trials}) == len(trials) > 1
     for trial, variant in zip(trials, variants, strict=True):
         named = {"team": trial.team.framework, **vars(trial.team), **trial.team.learning}
@@ -120,15 +120,15 @@ def test_every_experiment_of_teams_composes_and_gives_its_trials(name, tmp_path)
 def test_the_file_of_the_thesis_team_has_its_options():
     config = composed("explore", "team=gmm_thesis")
     assert config.codec == THESIS["codec"]
-    plain = missions.team_options(composed("explore"), 0, {"team": "gmm_thesis"})
-    assert missions.team_options(config, 0, {}) == plain
+    plain = from_options.team_options(composed("explore"), 0, {"team": "gmm_thesis"})
+    assert from_options.team_options(config, 0, {}) == plain
 
 
 def test_options_that_are_not_of_the_thesis_team_are_refused():
     with pytest.raises(InvalidArgumentError, match=r"team=gmm_thesis with codec=float.* has thesis"):
-        missions.team_options(composed("explore", "team=gmm_thesis", "codec=float"), 0, {})
+        from_options.team_options(composed("explore", "team=gmm_thesis", "codec=float"), 0, {})
     with pytest.raises(InvalidArgumentError, match="team=gmm_thesis sets options of all teams"):
-        missions.variants_of(composed("explore", "team=gmm_thesis", "experiment=deviations"))
+        from_options.variants_of(composed("explore", "team=gmm_thesis", "experiment=deviations"))
 
 
 def test_every_team_and_planner_has_its_file():
@@ -191,7 +191,7 @@ def test_the_map_has_the_options_of_its_group(name, more, expected):
 
 
 def test_an_exploration_of_the_options_is_the_default_one(tmp_path):
-    trial = missions.trial_of(composed("explore"), tmp_path)
+    trial = from_options.trial_of(composed("explore"), tmp_path)
     assert trial.team == TeamOptions()
     assert trial.world == WorldOptions(size=(50.0, 40.0, 8.0))
 

@@ -178,7 +178,7 @@ def test_topics_are_shown_while_they_are_mapped(watched, monkeypatch, tmp_path, 
 
     thread = threading.Thread(target=publish)
     thread.start()
-    options = [f"node.domain={ros_domain}", "sensor.poses=standing", "map.window=2", "view=true"]
+    options = ["sensor.poses=standing", "map.window=2", "view=true"]
     done = succeeded(run_here(monkeypatch, "ros", tmp_path, *options, "wait=20", "report.progress=false"))
     thread.join()
     watched.clients[0].received(b"/components", b"/robots/0")

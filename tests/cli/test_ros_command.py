@@ -34,8 +34,7 @@ from gmmtorch.live.live_scans import LiveOptions, LiveScans
 from gmmtorch.live.ros import Node
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.map_builder import MapBuilder
-from gmmtorch.team.cli.from_options import links, robots
-from gmmtorch.team.cli.from_options.robots import shared_map
+from gmmtorch.team.cli import from_options
 from gmmtorch.team.sharing import Replica
 from gmmtorch.team.sharing.shared_map import SharedMap
 from gmmtorch.team.sharing.transport.udp import UdpTransport
@@ -49,7 +48,7 @@ needs_dds = pytest.mark.skipif(
 
 
 def of_node(options: dict[str, Any]) -> list[str]:
-    return [f"node.{name}={value}" for name, value in options.items()]
+    return [f"node.{name}={value}" for name, value in options.items() if name != "domain"]
 
 
 def test_a_missing_topic_is_an_error_that_lists_what_is_there(monkeypatch, tmp_path, ros_options):
@@ -62,7 +61,6 @@ def test_a_missing_topic_is_an_error_that_lists_what_is_there(monkeypatch, tmp_p
     ("option", "words"),
     [
         ("node.middleware=tcp", "node.middleware='tcp'"),
-        ("node.domain=500", "domain=500"),
         ("sensor.poses=gps", "sensor.poses='gps'"),
         ("play=nowhere.bag", "nowhere.bag"),
         ("transport=tcp", "transport='tcp' is not one of udp, zenoh"),
@@ -73,18 +71,17 @@ def test_a_missing_topic_is_an_error_that_lists_what_is_there(monkeypatch, tmp_p
     ],
 )
 def test_wrong_options_are_errors_of_one_line(monkeypatch, tmp_path, ros_domain, option, words):
-    options = [f"node.domain={ros_domain}"] if "domain" not in option else []
-    assert words in refused(run_here(monkeypatch, "ros", tmp_path, *options, *option.split(), "wait=0.2"))
+    assert words in refused(run_here(monkeypatch, "ros", tmp_path, *option.split(), "wait=0.2"))
 
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_robot_that_starts_again_keeps_its_frame(monkeypatch, tmp_path, dim):
-    monkeypatch.setattr(robots, "run_dir", lambda: tmp_path)
+    monkeypatch.setattr(from_options, "run_dir", lambda: tmp_path)
     config = composed("ros", "transport=udp", "start=unknown", "link.listen=127.0.0.1:0")
     made = [random_components(dim, k=3, seed=seed) for seed in range(2)]
     for number, components in enumerate(made):
         with ExitStack() as stack:
-            shared = shared_map(config, stack)
+            shared = from_options.shared_map(config, stack)
             assert shared is not None
             shared.replica.add(components)
             shared.exchange(0.0)
@@ -167,10 +164,9 @@ def mapped(sweeps: list[int]) -> GaussianMap:
 @needs_dds
 @pytest.mark.slow
 def test_a_killed_mapper_of_a_team_goes_on_after_its_last_checkpoint(tmp_path, ros_domain):
-    folder, (here, other) = tmp_path / "run", links.free_addresses(2)
+    folder, (here, other) = tmp_path / "run", from_options.free_addresses(2)
     options = [
         f"hydra.run.dir={folder}",
-        f"node.domain={ros_domain}",
         "wait=50",
         "sensor.poses=standing",
         "sensor.max_latency=null",
@@ -188,7 +184,7 @@ def test_a_killed_mapper_of_a_team_goes_on_after_its_last_checkpoint(tmp_path, r
         time.sleep(1.0)
         return made
 
-    transport = UdpTransport.unicast(1, links.address("", other), [links.address("", here)])
+    transport = UdpTransport.unicast(1, from_options.address("", other), [from_options.address("", here)])
     teammate = SharedMap(Replica(1), transport)
     seen = mapped([99]).components()
     teammate.replica.publish(seen, whole=True)

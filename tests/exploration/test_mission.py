@@ -23,7 +23,7 @@ from gmmtorch.kernels import kernels
 from gmmtorch.mapping.components import Components
 from gmmtorch.simulation.furniture import box
 from gmmtorch.simulation.robot_camera import DepthCamera
-from gmmtorch.team.cli.explore_pictures import _coverage, _team_view
+from gmmtorch.team.cli.explorations import _coverage, _team_view
 from gmmtorch.team.exploration.mission.driver import SimulatedClock, Stopwatch, WallClock, drive, settle
 from gmmtorch.team.exploration.mission.mission import Mission
 from gmmtorch.team.exploration.mission.options import FRAMEWORKS, THESIS, TeamOptions

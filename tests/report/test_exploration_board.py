@@ -16,17 +16,17 @@ def test_trials_are_written_with_their_tags(tmp_path):
     with Board(tmp_path) as board:
         write_exploration_board(board, rows)
     events = read(tmp_path)
-    left = events.Scalars("gmm_shared/seed_0/entropy_left")
+    left = events.Scalars("E0/seed_0/entropy_left")
     assert [event.step for event in left] == [0, 10, 20, 30, 40, 50]
     np.testing.assert_allclose(
         [event.value for event in left], np.array(rows[0]["entropy_bits"]) / OBSERVABLE_BITS, rtol=1e-6
     )
     tags = events.Tags()["scalars"]
-    robots = {tag.split("/")[2] for tag in tags if tag.startswith("gmm_shared/seed_0/robot_")}
+    robots = {tag.split("/")[2] for tag in tags if tag.startswith("E0/seed_0/robot_")}
     assert robots == {"robot_0", "robot_1", "robot_2"}
-    assert "gmm_shared/seed_0/octree_bytes_over_time" in tags
-    assert "grid_isolated/seed_1/octree_bytes_over_time" not in tags
-    assert "grid_isolated/seed_1/auc" not in tags  # one number, which is in the table
+    assert "E0/seed_0/octree_bytes_over_time" in tags
+    assert "E2/seed_1/octree_bytes_over_time" not in tags
+    assert "E2/seed_1/auc" not in tags  # one number, which is in the table
     table = make_ndarray(events.Tensors("results/text_summary")[0].tensor_proto)[0].decode()
     assert "| auc |" in table
 
@@ -66,8 +66,8 @@ def test_variants_that_differ_only_in_their_network_have_different_tags(tmp_path
     events = read(tmp_path)
     tags = [tag for tag in events.Tags()["scalars"] if tag.endswith("/missing_share")]
     assert len(tags) == 4
-    (lossy,) = (tag for tag in tags if "loss_0.3" in tag)
-    assert lossy == "gmm_shared/loss_0.3_partitions_none/seed_0/missing_share"
+    (lossy,) = (tag for tag in tags if "30 % lost" in tag)
+    assert lossy == "30 % lost/seed_0/missing_share"
     found = events.Scalars(lossy)
     np.testing.assert_allclose([event.value for event in found], [0, 0.5, 0.3], rtol=1e-6)
-    assert any("partitions_60-120.5_0_1.2" in tag for tag in tags)
+    assert any("partition 0 | 1 2, 60–120.5 s" in tag for tag in tags)

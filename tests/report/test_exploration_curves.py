@@ -14,7 +14,6 @@ from gmmtorch.report.style import PALETTE, LineEnd, label_ends, new_figure
 from gmmtorch.team.exploration.mission.results import mean_band, paired_interval
 from gmmtorch.team.report.mission_bars import (
     deviations_figure,
-    profile_figure,
     summary_bars,
 )
 from gmmtorch.team.report.mission_curves import (
@@ -239,19 +238,6 @@ def test_summary_draws_no_mean_if_a_seed_has_no_value():
     assert "none" in texts(beneath)
 
 
-def test_profile_is_in_milliseconds_per_simulated_second():
-    rows = [
-        trial("gmm_shared", 0, times=[0.0, 50.0], stage_seconds={"sensing": 2.0, "mapping": 3.0}),
-        trial("gmm_shared", 1, times=[0.0, 30.0], stage_seconds={"mapping": 3.0}),
-        trial("grid_shared", 0, times=[0.0, 10.0], stage_seconds={"mapping": 2.0}),
-    ]
-    axes = profile_figure(rows).axes[0]
-    widths = [patch.get_width() for patch in axes.patches if patch.get_width() > 0]
-    assert sorted(widths) == pytest.approx([25, 75, 200])
-    assert "100 ms, 10.0× real time" in texts(axes)
-    assert "200 ms, 5.0× real time" in texts(axes)
-
-
 def test_line_end_labels_keep_order_and_do_not_overlap():
     figure = new_figure(6, 4)
     axes = figure.subplots()
@@ -275,7 +261,7 @@ def test_frameworks_have_fixed_names_and_colours():
 
 
 def test_curve_errors_name_the_argument():
-    for draw in (entropy_figure, bandwidth_figure, planner_comparison_figure, summary_bars, profile_figure):
+    for draw in (entropy_figure, bandwidth_figure, planner_comparison_figure, summary_bars):
         with pytest.raises(InvalidArgumentError, match="rows is empty"):
             draw([])
     with pytest.raises(InvalidArgumentError, match="observable_bits=0"):

@@ -13,7 +13,6 @@ from exploration_rows import flights, trial
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.team.report.mission_maps import (
-    RecordedMap,
     _log_robot,
     load_rerun,
     record_rerun,
@@ -27,10 +26,10 @@ def test_recording_contains_robots_map_mixture_and_curves(tmp_path):
     from rerun.chunk import RrdReader
 
     covariances = torch.eye(3).expand(2, 3, 3) * 0.01
-    maps = [
-        RecordedMap(20.0, [[0, 0, 0], [5, -1, 2]], torch.rand(2, 3), covariances),
-        RecordedMap(10.0, [[0, 0, 0]]),
-    ]
+    maps = {
+        20.0: {"cells": [[0, 0, 0], [5, -1, 2]], "means": torch.rand(2, 3), "covariances": covariances},
+        10.0: {"cells": [[0, 0, 0]]},
+    }
     path = record_rerun(
         tmp_path / "mission.rrd", flights(2, 30), maps=maps, row=trial("gmm_shared", 0, duration=100)
     )

@@ -7,11 +7,13 @@ import random
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import pytest
 import torch
 from sharing.schedules import act
 
 from gmmtorch.mapping.components import Components
-from gmmtorch.team.sharing.messages.component_messages import ComponentsMessage
+from gmmtorch.team.sharing.broadcast import Broadcast
+from gmmtorch.team.sharing.messages.component_messages import ComponentsMessage, counts_of
 from gmmtorch.team.sharing.messages.message_registry import decode
 from gmmtorch.team.sharing.messages.record_messages import (
     CorrectionMessage,
@@ -68,6 +70,15 @@ def replica_of(datagrams: list[bytes], robot: int = 1000) -> Replica:
     return replica
 
 
+def told_twice(sent: list[bytes], order: random.Random) -> tuple[Replica, Replica]:
+    """Equal replicas: one received the datagrams in order, the other in any order, and half of them twice."""
+    again = [*sent, *order.sample(sent, len(sent) // 2)]
+    order.shuffle(again)
+    one, other = replica_of(sent), replica_of(again)
+    assert one.digest() == other.digest()
+    return one, other
+
+
 def everything(replica: Replica) -> list[bytes]:
     """All records, as a replica sends them to a robot that has none."""
     newcomer, copy = Replica(1000), Replica(replica.robot)
@@ -87,6 +98,11 @@ def motion(x: float = 0.0, yaw: float = 0.0) -> torch.Tensor:
     return made
 
 
+def same_attributes(one: Components, other: Components) -> bool:
+    a, b = (c.attributes.present().tensors() for c in (one, other))
+    return a.keys() == b.keys() and all(torch.allclose(a[name], b[name], atol=1e-12) for name in a)
+
+
 def rows(components: Components) -> dict[int, tuple]:
     """Mean, covariance, support, flag and (origin, count) pairs of each component by its key."""
     found = {}
@@ -104,6 +120,53 @@ def rows(components: Components) -> dict[int, tuple]:
             tuple(seen),
         )
     return found
+
+
+class Follower:
+    """A map made of changes: mean, support and counts by origin of each component."""
+
+    def __init__(self) -> None:
+        self.shapes: dict[int, tuple] = {}
+        self.support: dict[int, float] = {}
+        self.counts: dict[tuple, float] = {}
+        self.rebuilt = 0
+        self.batches: list[Components] = []
+
+    def follow(self, replica: Replica | Broadcast) -> None:
+        new = replica.changes()
+        if new.rebuilt:
+            assert not new.added
+            assert not len(new.gained)
+            self.shapes, self.support, self.counts = {}, {}, {}
+            self.rebuilt += 1
+            self._enter(replica.components())
+            return
+        for batch in new.added:
+            assert len(batch)
+            assert not rows(batch).keys() & self.shapes.keys()  # no component is added twice
+            self._enter(batch)
+        self.batches += new.added
+        assert (new.gained.support > 0).all()
+        for key, (mean, _, gain, _, seen) in rows(new.gained).items():
+            assert self.shapes[key][0] == mean
+            self.support[key] += gain
+            for origin, count in seen:
+                self.counts[key, origin] += count
+
+    def _enter(self, batch: Components) -> None:
+        for key, (mean, covariance, support, flag, seen) in rows(batch).items():
+            self.shapes[key], self.support[key] = (mean, covariance, flag), support
+            self.counts |= {(key, origin): count for origin, count in seen}
+
+    def agrees(self, replica: Replica | Broadcast) -> bool:
+        expected = rows(replica.components())
+        counts = {(key, origin): n for key, row in expected.items() for origin, n in row[4]}
+        return (
+            self.shapes
+            == {key: (mean, covariance, flag) for key, (mean, covariance, _, flag, _) in expected.items()}
+            and self.support == pytest.approx({key: row[2] for key, row in expected.items()}, rel=1e-9)
+            and self.counts == pytest.approx(counts, rel=1e-9, abs=1e-12)
+        )
 
 
 class Model:
@@ -143,7 +206,9 @@ class Model:
         largest: dict[int, float] = {}
         for record in self.counting().values():
             if isinstance(record, CountersMessage):
-                for component, total in zip(record.components.tolist(), record.points.tolist(), strict=True):
+                for component, total in zip(
+                    record.components.tolist(), counts_of(record.steps).tolist(), strict=True
+                ):
                     if component == key:
                         life = record.key >> 28
                         largest[life] = max(largest.get(life, 0.0), total)

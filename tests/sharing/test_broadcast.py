@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapping.random_components import random_components
 from sharing.message_examples import codecs, frame_of_components
-from sharing.replica_histories import rows, told
+from sharing.replica_histories import Follower, rows, told
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.components import Components
@@ -97,28 +97,19 @@ def test_messages_in_any_order_equal_a_plain_model(codec: str, seed: int, order:
 def test_changes_of_a_broadcast_are_its_map(codec: str, seed: int, order: random.Random) -> None:
     said = history(seed, codec)
     order.shuffle(said)
-    one, support, shapes = Broadcast(9, codec), {}, {}
+    one, follower = Broadcast(9, codec), Follower()
     for datagram in said:
         before = one.version
         one.receive(datagram)
         if order.random() < 0.4:
-            changes = one.changes()
-            assert not changes.rebuilt
-            for batch in changes.added:
-                for key, row in rows(batch).items():
-                    assert key not in shapes
-                    shapes[key], support[key] = row[0], row[2]
-            for key, row in zip(changes.gained.ids.tolist(), range(len(changes.gained)), strict=True):
-                support[key[0] << 52 | key[1]] += float(changes.gained.support[row])
-                assert tuple(changes.gained.means[row].tolist()) == shapes[key[0] << 52 | key[1]]
+            follower.follow(one)
+            assert follower.agrees(one)
             again = one.changes()
             assert again.added == [] == again.gained.ids.tolist()
         assert one.version >= before
-    for batch in (changes := one.changes()).added:
-        support |= {key: row[2] for key, row in rows(batch).items()}
-    for key, gain in zip(changes.gained.ids.tolist(), changes.gained.support.tolist(), strict=True):
-        support[key[0] << 52 | key[1]] += gain
-    assert support == pytest.approx({key: row[2] for key, row in rows(one.components()).items()}, rel=1e-9)
+    follower.follow(one)
+    assert follower.agrees(one)
+    assert not follower.rebuilt
 
 
 @codecs

@@ -30,6 +30,16 @@ def robot_with(number: int, scans: list[gt.Scan], window: int = 20) -> Replica:
     return replica
 
 
+def joiner_of(replica: Replica, scans: list[gt.Scan], heard: list[bytes]) -> FrameJoiner:
+    """It remembers the scans; then its robot has received the datagrams."""
+    joiner = FrameJoiner(replica)
+    for scan in scans:
+        joiner.add(scan)
+    for datagram in heard:
+        replica.receive(datagram)
+    return joiner
+
+
 @pytest.fixture(scope="module")
 def scans() -> list[gt.Scan]:
     return list(gt.datasets.load("synthetic_building_2d", n_scans=N_SCANS))
@@ -45,12 +55,8 @@ def test_remembered_scans_follow_corrected_poses(scans, first_part):
     truth, drift = motion(30.0, -7.0, 2.0), motion(4.0, -2.0, 0.5)
     theirs = [scan.transformed(truth) for scan in scans[N_SCANS // 2 :]]
     one = robot_with(1, theirs)
-    joiner = FrameJoiner(one)
-    for scan in theirs:
-        joiner.add(scan.transformed(drift))
+    joiner = joiner_of(one, [scan.transformed(drift) for scan in theirs], first_part)
     joiner.correct(lambda origins: torch.linalg.inv(drift).expand(len(origins), 3, 3))
-    for datagram in first_part:
-        one.receive(datagram)
     assert any(joiner.search() for _ in range(20))
     back = one.placement.transform @ truth
     assert torch.allclose(back, torch.eye(3).double(), atol=0.05)
@@ -60,9 +66,7 @@ def test_two_parts_of_a_building_are_laid_over_each_other(scans, first_part):
     truth = motion(30.0, -7.0, 2.0)  # robot 1's frame ← the building's
     theirs = [scan.transformed(truth) for scan in scans[N_SCANS // 2 :]]
     one, watcher = robot_with(1, theirs), Replica(0, incarnation=5, own_frame=True)
-    joiner = FrameJoiner(one)
-    for scan in theirs:
-        joiner.add(scan)
+    joiner = joiner_of(one, theirs, [])
     assert not joiner.search()  # nothing to join yet
     for datagram in first_part:
         one.receive(datagram)
@@ -85,11 +89,7 @@ def test_a_frame_is_estimated_again_when_the_maps_have_grown(scans, first_part):
     truth = motion(30.0, -7.0, 2.0)  # robot 1's frame ← the building's
     theirs = [scan.transformed(truth) for scan in scans[N_SCANS // 2 :]]
     one = robot_with(1, theirs[:14])
-    joiner = FrameJoiner(one)
-    for scan in theirs[:14]:
-        joiner.add(scan)
-    for datagram in first_part:
-        one.receive(datagram)
+    joiner = joiner_of(one, theirs[:14], first_part)
     assert any(joiner.search() for _ in range(20))
     assert not joiner.search()  # nothing is new
     one.join(0, torch.linalg.inv(truth @ motion(0.1, 0.0, math.radians(0.5))))
@@ -108,11 +108,7 @@ def test_a_frame_is_estimated_again_when_the_maps_have_grown(scans, first_part):
 def test_a_map_of_another_building_is_not_joined(first_part):
     other = list(gt.datasets.load("synthetic_building_2d", n_scans=16, seed=5))
     one = robot_with(1, other)
-    joiner = FrameJoiner(one)
-    for scan in other:
-        joiner.add(scan)
-    for datagram in first_part:
-        one.receive(datagram)
+    joiner = joiner_of(one, other, first_part)
     n_places = len(joiner._places)
     assert not any(joiner.search() for _ in range(n_places))
     assert joiner.n_searches == n_places >= 8
@@ -124,11 +120,7 @@ def test_a_map_of_another_building_is_not_joined(first_part):
 def test_estimates_that_disagree_join_nothing(scans, first_part, monkeypatch):
     """Two wrong locations in succession, as two corridors that look the same would give."""
     one = robot_with(1, scans[:10])
-    joiner = FrameJoiner(one)
-    for scan in scans[: N_SCANS // 2]:
-        joiner.add(scan)
-    for datagram in first_part:
-        one.receive(datagram)
+    joiner = joiner_of(one, scans[: N_SCANS // 2], first_part)
     true, shifts = Tracker.locate, iter(range(100))
 
     def wrong(tracker, points):

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from mapping.map_cases import assert_same_components
 from mapping.random_components import random_components
 from sharing.message_examples import sealed
-from sharing.replica_histories import exchange, motion, replica_of, rows, told
+from sharing.replica_histories import Follower, exchange, motion, replica_of, rows, told, told_twice
 from sharing.schedules import act, components
 
 from gmmtorch.errors import DataError, InvalidArgumentError
@@ -31,56 +31,8 @@ from gmmtorch.team.sharing.messages.record_messages import (
 from gmmtorch.team.sharing.replica import authorship
 from gmmtorch.team.sharing.replica.record_keys import WORLD, Intervals, first_key
 from gmmtorch.team.sharing.replica.replica import Replica
-from gmmtorch.team.sharing.store import Store
 
 seeds = st.integers(0, 10**6)
-
-
-class Follower:
-    """A map made of changes: mean, support and counts by origin of each component."""
-
-    def __init__(self) -> None:
-        self.shapes: dict[int, tuple] = {}
-        self.support: dict[int, float] = {}
-        self.counts: dict[tuple, float] = {}
-        self.rebuilt = 0
-        self.batches: list[Components] = []
-
-    def follow(self, replica: Replica) -> None:
-        new = replica.changes()
-        if new.rebuilt:
-            assert not new.added
-            assert not len(new.gained)
-            self.shapes, self.support, self.counts = {}, {}, {}
-            self.rebuilt += 1
-            self._enter(replica.components())
-            return
-        for batch in new.added:
-            assert len(batch)
-            assert not rows(batch).keys() & self.shapes.keys()  # no component is added twice
-            self._enter(batch)
-        self.batches += new.added
-        assert (new.gained.support > 0).all()
-        for key, (mean, _, gain, _, seen) in rows(new.gained).items():
-            assert self.shapes[key][0] == mean
-            self.support[key] += gain
-            for origin, count in seen:
-                self.counts[key, origin] += count
-
-    def _enter(self, batch: Components) -> None:
-        for key, (mean, covariance, support, flag, seen) in rows(batch).items():
-            self.shapes[key], self.support[key] = (mean, covariance, flag), support
-            self.counts |= {(key, origin): count for origin, count in seen}
-
-    def agrees(self, replica: Replica) -> bool:
-        expected = rows(replica.components())
-        counts = {(key, origin): n for key, row in expected.items() for origin, n in row[4]}
-        return (
-            self.shapes
-            == {key: (mean, covariance, flag) for key, (mean, covariance, _, flag, _) in expected.items()}
-            and self.support == pytest.approx({key: row[2] for key, row in expected.items()}, rel=1e-9)
-            and self.counts == pytest.approx(counts, rel=1e-9, abs=1e-12)
-        )
 
 
 def growth(seed: int, n_acts: int = 14) -> list[bytes]:
@@ -157,29 +109,6 @@ def test_batches_equal_datagrams_at_all_robots():
         assert_same_components(mine, sent)
 
 
-def test_counters_of_unknown_components_wait_for_them():
-    one, other = Replica(0), Replica(1)
-    ids = [tuple(row) for row in one.add(random_components(3, k=3)).tolist()]
-    shapes = one.datagrams()
-    one.count({ids[0]: 64.0, ids[1]: 8.0})
-    for datagram in one.datagrams():
-        other.receive(datagram)
-    assert len(other.changes().gained) == 0
-    for datagram in shapes:
-        other.receive(datagram)
-    new = other.changes()
-    assert len(new.added) == 1
-    gained = {
-        tuple(row): float(gain) for row, gain in zip(new.gained.ids.tolist(), new.gained.support, strict=True)
-    }
-    assert gained == {ids[0]: 64.0, ids[1]: 8.0}
-    assert float(new.gained.seen_count.sum()) == pytest.approx(72.0)
-    one.count({ids[1]: 8.0})
-    for datagram in one.datagrams():
-        other.receive(datagram)
-    assert [float(gain) for gain in other.changes().gained.support] == [8.0]
-
-
 def test_a_component_without_points_gains_them_evenly():
     one = Replica(0)
     bare = random_components(3, k=1, seed=3, n_origins=4, max_sightings=1)
@@ -215,19 +144,6 @@ def test_only_changes_of_known_components_demand_a_rebuild():
     for datagram in one.datagrams():  # components arrive superseded and corrected
         late.receive(datagram)
     assert late.digest() == one.digest()
-
-
-def test_components_that_arrive_after_their_correction_are_corrected():
-    one, other, follower = Replica(0), Replica(1), Follower()
-    ids = one.add(random_components(3, k=4))
-    shapes = one.datagrams()
-    one.correct(0, motion(2.0), ids)
-    follower.follow(other)
-    for datagram in [*one.datagrams(), *shapes]:
-        other.receive(datagram)
-        follower.follow(other)
-    assert not follower.rebuilt
-    assert follower.agrees(other)
 
 
 def test_falling_counters_demand_a_rebuild():
@@ -300,13 +216,8 @@ class Model:
 @settings(max_examples=8, deadline=None)
 @given(seed=seeds, order=st.randoms(use_true_random=False))
 def test_order_and_repetition_do_not_matter(seed, order):
-    said = joined_history(seed)
-    again = [*said, *order.sample(said, len(said) // 2)]
-    order.shuffle(again)
-    one, other = replica_of(said), replica_of(again)
-    assert one.digest() == other.digest()
-    frames = {one.placement.root, *(7 | robot << 24 for robot in range(3))}
-    for frame in frames:
+    one, other = told_twice(joined_history(seed), order)
+    for frame in {one.placement.root, *(7 | robot << 24 for robot in range(3))}:
         assert_same_components(one.components(frame), other.components(frame))
 
 
@@ -436,27 +347,6 @@ def test_a_restarted_robot_goes_on_in_its_earlier_frame():
     found = zero.components()
     is_old = (found.ids[:, 0] == 1) & (found.ids[:, 1] >> 28 == 7)
     assert torch.allclose(found.means[is_old], old + torch.tensor([1.0, 0, 0]).double())
-
-
-def test_a_store_keeps_the_frame(tmp_path):
-    before = Replica(1, own_frame=True)
-    with Store(tmp_path / "s", 1) as store:
-        store.restore(before)
-        before.add(random_components(3, k=2))
-        assert store.keep(before.datagrams())
-    again = Replica(1, own_frame=True)
-    with Store(tmp_path / "s", 1) as store:
-        assert store.restore(again).n_refused == 0
-        (earlier,) = again.earlier_frames
-        again.join(earlier, torch.eye(4))
-        again.add(random_components(3, k=1, seed=5))
-        assert store.keep(again.datagrams())
-    assert len(again.components()) == 3
-    last = Replica(1, own_frame=True)
-    with Store(tmp_path / "s", 1) as store:
-        store.restore(last)
-    assert len(last.earlier_frames) == 2
-    assert len(last.components(earlier)) == 3
 
 
 def test_robots_join_lower_ids_only():

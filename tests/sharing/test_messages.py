@@ -89,10 +89,6 @@ def test_thesis_components_are_57_bytes_each_and_float32():
     assert torch.equal(found.max_range, components.max_range)
 
 
-def test_a_component_of_a_frame_takes_ten_bytes():
-    assert sum(map(len, encode_components(frame_of_components(100)))) <= 10 * 100
-
-
 @pytest.mark.parametrize("codec", ["float", "thesis"])
 def test_covariances_that_round_to_indefinite_are_refused(codec):
     components = frame_of_components(3)
@@ -216,14 +212,6 @@ def test_counts_in_float_are_exact_and_in_the_thesis_codec_8_bytes():
     assert {k: c for datagram in datagrams for k, c in decode(datagram).counts.items()} == rounded
 
 
-def test_counts_take_less_than_three_bytes_each():
-    generator = torch.Generator().manual_seed(0)
-    known = torch.randperm(5000, generator=generator)[:200].tolist()
-    counts = {(i % 3, number): 1.0 + number % 97 for i, number in enumerate(known)}
-    assert sum(map(len, encode_counts(0, counts))) <= 3 * 200
-    assert len(encode_counts(0, {(0, number): 8.0 for number in range(1000, 1100)})[0]) <= 40  # a run
-
-
 @pytest.mark.parametrize("count", [-1.0, math.nan, math.inf, 1e13])
 @codecs
 def test_invalid_counts_are_refused(count, codec):
@@ -293,6 +281,17 @@ def test_invalid_points_are_refused(name, value):
         encode_points(**{**sound, name: value})
 
 
+def test_components_counts_and_views_take_few_bytes():
+    assert sum(map(len, encode_components(frame_of_components(100)))) <= 10 * 100
+    known = torch.randperm(5000, generator=torch.Generator().manual_seed(0))[:200].tolist()
+    counts = {(i % 3, number): 1.0 + number % 97 for i, number in enumerate(known)}
+    assert sum(map(len, encode_counts(0, counts))) <= 3 * 200
+    assert len(encode_counts(0, {(0, number): 8.0 for number in range(1000, 1100)})[0]) <= 40  # a run
+    assert len(encode_views(views(50))[0]) <= 9 * 50
+    assert len(encode_views(views(0, 100))[0]) <= 2 * 100 + 20
+    assert len(encode_views(replace(views(0), removed=Intervals.span(5, 500_000)))[0]) <= 15
+
+
 # -- views and plans -------------------------------------------------------------------------------
 
 
@@ -333,12 +332,6 @@ def test_views_are_decoded_within_their_step(n, n_removed, seed, center):
     for message in found:
         removed |= message.removed
     assert removed == sent.removed
-
-
-def test_a_view_takes_few_bytes():
-    assert len(encode_views(views(50))[0]) <= 9 * 50
-    assert len(encode_views(views(0, 100))[0]) <= 2 * 100 + 20
-    assert len(encode_views(replace(views(0), removed=Intervals.span(5, 500_000)))[0]) <= 15
 
 
 INVALID_VIEWS = {

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapping.map_cases import assert_same_components
 from mapping.random_components import random_components
-from sharing.replica_histories import Model, exchange, history, motion, replica_of, rows
+from sharing.replica_histories import Model, exchange, history, motion, replica_of, rows, told_twice
 from sharing.schedules import components, run_schedule
 
 import gmmtorch as gt
@@ -32,11 +32,7 @@ seeds = st.integers(0, 10**6)
 @settings(max_examples=6, deadline=None)
 @given(seed=seeds, order=st.randoms(use_true_random=False))
 def test_order_and_repetition_do_not_matter(seed, order):
-    sent = history(seed)
-    again = [*sent, *order.sample(sent, len(sent) // 2)]
-    order.shuffle(again)
-    one, other = replica_of(sent), replica_of(again)
-    assert one.digest() == other.digest()
+    one, other = told_twice(history(seed), order)
     assert_same_components(one.components(), other.components())
 
 
@@ -88,23 +84,6 @@ def test_a_changed_map_sends_only_its_changes():
     assert sorted(map(tuple, quantized(fresh).means.tolist())) == sorted(
         map(tuple, other.components().means.tolist())
     )
-
-
-def test_superseded_components_stay_until_all_successors_arrive():
-    one = Replica(0)
-    old = one.add(random_components(3, k=5, seed=1))
-    first = one.datagrams()
-    one.add(random_components(3, k=4, seed=2), supersedes=old[:2])
-    second = one.datagrams()
-    supersession = [datagram for datagram in second if datagram[0] == 0x1B]
-    successors = [datagram for datagram in second if datagram[0] == 0x11]
-    assert len(supersession) == len(successors) == 1
-    other = replica_of([*first, *supersession])
-    assert other.n_components == 5
-    assert other.receive(successors[0])
-    assert other.n_components == 7
-    assert other.digest() == one.digest()
-    assert replica_of([*second, *first]).digest() == one.digest()
 
 
 def test_counter_records_stay_few():

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sharing.transport_cases import KEY, SECRET, Clock
 
-from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError, OutputError
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError
 from gmmtorch.team.sharing.transport.security import (
     FRESH_FRAMES,
     FRESH_SECONDS,
@@ -44,29 +44,19 @@ def refused(opener: Opener) -> dict[str, int]:
 # -- keys ------------------------------------------------------------------------------------------------
 
 
-def test_a_key_file_restores_the_key_and_is_private(tmp_path):
-    key = TeamKey.generate()
-    path = key.save(tmp_path / "team.key")
-    assert path.stat().st_mode & 0o777 == 0o600
-    assert TeamKey.from_file(path) == key
-    assert TeamKey.from_file(path) != TeamKey.generate()
-    with pytest.raises(OutputError, match=r"team\.key"):
-        TeamKey.generate().save(path)
-    assert TeamKey.from_file(path) == key
-
-
 def test_a_key_of_openssl_is_read(tmp_path, monkeypatch):
     path = tmp_path / "team.key"
     path.write_text(SECRET.hex() + "\n")
     path.chmod(0o400)
-    assert TeamKey.from_file(path) == KEY
+    assert TeamKey.from_file(path)._data == SECRET
     monkeypatch.setenv("GMMTORCH_TEAM_KEY", SECRET.hex().upper())
-    assert TeamKey.from_environment() == KEY
+    assert TeamKey.from_environment()._data == SECRET
 
 
 @pytest.mark.parametrize("mode", [0o644, 0o640, 0o604, 0o660, 0o602])
 def test_key_files_readable_by_others_are_refused(tmp_path, mode):
-    path = KEY.save(tmp_path / "team.key")
+    path = tmp_path / "team.key"
+    path.write_text(SECRET.hex())
     path.chmod(mode)
     with pytest.raises(DataError, match=f"mode {mode:o}.*chmod 600 .*team.key"):
         TeamKey.from_file(path)
@@ -111,7 +101,6 @@ def test_invalid_keys_are_refused_without_showing_them(tmp_path, monkeypatch):
     assert "str" in error_of(InvalidArgumentError, lambda: TeamKey(digits))
     error_of(InvalidArgumentError, lambda: pickle.dumps(KEY))
     error_of(InvalidArgumentError, lambda: copy.deepcopy(KEY))
-    error_of(OutputError, lambda: KEY.save(tmp_path / "no" / "folder"))
     shown = [*messages, repr(KEY), str(KEY), f"{KEY}", f"{[KEY]}", "%r" % KEY]  # noqa: UP031
     assert not any(digits[:8] in text or repr(SECRET)[2:20] in text for text in shown)
 
@@ -206,12 +195,6 @@ def test_invalid_senders_are_refused(arguments, message):
         Sealer(*arguments, KEY)
 
 
-def test_invalid_datagrams_are_not_sealed():
-    for datagram, message in ((bytes(1201), "1201 bytes"), ("text", "str")):
-        with pytest.raises(InvalidArgumentError, match=message):
-            Sealer(0, KEY).seal(datagram)
-
-
 # -- hostile frames --------------------------------------------------------------------------------------
 
 
@@ -247,7 +230,7 @@ def test_noise_with_a_valid_header_is_refused_without_state(header, data):
     assert opener.open(b"\xf1" + header + data) is None
     reason = "oversized" if len(data) > 1216 else "malformed" if len(data) < 16 else "wrong_key"
     assert refused(opener) == {reason: 1}
-    assert len(opener._sessions) == 0
+    assert len(opener._sessions._windows) == 0
 
 
 def test_each_rejection_reason_is_counted_separately():
@@ -415,7 +398,7 @@ def test_the_memory_of_sessions_is_bounded():
         sessions.refusal(i % 60000, name, i)
         sessions.refusal(7, name, 2 * i)
         sessions.refusal(7, A, 3 * i)
-    assert len(sessions) == MAX_SESSIONS
+    assert len(sessions._windows) == MAX_SESSIONS
     assert len(sessions._speakers) <= MAX_SESSIONS
     assert set(sessions.duplicates) <= set(sessions._speakers)
 
@@ -461,4 +444,4 @@ def test_the_memory_of_a_watch_is_bounded():
     watch = OwnIdWatch(clock)
     for k in range(3 * MAX_SESSIONS):
         assert not watch.detects(k.to_bytes(8, "little"), k)
-    assert len(watch) == MAX_SESSIONS
+    assert len(watch._sessions) == MAX_SESSIONS

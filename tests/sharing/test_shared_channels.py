@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapping.map_cases import assert_same_components
 from mapping.random_components import painted, random_components
-from sharing.replica_histories import exchange, replica_of
+from sharing.message_examples import sealed
+from sharing.replica_histories import exchange, same_attributes, told_twice
 from sharing.schedules import Older, act, run_schedule
 
 import gmmtorch as gt
@@ -49,11 +50,6 @@ RECORDED_TEAM = (
 
 def nine(seed: int = 4) -> Components:
     return random_components(3, k=9, seed=seed, extent=8.0)
-
-
-def same_attributes(one: Components, other: Components) -> bool:
-    a, b = (c.attributes.present().tensors() for c in (one, other))
-    return a.keys() == b.keys() and all(torch.allclose(a[name], b[name], atol=1e-12) for name in a)
 
 
 def test_without_attributes_no_byte_differs_from_earlier_versions():
@@ -129,10 +125,8 @@ def test_order_and_repetition_do_not_matter(seed, order):
     for datagram in list(sent):
         if datagram[:2] == COLOURED and order.random() < 0.5:
             sent += encode_components(bare(decode(datagram).components))
-    again = [*sent, *order.sample(sent, len(sent) // 2)]
-    order.shuffle(again)
-    one, other = replica_of(sent), replica_of(again)
-    assert one.digest() == other.digest() == robot.digest()
+    one, _ = told_twice(sent, order)
+    assert one.digest() == robot.digest()
     assert same_attributes(one.components(), robot.components())
 
 
@@ -161,13 +155,6 @@ def test_a_robot_shares_the_channels_that_are_chosen():
     sender.add(painted(nine()))
     exchange([sender, receiver])
     assert set(receiver.components().attributes.channels) == {"class"}
-
-
-def test_a_team_without_channels_announces_none():
-    one, other = Replica(0), Replica(1)
-    one.add(nine())
-    exchange([one, other])
-    assert len(one.announcements()) == len(other.announcements()) == 1
 
 
 def test_a_robot_of_an_earlier_version_gets_the_geometry_and_others_the_channels():
@@ -279,24 +266,10 @@ def test_a_block_with_more_values_than_a_message_may_have_is_refused():
         block.number(number)
     body = b"\x03" + size.to_bytes() + batch[:-4] + b"\x01" + block.to_bytes()
     with pytest.raises(DataError, match="too many"):
-        decode_batch(sealed_batch(body), 1024)
-
-
-def sealed_batch(body: bytes) -> bytes:
-    import zlib
-
-    return body + zlib.crc32(body).to_bytes(4, "little")
+        decode_batch(sealed(body), 1024)
 
 
 # -- stored ----------------------------------------------------------------------------------------
-
-
-def test_a_loaded_replica_has_the_channels():
-    for replica in run_schedule(1, n_steps=20, painters=2).replicas:
-        again = Replica(replica.robot)
-        assert again.load(*replica.stored()) == 0
-        assert again.digest() == replica.digest()
-        assert same_attributes(replica.components(), again.components())
 
 
 def test_a_store_keeps_channels_that_arrive_after_the_geometry(tmp_path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from fractions import Fraction
 
@@ -77,24 +76,6 @@ LEAST = 1200
 rates = st.integers(1, 5000)
 steps = st.lists(st.tuples(st.integers(0, 80), st.integers(0, 4000)), min_size=1, max_size=40)
 """Eighths of a second until the next time, and the bytes wanted then."""
-
-
-def spent(bucket: TokenBucket, steps: list[tuple[int, int]]) -> list[tuple[float, int]]:
-    """(time, bytes) of a user that takes as many of the wanted bytes as available."""
-    now, found = 0.0, []
-    for eighths, wanted in steps:
-        now += eighths / 8
-        found.append((now, min(wanted, bucket.available(now))))
-        bucket.take(found[-1][1])
-    return found
-
-
-@given(rate=rates, steps=steps)
-def test_any_span_takes_at_most_the_rate_and_a_burst(rate: int, steps: list[tuple[int, int]]) -> None:
-    taken = spent(TokenBucket(rate), steps)
-    for i, j in itertools.combinations_with_replacement(range(len(taken)), 2):
-        span = taken[j][0] - taken[i][0]
-        assert sum(n for _, n in taken[i : j + 1]) <= rate * span + max(rate, LEAST)
 
 
 @given(rate=rates, steps=steps)

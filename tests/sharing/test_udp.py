@@ -244,7 +244,6 @@ def test_a_port_in_use_is_reported_with_its_remedy(opening):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"robot": -1}, "sender=-1"),
         ({"robot": 65536}, "sender=65536"),
         ({"address": ("localhost", 0)}, "address=.*IPv4 address"),
         ({"address": ("::1", 0)}, "address=.*IPv4 address"),

@@ -291,7 +291,6 @@ def test_a_port_in_use_is_reported_with_the_remedy(opening):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"robot": -1}, "sender=-1"),
         ({"robot": 65536}, "sender=65536"),
         ({"team": ""}, "team=''"),
         ({"team": "a/b"}, "team='a/b'"),

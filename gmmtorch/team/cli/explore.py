@@ -33,27 +33,15 @@ TABLE = (
 
 
 @dataclass
-class ExploreReport(Report):
-    """What a mission shows and writes."""
-
-    recording: bool = option(False, "a file for the rerun viewer")
-
-
-@dataclass
-class ExploreRuntime(Device):
-    """Where missions run."""
-
-    workers: int = option(2, "missions of an experiment that run in parallel")
-
-
-@dataclass
 class ExploreCommand(team_schema.MissionCommand):
     """Options of gmmtorch-explore, beside those of `TeamOptions`."""
 
     transport: str = option("in_process", "in_process; gmmtorch-team has others")
     study: Any = option(None, "several missions, which an experiment sets")
-    report: ExploreReport = group(ExploreReport)
-    runtime: ExploreRuntime = group(ExploreRuntime)
+    report: Report = group(Report)
+    recording: bool = option(False, "a file for the rerun viewer", "report.recording")
+    runtime: Device = group(Device)
+    workers: int = option(2, "missions of an experiment that run in parallel", "runtime.workers")
 
 
 @dataclass

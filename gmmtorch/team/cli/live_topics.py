@@ -169,7 +169,7 @@ def _scans(config: DictConfig, node: Node) -> LiveScans:
         ranges = Ranges(config.sensor.max_range, config.sensor.no_return_range)
     sensor = find_sensor(node, config.sensor.topic, config.wait)
     print(f"topic     {sensor.topic.name} ({sensor.topic.type})", flush=True)
-    return open_scans(node, sensor, ranges, live, config.sensor.camera_info)
+    return open_scans(node, sensor, ranges, live)
 
 
 def _publisher(config: DictConfig, node: Node) -> MapPublisher:

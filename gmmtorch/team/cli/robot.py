@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from gmmtorch.cli import (
     Memory,
@@ -44,14 +44,6 @@ TABLE = "robot n_components n_records bytes_sent wire_bytes datagrams digest"
 
 
 @dataclass
-class JournalOptions:
-    """The store of a robot's map."""
-
-    enabled: bool = option(True, "the map is stored on disk and restored at the next start")
-    folder: str | None = option(None, "folder of the store, to restore from; null: the run's folder")
-
-
-@dataclass
 class LogOptions:
     """The replay of recorded scans."""
 
@@ -61,7 +53,6 @@ class LogOptions:
         "options of the map that differ from those of map=incremental, as in {name: windowed}",
     )
     rate: float = option(1.0, "scans per second")
-    part: str = option("consecutive", "consecutive or interleaved part of the log for each robot")
     start: str = option(
         "known",
         "known: the poses of the log; unknown: each robot maps in a frame of its own, and joins that of a "
@@ -75,12 +66,13 @@ class RobotCommand(team_schema.MissionCommand):
 
     id: int = option(0, "this robot's id; unique in the team")
     source: str = option("world", "world: a simulated camera in a simulated world; log: recorded scans")
-    clock: str | None = option("wall", "wall: each robot runs by its own clock")
     speed: float = option(1.0, "seconds of the robot's time per second")
     settle: float = option(10.0, "seconds without news after the last work, until the robot stops")
     transport: str = option("udp", "udp or zenoh")
     link: team_schema.LinkOptions = group(team_schema.LinkOptions)
-    journal: JournalOptions = group(JournalOptions)
+    journal: str | None = option(
+        None, "folder of the robot's store, to restore from; null: the run's folder", "journal.folder"
+    )
     log: LogOptions = group(LogOptions)
     report: Report = group(Report)
     runtime: Memory = group(Memory)
@@ -100,34 +92,29 @@ def main() -> None:
 
 def run(config: DictConfig) -> None:
     """Runs a robot until its work is done and the team is quiet, or until it is stopped."""
-    from gmmtorch.team.cli.from_options import links, robots
+    from gmmtorch.team.cli import from_options
 
     check_options(config)
     folder = run_dir()
     with ExitStack() as stack:
-        transport = links.open_link(config, config.id, is_alone=config.team.size == 1)
-        stack.callback(transport.close)
+        link = from_options.open_link(config, config.id, is_alone=config.team.size == 1)
+        transport = stack.enter_context(link)
         transport.lose(config.network.loss, config.seed + config.id)
-        make = robots.flying if config.source == "world" else robots.replaying
+        make = from_options.flying if config.source == "world" else from_options.replaying
         mission, view = make(config, transport, stack)
         _drive(config, mission, view, folder)
 
 
 def check_options(config: DictConfig) -> None:
     """Raises `InvalidArgumentError` for bad options of a robot or a team, before anything is opened."""
-    from gmmtorch.team.cli.from_options import links
+    from gmmtorch.team.cli.from_options import TRANSPORTS
 
     if set_up(config) != "cpu" and config.source == "log":
         raise InvalidArgumentError(
             f"runtime.device={config.runtime.device} is not available for source=log; use cpu."
         )
-    if config.clock not in ("wall", None):
-        raise InvalidArgumentError(
-            f"clock={config.clock} is not available: each robot runs by its own clock. Use clock=wall, with "
-            "speed=2 for twice real time."
-        )
     check_choice("source", config.source, ("world", "log"))
-    check_choice("transport", config.transport, links.TRANSPORTS)
+    check_choice("transport", config.transport, TRANSPORTS)
     check_choice("log.start", config.log.start, ("known", "unknown"))
     size = check_whole("team.size", config.team.size, 1)
     if check_whole("id", config.id, 0) >= size:
@@ -136,11 +123,9 @@ def check_options(config: DictConfig) -> None:
         raise InvalidArgumentError(
             f"network.loss={config.network.loss} must be a share of the datagrams in [0, 1)."
         )
-    if not config.evaluation.every > 0:
-        raise InvalidArgumentError(f"evaluation.every={config.evaluation.every} must be above zero seconds.")
-    rate = config.sensor.rate if config.source == "world" else config.log.rate
-    check_number("sensor.rate" if config.source == "world" else "log.rate", rate, above=True)
-    check_number("speed", config.speed, above=True)
+    rate = "sensor.rate" if config.source == "world" else "log.rate"
+    for name in ("evaluation.every", rate, "speed"):
+        check_number(name, OmegaConf.select(config, name), above=True)
     check_number("settle", config.settle)
     if config.source == "log" and config.log.dataset is None:
         raise InvalidArgumentError(

@@ -9,7 +9,6 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
@@ -18,6 +17,7 @@ from gmmtorch.cli import drop_unwritable, logger
 from gmmtorch.errors import OutputError
 
 if TYPE_CHECKING:
+    from gmmtorch.report import Board
     from gmmtorch.team.exploration import RobotView
 
 _PERIOD = 1.0
@@ -40,14 +40,16 @@ class RobotReport:
         self._view, self._sample_every = view, config.evaluation.every
         self._next_show = self._next_sample = 0.0
         self.series: dict[str, list[float]] = {"times": []}
-        self._displays: list[_StatusLine | _BoardDisplay] = []
+        self._displays: dict[str, _StatusLine | Board] = {}  # by the option that asks for it
         if config.report.progress and sys.stderr is not None:  # it is None if the process has closed it
-            self._displays.append(_StatusLine(view))
+            self._displays["report.progress"] = _StatusLine(view)
         if config.report.tensorboard:
+            from gmmtorch.report import Board
+
             try:
-                self._displays.append(_BoardDisplay(folder / "tensorboard"))
+                self._displays["report.tensorboard"] = Board(folder / "tensorboard")
             except OSError as error:
-                _log_failure(_BoardDisplay.option, error)
+                _log_failure("report.tensorboard", error)
 
     def __call__(self, now: float) -> None:
         """Updates the displays and the series at the time `now` (s), if it is time to."""
@@ -69,14 +71,17 @@ class RobotReport:
 
     def _show(self, now: float) -> None:
         scalars = self._view.scalars()
-        for display in list(self._displays):
+        for option, display in list(self._displays.items()):
             try:
-                display.show(now, scalars)
+                if isinstance(display, _StatusLine):
+                    display.show(now, scalars)
+                else:  # steps are milliseconds, so that all robots of a team have the same axis
+                    display.scalars(scalars, prefix="robot", step=round(1000 * now))
             except OSError as error:
-                self._displays.remove(display)
+                del self._displays[option]
                 with contextlib.suppress(OSError):
                     display.close()
-                _log_failure(display.option, error)
+                _log_failure(option, error)
 
     def _sample(self, now: float) -> None:
         scalars = self._view.scalars()
@@ -88,18 +93,16 @@ class RobotReport:
     def close(self) -> None:
         """Closes the displays."""
         while self._displays:
-            display = self._displays.pop()
+            option, display = self._displays.popitem()
             try:
                 display.close()
             except OSError as error:
-                _log_failure(display.option, error)
+                _log_failure(option, error)
 
     def __enter__(self) -> RobotReport:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
@@ -109,8 +112,6 @@ class _StatusLine(logging.Handler):
     On a terminal, each status line replaces the last; in a file it is appended. As a handler of the log it
     ends the status line before each record, so that records have their own lines.
     """
-
-    option = "report.progress"
 
     def __init__(self, view: RobotView) -> None:
         super().__init__()
@@ -152,24 +153,6 @@ class _StatusLine(logging.Handler):
             self._width = 0
             sys.stderr.write("\n")
             sys.stderr.flush()
-
-
-class _BoardDisplay:
-    """Scalars in TensorBoard."""
-
-    option = "report.tensorboard"
-
-    def __init__(self, folder: Path) -> None:
-        from gmmtorch.report import Board
-
-        self._board = Board(folder)
-
-    def show(self, now: float, scalars: dict[str, float]) -> None:
-        # Steps are milliseconds, so that all robots of a team have the same axis.
-        self._board.scalars(scalars, prefix="robot", step=round(1000 * now))
-
-    def close(self) -> None:
-        self._board.close()
 
 
 def _log_failure(option: str, error: OSError) -> None:

@@ -23,7 +23,6 @@ class NodeOptions:
     middleware: str = option(
         "dds", "dds (rmw_fastrtps, rmw_cyclonedds), the default of ROS 2, or zenoh (rmw_zenoh)"
     )
-    domain: int | None = option(None, "number of the domain; null: ROS_DOMAIN_ID, else 0")
     namespace: str = option("/", "of relative topic names, such as robot1")
     interface: str = option(
         "127.0.0.1", "of DDS: name or address of a network interface; 127.0.0.1: only this machine"
@@ -38,9 +37,6 @@ class SensorOptions(LiveOptions):
     """The topic of the sensor, and how its messages become scans."""
 
     topic: str | None = option(None, "a PointCloud2, LaserScan or depth Image; null: the only one")
-    camera_info: str | None = option(
-        None, "topic of the camera parameters of depth images; null: the nearest by name"
-    )
     max_range: float | None = option(
         None, "readings at or beyond this distance (m) are beams without return; null: no limit"
     )
@@ -108,7 +104,7 @@ def main() -> None:
 def run(config: DictConfig) -> None:
     """Run the command until Ctrl-C, or until the recording has been played."""
     from gmmtorch.team.cli import live_topics
-    from gmmtorch.team.cli.from_options.robots import shared_map
+    from gmmtorch.team.cli.from_options import shared_map
 
     device = set_up(config)
     check_number("wait", config.wait)

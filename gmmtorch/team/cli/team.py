@@ -122,9 +122,9 @@ def _quoted(path: Path) -> str:
 
 TABLE = "robot n_components n_records bytes_sent wire_bytes datagrams path_length collisions digest"
 _SUMS = ("bytes_sent", "wire_bytes", "datagrams", "path_length", "collisions")
-_OWN = ("id", "link.listen", "link.peers", "link.listen_endpoints", "link.connect_endpoints")
+_OWN = ("id", "link.listen", "link.peers")
 """Options that each robot gets from this command."""
-_NOT_OF_ROBOTS = ("clock", "view", "host", "port", "origins")
+_NOT_OF_ROBOTS = ("view", "host", "port", "origins")
 _STAGE = "seconds"
 _COMPARED = {True: "all hold the same map", False: "their maps differ", None: "their maps have no digest"}
 _PAUSE = 0.2
@@ -140,7 +140,7 @@ def main() -> None:
 
 def run(config: DictConfig) -> None:
     """Runs a team until all its robots have ended."""
-    from gmmtorch.team.cli.listener import listener
+    from gmmtorch.team.cli.from_options import listener
 
     check_options(config)
     folder = run_dir()
@@ -168,12 +168,12 @@ def run(config: DictConfig) -> None:
 
 def _prepare(config: DictConfig, bars: ProgressBars) -> None:
     """Computes the world's properties once for all robots, and raises errors of the options once."""
-    from gmmtorch.team.cli.from_options import missions
+    from gmmtorch.team.cli import from_options
     from gmmtorch.team.exploration import TeamOptions, start_poses
 
     if config.source == "world":
-        options = missions.team_options(config, config.seed, {})
-        world = missions.open_world(missions.world_options(config), options, bars)
+        options = from_options.team_options(config, config.seed, {})
+        world = from_options.open_world(from_options.world_options(config), options, bars)
         with naming(argument_names(TeamOptions)):
             start_poses(world, options)
 
@@ -210,26 +210,15 @@ def _given_options() -> list[str]:
 
 def _addresses(config: DictConfig) -> list[list[str]]:
     """The options of each robot that say where it listens, and where it sends to; of a view, too."""
-    from gmmtorch.team.cli.from_options import links
+    from gmmtorch.team.cli.from_options import free_addresses
 
-    n = config.team.size + (1 if config.view else 0)
-    if config.transport == "zenoh":
-        free = links.free_addresses(n, socket.SOCK_STREAM)
-        # Each connects to those before it: one link between any two.
-        return [
-            [
-                f"link.listen_endpoints=[tcp/{free[k]}]",
-                f"link.connect_endpoints=[{','.join(f'tcp/{other}' for other in free[:k])}]",
-            ]
-            for k in range(n)
-        ]
-    if config.link.group is not None:
+    n, is_zenoh = config.team.size + (1 if config.view else 0), config.transport == "zenoh"
+    if config.link.group is not None and not is_zenoh:
         return [[] for _ in range(n)]
-    free = links.free_addresses(n)
-    return [
-        [f"link.listen={free[k]}", f"link.peers=[{','.join(a for a in free if a != free[k])}]"]
-        for k in range(n)
-    ]
+    free = free_addresses(n, socket.SOCK_STREAM if is_zenoh else socket.SOCK_DGRAM)
+    # Over Zenoh each connects to those before it: one link between any two.
+    peers = [free[:k] if is_zenoh else [*free[:k], *free[k + 1 :]] for k in range(n)]
+    return [[f"link.listen={free[k]}", f"link.peers=[{','.join(peers[k])}]"] for k in range(n)]
 
 
 def _wait(robots: list[RobotProcess], bars: ProgressBars, listen: Callable[[bool], None]) -> None:

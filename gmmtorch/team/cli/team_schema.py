@@ -14,7 +14,7 @@ from gmmtorch.declarations import option, repeated
 from gmmtorch.team.exploration import TeamOptions, WorldOptions
 
 SIMULATED = (
-    *(f"network.{name}" for name in ("delay", "jitter", "bandwidth", "duplication", "reach", "partitions")),
+    *("network.bandwidth", "network.reach", "network.partitions"),
     "evaluation.codecs",
 )
 """Options of a mission that only a simulated network has, or only the simulated mission measures."""
@@ -34,11 +34,12 @@ class MissionCommand(ViewOptions):
 class LinkOptions:
     """The network of a robot."""
 
-    listen: str = option(
-        "127.0.0.1:7400",
-        "address of this machine, or 0.0.0.0, and port; a key is required except on loopback",
+    listen: str | None = option(
+        None,
+        "address of this machine, or 0.0.0.0, and port, or an endpoint of Zenoh, as in tls/0.0.0.0:7447; a "
+        "key is required except on loopback. null: 127.0.0.1:7400, or as zenoh_config says",
     )
-    peers: list[str] = option([], "addresses of the others, as in [192.168.1.12:7400]")
+    peers: list[str] = option([], "addresses of the others, as in [192.168.1.12:7400], or endpoints of Zenoh")
     group: str | None = option(
         None, "multicast group that all robots share, as in 239.71.77.7:7400; null: none"
     )
@@ -46,10 +47,6 @@ class LinkOptions:
     key_file: str | None = option(
         None, "file of 64 hexadecimal digits; null: $GMMTORCH_TEAM_KEY, if it is set"
     )
-    insecure: bool = option(False, "allow other machines without a key")
-    team: str = option("team", "the team's name, for Zenoh")
-    listen_endpoints: list[str] = option([], "Zenoh endpoints, as in [tcp/0.0.0.0:7447]")
-    connect_endpoints: list[str] = option([], "Zenoh endpoints of others, as in [tcp/192.168.1.12:7447]")
     zenoh_config: str | None = option(None, "file with settings of Zenoh, such as scouting; null: none")
 
 

@@ -1,12 +1,10 @@
 from .mission_bars import deviations_figure as deviations_figure
-from .mission_bars import profile_figure as profile_figure
 from .mission_bars import summary_bars as summary_bars
 from .mission_curves import bandwidth_figure as bandwidth_figure
 from .mission_curves import entropy_figure as entropy_figure
 from .mission_curves import loss_figure as loss_figure
 from .mission_curves import planner_comparison_figure as planner_comparison_figure
 from .mission_curves import team_run_figure as team_run_figure
-from .mission_maps import RecordedMap as RecordedMap
 from .mission_maps import TeamSnapshot as TeamSnapshot
 from .mission_maps import load_rerun as load_rerun
 from .mission_maps import record_rerun as record_rerun

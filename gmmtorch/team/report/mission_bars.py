@@ -1,33 +1,27 @@
-"""Figures that compare frameworks: results with paired differences, and computing time by stage."""
+"""Figures that compare frameworks: results with paired differences."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.container import BarContainer
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.report import (
     LABEL_SIZE,
-    PALETTE,
     TICK_SIZE,
     Rows,
     byte_text,
-    colour,
     draw_grid,
     figure_title,
     label_axes,
-    label_of,
-    legend_below,
     new_figure,
-    stacked_bars,
     tick_text,
 )
 from gmmtorch.team.exploration import mean_band
@@ -147,38 +141,6 @@ def deviations_figure(rows: Rows) -> Figure:
     return figure
 
 
-def profile_figure(rows: Rows) -> Figure:
-    """Draws the milliseconds of computing per simulated second by stage, one bar per framework.
-
-    The end of a bar gives the ratio of simulated to computing time.
-
-    rows: explore rows with `stage_seconds`.
-
-    Raises `InvalidArgumentError`: no row.
-    """
-    costs = {framework: _milliseconds(trials) for framework, trials in by_framework(rows).items()}
-    names = list(dict.fromkeys(stage for cost in costs.values() for stage in cost))
-    sizes = {label_of(n): np.array([cost.get(n, 0.0) for cost in costs.values()]) for n in names}
-    hues = [colour(index + 3) for index in range(len(names))]
-    figure = new_figure(9.6, 1.9 + 0.62 * len(costs))
-    axes = figure.subplots()
-    totals = stacked_bars(axes, sizes, hues)
-    longest = float(totals.max(initial=0.0)) or 1.0
-    for bars, hue in zip(cast(list[BarContainer], axes.containers), hues, strict=True):
-        texts = [f"{bar.get_width():.0f}" if bar.get_width() > 0.05 * longest else "" for bar in bars]
-        ink = "white" if hue in (PALETTE[0], PALETTE[6]) else "#111111"  # on dark bars
-        axes.bar_label(bars, texts, label_type="center", fontsize=TICK_SIZE, color=ink)
-    for place, total in enumerate(totals):
-        pace = f", {1000 / total:.1f}× real time" if total > 0 else ""
-        axes.text(total, place, f"  {total:.0f} ms{pace}", va="center", fontsize=LABEL_SIZE)
-    label_axes(axes, "", "computing time [ms per simulated second]", "")
-    axes.set_yticks(range(len(costs)), [framework_name(f) for f in costs], fontsize=LABEL_SIZE)
-    axes.set_xlim(0, 1.3 * longest)
-    legend_below(figure, max_columns=7)
-    figure_title(figure, "Computing time per simulated second")
-    return figure
-
-
 def _by_seed(trials: Rows, measure: _Measure) -> dict[Any, float | None]:
     """Returns the value of each seed; None if there is none, or none to take a ratio of."""
     values: dict[Any, float | None] = {}
@@ -250,12 +212,3 @@ def _log_ticks(axes: Axes, text: Callable[[float], str]) -> None:
 def _name_places(axes: Axes, names: Sequence[str]) -> None:
     axes.set_xticks(range(len(names)), names, fontsize=TICK_SIZE)
     axes.set_xlim(-0.6, len(names) - 0.4)
-
-
-def _milliseconds(trials: Rows) -> dict[str, float]:
-    """Returns the computing time of each stage per simulated second."""
-    seconds = sum(row["times"][-1] for row in trials)
-    names = dict.fromkeys(name for row in trials for name in row["stage_seconds"])
-    return {
-        name: 1000 * sum(row["stage_seconds"].get(name, 0.0) for row in trials) / seconds for name in names
-    }

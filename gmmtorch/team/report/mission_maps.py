@@ -7,7 +7,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import torch
@@ -223,22 +224,12 @@ def _draw_ellipses(axes: Axes, snapshot: TeamSnapshot) -> int:
 TIMELINE = "simulated_time"
 
 
-class RecordedMap(NamedTuple):
-    """The map at a time (s): occupied cells, as indices (C, 3) of the lattice, and means (K, 3) and
-    covariances (K, 3, 3) of the mixture, metres; either may be empty."""
-
-    time: float
-    cells: ArrayLike = ()
-    means: ArrayLike = ()
-    covariances: ArrayLike = ()
-
-
 def record_rerun(
     path: str | Path,
     trajectories: Sequence[ArrayLike],
     *,
     period: float = 1.0,
-    maps: Sequence[RecordedMap] = (),
+    maps: Mapping[float, Mapping[str, ArrayLike]] = MappingProxyType({}),
     resolution: float = 0.2,
     row: Mapping[str, Any] | None = None,
 ) -> Path:
@@ -248,7 +239,9 @@ def record_rerun(
     and curves of entropy and bytes.
 
     path: file name that ends in .rrd. trajectories: poses (T, ≥ 3) of each robot, world metres. period:
-    seconds between poses. maps: maps at several times, in any order. resolution: side (m) of the maps' cells.
+    seconds between poses. maps: by time (s), in any order, "cells", the occupied ones as indices (C, 3) of
+    the lattice, and perhaps "means" (K, 3) and "covariances" (K, 3, 3) of the mixture, metres.
+    resolution: side (m) of the maps' cells.
     row: explore row of `results.json` with the curves.
 
     Raises `GmmTorchError`: rerun is not installed, or older than 0.23; `InvalidArgumentError`: another
@@ -268,9 +261,9 @@ def record_rerun(
             stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
             for robot, trajectory in enumerate(trajectories):
                 _log_robot(rerun, stream, robot, as_array(trajectory), period)
-            for recorded in sorted(maps, key=lambda recorded: recorded.time):
-                stream.set_time(TIMELINE, duration=float(recorded.time))
-                _log_map(rerun, stream, recorded, resolution)
+            for time in sorted(maps):
+                stream.set_time(TIMELINE, duration=float(time))
+                _log_map(rerun, stream, maps[time], resolution)
             if row is not None:
                 _log_curves(rerun, stream, row)
             stream.flush()
@@ -309,15 +302,15 @@ def _log_robot(rerun: Any, stream: Any, robot: int, poses: np.ndarray, period: f
             stream.log(f"{name}/heading", rerun.Arrows3D(origins=[pose[:3]], vectors=[ahead], colors=[hue]))
 
 
-def _log_map(rerun: Any, stream: Any, recorded: RecordedMap, resolution: float) -> None:
-    cells = as_array(recorded.cells).reshape(-1, 3)
+def _log_map(rerun: Any, stream: Any, recorded: Mapping[str, ArrayLike], resolution: float) -> None:
+    cells = as_array(recorded["cells"]).reshape(-1, 3)
     centres = (cells + 0.5) * resolution
     half = np.full((len(cells), 3), resolution / 2)
     boxes = rerun.Boxes3D(centers=centres, half_sizes=half, colors=_shades(centres))
     stream.log("world/cells", boxes)
     means, covariances = checked_components(
-        torch.as_tensor(recorded.means).reshape(-1, 3),
-        torch.as_tensor(recorded.covariances).reshape(-1, 3, 3),
+        torch.as_tensor(recorded.get("means", ())).reshape(-1, 3),
+        torch.as_tensor(recorded.get("covariances", ())).reshape(-1, 3, 3),
     )
     deviations, directions = principal_axes(covariances.cpu())
     ellipsoids = rerun.Ellipsoids3D(

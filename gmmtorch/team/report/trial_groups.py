@@ -85,17 +85,11 @@ def by_variant(rows: Rows, otherwise: str = "planner") -> dict[str, list[Mapping
     fields = differing(rows) or [otherwise]
     groups: dict[str, list[Mapping[str, Any]]] = {}
     for row in rows:
-        named = named_fields(row, rows[0], fields) or fields
+        is_thesis = row.get("framework") == "gmm_thesis"
+        implied = {field for field in THESIS if is_thesis or row.get(field) == rows[0].get(field)}
+        named = [field for field in fields if field not in implied] or fields
         groups.setdefault(_variant_name(row, named), []).append(row)
     return groups
-
-
-def named_fields(row: Mapping[str, Any], first: Mapping[str, Any], fields: Sequence[str]) -> list[str]:
-    """Returns the `fields` that name the variant of a row: without options of `THESIS` that are as in the
-    first row, or that the framework implies."""
-    is_thesis = row.get("framework") == "gmm_thesis"
-    implied = {field for field in THESIS if is_thesis or row.get(field) == first.get(field)}
-    return [field for field in fields if field not in implied]
 
 
 def _variant_name(row: Mapping[str, Any], fields: Sequence[str]) -> str:
@@ -363,32 +357,17 @@ _SERIES = (
 def write_exploration_board(board: Board, rows: Rows) -> None:
     """Writes trials to one TensorBoard run.
 
-    Tags name the framework, the options in which rows differ, and the seed. Each trial has its entropy (bits,
-    and as a share of the observable), the entropies of its robots, cumulative bytes and the share of missing
-    records over simulated seconds, and every number of the row at the end.
+    Tags name the variant and the seed. Each trial has its entropy (bits, and as a share of the observable),
+    the entropies of its robots, cumulative bytes and the share of missing records over simulated seconds, and
+    every number of the row at the end.
 
     board: the run; the caller closes it. rows: explore rows of `results.json`.
     """
-    fields = differing(rows, without=["framework"])
-    for row in rows:
-        tag = f"{row['framework']}/{_variant(row, named_fields(row, rows[0], fields))}seed_{row['seed']}"
-        _write_series(board, row, tag)
-        board.scalars(row, tag, step=int(row["times"][-1]))
-
-
-def _variant(row: Mapping[str, Any], fields: Sequence[str]) -> str:
-    """Returns each field with its value as part of a tag: planner_mcts_loss_0.3/; "" without fields."""
-    parts = [f"{field}_{_short(row.get(field))}" for field in fields]
-    return "_".join(parts) + "/" if parts else ""
-
-
-def _short(value: Any) -> str:
-    """Returns a value as part of a tag; partitions as times and groups: 60-120_0_1.2."""
-    if not isinstance(value, list):
-        return str(value)
-    cuts = [(f"{cut['begin']:g}-{cut['end']:g}", cut["groups"]) for cut in value]
-    names = ["_".join([span, *(".".join(map(str, group)) for group in groups)]) for span, groups in cuts]
-    return "_".join(names) or "none"
+    for name, group in by_variant(rows, otherwise="framework").items():
+        for row in group:
+            tag = f"{name.replace('/', ' per ')}/seed_{row['seed']}"  # a slash begins a part of a tag
+            _write_series(board, row, tag)
+            board.scalars(row, tag, step=int(row["times"][-1]))
 
 
 def _write_series(board: Board, row: Mapping[str, Any], tag: str) -> None:

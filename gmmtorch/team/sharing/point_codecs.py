@@ -1,25 +1,22 @@
 """Point codecs: other ways to send the novel points of a frame, for comparison with mixtures.
 
-Each codec encodes the bytes and is as favourable to the points as possible: the order of the points is free,
-coordinates are relative to the lowest corner of the set, there is no container and no checksum, and the
-compression level is the strongest. Fields that every message has (robot, frame, sensor origin, no-return
-beams) are left out.
+Each codec is as favourable to the points as possible; docs/messages.md describes them.
 """
 
 from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_number
 from gmmtorch.mapping import BitReader, BitWriter, Ints, unzigzag, zigzag
 from gmmtorch.occupancy import check_resolution
 from gmmtorch.optional_packages import needs_extra
@@ -185,18 +182,8 @@ _DRACO_LEVEL = 10  # the strongest
 _DEEPEST = (1 << 16) - 1
 
 
-class PointCodec(Protocol):
-    """Encodes a set of points as bytes, and decodes it."""
-
-    name: ClassVar[str]
-
-    def encode(self, points: Tensor) -> bytes:
-        """Encode points (N, 3), metres. Raises `InvalidArgumentError` for points that cannot be stored."""
-        ...
-
-    def decode(self, data: bytes) -> Tensor:
-        """Decode to points (M, 3), float64, in any order. Raises `DataError` for invalid bytes."""
-        ...
+# `encode` makes bytes of points (N, 3), metres; raises `InvalidArgumentError` for those that it cannot store.
+# `decode` returns points (M, 3), float64, in any order; raises `DataError` for invalid bytes.
 
 
 @dataclass(frozen=True)
@@ -299,8 +286,7 @@ class Draco:
     name: ClassVar[str] = "draco"
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.error) and self.error > 0):
-            raise InvalidArgumentError(f"error={self.error} must be a root mean square above zero metres.")
+        check_number("error", self.error, above=True)
 
     def encode(self, points: Tensor) -> bytes:
         rows = checked_points(points)
@@ -344,8 +330,7 @@ class DepthImage:
     name: ClassVar[str] = "depth_image"
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.step) and self.step > 0):
-            raise InvalidArgumentError(f"step={self.step} must be above zero metres.")
+        check_number("step", self.step, above=True)
 
     @property
     def _per_metre(self) -> float:
@@ -384,17 +369,17 @@ class DepthImage:
         return torch.from_numpy(steps.reshape(int(height), int(width)) / self._per_metre)
 
 
+PointCodec = RawPoints | QuantizedPoints | Octree | Draco
+
+
 def point_codec(name: str, resolution: float, target_error: float) -> PointCodec:
     """The codec with this name; `resolution` (m) is the cell size, `target_error` (m, RMS) is for Draco."""
-    makers: dict[str, Callable[[], PointCodec]] = {
-        "raw": RawPoints,
-        "quantized": lambda: QuantizedPoints(resolution),
-        "octree": lambda: Octree(resolution),
-        "draco": lambda: Draco(target_error),
-    }
-    if name not in makers:
-        raise InvalidArgumentError(f"name={name!r} is not a point codec; known are {', '.join(makers)}.")
-    return makers[name]()
+    check_choice("name", name, POINT_CODECS)
+    if name == "raw":
+        return RawPoints()
+    if name == "draco":
+        return Draco(target_error)
+    return Octree(resolution) if name == "octree" else QuantizedPoints(resolution)
 
 
 def bytes_of_points(

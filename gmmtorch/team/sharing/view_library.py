@@ -91,12 +91,8 @@ class ViewLibrary:
     """Metres between views of one direction, at least."""
 
     def __init__(self, robot: int, *, incarnation: int = 0) -> None:
-        for name, number, most in (
-            ("robot", robot, LARGEST_ROBOT),
-            ("incarnation", incarnation, LARGEST_INCARNATION),
-        ):
-            if check_whole(name, number, 0) > most:
-                raise InvalidArgumentError(f"{name}={number} must be at most {most}.")
+        check_whole("robot", robot, 0, LARGEST_ROBOT)
+        check_whole("incarnation", incarnation, 0, LARGEST_INCARNATION)
         self.refused: Counter[str] = Counter()
         self.version = 0
         self._robot, self._first = robot, first_key(robot, incarnation)
@@ -117,11 +113,17 @@ class ViewLibrary:
         """All views, by key."""
         if self._cached is None:
             keys = sorted(self._views)
-            views = [self._views[key] for key in keys]
-            poses = torch.tensor([view.pose for view in views], dtype=torch.float64).reshape(-1, 4)
-            values = torch.tensor([view.value for view in views], dtype=torch.float64)
-            self._cached = Candidates(keys, poses, values)
+            self._cached = Candidates(keys, *self._tensors(keys)[:2])
         return self._cached
+
+    def _tensors(self, keys: list[int]) -> tuple[Tensor, Tensor, Tensor]:
+        """Poses (V, 4), values (V,) and stamps (V,) of views."""
+        views = [self._views[key] for key in keys]
+        poses, values, stamps = (
+            torch.tensor([getattr(view, name) for view in views], dtype=torch.float64)
+            for name in ("pose", "value", "stamp")
+        )
+        return poses.reshape(-1, 4), values, stamps
 
     # -- changes made here ------------------------------------------------------------------------
 
@@ -270,14 +272,7 @@ class ViewLibrary:
         return True
 
     def _message(self, keys: list[int], removed: Intervals) -> ViewsMessage:
-        views = [self._views[key] for key in keys]
-        return ViewsMessage(
-            ids=ids_of(np.array(keys, np.int64)),
-            poses=torch.tensor([view.pose for view in views], dtype=torch.float64).reshape(-1, 4),
-            values=torch.tensor([view.value for view in views], dtype=torch.float64),
-            stamps=torch.tensor([view.stamp for view in views], dtype=torch.float64),
-            removed=removed,
-        )
+        return ViewsMessage(ids_of(np.array(keys, np.int64)), *self._tensors(keys), removed)
 
     def _repeated(self, now: float) -> list[int]:
         """The keys to repeat, the longest unheard first. The finder waits least."""

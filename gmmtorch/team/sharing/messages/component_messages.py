@@ -45,6 +45,7 @@ from gmmtorch.team.sharing.messages.datagrams import (
     check_codec,
     check_ids,
     check_places,
+    check_range,
     id_order,
     make_datagram,
     read_ids,
@@ -252,11 +253,7 @@ def _check_quantized(values: Quantized) -> None:
 def _check_range(means: Tensor, origins: Tensor, ids: Tensor, farthest: float = FARTHEST) -> None:
     check_places("means", means, farthest)
     check_places("origins", origins, farthest)
-    if len(ids) and not 0 <= int(ids.min()) <= int(ids.max()) <= LARGEST_NUMBER:
-        raise InvalidArgumentError(
-            f"ids reach from {int(ids.min())} to {int(ids.max())}; robots and numbers go from 0 to "
-            f"{LARGEST_NUMBER}."
-        )
+    check_range("ids", ids)
 
 
 def _checked(components: Components, farthest: float = FARTHEST) -> Components:

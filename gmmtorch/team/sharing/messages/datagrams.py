@@ -155,14 +155,19 @@ def check_ids(name: str, ids: Tensor) -> Tensor:
     """The ids (J, 2); raises `InvalidArgumentError` unless they are int64, in range and distinct."""
     if ids.shape[1:] != (2,) or ids.dtype != torch.int64:
         raise InvalidArgumentError(f"{name} is {tuple(ids.shape)} of {ids.dtype}; expected (J, 2) of int64.")
-    if len(ids) and not (int(ids.min()) >= 0 and int(ids.max()) <= LARGEST_NUMBER):
+    check_range(name, ids)
+    if len(torch.unique(ids, dim=0)) != len(ids):
+        raise InvalidArgumentError(f"{name} holds the same (robot, number) twice; give each once.")
+    return ids
+
+
+def check_range(name: str, ids: Tensor) -> None:
+    """Raise `InvalidArgumentError` unless robots and numbers (J, 2) are in range."""
+    if len(ids) and not 0 <= int(ids.min()) <= int(ids.max()) <= LARGEST_NUMBER:
         raise InvalidArgumentError(
             f"{name} reach from {int(ids.min())} to {int(ids.max())}; robots and numbers go from 0 to "
             f"{LARGEST_NUMBER}."
         )
-    if len(torch.unique(ids, dim=0)) != len(ids):
-        raise InvalidArgumentError(f"{name} holds the same (robot, number) twice; give each once.")
-    return ids
 
 
 def id_order(ids: Tensor) -> Ints:

@@ -19,7 +19,6 @@ from gmmtorch.mapping import (
     ids_of_batch,
 )
 from gmmtorch.occupancy import N_BYTES, Calibration
-from gmmtorch.team.sharing.messages.component_messages import counts_of
 from gmmtorch.team.sharing.messages.datagrams import (
     FARTHEST,
     MAX_BYTES,
@@ -88,11 +87,6 @@ class CountersMessage:
     key: int
     components: Ints
     steps: Ints
-
-    @property
-    def points(self) -> np.ndarray:
-        """(J,)"""
-        return counts_of(self.steps)
 
 
 @dataclass(frozen=True, eq=False)

@@ -320,9 +320,6 @@ class Frames:
         self._anchors = {record.anchor for record in self._latest.values()}
         self._placed: dict[int, Placement] = {}
 
-    def __len__(self) -> int:
-        return len(self._latest)
-
     def place(self, frame: int) -> Placement:
         """Where the frame of an author is."""
         if frame not in self._placed:

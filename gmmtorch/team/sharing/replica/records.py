@@ -321,10 +321,6 @@ class Records:
         """Supersessions whose successors are all held."""
         return [record for record in self.of(SupersessionMessage) if record.key not in self._waiting]
 
-    def live(self) -> Intervals:
-        """Keys of the records that count."""
-        return self.held - self.dead
-
     @property
     def root(self) -> int:
         """The root of the author's frame."""

@@ -9,12 +9,11 @@ import threading
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterable, Sequence
-from types import TracebackType
 from typing import Any, Self
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError, check_whole
 from gmmtorch.team.sharing.transport.security import Opener, Sealer, TeamKey
-from gmmtorch.team.sharing.transport.simulated_network import Traffic
+from gmmtorch.team.sharing.transport.simulated_network import Traffic, sum_of
 
 MAX_WAITING = 4096
 """Datagrams in the queue; of more, the oldest are dropped."""
@@ -63,11 +62,11 @@ class FramedTransport(ABC):
         wait: datagrams that the network does not take at once are lost."""
         self._check("sender", sender)
         frames = [self._sealer.seal(datagram) for datagram in datagrams]
-        carried = _sum(*(self._carry(frame, kind) for frame in frames))
+        carried = sum_of(*(self._carry(frame, kind) for frame in frames))
         said = Traffic(len(frames), sum(map(len, datagrams)))
         with self._lock:
-            self.sent = _sum(self.sent, carried)
-            self._broadcast[kind] = _sum(self._broadcast.get(kind, Traffic()), said)
+            self.sent = sum_of(self.sent, carried)
+            self._broadcast[kind] = sum_of(self._broadcast.get(kind, Traffic()), said)
 
     def deliver(self, robot: int, now: float) -> list[tuple[int, bytes]]:
         """(sender, datagram) in the order of arrival, at most `max_waiting`; see `Transport`. Does not
@@ -106,7 +105,7 @@ class FramedTransport(ABC):
         if sender not in (None, self.robot):
             return Traffic()
         with self._lock:
-            return _sum(*(traffic for what, traffic in self._broadcast.items() if kind in (None, what)))
+            return sum_of(*(traffic for what, traffic in self._broadcast.items() if kind in (None, what)))
 
     @property
     def wire_bytes(self) -> int:
@@ -163,9 +162,7 @@ class FramedTransport(ABC):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     # -- inside --------------------------------------------------------------------------------------------
@@ -183,7 +180,7 @@ class FramedTransport(ABC):
         """Open a received frame of any bytes, and append its datagram to the queue. For one thread."""
         opened = self._opener.open(frame, source)
         with self._lock:
-            self.received = _sum(self.received, Traffic(1, len(frame)))
+            self.received = sum_of(self.received, Traffic(1, len(frame)))
             if opened is not None and self._random.random() < self._loss:
                 self.n_lost += 1
             elif opened is not None:
@@ -198,7 +195,3 @@ class FramedTransport(ABC):
             self.failures[name] = n = self.failures.get(name, 0) + 1
         if n == 1:
             _log.warning("Robot %d lost a datagram %s: %s (%s).", self.robot, direction, message, name)
-
-
-def _sum(*traffic: Traffic) -> Traffic:
-    return Traffic(sum(t.datagrams for t in traffic), sum(t.bytes for t in traffic))

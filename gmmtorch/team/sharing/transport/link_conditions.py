@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 import numbers
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gmmtorch.declarations import option
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import InvalidArgumentError, check_number
 
 if TYPE_CHECKING:
     import torch
@@ -35,23 +35,20 @@ class Partition(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class LinkConditions:
-    """Conditions of all links of a network. Raises `InvalidArgumentError` for values out of range."""
+    """Conditions of all links of a network. Raises `InvalidArgumentError` for values out of range.
 
-    latency: float = option(
-        0.05, "seconds from the end of transmission to arrival, at least", "network.delay"
-    )
-    jitter: float = option(
-        0.0,
-        "mean (s) of an exponential delay that is added for each receiver and each copy; reorders datagrams",
-        "network.jitter",
-    )
+    latency: seconds from the end of transmission to arrival, at least. jitter: mean (s) of an exponential
+    delay that is added for each receiver and each copy; it reorders datagrams. duplication: share of the
+    received datagrams that arrive twice.
+    """
+
+    latency: float = 0.05
+    jitter: float = 0.0
     bandwidth: float | None = option(
         None, "bytes per second that each robot can send; null: no limit", "network.bandwidth"
     )
     loss: float = option(0.0, "share of the datagrams that each receiver loses, [0, 1)", "network.loss")
-    duplication: float = option(
-        0.0, "share of the received datagrams that arrive twice, [0, 1]", "network.duplication"
-    )
+    duplication: float = 0.0
     reach: float | None = option(
         None, "largest distance (m) between two robots that communicate; null: any", "network.reach"
     )
@@ -62,13 +59,11 @@ class LinkConditions:
     )
 
     def __post_init__(self) -> None:
-        for field, (is_valid, requirement) in _REQUIREMENTS.items():
+        for field, largest in _LARGEST.items():
             value = getattr(self, field)
-            if value is None and field in _OPTIONAL:
-                continue
-            if not (_is_number(value) and is_valid(value)):
-                raise InvalidArgumentError(f"{field}={value!r} must be {requirement}.")
-            object.__setattr__(self, field, float(value))
+            if value is not None or field not in _OPTIONAL:
+                checked = check_number(field, value, largest, above=field in _OPTIONAL)
+                object.__setattr__(self, field, checked)
         if not isinstance(self.partitions, Sequence):
             raise InvalidArgumentError(f"partitions={self.partitions!r} must be a list of partitions.")
         partitions = tuple(_partition(f"partitions[{i}]", value) for i, value in enumerate(self.partitions))
@@ -119,14 +114,8 @@ class LinkConditions:
 
 
 _OPTIONAL = ("bandwidth", "reach")  # None: no limit
-_REQUIREMENTS: dict[str, tuple[Callable[[float], bool], str]] = {
-    "latency": (lambda s: 0 <= s < math.inf, "a time of zero seconds or more, and finite"),
-    "jitter": (lambda s: 0 <= s < math.inf, "a mean time of zero seconds or more, and finite"),
-    "bandwidth": (lambda rate: 0 < rate < math.inf, "above zero bytes per second, and finite, or None"),
-    "loss": (lambda share: 0 <= share < 1, "a share of the datagrams in [0, 1)"),
-    "duplication": (lambda share: 0 <= share <= 1, "a share of the datagrams in [0, 1]"),
-    "reach": (lambda metres: 0 < metres < math.inf, "above zero metres, and finite, or None"),
-}
+_LARGEST = dict.fromkeys(("latency", "jitter", *_OPTIONAL), math.inf)
+_LARGEST |= {"loss": math.nextafter(1, 0), "duplication": 1.0}  # a network that loses all is none
 
 
 def _partition(name: str, value: Any) -> Partition:
@@ -155,11 +144,8 @@ def _are_groups(value: Any) -> bool:
     if not (_is_list(value) and value and all(_is_list(group) and group for group in value)):
         return False
     robots: list[Any] = [robot for group in value for robot in group]
-    return all(map(_is_robot, robots)) and len(set(robots)) == len(robots)
-
-
-def _is_robot(value: Any) -> bool:
-    return _is_number(value) and isinstance(value, numbers.Integral) and int(value) >= 0
+    are_ids = all(_is_number(one) and isinstance(one, numbers.Integral) and int(one) >= 0 for one in robots)
+    return are_ids and len(set(robots)) == len(robots)
 
 
 def _is_list(value: Any) -> bool:

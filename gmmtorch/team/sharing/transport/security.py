@@ -6,7 +6,6 @@ byte by byte, and what it protects from.
 
 from __future__ import annotations
 
-import hmac
 import logging
 import os
 import secrets
@@ -24,7 +23,6 @@ from gmmtorch.errors import (
     GmmTorchError,
     InvalidArgumentError,
     MissingDataError,
-    OutputError,
     check_whole,
 )
 from gmmtorch.optional_packages import needs_extra
@@ -98,26 +96,6 @@ class TeamKey:
         except ValueError:
             raise DataError(f"{what} has characters that are no hexadecimal digits. {_HELP}") from None
 
-    def save(self, path: str | Path) -> Path:
-        """Write a file that `from_file` reads. Raises `OutputError` if the file exists already."""
-        path = Path(path)
-        try:
-            handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-        except OSError as error:
-            raise OutputError(f"The team key {path} cannot be written: {error.strerror}.") from None
-        try:
-            with os.fdopen(handle, "w") as file:
-                file.write(self._data.hex() + "\n")
-        except OSError as error:
-            path.unlink(missing_ok=True)
-            raise OutputError(f"The team key {path} cannot be written: {error.strerror}.") from None
-        return path
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, TeamKey) and hmac.compare_digest(self._data, other._data)
-
-    __hash__ = None  # type: ignore[assignment]
-
     def __repr__(self) -> str:
         return "TeamKey(…)"
 
@@ -190,9 +168,6 @@ class Sessions:
         self._speakers: dict[int, _Speaker] = {}
         self.duplicates: dict[int, str] = {}
 
-    def __len__(self) -> int:
-        return len(self._windows)
-
     def refusal(self, sender: int, session: bytes, number: int, source: str = "") -> str | None:
         """Why an authentic datagram is refused: 'replayed', 'duplicate_id', or None if it is accepted.
 
@@ -258,9 +233,6 @@ class OwnIdWatch:
         self._clock = clock
         self._sessions: OrderedDict[bytes, _Continuing] = OrderedDict()
 
-    def __len__(self) -> int:
-        return len(self._sessions)
-
     def detects(self, session: bytes, number: int) -> bool:
         """Whether another robot uses the id, after an authentic datagram of another session arrived."""
         now = self._clock()
@@ -275,8 +247,6 @@ class OwnIdWatch:
         heard.highest, heard.last, heard.n_fresh = number, now, heard.n_fresh + 1
         return heard.n_fresh >= FRESH_FRAMES and now - heard.since >= FRESH_SECONDS
 
-
-__all__ = ["REFUSALS", "Opener", "Sealer", "TeamKey"]
 
 FRAME_VERSION = 1
 MAX_SENDER = (1 << 16) - 1

@@ -47,6 +47,10 @@ class Traffic(NamedTuple):
         return self.bytes + HEADER_BYTES * self.datagrams
 
 
+def sum_of(*traffic: Traffic) -> Traffic:
+    return Traffic(sum(t.datagrams for t in traffic), sum(t.bytes for t in traffic))
+
+
 class Reception(NamedTuple):
     """What happened to the datagrams of other robots on the way to a receiver.
 
@@ -123,9 +127,8 @@ class Network:
                 copies = [(end + time, self._n_sent, sender, data) for time in times]
                 self._carry(copies, robot, begin, is_near, is_lost)
             self._n_sent += 1
-        before = self._traffic.get((sender, kind), Traffic())
-        n_bytes = sum(map(len, datagrams))
-        self._traffic[sender, kind] = Traffic(before.datagrams + len(datagrams), before.bytes + n_bytes)
+        sent = Traffic(len(datagrams), sum(map(len, datagrams)))
+        self._traffic[sender, kind] = sum_of(self._traffic.get((sender, kind), Traffic()), sent)
 
     def deliver(self, robot: int, now: float) -> list[tuple[int, bytes]]:
         """(sender, datagram) in the order of arrival, at equal times in that of sending; see `Transport`."""
@@ -145,7 +148,7 @@ class Network:
             for (who, what), traffic in self._traffic.items()
             if sender in (None, who) and kind in (None, what)
         ]
-        return Traffic(sum(t.datagrams for t in chosen), sum(t.bytes for t in chosen))
+        return sum_of(*chosen)
 
     def reception(self, robot: int | None = None) -> Reception:
         """Of the datagrams sent to one robot; or to all, where each broadcast counts for every receiver."""

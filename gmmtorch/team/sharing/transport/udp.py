@@ -269,7 +269,7 @@ def _check_key(name: str, address: Address, key: TeamKey | None, insecure: bool)
     if key is None and not insecure and not host.is_loopback:
         raise InvalidArgumentError(
             f"{name}={str(host)!r} reaches other machines, and there is no key (‹key›=None): give one, "
-            f"take {LOOPBACK}, or set ‹insecure›=True to let anyone read and write."
+            f"or take {LOOPBACK}; in Python, insecure=True lets anyone read and write."
         )
 
 

@@ -25,7 +25,7 @@ _IP_PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws")
 _ADDRESS = re.compile(r"(?:\[([0-9a-fA-F:.]+)\]|([^\s:\[\]]+)):([0-9]{1,5})")
 _LARGEST_MESSAGE = 1 << 16
 """Bytes that Zenoh assembles from parts. Its default would accept a gigabyte from any stranger."""
-_KEY_REMEDY = "give one, or say ‹insecure›=True to let anybody read and write."
+_KEY_REMEDY = "give one; in Python, insecure=True lets anyone read and write."
 _REMEDIES = {
     "in use": "another process has that port. Stop it (`ss -tulpn` shows it), or give another port.",
     "assign requested": "this machine has no such address, or not yet. `ip address` lists those it has; "

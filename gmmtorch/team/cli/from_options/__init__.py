@@ -1,1 +1,0 @@
-"""Networks, missions and robots from the options of a command."""
