@@ -155,8 +155,8 @@ def _climbed(
     limits: tuple[float, int],
 ) -> Registered:
     """The twin of `kernels.fused_registration`."""
-    if by_area:
-        f, g = _by_area(f), _by_area(g)
+    if by_area:  # what a component covers: √(λ₁λ₂) of its largest eigenvalues in 3D, √λ₁ in 2D
+        f, g = (mixture._replace(weights=deviations(mixture)[:, 1:].prod(1)) for mixture in (f, g))
     # Both are centred on their means, so that numbers stay small anywhere in the world.
     (f, here), (g, there) = _centered(f), _centered(g)
     motions = _between(Pose(*starts), here, there)
@@ -211,11 +211,6 @@ def _check_together(source: Parameters, target: Parameters) -> None:
         )
 
 
-def _by_area(mixture: Parameters) -> Parameters:
-    """Weighted by what a component covers, √(λ₁λ₂) of its largest eigenvalues in 3D, √λ₁ in 2D."""
-    return mixture._replace(weights=deviations(mixture)[:, 1:].prod(1))
-
-
 def _centered(mixture: Parameters) -> tuple[Parameters, Tensor]:
     """The mixture, weights adding up to one, about its mean; and the mean (D,)."""
     weights = mixture.weights / mixture.weights.sum()
@@ -253,14 +248,12 @@ def _levels(mixture: Parameters, blurs: list[float]) -> list[Parameters]:
     eye = torch.eye(mixture.means.shape[1]).to(mixture.means)
     levels = []
     for blur in blurs:
-        merged = _merged_in_cells(mixture, blur) if blur > size else mixture
+        merged = mixture
+        if blur > size:
+            cells, labels = torch.unique((mixture.means / blur).floor(), dim=0, return_inverse=True)
+            merged = merge_components(*mixture, labels, len(cells))
         levels.append(merged._replace(covariances=merged.covariances + 0.5 * blur**2 * eye))
     return levels
-
-
-def _merged_in_cells(mixture: Parameters, side: float) -> Parameters:
-    cells, labels = torch.unique((mixture.means / side).floor(), dim=0, return_inverse=True)
-    return merge_components(*mixture, labels, len(cells))
 
 
 # -- motions --------------------------------------------------------------------------------------
@@ -330,17 +323,6 @@ def _doubts(share: list[float], width: float, radius: float, converged: bool) ->
 # -- overlap --------------------------------------------------------------------------------------
 
 
-class Pairs(NamedTuple):
-    """Pairs of components, (P,) each: row of the motion, of the source, of the target."""
-
-    motion: Tensor
-    source: Tensor
-    target: Tensor
-
-    def of(self, kept: Tensor) -> Pairs:
-        return Pairs(*(rows[kept] for rows in self))
-
-
 class Overlap(NamedTuple):
     """Of B motions: log S (B,), −∞ where no pair is near; its gradient (B, F) over F = D + D(D−1)/2 degrees
     of freedom (v, ω); the mean information of a pair (B, F, F), JᵀWJ and ½ tr(W ∂C W ∂C); and the
@@ -359,13 +341,34 @@ class Overlap(NamedTuple):
         return Overlap(*(value[rows] for value in self))
 
 
-def overlap(source: Parameters, target: Parameters, motions: Pose, pairs: Pairs) -> Overlap:
-    """Log score, gradient, information and scatter of each motion, over the given pairs only."""
-    total, first, second, squares = _batched_sums(source, target, motions, pairs)
+def overlap(source: Parameters, target: Parameters, motions: Pose, pairs: Tensor) -> Overlap:
+    """Log score, gradient, information and scatter of each motion, over the given pairs only.
+
+    pairs: (3, P), rows of the motion, of the source's and of the target's component.
+    """
+    n, dim = motions.translation.shape
+    n_free = dim + dim * (dim - 1) // 2
+    lever = torch.einsum("bij,kj->ibk", motions.rotation, source.means).flatten(1)
+    moved = torch.einsum("bij,kjl,bml->imbk", motions.rotation, source.covariances, motions.rotation)
+    moved = moved.flatten(2)
+    there, still = target.means.T, target.covariances.permute(1, 2, 0)
+    # Σ s, Σ s ∂log N, and s times the information and ∂log N ∂log Nᵀ:
+    total = lever.new_zeros(n)
+    first, second, squares = (lever.new_zeros(n, n_free**power) for power in (1, 2, 2))
+    for b, i, j in pairs.split(_CHUNK, dim=1):
+        row = b * len(source.weights) + i
+        shift = motions.translation.T[:, b] - there[:, j]
+        log_density, slope, information = _pair_terms(lever[:, row], shift, moved[..., row], still[..., j])
+        share = source.weights[i] * target.weights[j] * torch.exp(log_density)
+        total.index_add_(0, b, share)
+        weighted = share * slope
+        first.index_add_(0, b, weighted.T)
+        second.index_add_(0, b, (share * information).flatten(0, 1).T)
+        squares.index_add_(0, b, (weighted[:, None] * slope).flatten(0, 1).T)
     scale = total.clamp_min(1e-300)[:, None]
     gradient = first / scale
-    scatter = squares / scale[:, None] - gradient[:, :, None] * gradient[:, None]
-    return Overlap(total.log(), gradient, second / scale[:, None], scatter)
+    scatter = (squares / scale).view(n, n_free, n_free) - gradient[:, :, None] * gradient[:, None]
+    return Overlap(total.log(), gradient, (second / scale).view(n, n_free, n_free), scatter)
 
 
 class Ascent:
@@ -404,8 +407,8 @@ class Ascent:
             if self._strayed(trial, listed):
                 rows = active.nonzero().squeeze(1)
                 listed, pairs = trial, self.pairs(trial[rows])
-                pairs = pairs._replace(motion=rows[pairs.motion])
-            tried = self.evaluate(trial, pairs.of(active[pairs.motion]))
+                pairs = torch.cat([rows[pairs[:1]], pairs[1:]])
+            tried = self.evaluate(trial, pairs[:, active[pairs[0]]])
             better = active & (tried.log_score > state.log_score)
             active &= (steps / self.scale).norm(dim=1) > tolerance
             motions = Pose(*chosen_rows(better, trial.parts, motions.parts))
@@ -413,7 +416,7 @@ class Ascent:
             share = torch.where(better, (2 * share).clamp_max(1), share / 4)
         return motions, state, ~active & torch.isfinite(state.log_score)
 
-    def evaluate(self, motions: Pose, pairs: Pairs) -> Overlap:
+    def evaluate(self, motions: Pose, pairs: Tensor) -> Overlap:
         self.n_evaluated += 1
         return overlap(self.source, self.target, motions, pairs)
 
@@ -439,8 +442,8 @@ class Ascent:
         length = steps.norm(dim=1, keepdim=True)
         return steps * (longest / length.clamp_min(longest)) * self.scale
 
-    def pairs(self, motions: Pose) -> Pairs:
-        """Pairs within the cutoff now, or after components have moved by the slack."""
+    def pairs(self, motions: Pose) -> Tensor:
+        """Pairs (3, P) within the cutoff now, or after components have moved by the slack."""
         k, n = len(self.source.weights), len(motions)
         moved = motions.apply(self.source.means)
         shapes = motions.rotation[:, None] @ self.source.covariances @ motions.rotation[:, None].mT
@@ -456,7 +459,7 @@ class Ascent:
             inside = (offset.mT @ torch.linalg.solve(near, offset))[:, 0, 0] <= 1
             found.append(torch.stack([point[inside], center[inside]]))
         point, center = torch.cat(found, 1)
-        return Pairs(point // k, point % k, center)
+        return torch.stack([point // k, point % k, center])
 
     def _strayed(self, motions: Pose, listed: Pose) -> bool:
         """Whether a component may have moved by more than the slack since pairs were listed."""
@@ -471,32 +474,6 @@ def log_self_overlap(mixture: Parameters) -> float:
     still = Pose.identity(mixture.means.shape[1], 1, device=mixture.means.device)
     ascent = Ascent(mixture, mixture, 1.0)
     return float(ascent.evaluate(still, ascent.pairs(still)).log_score[0])
-
-
-def _batched_sums(
-    source: Parameters, target: Parameters, motions: Pose, pairs: Pairs
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Sums over the pairs of each motion: Σ s, Σ s ∂log N, and s times the information and ∂log N ∂log Nᵀ."""
-    n, dim = motions.translation.shape
-    n_free = dim + dim * (dim - 1) // 2
-    lever = torch.einsum("bij,kj->ibk", motions.rotation, source.means).flatten(1)
-    moved = torch.einsum("bij,kjl,bml->imbk", motions.rotation, source.covariances, motions.rotation)
-    moved = moved.flatten(2)
-    there, still = target.means.T, target.covariances.permute(1, 2, 0)
-    total = lever.new_zeros(n)
-    first, second, squares = (lever.new_zeros(n, n_free**power) for power in (1, 2, 2))
-    for rows in torch.arange(len(pairs.motion), device=lever.device).split(_CHUNK):
-        b, i, j = pairs.of(rows)
-        row = b * len(source.weights) + i
-        shift = motions.translation.T[:, b] - there[:, j]
-        log_density, slope, information = _pair_terms(lever[:, row], shift, moved[..., row], still[..., j])
-        share = source.weights[i] * target.weights[j] * torch.exp(log_density)
-        total.index_add_(0, b, share)
-        weighted = share * slope
-        first.index_add_(0, b, weighted.T)
-        second.index_add_(0, b, (share * information).flatten(0, 1).T)
-        squares.index_add_(0, b, (weighted[:, None] * slope).flatten(0, 1).T)
-    return total, first, second.view(n, n_free, n_free), squares.view(n, n_free, n_free)
 
 
 def _pair_terms(lever: Tensor, shift: Tensor, moved: Tensor, still: Tensor) -> tuple[Tensor, Tensor, Tensor]:

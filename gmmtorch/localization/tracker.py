@@ -153,12 +153,15 @@ class Tracker:
         measured = None if motion is None else measured_motion(motion, self.dim, self._center.device)
         measured = continued(measured, self._motion) if isinstance(measured, Tensor) else measured
         predicted = self._predicted(measured)
-        rows = self._thinned(rows[rows.norm(dim=1) > _NEAREST])
+        rows = rows[rows.norm(dim=1) > _NEAREST]
+        drawn = torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))[: self.n_points]
+        rows = rows[drawn.to(rows.device)]
         best: Location | None = None
         searches = self._searches(rows, predicted, measured is not None) if len(rows) else ()
         for level, starts, is_enough in searches:
             found = self._climbed(rows, starts, level)
-            best = found if best is None else _better(best, found)
+            if best is None or (found.found, found.explained) > (best.found, best.explained):
+                best = found
             if best.found and best.explained >= is_enough:
                 break
         best = self._nothing(predicted) if best is None else self._questioned(best, predicted)
@@ -198,7 +201,7 @@ class Tracker:
                 yield _FINE, everywhere(self._places, _BLURS[_FINE]), 0.0
             else:  # from the last level that blurs more than a cell of the raster
                 first = max(sum(blur >= self._raster.cell for blur in _BLURS) - 1, 0)
-                yield first, self._raster.anywhere(rows, _RASTERED).poses, 0.0
+                yield first, self._raster.anywhere(rows, _RASTERED)[0], 0.0
 
     @functools.cached_property
     def _raster(self) -> PoseSearch | None:
@@ -206,10 +209,6 @@ class Tracker:
         if self.dim == 3 or self._seen is None:
             return None
         return PoseSearch.of_map(self._seen, self._center)
-
-    def _thinned(self, rows: Tensor) -> Tensor:
-        draw = torch.Generator().manual_seed(0)
-        return rows[torch.randperm(len(rows), generator=draw)[: self.n_points].to(rows.device)]
 
     def _climbed(self, rows: Tensor, starts: Pose, first: int) -> Location:
         """The location that the levels from `first` on reach from the best of the starts."""
@@ -295,10 +294,6 @@ class Tracker:
         self._last, self.n_lost, self._explained = now, 0, location.explained
 
 
-def _better(some: Location, other: Location) -> Location:
-    return max(some, other, key=lambda location: (location.found, location.explained))
-
-
 def _places(surfaces: Components, center: Tensor) -> Tensor:
     """Places (S, D) from which the map was seen, one in each cell of `_PLACES` metres, about `center`."""
     origins = surfaces.origins.to(center) - center
@@ -374,15 +369,17 @@ def clock_faults(times: Tensor) -> list[tuple[int, str]]:
         return []
     usual = float(steps[steps > 0].median()) if bool((steps > 0).any()) else 0.0
     faults = ((steps < 0) | (steps > _GAP * usual)).nonzero()[:, 0] + 1
-    return [(scan, _fault(float(steps[scan - 1]), usual)) for scan in faults.tolist()]
-
-
-def _fault(step: float, usual: float) -> str:
-    if step < 0:
-        return (
-            f"the clock goes back by {-step:.3g} s; readers of the trajectory drop the poses of one side: "
-            "correct the times of the recording (a bag: clock=received)"
+    found = []
+    for scan in faults.tolist():
+        step = float(steps[scan - 1])
+        fault = (
+            f"{step:.3g} s after the scan before it, usually {usual:.2g} s: scans are missing, or the clock "
+            "jumps"
         )
-    return (
-        f"{step:.3g} s after the scan before it, usually {usual:.2g} s: scans are missing, or the clock jumps"
-    )
+        if step < 0:
+            fault = (
+                f"the clock goes back by {-step:.3g} s; readers of the trajectory drop the poses of one "
+                "side: correct the times of the recording (a bag: clock=received)"
+            )
+        found.append((scan, fault))
+    return found
