@@ -11,10 +11,12 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, MemoryLimitError, check_choice, check_number, check_whole
 from gmmtorch.experiments.baselines.hilbert_features import (
-    FourierFeatures,
+    DenseFeatures,
     LatticeFeatures,
-    NystroemFeatures,
     check_lattice,
+    fourier_features,
+    nystroem_centers,
+    nystroem_features,
 )
 from gmmtorch.experiments.baselines.logistic_regression import (
     Covariance,
@@ -29,7 +31,7 @@ from gmmtorch.files import require
 from gmmtorch.occupancy import TensorFileMap, check_length, optional_length
 from gmmtorch.scan import Scan
 
-Features = FourierFeatures | NystroemFeatures | LatticeFeatures
+Features = DenseFeatures | LatticeFeatures
 FeatureKind = Literal["sparse", "nystroem", "fourier"]
 _LENGTHS: dict[str, float] = {"sparse": 0.3, "nystroem": 0.5, "fourier": 0.5}
 
@@ -169,11 +171,12 @@ class HilbertMap(TensorFileMap):
             return lattice, lattice.table.values[:, 0]
         if self._initial is not None:
             return self._initial
-        made: FourierFeatures | NystroemFeatures
         if self.features == "nystroem":
-            made = NystroemFeatures.of_data(points, self.n_features, self.length, self._anchor, generator)
+            centers = nystroem_centers(points - self._anchor, self.n_features, self.length, generator)
+            made = nystroem_features(centers, self._anchor, self.length)
         else:
-            made = FourierFeatures.drawn(self.n_features, self.length, self._anchor, generator)
+            frequencies = torch.randn(max(1, self.n_features // 2), points.shape[1], generator=generator)
+            made = fourier_features(frequencies.to(points.device) / self.length, self._anchor)
         return made, torch.zeros(made.count, device=points.device)
 
     def _lattice(self, dim: int, device: torch.device) -> LatticeFeatures:
@@ -198,7 +201,7 @@ class HilbertMap(TensorFileMap):
     def _tensors(self) -> dict[str, Tensor]:
         """The features and their weights as float32, without the points."""
         model = self.model()
-        return {} if model is None else {**model[0].tensors(), "weights": model[1]}
+        return {} if model is None else {**model[0].tensors, "weights": model[1]}
 
     def _restore(self, tensors: dict[str, Tensor], path: str | Path) -> None:
         if tensors:
@@ -214,8 +217,10 @@ class HilbertMap(TensorFileMap):
         anchor = require(tensors, "anchor", (self.dim,), torch.float64, path)
         if self.features == "nystroem":
             centers = require(tensors, "centers", (None, self.dim), torch.float32, path)
-            return NystroemFeatures(centers, anchor, self.length)
-        return FourierFeatures(require(tensors, "frequencies", (None, self.dim), torch.float32, path), anchor)
+            return nystroem_features(centers, anchor, self.length)
+        return fourier_features(
+            require(tensors, "frequencies", (None, self.dim), torch.float32, path), anchor
+        )
 
 
 _MAX_FULL = 4096  # most hinges with a full covariance
@@ -366,7 +371,7 @@ class BayesianHilbertMap(TensorFileMap):
     def _tensors(self) -> dict[str, Tensor]:
         """Hinges, means, and precisions or the lower triangle of their Cholesky factor, as float32."""
         mean, added = self._hinges.table.values.unbind(1)
-        tensors = {**self._hinges.tensors(), "means": mean}
+        tensors = {**self._hinges.tensors, "means": mean}
         if self.covariance == "full":
             rows, cols = torch.tril_indices(len(mean), len(mean))
             tensors["factor"] = self._factor[rows, cols]
