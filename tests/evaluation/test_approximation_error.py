@@ -10,7 +10,6 @@ import pytest
 import torch
 from pillar_room import timeless
 
-from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.report.approximation_error_figures import approximation_figures
 from gmmtorch.experiments.studies.approximation_error import (
     Scene,
@@ -138,20 +137,3 @@ def test_every_study_has_a_figure(rows):
         figure.canvas.draw()
         assert figure.get_suptitle()
     assert list(approximation_figures(list(of(rows, "sweep")))) == ["approximation_error_sweep"]
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"dims": (4,)}, "dims=4"),
-        ({"dims": ()}, r"dims=\[\] is empty"),
-        ({"n_pixels": 0}, "n_pixels=0"),
-        ({"n_rays": ()}, r"n_rays=\[\] is empty"),
-        ({"support": float("nan")}, "support=nan"),
-        ({"prior": -1.0}, "prior=-1"),
-        ({"resolution": 0.0}, "resolution=0"),
-    ],
-)
-def test_invalid_options_raise(options, message):
-    with pytest.raises(InvalidArgumentError, match=message):
-        ApproximationErrorStudy(**options)

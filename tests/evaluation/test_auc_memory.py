@@ -7,7 +7,6 @@ from evaluation.pillar_room import room_scans
 from gmmtorch.experiments.evaluation.held_out import Protocol, evaluate
 from gmmtorch.experiments.evaluation.mapping_methods import Form, MapFactory, methods
 from gmmtorch.experiments.studies import map_studies
-from gmmtorch.experiments.studies.map_studies import Sized
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import WindowedRule
 
@@ -21,11 +20,7 @@ def sized_map(n: int) -> MapFactory:
 def test_every_sized_method_has_a_row():
     scans = room_scans(12)
     grid = methods(GaussianMap)["occupancy_grid"]
-    sized = [
-        Sized("point", 4, sized_map(4)),
-        Sized("point", 12, sized_map(12)),
-        Sized("grid", None, grid),
-    ]
+    sized = {("point", 4): sized_map(4), ("point", 12): sized_map(12), ("grid", None): grid}
     counts: list[int] = []
     rows = map_studies.run_auc_memory(
         "room", scans, sized, PROTOCOL, on_rows=lambda rows: counts.append(len(rows))

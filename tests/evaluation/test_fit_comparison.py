@@ -166,7 +166,7 @@ def test_rows_depend_only_on_the_seed(everything):
 
 @pytest.mark.parametrize("method", ESTIMATORS)
 def test_lower_bounds_increase_with_one_per_iteration(method, everything):
-    bounds = everything.outcome.lower_bounds[method]
+    bounds = everything.outcome.mixtures[method].lower_bounds_
     (row,) = (row for row in everything.outcome.rows if row["method"] == method)
     assert len(bounds) == row["n_iterations"] > 1
     assert all(math.isfinite(bound) for bound in bounds)

@@ -202,7 +202,6 @@ def test_chosen_methods_are_known_and_keep_their_order():
         ({"kept": (1.0, 2.0)}, "kept=2"),
         ({"kept": (0.0,)}, "kept=0"),
         ({"test_every": 1}, "test_every=1"),
-        ({"removal": "rays"}, "removal='rays'"),
         ({"free": "behind"}, "free='behind'"),
         ({"pose_noise": (0.1,)}, "pose_noise="),
         ({"pose_noise": (-1.0, 0.0)}, "pose_noise="),

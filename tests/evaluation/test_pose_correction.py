@@ -99,10 +99,3 @@ def test_a_scan_without_points_has_no_components():
 def test_windows_of_several_scans_raise():
     with pytest.raises(InvalidArgumentError, match=r"window=None.*map=per_scan"):
         build_by_scan(GaussianMap(), room_scans(2))
-
-
-def test_a_missing_motion_raises():
-    built = per_scan()
-    born = build_by_scan(built, room_scans(2))
-    with pytest.raises(InvalidArgumentError, match="motions has 1 entries for 2 scans"):
-        correct_poses(built, born, [torch.eye(3, dtype=torch.float64)])

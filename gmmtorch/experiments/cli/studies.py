@@ -27,9 +27,16 @@ from gmmtorch.cli import (
     write_results,
 )
 from gmmtorch.errors import InvalidArgumentError, check_choice
-from gmmtorch.experiments.cli import fit_outputs, methods_of_options
-from gmmtorch.experiments.cli.fits_of_options import fit_data, fit_data_of, fit_options, selected_scans
-from gmmtorch.experiments.evaluation import Form, Protocol, baseline, choose, means
+from gmmtorch.experiments.cli import occupancy_runs
+from gmmtorch.experiments.cli.fit_runs import (
+    fit_data,
+    fit_data_of,
+    fit_options,
+    headline,
+    log_likelihood,
+    selected_scans,
+)
+from gmmtorch.experiments.evaluation import Form, MapFactory, Protocol, baseline, choose, means
 from gmmtorch.experiments.harness import Case
 from gmmtorch.experiments.report import (
     approximation_figures,
@@ -51,13 +58,13 @@ from gmmtorch.experiments.studies import (
     InitializationStudy,
     MapVariantsStudy,
     PoseCorrectionStudy,
-    Railing,
     SensorModelStudy,
-    Sized,
     VarianceThresholdStudy,
     cells_by_setting,
     evaluate_correction,
+    is_of_railing,
     middle,
+    railing_scans,
     run_approximation_error,
     run_auc_memory,
     run_component_count,
@@ -104,7 +111,7 @@ class Setting:
 
     @property
     def protocol(self) -> Protocol:
-        return methods_of_options.protocol_of(self.config)
+        return build(Protocol, self.config, "evaluation")
 
     def study(self, kind: type[T]) -> T:
         """The options of the study."""
@@ -192,8 +199,8 @@ def _fits(
 
     def headed(setting: Setting) -> list[Row]:
         rows = measure(setting)
-        setting.about = fit_outputs.headline(rows)
-        best = max(fit_outputs.log_likelihood(row) for row in shown(rows))
+        setting.about = headline(rows)
+        best = max(log_likelihood(row) for row in shown(rows))
         setting.scores = {"best_log_likelihood": best}
         return rows
 
@@ -231,20 +238,17 @@ FITS = (
 def _auc_memory(setting: Setting) -> list[Row]:
     """Our map and the BGK map at each of their sizes, and `study.others` at their only size."""
     config, protocol, study = setting.config, setting.protocol, setting.study(AucMemoryStudy)
-    sized = [
-        Sized(form, n, Form(map_factory(config, n_components=n), form))
+    sized: dict[tuple[str, int | None], MapFactory] = {
+        (form, n): Form(map_factory(config, n_components=n), form)
         for form in study.forms
         for n in study.n_components
-    ]
-    of_runtime = limits(config)
-    sized += [
-        Sized("bgk_points", n, baseline("bgk_points", of_runtime, max_points=n)) for n in study.bgk_points
-    ]
-    if study.others:
-        others = choose(study.others, methods_of_options.known_methods(config))
-        sized += [Sized(name, None, factory) for name, factory in others.items()]
-    for one in sized:
-        methods_of_options.check_factories({one.method: one.factory}, protocol.resolution[0])
+    }
+    for n in study.bgk_points:
+        sized["bgk_points", n] = baseline("bgk_points", limits(config), max_points=n)
+    for name, factory in choose(study.others, occupancy_runs.known_methods(config)).items():
+        sized[name, None] = factory
+    for (name, _), factory in sized.items():
+        occupancy_runs.check_factories({name: factory}, protocol.resolution[0])
     return run_auc_memory(*setting.scans(), sized, protocol, setting.seed, *setting.callbacks)
 
 
@@ -254,8 +258,8 @@ def _variance_threshold(setting: Setting) -> list[Row]:
     if study.railing is None:
         (name, scans), is_thin = setting.scans(), None
     else:
-        railing = Railing(study.railing)
-        name, scans, is_thin = "railing", railing.scans(study.railing_scans, setting.seed), railing.holds
+        name, scans = "railing", railing_scans(study.railing, study.railing_scans, setting.seed)
+        is_thin = partial(is_of_railing, width=study.railing)
 
     def new_map(n: int) -> GaussianMap:
         return map_factory(setting.config, n_components=n)()

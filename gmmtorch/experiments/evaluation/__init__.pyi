@@ -1,7 +1,6 @@
 from .fits import NO_LIKELIHOODS as NO_LIKELIHOODS
 from .fits import FitData as FitData
 from .fits import FitOutcome as FitOutcome
-from .fits import Split as Split
 from .fits import Views as Views
 from .fits import compare as compare
 from .fits import fit_streamed as fit_streamed
@@ -9,7 +8,6 @@ from .fits import in_use as in_use
 from .fits import means as means
 from .fits import row_of as row_of
 from .fits import split as split
-from .fits import split_data as split_data
 from .fits import split_source as split_source
 from .held_out import Built as Built
 from .held_out import Outcome as Outcome
@@ -27,7 +25,6 @@ from .metrics import separating_threshold as separating_threshold
 from .protocol_options import FitOptions as FitOptions
 from .protocol_options import Protocol as Protocol
 from .protocol_options import check_not_empty as check_not_empty
-from .protocol_options import check_test_every as check_test_every
 from .queries import FREE as FREE
 from .queries import OCCUPIED as OCCUPIED
 from .queries import Queries as Queries

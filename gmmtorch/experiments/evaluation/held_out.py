@@ -91,12 +91,12 @@ def evaluate(
     outcome = Outcome()
     largest = max(protocol.kept)
     for kept in protocol.kept:
-        shown = queries.keep_share(train, kept, protocol.removal, seed)
+        shown = queries.keep_share(train, kept, seed)
         for method, resolution, built, seconds, answer, seen in _built_maps(
             factories, shown, kept, protocol, on_event
         ):
             case = {"dataset": name, "method": method, "resolution": float(resolution)}
-            case |= {"removal": protocol.removal, "kept": float(kept)}
+            case |= {"removal": "beams", "kept": float(kept)}
             effort = {"build_seconds": seconds, "n_train_points": sum(len(scan.points) for scan in shown)}
             made = _score(built, answer, asked[resolution], seen, seed, protocol.unknown, case, effort)
             if protocol.save_map:
@@ -120,7 +120,7 @@ def _built_maps(
         shared = factory.new_map if isinstance(factory, Form) else method
         for resolution in protocol.resolution:
             if shared not in cache:
-                label = f"{made_as}, {kept:.0%} of the {protocol.removal}"
+                label = f"{made_as}, {kept:.0%} of the beams"
                 cache[shared] = _build(factory(resolution), shown, label, resolution, on_event)
             built, seconds, seen = cache[shared]
             if not built.any_resolution:

@@ -136,14 +136,14 @@ def psnr_terms(points: Tensor, sampled: Tensor) -> tuple[float, float]:
 
     x, y = points.cpu().numpy(), sampled.cpu().numpy()
     diagonal = float(np.linalg.norm(x.max(0) - x.min(0)))
-    return _psnr(cKDTree(y).query(x)[0], diagonal), _psnr(cKDTree(x).query(y)[0], diagonal)
-
-
-def _psnr(distances: np.ndarray, diagonal: float) -> float:
-    error = math.sqrt(float((distances**2).mean()))
-    if error == 0:
-        return math.inf
-    return 20 * math.log10(diagonal / error) if diagonal > 0 else -math.inf
+    terms = []
+    for one, other in ((x, y), (y, x)):
+        error = math.sqrt(float((cKDTree(other).query(one)[0] ** 2).mean()))
+        if error == 0:
+            terms.append(math.inf)
+        else:
+            terms.append(20 * math.log10(diagonal / error) if diagonal > 0 else -math.inf)
+    return terms[0], terms[1]
 
 
 def psnr2(points: Tensor, sampled: Tensor) -> float:
@@ -172,36 +172,21 @@ def reliability(theta: Tensor, labels: Tensor) -> Reliability:
     return Reliability(sums[0] / count[kept], sums[1] / count[kept], count[kept])
 
 
-def log_loss_bits(theta: Tensor, labels: Tensor) -> float:
-    """Cross-entropy (bits per point) of labels (M,) under probabilities (M,); θ = ½ everywhere scores 1.
+def scores(theta: Tensor, labels: Tensor) -> dict[str, float]:
+    """Scores of probabilities (M,) of points with labels (M,), 1 occupied and 0 free.
 
-    Probabilities are clipped to [2⁻⁵², 1 − 2⁻⁵²], so one certain mistake costs 52 bits.
+    ece: expected calibration error. brier: mean squared difference. log_loss_bits: cross-entropy (bits per
+    point), of probabilities clipped to [2⁻⁵², 1 − 2⁻⁵²]: a certain mistake costs 52 bits. accuracy: share
+    of the points that the threshold ½ classifies correctly; a point with θ = ½ counts one half.
     """
     truth, p = _checked(theta, labels)
     least = 2.0**-52
     given = np.clip(np.where(truth == 1, p, 1 - p), least, 1 - least)
-    return float(-np.log2(given).mean())
-
-
-def accuracy(theta: Tensor, labels: Tensor) -> float:
-    """Share of the points classified correctly with threshold ½; a point with θ = ½ counts one half."""
-    truth, p = _checked(theta, labels)
-    return float(np.where(p == 0.5, 0.5, (p > 0.5) == (truth == 1)).mean())
-
-
-def brier_score(theta: Tensor, labels: Tensor) -> float:
-    """Mean squared difference of probabilities (M,) and labels (M,); θ = ½ everywhere scores ¼."""
-    truth, p = _checked(theta, labels)
-    return float(np.square(p - truth).mean())
-
-
-def scores(theta: Tensor, labels: Tensor) -> dict[str, float]:
-    """`ece`, `brier`, `log_loss_bits` and `accuracy` of occupied and free points."""
     return {
         "ece": reliability(theta, labels).expected_error,
-        "brier": brier_score(theta, labels),
-        "log_loss_bits": log_loss_bits(theta, labels),
-        "accuracy": accuracy(theta, labels),
+        "brier": float(np.square(p - truth).mean()),
+        "log_loss_bits": float(-np.log2(given).mean()),
+        "accuracy": float(np.where(p == 0.5, 0.5, (p > 0.5) == (truth == 1)).mean()),
     }
 
 

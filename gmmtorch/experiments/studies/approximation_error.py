@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import NamedTuple
 
@@ -66,19 +66,15 @@ def methods(n_samples: int, n_large_samples: int) -> dict[str, Method]:
     return {
         "cone": lambda scene, _: cone_evidence(*scene),
         "cone_exact": lambda scene, _: cone_evidence(scene.cone, scene.low, scene.high, exact=True),
-        "point": lambda scene, _: _point(scene),
+        "point": lambda scene, _: point_evidence(
+            scene.cone, 0.5 * (scene.low + scene.high), float(scene.high[0, 0] - scene.low[0, 0])
+        ),
         "monte_carlo": lambda scene, generator: cast_rays(scene, n_samples, generator, "plain"),
         "monte_carlo_sobol": lambda scene, generator: cast_rays(scene, n_samples, generator, "sobol"),
         "monte_carlo_large": lambda scene, generator: cast_rays(scene, n_large_samples, generator, "sobol"),
         "flux": lambda scene, _: box_flux(*scene),
         "flux_float32": lambda scene, _: box_flux(*scene, dtype=torch.float32),
     }
-
-
-def _point(scene: Scene) -> Found:
-    resolution = float(scene.high[0, 0] - scene.low[0, 0])
-    found = point_evidence(scene.cone, 0.5 * (scene.low + scene.high), resolution)
-    return found.hits, found.misses
 
 
 def exact(scene: Scene) -> Found:
@@ -193,17 +189,11 @@ def run_approximation_error(
     return rows
 
 
-def _methods(
-    dim: int, options: ApproximationErrorStudy, names: Sequence[str] | None = None
-) -> dict[str, Method]:
-    return {
-        name: method
-        for name, method in methods(options.n_samples, options.n_large_samples).items()
-        if (dim == 3 or name != "cone_exact") and (names is None or name in names)
-    }
-
-
-# -- map ------------------------------------------------------------------------------------------
+def _methods(dim: int, options: ApproximationErrorStudy) -> dict[str, Method]:
+    found = methods(options.n_samples, options.n_large_samples)
+    if dim == 2:
+        del found["cone_exact"]
+    return found
 
 
 def map_rows(dim: int, options: ApproximationErrorStudy, generator: torch.Generator) -> Iterator[Row]:
@@ -216,7 +206,9 @@ def map_rows(dim: int, options: ApproximationErrorStudy, generator: torch.Genera
     scenes = [cells_before(float(p), depths, dim) for p in distances]
     clear = [scene.low[:, 0].view(len(OFFSETS), -1)[0] > 1e-6 for scene in scenes]
     truth = [exact(scene) for scene in scenes]
-    for name, method in _methods(dim, options, MAPPED).items():
+    for name, method in _methods(dim, options).items():
+        if name not in MAPPED:
+            continue
         error: list[list[float | None]] = []
         probability_error: list[list[float | None]] = []
         for scene, true, shown in zip(scenes, truth, clear, strict=True):
@@ -239,9 +231,6 @@ def map_rows(dim: int, options: ApproximationErrorStudy, generator: torch.Genera
         }
 
 
-# -- sweep ----------------------------------------------------------------------------------------
-
-
 def sweep_rows(dim: int, options: ApproximationErrorStudy, generator: torch.Generator) -> Iterator[Row]:
     """A row for each method: quantiles of its errors over random scenes."""
     scenes = [random_scene(dim, options.n_cells, generator) for _ in range(options.n_components)]
@@ -250,12 +239,11 @@ def sweep_rows(dim: int, options: ApproximationErrorStudy, generator: torch.Gene
         begin = time.perf_counter()
         found = [method(scene, generator) for scene in scenes]
         seconds = time.perf_counter() - begin
+        pairs = list(zip(found, truth, strict=True))
         errors = {
-            "hits": torch.cat([(f[0] - t[0]).abs() for f, t in zip(found, truth, strict=True)]),
-            "misses": torch.cat([(f[1] - t[1]).abs() for f, t in zip(found, truth, strict=True)]),
-            "probability": torch.cat(
-                [_probability_error(f, t, options) for f, t in zip(found, truth, strict=True)]
-            ),
+            "hits": torch.cat([(f[0] - t[0]).abs() for f, t in pairs]),
+            "misses": torch.cat([(f[1] - t[1]).abs() for f, t in pairs]),
+            "probability": torch.cat([_probability_error(f, t, options) for f, t in pairs]),
         }
         row: Row = {"study": "sweep", "dim": dim, "method": name, "n_cases": len(errors["hits"])}
         for field, values in errors.items():
@@ -263,9 +251,6 @@ def sweep_rows(dim: int, options: ApproximationErrorStudy, generator: torch.Gene
             row[f"{field}_p99"] = float(values.quantile(0.99))
             row[f"{field}_median"] = float(values.median())
         yield {**row, "seconds": seconds}
-
-
-# -- curve ----------------------------------------------------------------------------------------
 
 
 def curve_rows(dim: int, options: ApproximationErrorStudy, generator: torch.Generator) -> Iterator[Row]:
@@ -349,9 +334,7 @@ def _grid_errors(found: Evidence, truth: Evidence, prior: float) -> Row:
     }
 
 
-def _probability_error(
-    found: tuple[Tensor, Tensor], true: tuple[Tensor, Tensor], options: ApproximationErrorStudy
-) -> Tensor:
+def _probability_error(found: Found, true: Found, options: ApproximationErrorStudy) -> Tensor:
     thetas = [
         occupancy_probability(options.support * hits, options.support * misses, options.prior)
         for hits, misses in (found, true)

@@ -1,8 +1,8 @@
-"""The figures of gmmtorch-occupancy, as PNG and in TensorBoard."""
+"""The maps of gmmtorch-occupancy: their methods, their test, and their figures, as PNG and in TensorBoard."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,13 +11,38 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from gmmtorch.cli import chosen_options, show, surfaces_of
-from gmmtorch.experiments.evaluation import OCCUPIED, Built, Outcome, reliability, separating_threshold
+from gmmtorch.cli import (
+    all_scans,
+    as_options,
+    build,
+    chosen_options,
+    limits,
+    map_factory,
+    print_table,
+    show,
+    surfaces_of,
+    write_results,
+)
+from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.experiments.evaluation import (
+    OCCUPIED,
+    Built,
+    MapFactory,
+    Outcome,
+    Protocol,
+    choose,
+    evaluate,
+    methods,
+    reliability,
+    separating_threshold,
+)
 from gmmtorch.mapping import Components, GaussianMap
 from gmmtorch.report import (
     Board,
+    Event,
     MapPanel,
     OccupancyPanel,
+    Row,
     auc_against_kept_figure,
     busiest_regions,
     byte_text,
@@ -31,6 +56,50 @@ from gmmtorch.report import (
     roc_figure,
 )
 from gmmtorch.scan import Scan
+
+
+def known_methods(config: DictConfig) -> dict[str, MapFactory]:
+    """Every method by name."""
+    options = as_options(config.method_options)
+    return methods(map_factory(config), options, **limits(config))
+
+
+def check_factories(factories: Mapping[str, MapFactory], resolution: float) -> None:
+    """Make an empty map with each factory, so that an invalid option fails before any map is built."""
+    for name, factory in factories.items():
+        try:
+            factory(resolution)
+        except TypeError as error:  # for example text, where a baseline compares numbers
+            raise InvalidArgumentError(
+                f"method_options.{name} has a value of the wrong type: {error}."
+            ) from error
+
+
+def map_all(
+    config: DictConfig, columns: Sequence[str], device: str, folder: Path, on_event: Event
+) -> list[Row]:
+    """A row for each method, share kept and resolution."""
+    check_whole("report.magnify", config.report.magnify, 0)
+    factories = choose(list(config.method), known_methods(config))
+    protocol = build(Protocol, config, "evaluation")
+    check_factories(factories, protocol.resolution[0])
+    name, scans = all_scans(config, device, on_event)
+    outcome = evaluate(
+        name,
+        scans,
+        factories,
+        protocol,
+        config.seed,
+        on_event,
+        # Rows are written one by one, so that a run that fails late keeps them.
+        lambda rows: write_results("occupancy", config, rows, folder),
+    )
+    draw(config, scans, outcome, folder)
+    print_table(outcome.rows, columns, f"{name}: {len(scans)} scans")
+    return outcome.rows
+
+
+# -- outputs ----------------------------------------------------------------------------------------------
 
 
 def draw(config: DictConfig, scans: Sequence[Scan], outcome: Outcome, folder: Path) -> None:
