@@ -15,17 +15,8 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.datasets import Dataset
 from gmmtorch.errors import DataError, InvalidArgumentError, check_number, check_whole
-from gmmtorch.localization.alignment import (
-    Alignment,
-    AlignmentTarget,
-    align,
-    around,
-    best_distinct,
-    differences,
-    everywhere,
-    merged_below,
-    seen_normals,
-)
+from gmmtorch.localization import alignment
+from gmmtorch.localization.alignment import Alignment, AlignmentTarget
 from gmmtorch.localization.location import UNSEEN, Location, continued, measured_motion, pose_covariance
 from gmmtorch.localization.pose_search import CORRELATED, PoseSearch, free_segments
 from gmmtorch.mapping import Components, GaussianMap, Surfaces, surface_mixture
@@ -108,11 +99,13 @@ class Tracker:
         centered = mixture._replace(means=mixture.means - self._center)
         seen = surfaces.components() if isinstance(surfaces, GaussianMap) else surfaces
         self._seen = seen if isinstance(seen, Components) else None
-        normals = torch.zeros_like(centered.means) if self._seen is None else seen_normals(self._seen)
+        normals = (
+            torch.zeros_like(centered.means) if self._seen is None else alignment.seen_normals(self._seen)
+        )
         self._targets = [
             AlignmentTarget(merged, blur, faces)
             for blur in _BLURS
-            for merged, faces in (merged_below(centered, normals, blur),)
+            for merged, faces in (alignment.merged_below(centered, normals, blur),)
         ]
         self._places = mixture.means[:0] if self._seen is None else _places(self._seen, self._center)
         self.restart(pose)
@@ -173,7 +166,7 @@ class Tracker:
         if predicted is None or not location.found or location.explained >= _SURE * self._explained:
             return location
         pose = Pose.from_matrix(location.pose).shifted(-self._center)
-        if float(differences(pose[None], predicted[None], self.distance, self.angle)) <= 1:
+        if float(alignment.differences(pose[None], predicted[None], self.distance, self.angle)) <= 1:
             return location
         doubt = (
             f"{location.explained:.0%} of the points lie on surfaces, fewer than in the last scan, and the "
@@ -193,12 +186,16 @@ class Tracker:
             start = predicted[None]
             if self.n_lost == 0 and (is_measured or self._motion is not None):
                 yield _FINE, start, _USUAL * self._explained
-            yield _FINE, around(start, self.distance, self.angle, _BLURS[_FINE]), _USUAL * self._explained
+            yield (
+                _FINE,
+                alignment.around(start, self.distance, self.angle, _BLURS[_FINE]),
+                _USUAL * self._explained,
+            )
             wide = _WIDER * self.distance, min(_WIDER * self.angle, math.pi)
-            yield 0, around(start, *wide, _BLURS[0]), 0.0
+            yield 0, alignment.around(start, *wide, _BLURS[0]), 0.0
         if len(self._places) and (predicted is None or self.n_lost >= _GLOBAL_AFTER):
             if self._raster is None:
-                yield _FINE, everywhere(self._places, _BLURS[_FINE]), 0.0
+                yield _FINE, alignment.everywhere(self._places, _BLURS[_FINE]), 0.0
             else:  # from the last level that blurs more than a cell of the raster
                 first = max(sum(blur >= self._raster.cell for blur in _BLURS) - 1, 0)
                 yield first, self._raster.anywhere(rows, _RASTERED)[0], 0.0
@@ -219,8 +216,10 @@ class Tracker:
                 motions = Pose.cat([motions, self._ranked(rows, starts, target)])
             is_last = target is self._targets[-1]
             used = rows if is_last else rows[: max(_RANKING_POINTS, int(_COARSE_SHARE * len(rows)))]
-            found = align(used, target, motions, _STEPS if is_last or number == 0 else _BETWEEN_STEPS)
-            order = best_distinct(found.motions, found.evidence, target.blur * _SAME)
+            found = alignment.align(
+                used, target, motions, _STEPS if is_last or number == 0 else _BETWEEN_STEPS
+            )
+            order = alignment.best_distinct(found.motions, found.evidence, target.blur * _SAME)
             found = found.at(order[: max(2, n_starts >> number)])
             motions = found.motions
         return self._location(rows, found, is_tracked=len(starts) == 1)
@@ -237,7 +236,7 @@ class Tracker:
         order = score.argsort(descending=True, stable=True)
         if n > _RANKED:
             best = order[:_RANKED]
-            order = best[best_distinct(starts[best], score[best], 1.01 * target.blur)]
+            order = best[alignment.best_distinct(starts[best], score[best], 1.01 * target.blur)]
         return starts[order[:_CLIMBED]]
 
     def _location(self, rows: Tensor, found: Alignment, is_tracked: bool) -> Location:
@@ -251,7 +250,7 @@ class Tracker:
             doubts.append(f"only {share:.0%} of the points lie on surfaces: another place, or a changed one")
         if loosest > _LOOSEST:
             doubts.append(f"the surfaces leave a direction open: a standard deviation of {loosest:.2g} m")
-        other = differences(found.motions, found.motions, _APART, _APART)[0] > 1
+        other = alignment.differences(found.motions, found.motions, _APART, _APART)[0] > 1
         lead = (found.evidence[0] - found.evidence) * len(rows) / CORRELATED
         if bool((other & (lead <= _ALIKE)).any()):
             doubts.append("another pose explains the scan as well")

@@ -13,16 +13,7 @@ from typing import Any
 
 from omegaconf import MISSING, DictConfig
 
-from gmmtorch.cli import (
-    Report,
-    Runtime,
-    print_files,
-    run_dir,
-    schema_of,
-    set_up,
-    start,
-    store,
-)
+from gmmtorch import cli
 from gmmtorch.declarations import group, option
 from gmmtorch.experiments.cli import experiment_schema
 from gmmtorch.experiments.evaluation import FitOptions
@@ -33,16 +24,6 @@ TABLE = (
     "method n_components n_components_used seconds n_iterations log_likelihood held_out_log_likelihood "
     "psnr2_db held_out_psnr2_db nbytes"
 )
-
-
-@dataclass
-class StreamOptions:
-    """Clouds that are read in chunks."""
-
-    chunk_points: int = option(1 << 17, "points of a chunk, which limits the memory")
-    max_range: float | None = option(
-        None, "points at this distance (m) from the frame's origin or beyond are dropped; null: none"
-    )
 
 
 @dataclass
@@ -74,23 +55,28 @@ class FitCommand:
         None, "seconds between two checkpoints; null: every ten iterations"
     )
     resume: bool = option(False, "continue from the checkpoint if it exists; its folder must exist")
-    stream: StreamOptions = group(StreamOptions)
+    chunk_points: int = option(1 << 17, "points of a chunk, which limits the memory", "stream.chunk_points")
+    max_range: float | None = option(
+        None,
+        "points at this distance (m) from the frame's origin or beyond are dropped; null: none",
+        "stream.max_range",
+    )
     mixture: FitOptions = group(FitOptions)
-    report: Report = group(Report)
-    runtime: Runtime = group(Runtime)
+    report: cli.Report = group(cli.Report)
+    runtime: cli.Runtime = group(cli.Runtime)
 
 
 @functools.cache
 def register() -> None:
     """Stores the options of the command."""
     experiment_schema.register()
-    store({"fit": schema_of(FitCommand, ("mixture", PruneOptions))})
+    cli.store({"fit": cli.schema_of(FitCommand, ("mixture", PruneOptions))})
 
 
 def main() -> None:
     """Entry point of the command."""
     with _quiet_worker():
-        start("fit", run, register)
+        cli.start("fit", run, register)
 
 
 @contextmanager
@@ -112,14 +98,14 @@ def run(config: DictConfig) -> float | None:
     """
     from gmmtorch.experiments.cli import fit_runs
 
-    folder = run_dir()
+    folder = cli.run_dir()
     columns = TABLE.split()
     if fit_runs.is_streamed(config):
         row = fit_runs.stream(config, columns, folder)
         if row is None:
             return None
     else:
-        device = set_up(config)
+        device = cli.set_up(config)
         with ProgressBars(enabled=config.report.progress) as bars:
             if config.study is None:
                 row = fit_runs.fit_all(config, columns, device, folder, bars)[-1]
@@ -127,7 +113,7 @@ def run(config: DictConfig) -> float | None:
                 from gmmtorch.experiments.cli import studies
 
                 row = studies.run("fit", config, device, folder, bars)[-1]
-    print_files(folder)
+    cli.print_files(folder)
     return fit_runs.log_likelihood(row)
 
 

@@ -11,32 +11,11 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from gmmtorch.cli import (
-    as_options,
-    build,
-    chosen_options,
-    logger,
-    open_dataset,
-    print_table,
-    read_scans,
-    set_up,
-    show,
-    write_results,
-)
+from gmmtorch import cli
 from gmmtorch.datasets import PointChunks, in_memory, open_points
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.experiments.evaluation import (
-    NO_LIKELIHOODS,
-    FitData,
-    FitOptions,
-    FitOutcome,
-    Views,
-    compare,
-    fit_streamed,
-    in_use,
-    split,
-    split_source,
-)
+from gmmtorch.experiments import evaluation
+from gmmtorch.experiments.evaluation import FitData, FitOptions, FitOutcome
 from gmmtorch.mixture import Checkpoint, PruneOptions, is_launched, joined
 from gmmtorch.report import Event, ProgressBars, Row
 from gmmtorch.scan import Scan
@@ -55,7 +34,7 @@ _SAMPLE_POINTS = 100_000  # size of the random sample for the initialization of 
 def fit_options(config: DictConfig) -> FitOptions:
     """The options of a fit from `mixture.*` and `runtime.*`."""
     runtime = config.runtime
-    return build(FitOptions, config, "mixture", dtype=runtime.dtype, compiled=runtime.compile)
+    return cli.build(FitOptions, config, "mixture", dtype=runtime.dtype, compiled=runtime.compile)
 
 
 def fit_data(config: DictConfig, device: str, on_event: Event) -> FitData:
@@ -67,22 +46,24 @@ def fit_data_of(config: DictConfig, name: str, scans: Sequence[Scan]) -> FitData
     """The same for given scans of the data set with this name."""
     points = torch.cat([scan.points for scan in scans])
     sizes = torch.tensor([len(scan.points) for scan in scans], device=points.device)
-    views = Views(torch.repeat_interleave(sizes), torch.stack([scan.origin.double() for scan in scans]))
+    views = evaluation.Views(
+        torch.repeat_interleave(sizes), torch.stack([scan.origin.double() for scan in scans])
+    )
     chosen = _subset(points, config.max_points, config.seed)
     views = views._replace(scan=views.scan[chosen])
-    return split(name, points[chosen], config.test_share, config.seed, views)
+    return evaluation.split(name, points[chosen], config.test_share, config.seed, views)
 
 
 def selected_scans(config: DictConfig, device: str, on_event: Event) -> tuple[str, list[Scan]]:
     """The data set's name, and its scans with the indices `scans`; all scans for null."""
-    dataset = open_dataset(config.dataset)
+    dataset = cli.open_dataset(config.dataset)
     indices = list(range(len(dataset))) if config.scans is None else list(config.scans)
     for index in indices:
         if not -len(dataset) <= index < len(dataset):
             raise InvalidArgumentError(f"scans={indices}: {dataset.name} has scans 0 to {len(dataset) - 1}.")
     if not indices:
         raise InvalidArgumentError("scans is empty; give at least one index, or null for all.")
-    return dataset.name, read_scans(dataset, indices, device, on_event)
+    return dataset.name, cli.read_scans(dataset, indices, device, on_event)
 
 
 def _subset(points: Tensor, max_points: int | None, seed: int) -> Tensor | slice:
@@ -104,20 +85,20 @@ def fit_all(
 ) -> list[Row]:
     """A row for each method; saves and draws every mixture."""
     data = fit_data(config, device, on_event)
-    outcome = compare(
+    outcome = evaluation.compare(
         data,
         list(config.method),
         fit_options(config),
         config.seed,
         on_event,
-        lambda rows: write_results("fit", config, rows, folder),
-        as_options(config.method_options),
-        build(PruneOptions, config, "mixture"),
+        lambda rows: cli.write_results("fit", config, rows, folder),
+        cli.as_options(config.method_options),
+        cli.build(PruneOptions, config, "mixture"),
     )
     for method, mixture in outcome.mixtures.items():
         mixture.save(folder / f"{method}.safetensors")
     draw(config, data.train, outcome, folder)
-    print_table(outcome.rows, columns, headline(outcome.rows))
+    cli.print_table(outcome.rows, columns, headline(outcome.rows))
     return outcome.rows
 
 
@@ -131,7 +112,7 @@ def stream(config: DictConfig, columns: Sequence[str], folder: Path) -> Row | No
 
     columns: of the printed table.
     """
-    device = set_up(config)
+    device = cli.set_up(config)
     if device == "cuda":
         device = f"cuda:{os.environ.get('LOCAL_RANK', '0')}"
     _check(config)
@@ -139,7 +120,7 @@ def stream(config: DictConfig, columns: Sequence[str], folder: Path) -> Row | No
         joined(device, _TIMEOUT) as processes,
         ProgressBars(enabled=config.report.progress and processes.rank == 0) as bars,
     ):
-        row, mixture, sample = fit_streamed(
+        row, mixture, sample = evaluation.fit_streamed(
             *_sources(config, device, bars),
             fit_options(config),
             config.seed,
@@ -151,10 +132,10 @@ def stream(config: DictConfig, columns: Sequence[str], folder: Path) -> Row | No
     if processes.rank != 0:
         return None
     mixture.save(folder / "em.safetensors")
-    write_results("fit", config, [row], folder)
+    cli.write_results("fit", config, [row], folder)
     outcome = FitOutcome([row], {"em": mixture})
     draw(config, sample.train, outcome, folder)
-    print_table([row], columns, headline([row]))
+    cli.print_table([row], columns, headline([row]))
     return row
 
 
@@ -190,7 +171,7 @@ def _check(config: DictConfig) -> None:
                 f"checkpoint={path}: the folder {path.parent} does not exist, so there is nothing to resume; "
                 "correct the path, or remove resume=true."
             )
-        logger.warning("checkpoint=%s does not exist: the fit starts from the beginning.", path)
+        cli.logger.warning("checkpoint=%s does not exist: the fit starts from the beginning.", path)
 
 
 def _checkpoint(config: DictConfig) -> Checkpoint | None:
@@ -213,7 +194,7 @@ def _sources(
         )
         return (train, test), None
     source = open_points(config.points, chunk_points=stream.chunk_points, max_range=stream.max_range)
-    return split_source(source, config.test_share, config.seed), _SAMPLE_POINTS
+    return evaluation.split_source(source, config.test_share, config.seed), _SAMPLE_POINTS
 
 
 # -- outputs ----------------------------------------------------------------------------------------------
@@ -240,12 +221,14 @@ def draw(config: DictConfig, points: Tensor, outcome: FitOutcome, folder: Path) 
         from gmmtorch.report import comparison_figure, convergence_figure, label_of, mixture_figure
 
         mixtures = outcome.mixtures
-        likelihoods = {name: mixtures[name].lower_bounds_ for name in mixtures if name not in NO_LIKELIHOODS}
+        likelihoods = {
+            name: mixtures[name].lower_bounds_ for name in mixtures if name not in evaluation.NO_LIKELIHOODS
+        }
         found = {"convergence": convergence_figure(likelihoods)}
         if len(outcome.rows) > 1:
             found["comparison"] = comparison_figure(outcome.rows)
         for method, mixture in outcome.mixtures.items():
-            used = in_use(mixture, points)  # the positions of unused components are arbitrary
+            used = evaluation.in_use(mixture, points)  # the positions of unused components are arbitrary
             found[f"mixture_{method}"] = mixture_figure(
                 points,
                 mixture.means[used],
@@ -262,9 +245,9 @@ def draw(config: DictConfig, points: Tensor, outcome: FitOutcome, folder: Path) 
         for method, mixture in outcome.mixtures.items():
             for iteration, bound in enumerate(mixture.lower_bounds_, 1):
                 board.scalars({"lower_bound": bound}, method, step=iteration)
-            used = in_use(mixture, points)
+            used = evaluation.in_use(mixture, points)
             board.ellipsoids(f"mixture_{method}", mixture.means[used], mixture.covariances[used])
         metrics = {f"log_likelihood_{row['method']}": row["log_likelihood"] for row in outcome.rows}
-        board.hparams(chosen_options(config), metrics)
+        board.hparams(cli.chosen_options(config), metrics)
 
-    show(config, folder, figures, write)
+    cli.show(config, folder, figures, write)

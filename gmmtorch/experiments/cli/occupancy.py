@@ -8,16 +8,7 @@ from typing import Any
 
 from omegaconf import MISSING, DictConfig
 
-from gmmtorch.cli import (
-    Report,
-    Runtime,
-    print_files,
-    run_dir,
-    schema_of,
-    set_up,
-    start,
-    store,
-)
+from gmmtorch import cli
 from gmmtorch.declarations import group, option
 from gmmtorch.experiments.cli import experiment_schema
 from gmmtorch.experiments.evaluation import Protocol
@@ -30,7 +21,7 @@ TABLE = (
 
 
 @dataclass
-class OccupancyReport(Report):
+class OccupancyReport(cli.Report):
     """Figures of gmmtorch-occupancy."""
 
     magnify: int = option(
@@ -58,27 +49,27 @@ class OccupancyCommand:
     study: Any = option(None, "a study with rows of its own, which an experiment sets")
     evaluation: Protocol = group(Protocol)
     report: OccupancyReport = group(OccupancyReport)
-    runtime: Runtime = group(Runtime)
+    runtime: cli.Runtime = group(cli.Runtime)
 
 
 @functools.cache
 def register() -> None:
     """Stores the options of the command."""
     experiment_schema.register()
-    store({"occupancy": schema_of(OccupancyCommand)})
+    cli.store({"occupancy": cli.schema_of(OccupancyCommand)})
 
 
 def main() -> None:
     """Entry point of the command."""
-    start("occupancy", run, register)
+    cli.start("occupancy", run, register)
 
 
 def run(config: DictConfig) -> float | None:
     """Run the command; returns the AUC of the last row, which a sweep can optimize."""
     from gmmtorch.experiments.cli import occupancy_runs
 
-    device = set_up(config)
-    folder = run_dir()
+    device = cli.set_up(config)
+    folder = cli.run_dir()
     with ProgressBars(enabled=config.report.progress) as bars:
         if config.study is None:
             rows = occupancy_runs.map_all(config, TABLE.split(), device, folder, bars)
@@ -86,7 +77,7 @@ def run(config: DictConfig) -> float | None:
             from gmmtorch.experiments.cli import studies
 
             rows = studies.run("occupancy", config, device, folder, bars)
-    print_files(folder)
+    cli.print_files(folder)
     return rows[-1].get("auc")
 
 

@@ -11,57 +11,19 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from gmmtorch.cli import (
-    all_scans,
-    as_options,
-    build,
-    chosen_options,
-    limits,
-    map_factory,
-    print_table,
-    show,
-    surfaces_of,
-    write_results,
-)
+from gmmtorch import cli, report
 from gmmtorch.errors import InvalidArgumentError, check_whole
-from gmmtorch.experiments.evaluation import (
-    OCCUPIED,
-    Built,
-    MapFactory,
-    Outcome,
-    Protocol,
-    choose,
-    evaluate,
-    methods,
-    reliability,
-    separating_threshold,
-)
+from gmmtorch.experiments import evaluation
+from gmmtorch.experiments.evaluation import OCCUPIED, Built, MapFactory, Outcome, Protocol
 from gmmtorch.mapping import Components, GaussianMap
-from gmmtorch.report import (
-    Board,
-    Event,
-    MapPanel,
-    OccupancyPanel,
-    Row,
-    auc_against_kept_figure,
-    busiest_regions,
-    byte_text,
-    first_viewpoints,
-    label_of,
-    map_figure,
-    map_scene_figure,
-    mixture_figure,
-    reliability_figure,
-    robust_bounds,
-    roc_figure,
-)
+from gmmtorch.report import Board, Event, Row
 from gmmtorch.scan import Scan
 
 
 def known_methods(config: DictConfig) -> dict[str, MapFactory]:
     """Every method by name."""
-    options = as_options(config.method_options)
-    return methods(map_factory(config), options, **limits(config))
+    options = cli.as_options(config.method_options)
+    return evaluation.methods(cli.map_factory(config), options, **cli.limits(config))
 
 
 def check_factories(factories: Mapping[str, MapFactory], resolution: float) -> None:
@@ -80,11 +42,11 @@ def map_all(
 ) -> list[Row]:
     """A row for each method, share kept and resolution."""
     check_whole("report.magnify", config.report.magnify, 0)
-    factories = choose(list(config.method), known_methods(config))
-    protocol = build(Protocol, config, "evaluation")
+    factories = evaluation.choose(list(config.method), known_methods(config))
+    protocol = cli.build(Protocol, config, "evaluation")
     check_factories(factories, protocol.resolution[0])
-    name, scans = all_scans(config, device, on_event)
-    outcome = evaluate(
+    name, scans = cli.all_scans(config, device, on_event)
+    outcome = evaluation.evaluate(
         name,
         scans,
         factories,
@@ -92,10 +54,10 @@ def map_all(
         config.seed,
         on_event,
         # Rows are written one by one, so that a run that fails late keeps them.
-        lambda rows: write_results("occupancy", config, rows, folder),
+        lambda rows: cli.write_results("occupancy", config, rows, folder),
     )
     draw(config, scans, outcome, folder)
-    print_table(outcome.rows, columns, f"{name}: {len(scans)} scans")
+    cli.print_table(outcome.rows, columns, f"{name}: {len(scans)} scans")
     return outcome.rows
 
 
@@ -105,37 +67,37 @@ def map_all(
 def draw(config: DictConfig, scans: Sequence[Scan], outcome: Outcome, folder: Path) -> None:
     """Write the figures as PNG, and figures and numbers to TensorBoard."""
     figures = partial(_figures, config, scans, outcome)
-    show(config, folder, figures, partial(_write_board, config, scans, outcome))
+    cli.show(config, folder, figures, partial(_write_board, config, scans, outcome))
 
 
 def _figures(config: DictConfig, scans: Sequence[Scan], outcome: Outcome) -> dict[str, Any]:
     """The figures of a run by file name."""
     trajectory = torch.stack([scan.origin.double().cpu() for scan in scans])
     points = torch.cat([scan.points.double().cpu() for scan in scans])
-    low, high = robust_bounds(points[:: max(1, len(points) // 200_000)], trajectory)
+    low, high = report.robust_bounds(points[:: max(1, len(points) // 200_000)], trajectory)
     surfaces = _surfaces(outcome)
-    figures: dict[str, Any] = {"auc_against_kept": auc_against_kept_figure(outcome.rows)}
+    figures: dict[str, Any] = {"auc_against_kept": report.auc_against_kept_figure(outcome.rows)}
     for resolution in dict.fromkeys(built.row["resolution"] for built in outcome.shown):
         shown = [built for built in outcome.shown if built.row["resolution"] == resolution]
-        panels = [MapPanel(_label(built), built.answer, resolution, low, high) for built in shown]
-        figures[f"map_{resolution:g}m"] = map_figure(panels, [trajectory], **_image_limits(shown))
-        regions = busiest_regions(points, config.report.magnify) if len(low) == 2 else []
+        panels = [report.MapPanel(_label(built), built.answer, resolution, low, high) for built in shown]
+        figures[f"map_{resolution:g}m"] = report.map_figure(panels, [trajectory], **_image_limits(shown))
+        regions = report.busiest_regions(points, config.report.magnify) if len(low) == 2 else []
         for number, (corner, other) in enumerate(regions, 1):
-            close = [MapPanel(p.title, p.occupancy, resolution, corner, other) for p in panels]
-            figures[f"map_{resolution:g}m_region_{number}"] = map_figure(close)
+            close = [report.MapPanel(p.title, p.occupancy, resolution, corner, other) for p in panels]
+            figures[f"map_{resolution:g}m_region_{number}"] = report.map_figure(close)
         if config.report.scene and len(low) == 3:
             figures[f"scene_{resolution:g}m"] = _scene(shown, points, trajectory, surfaces)
         curves = {_label(built): built.roc for built in shown}
         about = f"{shown[0].row['dataset']}, {resolution:g} m"
-        figures[f"roc_{resolution:g}m"] = roc_figure(curves, about)
+        figures[f"roc_{resolution:g}m"] = report.roc_figure(curves, about)
         figures[f"reliability_{resolution:g}m"] = _reliability(shown, about)
     if surfaces is not None:
-        figures["mixture"] = mixture_figure(
+        figures["mixture"] = report.mixture_figure(
             points,
             surfaces.means,
             surfaces.covariances,
             surfaces.support,
-            seen_from=first_viewpoints(surfaces) if surfaces.dim == 3 else None,
+            seen_from=report.first_viewpoints(surfaces) if surfaces.dim == 3 else None,
             title="Surfaces of the map",
         )
     return figures
@@ -146,8 +108,8 @@ def _reliability(shown: Sequence[Built], about: str) -> Any:
     curves = {}
     for built in shown:
         known = built.asked.labels <= OCCUPIED
-        curves[_label(built)] = reliability(built.theta[known], built.asked.labels[known])
-    return reliability_figure(curves, f"Reliability: {about}")
+        curves[_label(built)] = evaluation.reliability(built.theta[known], built.asked.labels[known])
+    return report.reliability_figure(curves, f"Reliability: {about}")
 
 
 def _scene(shown: Sequence[Built], points: Tensor, trajectory: Tensor, surfaces: Components | None) -> Any:
@@ -156,15 +118,16 @@ def _scene(shown: Sequence[Built], points: Tensor, trajectory: Tensor, surfaces:
     for built in shown:
         row = built.row
         # Thresholds of their own, because maps differ in calibration.
-        least = separating_threshold(*built.asked.split(built.theta))
+        least = evaluation.separating_threshold(*built.asked.split(built.theta))
         n = "" if row["n_components"] is None else f"{row['n_components']:,} components, "
-        title = f"{_label(built)}: {n}{byte_text(row['nbytes'])}, AUC {row['auc']:.3f}, θ ≥ {least:.2f}"
-        maps.append(OccupancyPanel(title, built.answer, least))
+        title = (
+            f"{_label(built)}: {n}{report.byte_text(row['nbytes'])}, AUC {row['auc']:.3f}, θ ≥ {least:.2f}"
+        )
+        maps.append(report.OccupancyPanel(title, built.answer, least))
     resolution = shown[0].row["resolution"]
-    title = (
-        f"{label_of(shown[0].row['dataset'])}: cells of {100 * resolution:g} cm that each map calls occupied"
-    )
-    return map_scene_figure(points, trajectory, maps, resolution, surfaces, title=title)
+    name = report.label_of(shown[0].row["dataset"])
+    title = f"{name}: cells of {100 * resolution:g} cm that each map calls occupied"
+    return report.map_scene_figure(points, trajectory, maps, resolution, surfaces, title=title)
 
 
 def _image_limits(shown: Sequence[Built]) -> dict[str, Any]:
@@ -178,12 +141,12 @@ def _surfaces(outcome: Outcome) -> Components | None:
     """The surface components of the first `GaussianMap`; None if there is none."""
     for built in outcome.shown:
         if isinstance(built.map, GaussianMap):
-            return surfaces_of(built.map.components())
+            return cli.surfaces_of(built.map.components())
     return None
 
 
 def _label(built: Built) -> str:
-    return label_of(built.row["method"])
+    return report.label_of(built.row["method"])
 
 
 def _write_board(config: DictConfig, scans: Sequence[Scan], outcome: Outcome, board: Board) -> None:
@@ -200,4 +163,4 @@ def _write_board(config: DictConfig, scans: Sequence[Scan], outcome: Outcome, bo
     board.cloud("points", torch.cat([scan.points.double().cpu() for scan in scans]))
     if (surfaces := _surfaces(outcome)) is not None:
         board.ellipsoids("mixture", surfaces.means, surfaces.covariances)
-    board.hparams(chosen_options(config), scores)
+    board.hparams(cli.chosen_options(config), scores)

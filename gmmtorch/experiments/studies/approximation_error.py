@@ -20,22 +20,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch import datasets
+from gmmtorch import datasets, occupancy
 from gmmtorch.experiments.studies.angular_reference import angular_evidence
 from gmmtorch.experiments.studies.study_options import ApproximationErrorStudy
 from gmmtorch.mapping import GaussianMap
-from gmmtorch.occupancy import (
-    Cones,
-    Evidence,
-    Sampling,
-    VoxelGrid,
-    box_flux,
-    cone_evidence,
-    flux_evidence,
-    occupancy_probability,
-    point_evidence,
-    sample_rays,
-)
+from gmmtorch.occupancy import Cones, Evidence, Sampling, VoxelGrid
 from gmmtorch.report import Event, OnRows, Row, ignore
 
 # -- test scenes ---------------------------------------------------------------------------------------
@@ -64,16 +53,16 @@ def methods(n_samples: int, n_large_samples: int) -> dict[str, Method]:
     Stratified sampling is left out: for one component it equals plain sampling.
     """
     return {
-        "cone": lambda scene, _: cone_evidence(*scene),
-        "cone_exact": lambda scene, _: cone_evidence(scene.cone, scene.low, scene.high, exact=True),
-        "point": lambda scene, _: point_evidence(
+        "cone": lambda scene, _: occupancy.cone_evidence(*scene),
+        "cone_exact": lambda scene, _: occupancy.cone_evidence(scene.cone, scene.low, scene.high, exact=True),
+        "point": lambda scene, _: occupancy.point_evidence(
             scene.cone, 0.5 * (scene.low + scene.high), float(scene.high[0, 0] - scene.low[0, 0])
         ),
         "monte_carlo": lambda scene, generator: cast_rays(scene, n_samples, generator, "plain"),
         "monte_carlo_sobol": lambda scene, generator: cast_rays(scene, n_samples, generator, "sobol"),
         "monte_carlo_large": lambda scene, generator: cast_rays(scene, n_large_samples, generator, "sobol"),
-        "flux": lambda scene, _: box_flux(*scene),
-        "flux_float32": lambda scene, _: box_flux(*scene, dtype=torch.float32),
+        "flux": lambda scene, _: occupancy.box_flux(*scene),
+        "flux_float32": lambda scene, _: occupancy.box_flux(*scene, dtype=torch.float32),
     }
 
 
@@ -88,7 +77,7 @@ def cast_rays(
     scene: Scene, n_samples: int, generator: torch.Generator, sampling: Sampling = "plain"
 ) -> Found:
     """Evidence of a scene's boxes by sampled rays; every ray is intersected with every box."""
-    rays = sample_rays(scene.cone, n_samples, generator, sampling)
+    rays = occupancy.sample_rays(scene.cone, n_samples, generator, sampling)
     step = rays.ends - rays.origins
     step = torch.where(step.abs() < 1e-300, 1e-300, step)
     hits, misses = [], []
@@ -266,7 +255,7 @@ def curve_rows(dim: int, options: ApproximationErrorStudy, generator: torch.Gene
     cones = built.components().cones()
     places = torch.cat([cones.means, cones.origins]).double()
     grid = _grid_around(places, cones.origins[0].double(), options.resolution)
-    truth = flux_evidence(cones, grid, tolerance=_REFERENCE_TOLERANCE)
+    truth = occupancy.flux_evidence(cones, grid, tolerance=_REFERENCE_TOLERANCE)
     for method, setting, work in _settings(cones, grid, options, generator):
         begin = time.perf_counter()
         found = work()
@@ -304,7 +293,7 @@ def _settings(
             work = partial(_cast_on_grid, cones, grid, n, generator, sampling)
             yield f"monte_carlo_{sampling}", float(n), work
     for tolerance in options.tolerance:
-        yield "flux", tolerance, partial(flux_evidence, cones, grid, tolerance=tolerance)
+        yield "flux", tolerance, partial(occupancy.flux_evidence, cones, grid, tolerance=tolerance)
     yield "cone", None, partial(_cone_on_grid, cones, grid, False)
     if grid.dim == 3:
         yield "cone_exact", None, partial(_cone_on_grid, cones, grid, True)
@@ -314,13 +303,13 @@ def _cast_on_grid(
     cones: Cones, grid: VoxelGrid, n: int, generator: torch.Generator, sampling: Sampling
 ) -> Evidence:
     evidence = Evidence.empty(grid)
-    evidence.add_rays(*sample_rays(cones, n, generator, sampling))
+    evidence.add_rays(*occupancy.sample_rays(cones, n, generator, sampling))
     return evidence
 
 
 def _cone_on_grid(cones: Cones, grid: VoxelGrid, exact: bool) -> Evidence:
     low = grid.centers() - 0.5 * grid.resolution
-    hits, misses = cone_evidence(cones, low, low + grid.resolution, exact=exact)
+    hits, misses = occupancy.cone_evidence(cones, low, low + grid.resolution, exact=exact)
     return Evidence(grid, hits.view(grid.shape), misses.view(grid.shape))
 
 
@@ -336,7 +325,7 @@ def _grid_errors(found: Evidence, truth: Evidence, prior: float) -> Row:
 
 def _probability_error(found: Found, true: Found, options: ApproximationErrorStudy) -> Tensor:
     thetas = [
-        occupancy_probability(options.support * hits, options.support * misses, options.prior)
+        occupancy.occupancy_probability(options.support * hits, options.support * misses, options.prior)
         for hits, misses in (found, true)
     ]
     return (thetas[0] - thetas[1]).abs()

@@ -15,21 +15,8 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.experiments.evaluation import (
-    Built,
-    Form,
-    MapFactory,
-    Protocol,
-    Queries,
-    auc_gain,
-    evaluate,
-    hit_and_free,
-    keep_share,
-    pose_perturbations,
-    roc,
-    split_indices,
-    test_beams,
-)
+from gmmtorch.experiments import evaluation
+from gmmtorch.experiments.evaluation import Built, Form, MapFactory, Protocol, Queries
 from gmmtorch.mapping import GaussianMap
 from gmmtorch.mixture import GaussianMixture
 from gmmtorch.occupancy import OccupancyMap
@@ -60,7 +47,7 @@ def run_auc_memory(
         return [{**row, "method": m, "size": n} for row, (m, n) in zip(rows, sized, strict=True)]
 
     factories = dict(zip(names, methods.values(), strict=True))
-    outcome = evaluate(
+    outcome = evaluation.evaluate(
         name, scans, factories, protocol, seed, on_event, lambda rows: on_rows(with_size(rows))
     )
     return with_size(outcome.rows)
@@ -90,11 +77,13 @@ def run_map_variants(
     rows: list[Row] = []
     first: dict[float, Built] = {}
     for variant, factory in variants.items():
-        outcome = evaluate(name, scans, {variant: factory}, protocol, seed, on_event)
+        outcome = evaluation.evaluate(name, scans, {variant: factory}, protocol, seed, on_event)
         for built in outcome.shown:
             assert isinstance(built.map, GaussianMap)
             base = first.setdefault(built.row["resolution"], built)
-            gain, low, high = auc_gain(base.asked.split(base.theta), built.asked.split(built.theta))
+            gain, low, high = evaluation.auc_gain(
+                base.asked.split(base.theta), built.asked.split(built.theta)
+            )
             rows.append(
                 {
                     **built.row,
@@ -112,7 +101,7 @@ def run_map_variants(
 
 def held_out_points(scans: Sequence[Scan], test_every: int) -> Tensor:
     """About 5000 points (N, D) of the held-out scans."""
-    points = torch.cat([scans[i].points for i in split_indices(len(scans), test_every)[1]])
+    points = torch.cat([scans[i].points for i in evaluation.split_indices(len(scans), test_every)[1]])
     return points[:: max(1, len(points) // _SCORED_POINTS)].double()
 
 
@@ -180,15 +169,15 @@ def evaluate_correction(
     Returns a row for each share kept, method and resolution, with the AUCs `auc` (map from the perturbed
     poses), `auc_corrected` (the same map after correction) and `auc_clean` (map from the true poses).
     """
-    train_index, test_index = split_indices(len(scans), protocol.test_every)
+    train_index, test_index = evaluation.split_indices(len(scans), protocol.test_every)
     train = [scans[i] for i in train_index]
-    origins, ends = test_beams([scans[i] for i in test_index], protocol.max_beams, seed)
-    asked = {r: hit_and_free(origins, ends, protocol.free, r, seed) for r in protocol.resolution}
+    origins, ends = evaluation.test_beams([scans[i] for i in test_index], protocol.max_beams, seed)
+    asked = {r: evaluation.hit_and_free(origins, ends, protocol.free, r, seed) for r in protocol.resolution}
     rows: list[Row] = []
     for kept in protocol.kept:
         on_event("pose correction", 0, 3)
-        shown = keep_share(train, kept, seed)
-        motions = pose_perturbations(shown, protocol.pose_noise, seed)
+        shown = evaluation.keep_share(train, kept, seed)
+        motions = evaluation.pose_perturbations(shown, protocol.pose_noise, seed)
         moved = [scan.transformed(motion) for scan, motion in zip(shown, motions, strict=True)]
         true_map, perturbed_map = new_map(), new_map()
         build_by_scan(true_map, shown)
@@ -228,5 +217,5 @@ def _aucs(
     for method in methods:
         for resolution, ask in asked.items():
             theta = torch.as_tensor(built.occupancy(ask.points, resolution, method)).cpu()
-            found[method, resolution] = roc(*ask.split(theta)).auc
+            found[method, resolution] = evaluation.roc(*ask.split(theta)).auc
     return found
