@@ -15,8 +15,7 @@ from typing import Any
 
 from gmmtorch import GaussianMap, IncrementalRule, WindowedRule
 from gmmtorch.datasets import Dataset
-from gmmtorch.experiments.evaluation.held_out import Protocol, evaluate
-from gmmtorch.experiments.evaluation.mapping_methods import choose, methods
+from gmmtorch.experiments.evaluation import Protocol, choose, evaluate, methods
 from gmmtorch.experiments.harness import Case, Row, held_out, recording, run
 
 KEPT = (1.0, 0.3, 0.1, 0.05)

@@ -16,8 +16,7 @@ from typing import Any
 
 from gmmtorch import GaussianMap
 from gmmtorch.errors import MemoryLimitError
-from gmmtorch.experiments.evaluation.held_out import Built, Protocol, evaluate
-from gmmtorch.experiments.evaluation.mapping_methods import choose, methods
+from gmmtorch.experiments.evaluation import Built, Protocol, choose, evaluate, methods
 from gmmtorch.experiments.evaluation.metrics import scores, separating_threshold
 from gmmtorch.experiments.harness import Case, Row, held_out, recording, run
 

@@ -32,9 +32,7 @@ from torch import Tensor
 import gmmtorch as gt
 from gmmtorch import GaussianMap, IncrementalRule
 from gmmtorch.experiments.baselines import LogOdds, OccupancyGrid, OctoMapMap
-from gmmtorch.experiments.evaluation import metrics
-from gmmtorch.experiments.evaluation.held_out import Protocol, evaluate
-from gmmtorch.experiments.evaluation.mapping_methods import choose, methods
+from gmmtorch.experiments.evaluation import Protocol, choose, evaluate, methods, metrics
 from gmmtorch.experiments.harness import Case, Row, cpu_seconds, held_out, recording, run
 from gmmtorch.kernels.rays.ray_traversal import traverse
 from gmmtorch.report.style import PALETTE, label_axes, legend_below, new_figure, save_figure

@@ -24,8 +24,7 @@ import torch
 
 import gmmtorch as gt
 from gmmtorch.datasets import Dataset
-from gmmtorch.experiments.evaluation.held_out import Protocol, evaluate
-from gmmtorch.experiments.evaluation.mapping_methods import choose, methods
+from gmmtorch.experiments.evaluation import Protocol, choose, evaluate, methods
 from gmmtorch.experiments.harness import Case, Row, cpu_seconds, held_out, recording, run
 from gmmtorch.localization import Odometry
 from gmmtorch.localization.odometry import METHODS, with_odometry

@@ -348,27 +348,24 @@ def overlap(source: Parameters, target: Parameters, motions: Pose, pairs: Tensor
     """
     n, dim = motions.translation.shape
     n_free = dim + dim * (dim - 1) // 2
-    lever = torch.einsum("bij,kj->ibk", motions.rotation, source.means).flatten(1)
-    moved = torch.einsum("bij,kjl,bml->imbk", motions.rotation, source.covariances, motions.rotation)
-    moved = moved.flatten(2)
-    there, still = target.means.T, target.covariances.permute(1, 2, 0)
+    lever = torch.einsum("bij,kj->bki", motions.rotation, source.means)
+    moved = torch.einsum("bij,kjl,bml->bkim", motions.rotation, source.covariances, motions.rotation)
     # Σ s, Σ s ∂log N, and s times the information and ∂log N ∂log Nᵀ:
-    total = lever.new_zeros(n)
-    first, second, squares = (lever.new_zeros(n, n_free**power) for power in (1, 2, 2))
+    total, first = lever.new_zeros(n), lever.new_zeros(n, n_free)
+    second, squares = (lever.new_zeros(n, n_free, n_free) for _ in range(2))
     for b, i, j in pairs.split(_CHUNK, dim=1):
-        row = b * len(source.weights) + i
-        shift = motions.translation.T[:, b] - there[:, j]
-        log_density, slope, information = _pair_terms(lever[:, row], shift, moved[..., row], still[..., j])
+        shift = motions.translation[b] - target.means[j]
+        log_density, slope, information = _pair_terms(lever[b, i], shift, moved[b, i], target.covariances[j])
         share = source.weights[i] * target.weights[j] * torch.exp(log_density)
         total.index_add_(0, b, share)
-        weighted = share * slope
-        first.index_add_(0, b, weighted.T)
-        second.index_add_(0, b, (share * information).flatten(0, 1).T)
-        squares.index_add_(0, b, (weighted[:, None] * slope).flatten(0, 1).T)
+        weighted = share[:, None] * slope
+        first.index_add_(0, b, weighted)
+        second.index_add_(0, b, share[:, None, None] * information)
+        squares.index_add_(0, b, weighted[:, :, None] * slope[:, None])
     scale = total.clamp_min(1e-300)[:, None]
     gradient = first / scale
-    scatter = (squares / scale).view(n, n_free, n_free) - gradient[:, :, None] * gradient[:, None]
-    return Overlap(total.log(), gradient, (second / scale).view(n, n_free, n_free), scatter)
+    scatter = squares / scale[:, None] - gradient[:, :, None] * gradient[:, None]
+    return Overlap(total.log(), gradient, second / scale[:, None], scatter)
 
 
 class Ascent:
@@ -477,53 +474,27 @@ def log_self_overlap(mixture: Parameters) -> float:
 
 
 def _pair_terms(lever: Tensor, shift: Tensor, moved: Tensor, still: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Of P pairs log N (P,), its gradient (F, P) and information (F, F, P).
+    """Of P pairs log N (P,), its gradient (P, F) and information (P, F, F).
 
     Args:
-        lever: R μ_i (D, P). shift: t − μ_j (D, P). moved: A (D, D, P). still: Σ_j (D, D, P).
+        lever: R μ_i (P, D). shift: t − μ_j (P, D). moved: A (P, D, D). still: Σ_j (P, D, D).
     """
-    dim = len(lever)
+    n, dim = lever.shape
     spins = generators(dim).to(lever)
-    precision, half_log_det = _inverse(moved + still)
+    root = safe_cholesky(moved + still, "the sums of two covariances")
+    precision, half_log_det = torch.cholesky_inverse(root), root.diagonal(dim1=1, dim2=2).log().sum(1)
     offset = lever + shift
-    pull = _times(precision, offset[:, None])[:, 0]
-    log_density = -0.5 * (offset * pull).sum(0) - half_log_det - 0.5 * dim * math.log(2 * math.pi)
+    pull = (precision @ offset[:, :, None])[:, :, 0]
+    log_density = -0.5 * (offset * pull).sum(1) - half_log_det - 0.5 * dim * math.log(2 * math.pi)
 
-    arm = lever - _times(moved, pull[:, None])[:, 0]
-    matched = _times(moved, precision)
-    turned = torch.einsum("kij,jp->kip", spins, arm)
-    slope = -(pull * turned).sum(1) - torch.einsum("kij,jip->kp", spins, matched)
+    arm = lever - (moved @ pull[:, :, None])[:, :, 0]
+    turn = -torch.einsum("pi,kij,pj->pk", pull, spins, arm)
+    turn -= torch.einsum("kij,pji->pk", spins, moved @ precision)
 
-    jacobian = torch.cat([torch.eye(dim).to(lever)[..., None].expand(-1, -1, lever.shape[1]),
-                          torch.einsum("kij,jp->ikp", spins, lever)], 1)  # fmt: skip
-    information = _times(jacobian.transpose(0, 1), _times(precision, jacobian))
-    swept = torch.einsum("kij,jlp->kilp", spins, moved)
-    change = [_times(precision, s + s.transpose(0, 1)) for s in swept]
-    for k, one in enumerate(change):
-        for m, other in enumerate(change):
-            information[dim + k, dim + m] += 0.5 * (one * other.transpose(0, 1)).sum((0, 1))
-    return log_density, torch.cat([-pull, slope]), information
-
-
-def _inverse(matrices: Tensor) -> tuple[Tensor, Tensor]:
-    """Inverses (D, D, P) and ½ log det (P,) of positive definite matrices (D, D, P), by Cholesky's factors.
-
-    Written out: LAPACK takes a microsecond for each small matrix.
-    """
-    dim = len(matrices)
-    factor = torch.zeros_like(matrices)
-    for j in range(dim):
-        rest = matrices[j:, j] - (factor[j:, :j] * factor[j, :j]).sum(1)
-        factor[j:, j] = rest / rest[0].sqrt()
-    inverse = torch.zeros_like(matrices)  # of the factor
-    for j in range(dim):
-        inverse[j, j] = 1 / factor[j, j]
-        for i in range(j + 1, dim):
-            inverse[i, j] = -(factor[i, j:i] * inverse[j:i, j]).sum(0) / factor[i, i]
-    half_log_det = torch.stack([factor[j, j] for j in range(dim)]).log().sum(0)
-    return _times(inverse.transpose(0, 1), inverse), half_log_det
-
-
-def _times(a: Tensor, b: Tensor) -> Tensor:
-    """Matrix products (I, J, P) of (I, K, P) and (K, J, P)."""
-    return (a[:, :, None] * b[None]).sum(1)
+    eye = torch.eye(dim).to(lever).expand(n, dim, dim)
+    jacobian = torch.cat([eye, torch.einsum("kij,pj->pik", spins, lever)], 2)
+    information = jacobian.mT @ precision @ jacobian
+    swept = spins @ moved[:, None]
+    change = precision[:, None] @ (swept + swept.mT)
+    information[:, dim:, dim:] += 0.5 * torch.einsum("pkij,pmji->pkm", change, change)
+    return log_density, torch.cat([-pull, turn], 1), information

@@ -26,8 +26,10 @@ from gmmtorch.experiments.baselines.hilbert_features import (
     nystroem_centers,
     nystroem_features,
 )
-from gmmtorch.experiments.baselines.hilbert_map import BayesianHilbertMap, Features, HilbertMap
-from gmmtorch.experiments.baselines.logistic_regression import (
+from gmmtorch.experiments.baselines.hilbert_map import (
+    BayesianHilbertMap,
+    Features,
+    HilbertMap,
     Posterior,
     fit_posterior,
     jaakkola_lambda,
@@ -290,25 +292,6 @@ class TestMeanField(TensorFileContract):
     def make(self) -> BayesianHilbertMap:
         return BayesianHilbertMap(
             160.0, spacing=RESOLUTION, free_spacing=0.25, gap=RESOLUTION, thin=RESOLUTION, n_iter=2
-        )
-
-
-class TestDiagonal(TensorFileContract):
-    """Narrow kernels: with overlapping kernels the authors' fast form counts evidence several times."""
-
-    shift_tolerance = 1e-4
-    turn_tolerance = 0.15
-    thins_scans = True
-    damage: ClassVar = {"means": [lambda v: v * math.inf], "precisions": [lambda v: -v - 1]}
-
-    def make(self) -> BayesianHilbertMap:
-        return BayesianHilbertMap(
-            300.0,
-            spacing=RESOLUTION,
-            covariance="diagonal",
-            free_spacing=0.25,
-            gap=RESOLUTION,
-            thin=RESOLUTION,
         )
 
 

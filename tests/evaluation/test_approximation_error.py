@@ -35,9 +35,16 @@ SMALL = ApproximationErrorStudy(
 )
 
 
+EVENTS: list[tuple[str, int, int | None]] = []
+SEEN: list[int] = []
+
+
 @pytest.fixture(scope="module")
 def rows() -> list[dict[str, Any]]:
-    return run_approximation_error(SMALL, seed=0)
+    """Rows of the small study; its events and the numbers of rows so far are noted."""
+    return run_approximation_error(
+        SMALL, 0, lambda *event: EVENTS.append(event), lambda rows: SEEN.append(len(rows))
+    )
 
 
 def of(rows: list[dict[str, Any]], study: str) -> Iterator[dict[str, Any]]:
@@ -102,16 +109,11 @@ def test_monte_carlo_and_flux_converge_on_a_grid(rows):
 
 
 def test_rows_depend_only_on_the_seed_and_progress_is_complete(rows):
-    events: list[tuple[str, int, int | None]] = []
-    seen: list[int] = []
-    again = run_approximation_error(
-        SMALL, 0, lambda *event: events.append(event), lambda rows: seen.append(len(rows))
-    )
-    assert timeless(again) == timeless(rows)
-    assert [done for _, done, _ in events] == [0, 1, 2, 3]
-    assert seen == list(range(1, len(rows) + 1))
-    other = sweep_rows(2, SMALL, torch.Generator().manual_seed(1))
-    assert timeless(list(other)) != timeless([r for r in rows if r["study"] == "sweep"])
+    assert [done for _, done, _ in EVENTS] == [0, 1, 2, 3]
+    assert list(range(1, len(rows) + 1)) == SEEN
+    same, other = (timeless(sweep_rows(2, SMALL, torch.Generator().manual_seed(seed))) for seed in (0, 1))
+    assert same != other
+    assert [{"dataset": "one component", **row} for row in same] == timeless(of(rows, "sweep"))
 
 
 def test_cast_rays_distinguishes_hits_misses_and_no_crossing(generator):

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from evaluation.pillar_room import room_scans
 
-from gmmtorch.experiments.evaluation.held_out import Protocol, evaluate
-from gmmtorch.experiments.evaluation.mapping_methods import Form, MapFactory, methods
+from gmmtorch.experiments.evaluation.held_out import Form, MapFactory, Protocol, evaluate, methods
 from gmmtorch.experiments.studies import map_studies
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import WindowedRule

@@ -13,8 +13,7 @@ from pillar_room import room_scans, timeless
 
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.experiments.evaluation.held_out import Outcome, evaluate
-from gmmtorch.experiments.evaluation.mapping_methods import MapFactory, choose, methods
+from gmmtorch.experiments.evaluation.held_out import MapFactory, Outcome, choose, evaluate, methods
 from gmmtorch.experiments.evaluation.protocol_options import Protocol
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.occupancy.occupancy_grid import OccupancyGrid
