@@ -17,7 +17,7 @@ from typing import Any
 from gmmtorch import GaussianMap
 from gmmtorch.errors import MemoryLimitError
 from gmmtorch.experiments.evaluation import Built, Protocol, choose, evaluate, methods
-from gmmtorch.experiments.evaluation.metrics import scores, separating_threshold
+from gmmtorch.experiments.evaluation.metrics import scores
 from gmmtorch.experiments.harness import Case, Row, held_out, recording, run
 
 METHODS = ("point", "occupancy_grid", "occupancy_log_odds", "octomap")
@@ -46,8 +46,7 @@ def scored(data: Path, name: str, chosen: tuple[str, ...]) -> list[tuple[float, 
 
 def best_accuracy(built: Built) -> float:
     """The accuracy with the threshold that separates the test points best."""
-    threshold = separating_threshold(*built.asked.split(built.theta))
-    return scores((built.theta >= threshold).double(), built.asked.labels)["accuracy"]
+    return scores((built.theta >= built.roc.separating).double(), built.asked.labels)["accuracy"]
 
 
 def ours(options: Any) -> Iterator[Row]:

@@ -25,7 +25,6 @@ from gmmtorch.experiments.evaluation.metrics import (
     reliability,
     roc,
     scores,
-    separating_threshold,
     unknown_scores,
 )
 from gmmtorch.experiments.evaluation.queries import hit_and_free
@@ -66,7 +65,7 @@ def test_the_separating_threshold_is_the_best_of_all(occupied, free):
         return float((hits >= threshold).double().mean() - (misses >= threshold).double().mean())
 
     best = max(gain(k / 8) for k in range(10))
-    assert gain(separating_threshold(hits, misses)) == pytest.approx(best)
+    assert gain(roc(hits, misses).separating) == pytest.approx(best)
 
 
 @pytest.mark.parametrize(("n_occupied", "n_free"), [(0, 3), (3, 0), (0, 0)])

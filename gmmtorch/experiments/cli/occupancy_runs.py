@@ -87,7 +87,8 @@ def _figures(config: DictConfig, scans: Sequence[Scan], outcome: Outcome) -> dic
             figures[f"map_{resolution:g}m_region_{number}"] = report.map_figure(close)
         if config.report.scene and len(low) == 3:
             figures[f"scene_{resolution:g}m"] = _scene(shown, points, trajectory, surfaces)
-        curves = {_label(built): built.roc for built in shown}
+        rocs = {_label(built): built.roc for built in shown}
+        curves = {name: (r.false_positive, r.true_positive, r.auc) for name, r in rocs.items()}
         about = f"{shown[0].row['dataset']}, {resolution:g} m"
         figures[f"roc_{resolution:g}m"] = report.roc_figure(curves, about)
         figures[f"reliability_{resolution:g}m"] = _reliability(shown, about)
@@ -118,7 +119,7 @@ def _scene(shown: Sequence[Built], points: Tensor, trajectory: Tensor, surfaces:
     for built in shown:
         row = built.row
         # Thresholds of their own, because maps differ in calibration.
-        least = evaluation.separating_threshold(*built.asked.split(built.theta))
+        least = built.roc.separating
         n = "" if row["n_components"] is None else f"{row['n_components']:,} components, "
         title = (
             f"{_label(built)}: {n}{report.byte_text(row['nbytes'])}, AUC {row['auc']:.3f}, θ ≥ {least:.2f}"

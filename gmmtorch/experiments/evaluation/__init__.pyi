@@ -21,7 +21,6 @@ from .metrics import auc_gain as auc_gain
 from .metrics import auc_interval as auc_interval
 from .metrics import reliability as reliability
 from .metrics import roc as roc
-from .metrics import separating_threshold as separating_threshold
 from .protocol_options import FitOptions as FitOptions
 from .protocol_options import Protocol as Protocol
 from .protocol_options import check_not_empty as check_not_empty

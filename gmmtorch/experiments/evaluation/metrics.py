@@ -25,41 +25,31 @@ CALLED_FREE, CALLED_OCCUPIED = 0.2, 0.65
 
 
 class Roc(NamedTuple):
-    """false_positive (T,), true_positive (T,): the ROC curve; auc: the area under it."""
+    """False and true positive rates (T,) at thresholds (T,), of which the first is infinite; and the area."""
 
     false_positive: np.ndarray
     true_positive: np.ndarray
+    thresholds: np.ndarray
     auc: float
+
+    @property
+    def separating(self) -> float:
+        """The θ that separates occupied from free points best: points with at least it count as occupied.
+
+        The true minus the false positive rate is then largest (Youden 1950).
+        """
+        return float(self.thresholds[np.argmax(self.true_positive - self.false_positive)])
 
 
 def roc(occupied: Tensor, free: Tensor) -> Roc:
     """ROC curve of the probabilities of occupied (P,) and free (Q,) points; ties count one half."""
-    from sklearn.metrics import auc
-
-    false_positive, true_positive, _ = _roc_curve(occupied, free)
-    return Roc(false_positive, true_positive, float(auc(false_positive, true_positive)))
-
-
-def separating_threshold(occupied: Tensor, free: Tensor) -> float:
-    """The θ that separates occupied (P,) from free (Q,) points best.
-
-    Points with at least this probability count as occupied; the true minus the false positive rate is then
-    largest (Youden 1950).
-    """
-    false_positive, true_positive, thresholds = _roc_curve(occupied, free)
-    return float(thresholds[np.argmax(true_positive - false_positive)])
-
-
-def _roc_curve(occupied: Tensor, free: Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """False and true positive rates (T,) at thresholds (T,), of which the first is infinite."""
-    from sklearn.metrics import roc_curve
+    from sklearn.metrics import auc, roc_curve
 
     if occupied.numel() == 0 or free.numel() == 0:
         raise InvalidArgumentError("An ROC curve needs at least one occupied and one free point.")
     labels = np.concatenate([np.ones(occupied.numel()), np.zeros(free.numel())])
-    scores = torch.cat([occupied, free]).cpu().numpy()
-    false_positive, true_positive, thresholds = roc_curve(labels, scores)
-    return false_positive, true_positive, thresholds
+    false_positive, true_positive, thresholds = roc_curve(labels, torch.cat([occupied, free]).cpu().numpy())
+    return Roc(false_positive, true_positive, thresholds, float(auc(false_positive, true_positive)))
 
 
 def auc_interval(occupied: Tensor, free: Tensor, auc: float, seed: int) -> tuple[float, float]:
