@@ -15,11 +15,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.evaluation.fits import FitData, Row, split
 from gmmtorch.experiments.evaluation.protocol_options import FitOptions
 from gmmtorch.experiments.studies import fit_studies
-from gmmtorch.experiments.studies.fit_studies import (
-    count_modes,
-    middle,
-    run_component_count,
-)
+from gmmtorch.experiments.studies.fit_studies import count_modes, middle, run_component_count
 from gmmtorch.experiments.studies.study_options import ComponentCountStudy
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mixture import GaussianMixture
