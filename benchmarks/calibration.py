@@ -16,9 +16,8 @@ from typing import Any
 
 from gmmtorch import GaussianMap
 from gmmtorch.errors import MemoryLimitError
-from gmmtorch.experiments.evaluation.held_out import Built, Protocol, evaluate
-from gmmtorch.experiments.evaluation.mapping_methods import choose, methods
-from gmmtorch.experiments.evaluation.metrics import accuracy, separating_threshold
+from gmmtorch.experiments.evaluation import Built, Protocol, choose, evaluate, methods
+from gmmtorch.experiments.evaluation.metrics import scores
 from gmmtorch.experiments.harness import Case, Row, held_out, recording, run
 
 METHODS = ("point", "occupancy_grid", "occupancy_log_odds", "octomap")
@@ -36,7 +35,7 @@ def scored(data: Path, name: str, chosen: tuple[str, ...]) -> list[tuple[float, 
     scans, found = list(dataset), []
     for side in (0.02, *SIDES) if name in PLANAR else SIDES:
         names = [n for n in chosen if n != "octomap" or side >= SMALLEST.get(name, 0.1)]
-        protocol = Protocol(held_out(dataset), (1.0,), "beams", (side,), max_beams=MAX_BEAMS)
+        protocol = Protocol(held_out(dataset), (1.0,), (side,), max_beams=MAX_BEAMS)
         try:
             outcome = evaluate(name, scans, choose(names, methods(GaussianMap)), protocol)
         except MemoryLimitError:  # cells of a street
@@ -47,16 +46,15 @@ def scored(data: Path, name: str, chosen: tuple[str, ...]) -> list[tuple[float, 
 
 def best_accuracy(built: Built) -> float:
     """The accuracy with the threshold that separates the test points best."""
-    threshold = separating_threshold(*built.asked.split(built.theta))
-    return accuracy((built.theta >= threshold).double(), built.asked.labels)
+    return scores((built.theta >= built.roc.separating).double(), built.asked.labels)["accuracy"]
 
 
 def ours(options: Any) -> Iterator[Row]:
     for name in options.names:
         for side, built, rows in scored(options.data, name, METHODS):
             row = rows["point"]
-            scores = (row[field] for field in ("ece", "brier", "log_loss_bits", "accuracy"))
-            yield name, side, *scores, best_accuracy(built), row["auc"]
+            shown = (row[field] for field in ("ece", "brier", "log_loss_bits", "accuracy"))
+            yield name, side, *shown, best_accuracy(built), row["auc"]
 
 
 def peers(options: Any) -> Iterator[Row]:

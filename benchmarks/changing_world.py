@@ -32,9 +32,7 @@ from torch import Tensor
 import gmmtorch as gt
 from gmmtorch import GaussianMap, IncrementalRule
 from gmmtorch.experiments.baselines import LogOdds, OccupancyGrid, OctoMapMap
-from gmmtorch.experiments.evaluation import metrics
-from gmmtorch.experiments.evaluation.held_out import Protocol, evaluate
-from gmmtorch.experiments.evaluation.mapping_methods import choose, methods
+from gmmtorch.experiments.evaluation import Protocol, choose, evaluate, methods, metrics
 from gmmtorch.experiments.harness import Case, Row, cpu_seconds, held_out, recording, run
 from gmmtorch.kernels.rays.ray_traversal import traverse
 from gmmtorch.report.style import PALETTE, label_axes, legend_below, new_figure, save_figure
@@ -227,7 +225,7 @@ def static(options: Any) -> Iterator[Row]:
     for name in options.names:
         dataset = recording(options.data, name, **({"pixel_stride": 2} if name == "kinect" else {}))
         budget, cell = BUDGETS.get(name), CELLS.get(name, PLANAR)[0]
-        protocol = Protocol(held_out(dataset), (1.0,), "beams", (cell,), max_beams=20_000)
+        protocol = Protocol(held_out(dataset), (1.0,), (cell,), max_beams=20_000)
         found = []
         for forget in ("off", "contradiction"):
             rule = IncrementalRule(max_bytes=budget, forget=forget)

@@ -27,15 +27,7 @@ from gmmtorch import GaussianMap, Scan
 from gmmtorch.experiments.baselines import OctoMapMap
 from gmmtorch.experiments.harness import Case, Row, Table, alone, recording, results_of, run
 from gmmtorch.mapping import TiledMap, resident_bytes
-from gmmtorch.report import (
-    draw_grid,
-    label_axes,
-    legend_below,
-    line_look,
-    log_axis,
-    new_figure,
-    save_figure,
-)
+from gmmtorch.report import draw_grid, label_axes, legend_below, line_look, log_axis, new_figure, save_figure
 
 ROOT = Path(__file__).parents[1]
 CELLS = {"street": 0.2, "freiburg-campus": 0.1}  # metres, of the maps of cells and of the cubes asked about

@@ -22,14 +22,7 @@ from torch import Tensor
 from gmmtorch import GaussianMap
 from gmmtorch.experiments.harness import Case, Row, run
 from gmmtorch.export.mesh import surface_mesh
-from gmmtorch.simulation import (
-    DepthCamera,
-    DepthFrame,
-    MeshWorld,
-    building_3d,
-    poses_3d,
-    warehouse,
-)
+from gmmtorch.simulation import DepthCamera, DepthFrame, MeshWorld, building_3d, poses_3d, warehouse
 
 N_FRAMES, SWING, RATE = 60, 0.9, 1.3  # the camera looks to both sides of its path: rad, rad a frame
 NEAR = 0.05

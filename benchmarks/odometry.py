@@ -24,8 +24,7 @@ import torch
 
 import gmmtorch as gt
 from gmmtorch.datasets import Dataset
-from gmmtorch.experiments.evaluation.held_out import Protocol, evaluate
-from gmmtorch.experiments.evaluation.mapping_methods import choose, methods
+from gmmtorch.experiments.evaluation import Protocol, choose, evaluate, methods
 from gmmtorch.experiments.harness import Case, Row, cpu_seconds, held_out, recording, run
 from gmmtorch.localization import Odometry
 from gmmtorch.localization.odometry import METHODS, with_odometry
@@ -96,7 +95,7 @@ def map_score(scans: Dataset, name: str) -> float:
     """AUC of the map of the scans that are not held out, without a budget of bytes."""
     resolution = RESOLUTION[scans[0].dim]
     factories = choose(("point",), methods(partial(gt.GaussianMap, cutoff=3.0)))
-    protocol = Protocol(held_out(scans), (1.0,), "beams", (resolution,), max_beams=50_000)
+    protocol = Protocol(held_out(scans), (1.0,), (resolution,), max_beams=50_000)
     return float(evaluate(name, list(scans), factories, protocol).rows[0]["auc"])
 
 

@@ -62,7 +62,11 @@ _REPLACED = {
     "link.scouting": "set scouting in the file of link.zenoh_config.",
     "link.ttl": "robots of a multicast group share one network.",
     "runtime.cache": "results that depend only on the world are always stored.",
+    "evaluation.removal": "a share of the beams of each scan is kept.",
     "stream.checkpoint_seconds": "use checkpoint_seconds.",
+    "stream.checkpoint_every": "use checkpoint_seconds; else every ten iterations have one.",
+    "stream.sample_points": "the start of EM and PSNR2 take 100,000 points.",
+    "stream.timeout": "processes wait for each other for ten minutes.",
     "planner.beams": _CONSTANT % "`TeamOptions.n_beams`",
     "planner.prior": _CONSTANT % "`TeamOptions.planning_prior`, which a variant of a study may set",
 }
@@ -85,7 +89,11 @@ _REPLACED_GROUPS = (
         "free_points",
         _CONSTANT % "a field of the learning rule, of `QueryOptions` or of `FrameRule`; a study may vary it",
     ),
-    ("mixture.", "max_cells min_density_share min_support reg_covar", _CONSTANT % "the estimator has it"),
+    (
+        "mixture.",
+        "max_cells min_density_share min_support n_init reg_covar",
+        _CONSTANT % "the estimator has it",
+    ),
     (
         "robot.",
         "speed climb yaw_rate acceleration yaw_acceleration duration step",

@@ -128,7 +128,10 @@ class LocalMap:
         best: _Found | None = None
         for starts, targets in self._searches(scan, expected):
             tried = self._climbed(scan, expected, starts, targets)
-            confirmed = best is not None and best.location.found and _is_same(best.location, tried.location)
+            confirmed = False  # by another search that found the same pose
+            if best is not None and best.location.found:
+                before, now = (Pose.from_matrix(one.location.pose[None]) for one in (best, tried))
+                confirmed = float(differences(before, now, _APART, _APART)) < 1
             if best is None or (tried.location.found, tried.total) > (best.location.found, best.total):
                 best = tried
             supported = best.location.explained - best.contradicted
@@ -146,7 +149,7 @@ class LocalMap:
         starts = self._lattice(scan, near, near.poses, first, spacing, 2 * near.angle, _CLIMBED[0])
         if self.dim == 2:
             # Along a wall most climbs end in one wrong place: the best pose of the raster is not enough.
-            yield Pose.cat([starts, self._search.best(scan.points, expected, _STARTS).poses]), self._targets
+            yield Pose.cat([starts, self._search.best(scan.points, expected, _STARTS)[0]]), self._targets
             return
         still = Scan(scan.points, torch.zeros(self.dim))
         mixture = learn_window([still], self._rule, torch.Generator().manual_seed(0))
@@ -272,12 +275,6 @@ class LocalMap:
             covariance = covariance + _scatter(poses[best], poses[chosen])
         location = Location(poses[best].matrix, covariance, share, tuple(doubts), probability)
         return _Found(location, float(total[best]), contradicted)
-
-
-def _is_same(some: Location, other: Location) -> bool:
-    """Whether two searches found one pose."""
-    first, second = Pose.from_matrix(some.pose[None]), Pose.from_matrix(other.pose[None])
-    return float(differences(first, second, _APART, _APART)) < 1
 
 
 def _probability(*evidence: float) -> float:

@@ -40,7 +40,7 @@ _LONGEST_GAP = 2  # steps that a sensor may have moved since the last pose that 
 _FEWEST = 10  # returns of a scan that can be located
 _FIRST_STEP = 1.0, math.radians(30)  # standard deviations (m, rad) of the first motions
 _SURPRISE = 0.3, math.radians(10)  # least standard deviations of a motion from the predicted one
-_MEMORY = 0.7  # share of the past in the mean surprise
+_MEMORY = 0.7  # share of the past in the mean square of the surprise
 _SKEW = 0.05  # metres of a point between two estimates of its skew, above which the scan is located again
 _LONGEST_SWEEP = 1.0  # seconds between scans over which a velocity deskews points
 _LONG_MEMORY = 0.9  # share of the past in the mean explained share
@@ -155,7 +155,9 @@ class Odometry:
         rows, times = self._checked(points, seconds)
         dim = rows.shape[1]
         measured = None if motion is None else measured_motion(motion, dim, rows.device)
-        raw, times = self._scan(rows), None if times is None else times[_drawn(rows)]
+        # The points of a keyframe are in random order.
+        drawn = torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))[:_STORED]
+        raw, times = Keyframe(rows[drawn], Pose.identity(dim)), None if times is None else times[drawn]
         ratio = self._clock(stamp)
         if not self._poses:
             location, scan = Location(torch.eye(dim + 1).double(), nowhere(dim) * 0, 1.0, ()), raw
@@ -252,9 +254,6 @@ class Odometry:
         finite &= torch.isfinite(times)
         return rows[finite], times[finite]
 
-    def _scan(self, rows: Tensor) -> Keyframe:
-        return Keyframe(rows[_drawn(rows)], Pose.identity(rows.shape[1]))
-
     def _deskewed(self, scan: Keyframe, seconds: Tensor | None) -> Keyframe:
         return scan if seconds is None else scan._replace(points=self.deskewed(scan.points, seconds))
 
@@ -277,10 +276,9 @@ class Odometry:
         expected = Expectation(
             Pose.stack([guess, last @ rest]), *self._surprise, self._explained, reach, self.max_turn
         )
-        if len(scan.points) < _FEWEST or self._local is None:
-            doubt = (
-                "the scan has too few points" if len(scan.points) < _FEWEST else "no scan before had points"
-            )
+        is_empty = len(scan.points) < _FEWEST
+        if is_empty or self._local is None:
+            doubt = "the scan has too few points" if is_empty else "no scan before had points"
             return Location(guess.matrix, nowhere(last.dim), 0.0, (doubt,))
         location = self._local.locate(scan, expected)
         self._note_surprise(location, expected)
@@ -304,10 +302,11 @@ class Odometry:
             self._explained = _LONG_MEMORY * self._explained + (1 - _LONG_MEMORY) * location.explained
         else:
             seen = max(seen[0], LOST[0]), max(seen[1], LOST[1])
-        self._surprise = (
-            max(_SURPRISE[0], _mean(self._surprise[0], seen[0])),
-            max(_SURPRISE[1], _mean(self._surprise[1], seen[1])),
-        )
+        means = [
+            math.sqrt(_MEMORY * before**2 + (1 - _MEMORY) * now**2)
+            for before, now in zip(self._surprise, seen, strict=True)
+        ]
+        self._surprise = max(_SURPRISE[0], means[0]), max(_SURPRISE[1], means[1])
 
     def _remember(self, scan: Keyframe, location: Location) -> None:
         number, pose = len(self._poses), Pose.from_matrix(location.pose)
@@ -395,11 +394,6 @@ class Odometry:
         return Edges(torch.tensor(source), target, Pose.stack(motions), torch.stack(information), none)
 
 
-def _drawn(rows: Tensor) -> Tensor:
-    """Rows of the points of a keyframe, in random order."""
-    return torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))[:_STORED]
-
-
 def _bridged(poses: Pose, found: Tensor) -> Pose:
     """The poses (N), with lost ones on the way from the last found pose to the next one."""
     number, good = torch.arange(len(poses)), found.nonzero()[:, 0]
@@ -411,11 +405,6 @@ def _bridged(poses: Pose, found: Tensor) -> Pose:
     is_between = ~found & (first < number) & (number < last)
     shift = torch.where(is_between[:, None], way.translation, poses.translation)
     return Pose(torch.where(is_between[:, None, None], way.rotation, poses.rotation), shift)
-
-
-def _mean(before: float, now: float) -> float:
-    """Of squares, weighted by `_MEMORY`."""
-    return math.sqrt(_MEMORY * before**2 + (1 - _MEMORY) * now**2)
 
 
 # -- recordings -----------------------------------------------------------------------------------

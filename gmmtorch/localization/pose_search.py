@@ -84,11 +84,8 @@ class Expectation(NamedTuple):
         return nats + torch.where(is_near.any(1), 0.0, NEVER)
 
 
-class Found(NamedTuple):
-    """Poses (B), world ← sensor, best first, and their scores (B,), nats."""
-
-    poses: Pose
-    scores: Tensor
+Found = tuple[Pose, Tensor]
+"""Poses (B), world ← sensor, best first, and their scores (B,), nats."""
 
 
 class _Tried(NamedTuple):
@@ -249,7 +246,7 @@ class PoseSearch:
         order = order[_firsts(places.floor())][: _PLACES * most]
         found = Pose(tried.turned[heading[order]], self._middle(tried, shift[order], 1))
         chosen = distinct(found, *_TOLD_APART)[:most]
-        return Found(found[chosen], score[order[chosen]])
+        return found[chosen], score[order[chosen]]
 
     def _spread_out(self, points: Tensor) -> Tensor:
         """The first point of each cell, in their order: near the sensor, points are dense and tell little."""

@@ -155,8 +155,8 @@ def _climbed(
     limits: tuple[float, int],
 ) -> Registered:
     """The twin of `kernels.fused_registration`."""
-    if by_area:
-        f, g = _by_area(f), _by_area(g)
+    if by_area:  # what a component covers: √(λ₁λ₂) of its largest eigenvalues in 3D, √λ₁ in 2D
+        f, g = (mixture._replace(weights=deviations(mixture)[:, 1:].prod(1)) for mixture in (f, g))
     # Both are centred on their means, so that numbers stay small anywhere in the world.
     (f, here), (g, there) = _centered(f), _centered(g)
     motions = _between(Pose(*starts), here, there)
@@ -211,11 +211,6 @@ def _check_together(source: Parameters, target: Parameters) -> None:
         )
 
 
-def _by_area(mixture: Parameters) -> Parameters:
-    """Weighted by what a component covers, √(λ₁λ₂) of its largest eigenvalues in 3D, √λ₁ in 2D."""
-    return mixture._replace(weights=deviations(mixture)[:, 1:].prod(1))
-
-
 def _centered(mixture: Parameters) -> tuple[Parameters, Tensor]:
     """The mixture, weights adding up to one, about its mean; and the mean (D,)."""
     weights = mixture.weights / mixture.weights.sum()
@@ -253,14 +248,12 @@ def _levels(mixture: Parameters, blurs: list[float]) -> list[Parameters]:
     eye = torch.eye(mixture.means.shape[1]).to(mixture.means)
     levels = []
     for blur in blurs:
-        merged = _merged_in_cells(mixture, blur) if blur > size else mixture
+        merged = mixture
+        if blur > size:
+            cells, labels = torch.unique((mixture.means / blur).floor(), dim=0, return_inverse=True)
+            merged = merge_components(*mixture, labels, len(cells))
         levels.append(merged._replace(covariances=merged.covariances + 0.5 * blur**2 * eye))
     return levels
-
-
-def _merged_in_cells(mixture: Parameters, side: float) -> Parameters:
-    cells, labels = torch.unique((mixture.means / side).floor(), dim=0, return_inverse=True)
-    return merge_components(*mixture, labels, len(cells))
 
 
 # -- motions --------------------------------------------------------------------------------------
@@ -330,17 +323,6 @@ def _doubts(share: list[float], width: float, radius: float, converged: bool) ->
 # -- overlap --------------------------------------------------------------------------------------
 
 
-class Pairs(NamedTuple):
-    """Pairs of components, (P,) each: row of the motion, of the source, of the target."""
-
-    motion: Tensor
-    source: Tensor
-    target: Tensor
-
-    def of(self, kept: Tensor) -> Pairs:
-        return Pairs(*(rows[kept] for rows in self))
-
-
 class Overlap(NamedTuple):
     """Of B motions: log S (B,), −∞ where no pair is near; its gradient (B, F) over F = D + D(D−1)/2 degrees
     of freedom (v, ω); the mean information of a pair (B, F, F), JᵀWJ and ½ tr(W ∂C W ∂C); and the
@@ -359,9 +341,27 @@ class Overlap(NamedTuple):
         return Overlap(*(value[rows] for value in self))
 
 
-def overlap(source: Parameters, target: Parameters, motions: Pose, pairs: Pairs) -> Overlap:
-    """Log score, gradient, information and scatter of each motion, over the given pairs only."""
-    total, first, second, squares = _batched_sums(source, target, motions, pairs)
+def overlap(source: Parameters, target: Parameters, motions: Pose, pairs: Tensor) -> Overlap:
+    """Log score, gradient, information and scatter of each motion, over the given pairs only.
+
+    pairs: (3, P), rows of the motion, of the source's and of the target's component.
+    """
+    n, dim = motions.translation.shape
+    n_free = dim + dim * (dim - 1) // 2
+    lever = torch.einsum("bij,kj->bki", motions.rotation, source.means)
+    moved = torch.einsum("bij,kjl,bml->bkim", motions.rotation, source.covariances, motions.rotation)
+    # Σ s, Σ s ∂log N, and s times the information and ∂log N ∂log Nᵀ:
+    total, first = lever.new_zeros(n), lever.new_zeros(n, n_free)
+    second, squares = (lever.new_zeros(n, n_free, n_free) for _ in range(2))
+    for b, i, j in pairs.split(_CHUNK, dim=1):
+        shift = motions.translation[b] - target.means[j]
+        log_density, slope, information = _pair_terms(lever[b, i], shift, moved[b, i], target.covariances[j])
+        share = source.weights[i] * target.weights[j] * torch.exp(log_density)
+        total.index_add_(0, b, share)
+        weighted = share[:, None] * slope
+        first.index_add_(0, b, weighted)
+        second.index_add_(0, b, share[:, None, None] * information)
+        squares.index_add_(0, b, weighted[:, :, None] * slope[:, None])
     scale = total.clamp_min(1e-300)[:, None]
     gradient = first / scale
     scatter = squares / scale[:, None] - gradient[:, :, None] * gradient[:, None]
@@ -404,8 +404,8 @@ class Ascent:
             if self._strayed(trial, listed):
                 rows = active.nonzero().squeeze(1)
                 listed, pairs = trial, self.pairs(trial[rows])
-                pairs = pairs._replace(motion=rows[pairs.motion])
-            tried = self.evaluate(trial, pairs.of(active[pairs.motion]))
+                pairs = torch.cat([rows[pairs[:1]], pairs[1:]])
+            tried = self.evaluate(trial, pairs[:, active[pairs[0]]])
             better = active & (tried.log_score > state.log_score)
             active &= (steps / self.scale).norm(dim=1) > tolerance
             motions = Pose(*chosen_rows(better, trial.parts, motions.parts))
@@ -413,7 +413,7 @@ class Ascent:
             share = torch.where(better, (2 * share).clamp_max(1), share / 4)
         return motions, state, ~active & torch.isfinite(state.log_score)
 
-    def evaluate(self, motions: Pose, pairs: Pairs) -> Overlap:
+    def evaluate(self, motions: Pose, pairs: Tensor) -> Overlap:
         self.n_evaluated += 1
         return overlap(self.source, self.target, motions, pairs)
 
@@ -439,8 +439,8 @@ class Ascent:
         length = steps.norm(dim=1, keepdim=True)
         return steps * (longest / length.clamp_min(longest)) * self.scale
 
-    def pairs(self, motions: Pose) -> Pairs:
-        """Pairs within the cutoff now, or after components have moved by the slack."""
+    def pairs(self, motions: Pose) -> Tensor:
+        """Pairs (3, P) within the cutoff now, or after components have moved by the slack."""
         k, n = len(self.source.weights), len(motions)
         moved = motions.apply(self.source.means)
         shapes = motions.rotation[:, None] @ self.source.covariances @ motions.rotation[:, None].mT
@@ -456,7 +456,7 @@ class Ascent:
             inside = (offset.mT @ torch.linalg.solve(near, offset))[:, 0, 0] <= 1
             found.append(torch.stack([point[inside], center[inside]]))
         point, center = torch.cat(found, 1)
-        return Pairs(point // k, point % k, center)
+        return torch.stack([point // k, point % k, center])
 
     def _strayed(self, motions: Pose, listed: Pose) -> bool:
         """Whether a component may have moved by more than the slack since pairs were listed."""
@@ -473,80 +473,28 @@ def log_self_overlap(mixture: Parameters) -> float:
     return float(ascent.evaluate(still, ascent.pairs(still)).log_score[0])
 
 
-def _batched_sums(
-    source: Parameters, target: Parameters, motions: Pose, pairs: Pairs
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Sums over the pairs of each motion: Σ s, Σ s ∂log N, and s times the information and ∂log N ∂log Nᵀ."""
-    n, dim = motions.translation.shape
-    n_free = dim + dim * (dim - 1) // 2
-    lever = torch.einsum("bij,kj->ibk", motions.rotation, source.means).flatten(1)
-    moved = torch.einsum("bij,kjl,bml->imbk", motions.rotation, source.covariances, motions.rotation)
-    moved = moved.flatten(2)
-    there, still = target.means.T, target.covariances.permute(1, 2, 0)
-    total = lever.new_zeros(n)
-    first, second, squares = (lever.new_zeros(n, n_free**power) for power in (1, 2, 2))
-    for rows in torch.arange(len(pairs.motion), device=lever.device).split(_CHUNK):
-        b, i, j = pairs.of(rows)
-        row = b * len(source.weights) + i
-        shift = motions.translation.T[:, b] - there[:, j]
-        log_density, slope, information = _pair_terms(lever[:, row], shift, moved[..., row], still[..., j])
-        share = source.weights[i] * target.weights[j] * torch.exp(log_density)
-        total.index_add_(0, b, share)
-        weighted = share * slope
-        first.index_add_(0, b, weighted.T)
-        second.index_add_(0, b, (share * information).flatten(0, 1).T)
-        squares.index_add_(0, b, (weighted[:, None] * slope).flatten(0, 1).T)
-    return total, first, second.view(n, n_free, n_free), squares.view(n, n_free, n_free)
-
-
 def _pair_terms(lever: Tensor, shift: Tensor, moved: Tensor, still: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Of P pairs log N (P,), its gradient (F, P) and information (F, F, P).
+    """Of P pairs log N (P,), its gradient (P, F) and information (P, F, F).
 
     Args:
-        lever: R μ_i (D, P). shift: t − μ_j (D, P). moved: A (D, D, P). still: Σ_j (D, D, P).
+        lever: R μ_i (P, D). shift: t − μ_j (P, D). moved: A (P, D, D). still: Σ_j (P, D, D).
     """
-    dim = len(lever)
+    n, dim = lever.shape
     spins = generators(dim).to(lever)
-    precision, half_log_det = _inverse(moved + still)
+    root = safe_cholesky(moved + still, "the sums of two covariances")
+    precision, half_log_det = torch.cholesky_inverse(root), root.diagonal(dim1=1, dim2=2).log().sum(1)
     offset = lever + shift
-    pull = _times(precision, offset[:, None])[:, 0]
-    log_density = -0.5 * (offset * pull).sum(0) - half_log_det - 0.5 * dim * math.log(2 * math.pi)
+    pull = (precision @ offset[:, :, None])[:, :, 0]
+    log_density = -0.5 * (offset * pull).sum(1) - half_log_det - 0.5 * dim * math.log(2 * math.pi)
 
-    arm = lever - _times(moved, pull[:, None])[:, 0]
-    matched = _times(moved, precision)
-    turned = torch.einsum("kij,jp->kip", spins, arm)
-    slope = -(pull * turned).sum(1) - torch.einsum("kij,jip->kp", spins, matched)
+    arm = lever - (moved @ pull[:, :, None])[:, :, 0]
+    turn = -torch.einsum("pi,kij,pj->pk", pull, spins, arm)
+    turn -= torch.einsum("kij,pji->pk", spins, moved @ precision)
 
-    jacobian = torch.cat([torch.eye(dim).to(lever)[..., None].expand(-1, -1, lever.shape[1]),
-                          torch.einsum("kij,jp->ikp", spins, lever)], 1)  # fmt: skip
-    information = _times(jacobian.transpose(0, 1), _times(precision, jacobian))
-    swept = torch.einsum("kij,jlp->kilp", spins, moved)
-    change = [_times(precision, s + s.transpose(0, 1)) for s in swept]
-    for k, one in enumerate(change):
-        for m, other in enumerate(change):
-            information[dim + k, dim + m] += 0.5 * (one * other.transpose(0, 1)).sum((0, 1))
-    return log_density, torch.cat([-pull, slope]), information
-
-
-def _inverse(matrices: Tensor) -> tuple[Tensor, Tensor]:
-    """Inverses (D, D, P) and ½ log det (P,) of positive definite matrices (D, D, P), by Cholesky's factors.
-
-    Written out: LAPACK takes a microsecond for each small matrix.
-    """
-    dim = len(matrices)
-    factor = torch.zeros_like(matrices)
-    for j in range(dim):
-        rest = matrices[j:, j] - (factor[j:, :j] * factor[j, :j]).sum(1)
-        factor[j:, j] = rest / rest[0].sqrt()
-    inverse = torch.zeros_like(matrices)  # of the factor
-    for j in range(dim):
-        inverse[j, j] = 1 / factor[j, j]
-        for i in range(j + 1, dim):
-            inverse[i, j] = -(factor[i, j:i] * inverse[j:i, j]).sum(0) / factor[i, i]
-    half_log_det = torch.stack([factor[j, j] for j in range(dim)]).log().sum(0)
-    return _times(inverse.transpose(0, 1), inverse), half_log_det
-
-
-def _times(a: Tensor, b: Tensor) -> Tensor:
-    """Matrix products (I, J, P) of (I, K, P) and (K, J, P)."""
-    return (a[:, :, None] * b[None]).sum(1)
+    eye = torch.eye(dim).to(lever).expand(n, dim, dim)
+    jacobian = torch.cat([eye, torch.einsum("kij,pj->pik", spins, lever)], 2)
+    information = jacobian.mT @ precision @ jacobian
+    swept = spins @ moved[:, None]
+    change = precision[:, None] @ (swept + swept.mT)
+    information[:, dim:, dim:] += 0.5 * torch.einsum("pkij,pmji->pkm", change, change)
+    return log_density, torch.cat([-pull, turn], 1), information

@@ -15,17 +15,8 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.datasets import Dataset
 from gmmtorch.errors import DataError, InvalidArgumentError, check_number, check_whole
-from gmmtorch.localization.alignment import (
-    Alignment,
-    AlignmentTarget,
-    align,
-    around,
-    best_distinct,
-    differences,
-    everywhere,
-    merged_below,
-    seen_normals,
-)
+from gmmtorch.localization import alignment
+from gmmtorch.localization.alignment import Alignment, AlignmentTarget
 from gmmtorch.localization.location import UNSEEN, Location, continued, measured_motion, pose_covariance
 from gmmtorch.localization.pose_search import CORRELATED, PoseSearch, free_segments
 from gmmtorch.mapping import Components, GaussianMap, Surfaces, surface_mixture
@@ -108,11 +99,13 @@ class Tracker:
         centered = mixture._replace(means=mixture.means - self._center)
         seen = surfaces.components() if isinstance(surfaces, GaussianMap) else surfaces
         self._seen = seen if isinstance(seen, Components) else None
-        normals = torch.zeros_like(centered.means) if self._seen is None else seen_normals(self._seen)
+        normals = (
+            torch.zeros_like(centered.means) if self._seen is None else alignment.seen_normals(self._seen)
+        )
         self._targets = [
             AlignmentTarget(merged, blur, faces)
             for blur in _BLURS
-            for merged, faces in (merged_below(centered, normals, blur),)
+            for merged, faces in (alignment.merged_below(centered, normals, blur),)
         ]
         self._places = mixture.means[:0] if self._seen is None else _places(self._seen, self._center)
         self.restart(pose)
@@ -153,12 +146,15 @@ class Tracker:
         measured = None if motion is None else measured_motion(motion, self.dim, self._center.device)
         measured = continued(measured, self._motion) if isinstance(measured, Tensor) else measured
         predicted = self._predicted(measured)
-        rows = self._thinned(rows[rows.norm(dim=1) > _NEAREST])
+        rows = rows[rows.norm(dim=1) > _NEAREST]
+        drawn = torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))[: self.n_points]
+        rows = rows[drawn.to(rows.device)]
         best: Location | None = None
         searches = self._searches(rows, predicted, measured is not None) if len(rows) else ()
         for level, starts, is_enough in searches:
             found = self._climbed(rows, starts, level)
-            best = found if best is None else _better(best, found)
+            if best is None or (found.found, found.explained) > (best.found, best.explained):
+                best = found
             if best.found and best.explained >= is_enough:
                 break
         best = self._nothing(predicted) if best is None else self._questioned(best, predicted)
@@ -170,7 +166,7 @@ class Tracker:
         if predicted is None or not location.found or location.explained >= _SURE * self._explained:
             return location
         pose = Pose.from_matrix(location.pose).shifted(-self._center)
-        if float(differences(pose[None], predicted[None], self.distance, self.angle)) <= 1:
+        if float(alignment.differences(pose[None], predicted[None], self.distance, self.angle)) <= 1:
             return location
         doubt = (
             f"{location.explained:.0%} of the points lie on surfaces, fewer than in the last scan, and the "
@@ -190,15 +186,19 @@ class Tracker:
             start = predicted[None]
             if self.n_lost == 0 and (is_measured or self._motion is not None):
                 yield _FINE, start, _USUAL * self._explained
-            yield _FINE, around(start, self.distance, self.angle, _BLURS[_FINE]), _USUAL * self._explained
+            yield (
+                _FINE,
+                alignment.around(start, self.distance, self.angle, _BLURS[_FINE]),
+                _USUAL * self._explained,
+            )
             wide = _WIDER * self.distance, min(_WIDER * self.angle, math.pi)
-            yield 0, around(start, *wide, _BLURS[0]), 0.0
+            yield 0, alignment.around(start, *wide, _BLURS[0]), 0.0
         if len(self._places) and (predicted is None or self.n_lost >= _GLOBAL_AFTER):
             if self._raster is None:
-                yield _FINE, everywhere(self._places, _BLURS[_FINE]), 0.0
+                yield _FINE, alignment.everywhere(self._places, _BLURS[_FINE]), 0.0
             else:  # from the last level that blurs more than a cell of the raster
                 first = max(sum(blur >= self._raster.cell for blur in _BLURS) - 1, 0)
-                yield first, self._raster.anywhere(rows, _RASTERED).poses, 0.0
+                yield first, self._raster.anywhere(rows, _RASTERED)[0], 0.0
 
     @functools.cached_property
     def _raster(self) -> PoseSearch | None:
@@ -206,10 +206,6 @@ class Tracker:
         if self.dim == 3 or self._seen is None:
             return None
         return PoseSearch.of_map(self._seen, self._center)
-
-    def _thinned(self, rows: Tensor) -> Tensor:
-        draw = torch.Generator().manual_seed(0)
-        return rows[torch.randperm(len(rows), generator=draw)[: self.n_points].to(rows.device)]
 
     def _climbed(self, rows: Tensor, starts: Pose, first: int) -> Location:
         """The location that the levels from `first` on reach from the best of the starts."""
@@ -220,8 +216,10 @@ class Tracker:
                 motions = Pose.cat([motions, self._ranked(rows, starts, target)])
             is_last = target is self._targets[-1]
             used = rows if is_last else rows[: max(_RANKING_POINTS, int(_COARSE_SHARE * len(rows)))]
-            found = align(used, target, motions, _STEPS if is_last or number == 0 else _BETWEEN_STEPS)
-            order = best_distinct(found.motions, found.evidence, target.blur * _SAME)
+            found = alignment.align(
+                used, target, motions, _STEPS if is_last or number == 0 else _BETWEEN_STEPS
+            )
+            order = alignment.best_distinct(found.motions, found.evidence, target.blur * _SAME)
             found = found.at(order[: max(2, n_starts >> number)])
             motions = found.motions
         return self._location(rows, found, is_tracked=len(starts) == 1)
@@ -238,7 +236,7 @@ class Tracker:
         order = score.argsort(descending=True, stable=True)
         if n > _RANKED:
             best = order[:_RANKED]
-            order = best[best_distinct(starts[best], score[best], 1.01 * target.blur)]
+            order = best[alignment.best_distinct(starts[best], score[best], 1.01 * target.blur)]
         return starts[order[:_CLIMBED]]
 
     def _location(self, rows: Tensor, found: Alignment, is_tracked: bool) -> Location:
@@ -252,7 +250,7 @@ class Tracker:
             doubts.append(f"only {share:.0%} of the points lie on surfaces: another place, or a changed one")
         if loosest > _LOOSEST:
             doubts.append(f"the surfaces leave a direction open: a standard deviation of {loosest:.2g} m")
-        other = differences(found.motions, found.motions, _APART, _APART)[0] > 1
+        other = alignment.differences(found.motions, found.motions, _APART, _APART)[0] > 1
         lead = (found.evidence[0] - found.evidence) * len(rows) / CORRELATED
         if bool((other & (lead <= _ALIKE)).any()):
             doubts.append("another pose explains the scan as well")
@@ -293,10 +291,6 @@ class Tracker:
         is_next = last is not None and self.n_lost == 0 and self._explained > 0
         self._motion = last.inverse() @ now if last is not None and is_next else None
         self._last, self.n_lost, self._explained = now, 0, location.explained
-
-
-def _better(some: Location, other: Location) -> Location:
-    return max(some, other, key=lambda location: (location.found, location.explained))
 
 
 def _places(surfaces: Components, center: Tensor) -> Tensor:
@@ -374,15 +368,17 @@ def clock_faults(times: Tensor) -> list[tuple[int, str]]:
         return []
     usual = float(steps[steps > 0].median()) if bool((steps > 0).any()) else 0.0
     faults = ((steps < 0) | (steps > _GAP * usual)).nonzero()[:, 0] + 1
-    return [(scan, _fault(float(steps[scan - 1]), usual)) for scan in faults.tolist()]
-
-
-def _fault(step: float, usual: float) -> str:
-    if step < 0:
-        return (
-            f"the clock goes back by {-step:.3g} s; readers of the trajectory drop the poses of one side: "
-            "correct the times of the recording (a bag: clock=received)"
+    found = []
+    for scan in faults.tolist():
+        step = float(steps[scan - 1])
+        fault = (
+            f"{step:.3g} s after the scan before it, usually {usual:.2g} s: scans are missing, or the clock "
+            "jumps"
         )
-    return (
-        f"{step:.3g} s after the scan before it, usually {usual:.2g} s: scans are missing, or the clock jumps"
-    )
+        if step < 0:
+            fault = (
+                f"the clock goes back by {-step:.3g} s; readers of the trajectory drop the poses of one "
+                "side: correct the times of the recording (a bag: clock=received)"
+            )
+        found.append((scan, fault))
+    return found

@@ -59,7 +59,6 @@ from .map_builder import resident_bytes as resident_bytes
 from .query import Query as Query
 from .query_options import METHODS as METHODS
 from .query_options import QueryOptions as QueryOptions
-from .query_options import check_method as check_method
 from .surfaces import Body as Body
 from .surfaces import Surfaces as Surfaces
 from .surfaces import collision_probability as collision_probability

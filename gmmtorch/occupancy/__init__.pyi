@@ -41,7 +41,6 @@ from .forms.point import expected_range as expected_range
 from .forms.point import few_point_evidence as few_point_evidence
 from .forms.point import hit_probability as hit_probability
 from .forms.point import point_evidence as point_evidence
-from .forms.quadrature import check_tolerance as check_tolerance
 from .forms.quadrature import normal_mass as normal_mass
 from .grid import MEMORY_LIMIT as MEMORY_LIMIT
 from .grid import VoxelGrid as VoxelGrid

@@ -27,11 +27,6 @@ class TestOctoMapMap(OccupancyMapContract):
         return OctoMapMap(RESOLUTION)
 
 
-class TestOctoMapMapByRay(OccupancyMapContract):
-    def make(self) -> OctoMapMap:
-        return OctoMapMap(RESOLUTION, by_ray=True)
-
-
 def log_odds(p: float) -> float:
     return math.log(p / (1 - p))
 

@@ -18,13 +18,12 @@ from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
 
 from gmmtorch import datasets
-from gmmtorch.cli import common, export, inputs, localize, options_help
+from gmmtorch.cli import build, common, export, inputs, localize, options_help
 from gmmtorch.cli.inputs import open_dataset
 from gmmtorch.errors import InvalidArgumentError, MissingDataError
-from gmmtorch.experiments.cli import methods_of_options
 from gmmtorch.experiments.cli import studies as study_cases
 from gmmtorch.experiments.cli.experiment_schema import STUDIES
-from gmmtorch.experiments.cli.fits_of_options import fit_options
+from gmmtorch.experiments.cli.fit_runs import fit_options
 from gmmtorch.experiments.evaluation import methods
 from gmmtorch.experiments.evaluation.fits import ESTIMATORS
 from gmmtorch.mapping.gaussian_map import GaussianMap
@@ -200,7 +199,7 @@ def test_a_fit_of_the_options_is_the_default_one():
     from gmmtorch.experiments.evaluation.protocol_options import FitOptions, Protocol
 
     assert fit_options(composed("fit")) == FitOptions()
-    assert methods_of_options.protocol_of(composed("occupancy")) == Protocol()
+    assert build(Protocol, composed("occupancy"), "evaluation") == Protocol()
 
 
 def test_robots_and_teams_have_the_options_of_an_exploration():

@@ -14,6 +14,7 @@ import pytest
 import torch
 from command_runs import CHECKOUT, QUIET, TINY, Finished, environment, run_here, run_python
 
+from gmmtorch.experiments.cli import fit_runs
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 from gmmtorch.mixture.streaming import read_state
 
@@ -61,8 +62,9 @@ def assert_same(one: Finished, two: Path) -> None:
 
 @pytest.mark.slow
 def test_two_processes_give_the_result_of_one_and_write_it_once(run, cloud, tmp_path):
-    """The initialization uses a sample of 500 points, which must not depend on the number of processes."""
-    options = [f"points={cloud}", "stream.sample_points=500", "mixture.tol=1e-6"]
+    """The initialization uses a sample of the points, which must not depend on the number of processes."""
+    np.save(cloud, np.random.default_rng(1).normal(size=(120_000, 3)))  # more than the sample has
+    options = [f"points={cloud}", "mixture.tol=1e-3"]
     one = run(*options, name="one")
     assert one.status == 0, one.stderr
     two = torchrun(tmp_path / "two", *options)
@@ -79,8 +81,9 @@ def test_two_processes_give_the_result_of_one_and_write_it_once(run, cloud, tmp_
     assert {path.name for path in tmp_path.iterdir()} == {"cloud.npy", "one", "two"}
 
 
-def test_a_streamed_row_covers_the_whole_cloud(run, cloud):
-    done = run(f"points={cloud}", "stream.sample_points=300")
+def test_a_streamed_row_covers_the_whole_cloud(run, cloud, monkeypatch):
+    monkeypatch.setattr(fit_runs, "_SAMPLE_POINTS", 300)
+    done = run(f"points={cloud}")
     assert done.status == 0, done.stderr
     (row,) = done.results()["rows"]
     points = torch.from_numpy(np.load(cloud))
@@ -120,7 +123,6 @@ def test_a_run_resumes_from_its_checkpoint(run, cloud, tmp_path):
         (["points={cloud}", "test_share=1"], "test_share=1"),
         (["points={cloud}", "stream.chunk_points=0"], "chunk_points=0"),
         (["points={cloud}", "mixture.n_components=9999"], "n_components=9999"),
-        (["points={cloud}", "stream.timeout=0"], "timeout=0"),
         (["resume=true"], "checkpoint=FILE"),
         (["resume=true", "checkpoint=nowhere/a.safetensors"], "nowhere does not exist"),
     ],

@@ -10,7 +10,6 @@ import pytest
 import torch
 from pillar_room import timeless
 
-from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.report.approximation_error_figures import approximation_figures
 from gmmtorch.experiments.studies.approximation_error import (
     Scene,
@@ -36,9 +35,16 @@ SMALL = ApproximationErrorStudy(
 )
 
 
+EVENTS: list[tuple[str, int, int | None]] = []
+SEEN: list[int] = []
+
+
 @pytest.fixture(scope="module")
 def rows() -> list[dict[str, Any]]:
-    return run_approximation_error(SMALL, seed=0)
+    """Rows of the small study; its events and the numbers of rows so far are noted."""
+    return run_approximation_error(
+        SMALL, 0, lambda *event: EVENTS.append(event), lambda rows: SEEN.append(len(rows))
+    )
 
 
 def of(rows: list[dict[str, Any]], study: str) -> Iterator[dict[str, Any]]:
@@ -103,16 +109,11 @@ def test_monte_carlo_and_flux_converge_on_a_grid(rows):
 
 
 def test_rows_depend_only_on_the_seed_and_progress_is_complete(rows):
-    events: list[tuple[str, int, int | None]] = []
-    seen: list[int] = []
-    again = run_approximation_error(
-        SMALL, 0, lambda *event: events.append(event), lambda rows: seen.append(len(rows))
-    )
-    assert timeless(again) == timeless(rows)
-    assert [done for _, done, _ in events] == [0, 1, 2, 3]
-    assert seen == list(range(1, len(rows) + 1))
-    other = sweep_rows(2, SMALL, torch.Generator().manual_seed(1))
-    assert timeless(list(other)) != timeless([r for r in rows if r["study"] == "sweep"])
+    assert [done for _, done, _ in EVENTS] == [0, 1, 2, 3]
+    assert list(range(1, len(rows) + 1)) == SEEN
+    same, other = (timeless(sweep_rows(2, SMALL, torch.Generator().manual_seed(seed))) for seed in (0, 1))
+    assert same != other
+    assert [{"dataset": "one component", **row} for row in same] == timeless(of(rows, "sweep"))
 
 
 def test_cast_rays_distinguishes_hits_misses_and_no_crossing(generator):
@@ -138,20 +139,3 @@ def test_every_study_has_a_figure(rows):
         figure.canvas.draw()
         assert figure.get_suptitle()
     assert list(approximation_figures(list(of(rows, "sweep")))) == ["approximation_error_sweep"]
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"dims": (4,)}, "dims=4"),
-        ({"dims": ()}, r"dims=\[\] is empty"),
-        ({"n_pixels": 0}, "n_pixels=0"),
-        ({"n_rays": ()}, r"n_rays=\[\] is empty"),
-        ({"support": float("nan")}, "support=nan"),
-        ({"prior": -1.0}, "prior=-1"),
-        ({"resolution": 0.0}, "resolution=0"),
-    ],
-)
-def test_invalid_options_raise(options, message):
-    with pytest.raises(InvalidArgumentError, match=message):
-        ApproximationErrorStudy(**options)

@@ -13,8 +13,7 @@ from pillar_room import room_scans, timeless
 
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.experiments.evaluation.held_out import Outcome, evaluate
-from gmmtorch.experiments.evaluation.mapping_methods import MapFactory, choose, methods
+from gmmtorch.experiments.evaluation.held_out import MapFactory, Outcome, choose, evaluate, methods
 from gmmtorch.experiments.evaluation.protocol_options import Protocol
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.occupancy.occupancy_grid import OccupancyGrid
@@ -202,7 +201,6 @@ def test_chosen_methods_are_known_and_keep_their_order():
         ({"kept": (1.0, 2.0)}, "kept=2"),
         ({"kept": (0.0,)}, "kept=0"),
         ({"test_every": 1}, "test_every=1"),
-        ({"removal": "rays"}, "removal='rays'"),
         ({"free": "behind"}, "free='behind'"),
         ({"pose_noise": (0.1,)}, "pose_noise="),
         ({"pose_noise": (-1.0, 0.0)}, "pose_noise="),

@@ -97,7 +97,6 @@ def test_rows_are_reported_one_by_one_and_progress_is_complete(data):
     [
         ({"n_seeds": 0}, "n_seeds=0"),
         ({"n_components": ()}, r"n_components=\[\] is empty"),
-        ({"init_params": []}, r"init_params=\[\] is empty"),
         ({"initial_covariance": ("sphere",)}, "initial_covariance='sphere'"),
         ({"n_components": (2, 400)}, "n_components=400 is more than the n_samples=300"),
         ({"n_components": (0,)}, "n_components=0"),

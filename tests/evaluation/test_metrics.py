@@ -18,17 +18,13 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.evaluation.metrics import (
     SeenPredictions,
-    accuracy,
     auc_gain,
     auc_interval,
-    brier_score,
-    log_loss_bits,
     psnr2,
     psnr_terms,
     reliability,
     roc,
     scores,
-    separating_threshold,
     unknown_scores,
 )
 from gmmtorch.experiments.evaluation.queries import hit_and_free
@@ -69,7 +65,7 @@ def test_the_separating_threshold_is_the_best_of_all(occupied, free):
         return float((hits >= threshold).double().mean() - (misses >= threshold).double().mean())
 
     best = max(gain(k / 8) for k in range(10))
-    assert gain(separating_threshold(hits, misses)) == pytest.approx(best)
+    assert gain(roc(hits, misses).separating) == pytest.approx(best)
 
 
 @pytest.mark.parametrize(("n_occupied", "n_free"), [(0, 3), (3, 0), (0, 0)])
@@ -242,21 +238,17 @@ def test_scores_match_scikit_learn():
     assert list(found) == ["ece", "brier", "log_loss_bits", "accuracy"]
     assert all(type(value) is float for value in found.values())
     assert found["ece"] == reliability(theta, labels).expected_error
-    assert found["brier"] == brier_score(theta, labels)
     assert found["brier"] == pytest.approx(brier_score_loss(labels, theta), rel=1e-9)
-    assert found["log_loss_bits"] == log_loss_bits(theta, labels)
     assert found["log_loss_bits"] == pytest.approx(log_loss(labels, theta) / math.log(2), rel=1e-9)
     called = (theta > 0.5).double()
     called[theta == 0.5] = 0.5  # counts one half
-    assert found["accuracy"] == accuracy(theta, labels)
     assert found["accuracy"] == pytest.approx(1 - float((called - labels).abs().mean()))
 
 
 def test_log_loss_is_one_bit_at_one_half_and_52_for_a_certain_mistake():
-    labels = torch.tensor([0, 1])
-    assert log_loss_bits(torch.tensor([0.5, 0.5]), labels) == 1
-    assert log_loss_bits(torch.tensor([0.0, 1.0]), labels) == pytest.approx(0, abs=1e-12)
-    assert log_loss_bits(torch.tensor([1.0, 0.0]), labels) == pytest.approx(52)
+    for theta, bits in (([0.5, 0.5], 1), ([0.0, 1.0], 0), ([1.0, 0.0], 52)):
+        found = scores(torch.tensor(theta), torch.tensor([0, 1]))
+        assert found["log_loss_bits"] == pytest.approx(bits, abs=1e-12)
 
 
 def test_a_tally_of_predictions_has_the_scores_of_its_points():
@@ -328,7 +320,7 @@ def test_bins_of_a_tally_with_few_predictions_are_pooled():
         ([[0.5]], [[1]], "must be \\(M,\\)"),
     ],
 )
-@pytest.mark.parametrize("score", [reliability, brier_score, log_loss_bits, accuracy])
+@pytest.mark.parametrize("score", [reliability, scores])
 def test_invalid_probabilities_and_labels_raise(score, theta, labels, says):
     with pytest.raises(InvalidArgumentError, match=says):
         score(torch.tensor(theta), torch.tensor(labels))

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from gmmtorch.datasets import load
-from gmmtorch.experiments.evaluation.held_out import Protocol, evaluate
-from gmmtorch.experiments.evaluation.mapping_methods import choose, methods
+from gmmtorch.experiments.evaluation.held_out import Protocol, choose, evaluate, methods
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.scan import Scan
 

@@ -70,13 +70,12 @@ def test_odometry_of_a_turning_lidar_needs_the_times_of_points():
     assert float(flat.max()) < 0.005, flat
 
 
-@pytest.mark.parametrize("suffix", ["mcap", "bag"])
-def test_a_bag_without_tf_is_deskewed_by_its_odometry(tmp_path, suffix):
-    with BagWriter(tmp_path / f"a.{suffix}") as bag:
+def test_a_bag_without_tf_is_deskewed_by_its_odometry(tmp_path):
+    with BagWriter(tmp_path / "a.mcap") as bag:
         for number in range(N):
             points, seconds, _ = sweep(number)
             bag.cloud("/points", number * PERIOD + 1, "lidar", points, seconds)
-    dataset, found = with_odometry(load("rosbag", tmp_path / f"a.{suffix}", poses="standing"))
+    dataset, found = with_odometry(load("rosbag", tmp_path / "a.mcap", poses="standing"))
     assert found.found.all()
     true = poses_at(stamps()).matrix
     assert absolute_trajectory_error(found.poses, true, "first").rmse < 0.05

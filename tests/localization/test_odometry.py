@@ -11,7 +11,7 @@ from gmmtorch.datasets import load
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.localization import Odometry, with_odometry
 from gmmtorch.localization.alignment import align
-from gmmtorch.localization.local_map import LocalMap
+from gmmtorch.localization.local_map import Keyframe, LocalMap
 from gmmtorch.localization.odometry import _RULE, _bridged
 from gmmtorch.localization.pose_search import Expectation
 from gmmtorch.localization.trajectory_errors import absolute_trajectory_error
@@ -25,6 +25,11 @@ def sensor_scans(name: str, n: int) -> tuple[list[Tensor], Tensor]:
     scans = load(name)
     poses = torch.stack([scans.pose(i) for i in range(n)])
     return [scans[i].transformed(torch.linalg.inv(pose)).points for i, pose in enumerate(poses)], poses
+
+
+def keyframe(points: Tensor) -> Keyframe:
+    order = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))
+    return Keyframe(points[order], Pose.identity(points.shape[1]))
 
 
 @pytest.mark.parametrize(("name", "n"), [("synthetic_building_2d", N_2D), ("synthetic_building", N_3D)])
@@ -142,7 +147,7 @@ def test_a_room_with_equal_sides_leaves_the_heading_in_doubt():
     side = torch.linspace(-3, 3, 120).double()
     wall = torch.full_like(side, 3.0)
     room = torch.cat([torch.stack(w, 1) for w in ((side, wall), (side, -wall), (wall, side), (-wall, side))])
-    frame = Odometry()._scan(room)
+    frame = keyframe(room)
     local = LocalMap([frame], 0.5, _RULE)
     between = Pose.from_yaw([0.8], [0.0, 0.0])
     location = local.locate(frame, Expectation(between, 0.3, 0.2, 0.95))
@@ -165,9 +170,9 @@ def test_the_first_search_in_3d_reaches_past_the_nearest_maximum(seed):
     draw = torch.Generator().manual_seed(seed)
     before, after = wall(draw, 4000, 8, 1), wall(draw, 1000, 3, 1)
     before, after = (points[(points[:, 0].abs() > 0.2) | (points[:, 1] > 2.9)] for points in (before, after))
-    local = LocalMap([Odometry()._scan(before)], 0.5, _RULE)
+    local = LocalMap([keyframe(before)], 0.5, _RULE)
     predicted = Pose.from_yaw([0.0], [0.75, 0.0, 0.0])
-    location = local.locate(Odometry()._scan(after), Expectation(predicted, 0.3, 0.2, 0.95))
+    location = local.locate(keyframe(after), Expectation(predicted, 0.3, 0.2, 0.95))
     assert location.found
     assert float(location.pose[:3, 3].norm()) < 0.05
 
@@ -185,8 +190,8 @@ def wall_and_post(draw: torch.Generator, n: int, reach: float, dim: int) -> Tens
 def test_a_pose_that_slid_along_a_wall_returns_to_where_its_post_is(dim, shift):
     # At the last blur the post is out of reach, and along the wall the score is flat.
     draw = torch.Generator().manual_seed(0)
-    local = LocalMap([Odometry()._scan(wall_and_post(draw, 2000, 6, dim))], 0.5, _RULE)
-    scan = Odometry()._scan(wall_and_post(draw, 600, 3, dim))
+    local = LocalMap([keyframe(wall_and_post(draw, 2000, 6, dim))], 0.5, _RULE)
+    scan = keyframe(wall_and_post(draw, 600, 3, dim))
     start = Pose.from_yaw([0.0], [shift, 0.0, 0.0][:dim])
     expected = Expectation(Pose.identity(dim, 1), 0.3, 0.2, 0.95)
     climbed = align(scan.points, local._targets[-1], start.shifted(-local._center), 15).motions
@@ -199,8 +204,8 @@ def test_a_pose_that_slid_along_a_wall_returns_to_where_its_post_is(dim, shift):
 def test_a_small_gain_of_evidence_does_not_move_a_pose_from_the_largest_score():
     # Along the wall, the counts of points that agree with free space give places nearby 2 nats more.
     draw = torch.Generator().manual_seed(0)
-    local = LocalMap([Odometry()._scan(wall_and_post(draw, 2000, 6, 3))], 0.5, _RULE)
-    scan = Odometry()._scan(wall_and_post(draw, 600, 3, 3))
+    local = LocalMap([keyframe(wall_and_post(draw, 2000, 6, 3))], 0.5, _RULE)
+    scan = keyframe(wall_and_post(draw, 600, 3, 3))
     start = Pose.identity(3, 1)
     climbed = align(scan.points, local._targets[-1], start.shifted(-local._center), 15).motions
     location = local._climbed(scan, Expectation(start, 0.3, 0.2, 0.95), start, local._targets[-1:]).location
@@ -216,9 +221,9 @@ def test_a_box_that_moved_along_equal_pillars_is_not_believed(seed):
     for points, place in ((before, 1), (after, -1)):
         points[(points[:, 0] - place).abs() < 0.1, 1] -= 0.3
     after[:300, 1] = 3 - 0.3 * torch.rand(300, generator=draw)
-    local = LocalMap([Odometry()._scan(before)], 0.5, _RULE)
+    local = LocalMap([keyframe(before)], 0.5, _RULE)
     expected = Expectation(Pose.identity(2, 1), 0.3, 0.2, 0.95)
-    location = local.locate(Odometry()._scan(after), expected)
+    location = local.locate(keyframe(after), expected)
     assert float(location.pose[:2, 2].norm()) < 0.05 or not location.found
 
 
@@ -230,6 +235,53 @@ def test_a_motion_beyond_the_bounds_is_not_found():
     assert found.found
     assert not refused.found
     assert "max_step" in "".join(refused.doubts)
+
+
+# -- scans, clocks and wheels that are wrong in usual ways -------------------------------------------------
+
+
+def largest_error(odometry: Odometry, true: Tensor) -> float:
+    """The largest distance (m) of the poses from the true ones (N, 3, 3), with the first one there."""
+    return float(absolute_trajectory_error(odometry.poses, true, align="first").distances.max())
+
+
+def test_a_sensor_upside_down_sees_the_mirrored_world():
+    scans, true = sensor_scans("synthetic_building_2d", 6)
+    mirror = torch.diag(torch.tensor([1.0, -1.0])).double()
+    odometry = Odometry()
+    assert all(odometry.add(points.double() @ mirror).found for points in scans)
+    flip = torch.block_diag(mirror, torch.ones(1, 1).double())
+    assert largest_error(odometry, flip @ (true[0].inverse() @ true) @ flip) < 0.05
+
+
+def test_clocks_that_stand_still_or_jump_do_not_mislead():
+    scans, true = sensor_scans("synthetic_building_2d", 6)
+    odometry = Odometry()
+    stamps = [0.0, 0.0, 1.0, 1e9, math.nan, -5.0]
+    assert all(odometry.add(*pair).found for pair in zip(scans, stamps, strict=True))
+    assert largest_error(odometry, true) < 0.05
+
+
+def test_repeated_scans_do_not_move():
+    scans, _ = sensor_scans("synthetic_building_2d", 1)
+    odometry = Odometry()
+    assert all(odometry.add(scans[0]).found for _ in range(6))
+    assert len(odometry.keyframes) == 1
+    assert float(odometry.poses[:, :2, 2].norm(dim=1).max()) < 0.01
+
+
+def test_wheels_that_slip_by_a_third_are_corrected():
+    scans, true = sensor_scans("synthetic_building_2d", 6)
+    odometry = Odometry()
+    odometry.add(scans[0])
+    for number in range(1, 6):
+        motion = true[number - 1].inverse() @ true[number]
+        motion[:2, 2] *= 0.7
+        assert odometry.add(scans[number], motion=motion).found
+    assert largest_error(odometry, true) < 0.05
+
+
+# -- recordings ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.real_data

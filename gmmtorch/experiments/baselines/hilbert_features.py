@@ -18,9 +18,6 @@ from gmmtorch.experiments.baselines.samples import centroids
 CHUNK_VALUES = 1 << 22
 """Values of features that are computed at a time."""
 
-MAX_POINTS = 1 << 16
-"""Largest number of points per dense design, which limits the memory used."""
-
 _NYSTROEM_REACH = 5.0  # distance from the centres, in lengths, beyond which nothing is known
 
 
@@ -30,151 +27,124 @@ def rbf_kernel(distance: Tensor, length: float) -> Tensor:
 
 
 @dataclass(frozen=True)
-class DenseDesign:
-    """Features Φ = K mix⁻ᵀ (M, F) of M points. The rows of K are computed in chunks; the first is cached.
+class DenseFeatures:
+    """Features mix⁻¹ k(x), made by `fourier_features` or `nystroem_features`.
 
-    points: (M, D). values: computes K of points. mix: (F, F), lower triangular; None: the unit matrix.
-    near: tells whether points are in reach; None: all are.
+    count: their number, F. anchor: (D,), m, origin of x, so that positions far from the world origin stay
+    exact. values: computes k (M, F) of points. tensors: from which a file restores the features. mix: (F, F),
+    lower triangular; None: the unit matrix. near: tells whether points are in reach; None: all are.
     """
 
-    points: Tensor
     count: int
+    anchor: Tensor
     values: Callable[[Tensor], Tensor]
+    tensors: dict[str, Tensor]
     mix: Tensor | None = None
     near: Callable[[Tensor], Tensor] | None = None
+    max_points = 1 << 16
+    """Largest number of points per design, which limits the memory used."""
+
+    def design(self, points: Tensor) -> DenseDesign:
+        """The design of finite points (M, D), float64, in the world frame."""
+        return DenseDesign(self, points - self.anchor)
+
+
+class DenseDesign:
+    """Φ (M, F) of M points (M, D) about the anchor. Values are computed in chunks; the first is cached."""
+
+    def __init__(self, features: DenseFeatures, points: Tensor) -> None:
+        self._features, self._points = features, points
 
     @cached_property
     def _first(self) -> Tensor:
-        return self.values(self._chunks()[0])
+        return self._features.values(self._chunks()[0])
 
     def _chunks(self) -> tuple[Tensor, ...]:
-        return self.points.split(max(1, CHUNK_VALUES // max(1, self.count)))
+        return self._points.split(max(1, CHUNK_VALUES // max(1, self._features.count)))
 
     def _values_by_chunk(self) -> Iterator[Tensor]:
         yield self._first
         for chunk in self._chunks()[1:]:
-            yield self.values(chunk)
+            yield self._features.values(chunk)
 
     def dot(self, weights: Tensor) -> Tensor:
         """Φ w (M,)."""
-        if self.mix is not None:
-            weights = torch.linalg.solve_triangular(self.mix.mT, weights[:, None], upper=True)[:, 0]
+        mix = self._features.mix
+        if mix is not None:
+            weights = torch.linalg.solve_triangular(mix.mT, weights[:, None], upper=True)[:, 0]
         # Row by row, because the rounding of a matrix product depends on the number of rows.
         return torch.cat([(values * weights).sum(1) for values in self._values_by_chunk()])
 
     def transpose_dot(self, residuals: Tensor) -> Tensor:
         """Φᵀ r (F,)."""
-        total, start = residuals.new_zeros(self.count), 0
+        total, start, mix = residuals.new_zeros(self._features.count), 0, self._features.mix
         for values in self._values_by_chunk():
             total += residuals[start : start + len(values)] @ values
             start += len(values)
-        if self.mix is not None:
-            total = torch.linalg.solve_triangular(self.mix, total[:, None], upper=False)[:, 0]
+        if mix is not None:
+            total = torch.linalg.solve_triangular(mix, total[:, None], upper=False)[:, 0]
         return total
 
     def rows(self, index: Tensor) -> DenseDesign:
         """The design of a subset of the points."""
-        return DenseDesign(self.points[index], self.count, self.values, self.mix, self.near)
+        return DenseDesign(self._features, self._points[index])
 
     def in_reach(self) -> Tensor:
         """Whether each point (M,) is in the reach of the features."""
-        if self.near is None:
-            return torch.ones(len(self.points), dtype=torch.bool, device=self.points.device)
-        return torch.cat([self.near(chunk) for chunk in self._chunks()])
+        if self._features.near is None:
+            return torch.ones(len(self._points), dtype=torch.bool, device=self._points.device)
+        return torch.cat([self._features.near(chunk) for chunk in self._chunks()])
 
 
-class FourierFeatures:
+def fourier_features(frequencies: Tensor, anchor: Tensor) -> DenseFeatures:
     """Random Fourier features (Rahimi & Recht 2007): a constant, and √(2/F)·[cos ωᵀx, sin ωᵀx].
 
     With ω ~ N(0, I/ℓ²), φ(x)ᵀφ(y) ≈ exp(−‖x−y‖²/2ℓ²). Every point is in their reach. frequencies: ω (F/2, D),
-    1/m. anchor: (D,), m, origin of x, so that phases far from the world origin stay exact.
+    1/m.
     """
+    frequencies, anchor = frequencies.float(), anchor.double()  # rounded as in files
 
-    max_points = MAX_POINTS
-
-    def __init__(self, frequencies: Tensor, anchor: Tensor) -> None:
-        self.frequencies = frequencies.float()  # rounded as in files
-        self.anchor = anchor.double()
-
-    @classmethod
-    def drawn(
-        cls, n_features: int, length: float, anchor: Tensor, generator: torch.Generator
-    ) -> FourierFeatures:
-        """Draws `n_features` features of a kernel with this length (m)."""
-        frequencies = torch.randn(max(1, n_features // 2), anchor.shape[0], generator=generator)
-        return cls(frequencies.to(anchor.device) / length, anchor)
-
-    @property
-    def count(self) -> int:
-        """Number of features, F."""
-        return 2 * self.frequencies.shape[0] + 1
-
-    def design(self, points: Tensor) -> DenseDesign:
-        """The design of finite points (M, D), float64, in the world frame."""
-        return DenseDesign(points - self.anchor, self.count, self._values)
-
-    def _values(self, points: Tensor) -> Tensor:
-        phase = (points[:, None] * self.frequencies.double()).sum(2).float()
-        scale = self.frequencies.shape[0] ** -0.5
+    def values(points: Tensor) -> Tensor:
+        phase = (points[:, None] * frequencies.double()).sum(2).float()
+        scale = len(frequencies) ** -0.5
         one = torch.ones(len(points), 1, device=points.device)
         return torch.cat([one, phase.cos() * scale, phase.sin() * scale], 1).double()
 
-    def tensors(self) -> dict[str, Tensor]:
-        """The tensors from which a file restores the features."""
-        return {"frequencies": self.frequencies, "anchor": self.anchor}
+    tensors = {"frequencies": frequencies, "anchor": anchor}
+    return DenseFeatures(2 * len(frequencies) + 1, anchor, values, tensors)
 
 
-class NystroemFeatures:
+def nystroem_features(centers: Tensor, anchor: Tensor, length: float) -> DenseFeatures:
     """Nyström features L⁻¹ k(x), with k the kernel of the centres and L Lᵀ = K their kernel matrix.
 
     Williams & Seeger 2001. φ(x)ᵀφ(y) = k(x)ᵀ K⁻¹ k(y) is the exact kernel on the span of the centres.
     Points more than five lengths from all centres are out of reach. centers: (F, D), m, relative to the
     anchor (D,). length: ℓ of exp(−d²/2ℓ²) (m).
     """
+    centers, anchor = centers.float(), anchor.double()  # rounded as in files
 
-    max_points = MAX_POINTS
-
-    def __init__(self, centers: Tensor, anchor: Tensor, length: float) -> None:
-        self.centers = centers.float()  # rounded as in files
-        self.anchor = anchor.double()
-        self.length = length
-        kernel = self._values(self.centers.double())
-        # Close centres make K nearly singular; the ridge limits the size of cancelling weights.
-        ridge = 1e-6 * torch.eye(self.count, dtype=torch.float64, device=kernel.device)
-        self._factor = torch.linalg.cholesky(kernel + ridge)
-
-    @classmethod
-    def of_data(
-        cls, points: Tensor, n_features: int, length: float, anchor: Tensor, generator: torch.Generator
-    ) -> NystroemFeatures:
-        """Draws centres from the points (N, D) after merging those in one cube of half the length."""
-        candidates = centroids(points - anchor, 0.5 * length)
-        chosen = torch.randperm(candidates.shape[0], generator=generator)[:n_features].sort().values
-        return cls(candidates[chosen.to(points.device)], anchor, length)
-
-    @property
-    def count(self) -> int:
-        """Number of features, F."""
-        return self.centers.shape[0]
-
-    def design(self, points: Tensor) -> DenseDesign:
-        """The design of finite points (M, D), float64, in the world frame."""
-        return DenseDesign(points - self.anchor, self.count, self._values, self._factor, self._near)
-
-    def _values(self, points: Tensor) -> Tensor:
-        return rbf_kernel(self._distance(points), self.length)
-
-    def _distance(self, points: Tensor) -> Tensor:
+    def distance(points: Tensor) -> Tensor:
         # Exact differences, because products of large coordinates lose small distances.
-        exact = "donot_use_mm_for_euclid_dist"
-        return torch.cdist(points, self.centers.double(), compute_mode=exact)
+        return torch.cdist(points, centers.double(), compute_mode="donot_use_mm_for_euclid_dist")
 
-    def _near(self, points: Tensor) -> Tensor:
-        return (self._distance(points) <= _NYSTROEM_REACH * self.length).any(1)
+    def values(points: Tensor) -> Tensor:
+        return rbf_kernel(distance(points), length)
 
-    def tensors(self) -> dict[str, Tensor]:
-        """The tensors from which a file restores the features."""
-        return {"centers": self.centers, "anchor": self.anchor}
+    def near(points: Tensor) -> Tensor:
+        return (distance(points) <= _NYSTROEM_REACH * length).any(1)
+
+    kernel = values(centers.double())
+    # Close centres make K nearly singular; the ridge limits the size of cancelling weights.
+    factor = torch.linalg.cholesky(kernel + 1e-6 * torch.eye(len(centers)).to(kernel))
+    tensors = {"centers": centers, "anchor": anchor}
+    return DenseFeatures(len(centers), anchor, values, tensors, factor, near)
+
+
+def nystroem_centers(points: Tensor, n: int, length: float, generator: torch.Generator) -> Tensor:
+    """At most n centres (F, D) of points (N, D), of which those in one cube of half the length are merged."""
+    candidates = centroids(points, 0.5 * length)
+    chosen = torch.randperm(candidates.shape[0], generator=generator)[:n].sort().values
+    return candidates[chosen.to(points.device)]
 
 
 RBF_CUTOFF = 1e-3
@@ -282,7 +252,9 @@ class LatticeFeatures:
 
     def design(self, points: Tensor) -> LatticeDesign:
         own = (points / self.table.resolution).floor()
-        cells, cell = _distinct(own)
+        # Beyond 2^52 the cells of a float are not exact; no data is that far away.
+        cells, cell = torch.unique(own.clamp(-(2.0**52), 2.0**52), dim=0, return_inverse=True)
+        cells = cells.long()
         nodes, present = self.table.find_cells((cells[:, None] + self.offsets).flatten(0, 1))
         nodes = torch.where(present, nodes, -1).view(len(cells), len(self.offsets))
         return LatticeDesign(self, points / self.table.resolution - own, cell, nodes)
@@ -292,15 +264,9 @@ class LatticeFeatures:
         distance = ((self.offsets + 0.5) - within[:, None]).norm(dim=2) * self.table.resolution
         return self._kernel(distance, self.length)
 
+    @property
     def tensors(self) -> dict[str, Tensor]:
         return self.table.packed()
-
-
-def _distinct(cells: Tensor) -> tuple[Tensor, Tensor]:
-    """Distinct rows (C, D), int64, of finite cells (M, D), and the index (M,) of each cell among them."""
-    # Beyond 2^52 the cells of a float are not exact; no data is that far away.
-    rows, inverse = torch.unique(cells.clamp(-(2.0**52), 2.0**52), dim=0, return_inverse=True)
-    return rows.long(), inverse
 
 
 def check_lattice(kernel: str, length: float, spacing: float, dim: int) -> None:

@@ -11,7 +11,7 @@ import struct
 import tempfile
 import zlib
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -32,15 +32,6 @@ _NODE = struct.Struct("<fB")  # log-odds, and a bit for each child
 _INNER = 3  # two bits of a child in .bt; 1: free leaf, 2: occupied leaf
 
 
-class _Header(NamedTuple):
-    """binary: a `.bt` file. n_nodes: number of nodes. resolution: side of a cell (m). begin: of the nodes."""
-
-    binary: bool
-    n_nodes: int
-    resolution: float
-    begin: int
-
-
 def read_octree_file(path: str | Path) -> bytes:
     """The content of a file. Raises `MissingDataError`, and `DataError` for more than 2²⁵ nodes take."""
     path = Path(path).expanduser()
@@ -57,15 +48,28 @@ def parsed_octree(data: bytes, path: str | Path) -> tuple[Any, float]:
     Raises `DataError` for files that are not an OcTree, are damaged, or have more than 2²⁵ nodes.
     """
     path = Path(path)
-    header = _header(data, path)
-    check = _count_binary if header.binary else _count_full
-    n_nodes = check(data, header.begin, path) if len(data) > header.begin else 0
-    if n_nodes != header.n_nodes:
-        raise DataError(f"{path} announces {header.n_nodes:,} nodes, but has {n_nodes:,}; it is damaged.")
-    return _parsed(data[header.begin :], header), header.resolution
+    binary, announced, resolution, begin = _header(data, path)
+    check = _count_binary if binary else _count_full
+    n_nodes = check(data, begin, path) if len(data) > begin else 0
+    if n_nodes != announced:
+        raise DataError(f"{path} announces {announced:,} nodes, but has {n_nodes:,}; it is damaged.")
+    # OctoMap can only read from disk; it gets a header of ours.
+    text = f"\nid OcTree\nsize {n_nodes}\nres {resolution!r}\ndata\n".encode()
+    tree = load_pyoctomap().OcTree(resolution)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "tree"
+        file.write_bytes((_BINARY if binary else _FULL) + text + data[begin:])
+        if not binary:
+            tree = tree.read(str(file))
+        elif not tree.readBinary(str(file)):
+            tree = None
+    if tree is None:
+        raise DataError("OctoMap does not read this octree.")
+    return tree, resolution
 
 
-def _header(data: bytes, path: Path) -> _Header:
+def _header(data: bytes, path: Path) -> tuple[bool, int, float, int]:
+    """Whether it is a `.bt` file, the number of nodes, the side of a cell (m), and where the nodes begin."""
     binary = data.startswith(_BINARY)
     if not (binary or data.startswith(_FULL)):
         raise DataError(f"{path} does not begin as OctoMap's .bt and .ot files do.")
@@ -85,7 +89,7 @@ def _header(data: bytes, path: Path) -> _Header:
         raise DataError(f"{path}: its header is damaged: id or data is missing.")
     if not 0 <= n_nodes <= _MAX_NODES:
         raise DataError(f"{path} announces {n_nodes:,} nodes; at most {_MAX_NODES:,} are read.")
-    return _Header(binary, n_nodes, resolution, end + len(b"\ndata\n"))
+    return binary, n_nodes, resolution, end + len(b"\ndata\n")
 
 
 def _count_full(data: bytes, begin: int, path: Path) -> int:
@@ -124,23 +128,6 @@ def _check_depths(n_children: np.ndarray, path: Path, deepest: int = _DEPTH) -> 
             waiting += [depth + 1] * n
     if waiting:
         raise DataError(f"{path} ends before its tree does; it is cut off, so fetch it again.")
-
-
-def _parsed(nodes: bytes, header: _Header) -> Any:
-    """The octree of checked nodes, below a header of ours; OctoMap can only read from disk."""
-    first = _BINARY if header.binary else _FULL
-    text = f"\nid OcTree\nsize {header.n_nodes}\nres {header.resolution!r}\ndata\n".encode()
-    tree = load_pyoctomap().OcTree(header.resolution)
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "tree"
-        file.write_bytes(first + text + nodes)
-        if not header.binary:
-            tree = tree.read(str(file))
-        elif not tree.readBinary(str(file)):
-            tree = None
-    if tree is None:
-        raise DataError("OctoMap does not read this octree.")
-    return tree
 
 
 _MARK = b"# gmmtorch.octomap_map 1 "

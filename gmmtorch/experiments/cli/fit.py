@@ -9,50 +9,21 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from omegaconf import MISSING, DictConfig
 
-from gmmtorch.cli import (
-    Report,
-    Runtime,
-    as_options,
-    build,
-    print_files,
-    print_table,
-    run_dir,
-    schema_of,
-    set_up,
-    start,
-    store,
-    write_results,
-)
+from gmmtorch import cli
 from gmmtorch.declarations import group, option
 from gmmtorch.experiments.cli import experiment_schema
 from gmmtorch.experiments.evaluation import FitOptions
 from gmmtorch.mixture import PruneOptions
-from gmmtorch.report import Event, ProgressBars, Row
+from gmmtorch.report import ProgressBars
 
 TABLE = (
     "method n_components n_components_used seconds n_iterations log_likelihood held_out_log_likelihood "
     "psnr2_db held_out_psnr2_db nbytes"
 )
-
-
-@dataclass
-class StreamOptions:
-    """Clouds that are read in chunks."""
-
-    chunk_points: int = option(1 << 17, "points of a chunk, which limits the memory")
-    sample_points: int = option(
-        100_000, "size of the random sample for the initialization of EM and for PSNR2"
-    )
-    max_range: float | None = option(
-        None, "points at this distance (m) from the frame's origin or beyond are dropped; null: none"
-    )
-    checkpoint_every: int = option(10, "iterations between two checkpoints")
-    timeout: float = option(600.0, "seconds that the processes of torchrun wait for each other")
 
 
 @dataclass
@@ -81,26 +52,31 @@ class FitCommand:
     )
     checkpoint: str | None = option(None, "file for the state of the fit; null: none")
     checkpoint_seconds: float | None = option(
-        None, "seconds between two checkpoints; null: only by stream.checkpoint_every"
+        None, "seconds between two checkpoints; null: every ten iterations"
     )
     resume: bool = option(False, "continue from the checkpoint if it exists; its folder must exist")
-    stream: StreamOptions = group(StreamOptions)
+    chunk_points: int = option(1 << 17, "points of a chunk, which limits the memory", "stream.chunk_points")
+    max_range: float | None = option(
+        None,
+        "points at this distance (m) from the frame's origin or beyond are dropped; null: none",
+        "stream.max_range",
+    )
     mixture: FitOptions = group(FitOptions)
-    report: Report = group(Report)
-    runtime: Runtime = group(Runtime)
+    report: cli.Report = group(cli.Report)
+    runtime: cli.Runtime = group(cli.Runtime)
 
 
 @functools.cache
 def register() -> None:
     """Stores the options of the command."""
     experiment_schema.register()
-    store({"fit": schema_of(FitCommand, ("mixture", PruneOptions))})
+    cli.store({"fit": cli.schema_of(FitCommand, ("mixture", PruneOptions))})
 
 
 def main() -> None:
     """Entry point of the command."""
     with _quiet_worker():
-        start("fit", run, register)
+        cli.start("fit", run, register)
 
 
 @contextmanager
@@ -116,52 +92,29 @@ def _quiet_worker() -> Iterator[None]:
 
 
 def run(config: DictConfig) -> float | None:
-    """Run the command; returns `fit_outputs.log_likelihood` of the last row, which a sweep can optimize.
+    """Run the command; returns `fit_runs.log_likelihood` of the last row, which a sweep can optimize.
 
     Workers of a streamed fit return None.
     """
-    from gmmtorch.experiments.cli import fit_outputs, fit_stream
+    from gmmtorch.experiments.cli import fit_runs
 
-    folder = run_dir()
-    if fit_stream.is_wanted(config):
-        row = fit_stream.run(config, TABLE.split(), folder)
+    folder = cli.run_dir()
+    columns = TABLE.split()
+    if fit_runs.is_streamed(config):
+        row = fit_runs.stream(config, columns, folder)
         if row is None:
             return None
     else:
-        device = set_up(config)
+        device = cli.set_up(config)
         with ProgressBars(enabled=config.report.progress) as bars:
             if config.study is None:
-                row = _compare(config, device, folder, bars)[-1]
+                row = fit_runs.fit_all(config, columns, device, folder, bars)[-1]
             else:
                 from gmmtorch.experiments.cli import studies
 
                 row = studies.run("fit", config, device, folder, bars)[-1]
-    print_files(folder)
-    return fit_outputs.log_likelihood(row)
-
-
-def _compare(config: DictConfig, device: str, folder: Path, on_event: Event) -> list[Row]:
-    """A row for each method; saves and draws every mixture."""
-    from gmmtorch.experiments.cli import fit_outputs
-    from gmmtorch.experiments.cli.fits_of_options import fit_data, fit_options
-    from gmmtorch.experiments.evaluation import compare
-
-    data = fit_data(config, device, on_event)
-    outcome = compare(
-        data,
-        list(config.method),
-        fit_options(config),
-        config.seed,
-        on_event,
-        lambda rows: write_results("fit", config, rows, folder),
-        as_options(config.method_options),
-        build(PruneOptions, config, "mixture"),
-    )
-    for method, mixture in outcome.mixtures.items():
-        mixture.save(folder / f"{method}.safetensors")
-    fit_outputs.draw(config, data.train, outcome, folder)
-    print_table(outcome.rows, TABLE.split(), fit_outputs.headline(outcome.rows))
-    return outcome.rows
+    cli.print_files(folder)
+    return fit_runs.log_likelihood(row)
 
 
 if __name__ == "__main__":

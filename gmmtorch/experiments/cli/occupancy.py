@@ -4,28 +4,15 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from omegaconf import MISSING, DictConfig
 
-from gmmtorch.cli import (
-    Report,
-    Runtime,
-    print_files,
-    print_table,
-    run_dir,
-    schema_of,
-    set_up,
-    start,
-    store,
-    write_results,
-)
+from gmmtorch import cli
 from gmmtorch.declarations import group, option
-from gmmtorch.errors import check_whole
 from gmmtorch.experiments.cli import experiment_schema
 from gmmtorch.experiments.evaluation import Protocol
-from gmmtorch.report import Event, ProgressBars, Row
+from gmmtorch.report import ProgressBars
 
 TABLE = (
     "method resolution kept auc auc_low auc_high ece log_loss_bits accuracy n_components nbytes "
@@ -34,7 +21,7 @@ TABLE = (
 
 
 @dataclass
-class OccupancyReport(Report):
+class OccupancyReport(cli.Report):
     """Figures of gmmtorch-occupancy."""
 
     magnify: int = option(
@@ -62,60 +49,36 @@ class OccupancyCommand:
     study: Any = option(None, "a study with rows of its own, which an experiment sets")
     evaluation: Protocol = group(Protocol)
     report: OccupancyReport = group(OccupancyReport)
-    runtime: Runtime = group(Runtime)
+    runtime: cli.Runtime = group(cli.Runtime)
 
 
 @functools.cache
 def register() -> None:
     """Stores the options of the command."""
     experiment_schema.register()
-    store({"occupancy": schema_of(OccupancyCommand)})
+    cli.store({"occupancy": cli.schema_of(OccupancyCommand)})
 
 
 def main() -> None:
     """Entry point of the command."""
-    start("occupancy", run, register)
+    cli.start("occupancy", run, register)
 
 
 def run(config: DictConfig) -> float | None:
     """Run the command; returns the AUC of the last row, which a sweep can optimize."""
-    from gmmtorch.experiments.cli import studies
+    from gmmtorch.experiments.cli import occupancy_runs
 
-    device = set_up(config)
-    folder = run_dir()
+    device = cli.set_up(config)
+    folder = cli.run_dir()
     with ProgressBars(enabled=config.report.progress) as bars:
         if config.study is None:
-            rows = _compare(config, device, folder, bars)
+            rows = occupancy_runs.map_all(config, TABLE.split(), device, folder, bars)
         else:
+            from gmmtorch.experiments.cli import studies
+
             rows = studies.run("occupancy", config, device, folder, bars)
-    print_files(folder)
+    cli.print_files(folder)
     return rows[-1].get("auc")
-
-
-def _compare(config: DictConfig, device: str, folder: Path, on_event: Event) -> list[Row]:
-    """A row for each method, share kept and resolution."""
-    from gmmtorch.cli import all_scans
-    from gmmtorch.experiments.cli import methods_of_options, occupancy_outputs
-    from gmmtorch.experiments.evaluation import choose, evaluate
-
-    check_whole("report.magnify", config.report.magnify, 0)
-    factories = choose(list(config.method), methods_of_options.known_methods(config))
-    protocol = methods_of_options.protocol_of(config)
-    methods_of_options.check_factories(factories, protocol.resolution[0])
-    name, scans = all_scans(config, device, on_event)
-    outcome = evaluate(
-        name,
-        scans,
-        factories,
-        protocol,
-        config.seed,
-        on_event,
-        # Rows are written one by one, so that a run that fails late keeps them.
-        lambda rows: write_results("occupancy", config, rows, folder),
-    )
-    occupancy_outputs.draw(config, scans, outcome, folder)
-    print_table(outcome.rows, TABLE.split(), f"{name}: {len(scans)} scans")
-    return outcome.rows
 
 
 if __name__ == "__main__":

@@ -15,58 +15,20 @@ from typing import Any, TypeVar
 
 from omegaconf import DictConfig
 
-from gmmtorch.cli import (
-    all_scans,
-    build,
-    chosen_options,
-    limits,
-    map_factory,
-    naming,
-    print_table,
-    show,
-    write_results,
-)
+from gmmtorch import cli
 from gmmtorch.errors import InvalidArgumentError, check_choice
-from gmmtorch.experiments.cli import fit_outputs, methods_of_options
-from gmmtorch.experiments.cli.fits_of_options import fit_data, fit_data_of, fit_options, selected_scans
-from gmmtorch.experiments.evaluation import Form, Protocol, baseline, choose, means
+from gmmtorch.experiments import report, studies
+from gmmtorch.experiments.cli import occupancy_runs
+from gmmtorch.experiments.cli.fit_runs import (
+    fit_data,
+    fit_data_of,
+    fit_options,
+    headline,
+    log_likelihood,
+    selected_scans,
+)
+from gmmtorch.experiments.evaluation import Form, MapFactory, Protocol, baseline, choose, means
 from gmmtorch.experiments.harness import Case
-from gmmtorch.experiments.report import (
-    approximation_figures,
-    auc_memory_figures,
-    cells_figure,
-    closest_look,
-    component_count_figures,
-    initialization_figures,
-    map_variants_figures,
-    pose_correction_figures,
-    sensor_model_figures,
-    variance_threshold_figures,
-)
-from gmmtorch.experiments.studies import (
-    BOUNDS,
-    ApproximationErrorStudy,
-    AucMemoryStudy,
-    ComponentCountStudy,
-    InitializationStudy,
-    MapVariantsStudy,
-    PoseCorrectionStudy,
-    Railing,
-    SensorModelStudy,
-    Sized,
-    VarianceThresholdStudy,
-    cells_by_setting,
-    evaluate_correction,
-    middle,
-    run_approximation_error,
-    run_auc_memory,
-    run_component_count,
-    run_initialization,
-    run_map_variants,
-    run_sensor_noise,
-    run_variance_threshold,
-    sensor_model,
-)
 from gmmtorch.mapping import METHODS, GaussianMap, MixtureRule
 from gmmtorch.report import Board, Event, OnRows, Row
 from gmmtorch.scan import Scan
@@ -104,15 +66,15 @@ class Setting:
 
     @property
     def protocol(self) -> Protocol:
-        return methods_of_options.protocol_of(self.config)
+        return cli.build(Protocol, self.config, "evaluation")
 
     def study(self, kind: type[T]) -> T:
         """The options of the study."""
-        return build(kind, self.config, "study")
+        return cli.build(kind, self.config, "study")
 
     def scans(self) -> tuple[str, list[Scan]]:
         """The name of the data set, and all its scans."""
-        name, scans = all_scans(self.config, self.device, self.on_event)
+        name, scans = cli.all_scans(self.config, self.device, self.on_event)
         self.about = f"{name}: {len(scans)} scans"
         return name, scans
 
@@ -124,7 +86,7 @@ def run(command: str, config: DictConfig, device: str, folder: Path, on_event: E
     """
     check_choice("study.name", config.study.name, STUDIES[command])
     case = STUDIES[command][config.study.name]
-    setting = Setting(config, device, on_event, lambda rows: write_results(command, config, rows, folder))
+    setting = Setting(config, device, on_event, lambda rows: cli.write_results(command, config, rows, folder))
     rows = list(case.measure(setting))
     setting.on_rows(rows)
     shown = case.shown(rows)
@@ -133,13 +95,13 @@ def run(command: str, config: DictConfig, device: str, folder: Path, on_event: E
         for index, row in enumerate(sorted(shown, key=lambda row: row[case.step]) if case.step else shown):
             board.scalars(row, str(row[case.line]), step=int(row[case.step]) if case.step else index)
         if setting.scores:
-            board.hparams(chosen_options(config), dict(setting.scores))
+            board.hparams(cli.chosen_options(config), dict(setting.scores))
 
     def figures() -> dict[str, Any]:
         return {**case.figures(rows), **{name: draw() for name, draw in setting.figures.items()}}
 
-    show(config, folder, figures, write)
-    print_table(shown, list(case.columns), setting.about)
+    cli.show(config, folder, figures, write)
+    cli.print_table(shown, list(case.columns), setting.about)
     return rows
 
 
@@ -147,31 +109,33 @@ def run(command: str, config: DictConfig, device: str, folder: Path, on_event: E
 
 
 def _initialization(setting: Setting) -> list[Row]:
-    study = setting.study(InitializationStudy)
+    study = setting.study(studies.InitializationStudy)
     data = fit_data(setting.config, setting.device, setting.on_event)
-    return run_initialization(data, study, fit_options(setting.config), setting.seed, *setting.callbacks)
+    return studies.run_initialization(
+        data, study, fit_options(setting.config), setting.seed, *setting.callbacks
+    )
 
 
 def _sensor_model(setting: Setting) -> list[Row]:
     """Fields of a fit that this study does not measure are None."""
-    study = setting.study(SensorModelStudy)
+    study = setting.study(studies.SensorModelStudy)
     names = {name: f"study.sensor_options.{name}" for name in study.sensor_options}
-    with naming({**names, **{name: f"study.{name}" for name in ("sensor", "sensor_options")}}):
-        sensor_model(study)  # an invalid option fails before the scans are read
+    with cli.naming({**names, **{name: f"study.{name}" for name in ("sensor", "sensor_options")}}):
+        studies.sensor_model(study)  # an invalid option fails before the scans are read
     dataset, scans = selected_scans(setting.config, setting.device, setting.on_event)
     unmeasured = {"log_likelihood": None, "psnr2_db": None}
     return [
         {"method": row["variant"], "n_points": row["n_train_points"], **unmeasured, **row}
-        for row in run_sensor_noise(dataset, scans, study, setting.seed, setting.on_event)
+        for row in studies.run_sensor_noise(dataset, scans, study, setting.seed, setting.on_event)
     ]
 
 
 def _component_count(setting: Setting) -> list[Row]:
-    study = setting.study(ComponentCountStudy)
+    study = setting.study(studies.ComponentCountStudy)
     dataset, scans = selected_scans(setting.config, setting.device, setting.on_event)
-    data = fit_data_of(setting.config, dataset, middle(scans, study.window))
+    data = fit_data_of(setting.config, dataset, studies.middle(scans, study.window))
     options = fit_options(setting.config)
-    return run_component_count(data, scans, study, options, setting.seed, *setting.callbacks)
+    return studies.run_component_count(data, scans, study, options, setting.seed, *setting.callbacks)
 
 
 def _named(columns: str) -> dict[str, str]:
@@ -192,8 +156,8 @@ def _fits(
 
     def headed(setting: Setting) -> list[Row]:
         rows = measure(setting)
-        setting.about = fit_outputs.headline(rows)
-        best = max(fit_outputs.log_likelihood(row) for row in shown(rows))
+        setting.about = headline(rows)
+        best = max(log_likelihood(row) for row in shown(rows))
         setting.scores = {"best_log_likelihood": best}
         return rows
 
@@ -205,21 +169,21 @@ FITS = (
     _fits(
         "component_count",
         _component_count,
-        component_count_figures,
+        report.component_count_figures,
         "rule",
         "setting component_bytes held_out_psnr2_db held_out_log_likelihood auc count_seconds seconds",
     ),
     _fits(
         "initialization",
         _initialization,
-        initialization_figures,
+        report.initialization_figures,
         "start",
         "init_seconds n_iterations seconds psnr2_db held_out_psnr2_db log_likelihood held_out_log_likelihood",
     ),
     _fits(
         "sensor_model",
         _sensor_model,
-        sensor_model_figures,
+        report.sensor_model_figures,
         "variant",
         "held_out_log_likelihood auc auc_near_surface thickness sensor_deviation seconds n_iterations nbytes",
     ),
@@ -230,42 +194,41 @@ FITS = (
 
 def _auc_memory(setting: Setting) -> list[Row]:
     """Our map and the BGK map at each of their sizes, and `study.others` at their only size."""
-    config, protocol, study = setting.config, setting.protocol, setting.study(AucMemoryStudy)
-    sized = [
-        Sized(form, n, Form(map_factory(config, n_components=n), form))
+    config, protocol, study = setting.config, setting.protocol, setting.study(studies.AucMemoryStudy)
+    sized: dict[tuple[str, int | None], MapFactory] = {
+        (form, n): Form(cli.map_factory(config, n_components=n), form)
         for form in study.forms
         for n in study.n_components
-    ]
-    of_runtime = limits(config)
-    sized += [
-        Sized("bgk_points", n, baseline("bgk_points", of_runtime, max_points=n)) for n in study.bgk_points
-    ]
-    if study.others:
-        others = choose(study.others, methods_of_options.known_methods(config))
-        sized += [Sized(name, None, factory) for name, factory in others.items()]
-    for one in sized:
-        methods_of_options.check_factories({one.method: one.factory}, protocol.resolution[0])
-    return run_auc_memory(*setting.scans(), sized, protocol, setting.seed, *setting.callbacks)
+    }
+    for n in study.bgk_points:
+        sized["bgk_points", n] = baseline("bgk_points", cli.limits(config), max_points=n)
+    for name, factory in choose(study.others, occupancy_runs.known_methods(config)).items():
+        sized[name, None] = factory
+    for (name, _), factory in sized.items():
+        occupancy_runs.check_factories({name: factory}, protocol.resolution[0])
+    return studies.run_auc_memory(*setting.scans(), sized, protocol, setting.seed, *setting.callbacks)
 
 
 def _variance_threshold(setting: Setting) -> list[Row]:
     """Thin structures with several forms, sizes, cells, priors and thresholds."""
-    study = setting.study(VarianceThresholdStudy)
+    study = setting.study(studies.VarianceThresholdStudy)
     if study.railing is None:
         (name, scans), is_thin = setting.scans(), None
     else:
-        railing = Railing(study.railing)
-        name, scans, is_thin = "railing", railing.scans(study.railing_scans, setting.seed), railing.holds
+        name, scans = "railing", studies.railing_scans(study.railing, study.railing_scans, setting.seed)
+        is_thin = partial(studies.is_of_railing, width=study.railing)
 
     def new_map(n: int) -> GaussianMap:
-        return map_factory(setting.config, n_components=n)()
+        return cli.map_factory(setting.config, n_components=n)()
 
-    found = run_variance_threshold(name, scans, new_map, study, setting.seed, *setting.callbacks, is_thin)
+    found = studies.run_variance_threshold(
+        name, scans, new_map, study, setting.seed, *setting.callbacks, is_thin
+    )
     setting.about = f"{name}: {len(scans)} scans; variance threshold {study.variance_threshold[0]:g}"
-    if found.hits.shape[1] == 3 and (cells := cells_by_setting(found, study)):
+    if found.hits.shape[1] == 3 and (cells := studies.cells_by_setting(found, study)):
         thin = found.thin if len(found.thin) else found.hits
-        low, high = BOUNDS if study.railing else closest_look(thin, found.hits)
-        draw = partial(cells_figure, cells, found.hits, low, high, study.resolution[0])
+        low, high = studies.BOUNDS if study.railing else report.closest_look(thin, found.hits)
+        draw = partial(report.cells_figure, cells, found.hits, low, high, study.resolution[0])
         setting.figures["variance_threshold_cells"] = draw
     return found.rows
 
@@ -273,21 +236,23 @@ def _variance_threshold(setting: Setting) -> list[Row]:
 def _approximation_error(setting: Setting) -> list[Row]:
     """Every form of evidence against the exact angular form; needs no data set."""
     setting.about = "errors per ray of random single components"
-    return run_approximation_error(setting.study(ApproximationErrorStudy), setting.seed, *setting.callbacks)
+    return studies.run_approximation_error(
+        setting.study(studies.ApproximationErrorStudy), setting.seed, *setting.callbacks
+    )
 
 
 def _pose_correction(setting: Setting) -> list[Row]:
     """Maps from perturbed poses, before and after the correction of the poses."""
-    protocol, study = setting.protocol, setting.study(PoseCorrectionStudy)
-    new_map = map_factory(setting.config)
-    return evaluate_correction(
+    protocol, study = setting.protocol, setting.study(studies.PoseCorrectionStudy)
+    new_map = cli.map_factory(setting.config)
+    return studies.evaluate_correction(
         *setting.scans(), new_map, protocol, study.methods, setting.seed, *setting.callbacks
     )
 
 
 def _map_variants(setting: Setting) -> list[Row]:
     """Maps with changed options, such as pruning."""
-    config, protocol, study = setting.config, setting.protocol, setting.study(MapVariantsStudy)
+    config, protocol, study = setting.config, setting.protocol, setting.study(studies.MapVariantsStudy)
     form = next((method for method in config.method if method in METHODS), "point")
     variants = {}
     for name, changes in study.variants.items():
@@ -295,8 +260,8 @@ def _map_variants(setting: Setting) -> list[Row]:
             raise InvalidArgumentError(
                 f"study.variants.{name}.{min(unknown)} is not an option of map={config.map.name}."
             )
-        variants[name] = Form(map_factory(config, **changes), form)
-    return run_map_variants(*setting.scans(), variants, protocol, setting.seed, *setting.callbacks)
+        variants[name] = Form(cli.map_factory(config, **changes), form)
+    return studies.run_map_variants(*setting.scans(), variants, protocol, setting.seed, *setting.callbacks)
 
 
 MAPS = (
@@ -306,7 +271,7 @@ MAPS = (
         columns=_named(
             "method dim hits_max hits_p99 hits_median misses_max misses_p99 misses_median probability_max"
         ),
-        figures=approximation_figures,
+        figures=report.approximation_figures,
         shown=lambda rows: [row for row in rows if row["study"] == "sweep"],
     ),
     Case(
@@ -315,7 +280,7 @@ MAPS = (
         columns=_named(
             "method size resolution auc auc_low auc_high brier nbytes build_seconds query_seconds"
         ),
-        figures=auc_memory_figures,
+        figures=report.auc_memory_figures,
     ),
     Case(
         "map_variants",
@@ -324,14 +289,14 @@ MAPS = (
             "variant resolution n_components n_free_components nbytes auc auc_gain auc_gain_low "
             "auc_gain_high held_out_log_likelihood build_seconds"
         ),
-        figures=map_variants_figures,
+        figures=report.map_variants_figures,
         line="variant",
     ),
     Case(
         "pose_correction",
         _pose_correction,
         columns=_named("method resolution auc auc_corrected auc_clean n_components nbytes"),
-        figures=pose_correction_figures,
+        figures=report.pose_correction_figures,
     ),
     Case(
         "variance_threshold",
@@ -340,7 +305,7 @@ MAPS = (
             "method n_components resolution prior occupied_recall thin_recall thin_kept free_recall "
             "free_occupied auc auc_thin brier"
         ),
-        figures=variance_threshold_figures,
+        figures=report.variance_threshold_figures,
         # Those of the first threshold of the study.
         shown=lambda rows: [
             row for row in rows if row["variance_threshold"] == rows[0]["variance_threshold"]

@@ -8,7 +8,6 @@ import tempfile
 import time
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
@@ -17,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch import mixture as ours
-from gmmtorch.datasets import PointChunks, in_memory
+from gmmtorch.datasets import PointChunks
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.evaluation.metrics import psnr2, psnr_terms
 from gmmtorch.experiments.evaluation.protocol_options import FitOptions
@@ -175,13 +174,11 @@ def _arguments(method: str, options: FitOptions, seed: int, own: Mapping[str, An
     return {**shared, "random_state": seed, **own}
 
 
-@dataclass
-class FitOutcome:
-    """Rows of results.json, and the mixtures and lower bounds by method."""
+class FitOutcome(NamedTuple):
+    """Rows of results.json, and the mixtures by method."""
 
-    rows: list[Row] = field(default_factory=list)
-    mixtures: dict[str, MixtureEstimator] = field(default_factory=dict)
-    lower_bounds: dict[str, list[float]] = field(default_factory=dict)
+    rows: list[Row]
+    mixtures: dict[str, MixtureEstimator]
 
 
 class FitData(NamedTuple):
@@ -201,8 +198,7 @@ def split(dataset: str, points: Tensor, test_share: float, seed: int, views: Vie
 
     Raises `InvalidArgumentError` for a share outside [0, 1) or a cloud without points.
     """
-    if not 0 <= test_share < 1:
-        raise InvalidArgumentError(f"test_share={test_share} must be a share in [0, 1).")
+    _check_share(test_share)
     if points.shape[0] == 0:
         raise InvalidArgumentError("The chosen scans have no points; choose other scans by `scans`.")
     generator = torch.Generator().manual_seed(seed)
@@ -211,6 +207,11 @@ def split(dataset: str, points: Tensor, test_share: float, seed: int, views: Vie
     train = order[n_test:].sort().values
     views = None if views is None else views._replace(scan=views.scan[train])
     return FitData(dataset, points[train], points[order[:n_test]], views)
+
+
+def _check_share(test_share: float) -> None:
+    if not 0 <= test_share < 1:
+        raise InvalidArgumentError(f"test_share={test_share} must be a share in [0, 1).")
 
 
 def compare(
@@ -237,7 +238,7 @@ def compare(
     if not methods:
         raise InvalidArgumentError(f"method is empty; name at least one of {known}.")
     options.check(data.train.shape[0], seed)
-    outcome, pruning = FitOutcome(), pruning or PruneOptions()
+    outcome, pruning = FitOutcome([], {}), pruning or PruneOptions()
     for method in methods:
         begin = time.perf_counter()
         is_tree = method == "hierarchical"  # which is pruned while it grows
@@ -248,7 +249,6 @@ def compare(
             mixture = pruned(mixture, pruning, data.train, data.views)
         seconds = time.perf_counter() - begin
         outcome.mixtures[method] = mixture
-        outcome.lower_bounds[method] = mixture.lower_bounds_
         outcome.rows.append(row_of(data, method, mixture, seconds, seed))
         on_rows(outcome.rows)
     return outcome
@@ -322,35 +322,19 @@ def _finite(value: float) -> float | None:
 _SPLIT_SALT = 0x5EED  # makes the split independent of the sample
 
 
-class Split(NamedTuple):
-    """Training and test sources, and the number of points that are sampled from each (None: all)."""
+def split_source(source: PointChunks, test_share: float, seed: int) -> tuple[PointChunks, PointChunks]:
+    """Hold out a random share of the rows: the training and the test source.
 
-    train: PointChunks
-    test: PointChunks
-    sample_points: int | None
-
-
-def split_source(source: PointChunks, test_share: float, seed: int, sample_points: int | None) -> Split:
-    """Hold out a random share of the rows. Raises `InvalidArgumentError` for a share outside [0, 1)."""
-    if not 0 <= test_share < 1:
-        raise InvalidArgumentError(f"test_share={test_share} must be a share in [0, 1).")
-    return Split(
-        source.random_subset(test_share, 1.0, seed ^ _SPLIT_SALT),
-        source.random_subset(0.0, test_share, seed ^ _SPLIT_SALT),
-        sample_points,
-    )
-
-
-def split_data(data: FitData, chunk_points: int) -> Split:
-    """Sources for a cloud in memory that is already split; the samples are all its points."""
-    train, test = (
-        in_memory(points, data.dataset, chunk_points=chunk_points) for points in (data.train, data.test)
-    )
-    return Split(train, test, None)
+    Raises `InvalidArgumentError` for a share outside [0, 1).
+    """
+    _check_share(test_share)
+    seed ^= _SPLIT_SALT
+    return source.random_subset(test_share, 1.0, seed), source.random_subset(0.0, test_share, seed)
 
 
 def fit_streamed(
-    split: Split,
+    sources: tuple[PointChunks, PointChunks],
+    sample_points: int | None,
     options: FitOptions,
     seed: int,
     *,
@@ -361,18 +345,18 @@ def fit_streamed(
 ) -> tuple[Row, GaussianMixture, FitData]:
     """Fit the training source by EM, and score the mixture on both sources. Only rank 0 returns a row.
 
-    Also returns the mixture, and the points sampled from the sources.
+    Also returns the mixture, and the points sampled from the sources: `sample_points` of each, all for None.
 
     Likelihoods are means over all points. PSNR2 and `n_components_used` are computed from the samples.
     """
-    train, test = (part.shard(processes.rank, processes.size) for part in (split.train, split.test))
-    wanted = None if split.sample_points is None else max(split.sample_points, options.n_components or 1)
+    train, test = (part.shard(processes.rank, processes.size) for part in sources)
+    wanted = None if sample_points is None else max(sample_points, options.n_components or 1)
     on_event("reading points", 0, 2)
     found = survey_all(train, wanted, seed, processes)
     on_event("reading points", 1, 2)
     held_out = survey_all(test, wanted, seed, processes)
     on_event("reading points", 2, 2)
-    sample = FitData(split.train.name, found.points, held_out.points)
+    sample = FitData(sources[0].name, found.points, held_out.points)
 
     def on_iteration(iteration: int, lower_bound: float) -> None:
         on_event("em", min(iteration, options.max_iter), options.max_iter)

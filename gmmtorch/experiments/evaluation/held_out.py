@@ -1,10 +1,16 @@
-"""Builds maps from training scans and scores them on held-out scans."""
+"""Maps by the names of their methods, built from training scans and scored on held-out scans.
+
+The methods are the forms of evidence of `GaussianMap`, and the baselines.
+"""
 
 from __future__ import annotations
 
+import inspect
+import itertools
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +18,104 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.experiments import baselines
 from gmmtorch.experiments.evaluation import metrics, queries
-from gmmtorch.experiments.evaluation.mapping_methods import Form, MapFactory
 from gmmtorch.experiments.evaluation.metrics import SeenPredictions
 from gmmtorch.experiments.evaluation.protocol_options import Protocol
 from gmmtorch.experiments.evaluation.queries import UNKNOWN, Queries
 from gmmtorch.files import check_writable
-from gmmtorch.mapping import GaussianMap
-from gmmtorch.occupancy import OccupancyMap
+from gmmtorch.mapping import METHODS, GaussianMap
+from gmmtorch.occupancy import LogOdds, OccupancyGrid, OccupancyMap
 from gmmtorch.report import Event, OnRows, Row, ignore
 from gmmtorch.scan import Scan
+
+MapFactory = Callable[[float], OccupancyMap]
+"""resolution (m) → an empty map."""
+
+BASELINES: dict[str, Callable[..., OccupancyMap]] = {
+    "occupancy_grid": OccupancyGrid,
+    "occupancy_log_odds": partial(OccupancyGrid, log_odds=LogOdds()),
+    "hilbert": baselines.HilbertMap,
+    "bayesian_hilbert": baselines.BayesianHilbertMap,
+    "bgk": baselines.BGKMap,
+    "bgk_points": baselines.BGKPointsMap,
+    "gp": baselines.GPMap,
+    "ndt": baselines.NDTMap,
+    "octomap": baselines.OctoMapMap,
+}
+
+
+@dataclass(frozen=True)
+class Form:
+    """A factory of `GaussianMap`s that are queried by one form of evidence.
+
+    Forms with the same `new_map` share one map, which is built once.
+    """
+
+    new_map: Callable[[], GaussianMap]
+    form: str
+
+    def __call__(self, resolution: float) -> GaussianMap:
+        return self.new_map()
+
+
+def methods(
+    new_map: Callable[[], GaussianMap], options: Mapping[str, Mapping[str, Any]] | None = None, **limits: Any
+) -> dict[str, MapFactory]:
+    """Every method by name.
+
+    Args:
+        new_map: makes the empty `GaussianMap` that the forms of evidence query.
+        options: options of each baseline, by its name. The defaults are those of the baseline's paper, or the
+            best on training scans (see docs/baselines.md).
+        limits: `memory_limit`, `compiled`, `random_state`: given to the baselines that take them.
+
+    Raises `InvalidArgumentError` for an unknown baseline, or an option that it does not take.
+    """
+    options = options or {}
+    for name in options:
+        if name not in BASELINES:
+            raise InvalidArgumentError(
+                f"method_options.{name} is not known; known are {', '.join(BASELINES)}. The options of "
+                "GaussianMap are map.*."
+            )
+        if not isinstance(options[name], Mapping):
+            raise InvalidArgumentError(
+                f"method_options.{name}={options[name]!r} must be options, such as {{NAME: VALUE}}."
+            )
+    return {
+        **{form: Form(new_map, form) for form in METHODS},
+        **{name: baseline(name, limits, **options.get(name, {})) for name in BASELINES},
+    }
+
+
+def baseline(name: str, limits: Mapping[str, Any], **options: Any) -> MapFactory:
+    """A factory of a baseline's maps with these options, and with the limits that it takes."""
+    make = BASELINES[name]
+    parameters = set(inspect.signature(make).parameters)
+    known = parameters - {"resolution"}
+    for option in options:
+        if option not in known:
+            raise InvalidArgumentError(
+                f"method_options.{name}.{option} is not known; {name} takes {', '.join(sorted(known))}."
+            )
+    chosen = {**{key: value for key, value in limits.items() if key in known}, **options}
+    if "resolution" in parameters:
+        return lambda resolution: make(resolution, **chosen)
+    return lambda resolution: make(**chosen)
+
+
+def choose(names: Sequence[str], known: Mapping[str, MapFactory]) -> dict[str, MapFactory]:
+    """The factories with these names, in their order. Raises for an unknown name and lists the known ones."""
+    if not names:
+        raise InvalidArgumentError(f"method is empty; name at least one of {', '.join(sorted(known))}.")
+    for name in names:
+        if name not in known:
+            raise InvalidArgumentError(f"method={name!r} is not known; known are {', '.join(sorted(known))}.")
+    return {name: known[name] for name in names}
+
+
+# -- the test -------------------------------------------------------------------------------------------
 
 _PREDICTED_SCANS = 50  # of which a map without a calibration predicts some beams
 
@@ -70,9 +164,7 @@ def evaluate(
         name: of the data set, for the rows.
         scans: in time order, all in memory.
         factories: the methods; see `choose`.
-        protocol: the test.
         seed: of the random choice of training data, the free points and the bootstrap.
-        on_event: progress callback.
         on_row: called with all rows so far after each new row, so that a run that fails late keeps its rows.
     """
     if not 0 <= seed < 2**63:
@@ -80,52 +172,37 @@ def evaluate(
     train_index, test_index = queries.split_indices(len(scans), protocol.test_every)
     train = queries.perturb_poses([scans[i] for i in train_index], protocol.pose_noise, seed)
     origins, ends = queries.test_beams([scans[i] for i in test_index], protocol.max_beams, seed)
-    asked = {
-        r: _questions(origins, ends, [scans[i] for i in train_index], r, protocol, seed)
-        for r in protocol.resolution
-    }
+    seen_at = [scans[i] for i in train_index]  # at their true poses
+    asked = {r: _questions(origins, ends, seen_at, r, protocol, seed) for r in protocol.resolution}
     if protocol.save_queries:
         queries.save_queries(protocol.save_queries, asked, train_index, test_index)
     if protocol.save_map:
         check_writable(Path(protocol.save_map))
     outcome = Outcome()
-    largest = max(protocol.kept)
     for kept in protocol.kept:
-        shown = queries.keep_share(train, kept, protocol.removal, seed)
-        for method, resolution, built, seconds, answer, seen in _built_maps(
-            factories, shown, kept, protocol, on_event
-        ):
-            case = {"dataset": name, "method": method, "resolution": float(resolution)}
-            case |= {"removal": protocol.removal, "kept": float(kept)}
-            effort = {"build_seconds": seconds, "n_train_points": sum(len(scan.points) for scan in shown)}
-            made = _score(built, answer, asked[resolution], seen, seed, protocol.unknown, case, effort)
-            if protocol.save_map:
-                built.save(Path(protocol.save_map) / f"{method}_{kept:g}_{resolution:g}{built.suffix}")
-            outcome.rows.append(made.row)
-            on_row(outcome.rows)
-            if kept == largest:
-                outcome.shown.append(made)
-    return outcome
-
-
-def _built_maps(
-    factories: dict[str, MapFactory], shown: Sequence[Scan], kept: float, protocol: Protocol, on_event: Event
-) -> Iterator[tuple[str, float, OccupancyMap, float, Answer, SeenPredictions | None]]:
-    """Method, resolution, map, seconds of its building, its answers, and the calibration of a map that has
-    none of its own, for each method and resolution."""
-    # A map that serves several resolutions or forms of evidence is built once.
-    cache: dict[Any, tuple[OccupancyMap, float, SeenPredictions | None]] = {}
-    for method, factory in factories.items():
-        made_as = "mixture" if isinstance(factory, Form) else method
-        shared = factory.new_map if isinstance(factory, Form) else method
-        for resolution in protocol.resolution:
+        shown = queries.keep_share(train, kept, seed)
+        facts = {"dataset": name, "removal": "beams", "kept": float(kept)}
+        facts["n_train_points"] = sum(len(scan.points) for scan in shown)
+        # A map that serves several resolutions or forms of evidence is built once.
+        cache: dict[Any, tuple[OccupancyMap, float, SeenPredictions | None]] = {}
+        for (method, factory), resolution in itertools.product(factories.items(), protocol.resolution):
+            shared = factory.new_map if isinstance(factory, Form) else method
             if shared not in cache:
-                label = f"{made_as}, {kept:.0%} of the {protocol.removal}"
+                label = f"{'mixture' if shared is not method else method}, {kept:.0%} of the beams"
                 cache[shared] = _build(factory(resolution), shown, label, resolution, on_event)
             built, seconds, seen = cache[shared]
             if not built.any_resolution:
                 del cache[shared]
-            yield method, resolution, built, seconds, _answerer(built, factory, resolution), seen
+            facts |= {"method": method, "resolution": float(resolution), "build_seconds": seconds}
+            answer = _answerer(built, factory, resolution)
+            made = _scored(built, answer, asked[resolution], seen, protocol.unknown, seed, facts)
+            if protocol.save_map:
+                built.save(Path(protocol.save_map) / f"{method}_{kept:g}_{resolution:g}{built.suffix}")
+            outcome.rows.append(made.row)
+            on_row(outcome.rows)
+            if kept == max(protocol.kept):
+                outcome.shown.append(made)
+    return outcome
 
 
 def _answerer(built: OccupancyMap, factory: MapFactory, resolution: float) -> Answer:
@@ -170,17 +247,16 @@ def _build(
     return empty, seconds + time.perf_counter() - begin, seen
 
 
-def _score(
+def _scored(
     built: OccupancyMap,
     answer: Answer,
     asked: Queries,
     seen: SeenPredictions | None,
-    seed: int,
     unknown: bool,
-    case: Row,
-    effort: Row,
+    seed: int,
+    facts: Row,
 ) -> Built:
-    """The map with its row: the case, the scores, and the effort, in the order of the documentation."""
+    """The map with its row, in which the scores follow the facts."""
     begin = time.perf_counter()
     theta = answer(asked.points).cpu()
     seconds = time.perf_counter() - begin
@@ -192,17 +268,14 @@ def _score(
     # The scores of a map that has no calibration of its own, with one.
     calibrated = {} if seen is None else metrics.scores(seen.calibrated(theta)[known], asked.labels[known])
     row: Row = {
-        **case,
+        **facts,
         "auc": curve.auc,
         "auc_low": low,
         "auc_high": high,
-        "brier": scores["brier"],
         **scores,
         **{f"calibrated_{name}": calibrated.get(name) for name in ("ece", "log_loss_bits", "accuracy")},
-        "n_train_points": effort["n_train_points"],
         "n_components": built.n_components if isinstance(built, GaussianMap) else None,
         "nbytes": built.nbytes,
-        "build_seconds": effort["build_seconds"],
         "query_seconds": seconds,
         "n_queries": theta.shape[0],
     }

@@ -25,41 +25,31 @@ CALLED_FREE, CALLED_OCCUPIED = 0.2, 0.65
 
 
 class Roc(NamedTuple):
-    """false_positive (T,), true_positive (T,): the ROC curve; auc: the area under it."""
+    """False and true positive rates (T,) at thresholds (T,), of which the first is infinite; and the area."""
 
     false_positive: np.ndarray
     true_positive: np.ndarray
+    thresholds: np.ndarray
     auc: float
+
+    @property
+    def separating(self) -> float:
+        """The θ that separates occupied from free points best: points with at least it count as occupied.
+
+        The true minus the false positive rate is then largest (Youden 1950).
+        """
+        return float(self.thresholds[np.argmax(self.true_positive - self.false_positive)])
 
 
 def roc(occupied: Tensor, free: Tensor) -> Roc:
     """ROC curve of the probabilities of occupied (P,) and free (Q,) points; ties count one half."""
-    from sklearn.metrics import auc
-
-    false_positive, true_positive, _ = _roc_curve(occupied, free)
-    return Roc(false_positive, true_positive, float(auc(false_positive, true_positive)))
-
-
-def separating_threshold(occupied: Tensor, free: Tensor) -> float:
-    """The θ that separates occupied (P,) from free (Q,) points best.
-
-    Points with at least this probability count as occupied; the true minus the false positive rate is then
-    largest (Youden 1950).
-    """
-    false_positive, true_positive, thresholds = _roc_curve(occupied, free)
-    return float(thresholds[np.argmax(true_positive - false_positive)])
-
-
-def _roc_curve(occupied: Tensor, free: Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """False and true positive rates (T,) at thresholds (T,), of which the first is infinite."""
-    from sklearn.metrics import roc_curve
+    from sklearn.metrics import auc, roc_curve
 
     if occupied.numel() == 0 or free.numel() == 0:
         raise InvalidArgumentError("An ROC curve needs at least one occupied and one free point.")
     labels = np.concatenate([np.ones(occupied.numel()), np.zeros(free.numel())])
-    scores = torch.cat([occupied, free]).cpu().numpy()
-    false_positive, true_positive, thresholds = roc_curve(labels, scores)
-    return false_positive, true_positive, thresholds
+    false_positive, true_positive, thresholds = roc_curve(labels, torch.cat([occupied, free]).cpu().numpy())
+    return Roc(false_positive, true_positive, thresholds, float(auc(false_positive, true_positive)))
 
 
 def auc_interval(occupied: Tensor, free: Tensor, auc: float, seed: int) -> tuple[float, float]:
@@ -136,14 +126,14 @@ def psnr_terms(points: Tensor, sampled: Tensor) -> tuple[float, float]:
 
     x, y = points.cpu().numpy(), sampled.cpu().numpy()
     diagonal = float(np.linalg.norm(x.max(0) - x.min(0)))
-    return _psnr(cKDTree(y).query(x)[0], diagonal), _psnr(cKDTree(x).query(y)[0], diagonal)
-
-
-def _psnr(distances: np.ndarray, diagonal: float) -> float:
-    error = math.sqrt(float((distances**2).mean()))
-    if error == 0:
-        return math.inf
-    return 20 * math.log10(diagonal / error) if diagonal > 0 else -math.inf
+    terms = []
+    for one, other in ((x, y), (y, x)):
+        error = math.sqrt(float((cKDTree(other).query(one)[0] ** 2).mean()))
+        if error == 0:
+            terms.append(math.inf)
+        else:
+            terms.append(20 * math.log10(diagonal / error) if diagonal > 0 else -math.inf)
+    return terms[0], terms[1]
 
 
 def psnr2(points: Tensor, sampled: Tensor) -> float:
@@ -172,36 +162,21 @@ def reliability(theta: Tensor, labels: Tensor) -> Reliability:
     return Reliability(sums[0] / count[kept], sums[1] / count[kept], count[kept])
 
 
-def log_loss_bits(theta: Tensor, labels: Tensor) -> float:
-    """Cross-entropy (bits per point) of labels (M,) under probabilities (M,); θ = ½ everywhere scores 1.
+def scores(theta: Tensor, labels: Tensor) -> dict[str, float]:
+    """Scores of probabilities (M,) of points with labels (M,), 1 occupied and 0 free.
 
-    Probabilities are clipped to [2⁻⁵², 1 − 2⁻⁵²], so one certain mistake costs 52 bits.
+    ece: expected calibration error. brier: mean squared difference. log_loss_bits: cross-entropy (bits per
+    point), of probabilities clipped to [2⁻⁵², 1 − 2⁻⁵²]: a certain mistake costs 52 bits. accuracy: share
+    of the points that the threshold ½ classifies correctly; a point with θ = ½ counts one half.
     """
     truth, p = _checked(theta, labels)
     least = 2.0**-52
     given = np.clip(np.where(truth == 1, p, 1 - p), least, 1 - least)
-    return float(-np.log2(given).mean())
-
-
-def accuracy(theta: Tensor, labels: Tensor) -> float:
-    """Share of the points classified correctly with threshold ½; a point with θ = ½ counts one half."""
-    truth, p = _checked(theta, labels)
-    return float(np.where(p == 0.5, 0.5, (p > 0.5) == (truth == 1)).mean())
-
-
-def brier_score(theta: Tensor, labels: Tensor) -> float:
-    """Mean squared difference of probabilities (M,) and labels (M,); θ = ½ everywhere scores ¼."""
-    truth, p = _checked(theta, labels)
-    return float(np.square(p - truth).mean())
-
-
-def scores(theta: Tensor, labels: Tensor) -> dict[str, float]:
-    """`ece`, `brier`, `log_loss_bits` and `accuracy` of occupied and free points."""
     return {
         "ece": reliability(theta, labels).expected_error,
-        "brier": brier_score(theta, labels),
-        "log_loss_bits": log_loss_bits(theta, labels),
-        "accuracy": accuracy(theta, labels),
+        "brier": float(np.square(p - truth).mean()),
+        "log_loss_bits": float(-np.log2(given).mean()),
+        "accuracy": float(np.where(p == 0.5, 0.5, (p > 0.5) == (truth == 1)).mean()),
     }
 
 

@@ -13,16 +13,7 @@ from typing import Literal, get_args
 from gmmtorch.declarations import option
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_resolution, check_whole
 
-Removal = Literal["beams", "scans"]
 FreePoints = Literal["uniform", "near_surface", "clear"]
-
-
-def check_test_every(test_every: int) -> None:
-    """Raises unless at least one scan of each `test_every` scans is left for training."""
-    if test_every < 2:
-        raise InvalidArgumentError(
-            f"test_every={test_every} must be at least 2: with 1 every scan is held out and none is left."
-        )
 
 
 def check_not_empty(options: object, *names: str) -> None:
@@ -41,7 +32,6 @@ class Protocol:
     kept: Sequence[float] = option(
         (1.0,), "shares of the training data that are used; a smaller share is a subset of a larger one"
     )
-    removal: Removal = option("beams", "what is removed to keep a share: beams or scans")
     resolution: Sequence[float] = option((0.1,), "sides (m) of the cells for which occupancy is asked")
     free: FreePoints = option(
         "uniform",
@@ -63,8 +53,10 @@ class Protocol:
         for share in self.kept:
             if not 0 < share <= 1:
                 raise InvalidArgumentError(f"kept={share} must be a share in (0, 1].")
-        check_choice("removal", self.removal, get_args(Removal))
-        check_test_every(self.test_every)
+        if self.test_every < 2:
+            raise InvalidArgumentError(
+                f"test_every={self.test_every} must be at least 2: with 1 no scan is left to learn from."
+            )
         if len(self.pose_noise) != 2 or not all(math.isfinite(x) and x >= 0 for x in self.pose_noise):
             raise InvalidArgumentError(
                 f"pose_noise={list(self.pose_noise)} must be two numbers ≥ 0: metres and radians."
@@ -82,6 +74,7 @@ class FitOptions:
     Attributes:
         max_cells: sum the points into at most this many cells; None: learn from the points.
         reg_covar: added to the variances (m²).
+        n_init: initializations, of which the best is kept.
         dtype: type of the exponentials in EM, "float32" or "float64".
         compiled: without effect, because the kernels are compiled anyway.
     """
@@ -104,7 +97,7 @@ class FitOptions:
     tol: float = option(1e-3, "EM ends when the mean log-likelihood grows by less (nats per point)")
     reg_covar: float = 1e-6
     max_iter: int = option(100, "EM iterations, at most")
-    n_init: int = option(1, "initializations, of which the best is kept")
+    n_init: int = 1
     dtype: str = "float32"
     compiled: bool = False
 

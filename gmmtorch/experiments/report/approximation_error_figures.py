@@ -12,22 +12,8 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from gmmtorch.report import (
-    EDGE,
-    LABEL_SIZE,
-    TICK_SIZE,
-    TITLE_SIZE,
-    UNKNOWN,
-    Rows,
-    colour_bar,
-    draw_grid,
-    figure_title,
-    label_axes,
-    legend_below,
-    line_look,
-    log_axis,
-    new_figure,
-)
+from gmmtorch import report
+from gmmtorch.report import EDGE, LABEL_SIZE, TICK_SIZE, TITLE_SIZE, UNKNOWN, Rows
 
 _LABELS = {
     "point": "point form",
@@ -81,7 +67,7 @@ def _by_dim(rows: Rows) -> dict[int, list[Mapping[str, Any]]]:
 def _map_figure(rows: Rows, field: str, title: str) -> Figure:
     groups = _by_dim(rows)
     n_columns = max(map(len, groups.values()))
-    figure = new_figure(3.1 * n_columns + 1.4, 3.3 * len(groups) + 1.3)
+    figure = report.new_figure(3.1 * n_columns + 1.4, 3.3 * len(groups) + 1.3)
     grid = figure.subplots(len(groups), n_columns, squeeze=False, sharex=True, sharey=True)
     for line, (dim, own) in zip(grid, groups.items(), strict=True):
         for axes, row in zip(line, own, strict=False):
@@ -95,10 +81,10 @@ def _map_figure(rows: Rows, field: str, title: str) -> Figure:
         lowest.tick_params(labelbottom=True)
     colours = ScalarMappable(_SCALE, "cividis")
     text = "largest absolute error, cells up to 2σ off axis"
-    colour_bar(figure, colours, grid.ravel().tolist(), text, aspect=30, extend="both")
+    report.colour_bar(figure, colours, grid.ravel().tolist(), text, aspect=30, extend="both")
     unknown = Patch(facecolor=UNKNOWN, edgecolor=EDGE, label="cell begins behind the sensor")
-    legend_below(figure, [unknown])
-    figure_title(figure, title)
+    report.legend_below(figure, [unknown])
+    report.figure_title(figure, title)
     return figure
 
 
@@ -114,8 +100,8 @@ def _draw_map(axes: Axes, row: Mapping[str, Any], field: str) -> None:
         shading="nearest",
         rasterized=True,
     )
-    label_axes(axes, label(row["method"], row["dim"]))
-    log_axis(axes, "x", row["distances"])
+    report.label_axes(axes, label(row["method"], row["dim"]))
+    report.log_axis(axes, "x", row["distances"])
     if np.isfinite(values).any():
         axes.text(
             0.97,
@@ -131,22 +117,22 @@ def _draw_map(axes: Axes, row: Mapping[str, Any], field: str) -> None:
 def _sweep_figure(rows: Rows) -> Figure:
     groups = _by_dim(rows)
     quantities = {"hits": "hits per ray", "misses": "misses per ray", "probability": "probability θ"}
-    figure = new_figure(13.5, 4.2 * len(groups) + 0.9)
+    figure = report.new_figure(13.5, 4.2 * len(groups) + 0.9)
     grid = figure.subplots(len(groups), len(quantities), squeeze=False, sharex=True)
     for line, (dim, own) in zip(grid, groups.items(), strict=True):
         places = np.arange(len(own))[::-1]
         for axes, (field, quantity) in zip(line, quantities.items(), strict=True):
             _draw_quantiles(axes, own, field, places)
-            label_axes(axes, f"{dim}D: {quantity}", "absolute error" if line is grid[-1] else "")
-            log_axis(axes, "x", [_LEAST, 1.0])
+            report.label_axes(axes, f"{dim}D: {quantity}", "absolute error" if line is grid[-1] else "")
+            report.log_axis(axes, "x", [_LEAST, 1.0])
             axes.set_xlim(_LEAST / 3, 3)
             axes.set_xticks([_LEAST, 1e-6, 1e-3, 1], ["≤ 1e-9", "1e-6", "1e-3", "1"])
             axes.set_yticks(places, [label(r["method"], dim) for r in own] if axes is line[0] else [])
             axes.set_ylim(-0.6, len(own) - 0.4)
-            draw_grid(axes, "x")
-    legend_below(figure)
+            report.draw_grid(axes, "x")
+    report.legend_below(figure)
     title = "Error for random components and cells of any size, distance and incidence"
-    figure_title(figure, f"{title}: {rows[0]['n_cases']:,} cases each")
+    report.figure_title(figure, f"{title}: {rows[0]['n_cases']:,} cases each")
     return figure
 
 
@@ -154,13 +140,13 @@ def _draw_quantiles(axes: Axes, rows: Rows, field: str, places: np.ndarray) -> N
     values = {q: np.array([max(row[f"{field}_{q}"], _LEAST) for row in rows]) for q in _QUANTILES}
     axes.hlines(places, values["median"], values["max"], color="#bbbbbb", linewidth=3, zorder=1)
     for index, (quantile, text) in enumerate(_QUANTILES.items()):
-        look = line_look(index) | {"linestyle": "", "markersize": 8}
+        look = report.line_look(index) | {"linestyle": "", "markersize": 8}
         axes.plot(values[quantile], places, label=text, zorder=2, **look)
 
 
 def _curve_figure(rows: Rows) -> Figure:
     groups = _by_dim(rows)
-    figure = new_figure(5.8 * len(groups) + 0.6, 9.4)
+    figure = report.new_figure(5.8 * len(groups) + 0.6, 9.4)
     grid = figure.subplots(2, len(groups), squeeze=False, sharex="col", sharey="row")
     panels = {
         "error": "relative error of hits and misses",
@@ -170,15 +156,15 @@ def _curve_figure(rows: Rows) -> Figure:
         size = f"{dim}D: {own[0]['n_components']:,} components, {own[0]['n_cells']:,} cells"
         for axes, (field, text) in zip(grid[:, number], panels.items(), strict=True):
             _draw_curves(axes, own, field)
-            label_axes(axes, "", "", text if number == 0 else "")
-            log_axis(axes, "y", [row[field] for row in rows])
-            log_axis(axes, "x", [row["seconds"] for row in own])
+            report.label_axes(axes, "", "", text if number == 0 else "")
+            report.log_axis(axes, "y", [row[field] for row in rows])
+            report.log_axis(axes, "x", [row["seconds"] for row in own])
             axes.tick_params(labelbottom=True, labelleft=True)
-            draw_grid(axes)
+            report.draw_grid(axes)
         grid[0, number].set_title(size, fontsize=TITLE_SIZE)
         grid[1, number].set_xlabel("time [s]", fontsize=LABEL_SIZE)
-    legend_below(figure, max_columns=3)
-    figure_title(figure, "Error against computing time on a whole grid")
+    report.legend_below(figure, max_columns=3)
+    report.figure_title(figure, "Error against computing time on a whole grid")
     return figure
 
 
@@ -186,7 +172,7 @@ def _draw_curves(axes: Axes, rows: Rows, field: str) -> None:
     for method in dict.fromkeys(row["method"] for row in rows):
         own = [row for row in rows if row["method"] == method]
         index = _CURVES.index(method) if method in _CURVES else len(_CURVES)
-        look = line_look(index) | {"markersize": 8, "linestyle": "-" if len(own) > 1 else ""}
+        look = report.line_look(index) | {"markersize": 8, "linestyle": "-" if len(own) > 1 else ""}
         name = label(method, rows[0]["dim"]) + _settings(own)
         axes.plot([row["seconds"] for row in own], [row[field] for row in own], label=name, **look)
 

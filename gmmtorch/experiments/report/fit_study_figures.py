@@ -11,21 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from gmmtorch.report import (
-    TICK_SIZE,
-    Label,
-    Rows,
-    colour,
-    draw_grid,
-    figure_title,
-    label_axes,
-    label_of,
-    legend_below,
-    line_look,
-    log_axis,
-    new_figure,
-    place_labels,
-)
+from gmmtorch import report
+from gmmtorch.report import TICK_SIZE, Label, Rows
 
 _AXES = {"n_components": "components", "nbytes": "map size [bytes]"}
 _LABELS = {
@@ -63,7 +50,7 @@ def panels_figure(
         x: integer field on the x axis: `n_components` or `nbytes`.
     """
     n_rows = math.ceil(len(panels) / 2)
-    figure = new_figure(11.0, 4.1 * n_rows + 0.9)
+    figure = report.new_figure(11.0, 4.1 * n_rows + 0.9)
     grid = figure.subplots(n_rows, 2, squeeze=False)
     names = list(dict.fromkeys(str(row[line]) for row in rows))
     ticks = sorted({int(row[x]) for row in rows})
@@ -74,15 +61,15 @@ def panels_figure(
             base = {k: float(np.mean(v)) for k, v in values[names[0]].items()}
         for index, name in enumerate(names):
             _draw_line(axes, {k: v - base[k] for k, v in values[name].items() if k in base}, name, index)
-        label_axes(axes, panel.title, _AXES[x], panel.unit)
+        report.label_axes(axes, panel.title, _AXES[x], panel.unit)
         _scale(axes, x, ticks)
         if panel.log:
-            log_axis(axes, "y", [row[panel.field] for row in rows if row[panel.field] is not None])
-        draw_grid(axes)
+            report.log_axis(axes, "y", [row[panel.field] for row in rows if row[panel.field] is not None])
+        report.draw_grid(axes)
     for axes in list(grid.flat)[len(panels) :]:
         axes.set_visible(False)
-    legend_below(figure, max_columns=5)
-    figure_title(figure, title)
+    report.legend_below(figure, max_columns=5)
+    report.figure_title(figure, title)
     return figure
 
 
@@ -90,18 +77,18 @@ def subject(rows: Rows) -> str:
     """Returns the end of a title: data set, number of points, and number of seeds if more than one."""
     n_seeds = len({row.get("seed") for row in rows})
     over = f"\nmean and range of {n_seeds} seeds" if n_seeds > 1 else ""
-    return f"{label_of(str(rows[0]['dataset']))}, {rows[0]['n_points']:,} points{over}"
+    return f"{report.label_of(str(rows[0]['dataset']))}, {rows[0]['n_points']:,} points{over}"
 
 
 def line_label(name: str) -> str:
     """Returns the name of a line as shown in legends."""
-    return _LABELS.get(name, label_of(name))
+    return _LABELS.get(name, report.label_of(name))
 
 
 def _scale(axes: Axes, x: str, values: Sequence[int]) -> None:
     """Makes the x axis logarithmic; numbers of components have a tick each."""
     if x != "n_components":
-        log_axis(axes, "x", values)
+        report.log_axis(axes, "x", values)
         return
     axes.set_xscale("log", base=2)
     axes.set_xticks(values, [str(value) for value in values], fontsize=TICK_SIZE)
@@ -119,8 +106,8 @@ def _values(rows: Rows, x: str, field: str) -> dict[int, np.ndarray]:
 
 def _draw_line(axes: Axes, values: Mapping[int, np.ndarray], name: str, index: int) -> None:
     low, mean, high = ([function(v) for v in values.values()] for function in (np.min, np.mean, np.max))
-    axes.fill_between(list(values), low, high, color=colour(index), alpha=0.15, linewidth=0)
-    axes.plot(list(values), mean, label=line_label(name), **line_look(index))
+    axes.fill_between(list(values), low, high, color=report.colour(index), alpha=0.15, linewidth=0)
+    axes.plot(list(values), mean, label=line_label(name), **report.line_look(index))
 
 
 _COST = (
@@ -196,7 +183,7 @@ def component_count_figures(rows: Rows) -> dict[str, Figure]:
     Args:
         rows: of `gmmtorch.experiments.studies.fit_studies`.
     """
-    figure = new_figure(12.0, 9.4)
+    figure = report.new_figure(12.0, 9.4)
     grid = figure.subplots(2, 2)
     fits = [row for row in rows if not str(row["rule"]).startswith(_MAP_PREFIX)]
     maps = [
@@ -213,9 +200,9 @@ def component_count_figures(rows: Rows) -> dict[str, Figure]:
     if maps:
         labels += _draw_rules(grid.flat[3], maps, _AUC)
     grid.flat[3].set_visible(bool(maps))
-    legend_below(figure, max_columns=5)
-    figure_title(figure, f"Number of components: {subject(fits)}")
-    place_labels(figure, labels)
+    report.legend_below(figure, max_columns=5)
+    report.figure_title(figure, f"Number of components: {subject(fits)}")
+    report.place_labels(figure, labels)
     return {"component_count": figure}
 
 
@@ -227,11 +214,11 @@ def _draw_rules(axes: Axes, rows: Rows, panel: Panel) -> list[Label]:
         own = sorted((row for row in measured if row["rule"] == name), key=lambda row: row["component_bytes"])
         if own:
             labels += _draw_rule(axes, own, panel.field, name, index)
-    label_axes(axes, panel.title, "size of the components [bytes, float32]", panel.unit)
-    log_axis(axes, "x", [row["component_bytes"] for row in measured])
+    report.label_axes(axes, panel.title, "size of the components [bytes, float32]", panel.unit)
+    report.log_axis(axes, "x", [row["component_bytes"] for row in measured])
     if panel.log:
-        log_axis(axes, "y", [row[panel.field] for row in measured])
-    draw_grid(axes)
+        report.log_axis(axes, "y", [row[panel.field] for row in measured])
+    report.draw_grid(axes)
     return labels
 
 
@@ -241,7 +228,7 @@ def _draw_rule(axes: Axes, rows: Rows, field: str, name: str, index: int) -> lis
     if name == "fixed":
         axes.plot(sizes, values, ".-", color="#333333", linewidth=1.6, label=_RULE_NAMES[name], zorder=2)
         return []
-    look = line_look(index - 1) | {"linestyle": ":", "linewidth": 1.0, "markersize": 8}
+    look = report.line_look(index - 1) | {"linestyle": ":", "linewidth": 1.0, "markersize": 8}
     axes.plot(sizes, values, label=_RULE_NAMES[name], zorder=3, **look)
     if name == "bic":
         return []

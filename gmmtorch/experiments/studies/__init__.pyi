@@ -2,7 +2,6 @@ from .approximation_error import run_approximation_error as run_approximation_er
 from .fit_studies import middle as middle
 from .fit_studies import run_component_count as run_component_count
 from .fit_studies import run_initialization as run_initialization
-from .map_studies import Sized as Sized
 from .map_studies import evaluate_correction as evaluate_correction
 from .map_studies import run_auc_memory as run_auc_memory
 from .map_studies import run_map_variants as run_map_variants
@@ -17,6 +16,7 @@ from .study_options import PoseCorrectionStudy as PoseCorrectionStudy
 from .study_options import SensorModelStudy as SensorModelStudy
 from .study_options import VarianceThresholdStudy as VarianceThresholdStudy
 from .variance_threshold import BOUNDS as BOUNDS
-from .variance_threshold import Railing as Railing
 from .variance_threshold import cells_by_setting as cells_by_setting
+from .variance_threshold import is_of_railing as is_of_railing
+from .variance_threshold import railing_scans as railing_scans
 from .variance_threshold import run_variance_threshold as run_variance_threshold

@@ -13,29 +13,18 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from gmmtorch import datasets
+from gmmtorch import datasets, occupancy
 from gmmtorch.experiments.studies.angular_reference import angular_evidence
 from gmmtorch.experiments.studies.study_options import ApproximationErrorStudy
 from gmmtorch.mapping import GaussianMap
-from gmmtorch.occupancy import (
-    Cones,
-    Evidence,
-    Sampling,
-    VoxelGrid,
-    box_flux,
-    cone_evidence,
-    flux_evidence,
-    occupancy_probability,
-    point_evidence,
-    sample_rays,
-)
+from gmmtorch.occupancy import Cones, Evidence, Sampling, VoxelGrid
 from gmmtorch.report import Event, OnRows, Row, ignore
 
 # -- test scenes ---------------------------------------------------------------------------------------
@@ -64,21 +53,17 @@ def methods(n_samples: int, n_large_samples: int) -> dict[str, Method]:
     Stratified sampling is left out: for one component it equals plain sampling.
     """
     return {
-        "cone": lambda scene, _: cone_evidence(*scene),
-        "cone_exact": lambda scene, _: cone_evidence(scene.cone, scene.low, scene.high, exact=True),
-        "point": lambda scene, _: _point(scene),
+        "cone": lambda scene, _: occupancy.cone_evidence(*scene),
+        "cone_exact": lambda scene, _: occupancy.cone_evidence(scene.cone, scene.low, scene.high, exact=True),
+        "point": lambda scene, _: occupancy.point_evidence(
+            scene.cone, 0.5 * (scene.low + scene.high), float(scene.high[0, 0] - scene.low[0, 0])
+        ),
         "monte_carlo": lambda scene, generator: cast_rays(scene, n_samples, generator, "plain"),
         "monte_carlo_sobol": lambda scene, generator: cast_rays(scene, n_samples, generator, "sobol"),
         "monte_carlo_large": lambda scene, generator: cast_rays(scene, n_large_samples, generator, "sobol"),
-        "flux": lambda scene, _: box_flux(*scene),
-        "flux_float32": lambda scene, _: box_flux(*scene, dtype=torch.float32),
+        "flux": lambda scene, _: occupancy.box_flux(*scene),
+        "flux_float32": lambda scene, _: occupancy.box_flux(*scene, dtype=torch.float32),
     }
-
-
-def _point(scene: Scene) -> Found:
-    resolution = float(scene.high[0, 0] - scene.low[0, 0])
-    found = point_evidence(scene.cone, 0.5 * (scene.low + scene.high), resolution)
-    return found.hits, found.misses
 
 
 def exact(scene: Scene) -> Found:
@@ -92,7 +77,7 @@ def cast_rays(
     scene: Scene, n_samples: int, generator: torch.Generator, sampling: Sampling = "plain"
 ) -> Found:
     """Evidence of a scene's boxes by sampled rays; every ray is intersected with every box."""
-    rays = sample_rays(scene.cone, n_samples, generator, sampling)
+    rays = occupancy.sample_rays(scene.cone, n_samples, generator, sampling)
     step = rays.ends - rays.origins
     step = torch.where(step.abs() < 1e-300, 1e-300, step)
     hits, misses = [], []
@@ -193,17 +178,11 @@ def run_approximation_error(
     return rows
 
 
-def _methods(
-    dim: int, options: ApproximationErrorStudy, names: Sequence[str] | None = None
-) -> dict[str, Method]:
-    return {
-        name: method
-        for name, method in methods(options.n_samples, options.n_large_samples).items()
-        if (dim == 3 or name != "cone_exact") and (names is None or name in names)
-    }
-
-
-# -- map ------------------------------------------------------------------------------------------
+def _methods(dim: int, options: ApproximationErrorStudy) -> dict[str, Method]:
+    found = methods(options.n_samples, options.n_large_samples)
+    if dim == 2:
+        del found["cone_exact"]
+    return found
 
 
 def map_rows(dim: int, options: ApproximationErrorStudy, generator: torch.Generator) -> Iterator[Row]:
@@ -216,7 +195,9 @@ def map_rows(dim: int, options: ApproximationErrorStudy, generator: torch.Genera
     scenes = [cells_before(float(p), depths, dim) for p in distances]
     clear = [scene.low[:, 0].view(len(OFFSETS), -1)[0] > 1e-6 for scene in scenes]
     truth = [exact(scene) for scene in scenes]
-    for name, method in _methods(dim, options, MAPPED).items():
+    for name, method in _methods(dim, options).items():
+        if name not in MAPPED:
+            continue
         error: list[list[float | None]] = []
         probability_error: list[list[float | None]] = []
         for scene, true, shown in zip(scenes, truth, clear, strict=True):
@@ -239,9 +220,6 @@ def map_rows(dim: int, options: ApproximationErrorStudy, generator: torch.Genera
         }
 
 
-# -- sweep ----------------------------------------------------------------------------------------
-
-
 def sweep_rows(dim: int, options: ApproximationErrorStudy, generator: torch.Generator) -> Iterator[Row]:
     """A row for each method: quantiles of its errors over random scenes."""
     scenes = [random_scene(dim, options.n_cells, generator) for _ in range(options.n_components)]
@@ -250,12 +228,11 @@ def sweep_rows(dim: int, options: ApproximationErrorStudy, generator: torch.Gene
         begin = time.perf_counter()
         found = [method(scene, generator) for scene in scenes]
         seconds = time.perf_counter() - begin
+        pairs = list(zip(found, truth, strict=True))
         errors = {
-            "hits": torch.cat([(f[0] - t[0]).abs() for f, t in zip(found, truth, strict=True)]),
-            "misses": torch.cat([(f[1] - t[1]).abs() for f, t in zip(found, truth, strict=True)]),
-            "probability": torch.cat(
-                [_probability_error(f, t, options) for f, t in zip(found, truth, strict=True)]
-            ),
+            "hits": torch.cat([(f[0] - t[0]).abs() for f, t in pairs]),
+            "misses": torch.cat([(f[1] - t[1]).abs() for f, t in pairs]),
+            "probability": torch.cat([_probability_error(f, t, options) for f, t in pairs]),
         }
         row: Row = {"study": "sweep", "dim": dim, "method": name, "n_cases": len(errors["hits"])}
         for field, values in errors.items():
@@ -263,9 +240,6 @@ def sweep_rows(dim: int, options: ApproximationErrorStudy, generator: torch.Gene
             row[f"{field}_p99"] = float(values.quantile(0.99))
             row[f"{field}_median"] = float(values.median())
         yield {**row, "seconds": seconds}
-
-
-# -- curve ----------------------------------------------------------------------------------------
 
 
 def curve_rows(dim: int, options: ApproximationErrorStudy, generator: torch.Generator) -> Iterator[Row]:
@@ -281,7 +255,7 @@ def curve_rows(dim: int, options: ApproximationErrorStudy, generator: torch.Gene
     cones = built.components().cones()
     places = torch.cat([cones.means, cones.origins]).double()
     grid = _grid_around(places, cones.origins[0].double(), options.resolution)
-    truth = flux_evidence(cones, grid, tolerance=_REFERENCE_TOLERANCE)
+    truth = occupancy.flux_evidence(cones, grid, tolerance=_REFERENCE_TOLERANCE)
     for method, setting, work in _settings(cones, grid, options, generator):
         begin = time.perf_counter()
         found = work()
@@ -319,7 +293,7 @@ def _settings(
             work = partial(_cast_on_grid, cones, grid, n, generator, sampling)
             yield f"monte_carlo_{sampling}", float(n), work
     for tolerance in options.tolerance:
-        yield "flux", tolerance, partial(flux_evidence, cones, grid, tolerance=tolerance)
+        yield "flux", tolerance, partial(occupancy.flux_evidence, cones, grid, tolerance=tolerance)
     yield "cone", None, partial(_cone_on_grid, cones, grid, False)
     if grid.dim == 3:
         yield "cone_exact", None, partial(_cone_on_grid, cones, grid, True)
@@ -329,13 +303,13 @@ def _cast_on_grid(
     cones: Cones, grid: VoxelGrid, n: int, generator: torch.Generator, sampling: Sampling
 ) -> Evidence:
     evidence = Evidence.empty(grid)
-    evidence.add_rays(*sample_rays(cones, n, generator, sampling))
+    evidence.add_rays(*occupancy.sample_rays(cones, n, generator, sampling))
     return evidence
 
 
 def _cone_on_grid(cones: Cones, grid: VoxelGrid, exact: bool) -> Evidence:
     low = grid.centers() - 0.5 * grid.resolution
-    hits, misses = cone_evidence(cones, low, low + grid.resolution, exact=exact)
+    hits, misses = occupancy.cone_evidence(cones, low, low + grid.resolution, exact=exact)
     return Evidence(grid, hits.view(grid.shape), misses.view(grid.shape))
 
 
@@ -349,11 +323,9 @@ def _grid_errors(found: Evidence, truth: Evidence, prior: float) -> Row:
     }
 
 
-def _probability_error(
-    found: tuple[Tensor, Tensor], true: tuple[Tensor, Tensor], options: ApproximationErrorStudy
-) -> Tensor:
+def _probability_error(found: Found, true: Found, options: ApproximationErrorStudy) -> Tensor:
     thetas = [
-        occupancy_probability(options.support * hits, options.support * misses, options.prior)
+        occupancy.occupancy_probability(options.support * hits, options.support * misses, options.prior)
         for hits, misses in (found, true)
     ]
     return (thetas[0] - thetas[1]).abs()

@@ -24,7 +24,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from sklearn.cluster import MeanShift
@@ -66,11 +66,8 @@ def run_initialization(
 ) -> list[Row]:
     """A row for each initialization, number of components and seed: one run of exact EM on the points.
 
-    Of `options`, only `tol`, `reg_covar`, `max_iter` and `dtype` have an effect.
-
-    The rows have the fields of every fit and `init_params`, `initial_covariance` (None if the initialization
-    gives covariances), `start` (both in one name), `seed`, `init_seconds` and `em_seconds`, whose sum is
-    `seconds`. Raises `InvalidArgumentError` for an invalid option before the first fit.
+    Of `options`, only `tol`, `reg_covar`, `max_iter` and `dtype` have an effect. The fields of the rows are
+    in docs/commands.md. Raises `InvalidArgumentError` for an invalid option before the first fit.
     """
     exact = replace(options, algorithm="exact", max_cells=None, n_init=1)
     starts = [
@@ -140,15 +137,14 @@ def fit_timed(
 def box_covariances(points: Tensor, n_components: int) -> Tensor:
     """K isotropic covariances (K, D, D) with the square of the box's longest side as variance (2.1.3)."""
     side = (points.amax(0) - points.amin(0)).max()
-    dim = points.shape[1]
-    return (torch.eye(dim, dtype=points.dtype, device=points.device) * side**2).expand(n_components, dim, dim)
+    return (torch.eye(points.shape[1]).to(points) * side**2).expand(n_components, -1, -1)
 
 
 # -- the number of components --------------------------------------------------------------------------
 
-RULES = ("fixed", "flat_pieces", "bic", "mean_shift", "hierarchical", "map_fixed", "map_flat_pieces")
-
 T = TypeVar("T")
+Learned = tuple[MixtureEstimator, float, float]
+"""A mixture, the time to choose its number of components, and its total time (s)."""
 
 
 def middle(scans: Sequence[Scan], window: int) -> Sequence[Scan]:
@@ -160,28 +156,20 @@ def middle(scans: Sequence[Scan], window: int) -> Sequence[Scan]:
 def run_component_count(
     data: FitData,
     scans: Sequence[Scan],
-    study: ComponentCountStudy | None = None,
-    options: FitOptions | None = None,
+    study: ComponentCountStudy,
+    options: FitOptions,
     seed: int = 0,
     on_event: Event = ignore,
     on_rows: OnRows = lambda rows: None,
 ) -> list[Row]:
-    """The rows of the curve, of the rules, and of the maps.
+    """The rows of the curve, of the rules, and of the maps; their fields are in docs/commands.md.
 
     Args:
         data: points of the window, for the fits and their scores.
         scans: scans of the maps, in time order; with fewer than two scans no maps are built.
-        study: the settings.
         options: of EM: `reg_covar`, `tol`, `max_iter`, `algorithm`, `dtype`.
         seed: of the samples for PSNR2, the free points and the maps' rays.
-        on_event: progress callback. on_rows: called with all rows so far after each new row.
-
-    Returns rows with the fields of every fit (None if not measured) and: `rule`; `setting`, the rule's K,
-    multiple of the noise, or share; `count_seconds`, the part of `seconds` that chooses K;
-    `component_bytes`, four bytes for each parameter of a component (40 in 3D, 24 in 2D); `bic` of the
-    training points; `auc`, `auc_low`, `auc_high`.
     """
-    study, options = study or ComponentCountStudy(), options or FitOptions()
     cases = _cases(data.train, study, options)
     rows: list[Row] = []
     on_event("components", 0, len(cases))
@@ -189,7 +177,9 @@ def run_component_count(
         rows.append(_row(data, rule, setting, learn(), seed))
         on_rows(rows)
         on_event("components", len(rows), len(cases))
-    rows.append(_least_bic([row for row in rows if row["rule"] == "fixed"]))
+    curve = [row for row in rows if row["rule"] == "fixed"]
+    best, seconds = min(curve, key=lambda row: float(row["bic"])), sum(row["seconds"] for row in curve)
+    rows.append({**best, "rule": "bic", "seconds": seconds, "count_seconds": seconds - best["seconds"]})
     on_rows(rows)
     if len(scans) > 1 and study.window_components:
         rows += map_rows(data.dataset, scans, study, seed, on_event)
@@ -198,14 +188,6 @@ def run_component_count(
 
 
 _NO_MAP = {"auc": None, "auc_low": None, "auc_high": None}
-
-
-class Learned(NamedTuple):
-    """A mixture, the time to choose its number of components, and its total time (s)."""
-
-    mixture: MixtureEstimator
-    count_seconds: float
-    seconds: float
 
 
 def _cases(
@@ -228,7 +210,7 @@ def _cases(
 
 def _by_number(points: Tensor, n_components: int, options: FitOptions) -> Learned:
     mixture = GaussianMixture(**{**_em(options), "n_components": n_components})
-    return Learned(mixture, 0.0, _fit(mixture, points))
+    return mixture, 0.0, _fit(mixture, points)
 
 
 def _by_surfaces(points: Tensor, noise: float, options: FitOptions) -> Learned:
@@ -236,19 +218,19 @@ def _by_surfaces(points: Tensor, noise: float, options: FitOptions) -> Learned:
     ones = cloud.new_ones(len(cloud))
     _, counting = _timed(lambda: surface_pieces(cloud, ones, noise, options.reg_covar))
     mixture = GaussianMixture(**{**_em(options), "n_components": None, "noise": noise})
-    return Learned(mixture, counting, _fit(mixture, points))
+    return mixture, counting, _fit(mixture, points)
 
 
 def _by_modes(points: Tensor, share: float, options: FitOptions) -> Learned:
     n_components, counting = _timed(lambda: count_modes(points, share))
-    learned = _by_number(points, n_components, options)
-    return Learned(learned.mixture, counting, counting + learned.seconds)
+    mixture, _, seconds = _by_number(points, n_components, options)
+    return mixture, counting, counting + seconds
 
 
 def _by_tree(points: Tensor, thickness: float, options: FitOptions) -> Learned:
     shared = {name: getattr(options, name) for name in ("tol", "max_iter", "reg_covar", "dtype")}
     tree = HierarchicalGaussianMixture(None, thickness=thickness, random_state=0, **shared)
-    return Learned(tree, 0.0, _fit(tree, points))
+    return tree, 0.0, _fit(tree, points)
 
 
 def _em(options: FitOptions) -> dict[str, Any]:
@@ -276,20 +258,13 @@ def _row(data: FitData, rule: str, setting: float, learned: Learned, seed: int) 
         "rule": rule,
         "setting": float(setting),
         "count_seconds": counting,
-        "component_bytes": component_bytes(row["n_components"], data.train.shape[1]),
+        "component_bytes": _component_bytes(row["n_components"], data.train.shape[1]),
         "bic": mixture.bic(data.train),
         **_NO_MAP,
     }
 
 
-def _least_bic(curve: Sequence[Row]) -> Row:
-    """The row with the lowest criterion, with the time of the whole curve."""
-    best = min(curve, key=lambda row: float(row["bic"]))
-    seconds = sum(row["seconds"] for row in curve)
-    return {**best, "rule": "bic", "seconds": seconds, "count_seconds": seconds - best["seconds"]}
-
-
-def component_bytes(n_components: int, dim: int) -> int:
+def _component_bytes(n_components: int, dim: int) -> int:
     """Four bytes for each parameter: weight, mean and covariance; 40 bytes for a component in 3D."""
     return 4 * n_components * (1 + dim + dim * (dim + 1) // 2)
 
@@ -306,11 +281,8 @@ def count_modes(points: Tensor, share: float) -> int:
     return len(MeanShift(bandwidth=bandwidth, bin_seeding=True).fit(cloud.numpy()).cluster_centers_)
 
 
-# -- maps -------------------------------------------------------------------------------------------
-
-
 def map_rows(
-    dataset: str, scans: Sequence[Scan], study: ComponentCountStudy, seed: int = 0, on_event: Event = ignore
+    dataset: str, scans: Sequence[Scan], study: ComponentCountStudy, seed: int, on_event: Event
 ) -> list[Row]:
     """Rows of maps with flat pieces, and with fixed numbers of components for each window."""
     rule = WindowedRule(noise=study.noise)
@@ -345,12 +317,12 @@ def map_rows(
             "n_components_used": row["n_components"],
             "seconds": row["build_seconds"],
             **dict.fromkeys(_UNMEASURED),
-            "held_out_log_likelihood": _score(built.map, test),
+            "held_out_log_likelihood": surface_score(built.map, test),
             "nbytes": row["nbytes"],
             "rule": name,
             "setting": float(setting),
             "count_seconds": None,
-            "component_bytes": component_bytes(row["n_components"], test.shape[1]),
+            "component_bytes": _component_bytes(row["n_components"], test.shape[1]),
             "bic": None,
             **{field: row[field] for field in _NO_MAP},
         }
@@ -367,8 +339,3 @@ _UNMEASURED = (
     "psnr_backward_db",
     "held_out_psnr2_db",
 )
-
-
-def _score(built: object, points: Tensor) -> float:
-    assert isinstance(built, GaussianMap)
-    return surface_score(built, points)

@@ -10,29 +10,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.experiments.evaluation import (
-    Built,
-    Form,
-    MapFactory,
-    Protocol,
-    Queries,
-    auc_gain,
-    evaluate,
-    hit_and_free,
-    keep_share,
-    pose_perturbations,
-    roc,
-    split_indices,
-    test_beams,
-)
+from gmmtorch.experiments import evaluation
+from gmmtorch.experiments.evaluation import Built, Form, MapFactory, Protocol, Queries
 from gmmtorch.mapping import GaussianMap
 from gmmtorch.mixture import GaussianMixture
+from gmmtorch.occupancy import OccupancyMap
 from gmmtorch.pose import Pose
 from gmmtorch.report import Event, OnRows, Row, ignore
 from gmmtorch.scan import Scan
@@ -40,41 +27,30 @@ from gmmtorch.scan import Scan
 # -- AUC against size ----------------------------------------------------------------------------------
 
 
-class Sized(NamedTuple):
-    """A method with one size: its number of components or stored points; None if the method has one size."""
-
-    method: str
-    size: int | None
-    factory: MapFactory
-
-
 def run_auc_memory(
     name: str,
     scans: Sequence[Scan],
-    methods: Sequence[Sized],
+    methods: Mapping[tuple[str, int | None], MapFactory],
     protocol: Protocol,
     seed: int = 0,
     on_event: Event = ignore,
     on_rows: OnRows = lambda rows: None,
 ) -> list[Row]:
-    """A row of `held_out.evaluate` for each sized method, with the field `size`."""
-    by_label = {_label(sized): sized for sized in methods}
+    """A row of `held_out.evaluate` for each method, with the field `size`.
+
+    methods: by their names and sizes: numbers of components or stored points; None of a method with one size.
+    """
+    names = {name if size is None else f"{name} {size}": (name, size) for name, size in methods}
 
     def with_size(rows: Sequence[Row]) -> list[Row]:
-        return [
-            {**row, "method": by_label[row["method"]].method, "size": by_label[row["method"]].size}
-            for row in rows
-        ]
+        sized = [names[row["method"]] for row in rows]
+        return [{**row, "method": m, "size": n} for row, (m, n) in zip(rows, sized, strict=True)]
 
-    factories = {label: sized.factory for label, sized in by_label.items()}
-    outcome = evaluate(
+    factories = dict(zip(names, methods.values(), strict=True))
+    outcome = evaluation.evaluate(
         name, scans, factories, protocol, seed, on_event, lambda rows: on_rows(with_size(rows))
     )
     return with_size(outcome.rows)
-
-
-def _label(sized: Sized) -> str:
-    return sized.method if sized.size is None else f"{sized.method} {sized.size}"
 
 
 # -- options of learning -------------------------------------------------------------------------------
@@ -101,11 +77,13 @@ def run_map_variants(
     rows: list[Row] = []
     first: dict[float, Built] = {}
     for variant, factory in variants.items():
-        outcome = evaluate(name, scans, {variant: factory}, protocol, seed, on_event)
+        outcome = evaluation.evaluate(name, scans, {variant: factory}, protocol, seed, on_event)
         for built in outcome.shown:
             assert isinstance(built.map, GaussianMap)
             base = first.setdefault(built.row["resolution"], built)
-            gain, low, high = auc_gain(base.asked.split(base.theta), built.asked.split(built.theta))
+            gain, low, high = evaluation.auc_gain(
+                base.asked.split(base.theta), built.asked.split(built.theta)
+            )
             rows.append(
                 {
                     **built.row,
@@ -123,14 +101,15 @@ def run_map_variants(
 
 def held_out_points(scans: Sequence[Scan], test_every: int) -> Tensor:
     """About 5000 points (N, D) of the held-out scans."""
-    points = torch.cat([scans[i].points for i in split_indices(len(scans), test_every)[1]])
+    points = torch.cat([scans[i].points for i in evaluation.split_indices(len(scans), test_every)[1]])
     return points[:: max(1, len(points) // _SCORED_POINTS)].double()
 
 
-def surface_score(built: GaussianMap, points: Tensor) -> float:
-    """Mean log-likelihood (nats) of points (N, D) under the surfaces of a map, before the codec rounds them,
-    weighted by their support.
+def surface_score(built: OccupancyMap, points: Tensor) -> float:
+    """Mean log-likelihood (nats) of points (N, D) under the surfaces of a `GaussianMap`, before the codec
+    rounds them, weighted by their support.
     """
+    assert isinstance(built, GaussianMap)
     hits = ~built.max_range
     weight, means, covariances = built.support[hits], built.means[hits], built.covariances[hits]
     return GaussianMixture.from_parameters(weight / weight.sum(), means, covariances).score(points)
@@ -162,10 +141,6 @@ def correct_poses(built: GaussianMap, ids: Sequence[Tensor], motions: Sequence[T
 
     `ids`: the ids (J, 2) of each scan's components, from `build_by_scan`.
     """
-    if len(ids) != len(motions):
-        raise InvalidArgumentError(
-            f"motions has {len(motions)} entries for {len(ids)} scans; give one for each scan."
-        )
     for ids_of_scan, motion in zip(ids, motions, strict=True):
         if len(ids_of_scan):
             built.transform(Pose.from_matrix(motion).inverse().matrix, ids_of_scan)
@@ -190,22 +165,19 @@ def evaluate_correction(
         protocol: the test; its `pose_noise` (m, rad) perturbs the training poses.
         methods: forms of evidence.
         seed: of the perturbations, the random choice of training data, and the free points.
-        on_event: progress callback.
-        on_rows: called with all rows so far after new rows.
 
-    Returns a row for each share kept, method and resolution: `dataset, method, removal, kept, resolution,
-    pose_noise_m, pose_noise_rad, n_components, nbytes`, and the AUCs `auc` (map from the perturbed poses),
-    `auc_corrected` (the same map after correction) and `auc_clean` (map from the true poses).
+    Returns a row for each share kept, method and resolution, with the AUCs `auc` (map from the perturbed
+    poses), `auc_corrected` (the same map after correction) and `auc_clean` (map from the true poses).
     """
-    train_index, test_index = split_indices(len(scans), protocol.test_every)
+    train_index, test_index = evaluation.split_indices(len(scans), protocol.test_every)
     train = [scans[i] for i in train_index]
-    origins, ends = test_beams([scans[i] for i in test_index], protocol.max_beams, seed)
-    asked = {r: hit_and_free(origins, ends, protocol.free, r, seed) for r in protocol.resolution}
+    origins, ends = evaluation.test_beams([scans[i] for i in test_index], protocol.max_beams, seed)
+    asked = {r: evaluation.hit_and_free(origins, ends, protocol.free, r, seed) for r in protocol.resolution}
     rows: list[Row] = []
     for kept in protocol.kept:
         on_event("pose correction", 0, 3)
-        shown = keep_share(train, kept, protocol.removal, seed)
-        motions = pose_perturbations(shown, protocol.pose_noise, seed)
+        shown = evaluation.keep_share(train, kept, seed)
+        motions = evaluation.pose_perturbations(shown, protocol.pose_noise, seed)
         moved = [scan.transformed(motion) for scan, motion in zip(shown, motions, strict=True)]
         true_map, perturbed_map = new_map(), new_map()
         build_by_scan(true_map, shown)
@@ -219,7 +191,7 @@ def evaluate_correction(
             {
                 "dataset": name,
                 "method": method,
-                "removal": protocol.removal,
+                "removal": "beams",
                 "kept": float(kept),
                 "resolution": float(resolution),
                 "pose_noise_m": float(protocol.pose_noise[0]),
@@ -245,5 +217,5 @@ def _aucs(
     for method in methods:
         for resolution, ask in asked.items():
             theta = torch.as_tensor(built.occupancy(ask.points, resolution, method)).cpu()
-            found[method, resolution] = roc(*ask.split(theta)).auc
+            found[method, resolution] = evaluation.roc(*ask.split(theta)).auc
     return found

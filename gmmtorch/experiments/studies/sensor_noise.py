@@ -18,7 +18,8 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
+from typing import NamedTuple
 
 import torch
 from sklearn.exceptions import ConvergenceWarning
@@ -56,8 +57,7 @@ SENSORS: dict[str, type[DepthCameraModel] | type[LidarModel] | type[LaserModel]]
 VARIANTS = ("plain", "planar", "noise", "noise_planar")
 
 
-@dataclass(frozen=True)
-class _Cloud:
+class _Cloud(NamedTuple):
     """Points (N, D), their noise covariances (N, D, D), and the index of each point's scan (N,)."""
 
     points: Tensor
@@ -81,27 +81,23 @@ def sensor_model(study: SensorModelStudy) -> SensorModel:
 def run_sensor_noise(
     name: str,
     scans: Sequence[Scan],
-    study: SensorModelStudy | None = None,
+    study: SensorModelStudy,
     seed: int = 0,
     on_event: Event = ignore,
 ) -> list[Row]:
-    """Learn every variant at every size, and score it on the held-out scans.
+    """A row for each variant and size, scored on the held-out scans.
 
     Args:
         name: of the data set, for the rows.
         scans: in time order.
         study: sensor model, sizes and test.
         seed: of the points drawn, the initialization of EM, the free points and the map's rays.
-        on_event: progress callback.
 
-    Returns rows of: dataset, variant, n_components, nbytes (of the stored map), seconds, n_iterations,
-    converged, held_out_log_likelihood (by the variant's own density, nats per point),
-    log_likelihood_noise_added and log_likelihood_as_fitted (by each density), auc, auc_low, auc_high (hits
-    against free points anywhere on the beams), auc_near_surface (against free points 0.5 to 2 cells before
-    the hit), thickness (median of the components' smallest standard deviations, m), sensor_deviation (median
-    standard deviation of the training points along the beam, m), resolution, n_train_points, n_test_beams.
+    Fields that say more than their name: held_out_log_likelihood, by the variant's own density (nats per
+    point); auc: against free points anywhere on the beams; auc_near_surface: 0.5 to 2 cells before the hit;
+    thickness: median of the components' smallest standard deviations (m); sensor_deviation: median standard
+    deviation of the training points along the beam (m).
     """
-    study = study or SensorModelStudy()
     sensor = sensor_model(study)
     train_index, test_index = split_indices(len(scans), study.test_every)
     train = [scans[i] for i in train_index]

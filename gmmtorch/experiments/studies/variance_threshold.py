@@ -9,8 +9,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -33,52 +32,40 @@ _BARS = (0.55, _HEIGHT)
 _NOISE = 0.01
 _FLOOR = 0.15  # points below belong to the floor (m)
 
-
 BOUNDS: tuple[tuple[float, ...], tuple[float, ...]] = ((-0.3, -0.5, _FLOOR), (3.3, 0.5, 1.35))
 """Lowest and highest corner (m) of a box around one half of the railing, without the floor."""
 
 
-@dataclass(frozen=True)
-class Railing:
-    """Posts and two bars of square section, 3 m before a wall, on a floor; a lidar passes at 4 m.
+def railing_world(width: float) -> MeshWorld:
+    """Posts and two bars of square section, `width` metres wide, 3 m before a wall, on a floor."""
+    half = 0.5 * width
+    parts = [
+        box((-8.0, -8.0, -0.1), (8.0, 3.1, 0.0)),
+        box((-8.0, 3.0, 0.0), (8.0, 3.1, 3.0)),
+        *(box((x - half, -half, 0.0), (x + half, half, _HEIGHT)) for x in _POSTS),
+        *(box((-_HALF, -half, z - half), (_HALF, half, z + half)) for z in _BARS),
+    ]
+    return MeshWorld(torch.cat(parts))
 
-    width: side of the section (m).
-    """
 
-    width: float
+def railing_scans(width: float, n_scans: int, seed: int) -> list[Scan]:
+    """Scans (32 × 480 beams, range 12 m, noise 1 cm) from places along the railing, 4 m before it."""
+    sensor = spinning_lidar(32, 480, (-math.radians(20), math.radians(12)), 12.0, _NOISE)
+    world, generator = railing_world(width), torch.Generator().manual_seed(seed)
+    found = []
+    for x in torch.linspace(-4, 4, n_scans, dtype=torch.float64):
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, 3] = torch.stack([x, torch.tensor(-4.0).double(), torch.tensor(1.2).double()])
+        ends, missed = sense(sensor, pose, world, generator)
+        found.append(Scan(ends[~missed], pose[:3, 3], ends[missed]))
+    return found
 
-    def distances(self, origin: Tensor, directions: Tensor) -> Tensor:
-        """Range (N,) in metres from the origin (3,) along unit directions (N, 3); inf without a hit."""
-        return self._mesh.distances(origin, directions)
 
-    @cached_property
-    def _mesh(self) -> MeshWorld:
-        half = 0.5 * self.width
-        parts = [
-            box((-8.0, -8.0, -0.1), (8.0, 3.1, 0.0)),
-            box((-8.0, 3.0, 0.0), (8.0, 3.1, 3.0)),
-            *(box((x - half, -half, 0.0), (x + half, half, _HEIGHT)) for x in _POSTS),
-            *(box((-_HALF, -half, z - half), (_HALF, half, z + half)) for z in _BARS),
-        ]
-        return MeshWorld(torch.cat(parts))
-
-    def scans(self, n_scans: int, seed: int) -> list[Scan]:
-        """Scans (32 × 480 beams, range 12 m, noise 1 cm) from places along the railing."""
-        sensor = spinning_lidar(32, 480, (-math.radians(20), math.radians(12)), 12.0, _NOISE)
-        generator = torch.Generator().manual_seed(seed)
-        found = []
-        for x in torch.linspace(-4, 4, n_scans, dtype=torch.float64):
-            pose = torch.eye(4, dtype=torch.float64)
-            pose[:3, 3] = torch.stack([x, torch.tensor(-4.0).double(), torch.tensor(1.2).double()])
-            ends, missed = sense(sensor, pose, self, generator)
-            found.append(Scan(ends[~missed], pose[:3, 3], ends[missed]))
-        return found
-
-    def holds(self, scan: Scan) -> Tensor:
-        """Mask (N,) of the points of a scan that the railing returned."""
-        x, y, z = scan.points.unbind(1)
-        reach = 0.5 * self.width + 5 * _NOISE
-        return (y.abs() < reach) & (x.abs() < _HALF + reach) & (z > _FLOOR) & (z < _HEIGHT + reach)
+def is_of_railing(scan: Scan, width: float) -> Tensor:
+    """Mask (N,) of the points of a scan that the railing returned."""
+    x, y, z = scan.points.unbind(1)
+    reach = 0.5 * width + 5 * _NOISE
+    return (y.abs() < reach) & (x.abs() < _HALF + reach) & (z > _FLOOR) & (z < _HEIGHT + reach)
 
 
 # -- the study -----------------------------------------------------------------------------------------
@@ -87,17 +74,16 @@ _BEHIND = 0.5  # a beam passes a structure if it ends this far behind (m)
 _SIDES = 4  # axes across a beam along which a structure may be narrow
 
 
-@dataclass
-class Thresholds:
+class Thresholds(NamedTuple):
     """Rows of results.json, and evidence by number of components (None: the rays themselves).
 
     hits (H, D): test hits; thin (P, D): those on thin structures.
     """
 
-    rows: list[Row] = field(default_factory=list)
-    sources: dict[int | None, Source] = field(default_factory=dict)
-    hits: Tensor = field(default_factory=lambda: torch.empty(0, 3))
-    thin: Tensor = field(default_factory=lambda: torch.empty(0, 3))
+    rows: list[Row]
+    sources: dict[int | None, Source]
+    hits: Tensor
+    thin: Tensor
 
 
 class Source(NamedTuple):
@@ -142,7 +128,7 @@ def run_variance_threshold(
     share = len(on_thin) / sum(len(scan.points) for scan in test)
     generator = torch.Generator().manual_seed(seed)
     on_thin = on_thin[torch.randperm(len(on_thin), generator=generator)[: study.max_beams]]
-    found = Thresholds(hits=ends, thin=on_thin)
+    found = Thresholds([], {}, ends, on_thin)
     points = torch.cat([asked.points, on_thin])
     labels = torch.cat([asked.labels, torch.full((len(on_thin),), OCCUPIED)])
     on_event("maps", 0, len(study.n_components) + 1)
@@ -153,7 +139,7 @@ def run_variance_threshold(
             evidence = source.evidence(points, resolution, method)
             shared = {"dataset": name, "method": method, "resolution": resolution, "thin_share": share}
             thetas = {p: source.occupancy(evidence, resolution, points.shape[1], p) for p in study.prior}
-            found.rows += _rows({**shared, **source.facts}, thetas, labels, len(asked.points), study)
+            found.rows.extend(_rows({**shared, **source.facts}, thetas, labels, len(asked.points), study))
         on_rows(found.rows)
         on_event("maps", len(found.sources), len(study.n_components) + 1)
     return found
@@ -220,20 +206,17 @@ def cells_by_setting(
             counts, known = (
                 source.occupancy(evidence, resolution, centers.shape[1], x) for x in (prior, None)
             )
+            by_counts, by_known = classify(counts, strict), classify(known, strict)
             return {
-                f"counts, v = {strict:g}:\noccupied": _is(counts, strict, CellClass.OCCUPIED),
-                f"counts, v = {strict:g}:\nhit and not free": hit & ~_is(counts, strict, CellClass.FREE),
-                f"calibrated, v = {strict:g}:\nhit and not free": hit & ~_is(known, strict, CellClass.FREE),
-                f"calibrated, v = {lenient:g}:\noccupied": _is(known, lenient, CellClass.OCCUPIED),
+                f"counts, v = {strict:g}:\noccupied": by_counts == CellClass.OCCUPIED,
+                f"counts, v = {strict:g}:\nhit and not free": hit & (by_counts != CellClass.FREE),
+                f"calibrated, v = {strict:g}:\nhit and not free": hit & (by_known != CellClass.FREE),
+                f"calibrated, v = {lenient:g}:\noccupied": classify(known, lenient) == CellClass.OCCUPIED,
             }
 
         return masks
 
     return {n: masks_of(source) for n, source in found.sources.items() if n is not None}
-
-
-def _is(theta: Tensor, threshold: float, label: CellClass) -> Tensor:
-    return classify(theta, threshold) == label
 
 
 def _rows(

@@ -1,4 +1,4 @@
-"""Maps with corrected poses, against maps that were learned from the true poses."""
+"""Studies of maps: AUC against bytes, and maps with corrected poses against those of true poses."""
 
 from __future__ import annotations
 
@@ -10,12 +10,41 @@ from pillar_room import room_scans
 
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.experiments.evaluation.protocol_options import Protocol
+from gmmtorch.experiments.evaluation.held_out import Form, MapFactory, Protocol, evaluate, methods
 from gmmtorch.experiments.evaluation.queries import perturb_poses, pose_perturbations
-from gmmtorch.experiments.studies.map_studies import build_by_scan, correct_poses, evaluate_correction
+from gmmtorch.experiments.studies.map_studies import (
+    build_by_scan,
+    correct_poses,
+    evaluate_correction,
+    run_auc_memory,
+)
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import WindowedRule
 from gmmtorch.scan import Scan
+
+PROTOCOL = Protocol(test_every=4, resolution=(0.2,))
+
+
+def sized_map(n: int) -> MapFactory:
+    return Form(lambda: GaussianMap(window=5, learning=WindowedRule(n_components=n)), "point")
+
+
+def test_every_sized_method_has_a_row():
+    scans = room_scans(12)
+    grid = methods(GaussianMap)["occupancy_grid"]
+    sized = {("point", 4): sized_map(4), ("point", 12): sized_map(12), ("grid", None): grid}
+    counts: list[int] = []
+    rows = run_auc_memory("room", scans, sized, PROTOCOL, on_rows=lambda rows: counts.append(len(rows)))
+    assert [(row["method"], row["size"]) for row in rows] == [("point", 4), ("point", 12), ("grid", None)]
+    assert counts == [1, 2, 3]
+    assert rows[0]["nbytes"] < rows[1]["nbytes"]
+    assert rows[0]["n_components"] < rows[1]["n_components"]
+    (expected,) = evaluate("room", scans, {"grid": grid}, PROTOCOL).rows
+    assert rows[2]["auc"] == expected["auc"]
+    assert rows[2]["nbytes"] == expected["nbytes"]
+
+
+# -- corrected poses -------------------------------------------------------------------------------------
 
 NOISE = (0.3, 0.1)
 
@@ -99,10 +128,3 @@ def test_a_scan_without_points_has_no_components():
 def test_windows_of_several_scans_raise():
     with pytest.raises(InvalidArgumentError, match=r"window=None.*map=per_scan"):
         build_by_scan(GaussianMap(), room_scans(2))
-
-
-def test_a_missing_motion_raises():
-    built = per_scan()
-    born = build_by_scan(built, room_scans(2))
-    with pytest.raises(InvalidArgumentError, match="motions has 1 entries for 2 scans"):
-        correct_poses(built, born, [torch.eye(3, dtype=torch.float64)])
