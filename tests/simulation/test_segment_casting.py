@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.simulation import segment_casting
+from gmmtorch.simulation import buildings
+from gmmtorch.simulation.buildings import ray_segments
 from gmmtorch.simulation.furniture import circle, prism
-from gmmtorch.simulation.segment_casting import ray_segments
 
 DTYPE = torch.float64
 
@@ -49,7 +49,7 @@ def test_distances_agree_with_a_linear_solver(one_origin):
 def test_chunk_sizes_do_not_change_the_distances(monkeypatch):
     segments, directions = random((30, 2, 2), 0), random((200, 2), 1)
     whole = ray_segments(torch.zeros(2), directions, segments)
-    monkeypatch.setattr(segment_casting, "_CHUNK_PAIRS", 64)
+    monkeypatch.setattr(buildings, "_CHUNK_PAIRS", 64)
     torch.testing.assert_close(ray_segments(torch.zeros(2), directions, segments), whole)
 
 
