@@ -12,14 +12,16 @@ from sklearn.cluster import KMeans
 from sklearn.datasets import load_digits, load_iris
 
 from gmmtorch.mixture.em import kmeans as module
-from gmmtorch.mixture.em.initialization import Distinct
+from gmmtorch.mixture.em.initialization import distinct
 from gmmtorch.mixture.em.kmeans import kmeans, spread_out
 
 
 def clusters(x: np.ndarray, k: int, seed: int, n_runs: int = 1) -> tuple[np.ndarray, np.ndarray]:
     points = torch.from_numpy(x - x.mean(0))
-    cloud = Distinct.of(points, torch.ones(len(x)).double())
-    nearest, scatter = kmeans(*cloud, k, torch.Generator().manual_seed(seed), n_runs)
+    weight = torch.ones(len(x)).double()
+    nearest, scatter = kmeans(
+        points, weight, *distinct(points, weight), k, torch.Generator().manual_seed(seed), n_runs
+    )
     return nearest.numpy(), scatter.numpy()
 
 
@@ -51,9 +53,10 @@ def test_clusters_are_not_empty_and_improve_in_no_step_of_lloyd(seed, n, dim, k,
 
 def test_centers_are_distinct_points_even_if_far_ones_are_few():
     x = torch.cat([torch.zeros(500, 2), torch.arange(5.0)[:, None].expand(5, 2) * 1e8]).double()
-    *_, rows, _ = cloud = Distinct.of(x, torch.ones(505).double())
+    weight = torch.ones(505).double()
+    rows, mass = distinct(x, weight)
     assert len(rows) == 5
-    chosen = spread_out(*cloud, 5, torch.Generator().manual_seed(0), 4)
+    chosen = spread_out(x, weight, rows, mass, 5, torch.Generator().manual_seed(0), 4)
     assert all(len(set(map(tuple, x[own].tolist()))) == 5 for own in chosen)
 
 
@@ -69,7 +72,8 @@ def test_empty_clusters_continue_at_the_farthest_points(monkeypatch):
 def test_one_launch_finds_what_the_twin_finds(seed, n, dim, k):
     rng = np.random.default_rng(seed)
     weight = torch.from_numpy(rng.random(n) + 0.5)
-    cloud = Distinct.of(torch.from_numpy(rng.normal(size=(n, dim))), weight)
+    points = torch.from_numpy(rng.normal(size=(n, dim)))
+    cloud = (points, weight, *distinct(points, weight))
     twin, fused = by_both(lambda: kmeans(*cloud, min(k, n), torch.Generator().manual_seed(seed)))
     torch.testing.assert_close(fused, twin)
 

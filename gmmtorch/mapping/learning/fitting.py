@@ -466,7 +466,7 @@ def _from_tree(window: _Window, fit: SurfaceFit) -> _Learned:
         seen = window.counts(cells.member, cells.weight.shape[0])
         limit = DensityLimit(rule.min_density_share, window.sensor, window.origins, seen)
     means = cells.features[:, 1 : 1 + window.points.shape[1]].contiguous()
-    grown = grow(means, cells.weight, tree, density=limit).tree
+    grown, _, _ = grow(means, cells.weight, tree, density=limit)
     leaves = grown.leaves()
     mixture = Parameters(grown.weights[leaves], grown.means[leaves], grown.covariances[leaves])
     owner = most_likely_component(cells.features, mixture)

@@ -19,14 +19,14 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from gmmtorch.errors import NumericalError
 from gmmtorch.kernels import chunk_elements, chunked, softmax
-from gmmtorch.linalg import safe_cholesky, unpack_symmetric
+from gmmtorch.linalg import inverse_factor, safe_cholesky, unpack_symmetric
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.exact import Parameters
 
@@ -35,11 +35,8 @@ _MOST_LOST_VARIANCE = 1e-5  # share of a variance that the moments of the linear
 _ROWS = (512, 1 << 16)  # points of a product of the direct form, on a CPU and elsewhere
 _NO_SHARE = 1e-16  # of the largest responsibility of a component in a chunk: such points do not count
 
-
-class Joint(Protocol):
-    """From points (n, D) to log π_k + log N(x|k), (K, n). `square`: their `squares`, if they are known."""
-
-    def __call__(self, points: Tensor, square: Tensor | None = None) -> Tensor: ...
+Joint = Callable[..., Tensor]
+"""From points (n, D), and their `squares` if they are known, to log π_k + log N(x|k), (K, n)."""
 
 
 def has_linear_form(n_components: int, dim: int, kind: str) -> bool:
@@ -55,6 +52,11 @@ def compacted(parameters: Parameters, kind: str) -> Parameters:
     """The nearest covariances of the type, in its shape, to those (K, D, D)."""
     covariances = em.constrain(parameters.covariances, kind, parameters.weights)
     return parameters._replace(covariances=em.compact(covariances, kind))
+
+
+def expanded(parameters: Parameters, kind: str) -> Parameters:
+    """The parameters with covariances (K, D, D), given in the shape of their type."""
+    return parameters._replace(covariances=em.expand(parameters.covariances, kind, *parameters.means.shape))
 
 
 # -- log-densities --------------------------------------------------------------------------------
@@ -78,7 +80,7 @@ class Factors:
                 factors, info = torch.linalg.cholesky_ex(covariances)
                 self.failed = (info != 0).any()
             half_log_det = factors.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-            self.whiten = _invert(factors)
+            self.whiten = inverse_factor(factors).mT if factors.requires_grad else _invert(factors)
         else:
             self.failed = ~(covariances > 0).all()
             if check and bool(self.failed):
@@ -434,10 +436,10 @@ def exact_step(
 
 
 def direct_step(
-    points: Tensor, sample_weight: Tensor, parameters: Parameters, reg_covar: float
+    points: Tensor, sample_weight: Tensor, parameters: Parameters, reg_covar: float, kind: str = "full"
 ) -> tuple[Parameters, Tensor]:
-    """`exact_step` of full covariances in float64: new parameters and Σ_n p_n log p(x_n)."""
-    factors = Factors(parameters, "full")
+    """`exact_step` in float64: new parameters and Σ_n p_n log p(x_n)."""
+    factors = Factors(parameters, kind)
     gather = functools.partial(expected_moments, points, sample_weight, factors, torch.float64)
     found = exact_step(gather, factors, reg_covar, parameters)
     return found.parameters, found.value

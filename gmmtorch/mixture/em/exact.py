@@ -23,7 +23,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import expectation as expectation
 from gmmtorch.kernels import exponent_floor as exponent_floor
 from gmmtorch.kernels import fused_maximization, fused_natural_parameters, is_m_step_fused, most_likely
-from gmmtorch.linalg import inverse_factor, safe_cholesky, triangle_indices, unpack_symmetric
+from gmmtorch.linalg import inverse_factor, pack_symmetric, safe_cholesky, unpack_symmetric
 
 SOFTMAX_DTYPES = {"float32": torch.float32, "float64": torch.float64}
 """Dtypes for the exponentials of the E-step, by name."""
@@ -85,10 +85,9 @@ def natural_of_precisions(precision: Tensor, means: Tensor, constant: Tensor) ->
     """W (K, F) such that φ(x)·W_k = c_k − ½ (x − μ_k)ᵀ Λ_k (x − μ_k), with Λ (K, D, D), c (K,)."""
     linear = (precision @ means[:, :, None]).squeeze(-1)
     constant = constant - 0.5 * (linear * means).sum(1)
-    rows, cols = triangle_indices(means.shape[1], means.device)
     # φ has each off-diagonal product once, for two matrix entries.
-    quadratic = torch.where(rows == cols, -0.5, -1.0) * precision[:, rows, cols]
-    return torch.cat([constant[:, None], linear, quadratic], 1)
+    twice = pack_symmetric(0.5 * torch.eye(means.shape[1], dtype=means.dtype, device=means.device) - 1)
+    return torch.cat([constant[:, None], linear, twice * pack_symmetric(precision)], 1)
 
 
 def unchecked_expectation(
@@ -141,7 +140,7 @@ def feature_dimension(n_features: int) -> int:
     return int(((8 * n_features + 1) ** 0.5 - 3) / 2 + 0.5)
 
 
-# -- the direct form: slower, without cancellation ------------------------------------------------
+# -- loss of digits, after which a step takes the direct form of `by_type` ------------------------
 
 
 def is_ill_conditioned(parameters: Parameters, natural: Tensor | None = None) -> bool:
@@ -168,18 +167,6 @@ def has_cancelled(statistics: Tensor, parameters: Parameters) -> bool:
     second = statistics[:, 1:].abs().amax(1) / statistics[:, 0].clamp_min(1e-300)
     kept = torch.finfo(variance.dtype).eps * second <= 1e-6 * variance
     return bool(((info != 0) | ~kept).logical_and_(alive).any())
-
-
-def log_joint(points: Tensor, parameters: Parameters) -> Tensor:
-    """log π_k + log N(x_n | μ_k, Σ_k), (N, K), from ‖L⁻¹(x − μ)‖², without cancellation at any distance."""
-    weights, means, covariances = parameters
-    factors = safe_cholesky(covariances)
-    whiten = inverse_factor(factors)
-    offset = points[:, None, :] - means
-    squared = torch.einsum("nkd,kde->nke", offset, whiten).square().sum(-1)
-    half_log_det = torch.log(factors.diagonal(dim1=-2, dim2=-1)).sum(-1)
-    constant = torch.log(weights).clamp_min(MIN_LOG_WEIGHT) - half_log_det - 0.5 * means.shape[1] * LOG_2PI
-    return constant - 0.5 * squared
 
 
 # -- covariance types -----------------------------------------------------------------------------

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-import numbers
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Generic, TypeVar
@@ -15,7 +14,7 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError, NumericalError, check_number
 from gmmtorch.kernels import fused_em, fused_exact_em, in_spatial_order, is_em_fused, takes_one_launch
 from gmmtorch.mixture.em import by_type, exact
-from gmmtorch.mixture.em.exact import Parameters, compact, constrain, expand
+from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.reduction import merge_pairs
 
 if TYPE_CHECKING:
@@ -131,21 +130,7 @@ def em_step(
     points = rows.values if rows.are_points else None
     if points is not None and points.shape[1] > 3:
         return _typed_step(points, rows.weight, reg_covar, softmax_dtype, covariance_type)
-    natural = natural_step(rows.features(), rows.weight, reg_covar, softmax_dtype, points, covariance_type)
-    return in_shape_of_type(natural, covariance_type)
-
-
-def in_shape_of_type(natural: Steps[Parameters], covariance_type: str) -> Steps[Parameters]:
-    """The steps `natural`, whose covariances are (K, D, D), for covariances in the shape of their type."""
-    if covariance_type == "full":
-        return natural
-
-    def run(parameters: Parameters, tol: float, n_most: int, last: float) -> tuple[Parameters, list[float]]:
-        covariances = expand(parameters.covariances, covariance_type, *parameters.means.shape)
-        found, bounds = natural.run(parameters._replace(covariances=covariances), tol, n_most, last)
-        return found._replace(covariances=compact(found.covariances, covariance_type)), bounds
-
-    return Steps(run)
+    return natural_step(rows.features(), rows.weight, reg_covar, softmax_dtype, points, covariance_type)
 
 
 def _typed_step(
@@ -187,7 +172,7 @@ def natural_step(
     points: Tensor | None = None,
     covariance_type: str = "full",
 ) -> Steps[Parameters]:
-    """EM steps on features (N, F), float64, of points or cells.
+    """EM steps on features (N, F), float64, of points or cells. Covariances have the shape of their type.
 
     If `points` (N, D), the points of the features, are given, a step whose natural parameters would lose
     digits to cancellation uses the direct form instead.
@@ -199,13 +184,15 @@ def natural_step(
         return exact.expectation(*rows, exact.natural_parameters(parameters), softmax_dtype)
 
     def maximized(parameters: Parameters, statistics: Tensor, value: Tensor) -> tuple[Parameters, Tensor]:
-        new = of_type(exact.maximization(statistics, reg_covar, parameters), covariance_type)
-        return new, value / total
+        new = exact.maximization(statistics, reg_covar, parameters)
+        return by_type.compacted(new, covariance_type), value / total
 
     def step(parameters: Parameters) -> tuple[Parameters, Tensor]:
+        parameters = by_type.expanded(parameters, covariance_type)
         return maximized(parameters, *exact.unchecked_expectation(*rows, parameters, softmax_dtype))
 
     def checked_step(parameters: Parameters) -> tuple[Parameters, float]:
+        parameters = by_type.expanded(parameters, covariance_type)
         new, bound = maximized(parameters, *gather(parameters))
         return new, float(bound)
 
@@ -213,7 +200,9 @@ def natural_step(
         checked: Step[Parameters] = checked_step
         ahead = _ahead(step, checked_step, 1 if features.device.type == "cpu" else _STEPS_AHEAD)
     else:
-        direct = functools.partial(by_type.direct_step, points, sample_weight, reg_covar=reg_covar)
+        direct = functools.partial(
+            by_type.direct_step, points, sample_weight, reg_covar=reg_covar, kind=covariance_type
+        )
         checked = guarded = guarded_step(gather, direct, reg_covar, float(total), covariance_type)
         ahead = guarded.run
 
@@ -268,37 +257,24 @@ def guarded_step(
 ) -> Steps[Parameters]:
     """EM steps with an E-step `gather`: parameters → S (K, F) and Σ_n p_n log p(x_n). `total` is Σ_n p_n.
 
-    If the natural parameters or S lose digits to cancellation, `direct` takes the step.
+    If the natural parameters or S lose digits to cancellation, `direct` takes the step. Parameters have
+    covariances in the shape of their type, except those that `gather` gets, (K, D, D).
     """
 
     def run(parameters: Parameters, *_: float) -> tuple[Parameters, list[float]]:
-        if not exact.is_ill_conditioned(parameters):
-            statistics, value = gather(parameters)
-            new = of_type(exact.maximization(statistics, reg_covar, parameters), covariance_type)
-            if not exact.has_cancelled(statistics, new):
+        whole = by_type.expanded(parameters, covariance_type)
+        if not exact.is_ill_conditioned(whole):
+            statistics, value = gather(whole)
+            new = by_type.compacted(exact.maximization(statistics, reg_covar, whole), covariance_type)
+            if not exact.has_cancelled(statistics, by_type.expanded(new, covariance_type)):
                 return new, [float(value) / total]
         new, value = direct(parameters)
-        return of_type(new, covariance_type), [float(value) / total]
+        return new, [float(value) / total]
 
     return Steps(run)
 
 
-def of_type(parameters: Parameters, covariance_type: str) -> Parameters:
-    """The parameters with the nearest covariances (K, D, D) of the type (see `exact.constrain`)."""
-    covariances = constrain(parameters.covariances, covariance_type, parameters.weights)
-    return parameters._replace(covariances=covariances)
-
-
 # -- stepwise EM ----------------------------------------------------------------------------------
-
-
-def step_size(batch: float, seen: float, kappa: float) -> float:
-    """η = (n / (m + n))^κ, for a batch of weight n after points of weight m.
-
-    For batches of equal size η is (t + 1)^−κ, t = 0, 1, …: Liang & Klein's (t + 2)^−κ after a first batch
-    with η = 1. With κ = 1 every point counts equally, in batches of any size.
-    """
-    return float((batch / (seen + batch)) ** kappa)
 
 
 def blend(previous: Parameters, update: Parameters, step: float, kind: str = "full") -> Parameters:
@@ -345,9 +321,3 @@ def weight_of_past(seen: float | None, memory: float | None) -> float:
         return seen
     check_number("memory", memory)
     return float(memory) if seen is None else min(seen, float(memory))
-
-
-def check_kappa(kappa: object) -> None:
-    """Raise `InvalidArgumentError` unless 0.5 < κ ≤ 1, for which the steps of `step_size` converge."""
-    if not isinstance(kappa, numbers.Real) or not 0.5 < float(kappa) <= 1:
-        raise InvalidArgumentError(f"kappa={kappa!r} must be above 0.5 and at most 1.")

@@ -29,8 +29,8 @@ from torch import Tensor
 from gmmtorch.arrays import as_tensor
 from gmmtorch.errors import InvalidArgumentError, NumericalError
 from gmmtorch.linalg import check_symmetric, inverse_factor, safe_cholesky, unpack_symmetric
+from gmmtorch.mixture.em import by_type, loop
 from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em import loop
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.initialization import initialize
 from gmmtorch.mixture.estimator import MixtureEstimator
@@ -365,7 +365,8 @@ def _log_bounds(noise: Tensor, parameters: Parameters) -> Callable[[Tensor], tup
     thin, wide = (parameters._replace(covariances=parameters.covariances + r * eye) for r in (low, high))
     slack = 0.5 * (torch.logdet(wide.covariances) - torch.logdet(thin.covariances))
     if em.is_ill_conditioned(thin):
-        return lambda x: (em.log_joint(x, thin) - slack, em.log_joint(x, wide) + slack)
+        below, above = (by_type.Factors(mixture, "full").direct() for mixture in (thin, wide))
+        return lambda x: (below(x).T - slack, above(x).T + slack)
     lower, upper = em.natural_parameters(thin).T, em.natural_parameters(wide).T
 
     def bounds(points: Tensor) -> tuple[Tensor, Tensor]:

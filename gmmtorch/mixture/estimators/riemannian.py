@@ -255,35 +255,20 @@ def check_thickness(parameters: Parameters, points: Tensor) -> None:
 # -- the ascent -----------------------------------------------------------------------------------
 
 
-class LBFGS:
-    """The inverse Hessian implied by the last `memory` steps and gradient changes."""
+Memory = deque[tuple[Tensor, Tensor, float]]
+"""The last steps, the falls of the gradient along them, and their products."""
 
-    def __init__(self, memory: int = _MEMORY) -> None:
-        self._pairs: deque[tuple[Tensor, Tensor, float]] = deque(maxlen=memory)
 
-    def direction(self, point: Iterate) -> Tensor:
-        """Inverse Hessian times gradient, by the two-loop recursion."""
-        vector = point.gradient
-        shares = []
-        for step, fall, product in reversed(self._pairs):
-            shares.append(_dot(step, vector) / product)
-            vector = vector - shares[-1] * fall
-        vector = point.inverse_hessian * vector
-        for (step, fall, product), share in zip(self._pairs, reversed(shares), strict=True):
-            vector = vector + (share - _dot(fall, vector) / product) * step
-        return vector
-
-    def update(self, before: Iterate, direction: Tensor, length: float, after: Iterate) -> None:
-        step, fall = length * direction, before.gradient - after.gradient
-        product = _dot(step, fall)
-        if product > 1e-12 * math.sqrt(_dot(step, step) * _dot(fall, fall)):
-            self._pairs.append((step, fall, product))
-
-    def reset(self) -> bool:
-        """Reset to the first guess. False if there was nothing to reset."""
-        had_memory = len(self._pairs) > 0
-        self._pairs.clear()
-        return had_memory
+def quasi_newton(point: Iterate, memory: Memory) -> Tensor:
+    """The inverse Hessian that the memory implies, times the gradient: the two-loop recursion of L-BFGS."""
+    vector, shares = point.gradient, []
+    for step, fall, product in reversed(memory):
+        shares.append(_dot(step, vector) / product)
+        vector = vector - shares[-1] * fall
+    vector = point.inverse_hessian * vector
+    for (step, fall, product), share in zip(memory, reversed(shares), strict=True):
+        vector = vector + (share - _dot(fall, vector) / product) * step
+    return vector
 
 
 def ascend(
@@ -294,9 +279,9 @@ def ascend(
     Converged: an iteration gained less than `tol`, and a step by the first guess of the Hessian would also
     gain less, to second order; or no higher point was found, to rounding. Values never decrease.
     """
-    solver, values = LBFGS(), list[float]()
+    memory, values = Memory(maxlen=_MEMORY), list[float]()
     for iteration in range(max_iter):
-        found = _climb(point, solver)
+        found = _climb(point, memory)
         gain = found.value - point.value
         point = found
         values.append(point.value)
@@ -308,19 +293,23 @@ def ascend(
     return point, values, False
 
 
-def _climb(point: Iterate, solver: LBFGS) -> Iterate:
+def _climb(point: Iterate, memory: Memory) -> Iterate:
     """A higher point, or the same point if there is none.
 
-    Resets the solver if its direction does not ascend.
+    Clears the memory if its direction does not ascend.
     """
     while True:
-        direction = point.bounded(solver.direction(point))
+        direction = point.bounded(quasi_newton(point, memory))
         length, found = search(point, direction)
         if length > 0:
-            solver.update(point, direction, length, found)
+            step, fall = length * direction, point.gradient - found.gradient
+            product = _dot(step, fall)
+            if product > 1e-12 * math.sqrt(_dot(step, step) * _dot(fall, fall)):
+                memory.append((step, fall, product))
             return found
-        if not solver.reset():
+        if not memory:
             return point
+        memory.clear()
 
 
 def search(point: Iterate, direction: Tensor) -> tuple[float, Iterate]:
