@@ -38,29 +38,12 @@ SAMPLE_POINTS = 100_000
 Accumulate = Callable[[Tensor], tuple[Tensor, Tensor]]
 """From centred points (n, D), float64, to S (K, F) and Σ_n log p(x_n)."""
 EStep = Callable[[Parameters], Accumulate]
-"""Prepares one iteration with these parameters. Its `repr` states its name and settings."""
+"""Prepares one iteration with these parameters, covariances (K, D, D). Its `repr` states its settings."""
 _FILE_KIND, _FILE_VERSION = "gmmtorch.checkpoint", 1
 RunFacts = Mapping[str, Any]
 """Description of a run, in JSON types: settings and cloud, including n_components and dimensions."""
 Write = Callable[[Parameters, list[float], bool], None]
 """Called with the parameters and the lower bounds after an iteration, and whether it is the last."""
-
-
-@dataclass(frozen=True)
-class ExactEStep:
-    """E-step over all components. `dtype`: of the exponentials, float32 or float64."""
-
-    dtype: str = "float32"
-
-    def __call__(self, parameters: Parameters) -> Accumulate:
-        natural = em.natural_parameters(parameters)
-        softmax_dtype = em.SOFTMAX_DTYPES[self.dtype]
-
-        def accumulate(points: Tensor) -> tuple[Tensor, Tensor]:
-            features = em.quadratic_features(points)
-            return em.expectation(features, points.new_ones(points.shape[0]), natural, softmax_dtype)
-
-        return accumulate
 
 
 def fit_stream(
@@ -91,7 +74,7 @@ def fit_stream(
             sample does not depend on chunks or processes. None: all points, which must fit into memory.
         survey: result of `survey_all` for the source, if it is known already.
         device: device of the computation.
-        e_step: default `ExactEStep` with the mixture's `dtype`.
+        e_step: in place of EM's own; it must keep enough digits.
         processes: the processes that share the fit; rank 0 computes the start.
         checkpoint: where rank 0 stores the state, and what the fit continues from.
         on_iteration: called with the iteration (from 1) and the mean log-likelihood.
@@ -113,8 +96,8 @@ def fit_stream(
         if survey.n_points == 0:
             raise DataError(f"{source.name} has no valid points, only {survey.n_dropped} invalid ones.")
         mixture.check_parameters(survey.n_points)
-        e_step = ExactEStep(mixture.dtype) if e_step is None else e_step
-        facts = run_facts(mixture, survey, repr(e_step))
+        name = f"ExactEStep(dtype={mixture.dtype!r})" if e_step is None else repr(e_step)
+        facts = run_facts(mixture, survey, name)
         first = first_state(mixture, survey, facts, generator, checkpoint, processes)
         done += first.lower_bounds
         write = None
@@ -209,7 +192,7 @@ def _stream_step(
     source: PointChunks,
     processes: Processes,
     center: Tensor,
-    e_step: EStep,
+    e_step: EStep | None,
     n_points: int,
 ) -> loop.Step[Parameters]:
     """EM steps on the points of all processes, relative to `center` (D,).
@@ -233,20 +216,17 @@ def _stream_step(
         parts = packed.split([part.numel() for part in sums])
         return [part.view(like.shape) for part, like in zip(parts, sums, strict=True)]
 
-    def gather(parameters: Parameters) -> tuple[Tensor, Tensor]:
+    def given_step(e_step: EStep, parameters: Parameters) -> tuple[Parameters, Tensor]:
+        parameters = by_type.expanded(parameters, kind)
         accumulate = e_step(parameters)
-        statistics, total = summed(accumulate(points) for points, _ in centered())
-        return statistics, total
+        statistics, value = summed(accumulate(points) for points, _ in centered())
+        return by_type.compacted(em.maximization(statistics, reg_covar, parameters), kind), value
 
-    is_typed = isinstance(e_step, ExactEStep) and source.dim > 3
-    dtype = em.SOFTMAX_DTYPES[e_step.dtype] if isinstance(e_step, ExactEStep) and is_typed else torch.float64
-    kind, reg_covar = mixture.covariance_type, float(mixture.reg_covar)
-
-    def typed_step(parameters: Parameters) -> tuple[Parameters, Tensor]:
+    def own_step(parameters: Parameters) -> tuple[Parameters, Tensor]:
         """A step with the arithmetic of the covariance type, direct if the linear form loses digits."""
         factors = by_type.Factors(parameters, kind)
 
-        def gather_typed(linear: bool, about: Tensor | None) -> tuple[by_type.Sums, Tensor]:
+        def gather(linear: bool, about: Tensor | None) -> tuple[by_type.Sums, Tensor]:
             about = None if linear else factors.means if about is None else about
 
             def terms() -> Iterator[tuple[Tensor, ...]]:
@@ -260,16 +240,15 @@ def _stream_step(
                 own += part
             return whole, value
 
-        found = by_type.exact_step(gather_typed, factors, reg_covar, parameters, is_typed)
+        found = by_type.exact_step(gather, factors, reg_covar, parameters, linear=True)
         return found.parameters, found.value
 
-    if not is_typed:
-        return loop.guarded_step(gather, typed_step, reg_covar, float(n_points), kind)
-
     def step(parameters: Parameters) -> tuple[Parameters, float]:
-        new, value = typed_step(parameters)
+        new, value = own_step(parameters) if e_step is None else given_step(e_step, parameters)
         return new, float(value) / n_points
 
+    dtype, kind = em.SOFTMAX_DTYPES[mixture.dtype], mixture.covariance_type
+    reg_covar = float(mixture.reg_covar)
     return step
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import torch
 from scipy.stats import multivariate_normal
@@ -10,6 +12,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from gmmtorch.mixture import GaussianMixture
+from gmmtorch.mixture.em import by_type
 from gmmtorch.mixture.em.exact import Parameters, quadratic_features
 from gmmtorch.mixture.em.truncated import Rows
 
@@ -72,6 +75,16 @@ def scipy_log_joint(points: Tensor, parameters: Parameters) -> np.ndarray:
         for w, m, c in zip(*parameters, strict=True)
     ]
     return np.stack(columns, 1)
+
+
+def direct_step(
+    points: Tensor, weight: Tensor, parameters: Parameters, reg_covar: float
+) -> tuple[Parameters, Tensor]:
+    """An EM step of full covariances in the direct form, and Σ_n p_n log p(x_n)."""
+    factors = by_type.Factors(parameters, "full")
+    gather = functools.partial(by_type.expected_moments, points, weight, factors, torch.float64)
+    found = by_type.exact_step(gather, factors, reg_covar, parameters)
+    return found.parameters, found.value
 
 
 def blobs(n: int = 400, dim: int = 2, seed: int = 0) -> np.ndarray:

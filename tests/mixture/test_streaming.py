@@ -18,13 +18,13 @@ from torch import Tensor
 
 from gmmtorch.datasets.point_files.point_chunks import PointChunks, in_memory, open_points
 from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.distributed import SINGLE_PROCESS, LostProcessError, Processes, is_launched, joined
 from gmmtorch.mixture.em.exact import COVARIANCE_TYPES, Parameters, expand, type_shape
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 from gmmtorch.mixture.streaming import (
     Accumulate,
     Checkpoint,
-    ExactEStep,
     State,
     fit_stream,
     read_state,
@@ -139,20 +139,19 @@ def test_score_stream_is_the_mean_over_the_points():
 def test_e_step_gets_at_most_one_chunk_and_can_be_replaced():
     sizes: list[int] = []
 
-    class Watched(ExactEStep):
-        def __call__(self, parameters: Parameters) -> Accumulate:
-            accumulate = super().__call__(parameters)
+    def e_step(parameters: Parameters) -> Accumulate:
+        natural = em.natural_parameters(parameters)
 
-            def watched(points: Tensor) -> tuple[Tensor, Tensor]:
-                sizes.append(points.shape[0])
-                return accumulate(points)
+        def accumulate(points: Tensor) -> tuple[Tensor, Tensor]:
+            sizes.append(points.shape[0])
+            features = em.quadratic_features(points)
+            return em.expectation(features, points.new_ones(len(points)), natural, torch.float64)
 
-            return watched
+        return accumulate
 
     points = blobs(250, 3)
-    found = fit_stream(
-        exact(4), in_memory(points, chunk_points=40), sample_points=30, e_step=Watched("float64")
-    )
+    source = in_memory(points, chunk_points=40)
+    found = fit_stream(exact(4), source, sample_points=30, e_step=e_step)
     assert max(sizes) == 40
     assert sum(sizes) == 250 * 10
     assert_same(found, fit_stream(exact(4), in_memory(points), sample_points=30), 1e-10)

@@ -10,12 +10,20 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from mixture.fit_contract import check_mixture
-from mixture.mixture_cases import beads, cloud, random_parameters, random_weight, rows_of, thin_wall
+from mixture.mixture_cases import (
+    beads,
+    cloud,
+    direct_step,
+    random_parameters,
+    random_weight,
+    rows_of,
+    thin_wall,
+)
 from torch import Tensor
 
 from gmmtorch.mixture import GaussianMixture
-from gmmtorch.mixture.em import by_type, loop, truncated
 from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em import loop, truncated
 from gmmtorch.mixture.em.by_type import log_joint
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.initialization import flat_pieces, moments_of
@@ -197,7 +205,7 @@ def test_large_thin_cloud_uses_float64_and_equals_em(size, dtype, monkeypatch):
     spy = Spy(monkeypatch)
     found, *_ = run_truncated(rows, owner, parameters, setup)
     assert spy.dtypes == [dtype]
-    expected, total = by_type.direct_step(points, rows.weight, parameters, 1e-6)
+    expected, total = direct_step(points, rows.weight, parameters, 1e-6)
     tolerance = 1e-8 if dtype == torch.float64 else 1e-3
     assert found.lower_bounds[0] == pytest.approx(float(total) / 4000, abs=tolerance)
     least, truth = (torch.linalg.eigvalsh(p.covariances)[:, 0] for p in (found.parameters, expected))

@@ -4,7 +4,8 @@ Covariances have the shape of their type: full (K, D, D), tied (D, D), diag (K, 
 
  - spherical, diag: log π_k + log N(x|k) is linear in [1, x, |x|²] or [1, x, x²]: products of O(NKD).
  - tied: the same as spherical after one whitening, x ↦ L⁻¹ x.
- - full, few dimensions: linear in [1, x, x_i x_j (i ≤ j)], see `exact`; its products are the smallest.
+ - full, few dimensions: linear in [1, x, x_i x_j (i ≤ j)], see `exact`; its products are the smallest. Up to
+   three dimensions all types use them.
  - full, more dimensions: ‖L⁻¹x − L⁻¹μ‖², a block of components at a time. Second moments are taken about
    the component's last mean, on a CPU only of the points that it has a share in.
 
@@ -17,7 +18,6 @@ again in the direct form, ‖L⁻¹x − L⁻¹μ‖² for every type.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import NumericalError
-from gmmtorch.kernels import chunk_elements, chunked, softmax
+from gmmtorch.kernels import chunk_elements, chunked, in_spatial_order, softmax
 from gmmtorch.linalg import inverse_factor, safe_cholesky, unpack_symmetric
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.exact import Parameters
@@ -33,6 +33,7 @@ from gmmtorch.mixture.em.exact import Parameters
 _MOST_LOST = 1e-6  # nats a dimension that the log-density of the linear form may lose
 _MOST_LOST_VARIANCE = 1e-5  # share of a variance that the moments of the linear form may lose
 _ROWS = (512, 1 << 16)  # points of a product of the direct form, on a CPU and elsewhere
+FEW_DIMENSIONS = 3  # up to which all types take the E-step of `exact`, whose kernels are the fastest
 _NO_SHARE = 1e-16  # of the largest responsibility of a component in a chunk: such points do not count
 
 Joint = Callable[..., Tensor]
@@ -107,12 +108,19 @@ class Factors:
         size = self.whitened_means().square().sum(1) * self.weights.sign()
         return size.amax() * torch.finfo(size.dtype).eps > _MOST_LOST * self.dim
 
+    def natural(self) -> Tensor:
+        """The natural parameters (K, F) of `exact`, whatever the type."""
+        matrices = self.kind in ("full", "tied")
+        precision = self.whiten.mT @ self.whiten if matrices else self.whiten.square()
+        precision = em.expand(precision, self.kind, *self.means.shape)
+        return em.natural_of_precisions(precision, self.means, self.constant)
+
     def linear(self) -> Joint:
         """The linear form."""
         kind, means, dim = self.kind, self.means, self.dim
         if kind == "full":
-            weights = em.natural_of_precisions(self.whiten.mT @ self.whiten, means, self.constant)
-            constant, slope, curve = weights[:, 0], weights[:, 1 : 1 + dim], weights[:, 1 + dim :]
+            natural = self.natural()
+            constant, slope, curve = natural[:, 0], natural[:, 1 : 1 + dim], natural[:, 1 + dim :]
         elif kind == "tied":
             slope = self.whitened_means()
             constant = self.constant - 0.5 * slope.square().sum(1)
@@ -239,6 +247,19 @@ class Sums:
         else:
             self._second = like.new_zeros((k, dim, dim) if kind == "full" else (dim, dim))
 
+    @classmethod
+    def of(cls, statistics: Tensor, like: Tensor, kind: str) -> Sums:
+        """The sums of S (K, F) of `exact`."""
+        dim, second = like.shape[1], statistics[:, 1 + like.shape[1] :]
+        found = cls(len(statistics), like, kind)
+        found._count, found._first = statistics[:, 0], statistics[:, 1 : 1 + dim]
+        if kind != "full":
+            matrices = unpack_symmetric(second, dim)
+            second = matrices.sum(0) if kind == "tied" else matrices.diagonal(dim1=-2, dim2=-1)
+            second = second.sum(1, keepdim=True) if kind == "spherical" else second
+        found._second = second.clone()
+        return found
+
     def add(self, points: Tensor, gamma: Tensor, square: Tensor | None = None) -> None:
         """Add points (n, D) with responsibilities (K, n). `square`: their `squares`, if they are known."""
         self._count += gamma.sum(1)
@@ -332,11 +353,18 @@ def expected_moments(
     softmax_dtype: torch.dtype,
     linear: bool,
     about: Tensor | None = None,
+    rows: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Sums, Tensor]:
     """E-step (2.3): moments of the responsibilities, and Σ_n p_n log p(x_n), ().
 
-    Direct unless `linear`, with second moments about the last means, or `about` (K, D).
+    Direct unless `linear`, with second moments about the last means, or `about` (K, D). `rows`: see
+    `rows_of_few_dimensions`.
     """
+    if points.shape[1] <= FEW_DIMENSIONS and linear:
+        rows = (em.quadratic_features(points), sample_weight) if rows is None else rows
+        statistics, value = em.expectation(*rows, factors.natural(), softmax_dtype)
+        return Sums.of(statistics, points, factors.kind), value
+    softmax_dtype = torch.float64 if points.shape[1] <= FEW_DIMENSIONS else softmax_dtype
     (n, dim), k, kind = points.shape, factors.means.shape[0], factors.kind
     joint = factors.linear() if linear else factors.direct()
 
@@ -351,6 +379,13 @@ def expected_moments(
         sums.add(some, gamma, square)
         total += value
     return sums, total
+
+
+def rows_of_few_dimensions(points: Tensor, sample_weight: Tensor) -> tuple[Tensor, Tensor] | None:
+    """Features and weights of points, once for all E-steps, in the order in which these are fastest."""
+    if points.shape[1] > FEW_DIMENSIONS:
+        return None
+    return in_spatial_order(em.quadratic_features(points), sample_weight)
 
 
 def moments_of_labels(
@@ -433,13 +468,3 @@ def exact_step(
             return found
     found = em_step(*given, linear=False)
     return em_step(*given, False, found.parameters.means) if bool(found.lost) else found
-
-
-def direct_step(
-    points: Tensor, sample_weight: Tensor, parameters: Parameters, reg_covar: float, kind: str = "full"
-) -> tuple[Parameters, Tensor]:
-    """`exact_step` in float64: new parameters and Σ_n p_n log p(x_n)."""
-    factors = Factors(parameters, kind)
-    gather = functools.partial(expected_moments, points, sample_weight, factors, torch.float64)
-    found = exact_step(gather, factors, reg_covar, parameters)
-    return found.parameters, found.value

@@ -140,35 +140,6 @@ def feature_dimension(n_features: int) -> int:
     return int(((8 * n_features + 1) ** 0.5 - 3) / 2 + 0.5)
 
 
-# -- loss of digits, after which a step takes the direct form of `by_type` ------------------------
-
-
-def is_ill_conditioned(parameters: Parameters, natural: Tensor | None = None) -> bool:
-    """Whether the natural parameters, given if known, lose more than about 1e-6 nats to cancellation.
-
-    φ·W sums terms as large as μᵀΣ⁻¹μ to a few nats. For a component 1 mm thick this fails 10 km from the
-    centre of the cloud.
-    """
-    weights, means, _ = parameters
-    natural = natural_parameters(parameters) if natural is None else natural
-    size = (natural[:, 1 : 1 + means.shape[1]] * means).sum(1)
-    return bool((size * weights.sign()).max() * torch.finfo(size.dtype).eps > 1e-6)
-
-
-def has_cancelled(statistics: Tensor, parameters: Parameters) -> bool:
-    """Whether Σγxxᵀ/N − μμᵀ lost digits that the smallest variance, or the next step, needs.
-
-    The variance is that of the inverse trace, 1 to 1/D of the smallest. Covariances that are not positive
-    definite have lost digits.
-    """
-    alive = parameters.weights > 0
-    factors, info = torch.linalg.cholesky_ex(parameters.covariances)
-    variance = 1 / inverse_factor(factors).square().sum((1, 2))
-    second = statistics[:, 1:].abs().amax(1) / statistics[:, 0].clamp_min(1e-300)
-    kept = torch.finfo(variance.dtype).eps * second <= 1e-6 * variance
-    return bool(((info != 0) | ~kept).logical_and_(alive).any())
-
-
 # -- covariance types -----------------------------------------------------------------------------
 
 

@@ -126,21 +126,19 @@ def has_converged(bounds: Sequence[float], tol: float, previous_bound: float = -
 def em_step(
     rows: Rows, reg_covar: float, softmax_dtype: torch.dtype, covariance_type: str = "full"
 ) -> Steps[Parameters]:
-    """EM steps on points, centred, or cells. Covariances have the shape of their type."""
-    points = rows.values if rows.are_points else None
-    if points is not None and points.shape[1] > 3:
-        return _typed_step(points, rows.weight, reg_covar, softmax_dtype, covariance_type)
-    return natural_step(rows.features(), rows.weight, reg_covar, softmax_dtype, points, covariance_type)
+    """EM steps on points, centred, or cells. Covariances have the shape of their type.
 
-
-def _typed_step(
-    points: Tensor, sample_weight: Tensor, reg_covar: float, softmax_dtype: torch.dtype, kind: str
-) -> Steps[Parameters]:
-    """EM steps with the arithmetic of the covariance type; direct ones from the first that loses digits."""
-    total, direct = sample_weight.sum(), [False]
+    A step on points whose linear form loses digits takes the direct one; in many dimensions, so do all later
+    steps.
+    """
+    points, weight, kind = rows.values, rows.weight, covariance_type
+    if not rows.are_points:
+        return natural_step(points, weight, reg_covar, softmax_dtype, kind)
+    total, direct = weight.sum(), [False]
+    few = by_type.rows_of_few_dimensions(points, weight)
 
     def gather(factors: by_type.Factors) -> by_type.Gather:
-        return functools.partial(by_type.expected_moments, points, sample_weight, factors, softmax_dtype)
+        return functools.partial(by_type.expected_moments, points, weight, factors, softmax_dtype, rows=few)
 
     def step(parameters: Parameters) -> tuple[Parameters, Tensor]:
         k, dim = parameters.means.shape
@@ -150,7 +148,7 @@ def _typed_step(
         return found.parameters, (found.value / total).masked_fill(found.lost, math.nan)
 
     def checked(parameters: Parameters) -> tuple[Parameters, float]:
-        direct[0] = True
+        direct[0] = few is None
         factors = by_type.Factors(parameters, kind)
         found = by_type.exact_step(gather(factors), factors, reg_covar, parameters)
         bound = float(found.value / total)
@@ -161,7 +159,8 @@ def _typed_step(
             )
         return found.parameters, bound
 
-    return Steps(_ahead(step, checked, 1 if points.device.type == "cpu" else _STEPS_AHEAD))
+    steps = _ahead(step, checked, 1 if points.device.type == "cpu" else _STEPS_AHEAD)
+    return steps if few is None else _in_one_launch(few, kind, reg_covar, steps, checked, guarded=True)
 
 
 def natural_step(
@@ -169,19 +168,11 @@ def natural_step(
     sample_weight: Tensor,
     reg_covar: float,
     softmax_dtype: torch.dtype = torch.float32,
-    points: Tensor | None = None,
     covariance_type: str = "full",
 ) -> Steps[Parameters]:
-    """EM steps on features (N, F), float64, of points or cells. Covariances have the shape of their type.
-
-    If `points` (N, D), the points of the features, are given, a step whose natural parameters would lose
-    digits to cancellation uses the direct form instead.
-    """
+    """EM steps on features (N, F), float64, of cells. Covariances have the shape of their type."""
     rows = in_spatial_order(features, sample_weight)
     total = sample_weight.sum()
-
-    def gather(parameters: Parameters) -> tuple[Tensor, Tensor]:
-        return exact.expectation(*rows, exact.natural_parameters(parameters), softmax_dtype)
 
     def maximized(parameters: Parameters, statistics: Tensor, value: Tensor) -> tuple[Parameters, Tensor]:
         new = exact.maximization(statistics, reg_covar, parameters)
@@ -191,27 +182,35 @@ def natural_step(
         parameters = by_type.expanded(parameters, covariance_type)
         return maximized(parameters, *exact.unchecked_expectation(*rows, parameters, softmax_dtype))
 
-    def checked_step(parameters: Parameters) -> tuple[Parameters, float]:
+    def checked(parameters: Parameters) -> tuple[Parameters, float]:
         parameters = by_type.expanded(parameters, covariance_type)
-        new, bound = maximized(parameters, *gather(parameters))
+        natural = exact.natural_parameters(parameters)
+        new, bound = maximized(parameters, *exact.expectation(*rows, natural, softmax_dtype))
         return new, float(bound)
 
-    if points is None:
-        checked: Step[Parameters] = checked_step
-        ahead = _ahead(step, checked_step, 1 if features.device.type == "cpu" else _STEPS_AHEAD)
-    else:
-        direct = functools.partial(
-            by_type.direct_step, points, sample_weight, reg_covar=reg_covar, kind=covariance_type
-        )
-        checked = guarded = guarded_step(gather, direct, reg_covar, float(total), covariance_type)
-        ahead = guarded.run
+    steps = _ahead(step, checked, 1 if features.device.type == "cpu" else _STEPS_AHEAD)
+    return _in_one_launch(rows, covariance_type, reg_covar, steps, checked, guarded=False)
+
+
+def _in_one_launch(
+    rows: tuple[Tensor, Tensor],
+    covariance_type: str,
+    reg_covar: float,
+    steps: Steps[Parameters],
+    checked: Step[Parameters],
+    guarded: bool,
+) -> Steps[Parameters]:
+    """The steps, many in one launch of a fused kernel where that is faster.
+
+    With `guarded`, a step that loses digits is `checked`, and otherwise one that is impossible.
+    """
 
     def run(parameters: Parameters, tol: float, n_most: int, last: float) -> tuple[Parameters, list[float]]:
-        fits = covariance_type == "full" and takes_one_launch(len(features), len(parameters.weights))
+        fits = covariance_type == "full" and takes_one_launch(len(rows[0]), len(parameters.weights))
         if not fits or not is_em_fused(*rows, *parameters):
-            return ahead(parameters, tol, n_most, last)
+            return steps.run(parameters, tol, n_most, last)
         mixture, bounds, failed = fused_exact_em(
-            *rows, parameters, reg_covar, tol, n_most, last, guarded=points is not None
+            *rows, parameters, reg_covar, tol, n_most, last, guarded=guarded
         )
         if not failed:
             return Parameters(*mixture), bounds
@@ -223,7 +222,7 @@ def natural_step(
 
 def _ahead(
     step: Callable[[Parameters], tuple[Parameters, Tensor]], checked: Step[Parameters], n_ahead: int
-) -> Run[Parameters]:
+) -> Steps[Parameters]:
     """Up to `n_ahead` steps before their bounds are read: Python then waits once for all of them.
 
     A step whose bound is NaN is taken again by `checked`. Steps beyond the last one asked for are lost.
@@ -244,32 +243,6 @@ def _ahead(
                 return states[number + 1], bounds[: number + 1]
             last = bound
         return states[-1], bounds
-
-    return run
-
-
-def guarded_step(
-    gather: Callable[[Parameters], tuple[Tensor, Tensor]],
-    direct: Callable[[Parameters], tuple[Parameters, Tensor]],
-    reg_covar: float,
-    total: float,
-    covariance_type: str = "full",
-) -> Steps[Parameters]:
-    """EM steps with an E-step `gather`: parameters → S (K, F) and Σ_n p_n log p(x_n). `total` is Σ_n p_n.
-
-    If the natural parameters or S lose digits to cancellation, `direct` takes the step. Parameters have
-    covariances in the shape of their type, except those that `gather` gets, (K, D, D).
-    """
-
-    def run(parameters: Parameters, *_: float) -> tuple[Parameters, list[float]]:
-        whole = by_type.expanded(parameters, covariance_type)
-        if not exact.is_ill_conditioned(whole):
-            statistics, value = gather(whole)
-            new = by_type.compacted(exact.maximization(statistics, reg_covar, whole), covariance_type)
-            if not exact.has_cancelled(statistics, by_type.expanded(new, covariance_type)):
-                return new, [float(value) / total]
-        new, value = direct(parameters)
-        return new, [float(value) / total]
 
     return Steps(run)
 

@@ -166,25 +166,20 @@ class Likelihood:
 
     def _moments(self, parameters: Parameters) -> tuple[Tensor, Tensor, Tensor, float]:
         """Moments divided by Σp: N (K,), Σγ(x−μ) (K, D), Σγ(x−μ)(x−μ)ᵀ (K, D, D); and f."""
-        means, total = parameters.means, self.weight.sum()
-        dim = means.shape[1]
-        if em.is_ill_conditioned(parameters):
-            factors = by_type.Factors(parameters, "full")
-            given = self.points, self.weight, factors, torch.float64, False
-            found, value = by_type.expected_moments(*given)
-            count, first, second = found.tensors()
-            first = first - count[:, None] * means
-        else:
-            natural = em.natural_parameters(parameters)
-            sums, value = em.expectation(self._features, self.weight, natural, self.softmax_dtype)
-            count, first = sums[:, 0], sums[:, 1 : 1 + dim] - sums[:, :1] * means
-            mixed = (first + 0.5 * count[:, None] * means)[:, :, None] * means[:, None, :]
-            second = unpack_symmetric(sums[:, 1 + dim :], dim) - mixed - mixed.mT
-        return count / total, first / total, second / total, float(value / total)
+        factors = by_type.Factors(parameters, "full")
+        k, dim = parameters.means.shape
+        linear = by_type.has_linear_form(k, dim, "full") and not bool(factors.lost_digits())
+        given = self.points, self.weight, factors, self.softmax_dtype, linear
+        sums, value = by_type.expected_moments(*given, rows=self._rows)
+        (count, means, covariances), _ = sums.moments()
+        offset, total = means - parameters.means, self.weight.sum()
+        count = count / total
+        second = count[:, None, None] * (covariances + offset[:, :, None] * offset[:, None, :])
+        return count, count[:, None] * offset, second, float(value / total)
 
     @functools.cached_property
-    def _features(self) -> Tensor:
-        return em.quadratic_features(self.points)
+    def _rows(self) -> tuple[Tensor, Tensor] | None:
+        return by_type.rows_of_few_dimensions(self.points, self.weight)
 
 
 @dataclass(frozen=True)
