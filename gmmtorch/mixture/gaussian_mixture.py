@@ -12,7 +12,7 @@ from sklearn.utils._param_validation import Interval, StrOptions
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_number
-from gmmtorch.kernels import is_small
+from gmmtorch.kernels import fused_em, is_small
 from gmmtorch.mixture.em import by_type, loop
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.distributed import SINGLE_PROCESS, Processes
@@ -222,8 +222,15 @@ class GaussianMixture(MixtureEstimator):
             return []
         n_starts = 1 if self._continues() else self.n_init
         starts = [self._start(rows, center, generator)[0] for _ in range(n_starts)]
-        limits = self.tol, self.max_iter, self._previous_bound()
-        return loop.run_small(rows.values, rows.weight, starts, kind, float(self.reg_covar), *limits)
+        stacked, last = Parameters(*map(torch.stack, zip(*starts, strict=True))), self._previous_bound()
+        settings = kind, float(self.reg_covar), self.tol, self.max_iter, last
+        found = fused_em(rows.values, rows.weight, stacked, *settings)
+        # A run whose next iteration needs more than the kernel can do ends before it.
+        ends = zip(found.weights, found.means, found.covariances, found.bounds, strict=True)
+        return [
+            EMResult(Parameters(*end), bounds, loop.has_converged(bounds, self.tol, last))
+            for *end, bounds in ends
+        ]
 
     def _run(
         self,

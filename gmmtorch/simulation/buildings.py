@@ -54,7 +54,7 @@ from gmmtorch.simulation.furniture import (
     table,
     uniform,
 )
-from gmmtorch.simulation.mesh_world import MeshWorld
+from gmmtorch.simulation.mesh_world import MeshWorld, checked_rays
 from gmmtorch.simulation.sensors import smooth_path
 
 _THICKNESS = 0.2
@@ -136,16 +136,8 @@ def ray_segments(origins: ArrayLike, directions: ArrayLike, segments: ArrayLike)
         directions: (N, 2).
         segments: (S, 2, 2), the two end points of each segment.
     """
-    origins = as_tensor(origins, "origins", torch.float64)
-    directions = as_tensor(directions, "directions", torch.float64)
+    origins, directions = checked_rays(origins, directions, 2)
     segments = as_tensor(segments, "segments", torch.float64)
-    if directions.ndim != 2 or directions.shape[1] != 2:
-        raise InvalidArgumentError(f"directions has shape {tuple(directions.shape)}; expected (N, 2).")
-    if origins.shape not in ((2,), directions.shape):
-        raise InvalidArgumentError(
-            f"origins has shape {tuple(origins.shape)}; expected (2,) or {tuple(directions.shape)}, "
-            "one for each direction."
-        )
     if segments.ndim != 3 or segments.shape[1:] != (2, 2):
         raise InvalidArgumentError(f"segments have shape {tuple(segments.shape)}; expected (S, 2, 2).")
     origins = origins.expand(directions.shape)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,7 +13,8 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from gmmtorch.mixture import GaussianMixture
+from gmmtorch.files import pack_tensors, read_tensors
+from gmmtorch.mixture import GaussianMixture, MixtureEstimator
 from gmmtorch.mixture.em import by_type
 from gmmtorch.mixture.em.exact import Parameters, quadratic_features
 from gmmtorch.mixture.em.truncated import Rows
@@ -109,6 +112,22 @@ def given_start(dim: int, k: int = 3, seed: int = 1) -> dict[str, np.ndarray]:
 
 def fitted(dim: int = 2, **options) -> GaussianMixture:
     return GaussianMixture(3, random_state=0, **options).fit(blobs(dim=dim))
+
+
+MISSING = object()
+
+
+def changed_file(mixture: MixtureEstimator, folder: Path, changes: dict[str, Any], **facts: Any) -> Path:
+    """The file of a mixture with other tensors and facts; `MISSING` ones are left out."""
+    path = folder / "m.safetensors"
+    mixture.save(path)
+    tensors, known = read_tensors(path, "gmmtorch.mixture", 1)
+    tensors, known = (
+        {name: value for name, value in {**old, **new}.items() if value is not MISSING}
+        for old, new in ((tensors, changes), (known, facts))
+    )
+    path.write_bytes(pack_tensors(tensors, "gmmtorch.mixture", 1, **known))
+    return path
 
 
 def random_spd(rng: np.random.Generator, n: int, dim: int, scale: float = 1.0) -> np.ndarray:

@@ -55,19 +55,29 @@ def typed(kind: str, dim: int, k: int = 4) -> Parameters:
 
 
 @types
-@pytest.mark.parametrize("dim", [4, 30, 130])
-def test_a_fit_in_many_dimensions_is_that_of_scikit_learn(kind, dim):
+@pytest.mark.parametrize("dim", [1, 3, 4, 30, 130])
+@pytest.mark.parametrize("limits", [{"max_iter": 4, "tol": 0}, {"tol": 1e-6, "reg_covar": 0.1}])
+def test_a_fit_and_its_queries_are_those_of_scikit_learn(kind, dim, limits):
     x, test = cloud(500, dim), cloud(60, dim, seed=0)
-    options = {"max_iter": 4, "tol": 0, **start(kind, x)}
+    options = {**limits, **start(kind, x)}
     found = GaussianMixture(dtype="float64", **options).fit(x)
     expected = sklearn.mixture.GaussianMixture(**options).fit(x)
-    for name in ("weights_", "means_", "covariances_", "precisions_", "precisions_cholesky_"):
+    assert (found.n_iter_, found.converged_) == (expected.n_iter_, expected.converged_)
+    for name in (
+        "weights_",
+        "means_",
+        "covariances_",
+        "precisions_",
+        "precisions_cholesky_",
+        "lower_bounds_",
+    ):
         value = getattr(expected, name)
         np.testing.assert_allclose(getattr(found, name), value, rtol=1e-6, atol=1e-6 * np.abs(value).max())
     np.testing.assert_allclose(found.score_samples(test), expected.score_samples(test), rtol=1e-7)
     np.testing.assert_allclose(found.predict_proba(test), expected.predict_proba(test), atol=1e-7)
     assert (found.predict(test) == expected.predict(test)).all()
-    assert found.bic(test) == pytest.approx(expected.bic(test), rel=1e-7)
+    for name in ("score", "bic", "aic"):
+        assert getattr(found, name)(test) == pytest.approx(getattr(expected, name)(test), rel=1e-7)
     single = GaussianMixture(**options).fit(x.astype(np.float32))
     assert single.score_samples(test.astype(np.float32)).dtype == np.float32
     assert single.score(test) == pytest.approx(expected.score(test), rel=1e-4)
@@ -110,16 +120,17 @@ def test_both_forms_give_the_moments_in_chunks_of_any_size(kind, dim, monkeypatc
 
 
 @types
-def test_thin_components_far_apart_keep_their_digits(kind):
+@pytest.mark.parametrize("dim", [2, 5])
+def test_thin_components_far_apart_keep_their_digits(kind, dim):
     rng = np.random.default_rng(0)
-    parts = 1e-3 * rng.normal(size=(2, 300, 5))
+    parts = 1e-3 * rng.normal(size=(2, 300, dim))
     x = np.concatenate(parts + np.array([[[-1e5]], [[1e5]]]))
     first = by_type.Factors(
         Parameters(
             torch.full((2,), 0.5, dtype=torch.float64),
             torch.from_numpy(x[[0, 300]]),
-            torch.full(type_shape(kind, 2, 5), 1e-6, dtype=torch.float64)
-            * (torch.eye(5, dtype=torch.float64) if kind in ("full", "tied") else 1.0),
+            torch.full(type_shape(kind, 2, dim), 1e-6, dtype=torch.float64)
+            * (torch.eye(dim, dtype=torch.float64) if kind in ("full", "tied") else 1.0),
         ),
         kind,
     )

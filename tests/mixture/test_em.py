@@ -153,17 +153,6 @@ def test_bound_on_cells_never_decreases_and_is_below_the_log_likelihood(seed, di
 # -- the direct form, and when it is used -----------------------------------------------------------
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-def test_direct_and_natural_steps_agree(dim):
-    points = cloud(200, dim)
-    weight = random_weight(200, 1)
-    start = random_parameters(4, dim)
-    natural, bound = loop.natural_step(quadratic_features(points), weight, 1e-4, torch.float64)(start)
-    direct, total = direct_step(points, weight, start, 1e-4)
-    torch.testing.assert_close(natural, direct, rtol=1e-10, atol=1e-12)
-    assert bound == pytest.approx(float(total / weight.sum()), rel=1e-12)
-
-
 def loses_digits(weights: list[float], means: list[list[float]], variances: list[float]) -> bool:
     given = (torch.tensor(values).double() for values in (weights, means))
     covariances = torch.diag(torch.tensor(variances).double()).repeat(len(means), 1, 1)

@@ -49,7 +49,7 @@ class TestSlicedWassersteinGaussianMixture(MixtureContract):
 
     def make(self, n_components: int = 3, **options: Any) -> SlicedWassersteinGaussianMixture:
         # A short descent that stays near a good start; other tests run whole descents.
-        short = {"n_projections": 16, "max_iter": 4, "learning_rate": 0.02}
+        short = {"n_projections": 8, "max_iter": 4, "learning_rate": 0.02}
         return SlicedWassersteinGaussianMixture(n_components, **{"random_state": 0, **short, **options})
 
 
@@ -274,9 +274,8 @@ def rings(n: int = 600) -> np.ndarray:
 
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
-@pytest.mark.parametrize("init_params", ["kmeans", "random_points"])
-def test_result_is_closer_than_the_start_and_on_average_than_em(init_params):
-    points = rings()
+def test_result_is_closer_than_the_start_and_on_average_than_em():
+    points, init_params = rings(), "random_points"
     center = torch.from_numpy(points.mean(0))
     reached, of_em = [], []
     for seed in range(3):

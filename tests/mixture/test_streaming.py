@@ -96,14 +96,6 @@ def test_direct_form_is_used_where_natural_parameters_cancel():
     torch.testing.assert_close(found.covariances[0], expected, rtol=1e-4, atol=1e-10)
 
 
-def test_invalid_rows_of_a_file_are_dropped(tmp_path):
-    points = blobs(300, 3).float()
-    points[::10] = math.nan
-    np.save(tmp_path / "cloud.npy", points.numpy())
-    found = fit_stream(exact(4), open_points(tmp_path / "cloud.npy", chunk_points=77))
-    assert_same(found, exact(4).fit(points[torch.isfinite(points).all(1)].double()), 1e-10)
-
-
 def test_sample_for_the_start_does_not_depend_on_chunks():
     points = blobs(3000, 3)
     one, other = (

@@ -133,7 +133,7 @@ def test_momentum_converges_faster_than_em(n_iter, share):
         torch.full((2, 1, 1), 2.0, dtype=torch.float64),
     )
     rows, owner = rows_of(points), torch.zeros(3000, dtype=torch.int64)
-    step = loop.natural_step(rows.features(), rows.weight, 0.0, torch.float64)
+    step = loop.natural_step(em.quadratic_features(points), rows.weight, 0.0, torch.float64)
     plain = loop.run_em(step, parameters, tol=0.0, max_iter=n_iter)
     found, *_ = run_truncated(rows, owner, parameters, Settings(0.0, 0.0, n_iter, torch.float64))
     assert found.n_iter == n_iter

@@ -12,12 +12,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mixture.fit_contract import blobs, check_mixture, move, rigid_motion
+from mixture.mixture_cases import MISSING, changed_file
 from scipy import special, stats
 from sklearn.mixture import BayesianGaussianMixture
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, NumericalError
-from gmmtorch.files import pack_tensors, read_tensors
 from gmmtorch.kernels import kernels
 from gmmtorch.mixture import GaussianMixture, VariationalGaussianMixture
 from gmmtorch.mixture.density import NotFittedError
@@ -309,22 +309,11 @@ def test_gaussian_mixture_reads_the_file_without_the_posterior(tmp_path):
         ("degrees_of_freedom", torch.ones(3, dtype=torch.float64)),
         ("prior_mean", torch.ones(3, dtype=torch.float64)),
         ("prior_covariance", torch.ones(2, 2, dtype=torch.int64)),
-        ("prior_concentration", None),
+        ("prior_concentration", MISSING),
     ],
 )
 def test_file_with_an_invalid_posterior_is_rejected(tmp_path, name, value):
-    path = tmp_path / "m.safetensors"
-    variational(3).fit(blobs(2)).save(path)
-    tensors, facts = read_tensors(path, "gmmtorch.mixture", 1)
-    sound = pack_tensors(tensors, "gmmtorch.mixture", 1, **facts)
-    path.write_bytes(sound)
-    VariationalGaussianMixture.load(path)
-    tensors.pop(f"extra.{name}")
-    path.write_bytes(
-        pack_tensors(
-            {**tensors, **({} if value is None else {f"extra.{name}": value})}, "gmmtorch.mixture", 1, **facts
-        )
-    )
+    path = changed_file(variational(3).fit(blobs(2)), tmp_path, {f"extra.{name}": value})
     with pytest.raises(DataError, match=rf"m\.safetensors.*{name}"):
         VariationalGaussianMixture.load(path)
 

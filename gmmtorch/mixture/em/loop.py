@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError, check_number
-from gmmtorch.kernels import fused_em, fused_exact_em, in_spatial_order, is_em_fused, takes_one_launch
+from gmmtorch.kernels import fused_exact_em, in_spatial_order, is_em_fused, takes_one_launch
 from gmmtorch.mixture.em import by_type, exact
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.reduction import merge_pairs
@@ -92,30 +92,6 @@ def run_em(
             if on_iteration is not None:
                 on_iteration(len(bounds), bound)
     return EMResult(parameters, bounds, converged)
-
-
-def run_small(
-    points: Tensor,
-    weight: Tensor,
-    starts: Sequence[Parameters],
-    covariance_type: str,
-    reg_covar: float,
-    tol: float,
-    max_iter: int,
-    previous_bound: float,
-) -> list[EMResult[Parameters]]:
-    """`run_em` of a small table (see `kernels.is_small`) from several starts, in one launch.
-
-    A run whose next iteration needs more than the kernel can do ends before it.
-    """
-    stacked = Parameters(*(torch.stack(part) for part in zip(*starts, strict=True)))
-    limits = tol, max_iter, previous_bound
-    found = fused_em(points, weight, stacked, covariance_type, reg_covar, *limits)
-    rows = zip(found.weights, found.means, found.covariances, found.bounds, strict=True)
-    return [
-        EMResult(Parameters(*parameters), bounds, has_converged(bounds, tol, previous_bound))
-        for *parameters, bounds in rows
-    ]
 
 
 def has_converged(bounds: Sequence[float], tol: float, previous_bound: float = -math.inf) -> bool:

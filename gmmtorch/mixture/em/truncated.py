@@ -283,10 +283,6 @@ class Rows:
             return self.values
         return self.values[:, 1 : 1 + em.feature_dimension(self.values.shape[1])].contiguous()
 
-    def features(self) -> Tensor:
-        """Features (N, F)."""
-        return em.quadratic_features(self.values) if self.are_points else self.values
-
 
 class Groups(NamedTuple):
     """Rows sorted by owner, in blocks of B rows of one owner. Rows of weight 0 fill incomplete blocks.
