@@ -13,7 +13,6 @@ from .em.initialization import INITIALIZATIONS as INITIALIZATIONS
 from .em.initialization import initialize as initialize
 from .em.initialization import surface_pieces as surface_pieces
 from .em.loop import em_step as em_step
-from .em.loop import natural_step as natural_step
 from .em.loop import run_em as run_em
 from .em.partition import Cells as Cells
 from .em.partition import FlatnessRule as FlatnessRule

@@ -25,6 +25,7 @@ from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em import loop
 from gmmtorch.mixture.em.by_type import Factors
 from gmmtorch.mixture.em.exact import Parameters
+from gmmtorch.mixture.em.truncated import Rows
 from gmmtorch.mixture.estimators.riemannian import (
     Iterate,
     Likelihood,
@@ -62,7 +63,7 @@ def blurred_em_step(points: np.ndarray, reg_covar: float) -> loop.Step:
     dim = x.shape[1]
     rows, cols = torch.triu_indices(dim, dim)
     features[:, 1 + dim :] += reg_covar * (rows == cols)
-    return loop.natural_step(features, torch.ones(len(x)).double(), 0.0, torch.float64)
+    return loop.em_step(Rows(features, torch.ones(len(x)).double(), False), 0.0, torch.float64)
 
 
 @pytest.mark.parametrize("dim", [1, 2, 3])

@@ -113,7 +113,7 @@ def test_one_iteration_equals_one_em_step():
     points, weight, parameters = cloud(500, 3), random_weight(500), random_parameters(5, 3)
     setup = Settings(1e-6, 0.0, 1, torch.float64)
     found, *_ = run_truncated(rows_of(points, weight), nearest(points, parameters.means), parameters, setup)
-    step = loop.natural_step(em.quadratic_features(points), weight, 1e-6, torch.float64)
+    step = loop.em_step(Rows(em.quadratic_features(points), weight, False), 1e-6, torch.float64)
     expected, bound = step(parameters)
     assert found.lower_bounds == [pytest.approx(bound, rel=1e-12)]
     torch.testing.assert_close(tuple(found.parameters), tuple(expected), rtol=1e-9, atol=1e-10)
@@ -133,7 +133,7 @@ def test_momentum_converges_faster_than_em(n_iter, share):
         torch.full((2, 1, 1), 2.0, dtype=torch.float64),
     )
     rows, owner = rows_of(points), torch.zeros(3000, dtype=torch.int64)
-    step = loop.natural_step(em.quadratic_features(points), rows.weight, 0.0, torch.float64)
+    step = loop.em_step(Rows(em.quadratic_features(points), rows.weight, False), 0.0, torch.float64)
     plain = loop.run_em(step, parameters, tol=0.0, max_iter=n_iter)
     found, *_ = run_truncated(rows, owner, parameters, Settings(0.0, 0.0, n_iter, torch.float64))
     assert found.n_iter == n_iter

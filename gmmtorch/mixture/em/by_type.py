@@ -1,4 +1,4 @@
-"""EM in many dimensions: each covariance type has the arithmetic that it needs.
+"""EM steps: each covariance type has the arithmetic that it needs.
 
 Covariances have the shape of their type: full (K, D, D), tied (D, D), diag (K, D), spherical (K,).
 

@@ -13,7 +13,6 @@ that never decreases (Verbeek, Nunnink & Vlassis, 2006).
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import torch
@@ -62,22 +61,16 @@ def shift_features(features: Tensor, offset: Tensor) -> Tensor:
 
 def natural_parameters(parameters: Parameters) -> Tensor:
     """W (K, F) such that φ(x)·W_k = log π_k + log N(x | μ_k, Σ_k)."""
-    dim, covariances = parameters.means.shape[1], parameters.covariances
-    if is_m_step_fused(dim, *parameters):
+    weights, means, covariances = parameters
+    if is_m_step_fused(means.shape[1], *parameters):
         found, failed = fused_natural_parameters(*parameters)
         if not bool(failed):
             return found
-    return _natural_parameters(parameters, safe_cholesky(covariances))
-
-
-def _natural_parameters(parameters: Parameters, factors: Tensor) -> Tensor:
-    """`natural_parameters`, from the lower Cholesky factors (K, D, D) of the covariances."""
-    weights, means, _ = parameters
-    dim = means.shape[1]
+    factors = safe_cholesky(covariances)
     whiten = inverse_factor(factors)
     log_weight = torch.log(weights).clamp_min(MIN_LOG_WEIGHT)
     half_log_det = torch.log(factors.diagonal(dim1=-2, dim2=-1)).sum(-1)
-    constant = log_weight - half_log_det - 0.5 * dim * LOG_2PI
+    constant = log_weight - half_log_det - 0.5 * means.shape[1] * LOG_2PI
     return natural_of_precisions(whiten @ whiten.transpose(-2, -1), means, constant)
 
 
@@ -88,22 +81,6 @@ def natural_of_precisions(precision: Tensor, means: Tensor, constant: Tensor) ->
     # φ has each off-diagonal product once, for two matrix entries.
     twice = pack_symmetric(0.5 * torch.eye(means.shape[1], dtype=means.dtype, device=means.device) - 1)
     return torch.cat([constant[:, None], linear, twice * pack_symmetric(precision)], 1)
-
-
-def unchecked_expectation(
-    features: Tensor, sample_weight: Tensor, parameters: Parameters, softmax_dtype: torch.dtype
-) -> tuple[Tensor, Tensor]:
-    """`expectation` that does not wait for the device: the log-likelihood is NaN where the natural parameters
-    need the checks of `natural_parameters`.
-    """
-    if is_m_step_fused(parameters.means.shape[1], *parameters):
-        natural, failed = fused_natural_parameters(*parameters)
-    else:
-        factors, info = torch.linalg.cholesky_ex(parameters.covariances)
-        natural = _natural_parameters(parameters, factors)
-        failed = (info != 0).any() | ~torch.isfinite(natural).all()
-    statistics, value = expectation(features, sample_weight, natural, softmax_dtype)
-    return statistics, value.masked_fill(failed, math.nan)
 
 
 def most_likely_component(features: Tensor, parameters: Parameters) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError, check_number
 from gmmtorch.kernels import fused_exact_em, in_spatial_order, is_em_fused, takes_one_launch
-from gmmtorch.mixture.em import by_type, exact
+from gmmtorch.mixture.em import by_type
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.reduction import merge_pairs
 
@@ -100,18 +100,23 @@ def has_converged(bounds: Sequence[float], tol: float, previous_bound: float = -
 
 
 def em_step(
-    rows: Rows, reg_covar: float, softmax_dtype: torch.dtype, covariance_type: str = "full"
+    rows: Rows,
+    reg_covar: float,
+    softmax_dtype: torch.dtype = torch.float32,
+    covariance_type: str = "full",
 ) -> Steps[Parameters]:
     """EM steps on points, centred, or cells. Covariances have the shape of their type.
 
     A step on points whose linear form loses digits takes the direct one; in many dimensions, so do all later
-    steps.
+    steps. In few dimensions, a fused kernel takes many steps in one launch where that is faster.
     """
-    points, weight, kind = rows.values, rows.weight, covariance_type
-    if not rows.are_points:
-        return natural_step(points, weight, reg_covar, softmax_dtype, kind)
+    points, weight, kind = rows.points, rows.weight, covariance_type
     total, direct = weight.sum(), [False]
-    few = by_type.rows_of_few_dimensions(points, weight)
+    few = (
+        by_type.rows_of_few_dimensions(points, weight)
+        if rows.are_points
+        else in_spatial_order(rows.values, weight)
+    )
 
     def gather(factors: by_type.Factors) -> by_type.Gather:
         return functools.partial(by_type.expected_moments, points, weight, factors, softmax_dtype, rows=few)
@@ -121,12 +126,14 @@ def em_step(
         linear = by_type.has_linear_form(k, dim, kind) and not direct[0]
         factors = by_type.Factors(parameters, kind, check=False)
         found = by_type.em_step(gather(factors), factors, reg_covar, parameters, linear)
-        return found.parameters, (found.value / total).masked_fill(found.lost, math.nan)
+        lost = found.lost if rows.are_points else factors.failed
+        return found.parameters, (found.value / total).masked_fill(lost, math.nan)
 
     def checked(parameters: Parameters) -> tuple[Parameters, float]:
         direct[0] = few is None
         factors = by_type.Factors(parameters, kind)
-        found = by_type.exact_step(gather(factors), factors, reg_covar, parameters)
+        take = by_type.exact_step if rows.are_points else by_type.em_step
+        found = take(gather(factors), factors, reg_covar, parameters, linear=not rows.are_points)
         bound = float(found.value / total)
         if not math.isfinite(bound):
             raise NumericalError(
@@ -136,57 +143,13 @@ def em_step(
         return found.parameters, bound
 
     steps = _ahead(step, checked, 1 if points.device.type == "cpu" else _STEPS_AHEAD)
-    return steps if few is None else _in_one_launch(few, kind, reg_covar, steps, checked, guarded=True)
-
-
-def natural_step(
-    features: Tensor,
-    sample_weight: Tensor,
-    reg_covar: float,
-    softmax_dtype: torch.dtype = torch.float32,
-    covariance_type: str = "full",
-) -> Steps[Parameters]:
-    """EM steps on features (N, F), float64, of cells. Covariances have the shape of their type."""
-    rows = in_spatial_order(features, sample_weight)
-    total = sample_weight.sum()
-
-    def maximized(parameters: Parameters, statistics: Tensor, value: Tensor) -> tuple[Parameters, Tensor]:
-        new = exact.maximization(statistics, reg_covar, parameters)
-        return by_type.compacted(new, covariance_type), value / total
-
-    def step(parameters: Parameters) -> tuple[Parameters, Tensor]:
-        parameters = by_type.expanded(parameters, covariance_type)
-        return maximized(parameters, *exact.unchecked_expectation(*rows, parameters, softmax_dtype))
-
-    def checked(parameters: Parameters) -> tuple[Parameters, float]:
-        parameters = by_type.expanded(parameters, covariance_type)
-        natural = exact.natural_parameters(parameters)
-        new, bound = maximized(parameters, *exact.expectation(*rows, natural, softmax_dtype))
-        return new, float(bound)
-
-    steps = _ahead(step, checked, 1 if features.device.type == "cpu" else _STEPS_AHEAD)
-    return _in_one_launch(rows, covariance_type, reg_covar, steps, checked, guarded=False)
-
-
-def _in_one_launch(
-    rows: tuple[Tensor, Tensor],
-    covariance_type: str,
-    reg_covar: float,
-    steps: Steps[Parameters],
-    checked: Step[Parameters],
-    guarded: bool,
-) -> Steps[Parameters]:
-    """The steps, many in one launch of a fused kernel where that is faster.
-
-    With `guarded`, a step that loses digits is `checked`, and otherwise one that is impossible.
-    """
 
     def run(parameters: Parameters, tol: float, n_most: int, last: float) -> tuple[Parameters, list[float]]:
-        fits = covariance_type == "full" and takes_one_launch(len(rows[0]), len(parameters.weights))
-        if not fits or not is_em_fused(*rows, *parameters):
+        fits = few is not None and kind == "full" and takes_one_launch(len(weight), len(parameters.weights))
+        if few is None or not fits or not is_em_fused(*few, *parameters):
             return steps.run(parameters, tol, n_most, last)
         mixture, bounds, failed = fused_exact_em(
-            *rows, parameters, reg_covar, tol, n_most, last, guarded=guarded
+            *few, parameters, reg_covar, tol, n_most, last, guarded=rows.are_points
         )
         if not failed:
             return Parameters(*mixture), bounds
