@@ -100,8 +100,8 @@ def test_both_forms_give_the_density(kind, dim):
 @types
 @pytest.mark.parametrize("dim", [1, 3, 6])
 def test_both_forms_give_the_moments_in_chunks_of_any_size(kind, dim, monkeypatch):
-    points = torch.from_numpy(cloud(700, dim))
-    weight = torch.rand(700, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    points = torch.from_numpy(cloud(300, dim))
+    weight = torch.rand(300, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     factors = by_type.Factors(typed(kind, dim), kind)
     found = []
     for elements in (1 << 17, 1):

@@ -49,7 +49,7 @@ class TestSlicedWassersteinGaussianMixture(MixtureContract):
 
     def make(self, n_components: int = 3, **options: Any) -> SlicedWassersteinGaussianMixture:
         # A short descent that stays near a good start; other tests run whole descents.
-        short = {"n_projections": 8, "max_iter": 4, "learning_rate": 0.02}
+        short = {"n_projections": 16, "max_iter": 4, "learning_rate": 0.02}
         return SlicedWassersteinGaussianMixture(n_components, **{"random_state": 0, **short, **options})
 
 
