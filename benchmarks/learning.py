@@ -28,6 +28,7 @@ from gmmtorch.experiments.evaluation.metrics import psnr2
 from gmmtorch.experiments.harness import Case, Row, alone, clock, cpu_seconds, least_seconds, recording, run
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em import loop
+from gmmtorch.mixture.em.truncated import Rows
 
 REG_COVAR = 1e-5
 TIME_LIMIT = 240  # seconds of the processor, for one run
@@ -235,7 +236,8 @@ def em_iteration(options: Any) -> Iterator[Row]:
 
     def ours(dtype: torch.dtype) -> tuple[float, float]:
         center = points.mean(0)
-        step = loop.natural_step(em.quadratic_features(points - center), torch.ones(n).double(), 1e-6, dtype)
+        features = em.quadratic_features(points - center)
+        step = loop.em_step(Rows(features, torch.ones(n).double(), are_points=False), 1e-6, dtype)
         state = em.Parameters(weights, means - center, covariances)
         begin = time.perf_counter()
         found = loop.run_em(step, state, tol=0, max_iter=iterations)

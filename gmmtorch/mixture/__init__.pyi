@@ -8,12 +8,11 @@ from .em.exact import SOFTMAX_DTYPES as SOFTMAX_DTYPES
 from .em.exact import Parameters as Parameters
 from .em.exact import maximization as maximization
 from .em.exact import most_likely_component as most_likely_component
-from .em.exact import quadratic_features as quadratic_features
 from .em.exact import shift_features as shift_features
 from .em.initialization import INITIALIZATIONS as INITIALIZATIONS
 from .em.initialization import initialize as initialize
 from .em.initialization import surface_pieces as surface_pieces
-from .em.loop import natural_step as natural_step
+from .em.loop import em_step as em_step
 from .em.loop import run_em as run_em
 from .em.partition import Cells as Cells
 from .em.partition import FlatnessRule as FlatnessRule
@@ -23,6 +22,7 @@ from .em.partition import partition as partition
 from .em.partition import pool as pool
 from .em.partition import pool_into_cells as pool_into_cells
 from .em.partition import surface_rule as surface_rule
+from .em.truncated import Rows as Rows
 from .estimator import MixtureEstimator as MixtureEstimator
 from .estimators.deconvolved import DeconvolvedGaussianMixture as DeconvolvedGaussianMixture
 from .estimators.depth_image import fit_depth_image as fit_depth_image

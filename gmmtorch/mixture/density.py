@@ -18,7 +18,6 @@ from torch import Tensor, nn
 
 from gmmtorch.arrays import DeviceModule, check_unmasked
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
-from gmmtorch.kernels import chunk_elements
 from gmmtorch.linalg import inverse_factor, safe_cholesky
 from gmmtorch.mixture.em import by_type
 from gmmtorch.mixture.em import exact as em
@@ -31,8 +30,6 @@ _JOINTS: WeakKeyDictionary[MixtureDensity, tuple[list[tuple[Tensor, int]], by_ty
 """The log-densities of mixtures, with the parameters that they are of and the versions of these tensors.
 
 They are apart from the mixtures, because queries may not change an estimator's attributes."""
-_FAR = 1e4  # distance from the centre (m) beyond which products of features lose digits
-
 
 Self = TypeVar("Self", bound="MixtureDensity")
 
@@ -103,22 +100,12 @@ class MixtureDensity(DensityMixin, BaseEstimator, DeviceModule):
 
     def _joint(self, points: Tensor) -> Iterator[Tensor]:
         """log π_k + log N(x|k), in chunks (K, n)."""
-        (k, dim), kind = self.means.shape, self._fitted_type
-        if dim > 3 or kind in ("diag", "spherical"):
-            joint = self._typed_joint()
-            parts = points.split(by_type.rows_of_chunk(k, dim, kind, points.device))
-            yield from (joint(part) for part in parts)
-            return
-        center = (self.weights[:, None] * self.means).sum(0)
-        full = Parameters(self.weights, self.means - center, self.covariances)
-        parts = points.split(max(64, chunk_elements(points.device) // k))
-        natural = em.natural_parameters(full)
-        if em.is_ill_conditioned(full, natural) or bool(((points - center).abs() > _FAR).any()):
-            yield from (em.log_joint(part - center, full).T for part in parts)
-            return
-        yield from (natural @ em.quadratic_features(part - center).T for part in parts)
+        k, dim = self.means.shape
+        rows = by_type.rows_of_chunk(k, dim, self._fitted_type, points.device)
+        joint = self._log_joint()
+        return (joint(part) for part in points.split(rows))
 
-    def _typed_joint(self) -> by_type.Joint:
+    def _log_joint(self) -> by_type.Joint:
         """`by_type.log_joint` of the parameters, which is made anew if they change."""
         parameters = Parameters(self.weights, self.means, self._typed_covariances())
         if any(value.requires_grad or value.is_inference() for value in parameters):

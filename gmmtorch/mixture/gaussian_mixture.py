@@ -11,8 +11,8 @@ import torch
 from sklearn.utils._param_validation import Interval, StrOptions
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.kernels import is_small
+from gmmtorch.errors import InvalidArgumentError, check_number
+from gmmtorch.kernels import fused_em, is_small
 from gmmtorch.mixture.em import by_type, loop
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.distributed import SINGLE_PROCESS, Processes
@@ -166,7 +166,8 @@ class GaussianMixture(MixtureEstimator):
         Raises `InvalidArgumentError` and `NumericalError` as in `fit`; also for another dimension or
         n_components than the mixture, and an invalid kappa or memory.
         """
-        loop.check_kappa(kappa)
+        if not 0.5 < check_number("kappa", kappa) <= 1:
+            raise InvalidArgumentError(f"kappa={kappa!r} must be above 0.5 and at most 1.")
         started = hasattr(self, "means")
         past = loop.weight_of_past(getattr(self, "n_samples_seen_", None) if started else 0.0, memory)
         points, weight, center = self._prepare(X, sample_weight, reset=not started)
@@ -178,9 +179,9 @@ class GaussianMixture(MixtureEstimator):
         kind, dtype = self.covariance_type, em.SOFTMAX_DTYPES[self.dtype]
         step = loop.em_step(Rows(points, weight), float(self.reg_covar), dtype, kind)
         update, bound = step(previous)
-        eta = loop.step_size(float(weight.sum()), past, kappa)
-        blended = loop.blend(previous, update, eta, kind)
-        self._store_fit(blended, center, [bound], False, {"n_samples_seen": past + weight.sum()})
+        seen = past + weight.sum()
+        blended = loop.blend(previous, update, float(weight.sum() / seen) ** kappa, kind)
+        self._store_fit(blended, center, [bound], False, {"n_samples_seen": seen})
         return self
 
     # n_samples_seen is part of files and motions, but not of the state dict, which has only parameters.
@@ -221,8 +222,15 @@ class GaussianMixture(MixtureEstimator):
             return []
         n_starts = 1 if self._continues() else self.n_init
         starts = [self._start(rows, center, generator)[0] for _ in range(n_starts)]
-        limits = self.tol, self.max_iter, self._previous_bound()
-        return loop.run_small(rows.values, rows.weight, starts, kind, float(self.reg_covar), *limits)
+        stacked, last = Parameters(*map(torch.stack, zip(*starts, strict=True))), self._previous_bound()
+        settings = kind, float(self.reg_covar), self.tol, self.max_iter, last
+        found = fused_em(rows.values, rows.weight, stacked, *settings)
+        # A run whose next iteration needs more than the kernel can do ends before it.
+        ends = zip(found.weights, found.means, found.covariances, found.bounds, strict=True)
+        return [
+            EMResult(Parameters(*end), bounds, loop.has_converged(bounds, self.tol, last))
+            for *end, bounds in ends
+        ]
 
     def _run(
         self,
@@ -283,7 +291,7 @@ class GaussianMixture(MixtureEstimator):
             return Parameters(**given), None
         elif not given and self._truncates(n, k, dim) and self._initialization(n, k, dim) == "flat_pieces":
             found, owner = flat_pieces(rows.points, rows.weight, k, reg, features)
-            found, _ = replicated(found, k)
+            found = replicated(found, k)
         else:
             method, kind = self._initialization(n, k, dim), self.covariance_type
             found = initialize(method, rows.points, rows.weight, k, reg, generator, kind)

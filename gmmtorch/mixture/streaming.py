@@ -26,7 +26,7 @@ from gmmtorch.files import pack_tensors, read_tensors, require, write_bytes
 from gmmtorch.mixture.em import by_type, loop
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.distributed import SINGLE_PROCESS, LostProcessError, Processes
-from gmmtorch.mixture.em.exact import Parameters, expand
+from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.truncated import Rows, fit_truncated, nearest
 from gmmtorch.mixture.estimator import MixtureEstimator
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
@@ -38,29 +38,12 @@ SAMPLE_POINTS = 100_000
 Accumulate = Callable[[Tensor], tuple[Tensor, Tensor]]
 """From centred points (n, D), float64, to S (K, F) and Σ_n log p(x_n)."""
 EStep = Callable[[Parameters], Accumulate]
-"""Prepares one iteration with these parameters. Its `repr` states its name and settings."""
+"""Prepares one iteration with these parameters, covariances (K, D, D). Its `repr` states its settings."""
 _FILE_KIND, _FILE_VERSION = "gmmtorch.checkpoint", 1
 RunFacts = Mapping[str, Any]
 """Description of a run, in JSON types: settings and cloud, including n_components and dimensions."""
 Write = Callable[[Parameters, list[float], bool], None]
 """Called with the parameters and the lower bounds after an iteration, and whether it is the last."""
-
-
-@dataclass(frozen=True)
-class ExactEStep:
-    """E-step over all components. `dtype`: of the exponentials, float32 or float64."""
-
-    dtype: str = "float32"
-
-    def __call__(self, parameters: Parameters) -> Accumulate:
-        natural = em.natural_parameters(parameters)
-        softmax_dtype = em.SOFTMAX_DTYPES[self.dtype]
-
-        def accumulate(points: Tensor) -> tuple[Tensor, Tensor]:
-            features = em.quadratic_features(points)
-            return em.expectation(features, points.new_ones(points.shape[0]), natural, softmax_dtype)
-
-        return accumulate
 
 
 def fit_stream(
@@ -91,7 +74,7 @@ def fit_stream(
             sample does not depend on chunks or processes. None: all points, which must fit into memory.
         survey: result of `survey_all` for the source, if it is known already.
         device: device of the computation.
-        e_step: default `ExactEStep` with the mixture's `dtype`.
+        e_step: in place of EM's own; it must keep enough digits.
         processes: the processes that share the fit; rank 0 computes the start.
         checkpoint: where rank 0 stores the state, and what the fit continues from.
         on_iteration: called with the iteration (from 1) and the mean log-likelihood.
@@ -113,26 +96,41 @@ def fit_stream(
         if survey.n_points == 0:
             raise DataError(f"{source.name} has no valid points, only {survey.n_dropped} invalid ones.")
         mixture.check_parameters(survey.n_points)
-        e_step = ExactEStep(mixture.dtype) if e_step is None else e_step
-        facts = run_facts(mixture, survey, repr(e_step))
+        name = f"ExactEStep(dtype={mixture.dtype!r})" if e_step is None else repr(e_step)
+        facts = run_facts(mixture, survey, name)
         first = first_state(mixture, survey, facts, generator, checkpoint, processes)
         done += first.lower_bounds
+        write = None
+        if checkpoint is not None and processes.rank == 0:
+            write = checkpoint.writer(facts, first.center)
+        center = first.center.to(device)
         parameters = Parameters(*(value.to(device) for value in first.parameters))
-        run = _Run(mixture, source, processes, first.center.to(device), parameters, on_iteration)
-        if mixture.algorithm == "truncated":
-            result = _truncated(run)
+        if mixture.algorithm == "truncated":  # the points of this process stay in memory
+            held = [chunk.points.to(device) - center for chunk in source]
+            points = torch.cat(held) if held else center.new_empty(0, source.dim)
+            rows, owner = Rows(points, points.new_ones(len(points))), nearest(points, parameters.means)
+            result = fit_truncated(rows, owner, parameters, mixture._settings(on_iteration, processes))
         else:
-            write = None
-            if checkpoint is not None and processes.rank == 0:
-                write = checkpoint.writer(facts, first.center)
-            result = _exact(run, e_step, survey.n_points, done, write)
+            result = loop.run_em(
+                _noted(
+                    _stream_step(mixture, source, processes, center, e_step, survey.n_points), done, write
+                ),
+                parameters,
+                tol=mixture.tol,
+                max_iter=mixture.max_iter,
+                on_iteration=on_iteration,
+                lower_bounds=tuple(done),
+                previous_bound=mixture._previous_bound(),
+            )
+            if write is not None:
+                write(result.parameters, result.lower_bounds, True)
     except LostProcessError as error:
         resume_hint = "" if checkpoint is None else " " + checkpoint.resume_hint()
         raise LostProcessError(f"{error} It was in iteration {len(done) + 1}.{resume_hint}") from error
     mixture._tensors, mixture.n_features_in_ = True, source.dim
     mixture.__dict__.pop("feature_names_in_", None)
-    seen = {"n_samples_seen": run.center.new_tensor(survey.n_points)}
-    mixture._store_fit(result.parameters, run.center, result.lower_bounds, result.converged, seen)
+    seen = {"n_samples_seen": center.new_tensor(survey.n_points)}
+    mixture._store_fit(result.parameters, center, result.lower_bounds, result.converged, seen)
     if processes.rank == 0:
         mixture._warn_unless_converged()
     return mixture
@@ -173,69 +171,39 @@ def _in_chunks(source: PointChunks | ArrayLike) -> PointChunks:
     return source if isinstance(source, PointChunks) else in_memory(source, "source")
 
 
-# -- all iterations -------------------------------------------------------------------------------
+# -- one iteration --------------------------------------------------------------------------------
 
 
-class _Run(NamedTuple):
-    """One process's part of a fit. `first` is relative to `center` (D,)."""
+def _noted(step: loop.Step[Parameters], done: list[float], write: Write | None) -> loop.Step[Parameters]:
+    """The step, after which its bound is added to `done`, and its result written."""
 
-    mixture: GaussianMixture
-    source: PointChunks
-    processes: Processes
-    center: Tensor
-    first: Parameters
-    on_iteration: Callable[[int, float], None] | None
-
-
-def _exact(
-    run: _Run, e_step: EStep, n_points: int, done: list[float], write: Write | None
-) -> loop.EMResult[Parameters]:
-    """Exact EM. `done` has the lower bounds of earlier iterations, and gets those of the new ones."""
-    one_step, earlier = _stream_step(run, e_step, n_points), tuple(done)
-
-    def step(parameters: Parameters) -> tuple[Parameters, float]:
-        new, bound = one_step(parameters)
+    def noted(parameters: Parameters) -> tuple[Parameters, float]:
+        new, bound = step(parameters)
         done.append(bound)
         if write is not None:
             write(new, done, False)
         return new, bound
 
-    result = loop.run_em(
-        step,
-        run.first,
-        tol=run.mixture.tol,
-        max_iter=run.mixture.max_iter,
-        on_iteration=run.on_iteration,
-        lower_bounds=earlier,
-        previous_bound=run.mixture._previous_bound(),
-    )
-    if write is not None:
-        write(result.parameters, result.lower_bounds, True)
-    return result
+    return noted
 
 
-def _truncated(run: _Run) -> loop.EMResult[Parameters]:
-    """Truncated EM. The points of this process stay in memory."""
-    center, mixture = run.center, run.mixture
-    held = [chunk.points.to(center.device) - center for chunk in run.source]
-    points = torch.cat(held) if held else center.new_empty(0, run.source.dim)
-    del held
-    rows = Rows(points, points.new_ones(points.shape[0]))
-    settings = mixture._settings(run.on_iteration, run.processes)
-    return fit_truncated(rows, nearest(points, run.first.means), run.first, settings)
+def _stream_step(
+    mixture: GaussianMixture,
+    source: PointChunks,
+    processes: Processes,
+    center: Tensor,
+    e_step: EStep | None,
+    n_points: int,
+) -> loop.Step[Parameters]:
+    """EM steps on the points of all processes, relative to `center` (D,).
 
-
-# -- one iteration --------------------------------------------------------------------------------
-
-
-def _stream_step(run: _Run, e_step: EStep, n_points: int) -> loop.Step[Parameters]:
-    """EM steps on the points of all processes. Each process sums over its chunks, then all sum once."""
-    center, reg_covar = run.center, float(run.mixture.reg_covar)
+    Each process sums over its chunks, then all sum once.
+    """
 
     def centered() -> Iterator[tuple[Tensor, Tensor]]:
         # Zeros first, for a process without points.
-        yield center.new_empty(0, run.source.dim), center.new_empty(0)
-        for chunk in run.source:
+        yield center.new_empty(0, source.dim), center.new_empty(0)
+        for chunk in source:
             points = chunk.points.to(center.device) - center
             yield points, points.new_ones(points.shape[0])
 
@@ -244,24 +212,21 @@ def _stream_step(run: _Run, e_step: EStep, n_points: int) -> loop.Step[Parameter
         sums = next(terms)
         for term in terms:
             sums = tuple(a + b for a, b in zip(sums, term, strict=True))
-        packed = run.processes.sum(torch.cat([part.flatten() for part in sums]))
+        packed = processes.sum(torch.cat([part.flatten() for part in sums]))
         parts = packed.split([part.numel() for part in sums])
         return [part.view(like.shape) for part, like in zip(parts, sums, strict=True)]
 
-    def gather(parameters: Parameters) -> tuple[Tensor, Tensor]:
+    def given_step(e_step: EStep, parameters: Parameters) -> tuple[Parameters, Tensor]:
+        parameters = by_type.expanded(parameters, kind)
         accumulate = e_step(parameters)
-        statistics, total = summed(accumulate(points) for points, _ in centered())
-        return statistics, total
+        statistics, value = summed(accumulate(points) for points, _ in centered())
+        return by_type.compacted(em.maximization(statistics, reg_covar, parameters), kind), value
 
-    typed = e_step if isinstance(e_step, ExactEStep) and run.source.dim > 3 else None
-    dtype = torch.float64 if typed is None else em.SOFTMAX_DTYPES[typed.dtype]
-    kind = run.mixture.covariance_type
-
-    def typed_step(parameters: Parameters) -> tuple[Parameters, Tensor]:
+    def own_step(parameters: Parameters) -> tuple[Parameters, Tensor]:
         """A step with the arithmetic of the covariance type, direct if the linear form loses digits."""
         factors = by_type.Factors(parameters, kind)
 
-        def gather_typed(linear: bool, about: Tensor | None) -> tuple[by_type.Sums, Tensor]:
+        def gather(linear: bool, about: Tensor | None) -> tuple[by_type.Sums, Tensor]:
             about = None if linear else factors.means if about is None else about
 
             def terms() -> Iterator[tuple[Tensor, ...]]:
@@ -275,21 +240,15 @@ def _stream_step(run: _Run, e_step: EStep, n_points: int) -> loop.Step[Parameter
                 own += part
             return whole, value
 
-        found = by_type.exact_step(gather_typed, factors, reg_covar, parameters, typed is not None)
+        found = by_type.exact_step(gather, factors, reg_covar, parameters, linear=True)
         return found.parameters, found.value
 
-    def direct(parameters: Parameters) -> tuple[Parameters, Tensor]:
-        new, value = typed_step(by_type.compacted(parameters, kind))
-        return new._replace(covariances=expand(new.covariances, kind, *new.means.shape)), value
-
-    if typed is None:
-        guarded = loop.guarded_step(gather, direct, reg_covar, float(n_points), kind)
-        return loop.in_shape_of_type(guarded, kind)
-
     def step(parameters: Parameters) -> tuple[Parameters, float]:
-        new, value = typed_step(parameters)
+        new, value = own_step(parameters) if e_step is None else given_step(e_step, parameters)
         return new, float(value) / n_points
 
+    dtype, kind = em.SOFTMAX_DTYPES[mixture.dtype], mixture.covariance_type
+    reg_covar = float(mixture.reg_covar)
     return step
 
 
@@ -302,20 +261,8 @@ def survey_all(
     """Result of one pass over the sources of all processes, see `survey`. The seed of rank 0 is used."""
     if sample_points is not None:
         check_whole("sample_points", sample_points, 1)
-    seed = int(processes.broadcast(torch.tensor([seed], dtype=torch.float64)))
-    part = survey_source(source, sample_points, seed)
-    if processes.size == 1:
-        return part
-    counts = part.total.new_tensor([part.n_points, part.n_dropped, part.checksum])  # whole numbers below 2⁵³
-    facts = processes.gather(torch.cat([counts, part.total, part.low, part.high])[None])
-    samples = processes.gather(part.sample)
-    dim = source.dim
-    parts = []
-    for row, sample in zip(torch.cat(facts), samples, strict=True):
-        n_points, n_dropped, checksum = (int(value) for value in row[:3])
-        total, low, high = row[3:].split(dim)
-        parts.append(Survey(n_points, n_dropped, total, low, high, checksum, sample))
-    return merge_surveys(parts, sample_points)
+    parts = processes.gather(survey_source(source, sample_points, processes.broadcast(seed)))
+    return merge_surveys(parts, sample_points) if processes.size > 1 else parts[0]
 
 
 def first_state(
@@ -327,18 +274,14 @@ def first_state(
     processes: Processes,
 ) -> State:
     """Start or continuation of EM: the state of rank 0, the same in all processes."""
-    packed = None
+    state = None
     if processes.rank == 0:
         state = None if checkpoint is None else checkpoint.read(run)
         if state is None:
-            center = survey.center
-            points = survey.points - center
+            points = survey.points - survey.center
             rows = Rows(points, points.new_ones(points.shape[0]))
-            parameters, _ = mixture._start(rows, center, generator)
-            state = State(parameters, center, [])
-        packed = state.pack()
-    k, dim = cast(int, mixture.n_components), survey.low.shape[0]
-    return State.unpack(processes.broadcast(packed), k, dim, mixture.covariance_type)
+            state = State(mixture._start(rows, survey.center, generator)[0], survey.center, [])
+    return cast(State, processes.broadcast(state))
 
 
 def run_facts(mixture: GaussianMixture, survey: Survey, e_step: str) -> RunFacts:
@@ -379,20 +322,6 @@ class State(NamedTuple):
     parameters: Parameters
     center: Tensor
     lower_bounds: list[float]
-
-    def pack(self) -> Tensor:
-        """The state as one vector (n,), float64."""
-        bounds = self.center.new_tensor(self.lower_bounds)
-        return torch.cat([part.flatten() for part in (*self.parameters, self.center, bounds)])
-
-    @staticmethod
-    def unpack(vector: Tensor, n_components: int, dim: int, covariance_type: str) -> State:
-        """The inverse of `pack`."""
-        k, shape = n_components, em.type_shape(covariance_type, n_components, dim)
-        sizes = [k, k * dim, math.prod(shape), dim]
-        weights, means, covariances, center, bounds = vector.split([*sizes, vector.numel() - sum(sizes)])
-        parameters = Parameters(weights, means.view(k, dim), covariances.view(shape))
-        return State(parameters, center, bounds.tolist())
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@ from .buildings import World2D as World2D
 from .buildings import World3D as World3D
 from .buildings import building_2d as building_2d
 from .buildings import building_3d as building_3d
+from .buildings import ray_segments as ray_segments
 from .camera_options import CameraOptions as CameraOptions
 from .furniture import box as box
 from .mesh_world import MeshWorld as MeshWorld
@@ -9,7 +10,6 @@ from .mesh_world import checked_triangles as checked_triangles
 from .mine import tunnels as tunnels
 from .robot_camera import DepthCamera as DepthCamera
 from .robot_camera import DepthFrame as DepthFrame
-from .segment_casting import ray_segments as ray_segments
 from .sensors import RangeSensor as RangeSensor
 from .sensors import World as World
 from .sensors import depth_camera as depth_camera

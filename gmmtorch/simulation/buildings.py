@@ -33,7 +33,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from gmmtorch.arrays import ArrayLike
+from gmmtorch.arrays import ArrayLike, as_tensor
+from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.simulation.furniture import (
     CEILING,
     DrawPiece,
@@ -53,11 +54,16 @@ from gmmtorch.simulation.furniture import (
     table,
     uniform,
 )
-from gmmtorch.simulation.mesh_world import MeshWorld
-from gmmtorch.simulation.segment_casting import ray_segments
+from gmmtorch.simulation.mesh_world import MeshWorld, checked_rays
 from gmmtorch.simulation.sensors import smooth_path
 
 _THICKNESS = 0.2
+_CHUNK_PAIRS = 1 << 15
+"""Ray and segment pairs processed at a time."""
+
+_SLACK = 64 * torch.finfo(torch.float64).eps
+"""Relative distance outside an end at which a ray still counts as a hit, so that no ray passes between two
+adjacent segments. A ray whose angle to a segment is below four times this counts as parallel to it."""
 _CORRIDOR = Room(0.1, 9.1, 29.9, 11.3)
 _ROOMS = (
     Room(0.1, 0.1, 6.9, 8.9),
@@ -117,6 +123,44 @@ class World2D:
     def distances(self, origin: ArrayLike, directions: ArrayLike) -> Tensor:
         """Range (N,) in metres from the origin (2,) along unit directions (N, 2); inf without a hit."""
         return ray_segments(origin, directions, self.segments)
+
+
+def ray_segments(origins: ArrayLike, directions: ArrayLike, segments: ArrayLike) -> Tensor:
+    """Distances (N,), float64, to the nearest segment, in multiples of the direction's length; inf if none.
+
+    Worlds have few segments: each ray is tested against all of them.
+    Solves o + t d = a + s (b − a) for t > 0 and 0 ≤ s ≤ 1. A ray parallel to a segment does not hit it.
+
+    Args:
+        origins: (N, 2), or (2,) if all rays start at one point.
+        directions: (N, 2).
+        segments: (S, 2, 2), the two end points of each segment.
+    """
+    origins, directions = checked_rays(origins, directions, 2)
+    segments = as_tensor(segments, "segments", torch.float64)
+    if segments.ndim != 3 or segments.shape[1:] != (2, 2):
+        raise InvalidArgumentError(f"segments have shape {tuple(segments.shape)}; expected (S, 2, 2).")
+    origins = origins.expand(directions.shape)
+    best = torch.full_like(directions[:, 0], torch.inf)
+    if segments.shape[0] == 0:
+        return best
+    a, edge = segments[:, 0], segments[:, 1] - segments[:, 0]
+    flat = 4 * _SLACK * edge.norm(dim=1)
+    step = max(1, _CHUNK_PAIRS // segments.shape[0])
+    for start in range(0, directions.shape[0], step):
+        rows = slice(start, start + step)
+        d = directions[rows, None]
+        to_start = a - origins[rows, None]
+        turn = _cross_2d(d, edge)
+        t = _cross_2d(to_start, edge) / turn
+        s = _cross_2d(to_start, d) / turn
+        hit = (t > 0) & (s >= -_SLACK) & (s <= 1 + _SLACK) & (turn.abs() > flat * d.norm(dim=2))
+        best[rows] = torch.where(hit, t, torch.inf).amin(1)
+    return best
+
+
+def _cross_2d(u: Tensor, v: Tensor) -> Tensor:
+    return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
 
 
 def building_2d(generator: torch.Generator) -> World2D:

@@ -42,5 +42,10 @@ class CameraOptions:
                 )
         check_number("max_range", self.max_range, above=True, least=CLOSEST_READING)
         check_number("noise", self.noise)
-        if not 0 <= self.dropout < 1:
-            raise InvalidArgumentError(f"dropout={self.dropout} must be a share of the pixels in [0, 1).")
+        check_dropout("pixels", self.dropout)
+
+
+def check_dropout(parts: str, dropout: float) -> None:
+    """Raise `InvalidArgumentError` unless it is a share of the parts in [0, 1)."""
+    if not 0 <= dropout < 1:
+        raise InvalidArgumentError(f"dropout={dropout} must be a share of the {parts} in [0, 1).")

@@ -71,6 +71,21 @@ def have_area(triangles: Tensor) -> Tensor:
     return area > _MIN_AREA * edges.square().sum(2).amax(1)
 
 
+def checked_rays(
+    origin: ArrayLike, directions: ArrayLike, dim: int, device: torch.device | None = None
+) -> tuple[Tensor, Tensor]:
+    """Origin (D,) or (N, D) and directions (N, D), float64. Raises `InvalidArgumentError` for others."""
+    directions = as_tensor(directions, "directions", torch.float64, device)
+    origin = as_tensor(origin, "origin", torch.float64, device)
+    if directions.ndim != 2 or directions.shape[1] != dim:
+        raise InvalidArgumentError(f"directions has shape {tuple(directions.shape)}; expected (N, {dim}).")
+    if origin.shape not in ((dim,), directions.shape):
+        raise InvalidArgumentError(
+            f"origin has shape {tuple(origin.shape)}; expected ({dim},) or {tuple(directions.shape)}, metres."
+        )
+    return origin, directions
+
+
 class MeshWorld:
     """A world of triangles (T, 3, 3), metres, z up, on the device of the triangles.
 
@@ -107,15 +122,7 @@ class MeshWorld:
         Args:
             origin: (3,), or (N, 3) for one origin per ray. directions: (N, 3).
         """
-        directions = as_tensor(directions, "directions", torch.float64, self.device)
-        origin = as_tensor(origin, "origin", torch.float64, self.device)
-        if directions.ndim != 2 or directions.shape[1] != 3:
-            raise InvalidArgumentError(f"directions has shape {tuple(directions.shape)}; expected (N, 3).")
-        if origin.shape not in ((3,), directions.shape):
-            raise InvalidArgumentError(
-                f"origin has shape {tuple(origin.shape)}; expected (3,) or {tuple(directions.shape)}, metres."
-            )
-        return first_hits(self._tree, origin, directions)
+        return first_hits(self._tree, *checked_rays(origin, directions, 3, self.device))
 
     def clearance(self, points: ArrayLike) -> Tensor:
         """Distance (N,) in metres from each point (N, 3) to the nearest surface. Raises

@@ -6,10 +6,9 @@ Only the robot's yaw rotates the camera.
 
 from __future__ import annotations
 
+import functools
 import math
-from dataclasses import dataclass, fields
-from functools import cached_property
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -49,14 +48,10 @@ class DepthFrame:
 class DepthCamera(CameraOptions):
     """A pinhole depth camera whose noise grows with the square of the depth, as in triangulation."""
 
-    @cached_property
+    @property
     def directions(self) -> Tensor:
         """Unit vectors (height · width, 3) of the beams in the camera frame, row by row from the top left."""
-        focal = (
-            self.width / 2 / math.tan(self.horizontal_fov / 2),
-            self.height / 2 / math.tan(self.vertical_fov / 2),
-        )
-        return pixel_rays(self.width, self.height, focal)
+        return _directions(self, torch.device("cpu"))
 
     def sense(
         self,
@@ -87,7 +82,7 @@ class DepthCamera(CameraOptions):
         kept = (torch.rand(n, generator=generator, dtype=torch.float64) >= self.dropout).to(device)
         directions, truth = self.beams(world, pose) if beams is None else beams
         reach = truth.clamp_max(self.max_range)
-        depth = self._directions_on(device)[:, 0]
+        depth = _directions(self, device)[:, 0]
         reading = torch.addcmul(reach, error * reach.square(), depth)  # z = r · depth
         is_hit = (truth < self.max_range) & (reading < self.max_range)
         reading = torch.where(is_hit, reading.clamp_min(CLOSEST_READING), self.max_range)
@@ -104,7 +99,7 @@ class DepthCamera(CameraOptions):
         (height · width,), metres, to the first surface along them."""
         pose = _finite(pose, "pose", 4)
         turn = Pose.from_yaw(float(pose[3]), [0.0, 0.0, 0.0]).rotation.T.to(world.device)
-        directions = self._directions_on(world.device) @ turn
+        directions = _directions(self, world.device) @ turn
         return directions, world.distances(pose[:3], directions)
 
     def image(self, frame: DepthFrame) -> Tensor:
@@ -114,23 +109,19 @@ class DepthCamera(CameraOptions):
         """
         device = frame.ends.device
         depth = torch.full((self.width * self.height,), math.nan, dtype=torch.float64, device=device)
-        reading = (frame.ends - frame.origin).norm(dim=1) * self._directions_on(device)[frame.pixel, 0]
+        reading = (frame.ends - frame.origin).norm(dim=1) * _directions(self, device)[frame.pixel, 0]
         depth[frame.pixel] = torch.where(frame.is_hit, reading, math.inf)
         return depth.view(self.height, self.width)
 
-    def _directions_on(self, device: torch.device) -> Tensor:
-        """`directions` on a device, moved there once."""
-        if device not in self._moved:
-            self._moved[device] = self.directions.to(device)
-        return self._moved[device]
 
-    @cached_property
-    def _moved(self) -> dict[torch.device, Tensor]:
-        return {}
-
-    def __getstate__(self) -> dict[str, Any]:
-        """What a pickle keeps: the fields, without tensors that were computed from them, maybe on a GPU."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+@functools.lru_cache(maxsize=16)
+def _directions(camera: DepthCamera, device: torch.device) -> Tensor:
+    """`directions` on a device, apart from the camera, whose pickle so has no tensors of a GPU."""
+    focal = (
+        camera.width / 2 / math.tan(camera.horizontal_fov / 2),
+        camera.height / 2 / math.tan(camera.vertical_fov / 2),
+    )
+    return pixel_rays(camera.width, camera.height, focal).to(device)
 
 
 def _distance_to_spheres(centers: Tensor, radius: float, directions: Tensor) -> Tensor:

@@ -16,8 +16,8 @@ from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
 from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
+from gmmtorch.simulation.camera_options import CLOSEST_READING, check_dropout
 
-_CLOSEST_READING = 1e-3
 _CORNER_CUTS = 5
 _TANGENT_STEP = 0.05
 
@@ -51,13 +51,7 @@ class RangeSensor:
         object.__setattr__(self, "directions", as_tensor(self.directions, "directions", torch.float64))
         check_number("max_range", self.max_range, above=True)
         check_number("range_noise", self.range_noise)
-        check_share(self.dropout)
-
-
-def check_share(dropout: float) -> None:
-    """Raise `InvalidArgumentError` unless it is a share of the beams in [0, 1)."""
-    if not 0 <= dropout < 1:
-        raise InvalidArgumentError(f"dropout={dropout} must be a share of the beams in [0, 1).")
+        check_dropout("beams", self.dropout)
 
 
 def laser_2d(
@@ -142,7 +136,7 @@ def sense(
     noise = torch.randn(n_beams, generator=generator, dtype=torch.float64) * sensor.range_noise
     kept = torch.rand(n_beams, generator=generator, dtype=torch.float64) >= sensor.dropout
     truth = world.distances(origin, directions)
-    reading = (truth + noise).clamp_min(_CLOSEST_READING)
+    reading = (truth + noise).clamp_min(CLOSEST_READING)
     no_return = (truth >= sensor.max_range) | (reading >= sensor.max_range)
     reading = torch.where(no_return, sensor.max_range, reading)
     return (origin + directions * reading[:, None])[kept], no_return[kept]

@@ -118,8 +118,8 @@ def truncated_e_step(device):
     mixture = Parameters(torch.full_like(points[:40, 0], 1 / 40), points[:40], covariances)
     groups = group_rows(rows, torch.arange(3000, device=device) % 40, mixture.means, torch.float64)
     candidates = (torch.arange(40, device=device)[:, None] + torch.arange(16, device=device)) % 40
-    found = truncated_expectation(groups, candidates, mixture, want_owner=True)
-    return found.statistics, found.owner
+    statistics, _, owner = truncated_expectation(groups, candidates, mixture, want_owner=True)
+    return statistics, owner
 
 
 def learn_depth_images(device):

@@ -188,6 +188,7 @@ class MixtureContract(FitContract):
         assert type(other.means_) is type(mixture.means_)
         for name in ("lower_bounds_", "lower_bound_", "n_iter_", "converged_", "n_features_in_"):
             assert getattr(other, name) == getattr(mixture, name)
+        assert getattr(other, "n_samples_seen_", None) == getattr(mixture, "n_samples_seen_", None)
         assert other.get_params() == mixture.get_params()
         points = blobs(mixture.n_features_in_, 20, seed=2)
         assert (other.score_samples(points) == mixture.score_samples(points)).all()

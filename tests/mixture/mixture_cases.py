@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import torch
 from scipy.stats import multivariate_normal
@@ -9,7 +13,9 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from gmmtorch.mixture import GaussianMixture
+from gmmtorch.files import pack_tensors, read_tensors
+from gmmtorch.mixture import GaussianMixture, MixtureEstimator
+from gmmtorch.mixture.em import by_type
 from gmmtorch.mixture.em.exact import Parameters, quadratic_features
 from gmmtorch.mixture.em.truncated import Rows
 
@@ -74,6 +80,16 @@ def scipy_log_joint(points: Tensor, parameters: Parameters) -> np.ndarray:
     return np.stack(columns, 1)
 
 
+def direct_step(
+    points: Tensor, weight: Tensor, parameters: Parameters, reg_covar: float
+) -> tuple[Parameters, Tensor]:
+    """An EM step of full covariances in the direct form, and Σ_n p_n log p(x_n)."""
+    factors = by_type.Factors(parameters, "full")
+    gather = functools.partial(by_type.expected_moments, points, weight, factors, torch.float64)
+    found = by_type.exact_step(gather, factors, reg_covar, parameters)
+    return found.parameters, found.value
+
+
 def blobs(n: int = 400, dim: int = 2, seed: int = 0) -> np.ndarray:
     """Three overlapping clusters of different shapes."""
     rng = np.random.default_rng(seed)
@@ -96,6 +112,22 @@ def given_start(dim: int, k: int = 3, seed: int = 1) -> dict[str, np.ndarray]:
 
 def fitted(dim: int = 2, **options) -> GaussianMixture:
     return GaussianMixture(3, random_state=0, **options).fit(blobs(dim=dim))
+
+
+MISSING = object()
+
+
+def changed_file(mixture: MixtureEstimator, folder: Path, changes: dict[str, Any], **facts: Any) -> Path:
+    """The file of a mixture with other tensors and facts; `MISSING` ones are left out."""
+    path = folder / "m.safetensors"
+    mixture.save(path)
+    tensors, known = read_tensors(path, "gmmtorch.mixture", 1)
+    tensors, known = (
+        {name: value for name, value in {**old, **new}.items() if value is not MISSING}
+        for old, new in ((tensors, changes), (known, facts))
+    )
+    path.write_bytes(pack_tensors(tensors, "gmmtorch.mixture", 1, **known))
+    return path
 
 
 def random_spd(rng: np.random.Generator, n: int, dim: int, scale: float = 1.0) -> np.ndarray:

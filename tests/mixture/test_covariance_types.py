@@ -1,4 +1,4 @@
-"""Covariance types of both estimators, and what else users of scikit-learn's classes rely on."""
+"""Covariance types, and what else users of scikit-learn's classes and tools rely on."""
 
 from __future__ import annotations
 
@@ -8,9 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-import sklearn.mixture
+import scipy.sparse
+import sklearn
 import torch
 from mixture.mixture_cases import blobs, given_start
+from sklearn.datasets import load_iris
+from sklearn.decomposition import PCA
+from sklearn.metrics import adjusted_rand_score
+from sklearn.model_selection import GridSearchCV, KFold, cross_val_score
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
 from sklearn.utils._param_validation import InvalidParameterError
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
@@ -31,27 +38,6 @@ def start(kind: str) -> dict[str, Any]:
     given = given_start(3)
     precisions = compact(constrain(torch.from_numpy(given["precisions_init"]), kind), kind)
     return {**given, "covariance_type": kind, "precisions_init": precisions.numpy()}
-
-
-# -- the result of scikit-learn ----------------------------------------------------------------------
-
-
-@types
-@pytest.mark.parametrize("options", [{}, {"tol": 1e-7, "max_iter": 300}, {"max_iter": 2, "reg_covar": 0.1}])
-def test_each_type_gives_the_result_of_scikit_learn(kind, options):
-    x, test = cloud(), cloud(50, 9)
-    found = GaussianMixture(3, dtype="float64", **start(kind), **options).fit(x)
-    expected = sklearn.mixture.GaussianMixture(3, **start(kind), **options).fit(x)
-    assert found.n_iter_ == expected.n_iter_
-    assert found.converged_ == expected.converged_
-    names = ("weights_", "means_", "covariances_", "precisions_", "precisions_cholesky_", "lower_bounds_")
-    for name in names:
-        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-6, atol=1e-6)
-    for name in ("score_samples", "predict_proba"):
-        np.testing.assert_allclose(getattr(found, name)(test), getattr(expected, name)(test), atol=1e-6)
-    assert (found.predict(test) == expected.predict(test)).all()
-    for name in ("score", "bic", "aic"):
-        assert getattr(found, name)(test) == pytest.approx(getattr(expected, name)(test), rel=1e-6)
 
 
 # -- shapes and other operations ---------------------------------------------------------------------
@@ -213,3 +199,58 @@ def test_initializations_of_scikit_learn(init):
     else:
         assert all((np.abs(x - mean).max(1) < 1e-9).any() for mean in mixture.means_)
         np.testing.assert_allclose(mixture.covariances_, np.tile(1e-6 * np.eye(3), (3, 1, 1)))
+
+
+# -- pipelines, searches, parallel jobs, the array API ------------------------------------------------
+
+IRIS = load_iris()
+FOLDS = KFold(3, shuffle=True, random_state=0)
+
+
+@estimators
+def test_search_in_parallel_jobs_chooses_by_the_score_of_the_pipeline(estimator):
+    pipeline = make_pipeline(StandardScaler(), PCA(3), estimator(2, random_state=0))
+    name = estimator.__name__.lower()
+    grid = {f"{name}__covariance_type": ["full", "spherical"]}
+    search = GridSearchCV(pipeline, grid, cv=FOLDS, n_jobs=2).fit(IRIS.data)
+    for parameters, found in zip(
+        search.cv_results_["params"], search.cv_results_["mean_test_score"], strict=True
+    ):
+        one = cross_val_score(pipeline.set_params(**parameters), IRIS.data, cv=FOLDS).mean()
+        assert found == pytest.approx(one, rel=1e-6)
+    assert search.best_params_[f"{name}__covariance_type"] == "full"
+    assert search.score(IRIS.data) == search.best_estimator_.score(IRIS.data)
+
+
+@estimators
+def test_tables_of_a_pipeline_name_the_columns_of_the_mixture(estimator):
+    pandas = pytest.importorskip("pandas")
+    table = pandas.DataFrame(IRIS.data, columns=IRIS.feature_names)
+    pipeline = make_pipeline(StandardScaler(), estimator(3, random_state=0)).set_output(transform="pandas")
+    pipeline.fit(table)
+    assert list(pipeline[-1].feature_names_in_) == IRIS.feature_names
+    plain = make_pipeline(StandardScaler(), estimator(3, random_state=0)).fit(IRIS.data)
+    np.testing.assert_array_equal(pipeline.predict(table), plain.predict(IRIS.data))
+
+
+@estimators
+def test_pipeline_of_tensors_gives_tensors(estimator, monkeypatch):
+    monkeypatch.setenv("SCIPY_ARRAY_API", "1")
+    x = torch.from_numpy(IRIS.data)
+    with sklearn.config_context(array_api_dispatch=True):
+        pipeline = make_pipeline(StandardScaler(), estimator(3, random_state=0)).fit(x)
+        labels, shares = pipeline.predict(x), pipeline.predict_proba(x)
+    assert isinstance(labels, torch.Tensor)
+    assert isinstance(shares, torch.Tensor)
+    assert isinstance(pipeline[-1].means_, torch.Tensor)
+    plain = make_pipeline(StandardScaler(), estimator(3, random_state=0)).fit(IRIS.data)
+    np.testing.assert_allclose(shares.numpy(), plain.predict_proba(IRIS.data), atol=1e-6)
+    assert adjusted_rand_score(IRIS.target, labels.numpy()) > 0.5
+
+
+@estimators
+def test_sparse_tables_and_more_components_than_points_are_errors(estimator):
+    with pytest.raises(TypeError, match=r"[Ss]parse"):
+        estimator(2).fit(scipy.sparse.csr_array(IRIS.data))
+    with pytest.raises(InvalidArgumentError, match="n_components=151"):
+        estimator(151).fit(IRIS.data)

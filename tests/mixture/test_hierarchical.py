@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mixture.estimator_contract import MixtureContract
 from mixture.fit_contract import FAR, FitContract, blobs, check_mixture, rigid_motion
+from mixture.mixture_cases import MISSING, changed_file
 from mixture.tree_cases import exact, room, split_nodes
+from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, NumericalError
-from gmmtorch.files import pack_tensors, read_tensors
 from gmmtorch.mixture import GaussianMixture, HierarchicalGaussianMixture, LaserModel, prune
-from gmmtorch.mixture.estimators.hierarchical import check_tree
 from gmmtorch.mixture.estimators.tree_growth import Children, Tree, keep_children
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
@@ -258,45 +258,26 @@ def test_moved_moves_the_tree():
     assert_same_tree(tree, deep())
 
 
-def broken(change: str, tree: Tree) -> Tree:
-    parents, weights, means, covariances = (value.clone() for value in tree)
-    if change == "cycle":
-        parents[0] = len(parents) - 1
-    elif change == "self":
-        parents[3] = 3
-    elif change == "negative":
-        parents[0] = -2
-    elif change == "beyond":
-        parents[-1] = len(parents)
-    elif change == "leaves":
-        parents[-1] = -1
-        weights[-1] = 0.5
-    elif change == "type":
-        parents = parents.double()
-    elif change == "short":
-        means = means[:-1]
-    elif change == "single":
-        covariances = covariances.float()
-    elif change == "shape":
-        parents = parents[None]
-    return Tree(parents, weights, means, covariances)
-
-
 @pytest.mark.parametrize(
-    "change", ["cycle", "self", "negative", "beyond", "leaves", "type", "short", "single", "shape", "missing"]
+    ("name", "change"),
+    [
+        ("parents", lambda p: torch.cat([p.new_tensor([len(p) - 1]), p[1:]])),  # a cycle
+        ("parents", lambda p: torch.where(torch.arange(len(p)) == 3, 3, p)),  # its own parent
+        ("parents", lambda p: torch.where(torch.arange(len(p)) == 0, -2, p)),
+        ("parents", lambda p: torch.cat([p[:-1], p.new_tensor([len(p)])])),
+        ("weights", lambda w: torch.cat([w[:-1], w.new_tensor([0.5])])),  # not those of the mixture
+        ("parents", Tensor.double),
+        ("parents", lambda p: p[None]),
+        ("means", lambda m: m[:-1].clone()),
+        ("means", lambda m: MISSING),
+        ("covariances", Tensor.float),
+    ],
 )
-def test_file_with_an_invalid_tree_is_rejected(tmp_path, change):
-    tree, path = deep(), tmp_path / "tree.safetensors"
-    tree.save(path)
-    tensors, facts = read_tensors(path, "gmmtorch.mixture", 1)
-    check_tree(tree._tree(), tree.weights)
-    names = HierarchicalGaussianMixture._extra_names
-    tensors |= {f"extra.{n}": v for n, v in zip(names, broken(change, tree._tree()), strict=True)}
-    if change == "missing":
-        del tensors["extra.node_means"]
-    path.write_bytes(pack_tensors(tensors, "gmmtorch.mixture", 1, **facts))
-    with pytest.raises(DataError, match=r"tree\.safetensors"):
-        HierarchicalGaussianMixture.load(path)
+def test_file_with_an_invalid_tree_is_rejected(tmp_path, name, change):
+    tree = deep()
+    value = change(getattr(tree._tree(), name).clone())
+    with pytest.raises(DataError, match=r"m\.safetensors"):
+        HierarchicalGaussianMixture.load(changed_file(tree, tmp_path, {f"extra.node_{name}": value}))
 
 
 # -- limits of the splits --------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Starting parameters of EM."""
+"""Starting parameters of EM, and k-means: beside scikit-learn's, and by its definition."""
 
 from __future__ import annotations
 
@@ -11,24 +11,29 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from kernels.twins import by_both
 from mixture.fit_contract import check_mixture, degenerate_clouds, move, rigid_motion
 from mixture.mixture_cases import cloud, thin_wall
 from sklearn.base import clone
+from sklearn.cluster import KMeans
+from sklearn.datasets import load_digits, load_iris
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mixture import GaussianMixture
 from gmmtorch.mixture.em import initialization
+from gmmtorch.mixture.em import kmeans as module
 from gmmtorch.mixture.em.exact import Parameters, quadratic_features
 from gmmtorch.mixture.em.initialization import (
     INITIALIZATIONS,
-    Distinct,
+    distinct,
     flat_pieces,
     initialize,
     moments_of,
     replicated,
     surface_pieces,
 )
+from gmmtorch.mixture.em.kmeans import kmeans, spread_out
 from gmmtorch.mixture.em.partition import least_support, pool_into_cells
 
 METHODS = sorted(INITIALIZATIONS)
@@ -43,20 +48,20 @@ def begin(method: str, points: Tensor, k: int, weight: Tensor | None = None, see
 def test_distinct_points_have_summed_weights_in_any_order_and_at_minus_zero():
     points = torch.tensor([[1.0, 2.0], [-0.0, 5.0], [1.0, 2.0], [1.0, -3.0], [0.0, 5.0]]).double()
     weight = torch.tensor([1.0, 2.0, 3.0, 0.5, 4.0]).double()
-    *_, rows, mass = Distinct.of(points, weight)
+    rows, mass = distinct(points, weight)
     assert dict(zip(map(tuple, points[rows].tolist()), mass.tolist(), strict=True)) == {
         (0.0, 5.0): 6.0,
         (1.0, -3.0): 0.5,
         (1.0, 2.0): 4.0,
     }
-    other = Distinct.of(points.flip(0), weight.flip(0))
-    assert torch.equal(points.flip(0)[other.rows], points[rows])
+    other, _ = distinct(points.flip(0), weight.flip(0))
+    assert torch.equal(points.flip(0)[other], points[rows])
 
 
 @given(st.integers(0, 999), st.integers(1, 60), st.integers(1, 6), st.integers(1, 3))
 def test_distinct_points_are_those_of_numpy(seed, n, dim, places):
     points = np.random.default_rng(seed).integers(0, places, (n, dim)) * 2.0**40
-    *_, rows, mass = Distinct.of(torch.from_numpy(points), torch.ones(n).double())
+    rows, mass = distinct(torch.from_numpy(points), torch.ones(n).double())
     expected, count = np.unique(points, axis=0, return_counts=True)
     order = np.lexsort(points[rows.numpy()].T[::-1])
     np.testing.assert_array_equal(points[rows.numpy()][order], expected)
@@ -192,7 +197,7 @@ def test_moments_of_distant_thin_pieces_keep_their_digits():
 def test_replicated_components_share_the_weight(k):
     weights = torch.tensor([0.5, 0.3, 0.2], dtype=torch.float64)
     found = Parameters(weights, cloud(3, 2), torch.eye(2, dtype=torch.float64).repeat(3, 1, 1))
-    many, copy = replicated(found, k)
+    many, copy = replicated(found, k), torch.arange(k) % 3
     assert many.weights.shape == (k,)
     assert torch.equal(many.means, found.means[copy])
     sums = torch.zeros(3, dtype=torch.float64).index_add_(0, copy, many.weights)
@@ -407,3 +412,74 @@ def test_given_start_is_rejected(name):
 def test_invalid_noise_is_rejected(noise):
     with pytest.raises(InvalidArgumentError, match=r"^noise"):
         GaussianMixture(None, noise=noise).fit(room(10))
+
+
+# -- k-means ---------------------------------------------------------------------------------------
+
+
+def clusters(x: np.ndarray, k: int, seed: int, n_runs: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    points = torch.from_numpy(x - x.mean(0))
+    weight = torch.ones(len(x)).double()
+    nearest, scatter = kmeans(
+        points, weight, *distinct(points, weight), k, torch.Generator().manual_seed(seed), n_runs
+    )
+    return nearest.numpy(), scatter.numpy()
+
+
+def scatter_of(x: np.ndarray, labels: np.ndarray) -> float:
+    return sum(float(((x[labels == k] - x[labels == k].mean(0)) ** 2).sum()) for k in np.unique(labels))
+
+
+@pytest.mark.parametrize(("table", "k"), [(load_digits, 10), (load_iris, 3), (load_iris, 40)])
+def test_runs_are_as_good_as_those_of_scikit_learn(table, k):
+    x = table().data
+    _, ours = clusters(x, k, 0, 12)
+    theirs = [KMeans(k, n_init=1, random_state=seed).fit(x).inertia_ for seed in range(12)]
+    assert ours.mean() < 1.02 * np.mean(theirs)
+    assert ours.min() < 1.005 * np.min(theirs)
+
+
+@given(st.integers(0, 999), st.integers(2, 80), st.integers(1, 7), st.integers(1, 5), st.integers(1, 3))
+def test_clusters_are_not_empty_and_improve_in_no_step_of_lloyd(seed, n, dim, k, n_runs):
+    x = np.random.default_rng(seed).normal(size=(n, dim))
+    k = min(k, n)
+    nearest, scatter = clusters(x, k, seed, n_runs)
+    for labels, value in zip(nearest, scatter, strict=True):
+        assert len(np.unique(labels)) == k
+        means = np.stack([x[labels == j].mean(0) for j in range(k)])
+        next_labels = ((x[:, None] - means) ** 2).sum(2).argmin(1)
+        assert scatter_of(x, next_labels) >= (1 - 1e-3) * scatter_of(x, labels)
+        assert value == pytest.approx(scatter_of(x, labels), rel=1e-3, abs=1e-9)
+
+
+def test_centers_are_distinct_points_even_if_far_ones_are_few():
+    x = torch.cat([torch.zeros(500, 2), torch.arange(5.0)[:, None].expand(5, 2) * 1e8]).double()
+    weight = torch.ones(505).double()
+    rows, mass = distinct(x, weight)
+    assert len(rows) == 5
+    chosen = spread_out(x, weight, rows, mass, 5, torch.Generator().manual_seed(0), 4)
+    assert all(len(set(map(tuple, x[own].tolist()))) == 5 for own in chosen)
+
+
+def test_empty_clusters_continue_at_the_farthest_points(monkeypatch):
+    x = np.repeat(np.array([[-9.0], [0.0], [1.0], [20.0]]), 3, 0)
+    monkeypatch.setattr(module, "spread_out", lambda points, *_: torch.tensor([[0, 1, 2, 3]]))
+    for labels, scatter in by_both(lambda: clusters(x, 4, 0)):  # of four centers, three are equal
+        assert scatter[0] < 1e-9
+        assert sorted(np.bincount(labels[0]).tolist()) == [3, 3, 3, 3]
+
+
+@given(st.integers(0, 999), st.integers(2, 60), st.integers(1, 9), st.integers(1, 20))
+def test_one_launch_finds_what_the_twin_finds(seed, n, dim, k):
+    rng = np.random.default_rng(seed)
+    weight = torch.from_numpy(rng.random(n) + 0.5)
+    points = torch.from_numpy(rng.normal(size=(n, dim)))
+    cloud = (points, weight, *distinct(points, weight))
+    twin, fused = by_both(lambda: kmeans(*cloud, min(k, n), torch.Generator().manual_seed(seed)))
+    torch.testing.assert_close(fused, twin)
+
+
+def test_equal_and_extreme_points_have_clusters():
+    for x in (np.repeat(np.arange(5.0), 9)[:, None] * 1e8, np.full((20, 3), 1e200), np.eye(12)):
+        labels, _ = clusters(x, len(np.unique(x, axis=0)), 0, 3)
+        assert all(len(np.unique(own)) == len(np.unique(x, axis=0)) for own in labels)

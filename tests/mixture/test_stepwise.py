@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import copy
 import math
-import pickle
 
 import numpy as np
 import pytest
@@ -12,11 +10,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mixture.fit_contract import CENTERS, FAR
+from mixture.mixture_cases import changed_file
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.files import pack_tensors
 from gmmtorch.mixture import GaussianMixture
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
@@ -114,33 +112,6 @@ def test_statistics_follow_their_recursion(dim, kappa):
 # -- where it leads -------------------------------------------------------------------------------------
 
 
-def test_many_passes_in_small_batches_converge_to_em():
-    x = blobs(1000, 2, scale=1.5)
-    converged = exact(tol=1e-9, max_iter=2000).fit(x)
-    rng, gmm = np.random.default_rng(0), exact()
-    for _ in range(20):
-        for part in np.array_split(rng.permutation(1000), 20):
-            gmm.partial_fit(x[part])
-    first = exact().partial_fit(x[:50])
-    assert gmm.score(x) > converged.score(x) - 0.002
-    assert gmm.score(x) > first.score(x) + 0.02
-
-
-def test_short_memory_follows_a_changing_scene():
-    def at(time: int) -> np.ndarray:
-        return blobs(200, 2, seed=time) + 0.02 * time
-
-    followers = {memory: exact() for memory in (200.0, None)}
-    for time in range(150):
-        for memory, gmm in followers.items():
-            gmm.partial_fit(at(time), kappa=1.0, memory=memory)
-    scores = {memory: gmm.score(at(149)) for memory, gmm in followers.items()}
-    anew = exact(max_iter=200).fit(at(149)).score(at(149))
-    assert scores[200.0] > anew - 0.05
-    assert scores[None] < anew - 0.3
-    assert followers[200.0].n_samples_seen_ == 400
-
-
 # -- going on from something else -----------------------------------------------------------------------
 
 
@@ -171,27 +142,6 @@ def test_partial_fit_of_given_parameters_needs_memory():
     assert given.n_samples_seen_ == 400
 
 
-@pytest.mark.parametrize(
-    "keeper",
-    [
-        copy.deepcopy,
-        lambda g: pickle.loads(pickle.dumps(g)),
-        lambda g: g.moved(np.eye(3)),
-        lambda g: (g.save("m.safetensors"), GaussianMixture.load("m.safetensors"))[1],
-    ],
-    ids=["deepcopy", "pickle", "transform", "file"],
-)
-def test_copies_files_and_motions_can_continue_partial_fit(keeper, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    gmm = exact().partial_fit(blobs(100)).partial_fit(blobs(30, seed=1))
-    kept = keeper(gmm)
-    assert kept.n_samples_seen_ == 130
-    before = gmm.means_.copy()
-    kept.partial_fit(blobs(50, seed=2))
-    np.testing.assert_array_equal(gmm.means_, before)
-    assert_same(kept, gmm.partial_fit(blobs(50, seed=2)), 1e-13)
-
-
 def test_state_dict_has_only_the_parameters():
     gmm = exact().partial_fit(blobs())
     assert set(gmm.state_dict()) == {"weights", "means", "covariances"}
@@ -204,18 +154,10 @@ def test_state_dict_has_only_the_parameters():
 @pytest.mark.parametrize("seen", [torch.tensor(-1.0), torch.tensor([1.0, 2.0]), torch.zeros(0)])
 def test_file_with_an_invalid_count_is_rejected(tmp_path, seen):
     gmm = exact().fit(blobs())
-    tensors = {name: getattr(gmm, name) for name in ("weights", "means", "covariances")}
-    facts = {"lower_bounds": [-1.0], "converged": True, "arrays": True, "parameters": {"n_components": 3}}
-    for value, refused in ((torch.tensor(7.0), False), (seen, True)):
-        packed = pack_tensors(
-            {**tensors, "extra.n_samples_seen": value.double()}, "gmmtorch.mixture", 1, **facts
-        )
-        (tmp_path / "m.safetensors").write_bytes(packed)
-        if refused:
-            with pytest.raises(DataError, match="n_samples_seen"):
-                GaussianMixture.load(tmp_path / "m.safetensors")
-        else:
-            assert GaussianMixture.load(tmp_path / "m.safetensors").n_samples_seen_ == 7
+    whole = changed_file(gmm, tmp_path, {"extra.n_samples_seen": torch.tensor(7.0).double()})
+    assert GaussianMixture.load(whole).n_samples_seen_ == 7
+    with pytest.raises(DataError, match="n_samples_seen"):
+        GaussianMixture.load(changed_file(gmm, tmp_path, {"extra.n_samples_seen": seen.double()}))
 
 
 # -- frames, weights and kinds ----------------------------------------------------------------------------

@@ -12,15 +12,9 @@ from mixture.fit_contract import blobs
 from mixture.tree_cases import exact, room
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
-from torch import Tensor
 
 from gmmtorch.mixture.estimators import tree_growth
 from gmmtorch.mixture.estimators.hierarchical import HierarchicalGaussianMixture
-from gmmtorch.mixture.estimators.tree_growth import (
-    Children,
-    Members,
-    fit_children,
-)
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 
@@ -127,7 +121,7 @@ class NaiveTree:
 @pytest.mark.parametrize("branching", [2, 5])
 def test_tree_equals_a_naive_implementation(dim, branching):
     rng = np.random.default_rng(dim)
-    points = np.concatenate([room(240, noise=0.002)[:, :dim], blobs(dim, 80)])
+    points = np.concatenate([room(160, noise=0.002)[:, :dim], blobs(dim, 60)])
     weight = rng.uniform(0.2, 3.0, len(points))
     rule: dict[str, Any] = {
         "branching": branching,
@@ -160,38 +154,6 @@ def rows_of(nodes: list[tuple[int, float, np.ndarray, np.ndarray]]) -> list[np.n
         values = (above_weight, above_mean, above, weight, mean, covariance)
         rows.append(np.concatenate([np.ravel(value) for value in values]))
     return sorted(rows, key=lambda row: tuple(np.round(row, 4)))
-
-
-def present(children: Children, node: int) -> Children:
-    """The children of a node with weight above zero, from left to right."""
-    order = children.means[node, :, 0].argsort()
-    return Children(*(value[node][order][children.weights[node][order] > 0] for value in children))
-
-
-def test_nodes_of_a_batch_are_fitted_independently():
-    """The nodes have very different numbers of points; some have fewer places than children."""
-    points = torch.from_numpy(room(400))
-    points[:30] = points[0]
-    points[30:60] = points[[30, 31] * 15]
-    node = torch.repeat_interleave(torch.arange(5), torch.tensor([30, 30, 40, 250, 50]))
-    shuffle = torch.randperm(400, generator=torch.Generator().manual_seed(0))
-    members = Members(shuffle, node[shuffle], 0.5 + torch.arange(400).double() % 7)
-    rule = exact(reg_covar=1e-4, tol=1e-4, max_iter=40)
-
-    def learn(members: Members, centers: Tensor) -> tuple[Children, list[Tensor]]:
-        values: list[Tensor] = []
-        return fit_children(points, members, centers, 6, rule, lambda v: values.append(v.clone()))[1], values
-
-    centers = torch.stack([points[node == i].mean(0) for i in range(5)])
-    together, values = learn(members, centers)
-    assert (together.weights > 0).sum(1).tolist() == [1, 2, 6, 6, 6]
-    for i in range(5):
-        separate, _ = learn(members.select(torch.tensor([i]), 5), centers[i : i + 1])
-        for found, expected in zip(present(together, i), present(separate, 0), strict=True):
-            torch.testing.assert_close(found, expected, rtol=1e-7, atol=1e-9)
-    rises = torch.stack(values).diff(dim=0)
-    assert bool((rises > -1e-3).all())
-    assert int((rises[-1] == 0).sum()) >= 3  # the nodes converge independently
 
 
 def test_features_that_are_made_again_give_the_same_tree(monkeypatch):

@@ -10,12 +10,21 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from mixture.fit_contract import check_mixture
-from mixture.mixture_cases import beads, cloud, random_parameters, random_weight, rows_of, thin_wall
+from mixture.mixture_cases import (
+    beads,
+    cloud,
+    direct_step,
+    random_parameters,
+    random_weight,
+    rows_of,
+    thin_wall,
+)
 from torch import Tensor
 
 from gmmtorch.mixture import GaussianMixture
-from gmmtorch.mixture.em import by_type, loop, truncated
 from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em import loop, truncated
+from gmmtorch.mixture.em.by_type import log_joint
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.initialization import flat_pieces, moments_of
 from gmmtorch.mixture.em.truncated import (
@@ -94,7 +103,7 @@ def test_result_is_at_least_as_good_as_the_last_bound(seed, dim, k, n_candidates
     found, owner, candidates = run_truncated(
         rows_of(points, weight), nearest(points, parameters.means), parameters, setup
     )
-    joint = em.log_joint(points, found.parameters)
+    joint = log_joint(found.parameters, "full")(points).T
     allowed = torch.full_like(joint, -torch.inf).scatter(1, candidates[owner], 0.0)
     bound, score = (torch.logsumexp(j, 1) @ weight / weight.sum() for j in (joint + allowed, joint))
     assert found.lower_bounds[-1] - 1e-7 <= float(bound) <= float(score) + 1e-12
@@ -104,7 +113,7 @@ def test_one_iteration_equals_one_em_step():
     points, weight, parameters = cloud(500, 3), random_weight(500), random_parameters(5, 3)
     setup = Settings(1e-6, 0.0, 1, torch.float64)
     found, *_ = run_truncated(rows_of(points, weight), nearest(points, parameters.means), parameters, setup)
-    step = loop.natural_step(em.quadratic_features(points), weight, 1e-6, torch.float64)
+    step = loop.em_step(Rows(em.quadratic_features(points), weight, False), 1e-6, torch.float64)
     expected, bound = step(parameters)
     assert found.lower_bounds == [pytest.approx(bound, rel=1e-12)]
     torch.testing.assert_close(tuple(found.parameters), tuple(expected), rtol=1e-9, atol=1e-10)
@@ -124,7 +133,7 @@ def test_momentum_converges_faster_than_em(n_iter, share):
         torch.full((2, 1, 1), 2.0, dtype=torch.float64),
     )
     rows, owner = rows_of(points), torch.zeros(3000, dtype=torch.int64)
-    step = loop.natural_step(rows.features(), rows.weight, 0.0, torch.float64)
+    step = loop.em_step(Rows(em.quadratic_features(points), rows.weight, False), 0.0, torch.float64)
     plain = loop.run_em(step, parameters, tol=0.0, max_iter=n_iter)
     found, *_ = run_truncated(rows, owner, parameters, Settings(0.0, 0.0, n_iter, torch.float64))
     assert found.n_iter == n_iter
@@ -142,13 +151,13 @@ class Spy:
         monkeypatch.setattr(truncated, "truncated_expectation", self)
 
     def __call__(self, groups, candidates, parameters, want_owner=False, *rest):
-        found = truncated_expectation(groups, candidates, parameters, want_owner, *rest)
+        statistics, value, owner = truncated_expectation(groups, candidates, parameters, want_owner, *rest)
         if len(self.given) in self.failing:
-            found = found._replace(value=found.value - 1e6)
+            value -= 1e6
         self.given.append(parameters)
         self.dtypes.append(groups.features.dtype)
         self.sets.append(candidates)
-        return found
+        return statistics, value, owner
 
 
 def run_on_beads(max_iter: int) -> loop.EMResult:
@@ -196,7 +205,7 @@ def test_large_thin_cloud_uses_float64_and_equals_em(size, dtype, monkeypatch):
     spy = Spy(monkeypatch)
     found, *_ = run_truncated(rows, owner, parameters, setup)
     assert spy.dtypes == [dtype]
-    expected, total = by_type.direct_step(points, rows.weight, parameters, 1e-6)
+    expected, total = direct_step(points, rows.weight, parameters, 1e-6)
     tolerance = 1e-8 if dtype == torch.float64 else 1e-3
     assert found.lower_bounds[0] == pytest.approx(float(total) / 4000, abs=tolerance)
     least, truth = (torch.linalg.eigvalsh(p.covariances)[:, 0] for p in (found.parameters, expected))
@@ -212,7 +221,7 @@ def test_components_that_become_thin_switch_to_float64(monkeypatch):
     found, *_ = run_truncated(rows, owner, parameters, Settings(1e-6, 0.0, 2))
     assert spy.dtypes == [torch.float32, torch.float64]
     for at, bound in zip(spy.given, found.lower_bounds, strict=True):
-        score = torch.logsumexp(em.log_joint(points, at), 1).mean()
+        score = torch.logsumexp(log_joint(at, "full")(points), 0).mean()
         assert bound == pytest.approx(float(score), abs=1e-4)
     thinnest = torch.linalg.eigvalsh(found.parameters.covariances)[:, 0]
     torch.testing.assert_close(thinnest, torch.full_like(thinnest, 1.01e-6), rtol=0.01, atol=0)

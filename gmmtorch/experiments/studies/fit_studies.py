@@ -41,9 +41,9 @@ from gmmtorch.mixture import (
     GaussianMixture,
     HierarchicalGaussianMixture,
     MixtureEstimator,
+    Rows,
+    em_step,
     initialize,
-    natural_step,
-    quadratic_features,
     run_em,
     surface_pieces,
 )
@@ -110,9 +110,7 @@ def fit_timed(
     if covariance == "box":
         first = first._replace(covariances=box_covariances(points, n_components))
     between = time.perf_counter()
-    step = natural_step(
-        quadratic_features(points), weight, options.reg_covar, SOFTMAX_DTYPES[options.dtype], points
-    )
+    step = em_step(Rows(points, weight), options.reg_covar, SOFTMAX_DTYPES[options.dtype])
     found = run_em(step, first, tol=options.tol, max_iter=options.max_iter)
     end = time.perf_counter()
     weights, means, covariances = found.parameters

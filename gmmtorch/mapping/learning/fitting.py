@@ -28,10 +28,11 @@ from gmmtorch.mixture import (
     Cells,
     FlatnessRule,
     Parameters,
+    Rows,
     coarsest_allowed,
+    em_step,
     maximization,
     most_likely_component,
-    natural_step,
     partition,
     pool,
     pool_into_cells,
@@ -445,7 +446,7 @@ def _from_tree(window: _Window, fit: SurfaceFit) -> _Learned:
         seen = window.counts(cells.member, cells.weight.shape[0])
         limit = DensityLimit(rule.min_density_share, window.sensor, window.origins, seen)
     means = cells.features[:, 1 : 1 + window.points.shape[1]].contiguous()
-    grown = grow(means, cells.weight, tree, density=limit).tree
+    grown, _, _ = grow(means, cells.weight, tree, density=limit)
     leaves = grown.leaves()
     mixture = Parameters(grown.weights[leaves], grown.means[leaves], grown.covariances[leaves])
     owner = most_likely_component(cells.features, mixture)
@@ -466,5 +467,5 @@ def _mixture_of(features: Tensor, weight: Tensor, dim: int, fit: SurfaceFit) -> 
     pieces = partition(means, weight, fit.flatness, *moments)
     smallest_variance = fit.noise**2
     first = maximization(pool(features, weight, pieces.labels, pieces.n_pieces), smallest_variance)
-    step = natural_step(features, weight, smallest_variance, fit.dtype)
+    step = em_step(Rows(features, weight, are_points=False), smallest_variance, fit.dtype)
     return run_em(step, first, tol=_TOLERANCE, max_iter=fit.iterations).parameters

@@ -1,10 +1,11 @@
-"""EM in many dimensions: each covariance type has the arithmetic that it needs.
+"""EM steps: each covariance type has the arithmetic that it needs.
 
 Covariances have the shape of their type: full (K, D, D), tied (D, D), diag (K, D), spherical (K,).
 
  - spherical, diag: log π_k + log N(x|k) is linear in [1, x, |x|²] or [1, x, x²]: products of O(NKD).
  - tied: the same as spherical after one whitening, x ↦ L⁻¹ x.
- - full, few dimensions: linear in [1, x, x_i x_j (i ≤ j)], see `exact`; its products are the smallest.
+ - full, few dimensions: linear in [1, x, x_i x_j (i ≤ j)], see `exact`; its products are the smallest. Up to
+   three dimensions all types use them.
  - full, more dimensions: ‖L⁻¹x − L⁻¹μ‖², a block of components at a time. Second moments are taken about
    the component's last mean, on a CPU only of the points that it has a share in.
 
@@ -17,29 +18,26 @@ again in the direct form, ‖L⁻¹x − L⁻¹μ‖² for every type.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Iterator
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from gmmtorch.errors import NumericalError
-from gmmtorch.kernels import chunk_elements, chunked, softmax
-from gmmtorch.linalg import safe_cholesky, unpack_symmetric
+from gmmtorch.kernels import chunk_elements, chunked, in_spatial_order, softmax
+from gmmtorch.linalg import inverse_factor, safe_cholesky, unpack_symmetric
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.exact import Parameters
 
 _MOST_LOST = 1e-6  # nats a dimension that the log-density of the linear form may lose
 _MOST_LOST_VARIANCE = 1e-5  # share of a variance that the moments of the linear form may lose
 _ROWS = (512, 1 << 16)  # points of a product of the direct form, on a CPU and elsewhere
+FEW_DIMENSIONS = 3  # up to which all types take the E-step of `exact`, whose kernels are the fastest
 _NO_SHARE = 1e-16  # of the largest responsibility of a component in a chunk: such points do not count
 
-
-class Joint(Protocol):
-    """From points (n, D) to log π_k + log N(x|k), (K, n). `square`: their `squares`, if they are known."""
-
-    def __call__(self, points: Tensor, square: Tensor | None = None) -> Tensor: ...
+Joint = Callable[..., Tensor]
+"""From points (n, D), and their `squares` if they are known, to log π_k + log N(x|k), (K, n)."""
 
 
 def has_linear_form(n_components: int, dim: int, kind: str) -> bool:
@@ -55,6 +53,11 @@ def compacted(parameters: Parameters, kind: str) -> Parameters:
     """The nearest covariances of the type, in its shape, to those (K, D, D)."""
     covariances = em.constrain(parameters.covariances, kind, parameters.weights)
     return parameters._replace(covariances=em.compact(covariances, kind))
+
+
+def expanded(parameters: Parameters, kind: str) -> Parameters:
+    """The parameters with covariances (K, D, D), given in the shape of their type."""
+    return parameters._replace(covariances=em.expand(parameters.covariances, kind, *parameters.means.shape))
 
 
 # -- log-densities --------------------------------------------------------------------------------
@@ -78,7 +81,7 @@ class Factors:
                 factors, info = torch.linalg.cholesky_ex(covariances)
                 self.failed = (info != 0).any()
             half_log_det = factors.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-            self.whiten = _invert(factors)
+            self.whiten = inverse_factor(factors).mT if factors.requires_grad else _invert(factors)
         else:
             self.failed = ~(covariances > 0).all()
             if check and bool(self.failed):
@@ -105,12 +108,19 @@ class Factors:
         size = self.whitened_means().square().sum(1) * self.weights.sign()
         return size.amax() * torch.finfo(size.dtype).eps > _MOST_LOST * self.dim
 
+    def natural(self) -> Tensor:
+        """The natural parameters (K, F) of `exact`, whatever the type."""
+        matrices = self.kind in ("full", "tied")
+        precision = self.whiten.mT @ self.whiten if matrices else self.whiten.square()
+        precision = em.expand(precision, self.kind, *self.means.shape)
+        return em.natural_of_precisions(precision, self.means, self.constant)
+
     def linear(self) -> Joint:
         """The linear form."""
         kind, means, dim = self.kind, self.means, self.dim
         if kind == "full":
-            weights = em.natural_of_precisions(self.whiten.mT @ self.whiten, means, self.constant)
-            constant, slope, curve = weights[:, 0], weights[:, 1 : 1 + dim], weights[:, 1 + dim :]
+            natural = self.natural()
+            constant, slope, curve = natural[:, 0], natural[:, 1 : 1 + dim], natural[:, 1 + dim :]
         elif kind == "tied":
             slope = self.whitened_means()
             constant = self.constant - 0.5 * slope.square().sum(1)
@@ -237,6 +247,19 @@ class Sums:
         else:
             self._second = like.new_zeros((k, dim, dim) if kind == "full" else (dim, dim))
 
+    @classmethod
+    def of(cls, statistics: Tensor, like: Tensor, kind: str) -> Sums:
+        """The sums of S (K, F) of `exact`."""
+        dim, second = like.shape[1], statistics[:, 1 + like.shape[1] :]
+        found = cls(len(statistics), like, kind)
+        found._count, found._first = statistics[:, 0], statistics[:, 1 : 1 + dim]
+        if kind != "full":
+            matrices = unpack_symmetric(second, dim)
+            second = matrices.sum(0) if kind == "tied" else matrices.diagonal(dim1=-2, dim2=-1)
+            second = second.sum(1, keepdim=True) if kind == "spherical" else second
+        found._second = second.clone()
+        return found
+
     def add(self, points: Tensor, gamma: Tensor, square: Tensor | None = None) -> None:
         """Add points (n, D) with responsibilities (K, n). `square`: their `squares`, if they are known."""
         self._count += gamma.sum(1)
@@ -330,11 +353,18 @@ def expected_moments(
     softmax_dtype: torch.dtype,
     linear: bool,
     about: Tensor | None = None,
+    rows: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Sums, Tensor]:
     """E-step (2.3): moments of the responsibilities, and Σ_n p_n log p(x_n), ().
 
-    Direct unless `linear`, with second moments about the last means, or `about` (K, D).
+    Direct unless `linear`, with second moments about the last means, or `about` (K, D). `rows`: see
+    `rows_of_few_dimensions`.
     """
+    if points.shape[1] <= FEW_DIMENSIONS and linear:
+        rows = (em.quadratic_features(points), sample_weight) if rows is None else rows
+        statistics, value = em.expectation(*rows, factors.natural(), softmax_dtype)
+        return Sums.of(statistics, points, factors.kind), value
+    softmax_dtype = torch.float64 if points.shape[1] <= FEW_DIMENSIONS else softmax_dtype
     (n, dim), k, kind = points.shape, factors.means.shape[0], factors.kind
     joint = factors.linear() if linear else factors.direct()
 
@@ -349,6 +379,13 @@ def expected_moments(
         sums.add(some, gamma, square)
         total += value
     return sums, total
+
+
+def rows_of_few_dimensions(points: Tensor, sample_weight: Tensor) -> tuple[Tensor, Tensor] | None:
+    """Features and weights of points, once for all E-steps, in the order in which these are fastest."""
+    if points.shape[1] > FEW_DIMENSIONS:
+        return None
+    return in_spatial_order(em.quadratic_features(points), sample_weight)
 
 
 def moments_of_labels(
@@ -431,13 +468,3 @@ def exact_step(
             return found
     found = em_step(*given, linear=False)
     return em_step(*given, False, found.parameters.means) if bool(found.lost) else found
-
-
-def direct_step(
-    points: Tensor, sample_weight: Tensor, parameters: Parameters, reg_covar: float
-) -> tuple[Parameters, Tensor]:
-    """`exact_step` of full covariances in float64: new parameters and Σ_n p_n log p(x_n)."""
-    factors = Factors(parameters, "full")
-    gather = functools.partial(expected_moments, points, sample_weight, factors, torch.float64)
-    found = exact_step(gather, factors, reg_covar, parameters)
-    return found.parameters, found.value

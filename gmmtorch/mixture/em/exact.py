@@ -13,7 +13,6 @@ that never decreases (Verbeek, Nunnink & Vlassis, 2006).
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import torch
@@ -23,7 +22,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import expectation as expectation
 from gmmtorch.kernels import exponent_floor as exponent_floor
 from gmmtorch.kernels import fused_maximization, fused_natural_parameters, is_m_step_fused, most_likely
-from gmmtorch.linalg import inverse_factor, safe_cholesky, triangle_indices, unpack_symmetric
+from gmmtorch.linalg import inverse_factor, pack_symmetric, safe_cholesky, unpack_symmetric
 
 SOFTMAX_DTYPES = {"float32": torch.float32, "float64": torch.float64}
 """Dtypes for the exponentials of the E-step, by name."""
@@ -62,22 +61,16 @@ def shift_features(features: Tensor, offset: Tensor) -> Tensor:
 
 def natural_parameters(parameters: Parameters) -> Tensor:
     """W (K, F) such that φ(x)·W_k = log π_k + log N(x | μ_k, Σ_k)."""
-    dim, covariances = parameters.means.shape[1], parameters.covariances
-    if is_m_step_fused(dim, *parameters):
+    weights, means, covariances = parameters
+    if is_m_step_fused(means.shape[1], *parameters):
         found, failed = fused_natural_parameters(*parameters)
         if not bool(failed):
             return found
-    return _natural_parameters(parameters, safe_cholesky(covariances))
-
-
-def _natural_parameters(parameters: Parameters, factors: Tensor) -> Tensor:
-    """`natural_parameters`, from the lower Cholesky factors (K, D, D) of the covariances."""
-    weights, means, _ = parameters
-    dim = means.shape[1]
+    factors = safe_cholesky(covariances)
     whiten = inverse_factor(factors)
     log_weight = torch.log(weights).clamp_min(MIN_LOG_WEIGHT)
     half_log_det = torch.log(factors.diagonal(dim1=-2, dim2=-1)).sum(-1)
-    constant = log_weight - half_log_det - 0.5 * dim * LOG_2PI
+    constant = log_weight - half_log_det - 0.5 * means.shape[1] * LOG_2PI
     return natural_of_precisions(whiten @ whiten.transpose(-2, -1), means, constant)
 
 
@@ -85,26 +78,9 @@ def natural_of_precisions(precision: Tensor, means: Tensor, constant: Tensor) ->
     """W (K, F) such that φ(x)·W_k = c_k − ½ (x − μ_k)ᵀ Λ_k (x − μ_k), with Λ (K, D, D), c (K,)."""
     linear = (precision @ means[:, :, None]).squeeze(-1)
     constant = constant - 0.5 * (linear * means).sum(1)
-    rows, cols = triangle_indices(means.shape[1], means.device)
     # φ has each off-diagonal product once, for two matrix entries.
-    quadratic = torch.where(rows == cols, -0.5, -1.0) * precision[:, rows, cols]
-    return torch.cat([constant[:, None], linear, quadratic], 1)
-
-
-def unchecked_expectation(
-    features: Tensor, sample_weight: Tensor, parameters: Parameters, softmax_dtype: torch.dtype
-) -> tuple[Tensor, Tensor]:
-    """`expectation` that does not wait for the device: the log-likelihood is NaN where the natural parameters
-    need the checks of `natural_parameters`.
-    """
-    if is_m_step_fused(parameters.means.shape[1], *parameters):
-        natural, failed = fused_natural_parameters(*parameters)
-    else:
-        factors, info = torch.linalg.cholesky_ex(parameters.covariances)
-        natural = _natural_parameters(parameters, factors)
-        failed = (info != 0).any() | ~torch.isfinite(natural).all()
-    statistics, value = expectation(features, sample_weight, natural, softmax_dtype)
-    return statistics, value.masked_fill(failed, math.nan)
+    twice = pack_symmetric(0.5 * torch.eye(means.shape[1], dtype=means.dtype, device=means.device) - 1)
+    return torch.cat([constant[:, None], linear, twice * pack_symmetric(precision)], 1)
 
 
 def most_likely_component(features: Tensor, parameters: Parameters) -> Tensor:
@@ -139,47 +115,6 @@ def maximization(statistics: Tensor, reg_covar: float, previous: Parameters | No
 def feature_dimension(n_features: int) -> int:
     """D such that 1 + D + D(D+1)/2 = n_features."""
     return int(((8 * n_features + 1) ** 0.5 - 3) / 2 + 0.5)
-
-
-# -- the direct form: slower, without cancellation ------------------------------------------------
-
-
-def is_ill_conditioned(parameters: Parameters, natural: Tensor | None = None) -> bool:
-    """Whether the natural parameters, given if known, lose more than about 1e-6 nats to cancellation.
-
-    φ·W sums terms as large as μᵀΣ⁻¹μ to a few nats. For a component 1 mm thick this fails 10 km from the
-    centre of the cloud.
-    """
-    weights, means, _ = parameters
-    natural = natural_parameters(parameters) if natural is None else natural
-    size = (natural[:, 1 : 1 + means.shape[1]] * means).sum(1)
-    return bool((size * weights.sign()).max() * torch.finfo(size.dtype).eps > 1e-6)
-
-
-def has_cancelled(statistics: Tensor, parameters: Parameters) -> bool:
-    """Whether Σγxxᵀ/N − μμᵀ lost digits that the smallest variance, or the next step, needs.
-
-    The variance is that of the inverse trace, 1 to 1/D of the smallest. Covariances that are not positive
-    definite have lost digits.
-    """
-    alive = parameters.weights > 0
-    factors, info = torch.linalg.cholesky_ex(parameters.covariances)
-    variance = 1 / inverse_factor(factors).square().sum((1, 2))
-    second = statistics[:, 1:].abs().amax(1) / statistics[:, 0].clamp_min(1e-300)
-    kept = torch.finfo(variance.dtype).eps * second <= 1e-6 * variance
-    return bool(((info != 0) | ~kept).logical_and_(alive).any())
-
-
-def log_joint(points: Tensor, parameters: Parameters) -> Tensor:
-    """log π_k + log N(x_n | μ_k, Σ_k), (N, K), from ‖L⁻¹(x − μ)‖², without cancellation at any distance."""
-    weights, means, covariances = parameters
-    factors = safe_cholesky(covariances)
-    whiten = inverse_factor(factors)
-    offset = points[:, None, :] - means
-    squared = torch.einsum("nkd,kde->nke", offset, whiten).square().sum(-1)
-    half_log_det = torch.log(factors.diagonal(dim1=-2, dim2=-1)).sum(-1)
-    constant = torch.log(weights).clamp_min(MIN_LOG_WEIGHT) - half_log_det - 0.5 * means.shape[1] * LOG_2PI
-    return constant - 0.5 * squared
 
 
 # -- covariance types -----------------------------------------------------------------------------

@@ -26,14 +26,9 @@ _FEWEST_CELLS, _CELLS_OF_A_COMPONENT = 4096, 8  # lower limits of the cells for 
 _FINEST_CELLS = 1 << 14  # along the longest side
 _SURFACE_CELLS = 1 << 17  # `surface_pieces` partitions cells from twice this number of points on
 
-Initialization = Callable[["Distinct", int, float, torch.Generator, str], Parameters]
-"""(points, K, reg_covar, generator, covariance type) → parameters, with covariances in the shape of the
-type. Points centred, float64.
-"""
 
-
-class Distinct(NamedTuple):
-    """Points (N, D) with weights (N,), and which of them are distinct.
+class Start(NamedTuple):
+    """What a start is computed from: points (N, D), centred, float64, with weights (N,), and the settings.
 
     rows: (M,) one point of each place, in an order that depends on the values only: by the first column,
     then by a hash of the others. mass: (M,) the summed weights of the points there.
@@ -43,29 +38,48 @@ class Distinct(NamedTuple):
     weight: Tensor
     rows: Tensor
     mass: Tensor
+    n_components: int
+    reg_covar: float
+    generator: torch.Generator
+    kind: str
 
-    @staticmethod
-    def of(points: Tensor, weight: Tensor) -> Distinct:
-        order = argsort(points[:, 0].contiguous())
-        column = points[order, 0]
-        same = column[1:] == column[:-1]
-        if not bool(same.any()):
-            return Distinct(points, weight, order, weight[order])
-        # Only rows that are equal in the first column need the other columns.
-        tied = torch.cat([same.new_zeros(1), same]) | torch.cat([same, same.new_zeros(1)])
-        among = order[tied]
-        among = among[argsort(_hash(points, among))]
-        order[tied] = among[argsort(points[among, 0])]
-        for some in same.nonzero().squeeze(1).split(chunk_rows(points)):
-            same[some] = (points[order[some + 1]] == points[order[some]]).all(1)
-        is_new = torch.cat([~same.new_zeros(1), ~same])
-        mass = weight.new_zeros(int(is_new.sum())).index_add_(0, is_new.cumsum(0) - 1, weight[order])
-        return Distinct(points, weight, order[is_new], mass)
+    def drawn(self) -> Tensor:
+        """K distinct points (K, D), drawn by weight: the smallest of E/w, E exponential."""
+        race = torch.empty(self.mass.shape, dtype=torch.float64).exponential_(generator=self.generator)
+        first = (race.to(self.mass.device) / self.mass).argsort()[: self.n_components]
+        return self.points[self.rows[first]]
 
-    def drawn(self, n: int, generator: torch.Generator) -> Tensor:
-        """A draw (n, D) without replacement, by weight: the n smallest of E/w, E exponential."""
-        race = torch.empty(self.mass.shape, dtype=torch.float64).exponential_(generator=generator)
-        return self.points[self.rows[(race.to(self.mass.device) / self.mass).argsort()[:n]]]
+    def tiling(self, means: Tensor) -> Parameters:
+        """Components with the cloud's mean variance, reduced as if they tile the cloud: σ² K^(−2/D)."""
+        spread = mean_variance(self.points, self.weight)
+        return self.isotropic(means, spread * len(means) ** (-2 / means.shape[1]) + self.reg_covar)
+
+    def isotropic(self, means: Tensor, variance: Tensor | float) -> Parameters:
+        """Components of equal weight and variance at the means (K, D)."""
+        k, dim = means.shape
+        values = means.new_ones(em.type_shape(self.kind, k, dim)) * variance
+        if self.kind in ("full", "tied"):
+            values *= torch.eye(dim, dtype=means.dtype, device=means.device)
+        return Parameters(means.new_full((k,), 1 / k), means, values)
+
+
+def distinct(points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """`rows` and `mass` of a `Start`."""
+    order = argsort(points[:, 0].contiguous())
+    column = points[order, 0]
+    same = column[1:] == column[:-1]
+    if not bool(same.any()):
+        return order, weight[order]
+    # Only rows that are equal in the first column need the other columns.
+    tied = torch.cat([same.new_zeros(1), same]) | torch.cat([same, same.new_zeros(1)])
+    among = order[tied]
+    among = among[argsort(_hash(points, among))]
+    order[tied] = among[argsort(points[among, 0])]
+    for some in same.nonzero().squeeze(1).split(chunk_rows(points)):
+        same[some] = (points[order[some + 1]] == points[order[some]]).all(1)
+    is_new = torch.cat([~same.new_zeros(1), ~same])
+    mass = weight.new_zeros(int(is_new.sum())).index_add_(0, is_new.cumsum(0) - 1, weight[order])
+    return order[is_new], mass
 
 
 def _hash(points: Tensor, rows: Tensor) -> Tensor:
@@ -78,97 +92,51 @@ def _hash(points: Tensor, rows: Tensor) -> Tensor:
     return torch.cat(found)
 
 
-def from_kmeans(
-    cloud: Distinct,
-    n_components: int,
-    reg_covar: float,
-    generator: torch.Generator,
-    kind: str,
-    n_init: int = 1,
-) -> Parameters:
+def _kmeans_clusters(start: Start, n_init: int = 1) -> Parameters:
     """The moments of k-means clusters; of `n_init` runs, the clustering with least scatter."""
-    points, weight = cloud.points, cloud.weight
-    labels, scatter = kmeans(*cloud, n_components, generator, n_init)
+    points, weight, _, _, k, reg_covar, generator, kind = start
+    labels, scatter = kmeans(*start[:4], k, generator, n_init)
     best = labels[scatter.argmin()]
-    if is_small(points, weight, n_components, kind):
-        return Parameters(*fused_moments(points, weight, best, n_components, kind, reg_covar))
+    if is_small(points, weight, k, kind):
+        return Parameters(*fused_moments(points, weight, best, k, kind, reg_covar))
     if points.shape[1] > 3:
-        found = by_type.moments_of_labels(points, weight, best, n_components, kind)
+        found = by_type.moments_of_labels(points, weight, best, k, kind)
         return by_type.maximized(found, reg_covar, None, kind)
-    found = moments_of(em.quadratic_features(points), weight, best, n_components, reg_covar, points)
+    found = moments_of(em.quadratic_features(points), weight, best, k, reg_covar, points)
     return by_type.compacted(found, kind)
 
 
-def from_random_points(
-    cloud: Distinct, n_components: int, reg_covar: float, generator: torch.Generator, kind: str
-) -> Parameters:
-    """Means at distinct random points, drawn by weight; isotropic covariance, uniform weights."""
-    return _tiling(cloud.drawn(n_components, generator), cloud, reg_covar, kind)
-
-
-def from_single_points(
-    cloud: Distinct, n_components: int, reg_covar: float, generator: torch.Generator, kind: str
-) -> Parameters:
-    """Components of one random point each, with variance `reg_covar`: scikit-learn's "random_from_data"."""
-    return _isotropic(cloud.drawn(n_components, generator), reg_covar, kind)
-
-
-def from_kmeans_plus_plus(
-    cloud: Distinct, n_components: int, reg_covar: float, generator: torch.Generator, kind: str
-) -> Parameters:
+def _far_points(start: Start) -> Parameters:
     """Components of one point each, chosen far apart as k-means++ does, with variance `reg_covar`."""
-    chosen = spread_out(*cloud, n_components, generator)[0]
-    return _isotropic(cloud.points[chosen], reg_covar, kind)
+    chosen = spread_out(*start[:4], start.n_components, start.generator)[0]
+    return start.isotropic(start.points[chosen], start.reg_covar)
 
 
-def from_random_responsibilities(
-    cloud: Distinct, n_components: int, reg_covar: float, generator: torch.Generator, kind: str
-) -> Parameters:
+def _random_responsibilities(start: Start) -> Parameters:
     """The moments of uniformly random responsibilities: scikit-learn's "random"."""
-    dim, device = cloud.points.shape[1], cloud.points.device
-    linear = by_type.has_linear_form(n_components, dim, kind)
-    about = None if linear else cloud.points.new_zeros(n_components, dim)
-    sums = by_type.Sums(n_components, cloud.points, kind, about)
-    size = by_type.rows_of_chunk(n_components, dim, kind, device)
-    for some, p in zip(cloud.rows.split(size), cloud.mass.split(size), strict=True):
-        share = torch.rand(some.shape[0], n_components, generator=generator, dtype=torch.float64)
-        share = share.to(device).T
-        sums.add(cloud.points[some], share * (p / share.sum(0)))
-    return by_type.maximized(sums.moments()[0], reg_covar, None, kind)
+    points, k, kind = start.points, start.n_components, start.kind
+    linear = by_type.has_linear_form(k, points.shape[1], kind)
+    sums = by_type.Sums(k, points, kind, None if linear else points.new_zeros(k, points.shape[1]))
+    size = by_type.rows_of_chunk(k, points.shape[1], kind, points.device)
+    for some, p in zip(start.rows.split(size), start.mass.split(size), strict=True):
+        share = torch.rand(some.shape[0], k, generator=start.generator, dtype=torch.float64)
+        share = share.to(points.device).T
+        sums.add(points[some], share * (p / share.sum(0)))
+    return by_type.maximized(sums.moments()[0], start.reg_covar, None, kind)
 
 
-def from_bounding_box(
-    cloud: Distinct, n_components: int, reg_covar: float, generator: torch.Generator, kind: str
-) -> Parameters:
+def _bounding_box(start: Start) -> Parameters:
     """Means uniform in the bounding box; isotropic covariance, uniform weights."""
-    low, high = cloud.points.amin(0), cloud.points.amax(0)
-    uniform = torch.rand(n_components, len(low), generator=generator, dtype=torch.float64)
-    return _tiling(low + (high - low) * uniform.to(low.device), cloud, reg_covar, kind)
+    low, high = start.points.aminmax(dim=0)
+    uniform = torch.rand(start.n_components, len(low), generator=start.generator, dtype=torch.float64)
+    return start.tiling(low + (high - low) * uniform.to(low.device))
 
 
-def _tiling(means: Tensor, cloud: Distinct, reg_covar: float, kind: str) -> Parameters:
-    """Components with the cloud's mean variance, reduced as if they tile the cloud: σ² K^(−2/D)."""
-    n_components, dim = means.shape
-    spread = mean_variance(cloud.points, cloud.weight)
-    return _isotropic(means, spread * n_components ** (-2 / dim) + reg_covar, kind)
-
-
-def _isotropic(means: Tensor, variance: Tensor | float, kind: str) -> Parameters:
-    """Components of equal weight and variance at the means (K, D)."""
-    k, dim = means.shape
-    weights = means.new_full((k,), 1 / k)
-    values = means.new_ones(em.type_shape(kind, k, dim)) * variance
-    if kind in ("full", "tied"):
-        values *= torch.eye(dim, dtype=means.dtype, device=means.device)
-    return Parameters(weights, means, values)
-
-
-def from_flat_pieces(
-    cloud: Distinct, n_components: int, reg_covar: float, generator: torch.Generator, kind: str
-) -> Parameters:
+def _one_of_each_piece(start: Start) -> Parameters:
     """One component for each of the cloud's flat pieces: deterministic, and fast for any K."""
-    found, _ = flat_pieces(cloud.points[cloud.rows], cloud.mass, n_components, reg_covar)
-    return by_type.compacted(replicated(found, n_components)[0], kind)
+    k = start.n_components
+    found, _ = flat_pieces(start.points[start.rows], start.mass, k, start.reg_covar)
+    return by_type.compacted(replicated(found, k), start.kind)
 
 
 def flat_pieces(
@@ -254,16 +222,17 @@ def moments_of(
     return Parameters(found.weights, means + found.means, found.covariances)
 
 
-INITIALIZATIONS: dict[str, Initialization] = {
-    "kmeans": from_kmeans,
-    "kmeans_restarts": functools.partial(from_kmeans, n_init=10),
-    "k-means++": from_kmeans_plus_plus,
-    "random": from_random_responsibilities,
-    "random_from_data": from_single_points,
-    "random_points": from_random_points,
-    "bounding_box": from_bounding_box,
-    "flat_pieces": from_flat_pieces,
+INITIALIZATIONS: dict[str, Callable[[Start], Parameters]] = {
+    "kmeans": _kmeans_clusters,
+    "kmeans_restarts": functools.partial(_kmeans_clusters, n_init=10),
+    "k-means++": _far_points,
+    "random": _random_responsibilities,
+    "random_from_data": lambda start: start.isotropic(start.drawn(), start.reg_covar),
+    "random_points": lambda start: start.tiling(start.drawn()),
+    "bounding_box": _bounding_box,
+    "flat_pieces": _one_of_each_piece,
 }
+"""Methods by name. "random_from_data", of scikit-learn, gives each drawn point the variance `reg_covar`."""
 
 
 def initialize(
@@ -282,21 +251,18 @@ def initialize(
     If there are fewer distinct points than components, each distinct point gives one component, and the
     other components are copies that share its weight. The density is then that of the distinct points.
     """
-    cloud = Distinct.of(points, weight)
-    n = min(n_components, cloud.rows.shape[0])
-    found = INITIALIZATIONS[method](cloud, n, reg_covar, generator, covariance_type)
-    return replicated(found, n_components, covariance_type)[0]
+    rows, mass = distinct(points, weight)
+    n = min(n_components, rows.shape[0])
+    start = Start(points, weight, rows, mass, n, reg_covar, generator, covariance_type)
+    return replicated(INITIALIZATIONS[method](start), n_components, covariance_type)
 
 
-def replicated(found: Parameters, n_components: int, kind: str = "full") -> tuple[Parameters, Tensor]:
-    """K components from fewer: copies share the weight.
-
-    Also the index (K,) of the component each one copies.
-    """
+def replicated(found: Parameters, n_components: int, kind: str = "full") -> Parameters:
+    """K components from fewer: copies share the weight."""
     n = found.weights.shape[0]
-    copy = torch.arange(n_components, device=found.weights.device) % n
     if n == n_components:
-        return found, copy
+        return found
+    copy = torch.arange(n_components, device=found.weights.device) % n
     shares = torch.bincount(copy, minlength=n)[copy]
     covariances = found.covariances if kind == "tied" else found.covariances[copy]
-    return Parameters(found.weights[copy] / shares, found.means[copy], covariances), copy
+    return Parameters(found.weights[copy] / shares, found.means[copy], covariances)

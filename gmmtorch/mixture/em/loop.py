@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-import numbers
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Generic, TypeVar
@@ -13,9 +12,9 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError, check_number
-from gmmtorch.kernels import fused_em, fused_exact_em, in_spatial_order, is_em_fused, takes_one_launch
-from gmmtorch.mixture.em import by_type, exact
-from gmmtorch.mixture.em.exact import Parameters, compact, constrain, expand
+from gmmtorch.kernels import fused_exact_em, in_spatial_order, is_em_fused, takes_one_launch
+from gmmtorch.mixture.em import by_type
+from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.reduction import merge_pairs
 
 if TYPE_CHECKING:
@@ -95,79 +94,46 @@ def run_em(
     return EMResult(parameters, bounds, converged)
 
 
-def run_small(
-    points: Tensor,
-    weight: Tensor,
-    starts: Sequence[Parameters],
-    covariance_type: str,
-    reg_covar: float,
-    tol: float,
-    max_iter: int,
-    previous_bound: float,
-) -> list[EMResult[Parameters]]:
-    """`run_em` of a small table (see `kernels.is_small`) from several starts, in one launch.
-
-    A run whose next iteration needs more than the kernel can do ends before it.
-    """
-    stacked = Parameters(*(torch.stack(part) for part in zip(*starts, strict=True)))
-    limits = tol, max_iter, previous_bound
-    found = fused_em(points, weight, stacked, covariance_type, reg_covar, *limits)
-    rows = zip(found.weights, found.means, found.covariances, found.bounds, strict=True)
-    return [
-        EMResult(Parameters(*parameters), bounds, has_converged(bounds, tol, previous_bound))
-        for *parameters, bounds in rows
-    ]
-
-
 def has_converged(bounds: Sequence[float], tol: float, previous_bound: float = -math.inf) -> bool:
     """Whether the last iteration changed the bound by less than `tol`."""
     return len(bounds) > 0 and abs(bounds[-1] - [previous_bound, *bounds][-2]) < tol
 
 
 def em_step(
-    rows: Rows, reg_covar: float, softmax_dtype: torch.dtype, covariance_type: str = "full"
+    rows: Rows,
+    reg_covar: float,
+    softmax_dtype: torch.dtype = torch.float32,
+    covariance_type: str = "full",
 ) -> Steps[Parameters]:
-    """EM steps on points, centred, or cells. Covariances have the shape of their type."""
-    points = rows.values if rows.are_points else None
-    if points is not None and points.shape[1] > 3:
-        return _typed_step(points, rows.weight, reg_covar, softmax_dtype, covariance_type)
-    natural = natural_step(rows.features(), rows.weight, reg_covar, softmax_dtype, points, covariance_type)
-    return in_shape_of_type(natural, covariance_type)
+    """EM steps on points, centred, or cells. Covariances have the shape of their type.
 
-
-def in_shape_of_type(natural: Steps[Parameters], covariance_type: str) -> Steps[Parameters]:
-    """The steps `natural`, whose covariances are (K, D, D), for covariances in the shape of their type."""
-    if covariance_type == "full":
-        return natural
-
-    def run(parameters: Parameters, tol: float, n_most: int, last: float) -> tuple[Parameters, list[float]]:
-        covariances = expand(parameters.covariances, covariance_type, *parameters.means.shape)
-        found, bounds = natural.run(parameters._replace(covariances=covariances), tol, n_most, last)
-        return found._replace(covariances=compact(found.covariances, covariance_type)), bounds
-
-    return Steps(run)
-
-
-def _typed_step(
-    points: Tensor, sample_weight: Tensor, reg_covar: float, softmax_dtype: torch.dtype, kind: str
-) -> Steps[Parameters]:
-    """EM steps with the arithmetic of the covariance type; direct ones from the first that loses digits."""
-    total, direct = sample_weight.sum(), [False]
+    A step on points whose linear form loses digits takes the direct one; in many dimensions, so do all later
+    steps. In few dimensions, a fused kernel takes many steps in one launch where that is faster.
+    """
+    points, weight, kind = rows.points, rows.weight, covariance_type
+    total, direct = weight.sum(), [False]
+    few = (
+        by_type.rows_of_few_dimensions(points, weight)
+        if rows.are_points
+        else in_spatial_order(rows.values, weight)
+    )
 
     def gather(factors: by_type.Factors) -> by_type.Gather:
-        return functools.partial(by_type.expected_moments, points, sample_weight, factors, softmax_dtype)
+        return functools.partial(by_type.expected_moments, points, weight, factors, softmax_dtype, rows=few)
 
     def step(parameters: Parameters) -> tuple[Parameters, Tensor]:
         k, dim = parameters.means.shape
         linear = by_type.has_linear_form(k, dim, kind) and not direct[0]
         factors = by_type.Factors(parameters, kind, check=False)
         found = by_type.em_step(gather(factors), factors, reg_covar, parameters, linear)
-        return found.parameters, (found.value / total).masked_fill(found.lost, math.nan)
+        lost = found.lost if rows.are_points else factors.failed
+        return found.parameters, (found.value / total).masked_fill(lost, math.nan)
 
     def checked(parameters: Parameters) -> tuple[Parameters, float]:
-        direct[0] = True
+        direct[0] = few is None
         factors = by_type.Factors(parameters, kind)
-        found = by_type.exact_step(gather(factors), factors, reg_covar, parameters)
+        take = by_type.exact_step if rows.are_points else by_type.em_step
+        found = take(gather(factors), factors, reg_covar, parameters, linear=not rows.are_points)
         bound = float(found.value / total)
         if not math.isfinite(bound):
             raise NumericalError(
@@ -176,53 +142,14 @@ def _typed_step(
             )
         return found.parameters, bound
 
-    return Steps(_ahead(step, checked, 1 if points.device.type == "cpu" else _STEPS_AHEAD))
-
-
-def natural_step(
-    features: Tensor,
-    sample_weight: Tensor,
-    reg_covar: float,
-    softmax_dtype: torch.dtype = torch.float32,
-    points: Tensor | None = None,
-    covariance_type: str = "full",
-) -> Steps[Parameters]:
-    """EM steps on features (N, F), float64, of points or cells.
-
-    If `points` (N, D), the points of the features, are given, a step whose natural parameters would lose
-    digits to cancellation uses the direct form instead.
-    """
-    rows = in_spatial_order(features, sample_weight)
-    total = sample_weight.sum()
-
-    def gather(parameters: Parameters) -> tuple[Tensor, Tensor]:
-        return exact.expectation(*rows, exact.natural_parameters(parameters), softmax_dtype)
-
-    def maximized(parameters: Parameters, statistics: Tensor, value: Tensor) -> tuple[Parameters, Tensor]:
-        new = of_type(exact.maximization(statistics, reg_covar, parameters), covariance_type)
-        return new, value / total
-
-    def step(parameters: Parameters) -> tuple[Parameters, Tensor]:
-        return maximized(parameters, *exact.unchecked_expectation(*rows, parameters, softmax_dtype))
-
-    def checked_step(parameters: Parameters) -> tuple[Parameters, float]:
-        new, bound = maximized(parameters, *gather(parameters))
-        return new, float(bound)
-
-    if points is None:
-        checked: Step[Parameters] = checked_step
-        ahead = _ahead(step, checked_step, 1 if features.device.type == "cpu" else _STEPS_AHEAD)
-    else:
-        direct = functools.partial(by_type.direct_step, points, sample_weight, reg_covar=reg_covar)
-        checked = guarded = guarded_step(gather, direct, reg_covar, float(total), covariance_type)
-        ahead = guarded.run
+    steps = _ahead(step, checked, 1 if points.device.type == "cpu" else _STEPS_AHEAD)
 
     def run(parameters: Parameters, tol: float, n_most: int, last: float) -> tuple[Parameters, list[float]]:
-        fits = covariance_type == "full" and takes_one_launch(len(features), len(parameters.weights))
-        if not fits or not is_em_fused(*rows, *parameters):
-            return ahead(parameters, tol, n_most, last)
+        fits = few is not None and kind == "full" and takes_one_launch(len(weight), len(parameters.weights))
+        if few is None or not fits or not is_em_fused(*few, *parameters):
+            return steps.run(parameters, tol, n_most, last)
         mixture, bounds, failed = fused_exact_em(
-            *rows, parameters, reg_covar, tol, n_most, last, guarded=points is not None
+            *few, parameters, reg_covar, tol, n_most, last, guarded=rows.are_points
         )
         if not failed:
             return Parameters(*mixture), bounds
@@ -234,7 +161,7 @@ def natural_step(
 
 def _ahead(
     step: Callable[[Parameters], tuple[Parameters, Tensor]], checked: Step[Parameters], n_ahead: int
-) -> Run[Parameters]:
+) -> Steps[Parameters]:
     """Up to `n_ahead` steps before their bounds are read: Python then waits once for all of them.
 
     A step whose bound is NaN is taken again by `checked`. Steps beyond the last one asked for are lost.
@@ -256,49 +183,10 @@ def _ahead(
             last = bound
         return states[-1], bounds
 
-    return run
-
-
-def guarded_step(
-    gather: Callable[[Parameters], tuple[Tensor, Tensor]],
-    direct: Callable[[Parameters], tuple[Parameters, Tensor]],
-    reg_covar: float,
-    total: float,
-    covariance_type: str = "full",
-) -> Steps[Parameters]:
-    """EM steps with an E-step `gather`: parameters → S (K, F) and Σ_n p_n log p(x_n). `total` is Σ_n p_n.
-
-    If the natural parameters or S lose digits to cancellation, `direct` takes the step.
-    """
-
-    def run(parameters: Parameters, *_: float) -> tuple[Parameters, list[float]]:
-        if not exact.is_ill_conditioned(parameters):
-            statistics, value = gather(parameters)
-            new = of_type(exact.maximization(statistics, reg_covar, parameters), covariance_type)
-            if not exact.has_cancelled(statistics, new):
-                return new, [float(value) / total]
-        new, value = direct(parameters)
-        return of_type(new, covariance_type), [float(value) / total]
-
     return Steps(run)
 
 
-def of_type(parameters: Parameters, covariance_type: str) -> Parameters:
-    """The parameters with the nearest covariances (K, D, D) of the type (see `exact.constrain`)."""
-    covariances = constrain(parameters.covariances, covariance_type, parameters.weights)
-    return parameters._replace(covariances=covariances)
-
-
 # -- stepwise EM ----------------------------------------------------------------------------------
-
-
-def step_size(batch: float, seen: float, kappa: float) -> float:
-    """η = (n / (m + n))^κ, for a batch of weight n after points of weight m.
-
-    For batches of equal size η is (t + 1)^−κ, t = 0, 1, …: Liang & Klein's (t + 2)^−κ after a first batch
-    with η = 1. With κ = 1 every point counts equally, in batches of any size.
-    """
-    return float((batch / (seen + batch)) ** kappa)
 
 
 def blend(previous: Parameters, update: Parameters, step: float, kind: str = "full") -> Parameters:
@@ -345,9 +233,3 @@ def weight_of_past(seen: float | None, memory: float | None) -> float:
         return seen
     check_number("memory", memory)
     return float(memory) if seen is None else min(seen, float(memory))
-
-
-def check_kappa(kappa: object) -> None:
-    """Raise `InvalidArgumentError` unless 0.5 < κ ≤ 1, for which the steps of `step_size` converge."""
-    if not isinstance(kappa, numbers.Real) or not 0.5 < float(kappa) <= 1:
-        raise InvalidArgumentError(f"kappa={kappa!r} must be above 0.5 and at most 1.")

@@ -82,51 +82,36 @@ class Momentum:
 
     def step(self, statistics: Tensor, parameters: Parameters) -> Parameters:
         """The next parameters, from statistics (K, F) relative to the means of `parameters`."""
-        last, self._last = self._last, (statistics, parameters.means)
+        means, last, self._last = parameters.means, self._last, (statistics, parameters.means)
+        centered = parameters._replace(means=torch.zeros_like(means))
+
+        def maximized(sums: Tensor) -> Parameters:
+            found = em.maximization(sums, self._reg_covar, centered)
+            return found._replace(means=found.means + means)
+
+        em_step = self._em_step = maximized(statistics)
         share = 0.0 if last is None else self._age / (self._age + 3)
         self._age += last is not None
         self.is_extrapolated = share > 0
-        used = last if self.is_extrapolated else None
-        self._em_step, ahead = _steps(statistics, parameters, self._reg_covar, used, share)
-        return self._em_step if ahead is None else ahead
+        if last is None or not self.is_extrapolated:
+            return em_step
+        ahead = statistics + share * (statistics - em.shift_features(last[0], last[1] - means))
+        trusted = ahead[:, 0] > 0.2 * statistics[:, 0]
+        moved = maximized(torch.where(trusted[:, None], ahead, statistics))
+        thickness, em_thickness = (torch.linalg.eigvalsh(p.covariances)[:, 0] for p in (moved, em_step))
+        trusted &= thickness > 0.3 * em_thickness
+        weights = torch.where(trusted, moved.weights, em_step.weights)
+        return Parameters(
+            weights / weights.sum(),
+            torch.where(trusted[:, None], moved.means, em_step.means),
+            torch.where(trusted[:, None, None], moved.covariances, em_step.covariances),
+        )
 
     def undo(self) -> Parameters:
         """EM's own parameters of the last step. Resets the momentum."""
         assert self._em_step is not None
         self._last, self._age, self.is_extrapolated = None, 0, False
         return self._em_step
-
-
-def _steps(
-    statistics: Tensor,
-    parameters: Parameters,
-    reg_covar: float,
-    last: tuple[Tensor, Tensor] | None,
-    share: float,
-) -> tuple[Parameters, Parameters | None]:
-    """EM's own step and the extrapolated one."""
-    centered = parameters._replace(means=torch.zeros_like(parameters.means))
-
-    def maximized(sums: Tensor) -> Parameters:
-        found = em.maximization(sums, reg_covar, centered)
-        return found._replace(means=found.means + parameters.means)
-
-    em_step = maximized(statistics)
-    if last is None:
-        return em_step, None
-    before = em.shift_features(last[0], last[1] - parameters.means)
-    ahead = statistics + share * (statistics - before)
-    trusted = ahead[:, 0] > 0.2 * statistics[:, 0]
-    ahead = torch.where(trusted[:, None], ahead, statistics)
-    moved = maximized(ahead)
-    thickness, em_thickness = (torch.linalg.eigvalsh(p.covariances)[:, 0] for p in (moved, em_step))
-    trusted &= thickness > 0.3 * em_thickness
-    weights = torch.where(trusted, moved.weights, em_step.weights)
-    return em_step, Parameters(
-        weights / weights.sum(),
-        torch.where(trusted[:, None], moved.means, em_step.means),
-        torch.where(trusted[:, None, None], moved.covariances, em_step.covariances),
-    )
 
 
 # -- the loop -------------------------------------------------------------------------------------
@@ -158,8 +143,10 @@ def run_truncated(
         own = centered_parameters(parameters)
         groups = _with_enough_digits(rows, new_sets[0], parameters.means, own)
         last_of_set = left == 1 and not frozen
-        found = truncated_expectation(groups, new_sets[1], parameters, last_of_set, own)
-        packed = torch.cat([found.statistics.flatten(), found.statistics.new_tensor([found.value])])
+        statistics, value, likeliest = truncated_expectation(
+            groups, new_sets[1], parameters, last_of_set, own
+        )
+        packed = torch.cat([statistics.flatten(), statistics.new_tensor([value])])
         packed = settings.processes.sum(packed)
         bound = float(packed[-1]) / total
         if bounds and bound < bounds[-1]:
@@ -176,14 +163,13 @@ def run_truncated(
         if settings.on_iteration is not None:
             settings.on_iteration(len(bounds), bound)
         was_extrapolated = momentum.is_extrapolated
-        parameters = momentum.step(packed[:-1].view_as(found.statistics), parameters)
+        parameters = momentum.step(packed[:-1].view_as(statistics), parameters)
         if has_converged(bounds, settings.tol, settings.previous_bound):
             if not was_extrapolated:
                 converged = True
                 break
             parameters = momentum.undo()  # the extrapolation may be too long: decide by EM's own step
-        if found.owner is not None:
-            owner = found.owner
+        owner = owner if likeliest is None else likeliest
     # EM's own parameters are certainly not worse than the last bound; extrapolated ones may be.
     parameters = momentum.undo() if momentum.is_extrapolated else parameters
     return EMResult(parameters, bounds, converged), owners_of(sets[0]), sets[1]
@@ -297,10 +283,6 @@ class Rows:
             return self.values
         return self.values[:, 1 : 1 + em.feature_dimension(self.values.shape[1])].contiguous()
 
-    def features(self) -> Tensor:
-        """Features (N, F)."""
-        return em.quadratic_features(self.values) if self.are_points else self.values
-
 
 class Groups(NamedTuple):
     """Rows sorted by owner, in blocks of B rows of one owner. Rows of weight 0 fill incomplete blocks.
@@ -360,9 +342,12 @@ def group_rows(
 
 def owners_of(groups: Groups) -> Tensor:
     """The owner of each row, (N,)."""
-    owner = torch.empty_like(groups.row)
-    owner[groups.row] = groups.owner[groups.slot // groups.weight.shape[1]]
-    return owner
+    return _of_rows(groups, groups.owner[groups.slot // groups.weight.shape[1]])
+
+
+def _of_rows(groups: Groups, values: Tensor) -> Tensor:
+    """Values (N,) in the order of `groups.row`, in the order of the rows."""
+    return torch.empty_like(values).scatter_(0, groups.row, values)
 
 
 def nearest(points: Tensor, means: Tensor) -> Tensor:
@@ -405,29 +390,18 @@ def choose_candidates(groups: Groups, parameters: Parameters, n_candidates: int)
 # -- the E-step over candidates -------------------------------------------------------------------
 
 
-class Expectation(NamedTuple):
-    """Result of a truncated E-step.
-
-    statistics: (K, F) relative to the components' means, float64. value: Σ p log Σ_candidates, nats.
-    owner: (N,) the most likely candidate of each row, if requested.
-    """
-
-    statistics: Tensor
-    value: float
-    owner: Tensor | None
-
-
 def truncated_expectation(
     groups: Groups,
     candidates: Tensor,
     parameters: Parameters,
     want_owner: bool = False,
     own: Tensor | None = None,
-) -> Expectation:
+) -> tuple[Tensor, float, Tensor | None]:
     """E-step of `exact.expectation`, restricted to the candidates (G, m) of each of the G groups.
 
-    With `want_owner`, also returns each row's most likely candidate. `own`: the `centered_parameters`, if
-    they are known.
+    Returns the statistics (K, F) relative to the components' means, float64; Σ p log Σ_candidates, nats; and
+    with `want_owner` the most likely candidate (N,) of each row. `own`: the `centered_parameters`, if they
+    are known.
     """
     own = centered_parameters(parameters) if own is None else own
     n_groups, m = candidates.shape
@@ -454,16 +428,8 @@ def truncated_expectation(
     about_means = em.shift_features(by_pair, groups.centers[:, None] - parameters.means[candidates])
     statistics = about_means.new_zeros(parameters.weights.shape[0], n_features)
     statistics.index_add_(0, candidates.flatten(), about_means.flatten(0, 1))
-    return Expectation(statistics, float(value), _owner_of_rows(groups, likeliest))
-
-
-def _owner_of_rows(groups: Groups, likeliest: Tensor | None) -> Tensor | None:
-    """The most likely candidates of all slots in the order of the rows, (N,)."""
-    if likeliest is None:
-        return None
-    owners = torch.empty_like(groups.row)
-    owners[groups.row] = likeliest.flatten()[groups.slot]
-    return owners
+    likeliest_of_rows = None if likeliest is None else _of_rows(groups, likeliest.flatten()[groups.slot])
+    return statistics, float(value), likeliest_of_rows
 
 
 def centered_parameters(parameters: Parameters) -> Tensor:

@@ -19,11 +19,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels import fused_em, in_spatial_order, is_small
+from gmmtorch.kernels import fused_em, is_small
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.mixture.em import by_type, loop
-from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em.exact import LOG_2PI, Parameters, compact, constrain, expand, type_shape
+from gmmtorch.mixture.em.exact import LOG_2PI, Parameters, compact, constrain, type_shape
 
 
 class Prior(NamedTuple):
@@ -241,7 +240,7 @@ def variational_step(
     The bound (nats per point) is that of the returned posterior. Covariances of the points of a component
     include `reg_covar` (m²).
     """
-    rows = in_spatial_order(em.quadratic_features(points), sample_weight) if points.shape[1] <= 3 else None
+    rows = by_type.rows_of_few_dimensions(points, sample_weight)
     total = float(sample_weight.sum())
     kind = covariance_type
 
@@ -259,72 +258,26 @@ def variational_step(
         log_weight, gaussians = expected_log_density(posterior)
         if is_small(points, sample_weight, len(log_weight), kind):
             start = Parameters(*(part.clone()[None] for part in gaussians))
-            moved = fused_em(points, sample_weight, start, kind, reg_covar, log_weights=log_weight)
-            if not moved.failed[0]:
-                found = Parameters(moved.counts[0], moved.means[0], moved.covariances[0])
+            small = fused_em(points, sample_weight, start, kind, reg_covar, log_weights=log_weight)
+            if not small.failed[0]:
+                found = Parameters(small.counts[0], small.means[0], small.covariances[0])
                 new = update(prior, found, process, kind)
                 return new, float(
-                    moved.entropy[0] + log_evidence(of_prior(len(log_weight)), new, total, kind)
+                    small.entropy[0] + log_evidence(of_prior(len(log_weight)), new, total, kind)
                 ) / total
         factors = by_type.Factors(gaussians, kind)
-        if rows is None:
-            found, value = _typed_moments(
-                points, sample_weight, log_weight, factors, reg_covar, softmax_dtype
-            )
-        else:
-            matrices = expand(gaussians.covariances, kind, *gaussians.means.shape)
-            given = log_weight, gaussians._replace(covariances=matrices), reg_covar, softmax_dtype
-            found, value = _expected_moments(rows, points, sample_weight, *given)
-            found = by_type.compacted(found, kind)
+        weighted = copy.copy(factors)  # responsibilities γ_nk ∝ exp(ω_k) N(x_n | m_k, Σ_k)
+        weighted.constant = factors.constant + log_weight
+        weighted.weights = torch.exp(log_weight - log_weight.max())
+        given = points, sample_weight, weighted, softmax_dtype
+        gather = functools.partial(by_type.expected_moments, *given, rows=rows)
+        moved = by_type.exact_step(gather, weighted, reg_covar, None, linear=True)
+        found = moved.parameters._replace(weights=moved.points)
         new = update(prior, found, process, kind)
         plain = found.covariances.clone()
         diagonal = plain.diagonal(dim1=-2, dim2=-1) if kind in ("full", "tied") else plain
         diagonal.sub_(reg_covar)
-        entropy = value - assigned_log_density(found._replace(covariances=plain), log_weight, factors)
+        entropy = moved.value - assigned_log_density(found._replace(covariances=plain), log_weight, factors)
         return new, float(entropy + log_evidence(of_prior(len(log_weight)), new, total, kind)) / total
 
     return step
-
-
-def _expected_moments(
-    rows: tuple[Tensor, Tensor],
-    points: Tensor,
-    sample_weight: Tensor,
-    log_weight: Tensor,
-    gaussians: Parameters,
-    reg_covar: float,
-    softmax_dtype: torch.dtype,
-) -> tuple[Parameters, Tensor]:
-    """Moments of γ_nk ∝ exp(ω_k) N(x_n | m_k, Σ_k), and Σ_n p_n times the log of their normaliser.
-
-    Computed as two products with `rows`, features and weights in any order, or directly from `points` if the
-    products would cancel.
-    """
-    weights = torch.exp(log_weight - log_weight.max())
-    unnormalised = gaussians._replace(weights=weights)
-    if not em.is_ill_conditioned(unnormalised):
-        natural = em.natural_parameters(gaussians)
-        natural[:, 0] += log_weight
-        sums, value = em.expectation(*rows, natural, softmax_dtype)
-        found = em.maximization(sums, reg_covar)._replace(weights=sums[:, 0])
-        if not em.has_cancelled(sums, found._replace(weights=(sums[:, 0] > 1e-9).to(sums))):
-            return found, value
-    found, value = by_type.direct_step(points, sample_weight, unnormalised, reg_covar)
-    total = sample_weight.sum()
-    return found._replace(weights=found.weights * total), value + log_weight.max() * total
-
-
-def _typed_moments(
-    points: Tensor,
-    sample_weight: Tensor,
-    log_weight: Tensor,
-    factors: by_type.Factors,
-    reg_covar: float,
-    softmax_dtype: torch.dtype,
-) -> tuple[Parameters, Tensor]:
-    """The same with the arithmetic of the covariance type, for many dimensions."""
-    weighted = copy.copy(factors)
-    weighted.constant = factors.constant + log_weight
-    gather = functools.partial(by_type.expected_moments, points, sample_weight, weighted, softmax_dtype)
-    found = by_type.exact_step(gather, weighted, reg_covar, None, linear=True)
-    return found.parameters._replace(weights=found.points), found.value

@@ -28,9 +28,9 @@ from torch import Tensor
 
 from gmmtorch.arrays import as_tensor
 from gmmtorch.errors import InvalidArgumentError, NumericalError
-from gmmtorch.linalg import check_symmetric, inverse_factor, safe_cholesky, unpack_symmetric
+from gmmtorch.linalg import check_symmetric, safe_cholesky, unpack_symmetric
+from gmmtorch.mixture.em import by_type, loop
 from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em import loop
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.initialization import initialize
 from gmmtorch.mixture.estimator import MixtureEstimator
@@ -198,8 +198,8 @@ def expectation(block: Block, parameters: Parameters) -> tuple[Tensor, Tensor]:
     """
     if block.noise.ndim == 3:
         return _expectation_each(block, parameters)
-    noisy = parameters._replace(covariances=parameters.covariances + block.noise)
-    if em.is_ill_conditioned(noisy):
+    noisy = by_type.Factors(blurred(parameters, block.noise), "full")
+    if bool(noisy.lost_digits()):
         each = block.noise.expand(len(block.points), -1, -1)
         return _expectation_each(block._replace(noise=each), parameters)
     return _expectation_shared(block, parameters, noisy)
@@ -272,18 +272,24 @@ def deconvolution_step(
 # -- one covariance for all points of a block -------------------------------------------------------
 
 
-def _expectation_shared(block: Block, parameters: Parameters, noisy: Parameters) -> tuple[Tensor, Tensor]:
+def blurred(parameters: Parameters, noise: Tensor) -> Parameters:
+    """The mixture of points with the noise covariance (D, D)."""
+    return parameters._replace(covariances=parameters.covariances + noise)
+
+
+def _expectation_shared(
+    block: Block, parameters: Parameters, noisy: by_type.Factors
+) -> tuple[Tensor, Tensor]:
     """Sums of plain EM with covariances T = Σ + R; b and B are linear functions of them."""
     dim = block.points.shape[1]
     features = em.quadratic_features(block.points)
-    sums, value = em.expectation(features, block.weight, em.natural_parameters(noisy), torch.float64)
+    sums, value = em.expectation(features, block.weight, noisy.natural(), torch.float64)
     count, means = sums[:, 0], parameters.means
     first = sums[:, 1 : 1 + dim] - count[:, None] * means
     cross = sums[:, 1 : 1 + dim, None] * means[:, None, :]
     second = unpack_symmetric(sums[:, 1 + dim :], dim) - cross - cross.transpose(-2, -1)
     second = second + count[:, None, None] * means[:, :, None] * means[:, None, :]
-    whiten = inverse_factor(safe_cholesky(noisy.covariances))
-    lost = block.noise @ whiten @ whiten.transpose(-2, -1)  # R T⁻¹: b − μ = (I − R T⁻¹)(x − μ)
+    lost = block.noise @ noisy.whiten.mT @ noisy.whiten  # R T⁻¹: b − μ = (I − R T⁻¹)(x − μ)
     gain = torch.eye(dim, dtype=lost.dtype, device=lost.device) - lost
     remaining = count[:, None, None] * (lost @ parameters.covariances)
     moved = (gain @ first[:, :, None]).squeeze(-1)
@@ -362,11 +368,12 @@ def _log_bounds(noise: Tensor, parameters: Parameters) -> Callable[[Tensor], tup
     spread = torch.linalg.eigvalsh(noise)
     low, high = spread[:, 0].amin().clamp_min(0), spread[:, -1].amax()
     eye = torch.eye(noise.shape[-1], dtype=noise.dtype, device=noise.device)
-    thin, wide = (parameters._replace(covariances=parameters.covariances + r * eye) for r in (low, high))
-    slack = 0.5 * (torch.logdet(wide.covariances) - torch.logdet(thin.covariances))
-    if em.is_ill_conditioned(thin):
-        return lambda x: (em.log_joint(x, thin) - slack, em.log_joint(x, wide) + slack)
-    lower, upper = em.natural_parameters(thin).T, em.natural_parameters(wide).T
+    thin, wide = (by_type.Factors(blurred(parameters, r * eye), "full") for r in (low, high))
+    slack = thin.constant - wide.constant  # half the difference of the log-determinants
+    if bool(thin.lost_digits()):
+        below, above = thin.direct(), wide.direct()
+        return lambda x: (below(x).T - slack, above(x).T + slack)
+    lower, upper = thin.natural().T, wide.natural().T
 
     def bounds(points: Tensor) -> tuple[Tensor, Tensor]:
         features = em.quadratic_features(points)

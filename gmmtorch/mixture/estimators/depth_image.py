@@ -106,8 +106,8 @@ def fit_depth_image(
         features = em.shift_features(cells.values, -center)
         centered = Rows(features, cells.weight, are_points=False)
         first, _ = flat_pieces(centered.points, cells.weight, n_components, noise**2, features)
-        step = loop.natural_step(features, cells.weight, noise**2)
-        found = loop.run_em(step, replicated(first, n_components)[0], tol=0.0, max_iter=max_iter)
+        step = loop.em_step(centered, noise**2)
+        found = loop.run_em(step, replicated(first, n_components), tol=0.0, max_iter=max_iter)
         weights, means, covariances = found.parameters
         means = means + center
     return GaussianMixture.from_parameters(

@@ -124,12 +124,12 @@ class HierarchicalGaussianMixture(MixtureEstimator):
         observed a component.
         """
         points, weight, center = self._prepare(X, sample_weight)
-        found = grow(points, weight, self, on_iteration, density=self._density_limit(origins, center))
-        tree = found.tree._replace(means=found.tree.means + center)
+        limit = self._density_limit(origins, center)
+        tree, bounds, converged = grow(points, weight, self, on_iteration, limit)
         leaves = tree.leaves()
-        mixture = Parameters(*(value[leaves] for value in found.tree[1:]))
-        extra = dict(zip(self._extra_names, tree, strict=True))
-        self._store_fit(mixture, center, found.lower_bounds, found.converged, extra)
+        mixture = Parameters(*(value[leaves] for value in tree[1:]))
+        extra = dict(zip(self._extra_names, tree._replace(means=tree.means + center), strict=True))
+        self._store_fit(mixture, center, bounds, converged, extra)
         self._warn_unless_converged()
         return self
 

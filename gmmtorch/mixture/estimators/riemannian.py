@@ -166,25 +166,20 @@ class Likelihood:
 
     def _moments(self, parameters: Parameters) -> tuple[Tensor, Tensor, Tensor, float]:
         """Moments divided by Σp: N (K,), Σγ(x−μ) (K, D), Σγ(x−μ)(x−μ)ᵀ (K, D, D); and f."""
-        means, total = parameters.means, self.weight.sum()
-        dim = means.shape[1]
-        if em.is_ill_conditioned(parameters):
-            factors = by_type.Factors(parameters, "full")
-            given = self.points, self.weight, factors, torch.float64, False
-            found, value = by_type.expected_moments(*given)
-            count, first, second = found.tensors()
-            first = first - count[:, None] * means
-        else:
-            natural = em.natural_parameters(parameters)
-            sums, value = em.expectation(self._features, self.weight, natural, self.softmax_dtype)
-            count, first = sums[:, 0], sums[:, 1 : 1 + dim] - sums[:, :1] * means
-            mixed = (first + 0.5 * count[:, None] * means)[:, :, None] * means[:, None, :]
-            second = unpack_symmetric(sums[:, 1 + dim :], dim) - mixed - mixed.mT
-        return count / total, first / total, second / total, float(value / total)
+        factors = by_type.Factors(parameters, "full")
+        k, dim = parameters.means.shape
+        linear = by_type.has_linear_form(k, dim, "full") and not bool(factors.lost_digits())
+        given = self.points, self.weight, factors, self.softmax_dtype, linear
+        sums, value = by_type.expected_moments(*given, rows=self._rows)
+        (count, means, covariances), _ = sums.moments()
+        offset, total = means - parameters.means, self.weight.sum()
+        count = count / total
+        second = count[:, None, None] * (covariances + offset[:, :, None] * offset[:, None, :])
+        return count, count[:, None] * offset, second, float(value / total)
 
     @functools.cached_property
-    def _features(self) -> Tensor:
-        return em.quadratic_features(self.points)
+    def _rows(self) -> tuple[Tensor, Tensor] | None:
+        return by_type.rows_of_few_dimensions(self.points, self.weight)
 
 
 @dataclass(frozen=True)
@@ -255,35 +250,20 @@ def check_thickness(parameters: Parameters, points: Tensor) -> None:
 # -- the ascent -----------------------------------------------------------------------------------
 
 
-class LBFGS:
-    """The inverse Hessian implied by the last `memory` steps and gradient changes."""
+Memory = deque[tuple[Tensor, Tensor, float]]
+"""The last steps, the falls of the gradient along them, and their products."""
 
-    def __init__(self, memory: int = _MEMORY) -> None:
-        self._pairs: deque[tuple[Tensor, Tensor, float]] = deque(maxlen=memory)
 
-    def direction(self, point: Iterate) -> Tensor:
-        """Inverse Hessian times gradient, by the two-loop recursion."""
-        vector = point.gradient
-        shares = []
-        for step, fall, product in reversed(self._pairs):
-            shares.append(_dot(step, vector) / product)
-            vector = vector - shares[-1] * fall
-        vector = point.inverse_hessian * vector
-        for (step, fall, product), share in zip(self._pairs, reversed(shares), strict=True):
-            vector = vector + (share - _dot(fall, vector) / product) * step
-        return vector
-
-    def update(self, before: Iterate, direction: Tensor, length: float, after: Iterate) -> None:
-        step, fall = length * direction, before.gradient - after.gradient
-        product = _dot(step, fall)
-        if product > 1e-12 * math.sqrt(_dot(step, step) * _dot(fall, fall)):
-            self._pairs.append((step, fall, product))
-
-    def reset(self) -> bool:
-        """Reset to the first guess. False if there was nothing to reset."""
-        had_memory = len(self._pairs) > 0
-        self._pairs.clear()
-        return had_memory
+def quasi_newton(point: Iterate, memory: Memory) -> Tensor:
+    """The inverse Hessian that the memory implies, times the gradient: the two-loop recursion of L-BFGS."""
+    vector, shares = point.gradient, []
+    for step, fall, product in reversed(memory):
+        shares.append(_dot(step, vector) / product)
+        vector = vector - shares[-1] * fall
+    vector = point.inverse_hessian * vector
+    for (step, fall, product), share in zip(memory, reversed(shares), strict=True):
+        vector = vector + (share - _dot(fall, vector) / product) * step
+    return vector
 
 
 def ascend(
@@ -294,9 +274,9 @@ def ascend(
     Converged: an iteration gained less than `tol`, and a step by the first guess of the Hessian would also
     gain less, to second order; or no higher point was found, to rounding. Values never decrease.
     """
-    solver, values = LBFGS(), list[float]()
+    memory, values = Memory(maxlen=_MEMORY), list[float]()
     for iteration in range(max_iter):
-        found = _climb(point, solver)
+        found = _climb(point, memory)
         gain = found.value - point.value
         point = found
         values.append(point.value)
@@ -308,19 +288,23 @@ def ascend(
     return point, values, False
 
 
-def _climb(point: Iterate, solver: LBFGS) -> Iterate:
+def _climb(point: Iterate, memory: Memory) -> Iterate:
     """A higher point, or the same point if there is none.
 
-    Resets the solver if its direction does not ascend.
+    Clears the memory if its direction does not ascend.
     """
     while True:
-        direction = point.bounded(solver.direction(point))
+        direction = point.bounded(quasi_newton(point, memory))
         length, found = search(point, direction)
         if length > 0:
-            solver.update(point, direction, length, found)
+            step, fall = length * direction, point.gradient - found.gradient
+            product = _dot(step, fall)
+            if product > 1e-12 * math.sqrt(_dot(step, step) * _dot(fall, fall)):
+                memory.append((step, fall, product))
             return found
-        if not solver.reset():
+        if not memory:
             return point
+        memory.clear()
 
 
 def search(point: Iterate, direction: Tensor) -> tuple[float, Iterate]:

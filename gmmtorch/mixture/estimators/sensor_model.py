@@ -18,7 +18,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -36,31 +35,13 @@ _SPACING_NEIGHBORS = 32  # more than the beams of one ring that are nearer than 
 _SPACING_BEAMS = 1_000  # of a scan, for which the spacing is measured
 
 
-class Deviations(NamedTuple):
-    """Standard deviations (m) at given ranges: along the beam, across it, and of its footprint."""
-
-    along: Tensor
-    across: Tensor
-    footprint: Tensor
-
-
-class SensorModel(Protocol):
-    """The sensor properties that fitting and pruning use."""
-
-    def noise_covariances(
-        self, points: ArrayLike, origin: ArrayLike, normals: ArrayLike | None = None
-    ) -> Tensor:
-        """Covariances (N, D, D), m², of the errors of the points, world frame."""
-        ...
-
-    def point_density(self, distance: ArrayLike, cos_incidence: ArrayLike | float = 1.0) -> Tensor:
-        """Expected points of one scan on a surface, per square metre in 3D and per metre in 2D."""
-        ...
+Deviations = tuple[Tensor, Tensor, Tensor]
+"""Standard deviations (m) of readings: along the beam, across it, and of its footprint."""
 
 
 @dataclass(frozen=True)
-class _BeamModel(ABC):
-    """Base of the sensor models.
+class SensorModel(ABC):
+    """The sensor properties that fitting and pruning use.
 
     max_incidence: radians. A surface at a larger incidence is treated as at this angle. It limits f tan θ
         from above and the density from below: an observed surface is not exactly edge-on.
@@ -73,14 +54,13 @@ class _BeamModel(ABC):
             raise InvalidArgumentError(
                 f"max_incidence={self.max_incidence} must be an angle from 0 to below π/2 radians."
             )
-
-    def _check_above_zero(self, *names: str) -> None:
-        for name in names:
-            check_number(name, getattr(self, name), above=True)
+        for name, value in vars(self).items():
+            if name not in ("max_incidence", "axial"):
+                check_number(name, value, above=name != "proportional_noise")
 
     @abstractmethod
     def deviations(self, distance: ArrayLike) -> Deviations:
-        """Standard deviations at ranges (m) of any shape, at incidence 0."""
+        """The deviations at ranges (m) of any shape, at incidence 0."""
 
     @abstractmethod
     def _density(self, distance: Tensor) -> Tensor:
@@ -117,7 +97,7 @@ class _BeamModel(ABC):
 
 
 @dataclass(frozen=True)
-class DepthCameraModel(_BeamModel):
+class DepthCameraModel(SensorModel):
     """A structured-light or stereo camera: σ(z) = a + b z + c z², because it measures disparity.
 
     The defaults are those of a Kinect: axial noise 1.2 mm + 1.9 mm (z − 0.4)², lateral noise 0.8 pixels
@@ -132,7 +112,6 @@ class DepthCameraModel(_BeamModel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check_above_zero("lateral", "pixel_angle")
         a, b, c = self.axial
         # Positive at every range: at 0, at infinity, and at the minimum if that is between them.
         if not (a > 0 and c >= 0 and b > -2 * math.sqrt(a * c) and all(map(math.isfinite, self.axial))):
@@ -143,14 +122,14 @@ class DepthCameraModel(_BeamModel):
         z = _ranges(distance)
         pixel = z * self.pixel_angle
         # The footprint is uniform within the pixel.
-        return Deviations(a + b * z + c * z**2, pixel * self.lateral, pixel / math.sqrt(12))
+        return a + b * z + c * z**2, pixel * self.lateral, pixel / math.sqrt(12)
 
     def _density(self, distance: Tensor) -> Tensor:
         return 1 / (distance * self.pixel_angle) ** 2
 
 
 @dataclass(frozen=True)
-class LidarModel(_BeamModel):
+class LidarModel(SensorModel):
     """A spinning or solid-state lidar: constant and proportional range noise, and a beam that widens.
 
     The defaults are those of a 16-ring spinning lidar's data sheet, except for the noise, which in
@@ -166,11 +145,6 @@ class LidarModel(_BeamModel):
     azimuth_step: float = math.radians(0.2)
     elevation_step: float = math.radians(2.0)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._check_above_zero("noise", "divergence", "azimuth_step", "elevation_step")
-        check_number("proportional_noise", self.proportional_noise)
-
     def deviations(self, distance: ArrayLike) -> Deviations:
         return _laser(distance, self.noise, self.proportional_noise, self.divergence)
 
@@ -179,7 +153,7 @@ class LidarModel(_BeamModel):
 
 
 @dataclass(frozen=True)
-class LaserModel(_BeamModel):
+class LaserModel(SensorModel):
     """A laser that sweeps a plane: `LidarModel` in 2D.
 
     The defaults are those of common indoor scanners of the 2000s: 1 cm, beams of 0.25°, 1° apart.
@@ -189,11 +163,6 @@ class LaserModel(_BeamModel):
     proportional_noise: float = 0.0
     divergence: float = math.radians(0.25)
     angular_step: float = math.radians(1.0)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._check_above_zero("noise", "divergence", "angular_step")
-        check_number("proportional_noise", self.proportional_noise)
 
     def deviations(self, distance: ArrayLike) -> Deviations:
         return _laser(distance, self.noise, self.proportional_noise, self.divergence)
@@ -264,7 +233,7 @@ def measured_sensor(points: ArrayLike, origin: ArrayLike) -> LaserModel | LidarM
 def _laser(distance: ArrayLike, noise: float, proportional: float, divergence: float) -> Deviations:
     ranges = _ranges(distance)
     width = ranges * divergence / 4
-    return Deviations(noise + proportional * ranges, width, width)
+    return noise + proportional * ranges, width, width
 
 
 def _ranges(distance: ArrayLike) -> Tensor:

@@ -203,13 +203,11 @@ def differentiate(shape: Shape, slices: Slices, dtype: torch.dtype = torch.float
         along = slices.directions @ means.T
         deviations = torch.einsum("pi,kij,pj->pk", slices.directions, covariances, slices.directions)
         deviations = (deviations + _THINNEST**2).sqrt()  # avoids division by zero
-    moved = transport(slices, *(value.detach().to(dtype) for value in (weights, along, deviations)))
+    given = (value.detach().to(dtype) for value in (weights, along, deviations))
+    cost, by_weight, by_mean, by_deviation = (value.double() for value in transport(slices, *given))
     shape.zero_grad()
-    torch.autograd.backward(
-        [weights, along, deviations],
-        [moved.by_weight.mean(0).double(), moved.by_mean.double() / n, moved.by_deviation.double() / n],
-    )
-    return float(moved.cost.double().mean())
+    torch.autograd.backward([weights, along, deviations], [by_weight.mean(0), by_mean / n, by_deviation / n])
+    return float(cost.mean())
 
 
 # -- optimal transport along lines ----------------------------------------------------------------
@@ -230,18 +228,6 @@ class Slices(NamedTuple):
     def rows(self, index: Tensor | slice) -> Slices:
         """The slices of some directions."""
         return Slices(self.directions[index], self.values[index], self.levels, self.power[index])
-
-    def to(self, dtype: torch.dtype) -> Slices:
-        return Slices(*(value.to(dtype) for value in self))
-
-
-class Transport(NamedTuple):
-    """W₂² (P,) along each direction, and its derivatives by w, m and s, each (P, K)."""
-
-    cost: Tensor
-    by_weight: Tensor
-    by_mean: Tensor
-    by_deviation: Tensor
 
 
 def random_directions(n: int, dim: int, generator: torch.Generator) -> Tensor:
@@ -320,22 +306,21 @@ def normal_density(z: Tensor) -> Tensor:
     return torch.exp(-0.5 * z.square()) / math.sqrt(2 * math.pi)
 
 
-def transport(slices: Slices, weights: Tensor, means: Tensor, deviations: Tensor) -> Transport:
+def transport(
+    slices: Slices, weights: Tensor, means: Tensor, deviations: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Transport from 1-D mixtures, means and deviations (P, K), weights (K,), to the slices of a cloud.
 
-    Computed in the dtype of the mixtures, in chunks of directions.
+    Returns W₂² (P,) along each direction, and its derivatives by w, m and s, each (P, K). Computed in the
+    dtype of the mixtures, in chunks of directions.
     """
     rows = max(1, _BLOCK_ELEMENTS // (LEVELS * weights.shape[0]))
-    parts = [
-        _transport(slices.rows(slice(begin, begin + rows)).to(means.dtype), weights, m, s)
-        for begin, m, s in zip(
-            range(0, means.shape[0], rows), means.split(rows), deviations.split(rows), strict=True
-        )
-    ]
-    return Transport(*(torch.cat(values) for values in zip(*parts, strict=True)))
-
-
-def _transport(slices: Slices, weights: Tensor, means: Tensor, deviations: Tensor) -> Transport:
+    if means.shape[0] > rows:
+        chunks = (slice(begin, begin + rows) for begin in range(0, means.shape[0], rows))
+        parts = [transport(slices.rows(part), weights, means[part], deviations[part]) for part in chunks]
+        cost, by_weight, by_mean, by_deviation = (torch.cat(values) for values in zip(*parts, strict=True))
+        return cost, by_weight, by_mean, by_deviation
+    slices = Slices(*(value.to(means.dtype) for value in slices))
     cuts = mixture_quantiles(slices.levels, weights, means, deviations)
     z = (cuts[:, :, None] - means[:, None]) / deviations[:, None]
     above, density = torch.special.ndtr(-z), normal_density(z)
@@ -350,9 +335,5 @@ def _transport(slices: Slices, weights: Tensor, means: Tensor, deviations: Tenso
     potential = first * means + deviations * summed(density - z * above)
     by_weight = means.square() + deviations.square() - 2 * potential
     conjugate = (rise * cuts * (1 - slices.levels)).sum(1)
-    return Transport(
-        by_weight @ weights + slices.power - 2 * conjugate,
-        by_weight,
-        2 * weights * (means - mapped),
-        2 * weights * (deviations - stretched),
-    )
+    cost = by_weight @ weights + slices.power - 2 * conjugate
+    return cost, by_weight, 2 * weights * (means - mapped), 2 * weights * (deviations - stretched)

@@ -19,13 +19,8 @@ from torch import Tensor
 from gmmtorch.kernels import chunk_elements
 from gmmtorch.linalg import unpack_symmetric
 from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em.exact import (
-    SOFTMAX_DTYPES,
-    Parameters,
-    feature_dimension,
-    log_joint,
-    natural_parameters,
-)
+from gmmtorch.mixture.em.by_type import Factors
+from gmmtorch.mixture.em.exact import SOFTMAX_DTYPES, Parameters, feature_dimension, natural_parameters
 from gmmtorch.mixture.em.truncated import Rows, group_rows
 
 if TYPE_CHECKING:
@@ -97,22 +92,16 @@ class Nodes(NamedTuple):
         return Nodes(self.place[nodes], parameters, self.own[nodes], self.bound[nodes])
 
 
-class Growth(NamedTuple):
-    """tree; lower_bounds of the mean log-likelihood, nats; converged: whether EM converged in all nodes."""
-
-    tree: Tree
-    lower_bounds: list[float]
-    converged: bool
-
-
 def grow(
     points: Tensor,
     weight: Tensor,
     rule: Rule,
     on_iteration: Callable[[int, float], None] | None = None,
     density: DensityLimit | None = None,
-) -> Growth:
+) -> tuple[Tree, list[float], bool]:
     """Grow the tree of centred points (N, D) with weights (N,) above zero, float64.
+
+    Also returns the lower bounds of the mean log-likelihood, nats, and whether EM converged in all nodes.
 
     Args:
         rule: an estimator; its parameters say when a node is split, and how children are fitted.
@@ -124,15 +113,13 @@ def grow(
     bounds: list[float] = []
     levels: list[Tree] = []
 
-    def report_values(rest: Tensor, values: Tensor) -> None:
-        report_bound(rest + values.sum())
-
-    def report_bound(value: Tensor) -> None:
-        bounds.append(float(value / weight.sum()))
+    def report(rest: Tensor, values: Tensor) -> None:
+        bounds.append(float((rest + values.sum()) / weight.sum()))
         if on_iteration is not None:
             on_iteration(len(bounds), bounds[-1])
 
-    report_bound(score)
+    nothing = torch.zeros_like(score)
+    report(nothing, score)
     for _ in range(rule.max_levels):
         free = math.inf if rule.n_components is None else rule.n_components - n_leaves
         if free < 1:
@@ -149,7 +136,7 @@ def grow(
             members, nodes = members.select(chosen, nodes.n), nodes.select(chosen)
         if nodes.n == 0:
             break
-        on_values = functools.partial(report_values, score - nodes.own.sum())
+        on_values = functools.partial(report, score - nodes.own.sum())
         children, assignment, gain, finished = _split(points, members, nodes, m, rule, on_values, density)
         accepted = _accepted_splits(children, gain, members.mass(nodes.n), free, rule)
         score = score - nodes.bound[accepted].sum()
@@ -159,10 +146,9 @@ def grow(
         score = score + nodes.bound.sum()
         n_leaves += nodes.n - int(accepted.sum())
         converged &= finished
-        report_bound(score)
-    if n_leaves == 1:
-        return Growth(Tree(root.place, *root.parameters), bounds, converged)
-    return Growth(Tree(*(torch.cat(values) for values in zip(*levels, strict=True))), bounds, converged)
+        report(nothing, score)
+    levels = levels if n_leaves > 1 else [Tree(root.place, *root.parameters)]
+    return Tree(*(torch.cat(values) for values in zip(*levels, strict=True))), bounds, converged
 
 
 def _root(points: Tensor, weight: Tensor, reg_covar: float) -> tuple[Nodes, Members]:
@@ -173,7 +159,7 @@ def _root(points: Tensor, weight: Tensor, reg_covar: float) -> tuple[Nodes, Memb
     covariance = (weight[:, None] * offset).T @ offset / total
     covariance.diagonal().add_(reg_covar)
     root = Parameters(torch.ones_like(total)[None], mean[None], covariance[None])
-    own = (weight * log_joint(points, root)[:, 0]).sum()[None]
+    own = (Factors(root, "full").direct()(points)[0] @ weight)[None]
     index = torch.arange(points.shape[0], device=points.device)
     return Nodes(index.new_tensor([-1]), root, own, own), Members(index, torch.zeros_like(index), weight)
 
@@ -211,9 +197,9 @@ def _split(
     packed, children, converged = fit_children(points, members, centers, m, rule, on_values)
     children = keep_children(children, children.weights * mass[:, None] >= rule.min_support)
     assignment = assign_members(packed, children, members, rule.soft_threshold)
-    gain = assignment.value - nodes.own
+    gain = assignment[2] - nodes.own
     if density is not None:
-        children = density.drop_sparse_children(children, centers, assignment.members)
+        children = density.drop_sparse_children(children, centers, assignment[0])
         assignment = assign_members(packed, children, members, rule.soft_threshold)
     return children, assignment, gain, converged
 
@@ -232,13 +218,13 @@ def _accepted_splits(children: Children, gain: Tensor, mass: Tensor, free: float
 
 
 def _build_children(
-    children: Children, found: Assignment, nodes: Nodes, accepted: Tensor, weight: Tensor, n_before: int
+    children: Children, assignment: Assignment, nodes: Nodes, accepted: Tensor, weight: Tensor, n_before: int
 ) -> tuple[Nodes, Members, Tree]:
     """The children of the accepted nodes, their members, and the new level of the tree.
 
     weight: (N,) of the points. n_before: number of nodes in earlier levels.
     """
-    assignment, m = found.members, children.weights.shape[1]
+    (members, log_density, _), m = assignment, children.weights.shape[1]
     chosen = ((children.weights > 0) & accepted[:, None]).flatten().nonzero().squeeze(1)
     parents = nodes.parameters
     parent = chosen // m
@@ -247,14 +233,14 @@ def _build_children(
     parameters = Parameters(
         path_weights[chosen], parents.means[parent] + local.means[chosen], local.covariances[chosen]
     )
-    p, child = assignment.weight, assignment.node
-    own = torch.zeros_like(path_weights).index_add_(0, child, p * found.log_density)
-    shared = p * path_weights.log()[child] - torch.xlogy(p, p / weight[assignment.point])
+    p, child = members.weight, members.node
+    own = torch.zeros_like(path_weights).index_add_(0, child, p * log_density)
+    shared = p * path_weights.log()[child] - torch.xlogy(p, p / weight[members.point])
     bound = own.index_add(0, child, shared)
     place = n_before + torch.arange(chosen.shape[0], device=chosen.device)
     return (
         Nodes(place, parameters, own[chosen], bound[chosen]),
-        assignment.select(chosen, path_weights.shape[0]),
+        members.select(chosen, path_weights.shape[0]),
         Tree(nodes.place[parent], *parameters),
     )
 
@@ -310,20 +296,10 @@ class Packed(NamedTuple):
         for begin in range(0, self.node.shape[0], step):
             part = slice(begin, begin + step)
             x = self.values[part]
-            if are_points:
-                x = _features_of_columns(x)
+            if are_points:  # `exact.quadratic_features` in another layout
+                squares = [x[:, i : i + 1] * x[:, i:] for i in range(self.dim)]
+                x = torch.cat([torch.ones_like(x[:, :1]), x, *squares], 1)
             yield part, x, self.weight[part], self.node[part]
-
-
-def _features_of_columns(x: Tensor) -> Tensor:
-    """Features (b, F, B) of points (b, D, B): `exact.quadratic_features` in another layout."""
-    dim = x.shape[1]
-    found = x.new_empty(x.shape[0], 1 + dim + dim * (dim + 1) // 2, x.shape[2])
-    found[:, 0], found[:, 1 : 1 + dim], begin = 1.0, x, 1 + dim
-    for i in range(dim):
-        torch.mul(x[:, i : i + 1], x[:, i:], out=found[:, begin : begin + dim - i])
-        begin += dim - i
-    return found
 
 
 def pack(points: Tensor, members: Members, centers: Tensor, dtype: torch.dtype) -> Packed:
@@ -503,15 +479,9 @@ def keep_children(children: Children, kept: Tensor) -> Children:
 # -- assignment of members to children ------------------------------------------------------------
 
 
-class Assignment(NamedTuple):
-    """Members of the children, which are numbered node · m + child.
-
-    log_density: (R,) of each member at its child, nats. value: (G,) Σ p log Σ_children of the nodes.
-    """
-
-    members: Members
-    log_density: Tensor
-    value: Tensor
+Assignment = tuple[Members, Tensor, Tensor]
+"""The members of children, which are numbered node · m + child; their log-densities (R,) there, nats; and
+Σ p log Σ_children (G,) of the nodes."""
 
 
 def assign_members(packed: Packed, children: Children, members: Members, soft_threshold: float) -> Assignment:
@@ -539,8 +509,5 @@ def assign_members(packed: Packed, children: Children, members: Members, soft_th
         where = (block, child, place)
         found.append((packed.member[part][block, place], node[block] * m + child, gamma[where], joint[where]))
     member, child, share, log_joint = (torch.cat(values) for values in zip(*found, strict=True))
-    return Assignment(
-        Members(members.point[member], child, members.weight[member] * share),
-        log_joint.double() - log_weight[child],
-        value,
-    )
+    assigned = Members(members.point[member], child, members.weight[member] * share)
+    return assigned, log_joint.double() - log_weight[child], value

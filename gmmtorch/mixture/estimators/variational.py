@@ -18,13 +18,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.linalg import check_symmetric, safe_cholesky
 from gmmtorch.mixture.density import NotFittedError
 from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em.exact import (
-    COVARIANCE_TYPES,
-    Parameters,
-    compact,
-    expand,
-    type_shape,
-)
+from gmmtorch.mixture.em.exact import COVARIANCE_TYPES, Parameters, compact, expand, type_shape
 from gmmtorch.mixture.em.initialization import initialize
 from gmmtorch.mixture.em.loop import EMResult, OnIteration, run_em
 from gmmtorch.mixture.em.variational_bayes import (

@@ -50,7 +50,7 @@ def test_a_run_of_exact_em_is_that_of_the_twin(device, seed, n, dim, k, tol, max
     features, weight = quadratic_features(cloud(n, dim, seed)), random_weight(n, seed)
     start = random_parameters(k, dim, seed)
     with kernels("torch"):
-        step = loop.natural_step(features, weight, 1e-3, torch.float64)
+        step = loop.em_step(Rows(features, weight, False), 1e-3, torch.float64)
         expected = loop.run_em(step, start, tol=tol, max_iter=max_iter)
     found = fused_exact_em(features, weight, start, 1e-3, tol, max_iter, guarded=guarded, team=team)
     assert not found.failed
@@ -86,7 +86,7 @@ def test_a_start_whose_sums_lose_digits_takes_the_direct_step():
 
 def test_callbacks_and_continued_runs_see_every_iteration():
     features, weight, seen = quadratic_features(cloud(300, 2)), random_weight(300), []
-    step, start = loop.natural_step(features, weight, 1e-3), random_parameters(4, 2)
+    step, start = loop.em_step(Rows(features, weight, False), 1e-3), random_parameters(4, 2)
     whole = loop.run_em(step, start, tol=0.0, max_iter=9, on_iteration=lambda *at: seen.append(at))
     assert seen == list(enumerate(whole.lower_bounds, 1))
     half = loop.run_em(step, start, tol=0.0, max_iter=4)
