@@ -35,7 +35,7 @@ def scored(data: Path, name: str, chosen: tuple[str, ...]) -> list[dict[str, Any
     # What gmmtorch-occupancy takes unless it is told otherwise.
     factories = choose(chosen, methods(partial(GaussianMap, rule, cutoff=3.0)))
     cells = CELLS.get(name, PLANAR)
-    protocol = Protocol(held_out(dataset), KEPT, cells, max_beams=MAX_BEAMS)
+    protocol = Protocol(held_out(dataset), KEPT, "beams", cells, max_beams=MAX_BEAMS)
     return evaluate(name, list(dataset), factories, protocol).rows
 
 
@@ -90,7 +90,7 @@ RULES: dict[str, dict[str, float]] = {
 def protocol(name: str, dataset: Dataset) -> Protocol:
     if dataset[0].dim == 2:
         return Protocol(kept=(1.0, 0.1), resolution=(0.1, 0.02))
-    return Protocol(held_out(dataset), (1.0, 0.1), (0.05 if name == "kinect" else 0.2,))
+    return Protocol(held_out(dataset), (1.0, 0.1), "beams", (0.05 if name == "kinect" else 0.2,))
 
 
 def by_rule(name: str, options: Any) -> Iterator[Row]:

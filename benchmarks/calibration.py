@@ -35,7 +35,7 @@ def scored(data: Path, name: str, chosen: tuple[str, ...]) -> list[tuple[float, 
     scans, found = list(dataset), []
     for side in (0.02, *SIDES) if name in PLANAR else SIDES:
         names = [n for n in chosen if n != "octomap" or side >= SMALLEST.get(name, 0.1)]
-        protocol = Protocol(held_out(dataset), (1.0,), (side,), max_beams=MAX_BEAMS)
+        protocol = Protocol(held_out(dataset), (1.0,), "beams", (side,), max_beams=MAX_BEAMS)
         try:
             outcome = evaluate(name, scans, choose(names, methods(GaussianMap)), protocol)
         except MemoryLimitError:  # cells of a street

@@ -225,7 +225,7 @@ def static(options: Any) -> Iterator[Row]:
     for name in options.names:
         dataset = recording(options.data, name, **({"pixel_stride": 2} if name == "kinect" else {}))
         budget, cell = BUDGETS.get(name), CELLS.get(name, PLANAR)[0]
-        protocol = Protocol(held_out(dataset), (1.0,), (cell,), max_beams=20_000)
+        protocol = Protocol(held_out(dataset), (1.0,), "beams", (cell,), max_beams=20_000)
         found = []
         for forget in ("off", "contradiction"):
             rule = IncrementalRule(max_bytes=budget, forget=forget)

@@ -95,7 +95,7 @@ def map_score(scans: Dataset, name: str) -> float:
     """AUC of the map of the scans that are not held out, without a budget of bytes."""
     resolution = RESOLUTION[scans[0].dim]
     factories = choose(("point",), methods(partial(gt.GaussianMap, cutoff=3.0)))
-    protocol = Protocol(held_out(scans), (1.0,), (resolution,), max_beams=50_000)
+    protocol = Protocol(held_out(scans), (1.0,), "beams", (resolution,), max_beams=50_000)
     return float(evaluate(name, list(scans), factories, protocol).rows[0]["auc"])
 
 

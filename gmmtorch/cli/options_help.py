@@ -62,7 +62,6 @@ _REPLACED = {
     "link.scouting": "set scouting in the file of link.zenoh_config.",
     "link.ttl": "robots of a multicast group share one network.",
     "runtime.cache": "results that depend only on the world are always stored.",
-    "evaluation.removal": "a share of the beams of each scan is kept.",
     "stream.checkpoint_seconds": "use checkpoint_seconds.",
     "stream.checkpoint_every": "use checkpoint_seconds; else every ten iterations have one.",
     "stream.sample_points": "the start of EM and PSNR2 take 100,000 points.",
@@ -79,7 +78,6 @@ _REPLACED_GROUPS = (
         "missions have no checkpoints. A study that was killed continues with the missions that are missing "
         "if you run the same command with hydra.run.dir=RUN, the folder of the killed run.",
     ),
-    ("network.", "delay jitter duplication", _CONSTANT % "`TeamOptions` has it"),
     ("belief.", "prior clamp free occupied", _CONSTANT % "`BeliefRule`"),
     (
         "map.",

@@ -261,8 +261,20 @@ def survey_all(
     """Result of one pass over the sources of all processes, see `survey`. The seed of rank 0 is used."""
     if sample_points is not None:
         check_whole("sample_points", sample_points, 1)
-    parts = processes.gather(survey_source(source, sample_points, processes.broadcast(seed)))
-    return merge_surveys(parts, sample_points) if processes.size > 1 else parts[0]
+    seed = int(processes.broadcast(torch.tensor([seed], dtype=torch.float64)))
+    part = survey_source(source, sample_points, seed)
+    if processes.size == 1:
+        return part
+    counts = part.total.new_tensor([part.n_points, part.n_dropped, part.checksum])  # whole numbers below 2⁵³
+    facts = processes.gather(torch.cat([counts, part.total, part.low, part.high])[None])
+    samples = processes.gather(part.sample)
+    dim = source.dim
+    parts = []
+    for row, sample in zip(torch.cat(facts), samples, strict=True):
+        n_points, n_dropped, checksum = (int(value) for value in row[:3])
+        total, low, high = row[3:].split(dim)
+        parts.append(Survey(n_points, n_dropped, total, low, high, checksum, sample))
+    return merge_surveys(parts, sample_points)
 
 
 def first_state(
@@ -274,14 +286,16 @@ def first_state(
     processes: Processes,
 ) -> State:
     """Start or continuation of EM: the state of rank 0, the same in all processes."""
-    state = None
+    packed = None
     if processes.rank == 0:
         state = None if checkpoint is None else checkpoint.read(run)
         if state is None:
             points = survey.points - survey.center
             rows = Rows(points, points.new_ones(points.shape[0]))
             state = State(mixture._start(rows, survey.center, generator)[0], survey.center, [])
-    return cast(State, processes.broadcast(state))
+        packed = state.pack()
+    k, dim = cast(int, mixture.n_components), survey.low.shape[0]
+    return State.unpack(processes.broadcast(packed), k, dim, mixture.covariance_type)
 
 
 def run_facts(mixture: GaussianMixture, survey: Survey, e_step: str) -> RunFacts:
@@ -322,6 +336,20 @@ class State(NamedTuple):
     parameters: Parameters
     center: Tensor
     lower_bounds: list[float]
+
+    def pack(self) -> Tensor:
+        """The state as one vector (n,), float64."""
+        bounds = self.center.new_tensor(self.lower_bounds)
+        return torch.cat([part.flatten() for part in (*self.parameters, self.center, bounds)])
+
+    @staticmethod
+    def unpack(vector: Tensor, n_components: int, dim: int, covariance_type: str) -> State:
+        """The inverse of `pack`."""
+        k, shape = n_components, em.type_shape(covariance_type, n_components, dim)
+        sizes = [k, k * dim, math.prod(shape), dim]
+        weights, means, covariances, center, bounds = vector.split([*sizes, vector.numel() - sum(sizes)])
+        parameters = Parameters(weights, means.view(k, dim), covariances.view(shape))
+        return State(parameters, center, bounds.tolist())
 
 
 @dataclass(frozen=True)

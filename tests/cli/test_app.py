@@ -95,7 +95,6 @@ def test_a_log_call_with_wrong_arguments_ends_no_command(monkeypatch, tmp_path):
         ("map", "map.cutoff=2", "map.cutoff is no longer an option: it is a constant;`GaussianMap`"),
         ("map", "map.min_points=2", "map.min_points is no longer an option: it is a constant;learning rule"),
         ("robot", "link.listen_endpoints=[]", "is no longer an option: give link.listen"),
-        ("explore", "network.jitter=1", "is no longer an option: it is a constant;TeamOptions"),
         ("explore", "checkpoint.every=60", "checkpoint.every is no longer;continues;hydra.run.dir=RUN"),
     ],
 )

@@ -180,15 +180,17 @@ def evaluate(
         check_writable(Path(protocol.save_map))
     outcome = Outcome()
     for kept in protocol.kept:
-        shown = queries.keep_share(train, kept, seed)
-        facts = {"dataset": name, "removal": "beams", "kept": float(kept)}
+        shown = queries.keep_share(train, kept, protocol.removal, seed)
+        facts = {"dataset": name, "removal": protocol.removal, "kept": float(kept)}
         facts["n_train_points"] = sum(len(scan.points) for scan in shown)
         # A map that serves several resolutions or forms of evidence is built once.
         cache: dict[Any, tuple[OccupancyMap, float, SeenPredictions | None]] = {}
         for (method, factory), resolution in itertools.product(factories.items(), protocol.resolution):
             shared = factory.new_map if isinstance(factory, Form) else method
             if shared not in cache:
-                label = f"{'mixture' if shared is not method else method}, {kept:.0%} of the beams"
+                label = (
+                    f"{'mixture' if shared is not method else method}, {kept:.0%} of the {protocol.removal}"
+                )
                 cache[shared] = _build(factory(resolution), shown, label, resolution, on_event)
             built, seconds, seen = cache[shared]
             if not built.any_resolution:

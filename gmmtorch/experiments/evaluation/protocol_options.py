@@ -14,6 +14,7 @@ from gmmtorch.declarations import option
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_resolution, check_whole
 
 FreePoints = Literal["uniform", "near_surface", "clear"]
+Removal = Literal["beams", "scans"]
 
 
 def check_not_empty(options: object, *names: str) -> None:
@@ -32,6 +33,7 @@ class Protocol:
     kept: Sequence[float] = option(
         (1.0,), "shares of the training data that are used; a smaller share is a subset of a larger one"
     )
+    removal: Removal = option("beams", "what is removed to keep a share: beams or scans")
     resolution: Sequence[float] = option((0.1,), "sides (m) of the cells for which occupancy is asked")
     free: FreePoints = option(
         "uniform",
@@ -53,6 +55,7 @@ class Protocol:
         for share in self.kept:
             if not 0 < share <= 1:
                 raise InvalidArgumentError(f"kept={share} must be a share in (0, 1].")
+        check_choice("removal", self.removal, get_args(Removal))
         if self.test_every < 2:
             raise InvalidArgumentError(
                 f"test_every={self.test_every} must be at least 2: with 1 no scan is left to learn from."

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.experiments.evaluation.protocol_options import FreePoints
+from gmmtorch.experiments.evaluation.protocol_options import FreePoints, Removal
 from gmmtorch.files import write_bytes
 from gmmtorch.occupancy import SparseEvidence
 from gmmtorch.pose import Pose
@@ -31,14 +31,17 @@ def split_indices(n_scans: int, test_every: int) -> tuple[list[int], list[int]]:
     return [i for i in range(n_scans) if i not in held_out], test
 
 
-def keep_share(scans: Sequence[Scan], share: float, seed: int) -> list[Scan]:
-    """Keeps a random share of the beams of each scan.
+def keep_share(scans: Sequence[Scan], share: float, removal: Removal, seed: int) -> list[Scan]:
+    """Keeps a random share of the beams of each scan, or a random share of the scans.
 
     With the same seed, a smaller share is a subset of a larger one.
     """
     if share == 1:
         return list(scans)
     generator = torch.Generator().manual_seed(seed)
+    if removal == "scans":
+        rank = torch.rand(len(scans), generator=generator).argsort().argsort()
+        return [scan for scan, r in zip(scans, rank.tolist(), strict=True) if r < max(1, share * len(scans))]
     return [scan.select(torch.rand(scan.n_beams, generator=generator) < share) for scan in scans]
 
 

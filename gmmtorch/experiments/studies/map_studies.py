@@ -176,7 +176,7 @@ def evaluate_correction(
     rows: list[Row] = []
     for kept in protocol.kept:
         on_event("pose correction", 0, 3)
-        shown = evaluation.keep_share(train, kept, seed)
+        shown = evaluation.keep_share(train, kept, protocol.removal, seed)
         motions = evaluation.pose_perturbations(shown, protocol.pose_noise, seed)
         moved = [scan.transformed(motion) for scan, motion in zip(shown, motions, strict=True)]
         true_map, perturbed_map = new_map(), new_map()
@@ -191,7 +191,7 @@ def evaluate_correction(
             {
                 "dataset": name,
                 "method": method,
-                "removal": "beams",
+                "removal": protocol.removal,
                 "kept": float(kept),
                 "resolution": float(resolution),
                 "pose_noise_m": float(protocol.pose_noise[0]),

@@ -9,16 +9,15 @@ from __future__ import annotations
 import datetime
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 
-T = TypeVar("T")
 _LAUNCHED = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 TIMEOUT = 600.0
 """Default time (s) that a process waits for the others."""
@@ -38,13 +37,20 @@ class Processes:
         """The sum of the tensors of all processes, of equal shape and dtype."""
         return tensor
 
-    def gather(self, value: T) -> list[T]:
-        """The values of all processes, by rank."""
-        return [value]
+    def gather(self, rows: Tensor) -> list[Tensor]:
+        """The rows (n, C) of all processes, by rank; n may differ."""
+        counts = torch.zeros(self.size, dtype=torch.int64)
+        counts[self.rank] = rows.shape[0]
+        lengths = self.sum(counts).tolist()
+        padded = rows.new_zeros(self.size, max(lengths), rows.shape[1])
+        padded[self.rank, : rows.shape[0]] = rows
+        return [part[:n] for part, n in zip(self.sum(padded), lengths, strict=True)]
 
-    def broadcast(self, value: T) -> T:
-        """The value of rank 0."""
-        return value
+    def broadcast(self, vector: Tensor | None) -> Tensor:
+        """The vector (n,), float64, of rank 0. Other ranks may pass None."""
+        given = torch.zeros(0, dtype=torch.float64) if vector is None or self.rank else vector
+        length = int(self.sum(torch.tensor(given.numel())))
+        return self.sum(given if self.rank == 0 else given.new_zeros(length))
 
 
 SINGLE_PROCESS = Processes()
@@ -62,28 +68,15 @@ class ProcessGroup(Processes):
 
     def sum(self, tensor: Tensor) -> Tensor:
         total = tensor.to(self._device).contiguous()
-        self._exchange(self._distributed.all_reduce, total)
-        return total.to(tensor.device)
-
-    def gather(self, value: T) -> list[T]:
-        found = [value] * self.size
-        self._exchange(self._distributed.all_gather_object, found, value)
-        return found
-
-    def broadcast(self, value: T) -> T:
-        box = [value]
-        self._exchange(self._distributed.broadcast_object_list, box)
-        return box[0]
-
-    def _exchange(self, collective: Callable[..., object], *values: object) -> None:
         try:
-            collective(*values)
+            self._distributed.all_reduce(total)
         except RuntimeError as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise LostProcessError(
                 f"rank {self.rank} of {self.size} lost another process, or got no answer within "
                 f"{self._timeout:g} s ({reason})."
             ) from error
+        return total.to(tensor.device)
 
 
 def is_launched() -> bool:

@@ -14,7 +14,7 @@ from gmmtorch.declarations import option, repeated
 from gmmtorch.team.exploration import TeamOptions, WorldOptions
 
 SIMULATED = (
-    *("network.bandwidth", "network.reach", "network.partitions"),
+    *(f"network.{name}" for name in ("delay", "jitter", "bandwidth", "duplication", "reach", "partitions")),
     "evaluation.codecs",
 )
 """Options of a mission that only a simulated network has, or only the simulated mission measures."""

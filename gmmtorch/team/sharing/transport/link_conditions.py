@@ -35,20 +35,23 @@ class Partition(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class LinkConditions:
-    """Conditions of all links of a network. Raises `InvalidArgumentError` for values out of range.
+    """Conditions of all links of a network. Raises `InvalidArgumentError` for values out of range."""
 
-    latency: seconds from the end of transmission to arrival, at least. jitter: mean (s) of an exponential
-    delay that is added for each receiver and each copy; it reorders datagrams. duplication: share of the
-    received datagrams that arrive twice.
-    """
-
-    latency: float = 0.05
-    jitter: float = 0.0
+    latency: float = option(
+        0.05, "seconds from the end of transmission to arrival, at least", "network.delay"
+    )
+    jitter: float = option(
+        0.0,
+        "mean (s) of an exponential delay that is added for each receiver and each copy; reorders datagrams",
+        "network.jitter",
+    )
     bandwidth: float | None = option(
         None, "bytes per second that each robot can send; null: no limit", "network.bandwidth"
     )
     loss: float = option(0.0, "share of the datagrams that each receiver loses, [0, 1)", "network.loss")
-    duplication: float = 0.0
+    duplication: float = option(
+        0.0, "share of the received datagrams that arrive twice, [0, 1]", "network.duplication"
+    )
     reach: float | None = option(
         None, "largest distance (m) between two robots that communicate; null: any", "network.reach"
     )
