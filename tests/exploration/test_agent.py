@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -74,8 +75,7 @@ def agent(number: int = 0, kind: str = "replica", **options: Any) -> tuple[Agent
     team = TeamOptions(framework=framework, size=3, camera=CAMERA, window=(40, 40, 20), **options)
     made: Mapper = mapper(number, "replica" if kind.startswith("grid") else kind)
     if kind.startswith("grid"):
-        local, belief = made.local, made.belief
-        made = GridMapper(number, local, belief, CAMERA.width, NOVELTY, Memo(64), team.shares, team.size)
+        made = GridMapper(number, made.local, made.belief, replace(team, novelty=NOVELTY), Memo(64))
     library = ViewLibrary(number, incarnation=0)
     robot = Robot(number, START, made, Ahead(), library, Roadmap(), LAUNCH, StoppingRule())
     post = Post()

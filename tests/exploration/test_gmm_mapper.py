@@ -33,11 +33,12 @@ from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.fitting import fit_window
 from gmmtorch.mapping.learning.merging import all_origins
 from gmmtorch.mapping.learning.novelty import beam_novelty, count_explained
-from gmmtorch.occupancy.voxels.cells import Box, intersection
+from gmmtorch.occupancy.voxels.cells import intersection
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.scan import Scan
 from gmmtorch.simulation.robot_camera import DepthFrame
-from gmmtorch.team.exploration.robot.gmm_mapper import FrameRule, GmmMapper
+from gmmtorch.team.exploration.mission.options import FrameRule
+from gmmtorch.team.exploration.robot.gmm_mapper import GmmMapper
 from gmmtorch.team.exploration.robot.mapper import FrameUpdate, Memo
 from gmmtorch.team.sharing.messages.component_messages import (
     ComponentsMessage,
@@ -442,9 +443,10 @@ def test_superseded_components_leave_the_voxels() -> None:
     speaker.receive(heard(*listener.shared.datagrams(), sender=1))
     assert speaker.shared.digest() == listener.shared.digest()
     assert_same_evidence(speaker, rebuilt(listener))
-    everywhere = Box(torch.tensor([-(10**7)] * 3), torch.tensor([10**7] * 3))
-    tiled = listener.tiles.near(everywhere, 0.2)
-    assert sum(map(len, tiled)) == len(listener.components())
+    everywhere = torch.full((3,), 1e6, dtype=torch.float64)
+    for boxes in (listener._by_rays, listener._by_explained):
+        assert sum(map(len, boxes.near(-everywhere, everywhere))) == len(listener.components())
+        assert boxes.near(everywhere, 2 * everywhere) == []
 
 
 def test_corrected_components_move_in_the_voxels() -> None:

@@ -16,11 +16,11 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.occupancy.voxels.cells import Box, CellEvidence
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
-from gmmtorch.simulation.robot_camera import DepthFrame
+from gmmtorch.simulation.robot_camera import DepthCamera, DepthFrame
 from gmmtorch.team.exploration.mission.mission import Mission
+from gmmtorch.team.exploration.mission.options import TeamOptions
 from gmmtorch.team.exploration.mission.trials import assemble
 from gmmtorch.team.exploration.planning.collision_checking import cells_in_sphere
 from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
@@ -54,9 +54,8 @@ class Idle:
 
 def robot(start_radius: float = 0.0) -> Robot:
     belief = BeliefMap(0.2, BOX, torch.ones(BOX.shape, dtype=torch.bool), BeliefRule())
-    mapper = GridMapper(
-        0, RollingWindow(0.2, WINDOW, 4), belief, 8, NoveltyRule(resolution=0.2), Memo(8), True, 3
-    )
+    team = TeamOptions(framework="grid_shared", camera=DepthCamera(width=8, height=6))
+    mapper = GridMapper(0, RollingWindow(0.2, WINDOW, 4), belief, team, Memo(8))
     mapper.center_on(START[:3])
     launch = InitialFreeSpace(cells_in_sphere(START[:3], start_radius, 0.2), START[None, :3])
     return Robot(0, START, mapper, Idle(), ViewLibrary(0), Roadmap(), launch, StoppingRule())

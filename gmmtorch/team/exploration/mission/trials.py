@@ -156,16 +156,12 @@ def _mapper(
     x, y, z = (n + 2 * (_SLACK + _ROUNDING) for n in options.window)
     local = RollingWindow(world.resolution, (x, y, z), _SLACK, options.device)
     belief = BeliefMap(world.resolution, world.box, world.observable, options.belief, options.device)
-    width = options.camera.width
     if not options.has_mixtures:
-        team = options.shares, options.size
-        return GridMapper(number, local, belief, width, options.novelty, evidence, *team, memo.decoded)
-    shared: Replica | Broadcast
+        return GridMapper(number, local, belief, options, evidence, memo.decoded)
     if options.codec == "quantized":
-        shared = Replica(number, dim=3, incarnation=incarnation)
-    else:
-        shared = Broadcast(number, options.codec)
-    return GmmMapper(local, belief, width, options.novelty, options.frame, evidence, shared)
+        replica = Replica(number, dim=3, incarnation=incarnation)
+        return GmmMapper(local, belief, options, evidence, replica)
+    return GmmMapper(local, belief, options, evidence, Broadcast(number, options.codec))
 
 
 ROW = "row.json"

@@ -18,7 +18,6 @@ from torch import Tensor
 
 from gmmtorch.mapping import (
     Components,
-    NoveltyRule,
     all_origins,
     box_around,
     count_explained,
@@ -26,11 +25,11 @@ from gmmtorch.mapping import (
     fit_window,
     summed,
 )
-from gmmtorch.occupancy import Box, CellEvidence, RollingWindow, intersection
+from gmmtorch.occupancy import CellEvidence, RollingWindow, cone_bounds, intersection
 from gmmtorch.scan import Scan
 from gmmtorch.simulation import DepthFrame
-from gmmtorch.team.exploration.mission.options import FrameRule
-from gmmtorch.team.exploration.robot.component_rays import MixtureTiles, component_evidence, regenerate
+from gmmtorch.team.exploration.mission.options import TeamOptions
+from gmmtorch.team.exploration.robot.component_rays import RayRule, component_evidence
 from gmmtorch.team.exploration.robot.mapper import FrameUpdate, Mapper, Memo, novel_beams
 from gmmtorch.team.exploration.world.scoring import BeliefMap
 from gmmtorch.team.sharing import Broadcast, ReceivedMessage, Replica
@@ -39,6 +38,29 @@ _LEEWAY = 0.5  # cells
 _EMPTY_RAYS = 0.75  # of the rays of components of surfaces: components of free space overlap far more
 _EMPTY_CUTOFF = 2.0
 """Mahalanobis distance. Tails of components of free space reach through surfaces that beams just missed."""
+
+
+_REACH = 3.0  # deviations around the means in which the rays of components end
+
+
+class _Boxes:
+    """Batches of components, each with the box (2, 3) around its rays, or around what it explains, metres."""
+
+    def __init__(self) -> None:
+        self._batches: list[Components] = []
+        self._corners = torch.zeros(0, 2, 3, dtype=torch.float64)
+
+    def add(self, batch: Components, low: Tensor, high: Tensor) -> None:
+        """Adds a batch of K parts with boxes from `low` to `high`, (K, 3)."""
+        self._batches.append(batch)
+        corners = torch.stack([low.amin(0), high.amax(0)])[None]
+        self._corners = torch.cat([self._corners.to(corners), corners])
+
+    def near(self, low: Tensor, high: Tensor) -> list[Components]:
+        """The batches whose box meets that from `low` to `high`, (3,), in the order of `add`."""
+        first, last = self._corners.unbind(1)
+        meets = ((first <= high.to(first)) & (last >= low.to(last))).all(1)
+        return [self._batches[row] for row in meets.nonzero().squeeze(1).tolist()]
 
 
 class GmmMapper(Mapper):
@@ -54,29 +76,41 @@ class GmmMapper(Mapper):
         self,
         local: RollingWindow,
         belief: BeliefMap,
-        width: int,
-        novelty: NoveltyRule,
-        rule: FrameRule,
+        options: TeamOptions,
         memo: Memo,
         shared: Replica | Broadcast,
     ) -> None:
-        super().__init__(local, belief, width, novelty, memo)
+        super().__init__(local, belief, options, memo)
         self.shared = shared
-        self.tiles = MixtureTiles()
-        self._rule = rule
+        self._rule = rule = options.frame
+        self._rays = RayRule(
+            local.resolution,
+            rays_per_cell=rule.rays,
+            empty_rays_per_cell=_EMPTY_RAYS * rule.rays,
+            empty_cutoff=_EMPTY_CUTOFF,
+            shell=rule.shell,
+            hits_per_ray=rule.hits_per_ray,
+            thinned=True,
+        )
         self._gained: dict[tuple[int, int], float] = {}  # counts that have not grown enough, by id
         self._due: dict[tuple[int, int], float] = {}  # counts that are sent with the next message
         self._n_frames = 0
+        self._forget()
+
+    def _forget(self) -> None:
+        """Forgets where batches are."""
+        self._by_rays, self._by_explained = _Boxes(), _Boxes()
         self._by_origin: dict[tuple[int, ...], list[Components]] = {}  # batches by the cell of their origins
-        self._by_place: list[tuple[Tensor, Components]] = []  # batches with the box (2, 3) that they explain
         self._near: tuple[list[Components], Components] | None = None  # the last `_seen_from_near`
 
     # -- sensing ----------------------------------------------------------------------------------
 
     def center_on(self, position: Tensor) -> None:
-        uncovered = [intersection(box, self.belief.grid.box) for box in self.local.center_on(position)]
-        boxes = [box for box in uncovered if box is not None]
-        regenerate(self.local, boxes, self.tiles, self._evidence)
+        for uncovered in self.local.center_on(position):
+            box, side = intersection(uncovered, self.belief.grid.box), self.local.resolution
+            # Rays are clipped to the uncovered cells, so nothing is counted twice (thesis Fig 4.2).
+            if box is not None and (near := self._by_rays.near(*(side * corner.double() for corner in box))):
+                self.local.add(component_evidence(Components.concatenate(near), box, self._rays))
 
     def sense(self, frame: DepthFrame) -> FrameUpdate:
         rule = self._rule
@@ -147,12 +181,8 @@ class GmmMapper(Mapper):
 
     def _around(self, points: Tensor) -> Components | None:
         """Components, with all counts, of the batches that may explain points (M, 3); None if none may."""
-        if not self._by_place or len(points) == 0:
-            return None
-        first, last = points.aminmax(dim=0)
-        low, high = torch.stack([box for box, _ in self._by_place], 1)
-        near = ((low <= last) & (high >= first)).all(1).nonzero().squeeze(1).tolist()
-        return summed(Components.concatenate([self._by_place[n][1] for n in near])) if near else None
+        near = self._by_explained.near(*points.aminmax(dim=0)) if len(points) else []
+        return summed(Components.concatenate(near)) if near else None
 
     def _seen_from_near(self, origin: Tensor) -> Components | None:
         """Components with all their counts, of batches seen from near a place (3,); None: there are none."""
@@ -197,7 +227,7 @@ class GmmMapper(Mapper):
         """Casts the whole mixture again, after components were moved or replaced."""
         self.local.clear()
         self.belief.clear()
-        self.tiles, self._by_origin, self._by_place = MixtureTiles(), {}, []
+        self._forget()
         everything = self.shared.components()
         if len(everything):
             self._enter(everything)
@@ -206,29 +236,13 @@ class GmmMapper(Mapper):
         """Enters a batch of components, or of counts added to some; returns its evidence."""
         grid = self.belief.grid
         there = batch.to(grid.device)
-        self.tiles.add(there)
+        self._by_rays.add(there, *cone_bounds(there.cones(), _REACH))
+        self._by_explained.add(there, *box_around(there, explained_within(3, self._novelty.explained)))
         for cell in {self._origin_cell(origin) for origin in batch.origins}:
             self._by_origin.setdefault(cell, []).append(there)
-        low, high = box_around(there, explained_within(3, self._novelty.explained))
-        self._by_place.append((torch.stack([low.amin(0), high.amax(0)]), there))
-        evidence = self._memo(_key(batch), lambda: self._evidence(there, grid.resolution, grid.box))
+        evidence = self._memo(_key(batch), lambda: component_evidence(there, grid.box, self._rays))
         self._add(evidence)
         return evidence
-
-    def _evidence(self, batch: Components, resolution: float, box: Box) -> CellEvidence:
-        """The evidence of components for the cells of a box."""
-        rule = self._rule
-        return component_evidence(
-            batch,
-            resolution,
-            box,
-            rays_per_cell=rule.rays,
-            shell=rule.shell,
-            hits_per_ray=rule.hits_per_ray,
-            thinned=True,
-            empty_rays_per_cell=_EMPTY_RAYS * rule.rays,
-            empty_cutoff=_EMPTY_CUTOFF,
-        )
 
 
 def _key(batch: Components) -> bytes:

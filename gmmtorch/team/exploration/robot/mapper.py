@@ -16,6 +16,7 @@ from gmmtorch.errors import check_whole
 from gmmtorch.mapping import Components, NoveltyRule, beam_novelty
 from gmmtorch.occupancy import Box, CellEvidence, RollingWindow, cast_evidence
 from gmmtorch.simulation import DepthFrame
+from gmmtorch.team.exploration.mission.options import TeamOptions
 from gmmtorch.team.exploration.world.scoring import BeliefMap
 from gmmtorch.team.sharing import (
     Broadcast,
@@ -127,7 +128,6 @@ class Mapper(ABC):
 
     Args:
         local: the window. belief: the map of the world, which the evaluator reads.
-        width: of the camera's images, pixels. novelty: when a beam is novel.
         memo: cache of evidence; shared by the robots of a simulation.
 
     Attributes:
@@ -136,11 +136,9 @@ class Mapper(ABC):
 
     shared: Replica | Broadcast | SharedPoints
 
-    def __init__(
-        self, local: RollingWindow, belief: BeliefMap, width: int, novelty: NoveltyRule, memo: Memo
-    ) -> None:
+    def __init__(self, local: RollingWindow, belief: BeliefMap, options: TeamOptions, memo: Memo) -> None:
         self.local, self.belief = local, belief
-        self._width, self._novelty, self._memo = width, novelty, memo
+        self._width, self._novelty, self._memo = options.camera.width, options.novelty, memo
 
     @abstractmethod
     def center_on(self, position: Tensor) -> None:
@@ -199,8 +197,7 @@ class GridMapper(Mapper):
     The grid behind the window is `belief.grid`.
 
     Args:
-        robot: its id. shares: whether the robot sends its novel points. size: robots of the team.
-        decode: turns a datagram into a message; a memo's, where robots share one.
+        robot: its id. decode: turns a datagram into a message; a cached one, where robots share the work.
     """
 
     shared: SharedPoints
@@ -210,16 +207,13 @@ class GridMapper(Mapper):
         robot: int,
         local: RollingWindow,
         belief: BeliefMap,
-        width: int,
-        novelty: NoveltyRule,
+        options: TeamOptions,
         memo: Memo,
-        shares: bool,
-        size: int,
         decode: Callable[[bytes], Message] = decode,
     ) -> None:
-        super().__init__(local, belief, width, novelty, memo)
-        self.shared = SharedPoints(robot, size)
-        self._shares, self._decode = shares, decode
+        super().__init__(local, belief, options, memo)
+        self.shared = SharedPoints(robot, options.size)
+        self._shares, self._decode = options.shares, decode
 
     def center_on(self, position: Tensor) -> None:
         for box in self.local.center_on(position):
