@@ -17,8 +17,6 @@ from gmmtorch.simulation import CameraOptions
 from gmmtorch.team.sharing import LinkConditions
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from gmmtorch.mapping import SurfaceFit
     from gmmtorch.simulation import DepthCamera
     from gmmtorch.team.exploration.world.scoring import BeliefRule
@@ -32,7 +30,6 @@ _EMPTY_LENGTH = 2 / 3
 """Length of components of free space, as a share of that of surfaces."""
 _FLAT = 0.5
 """Thickness of a flat piece, as a share of `FrameRule.side`."""
-_ROUNDING = 1e-9
 
 FRAMEWORKS = ("gmm_shared", "grid_shared", "grid_isolated", "gmm_thesis")
 """E0, E1 and E2 of the thesis; and `gmm_shared` with the options of `THESIS`."""
@@ -87,47 +84,6 @@ class Dynamics:
     def n_steps(self) -> int:
         """Number of states on the path of a primitive."""
         return round(self.duration / self.step)
-
-    @property
-    def n_braking_steps(self) -> int:
-        """Number of states until rest from the largest velocities."""
-        return int(self._n_ramp_steps(self._limits).max())
-
-    @property
-    def _limits(self) -> Tensor:
-        import torch
-
-        return torch.tensor([self.speed, self.climb, self.yaw_rate], dtype=torch.float64)
-
-    def _n_ramp_steps(self, change: Tensor) -> Tensor:
-        """Number of whole steps that changes (..., 3) of the velocities take."""
-        import torch
-
-        rates = [self.acceleration, self.acceleration, self.yaw_acceleration]
-        per_step = torch.tensor(rates, dtype=torch.float64) * self.step
-        return (change.abs() / per_step - _ROUNDING).ceil()
-
-    def velocities(self, states: Tensor, commands: Tensor, n_steps: int) -> Tensor:
-        """Return velocities (..., n_steps + 1, 3) from those of states (..., 7) to the commands (..., 3).
-
-        Each velocity changes linearly over the whole steps that the acceleration limit needs, then stays
-        constant. It is therefore linear within every step. Raises `InvalidArgumentError` for states
-        beyond the limits.
-        """
-        import torch
-
-        now = states[..., 4:]
-        if not bool((now.abs() <= self._limits * (1 + _ROUNDING)).all()):  # also catches NaN
-            worst = now.reshape(-1, 3).abs().amax(0).tolist()
-            raise InvalidArgumentError(
-                f"states have velocities up to {worst}; speed, climb and yaw_rate allow "
-                f"{self._limits.tolist()}."
-            )
-        change = commands - now
-        n_ramp = self._n_ramp_steps(change).clamp_min(1)[..., None, :]
-        time = torch.arange(n_steps + 1, dtype=torch.float64)[:, None]
-        ramp = now[..., None, :] + change[..., None, :] * (time / n_ramp)
-        return torch.where(time < n_ramp, ramp, commands[..., None, :])
 
 
 @dataclass(frozen=True)
@@ -421,16 +377,10 @@ class WorldOptions:
         """The world for robots with this camera and this body."""
         from gmmtorch.team.exploration.world.world import open_world
 
-        return open_world(
-            self.name,
-            path=self.path,
-            bounds=self.bounds,
-            seed=self.seed,
-            size=self.size,
-            resolution=self.resolution,
-            vertical_fov=team.camera.vertical_fov,
-            max_range=team.camera.max_range,
-            robot_radius=team.dynamics.radius,
-            cache=self.cache,
-            on_event=on_event,
-        )
+        camera, radius = team.camera, team.dynamics.radius
+        of_team: dict[str, Any] = {
+            "vertical_fov": camera.vertical_fov,
+            "max_range": camera.max_range,
+            "robot_radius": radius,
+        }
+        return open_world(**vars(self), **of_team, on_event=on_event)

@@ -29,7 +29,7 @@ from gmmtorch.team.exploration.mission.mission import Mission, MissionScore
 from gmmtorch.team.exploration.mission.options import TeamOptions, WorldOptions
 from gmmtorch.team.exploration.mission.results import mission_row
 from gmmtorch.team.exploration.planning.journeys import Roadmap
-from gmmtorch.team.exploration.planning.planners import make_planner
+from gmmtorch.team.exploration.planning.planners import PLANNERS
 from gmmtorch.team.exploration.planning.primitives import Primitives
 from gmmtorch.team.exploration.planning.view_evaluator import ViewEvaluator
 from gmmtorch.team.exploration.robot.agent import Agent, Robot
@@ -126,7 +126,7 @@ def make_agent(
         number,
         pose,
         _mapper(number, world, options, memo, evidence, incarnation),
-        make_planner(options.planner, primitives, evaluator),
+        PLANNERS[options.planner](primitives, evaluator),
         ViewLibrary(number, incarnation=incarnation),
         Roadmap(),
         start,

@@ -20,9 +20,9 @@ from gmmtorch.team.exploration.planning.primitives import Primitives
 from gmmtorch.team.exploration.robot.mapper import LocalMap
 from gmmtorch.team.exploration.world.navigable import widened
 
-_SPACING, _FINE_SPACING = 1.0, 0.25
-"""Cells between the checked points of a path, half of which is the margin around the body; and the same for a
-robot that leaves a place where it does not fit."""
+_FINE_SPACING = 0.25
+"""Cells between the checked points of a path on which a robot leaves a place where it does not fit; half of
+this is the margin around the body. On other paths it is one cell."""
 _STRUCK_RAYS, _STRUCK_SHARE = 1.0, 0.05
 """A cell with at least this many hits and this share of hits among its rays is an obstacle. A rail of a
 twentieth of a cell's width is hit by no larger share."""
@@ -51,7 +51,7 @@ def inflated(blocked: Tensor, radius: float, resolution: float) -> Tensor:
 
 def passable_cells(free: Tensor, radius: float, resolution: float) -> Tensor:
     """Return cells (nx, ny, nz), bool, in which the centre of a robot may be, given the free cells."""
-    return ~inflated(~free, radius + _SPACING / 2 * resolution, resolution)
+    return ~inflated(~free, radius + resolution / 2, resolution)
 
 
 def cells_in_sphere(center: Tensor, radius: float, resolution: float) -> Tensor:
@@ -137,7 +137,7 @@ def feasible(
     begin = start.to(rollout).expand(*rollout.shape[:-2], 7)
     origin = begin[..., :3]
     states = torch.cat([begin[..., None, :], rollout, braking], -2)
-    safe = local_map.is_passable(_points_along(states, _SPACING * local_map.resolution)).all(-1)
+    safe = local_map.is_passable(_points_along(states, local_map.resolution)).all(-1)
     stuck = ~local_map.is_passable(origin)
     safe &= ~stuck
     if radius is not None:
@@ -172,7 +172,7 @@ def feasible_motions(
         follows,
         states,
         ends,
-        _points_of_a_step(longest, turn, spacing_of(local_map)),
+        _points_of_a_step(longest, turn, local_map.resolution),
         min(after, peers.paths.shape[1] - 1),
     )
 
@@ -185,15 +185,10 @@ def free_space(local_map: LocalMap, peers: PeerTrajectories) -> FreeSpace:
     return FreeSpace(passable, local_map.low, nx, ny, nz, side, paths, n_peers, n_times, peers.separation)
 
 
-def spacing_of(local_map: LocalMap) -> float:
-    """Metres between the checked points of a path."""
-    return _SPACING * local_map.resolution
-
-
 def check_steps(primitives: Primitives, local_map: LocalMap) -> None:
     """Raises `InvalidArgumentError` if steps of primitives are too long to be checked in a map's cells."""
     longest, turn = primitives.longest.amax(0).tolist()
-    _points_of_a_step(longest, turn, spacing_of(local_map))
+    _points_of_a_step(longest, turn, local_map.resolution)
 
 
 def _covering_boxes(square: float) -> list[tuple[int, int, int]]:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels import MotionTree, is_fused
-from gmmtorch.team.exploration.planning.collision_checking import check_steps, free_space, spacing_of
+from gmmtorch.team.exploration.planning.collision_checking import check_steps, free_space
 from gmmtorch.team.exploration.planning.journeys import Goal
 from gmmtorch.team.exploration.planning.planner_interface import PlanningTask, options
 from gmmtorch.team.exploration.planning.primitives import Primitives
@@ -97,8 +97,11 @@ def search_tree(
     memory: values of views; None: only the goal counts. goal: the goal; None: only views count. first:
     primitives of a branch that is tried first, such as the rest of the last plan.
     """
+    start, residual = task.state.double(), task.residual
+    if memory is not None:  # the robot has just looked from here, so another look gains nothing
+        residual = memory.marginal(memory.rows(start[None, :4]), residual[None])[1][0]
     kind = _FusedTree if is_fused(task.local_map.passable, task.state) else _Tree
-    tree = kind(primitives, rule, task, memory, goal)
+    tree = kind(primitives, rule, task, memory, goal, residual)
     tree.grow(first)
     return tree.best()
 
@@ -113,6 +116,7 @@ class _Tree:
         task: PlanningTask,
         memory: ViewCache | None,
         goal: Goal | None,
+        residual: Tensor,
     ) -> None:
         self._primitives, self._rule, self._task = primitives, rule, task
         self._memory, self._goal = memory, goal
@@ -123,9 +127,6 @@ class _Tree:
         self._ends = start.expand(most, n_primitives, 7).clone()  # end states of the primitives
         self._metres = torch.zeros(most, dtype=torch.float64)  # remaining to the goal
         self._metres_after = torch.zeros(most, n_primitives, dtype=torch.float64)
-        residual = task.residual[None]
-        if memory is not None:  # the robot has just looked from here, so another look gains nothing
-            residual = memory.marginal(memory.rows(start[None, :4]), residual)[1]
         self._residuals = residual.expand(most, -1).clone()
         self._scale = 1e-12  # the largest return found
         root = _Node(0, None, -1, 0)
@@ -265,21 +266,20 @@ class _FusedTree:
         task: PlanningTask,
         memory: ViewCache | None,
         goal: Goal | None,
+        residual: Tensor,
     ) -> None:
         check_steps(primitives, task.local_map)
         self._primitives, self._rule, self._task = primitives, rule, task
         self._memory, self._goal = memory, goal
-        start, residual = task.state.double(), task.residual[None]
-        if memory is not None:
-            residual = memory.marginal(memory.rows(start[None, :4]), residual)[1]
+        start = task.state.double()
         self._paths, self._braking, feasible = options(primitives, start[None], task, may_escape=True)
-        self._space, self._spacing = free_space(task.local_map, task.peers), spacing_of(task.local_map)
+        self._space = free_space(task.local_map, task.peers)
         self._tree = MotionTree(
             1 + rule.depth + rule.n_rounds * rule.n_leaves,
             start,
             self._paths[0, :, -1],
             feasible[0],
-            residual[0],
+            residual,
             0.0 if goal is None else float(goal.cost(start).clamp_max(_FAR)),
             deepest=rule.depth,
             exploration=rule.exploration,
@@ -320,7 +320,15 @@ class _FusedTree:
             rows = self._memory.rows(tree.states[tree.n_nodes - n : tree.n_nodes, :4])
             views = rows, *self._memory.tables
         primitives = self._primitives
-        tree.open(primitives.library, self._space, primitives.longest, self._spacing, n, is_last, views)
+        tree.open(
+            primitives.library,
+            self._space,
+            primitives.longest,
+            self._space.resolution,
+            n,
+            is_last,
+            views,
+        )
         return self._orders()
 
     def _orders(self) -> Tensor:

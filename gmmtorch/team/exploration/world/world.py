@@ -85,8 +85,8 @@ def cached_cells(
 MAX_CELLS = 1 << 28
 """Largest number of cells of a world; computing it takes about 2 GB."""
 
+_SPACING = 1.0  # metres between the viewpoints that determine the observable cells
 _SHARP = 0.4  # share of the camera's range at which the rays that find observable cells are one cell apart
-
 _FINEST = 0.01  # smallest angle (rad) between those rays
 
 
@@ -126,7 +126,6 @@ class World:
         max_range: float = 6.0,
         robot_radius: float = 0.3,
         start: Sequence[float] | Tensor | None = None,
-        spacing: float = 1.0,
         cache: bool = True,
         on_event: Event = ignore,
         name: str = "mesh",
@@ -141,7 +140,6 @@ class World:
             max_range: of the camera (m).
             start: (3,), a point in the connected part to fly in. Default: the part with most places that are
                 surrounded by walls (`MeshWorld.standing_places`), else the largest part.
-            spacing: distance (m) between the viewpoints that determine the observable cells.
             cache: read the result from disk, or store it there (see `cached_cells`).
             on_event: callback for the stages.
 
@@ -149,7 +147,16 @@ class World:
         contain no surface, a camera that sees only the neighbouring cells, or a world without room for a
         robot, and `MemoryLimitError` for more than `MAX_CELLS` cells.
         """
-        _check_sizes(resolution, vertical_fov, max_range, robot_radius, spacing)
+        check_resolution(resolution)
+        if not 0 < vertical_fov <= math.pi:
+            raise InvalidArgumentError(f"vertical_fov={vertical_fov} must be above 0 and at most π rad.")
+        check_number("max_range", max_range, above=True)
+        check_number("robot_radius", robot_radius, above=True)
+        if max_range <= robot_radius + 2 * resolution:
+            raise InvalidArgumentError(
+                f"max_range={max_range} m ends within two cells of the robot (‹robot_radius›={robot_radius} "
+                f"m, ‹resolution›={resolution} m); use a longer range or finer cells."
+            )
         triangles = checked_triangles(triangles, name)
         mesh = MeshWorld(triangles)
         box = _lattice_box(mesh, bounds, resolution, name)
@@ -162,7 +169,7 @@ class World:
             "max_range": max_range,
             "robot_radius": robot_radius,
             "start": None if place is None else place.tolist(),
-            "spacing": spacing,
+            "spacing": _SPACING,
         }
 
         def compute() -> _Cells:
@@ -198,27 +205,12 @@ def _compute_cells(
     if not bool(occupied.any()):
         return None
     navigable = connected(clear, mesh, resolution, box, start, radius, name)
-    places = viewpoints(navigable, max(1, round(options["spacing"] / resolution)))
+    places = viewpoints(navigable, max(1, round(_SPACING / resolution)))
     angle = max(resolution / (_SHARP * max_range), _FINEST)
     directions = view_directions(options["vertical_fov"], angle)
     seen = observable_cells(mesh, occupied, box, resolution, places, directions, max_range, on_event)
     seen = (seen | navigable) & (grounded | occupied)
     return {"occupied": occupied, "observable": seen, "navigable": navigable}
-
-
-def _check_sizes(
-    resolution: float, vertical_fov: float, max_range: float, robot_radius: float, spacing: float
-) -> None:
-    check_resolution(resolution)
-    if not 0 < vertical_fov <= math.pi:
-        raise InvalidArgumentError(f"vertical_fov={vertical_fov} must be above 0 and at most π rad.")
-    for key, value in {"max_range": max_range, "robot_radius": robot_radius, "spacing": spacing}.items():
-        check_number(key, value, above=True)
-    if max_range <= robot_radius + 2 * resolution:
-        raise InvalidArgumentError(
-            f"max_range={max_range} m ends within two cells of the robot (‹robot_radius›={robot_radius} m, "
-            f"‹resolution›={resolution} m); use a longer range or finer cells."
-        )
 
 
 def _point(start: Sequence[float] | Tensor) -> Tensor:
