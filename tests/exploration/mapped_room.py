@@ -15,8 +15,7 @@ from gmmtorch.occupancy.voxels.cells import Box
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.simulation.robot_camera import DepthCamera, DepthFrame
 from gmmtorch.team.exploration.mission.options import THESIS, FrameRule, TeamOptions
-from gmmtorch.team.exploration.robot.gmm_mapper import GmmMapper
-from gmmtorch.team.exploration.robot.mapper import Memo
+from gmmtorch.team.exploration.robot.mapper import GmmMapper, Memo
 from gmmtorch.team.exploration.world.scoring import BeliefMap, BeliefRule
 from gmmtorch.team.sharing.broadcast import Broadcast
 from gmmtorch.team.sharing.messages.component_messages import ComponentsMessage, CountsMessage

@@ -20,8 +20,7 @@ from gmmtorch.errors import DataError
 from gmmtorch.occupancy.voxels.cells import CellEvidence
 from gmmtorch.team.exploration.mission.driver import Stopwatch
 from gmmtorch.team.exploration.mission.options import TeamOptions
-from gmmtorch.team.exploration.planning.collision_checking import cells_in_sphere
-from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
+from gmmtorch.team.exploration.planning.collision_checking import PeerTrajectories, cells_in_sphere
 from gmmtorch.team.exploration.planning.journeys import Roadmap
 from gmmtorch.team.exploration.planning.planner_interface import Plan, PlanningTask
 from gmmtorch.team.exploration.planning.primitives import Primitives

@@ -16,15 +16,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.team.exploration.mission.mission import plan_together
+from gmmtorch.team.exploration.mission.mission import COORDINATIONS, Coordination, plan_together
 from gmmtorch.team.exploration.mission.options import TeamOptions
-from gmmtorch.team.exploration.planning.coordination import (
-    COORDINATIONS,
-    Coordination,
-    PeerTrajectories,
-    clear_of,
-    predicted_path,
-)
+from gmmtorch.team.exploration.planning.collision_checking import PeerTrajectories, clear_of, predicted_path
 from gmmtorch.team.exploration.planning.planner_interface import Plan
 from gmmtorch.team.sharing.messages.mission_messages import PlanMessage
 

@@ -12,6 +12,7 @@ from exploration.voxel_worlds import RESOLUTION, surroundings_from
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gmmtorch.team.exploration.planning.collision_checking import LocalMap
 from gmmtorch.team.exploration.planning.journeys import (
     DistanceField,
     Roadmap,
@@ -19,7 +20,6 @@ from gmmtorch.team.exploration.planning.journeys import (
     coarsened,
     geodesic,
 )
-from gmmtorch.team.exploration.robot.mapper import LocalMap
 
 STEPS = [step for step in itertools.product((-1, 0, 1), repeat=3) if any(step)]
 

@@ -38,8 +38,7 @@ from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.scan import Scan
 from gmmtorch.simulation.robot_camera import DepthFrame
 from gmmtorch.team.exploration.mission.options import FrameRule
-from gmmtorch.team.exploration.robot.gmm_mapper import GmmMapper
-from gmmtorch.team.exploration.robot.mapper import FrameUpdate, Memo
+from gmmtorch.team.exploration.robot.mapper import FrameUpdate, GmmMapper, Memo
 from gmmtorch.team.sharing.messages.component_messages import (
     ComponentsMessage,
     CountsMessage,

@@ -30,7 +30,7 @@ from gmmtorch.team.exploration.mission.options import FRAMEWORKS, THESIS, TeamOp
 from gmmtorch.team.exploration.mission.results import mission_row, with_times
 from gmmtorch.team.exploration.mission.robot_view import FlyingRobotView
 from gmmtorch.team.exploration.mission.trials import assemble, make_agent, start_poses
-from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
+from gmmtorch.team.exploration.planning.collision_checking import PeerTrajectories
 from gmmtorch.team.exploration.robot.agent import StoppingRule
 from gmmtorch.team.exploration.world.world import World
 from gmmtorch.team.sharing.messages.mission_messages import PlanMessage, encode_plan

@@ -18,12 +18,10 @@ from exploration.voxel_worlds import (
     two_rooms,
 )
 
-from gmmtorch.team.exploration.planning.collision_checking import feasible
-from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
+from gmmtorch.team.exploration.planning.collision_checking import LocalMap, PeerTrajectories, feasible
 from gmmtorch.team.exploration.planning.journeys import Journey
 from gmmtorch.team.exploration.planning.planner_interface import Plan
 from gmmtorch.team.exploration.planning.planners import PLANNERS, find_frontiers, frontier_cells
-from gmmtorch.team.exploration.robot.mapper import LocalMap
 
 
 def planner_named(name: str):

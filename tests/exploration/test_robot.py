@@ -22,8 +22,7 @@ from gmmtorch.simulation.robot_camera import DepthCamera, DepthFrame
 from gmmtorch.team.exploration.mission.mission import Mission
 from gmmtorch.team.exploration.mission.options import TeamOptions
 from gmmtorch.team.exploration.mission.trials import assemble
-from gmmtorch.team.exploration.planning.collision_checking import cells_in_sphere
-from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
+from gmmtorch.team.exploration.planning.collision_checking import PeerTrajectories, cells_in_sphere
 from gmmtorch.team.exploration.planning.journeys import Roadmap
 from gmmtorch.team.exploration.planning.planner_interface import (
     Plan,

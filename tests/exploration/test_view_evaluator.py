@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.team.exploration.planning.collision_checking import LocalMap
 from gmmtorch.team.exploration.planning.view_evaluator import ViewEvaluator, ViewValues
-from gmmtorch.team.exploration.robot.mapper import LocalMap
 
 FOV = (1.5184, 1.0123)
 RESOLUTION = 0.2

@@ -16,15 +16,16 @@ from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.simulation.furniture import box
 from gmmtorch.simulation.mesh_world import MeshWorld
 from gmmtorch.team.exploration.planning.primitives import Dynamics, Primitives
-from gmmtorch.team.exploration.world.navigable import (
+from gmmtorch.team.exploration.world.starts import check_start, start_poses
+from gmmtorch.team.exploration.world.world import (
+    World,
     collides,
     meets_others,
     observable_cells,
+    open_world,
     view_directions,
     viewpoints,
 )
-from gmmtorch.team.exploration.world.starts import check_start, start_poses
-from gmmtorch.team.exploration.world.world import World, open_world
 
 
 @pytest.fixture(autouse=True)

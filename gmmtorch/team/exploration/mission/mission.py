@@ -5,26 +5,26 @@ from __future__ import annotations
 import functools
 import math
 import operator
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from gmmtorch.errors import check_choice, check_whole
 from gmmtorch.files import write_npz
 from gmmtorch.kernels import mark_cells_of_rays
 from gmmtorch.occupancy import Box, to_lattice
 from gmmtorch.simulation import DepthFrame
 from gmmtorch.team.exploration.mission.driver import Stopwatch
 from gmmtorch.team.exploration.mission.options import TeamOptions
-from gmmtorch.team.exploration.planning.coordination import Coordination, PeerTrajectories, predicted_path
+from gmmtorch.team.exploration.planning.collision_checking import PeerTrajectories, predicted_path
 from gmmtorch.team.exploration.planning.planner_interface import Plan
 from gmmtorch.team.exploration.robot.agent import Agent, Robot
 from gmmtorch.team.exploration.robot.mapper import FrameUpdate
-from gmmtorch.team.exploration.world.navigable import collides, finely, meets_others
 from gmmtorch.team.exploration.world.scoring import BeliefMap
-from gmmtorch.team.exploration.world.world import World
+from gmmtorch.team.exploration.world.world import World, collides, finely, meets_others
 from gmmtorch.team.sharing import Network, bytes_of_points
 
 _SEEN_STRIDE = 4  # pixels between the beams, along rows and columns, that mark cells as seen
@@ -106,6 +106,69 @@ class MissionScore:
         everything = functools.reduce(operator.or_, held)
         lacking = max((everything - one).size for one in held)
         return lacking / everything.size if everything else 0.0
+
+
+COORDINATIONS = ("myopic", "greedy", "distributed_greedy", "random_partition")
+
+
+class Coordination:
+    """The rule by which the robots of a team plan together.
+
+    "myopic": each robot plans as if it were alone. "greedy": robots plan one after the other, and each
+    considers all earlier plans; if the joint value is monotone and submodular, the result is at least half
+    of the optimum. The other rules take `n_rounds` rounds. In a round robots plan at the same time and
+    consider the plans of the rounds before. "random_partition": each robot plans in one random round.
+    "distributed_greedy": all remaining robots plan in every round, and an equal share of them, those with
+    the best plans, keep their plans.
+    """
+
+    def __init__(self, name: str = "greedy", n_rounds: int = 3) -> None:
+        check_choice("coordination", name, COORDINATIONS)
+        self.name = name
+        self.n_rounds = check_whole("n_rounds", n_rounds, 1)
+
+    def rounds(self, n_robots: int, generator: torch.Generator) -> list[list[int]]:
+        """Return the robots, of 0 … n_robots − 1, that plan in each round, without empty rounds. In
+        "distributed_greedy" the later rounds depend on the plans, so only the first round is returned."""
+        everyone = list(range(n_robots))
+        if self.name == "greedy":
+            rounds = [[robot] for robot in everyone]
+        elif self.name == "random_partition":
+            drawn = torch.randint(self.n_rounds, (n_robots,), generator=generator).tolist()
+            rounds = [[robot for robot in everyone if drawn[robot] == k] for k in range(self.n_rounds)]
+        else:
+            rounds = [everyone]
+        return [robots for robots in rounds if robots]
+
+    def coordinate(
+        self,
+        robots: Iterable[int],
+        plan: Callable[[int, dict[int, Plan]], Plan],
+        generator: torch.Generator,
+    ) -> dict[int, Plan]:
+        """Return the plan of each robot, in the order in which the plans were fixed.
+
+        plan: called with a robot and the plans of other robots that it must consider; returns its plan.
+        """
+        team = list(robots)
+        if self.name == "distributed_greedy":
+            return self._distributed(team, plan)
+        settled: dict[int, Plan] = {}
+        for numbers in self.rounds(len(team), generator):
+            together = {team[number]: plan(team[number], dict(settled)) for number in numbers}
+            settled.update(together)
+        return settled
+
+    def _distributed(self, team: list[int], plan: Callable[[int, dict[int, Plan]], Plan]) -> dict[int, Plan]:
+        settled: dict[int, Plan] = {}
+        left = team
+        for k in range(self.n_rounds):
+            found = {robot: plan(robot, dict(settled)) for robot in left}
+            best = sorted(left, key=lambda robot: -found[robot].value)  # the first of equals comes first
+            best = best[: -(-len(left) // (self.n_rounds - k))]
+            settled.update((robot, found[robot]) for robot in best)
+            left = [robot for robot in left if robot not in best]
+        return settled
 
 
 class Mission:

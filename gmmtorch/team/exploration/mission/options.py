@@ -234,7 +234,7 @@ class TeamOptions(LinkConditions):
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        from gmmtorch.team.exploration.planning.coordination import Coordination
+        from gmmtorch.team.exploration.mission.mission import Coordination
         from gmmtorch.team.exploration.planning.planners import PLANNERS
         from gmmtorch.team.exploration.planning.view_evaluator import INFORMATION
         from gmmtorch.team.sharing import POINT_CODECS, Radio, check_codec

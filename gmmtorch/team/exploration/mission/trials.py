@@ -33,8 +33,7 @@ from gmmtorch.team.exploration.planning.planners import PLANNERS
 from gmmtorch.team.exploration.planning.primitives import Primitives
 from gmmtorch.team.exploration.planning.view_evaluator import ViewEvaluator
 from gmmtorch.team.exploration.robot.agent import Agent, Robot
-from gmmtorch.team.exploration.robot.gmm_mapper import GmmMapper
-from gmmtorch.team.exploration.robot.mapper import GridMapper, Mapper, Memo
+from gmmtorch.team.exploration.robot.mapper import GmmMapper, GridMapper, Mapper, Memo
 from gmmtorch.team.exploration.world import starts
 from gmmtorch.team.exploration.world.scoring import BeliefMap
 from gmmtorch.team.exploration.world.world import World

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gmmtorch.occupancy import Box
-from gmmtorch.team.exploration.robot.mapper import LocalMap
+from gmmtorch.team.exploration.planning.collision_checking import LocalMap
 
 if TYPE_CHECKING:
     from gmmtorch.team.exploration.planning.planner_interface import PlanningTask

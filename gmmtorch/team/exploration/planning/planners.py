@@ -12,6 +12,7 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
+from gmmtorch.team.exploration.planning.collision_checking import LocalMap, widened
 from gmmtorch.team.exploration.planning.journeys import COARSE, DistanceField, Journey, angle, looks
 from gmmtorch.team.exploration.planning.planner_interface import Plan, Planner, PlanningTask, Waiting, options
 from gmmtorch.team.exploration.planning.primitives import Primitives
@@ -22,8 +23,6 @@ from gmmtorch.team.exploration.planning.view_evaluator import (
     ViewCache,
     ViewEvaluator,
 )
-from gmmtorch.team.exploration.robot.mapper import LocalMap
-from gmmtorch.team.exploration.world.navigable import widened
 from gmmtorch.team.sharing import ViewLibrary
 
 _SEARCH = SearchRule(depth=3, n_rounds=2, n_leaves=24)

@@ -13,8 +13,8 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_whole
 from gmmtorch.kernels import Beams, Cells, information_by_block
 from gmmtorch.occupancy import check_resolution
+from gmmtorch.team.exploration.planning.collision_checking import LocalMap
 from gmmtorch.team.exploration.planning.planner_interface import PlanningTask
-from gmmtorch.team.exploration.robot.mapper import LocalMap
 
 _MOST_CELLS = 1 << 22
 _NEGLIGIBLE = 1e-5  # values of the depth kernel below this count as zero
