@@ -47,6 +47,10 @@ _REPLACED = {
     "link.ttl": "robots of a multicast group share one network.",
     "runtime.cache": "results that depend only on the world are always stored.",
     "stream.checkpoint_seconds": "use checkpoint_seconds.",
+    "codec": _CONSTANT
+    % "`TeamOptions.codec`, which a variant of a study may set; team=gmm_thesis has its own",
+    "rounds": "there are always three.",
+    "planner.rest": _CONSTANT % "`TeamOptions.rest`",
     "planner.beams": _CONSTANT % "`TeamOptions.n_beams`",
     "planner.prior": _CONSTANT % "`TeamOptions.planning_prior`, which a variant of a study may set",
 }
@@ -70,12 +74,12 @@ _REPLACED_GROUPS = (
     ("mixture.", "max_cells min_density_share min_support reg_covar", _CONSTANT % "the estimator has it"),
     (
         "robot.",
-        "speed climb yaw_rate acceleration yaw_acceleration duration step",
+        "radius speed climb yaw_rate acceleration yaw_acceleration duration step",
         _CONSTANT % "`Dynamics` has it",
     ),
     (
         "sensor.",
-        "horizontal_fov vertical_fov noise dropout max_gap deskew",
+        "horizontal_fov vertical_fov max_range noise dropout max_gap deskew",
         _CONSTANT % "`DepthCamera` or `LiveOptions` has it",
     ),
     (

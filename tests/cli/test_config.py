@@ -151,15 +151,14 @@ def test_worlds_teams_and_planners_compose(world, team, planner, tmp_path):
 
 
 def test_the_file_of_the_thesis_team_has_its_options():
-    config = composed("explore", "team=gmm_thesis")
-    assert config.codec == THESIS["codec"]
     plain = missions.team_options(composed("explore"), 0, {"team": "gmm_thesis"})
-    assert missions.team_options(config, 0, {}) == plain
+    assert plain.codec == THESIS["codec"]
+    assert missions.team_options(composed("explore", "team=gmm_thesis"), 0, {}) == plain
 
 
 def test_options_that_are_not_of_the_thesis_team_are_refused():
     with pytest.raises(InvalidArgumentError, match=r"team=gmm_thesis with codec=float.* has thesis"):
-        missions.team_options(composed("explore", "team=gmm_thesis", "codec=float"), 0, {})
+        missions.team_options(composed("explore", "team=gmm_thesis"), 0, {"codec": "float"})
     with pytest.raises(InvalidArgumentError, match="team=gmm_thesis sets options of all teams"):
         missions.variants_of(composed("explore", "team=gmm_thesis", "experiment=deviations"))
 

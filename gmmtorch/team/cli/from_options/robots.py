@@ -41,9 +41,8 @@ from gmmtorch.team.exploration import (
 from gmmtorch.team.sharing import FramedTransport, FrameJoiner, Replica, SharedMap, Store, drawn_incarnation
 
 _NO_RESTART = (
-    "A robot with team=%s codec=%s cannot be restarted while its team runs: it would number its messages "
-    "from 0 again, and its teammates would ignore them as repetitions. Use team=gmm_shared codec=quantized "
-    "if it may be restarted."
+    "A robot with team=%s cannot be restarted while its team runs: it would number its messages from 0 "
+    "again, and its teammates would ignore them as repetitions. Use team=gmm_shared if it may be restarted."
 )
 
 
@@ -63,7 +62,7 @@ def flying(config: DictConfig, transport: FramedTransport, stack: ExitStack) -> 
             store.restore(shared)
             agent.keep_in(store)
     elif options.shares:
-        logger.warning(_NO_RESTART, config.team.name, config.codec)
+        logger.warning(_NO_RESTART, config.team.name)
     mission = Mission(world, [agent], options, watch)
     return mission, FlyingRobotView(mission, transport)
 

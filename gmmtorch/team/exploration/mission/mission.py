@@ -5,14 +5,13 @@ from __future__ import annotations
 import functools
 import math
 import operator
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import check_choice, check_whole
 from gmmtorch.files import write_npz
 from gmmtorch.kernels import mark_cells_of_rays
 from gmmtorch.occupancy import Box, to_lattice
@@ -109,10 +108,17 @@ class MissionScore:
 
 
 COORDINATIONS = ("myopic", "greedy", "distributed_greedy", "random_partition")
+_ROUNDS = 3  # of the last two
 
 
-class Coordination:
-    """The rule by which the robots of a team plan together.
+def coordinate(
+    name: str,
+    n_robots: int,
+    plan: Callable[[int, dict[int, Plan]], Plan],
+    generator: torch.Generator,
+    n_rounds: int = _ROUNDS,
+) -> dict[int, Plan]:
+    """The plans of robots 0 … n_robots − 1 by one of `COORDINATIONS`, in the order in which they were fixed.
 
     "myopic": each robot plans as if it were alone. "greedy": robots plan one after the other, and each
     considers all earlier plans; if the joint value is monotone and submodular, the result is at least half
@@ -120,55 +126,28 @@ class Coordination:
     consider the plans of the rounds before. "random_partition": each robot plans in one random round.
     "distributed_greedy": all remaining robots plan in every round, and an equal share of them, those with
     the best plans, keep their plans.
+
+    plan: called with a robot and the plans of other robots that it must consider; returns its plan.
     """
-
-    def __init__(self, name: str = "greedy", n_rounds: int = 3) -> None:
-        check_choice("coordination", name, COORDINATIONS)
-        self.name = name
-        self.n_rounds = check_whole("n_rounds", n_rounds, 1)
-
-    def rounds(self, n_robots: int, generator: torch.Generator) -> list[list[int]]:
-        """Return the robots, of 0 … n_robots − 1, that plan in each round, without empty rounds. In
-        "distributed_greedy" the later rounds depend on the plans, so only the first round is returned."""
-        everyone = list(range(n_robots))
-        if self.name == "greedy":
-            rounds = [[robot] for robot in everyone]
-        elif self.name == "random_partition":
-            drawn = torch.randint(self.n_rounds, (n_robots,), generator=generator).tolist()
-            rounds = [[robot for robot in everyone if drawn[robot] == k] for k in range(self.n_rounds)]
-        else:
-            rounds = [everyone]
-        return [robots for robots in rounds if robots]
-
-    def coordinate(
-        self,
-        robots: Iterable[int],
-        plan: Callable[[int, dict[int, Plan]], Plan],
-        generator: torch.Generator,
-    ) -> dict[int, Plan]:
-        """Return the plan of each robot, in the order in which the plans were fixed.
-
-        plan: called with a robot and the plans of other robots that it must consider; returns its plan.
-        """
-        team = list(robots)
-        if self.name == "distributed_greedy":
-            return self._distributed(team, plan)
-        settled: dict[int, Plan] = {}
-        for numbers in self.rounds(len(team), generator):
-            together = {team[number]: plan(team[number], dict(settled)) for number in numbers}
-            settled.update(together)
-        return settled
-
-    def _distributed(self, team: list[int], plan: Callable[[int, dict[int, Plan]], Plan]) -> dict[int, Plan]:
-        settled: dict[int, Plan] = {}
-        left = team
-        for k in range(self.n_rounds):
+    everyone, settled = list(range(n_robots)), dict[int, Plan]()
+    if name == "distributed_greedy":
+        left = everyone
+        for k in range(n_rounds):
             found = {robot: plan(robot, dict(settled)) for robot in left}
             best = sorted(left, key=lambda robot: -found[robot].value)  # the first of equals comes first
-            best = best[: -(-len(left) // (self.n_rounds - k))]
+            best = best[: -(-len(left) // (n_rounds - k))]
             settled.update((robot, found[robot]) for robot in best)
             left = [robot for robot in left if robot not in best]
         return settled
+    rounds = [everyone]
+    if name == "greedy":
+        rounds = [[robot] for robot in everyone]
+    elif name == "random_partition":
+        drawn = torch.randint(n_rounds, (n_robots,), generator=generator).tolist()
+        rounds = [[robot for robot in everyone if drawn[robot] == k] for k in range(n_rounds)]
+    for robots in rounds:
+        settled.update({robot: plan(robot, dict(settled)) for robot in robots})
+    return settled
 
 
 class Mission:
@@ -199,9 +178,7 @@ class Mission:
         self.trajectories: list[list[Tensor]] = [[robot.state[:4].clone()] for robot in self.robots]
         """Poses (4,) x, y, z, yaw of each robot: at the start, and after each tick."""
         # Robots that share nothing plan independently.
-        self.coordination = Coordination(
-            options.coordination if options.shares else "myopic", options.n_rounds
-        )
+        self.coordination = options.coordination if options.shares else "myopic"
         self._network, self._score = network, score
         self._mesh = world.mesh.to(options.device)  # where cameras see it
         self._generator = torch.Generator().manual_seed(options.seed)
@@ -342,7 +319,7 @@ class Mission:
 
 def plan_together(
     agents: Sequence[Agent],
-    coordination: Coordination,
+    coordination: str,
     options: TeamOptions,
     now: float,
     number: int,
@@ -376,7 +353,7 @@ def plan_together(
         proposed[robot] = agent.propose(now, final, peers)
         return proposed[robot]
 
-    plans = coordination.coordinate(range(len(agents)), plan_of, generator)
+    plans = coordinate(coordination, len(agents), plan_of, generator)
     for robot in plans:
         agents[robot].follow()
     send(plans)
@@ -413,11 +390,11 @@ def _peer_trajectories(
     robot: int,
     final: Mapping[int, Plan],
     proposed: Mapping[int, Plan],
-    coordination: Coordination,
+    coordination: str,
     options: TeamOptions,
 ) -> PeerTrajectories:
     """Where the other robots may be: on their final or proposed plan, and braking if that may change."""
-    stays_final = coordination.name != "distributed_greedy"
+    stays_final = coordination != "distributed_greedy"
     paths = []
     for other in agents:
         if other.number == robot:

@@ -58,7 +58,8 @@ class Dynamics:
         speed, climb, yaw_rate: largest velocities along the heading, up or down, and of the yaw.
         acceleration: largest acceleration along the heading and vertically, m/s².
         yaw_acceleration: largest yaw acceleration, rad/s².
-        duration: of a primitive. step: time between two states of a path; it divides the duration.
+        radius: of a sphere around the body. duration: of a primitive.
+        step: time between two states of a path; it divides the duration.
 
     Raises `InvalidArgumentError` unless all are above zero and the step divides the duration.
     """
@@ -70,7 +71,7 @@ class Dynamics:
     yaw_acceleration: float = 3.0
     duration: float = 2.0
     step: float = 0.2
-    radius: float = option(0.3, "radius (m) of a sphere around the body")
+    radius: float = 0.3
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -153,11 +154,7 @@ class StoppingRule:
     """When a robot rests: once it has learned less in the last `window` seconds than `share` of the most that
     it ever learned in one window. The window should be longer than a flight across the map."""
 
-    share: float = option(
-        0.01,
-        "a robot stops if two minutes give less than this share of its best two minutes; 0: never",
-        "rest",
-    )
+    share: float = 0.01
     window: float = 120.0
 
     def __post_init__(self) -> None:
@@ -188,6 +185,9 @@ class TeamOptions(LinkConditions):
 
     belief: from evidence to occupancy, for every team and for the evaluation. n_beams: of a view.
     planning_prior: occupancy of unobserved cells in the information of a view.
+    window: cells along x, y and z of the local map around a robot, for planning, at least: it contains what
+    the camera sees.
+    codec: of components: quantized (about 6 bytes each), float, or thesis (57 bytes), see `CODECS`.
     margin: metres between robots. device: of the maps, of learning, and of the information of views; sensing,
     planning and messages are on the CPU. A robot plans once every `dynamics.duration`.
     """
@@ -198,23 +198,18 @@ class TeamOptions(LinkConditions):
     seed: int = option(0, "seed of sensor noise, network and planners")
     rate: float = option(1.0, "frames per second", "sensor.rate")
     camera: DepthCamera = group(CameraOptions, "sensor", make=_camera)
-    dynamics: Dynamics = group(Dynamics, "robot")
+    dynamics: Dynamics = field(default_factory=Dynamics)
     belief: BeliefRule = field(default_factory=_belief)
     novelty: NoveltyRule = field(default_factory=_novelty)
     frame: FrameRule = group(FrameRule, "map")
-    window: tuple[int, int, int] = option(
-        (80, 80, 40), "cells along x, y and z of the local map around a robot, for planning", "map.window"
-    )
+    window: tuple[int, int, int] = (80, 80, 40)
     planner: str = option("mcts", "mcts, frontier or random", "planner.name")
     information: str = option("csqmi", "measure of the information of a view: csqmi or fsmi")
     n_beams: int = 160
     coordination: str = option("greedy", "myopic, greedy, distributed_greedy or random_partition")
-    n_rounds: int = option(3, "rounds of distributed_greedy and random_partition", "rounds")
     planning_prior: float = 0.125
-    rest: StoppingRule = group(StoppingRule, "planner")
-    codec: str = option(
-        _CODEC, "code of components: quantized (about 6 bytes each), float, or thesis (57 bytes)"
-    )
+    rest: StoppingRule = field(default_factory=StoppingRule)
+    codec: str = _CODEC
     announce_every: float = option(
         10.0, "seconds between announcements of a robot's records, while these change", "network.announce"
     )
@@ -234,7 +229,7 @@ class TeamOptions(LinkConditions):
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        from gmmtorch.team.exploration.mission.mission import Coordination
+        from gmmtorch.team.exploration.mission.mission import COORDINATIONS
         from gmmtorch.team.exploration.planning.planners import PLANNERS
         from gmmtorch.team.exploration.planning.view_evaluator import INFORMATION
         from gmmtorch.team.sharing import POINT_CODECS, Radio, check_codec
@@ -242,6 +237,7 @@ class TeamOptions(LinkConditions):
         super().__post_init__()
         check_choice("team", self.framework, FRAMEWORKS)
         check_choice("planner", self.planner, PLANNERS)
+        check_choice("coordination", self.coordination, COORDINATIONS)
         check_choice("information", self.information, INFORMATION)
         for name in self.codecs:
             check_choice("codecs", name, tuple(POINT_CODECS))
@@ -257,7 +253,6 @@ class TeamOptions(LinkConditions):
         if self.start is not None:
             object.__setattr__(self, "start", _checked_poses(self.start))
         # These check their own arguments.
-        Coordination(self.coordination, self.n_rounds)
         Radio.check(self.announce_every, self.budget)
         self.check_team(self.size)
         if not 0 < self.planning_prior < 1:

@@ -102,7 +102,7 @@ def make_agent(
 
     Raises `InvalidArgumentError` for options that contradict each other or the world.
     """
-    _check_window(options, world.resolution)
+    options = _with_window(options, world.resolution)
     memo = Memo(_CACHED_MESSAGES_ALONE) if memo is None else memo
     evidence = Memo(_CACHED_EVIDENCE) if evidence is None else evidence
     camera = options.camera
@@ -135,18 +135,15 @@ def make_agent(
     return Agent(robot, transport, evaluator, primitives, options, memo, watch)
 
 
-def _check_window(options: TeamOptions, resolution: float) -> None:
-    """Raises `InvalidArgumentError` unless the window contains the camera's whole field of view."""
+def _with_window(options: TeamOptions, resolution: float) -> TeamOptions:
+    """The options with a window that contains the camera's whole field of view."""
     camera = options.camera
     far = (camera.max_range, camera.max_range, camera.max_range * math.sin(camera.vertical_fov / 2))
-    for axis, n, needed in zip("xyz", options.window, far, strict=True):
-        sight = (n / 2 - _ROUNDING) * resolution
-        if sight < needed:
-            raise InvalidArgumentError(
-                f"‹window›={list(options.window)} cells of {resolution} m reaches {max(sight, 0):.3g} m "
-                f"around the robot along {axis}, less than the {needed:.3g} m that a camera of "
-                f"‹max_range›={camera.max_range} m sees; take a larger window."
-            )
+    x, y, z = (
+        max(n, 2 * (math.ceil(sight / resolution) + _ROUNDING))
+        for n, sight in zip(options.window, far, strict=True)
+    )
+    return replace(options, window=(x, y, z))
 
 
 def _mapper(
