@@ -88,17 +88,6 @@ def test_no_cell_that_a_surface_cuts_is_freed(view: str, shell: float) -> None:
     torch.testing.assert_close(found[1][beyond], plain[1][beyond], rtol=1e-6, atol=1e-4)
 
 
-@pytest.mark.parametrize("view", ["frontal", "grazing"])
-def test_all_cells_along_a_lattice_aligned_surface_are_kept(view: str) -> None:
-    component, unit, offset = sheet(*VIEWS[view])
-    nearest, _ = distances(unit, offset)
-    plain = dense(evidence_of(component, RESOLUTION, AROUND), AROUND)
-    found = dense(evidence_of(component, RESOLUTION, AROUND, shell=1.0), AROUND)
-    cut = nearest == 0
-    assert float(found[1][cut].sum()) == 0
-    assert (float(plain[1][cut].sum()) > 100) == (view == "grazing")
-
-
 def test_no_return_components_have_no_shell() -> None:
     component, _, _ = sheet(*VIEWS["tilted"])
     empty = replace(component, max_range=torch.tensor([True]))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from dataclasses import replace
 
 import pytest
 import torch
@@ -467,15 +466,3 @@ def test_corrected_components_move_in_the_voxels() -> None:
         each.center_on(far)
     for a, b in zip(listener.local.evidence(), other.local.evidence(), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-4)
-
-
-def test_the_evidence_cache_distinguishes_all_values_of_a_batch() -> None:
-    memo, one = Memo(8), first_batch()[0]
-    held = one.components()
-    moved = replace(held, means=held.means + 0.3, origins=held.origins + 0.3)
-    found = []
-    for batch in (held, moved):
-        other = mapper(codec="float", memo=memo)
-        other._enter(batch)
-        found.append(torch.stack(other.belief.grid.dense(BOX)))
-    assert not torch.equal(*found)

@@ -77,14 +77,6 @@ def test_the_first_beam_of_a_block_decides_for_the_block(
     assert found.tolist() == novel_by_a_loop(local, seen, width, short, side)
 
 
-def test_a_frame_without_beams_has_no_novel_beams() -> None:
-    empty = beams_of_a_frame(8, 6, 0, 1.1)
-    assert len(empty.pixel) == 0
-    found = novel_beams(random_window(0), empty, 8, RULE, WITHIN)
-    assert found.shape == (0,)
-    assert found.dtype == torch.bool
-
-
 # -- memo -----------------------------------------------------------------------------------------
 
 

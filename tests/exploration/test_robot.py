@@ -75,30 +75,20 @@ def zigzag(n: int = 10) -> Tensor:
     return path
 
 
-def test_path_length_is_the_sum_of_the_steps() -> None:
+def test_path_length_is_the_sum_of_the_steps_and_a_robot_stays_at_the_end() -> None:
     one, path = robot(), zigzag()
     one.follow(plan(path))
     assert torch.equal(one.advance(0, 3), path[:3, :3])
     assert one.path_length == pytest.approx(0.3 + 0.4 + 0.3)
     assert torch.equal(one.state, path[2])
-    assert torch.equal(one.advance(3, 6), path[3:6, :3])
-    assert one.path_length == pytest.approx(3 * 0.3 + 3 * 0.4)
-    assert torch.equal(one.state, path[5])
-
-
-def test_a_robot_stays_at_the_end_of_its_path() -> None:
-    one, path = robot(), zigzag()
-    one.follow(plan(path))
-    one.advance(0, 8)
-    assert one.advance(8, 13).shape == (2, 3)
+    assert one.advance(3, 13).shape == (7, 3)
     flown = one.path_length
     assert flown == pytest.approx(5 * 0.3 + 5 * 0.4)
     for _ in range(3):
         assert one.advance(13, 18).shape == (0, 3)
         assert one.path_length == flown
         assert torch.equal(one.state, path[-1])
-    # The next plan starts there.
-    back = path.flip(0)[1:]
+    back = path.flip(0)[1:]  # the next plan starts there
     one.follow(plan(back))
     one.advance(0, 9)
     assert one.path_length == pytest.approx(2 * flown - 0.3)
@@ -258,13 +248,6 @@ def test_news_wake_a_resting_robot_for_at_least_a_window():
         assert not returns.rests
     returns.note(46, 110, 175.0)
     assert returns.rests
-
-
-def test_a_zero_share_never_rests():
-    returns = StoppingCriterion(StoppingRule(0.0, window=4.0))
-    for now in range(50):
-        returns.note(now, 0.0, 0.0)
-    assert not returns.rests
 
 
 @pytest.mark.parametrize(
