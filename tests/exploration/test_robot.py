@@ -23,7 +23,6 @@ from gmmtorch.team.exploration.mission.mission import Mission
 from gmmtorch.team.exploration.mission.options import TeamOptions
 from gmmtorch.team.exploration.mission.trials import assemble
 from gmmtorch.team.exploration.planning.collision_checking import PeerTrajectories, cells_in_sphere
-from gmmtorch.team.exploration.planning.journeys import Roadmap
 from gmmtorch.team.exploration.planning.planner_interface import (
     Plan,
     PlanningTask,
@@ -37,7 +36,6 @@ from gmmtorch.team.exploration.robot.mapper import GridMapper, Memo
 from gmmtorch.team.exploration.world.scoring import BeliefMap, BeliefRule
 from gmmtorch.team.exploration.world.starts import InitialFreeSpace
 from gmmtorch.team.exploration.world.world import World
-from gmmtorch.team.sharing.view_library import ViewLibrary
 
 BOX = Box(torch.tensor([0, 0, 0]), torch.tensor([32, 32, 16]))
 WINDOW = (32, 32, 16)
@@ -57,7 +55,7 @@ def robot(start_radius: float = 0.0) -> Robot:
     mapper = GridMapper(0, RollingWindow(0.2, WINDOW, 4), belief, team, Memo(8))
     mapper.center_on(START[:3])
     launch = InitialFreeSpace(cells_in_sphere(START[:3], start_radius, 0.2), START[None, :3])
-    return Robot(0, START, mapper, Idle(), ViewLibrary(0), Roadmap(), launch, StoppingRule())
+    return Robot(0, START, mapper, Idle(), launch, StoppingRule())
 
 
 def plan(path: Tensor) -> Plan:

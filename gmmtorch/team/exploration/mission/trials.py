@@ -28,7 +28,6 @@ from gmmtorch.team.exploration.mission.driver import SimulatedClock, Stopwatch, 
 from gmmtorch.team.exploration.mission.mission import Mission, MissionScore
 from gmmtorch.team.exploration.mission.options import TeamOptions, WorldOptions
 from gmmtorch.team.exploration.mission.results import mission_row
-from gmmtorch.team.exploration.planning.journeys import Roadmap
 from gmmtorch.team.exploration.planning.planners import PLANNERS
 from gmmtorch.team.exploration.planning.primitives import Primitives
 from gmmtorch.team.exploration.planning.view_evaluator import ViewEvaluator
@@ -37,7 +36,7 @@ from gmmtorch.team.exploration.robot.mapper import GmmMapper, GridMapper, Mapper
 from gmmtorch.team.exploration.world import starts
 from gmmtorch.team.exploration.world.scoring import BeliefMap
 from gmmtorch.team.exploration.world.world import World
-from gmmtorch.team.sharing import Broadcast, Network, Replica, Transport, ViewLibrary
+from gmmtorch.team.sharing import Broadcast, Network, Replica, Transport
 
 _SLACK = 24
 """Cells by which the sliding map moves, once the robot is so far from its centre. Rays are long: a map that
@@ -126,10 +125,9 @@ def make_agent(
         pose,
         _mapper(number, world, options, memo, evidence, incarnation),
         PLANNERS[options.planner](primitives, evaluator),
-        ViewLibrary(number, incarnation=incarnation),
-        Roadmap(),
         start,
         options.rest,
+        incarnation,
     )
     watch = Stopwatch() if watch is None else watch
     return Agent(robot, transport, evaluator, primitives, options, memo, watch)

@@ -110,13 +110,12 @@ class Robot:
         pose: Tensor,
         mapper: Mapper,
         planner: Planner,
-        library: ViewLibrary,
-        roadmap: Roadmap,
         start: InitialFreeSpace,
         rest: StoppingRule,
+        incarnation: int = 0,
     ) -> None:
-        self.number = number
-        self.mapper, self.planner, self.library, self.roadmap = mapper, planner, library, roadmap
+        self.number, self.mapper, self.planner = number, mapper, planner
+        self.library, self.roadmap = ViewLibrary(number, incarnation=incarnation), Roadmap()
         self.state = torch.cat([pose.double(), torch.zeros(3, dtype=torch.float64)])
         self.path = self.state[None].clone()
         self.braking = self.state[None].clone()
