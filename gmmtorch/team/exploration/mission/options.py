@@ -169,10 +169,6 @@ def _camera() -> DepthCamera:
     return DepthCamera()
 
 
-def _novelty() -> NoveltyRule:
-    return NoveltyRule(resolution=0.2, observed=0.5, distance=2.0)
-
-
 def _belief() -> BeliefRule:
     from gmmtorch.team.exploration.world.scoring import BeliefRule
 
@@ -200,7 +196,9 @@ class TeamOptions(LinkConditions):
     camera: DepthCamera = group(CameraOptions, "sensor", make=_camera)
     dynamics: Dynamics = field(default_factory=Dynamics)
     belief: BeliefRule = field(default_factory=_belief)
-    novelty: NoveltyRule = field(default_factory=_novelty)
+    novelty: NoveltyRule = field(
+        default_factory=lambda: NoveltyRule(resolution=0.2, observed=0.5, distance=2.0)
+    )
     frame: FrameRule = group(FrameRule, "map")
     window: tuple[int, int, int] = (80, 80, 40)
     planner: str = option("mcts", "mcts, frontier or random", "planner.name")

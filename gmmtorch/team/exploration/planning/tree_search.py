@@ -97,11 +97,8 @@ def search_tree(
     memory: values of views; None: only the goal counts. goal: the goal; None: only views count. first:
     primitives of a branch that is tried first, such as the rest of the last plan.
     """
-    start, residual = task.state.double(), task.residual
-    if memory is not None:  # the robot has just looked from here, so another look gains nothing
-        residual = memory.marginal(memory.rows(start[None, :4]), residual[None])[1][0]
     kind = _FusedTree if is_fused(task.local_map.passable, task.state) else _Tree
-    tree = kind(primitives, rule, task, memory, goal, residual)
+    tree = kind(primitives, rule, task, memory, goal)
     tree.grow(first)
     return tree.best()
 
@@ -116,24 +113,28 @@ class _Tree:
         task: PlanningTask,
         memory: ViewCache | None,
         goal: Goal | None,
-        residual: Tensor,
     ) -> None:
         self._primitives, self._rule, self._task = primitives, rule, task
         self._memory, self._goal = memory, goal
-        start = task.state.double()
-        most = 1 + rule.depth + rule.n_rounds * rule.n_leaves
-        n_primitives = len(primitives.commands)
+        start, residual = task.state.double(), task.residual
+        if memory is not None:  # the robot has just looked from here, so another look gains nothing
+            residual = memory.marginal(memory.rows(start[None, :4]), residual[None])[1][0]
+        self._paths, self._braking, feasible = options(primitives, start[None], task, may_escape=True)
+        metres = 0.0 if goal is None else float(goal.cost(start).clamp_max(_FAR))
+        self._begin(1 + rule.depth + rule.n_rounds * rule.n_leaves, residual, feasible, metres)
+
+    def _begin(self, most: int, residual: Tensor, feasible: Tensor, metres: float) -> None:
+        """Make the tables of at most `most` nodes, and the root: what is left of each block (G,), which
+        primitives are feasible (1, P), and the metres to the goal."""
+        start, n_primitives = self._task.state.double(), len(self._primitives)
         self._states = start.expand(most, 7).clone()
         self._ends = start.expand(most, n_primitives, 7).clone()  # end states of the primitives
-        self._metres = torch.zeros(most, dtype=torch.float64)  # remaining to the goal
+        self._metres = torch.full((most,), metres, dtype=torch.float64)  # remaining to the goal
         self._metres_after = torch.zeros(most, n_primitives, dtype=torch.float64)
         self._residuals = residual.expand(most, -1).clone()
         self._scale = 1e-12  # the largest return found
         root = _Node(0, None, -1, 0)
         self._nodes = [root]
-        if goal is not None:
-            self._metres[0] = goal.cost(start).clamp_max(_FAR)
-        self._paths, self._braking, feasible = options(primitives, start[None], task, may_escape=True)
         self._open([root], self._paths[:, :, -1], feasible)
 
     def grow(self, first: Sequence[int]) -> None:
@@ -256,31 +257,20 @@ class _Tree:
             node.untried, node.closed = actions[:n], n == 0
 
 
-class _FusedTree:
+class _FusedTree(_Tree):
     """The tree of one search in the tables of fused kernels; `_Tree` is its twin."""
 
-    def __init__(
-        self,
-        primitives: Primitives,
-        rule: SearchRule,
-        task: PlanningTask,
-        memory: ViewCache | None,
-        goal: Goal | None,
-        residual: Tensor,
-    ) -> None:
-        check_steps(primitives, task.local_map)
-        self._primitives, self._rule, self._task = primitives, rule, task
-        self._memory, self._goal = memory, goal
-        start = task.state.double()
-        self._paths, self._braking, feasible = options(primitives, start[None], task, may_escape=True)
+    def _begin(self, most: int, residual: Tensor, feasible: Tensor, metres: float) -> None:
+        task, rule, goal = self._task, self._rule, self._goal
+        check_steps(self._primitives, task.local_map)
         self._space = free_space(task.local_map, task.peers)
         self._tree = MotionTree(
-            1 + rule.depth + rule.n_rounds * rule.n_leaves,
-            start,
+            most,
+            task.state.double(),
             self._paths[0, :, -1],
             feasible[0],
             residual,
-            0.0 if goal is None else float(goal.cost(start).clamp_max(_FAR)),
+            metres,
             deepest=rule.depth,
             exploration=rule.exploration,
             widening=_WIDENING,
